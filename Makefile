@@ -1,0 +1,33 @@
+# make demo   sets up, makes furnished rooms, trains on them and shows the results
+# make test   sets up and runs the whole test suite
+PYTHON ?= python3
+BIN := .venv/bin
+READY := .venv/.ready
+
+.PHONY: install demo test lint bench
+
+install: $(READY)
+
+$(READY): pyproject.toml constraints.txt
+	@echo "Setting up .venv (about 6 GB, some minutes; only when the dependencies change) …"
+	@$(PYTHON) -c 'import sys; sys.exit(None if (3, 11) <= sys.version_info < (3, 14) else "Python 3.11 to 3.13 is needed: make PYTHON=python3.12 …")'
+	$(PYTHON) -m venv .venv
+	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	@touch $@
+
+demo: install
+	@echo "Making rooms, training and evaluating (about 6 minutes on two cores) …"
+	$(BIN)/tangent-train experiment=rooms/demo
+
+test: install
+	@echo "Running the whole test suite (some minutes on two cores) …"
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal --cov --cov-report=term:skip-covered
+
+lint: install
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+bench: install
+	$(BIN)/python -m benchmarks

@@ -1,0 +1,1 @@
+"""Train and evaluate ordinary networks on 360° panoramas through tangent images."""

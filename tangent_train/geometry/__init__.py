@@ -1,0 +1,61 @@
+"""Pure geometry of panoramas and tangent images; NumPy only, float64.
+
+Convention, stated here once and used everywhere:
+
+* **Directions** are unit vectors ``x = cos φ cos λ, y = cos φ sin λ, z = sin φ`` with latitude φ
+  growing upwards and longitude λ growing to the right, as seen from the centre: x looks at the
+  middle of the panorama, y to the right, z up. Seen as a place in a room this frame is mirrored (a
+  right-handed room has y to the left): `FLIP_Y` changes between the two.
+* **Equirectangular (ERP) pixels** have integer centres ``(u, v)``, u to the right, v down:
+  ``λ = (u + ½) / W · 2π − π``, ``φ = π/2 − (v + ½) / H · π``. Longitude wraps for every
+  interpolation, nearest included; beyond a pole the row reflects with a half-turn in longitude.
+* **Camera axes** are x right, y down, z forward. **Image pixels** have integer centres, so that a
+  camera matrix maps the pixel in row i, column j to (j, i).
+* Angles are in radians unless a name says ``deg``.
+"""
+
+from tangent_train.geometry.camera import (
+    camera_matrix_from_fov,
+    normalize_camera,
+    perspective_directions,
+    shift_range,
+)
+from tangent_train.geometry.equirect import (
+    equirect_directions,
+    equirect_latitudes,
+    equirect_shape,
+    equirect_solid_angles,
+    equirect_to_lonlat,
+    lonlat_to_equirect,
+)
+from tangent_train.geometry.grid import TangentGrid
+from tangent_train.geometry.icosphere import Icosphere, icosphere, vertex_resolution
+from tangent_train.geometry.sphere import (
+    FLIP_Y,
+    lonlat_to_xyz,
+    random_rotation,
+    rotation_about,
+    xyz_to_lonlat,
+)
+
+__all__ = [
+    "FLIP_Y",
+    "Icosphere",
+    "TangentGrid",
+    "camera_matrix_from_fov",
+    "equirect_directions",
+    "equirect_latitudes",
+    "equirect_shape",
+    "equirect_solid_angles",
+    "equirect_to_lonlat",
+    "icosphere",
+    "lonlat_to_equirect",
+    "lonlat_to_xyz",
+    "normalize_camera",
+    "perspective_directions",
+    "random_rotation",
+    "rotation_about",
+    "shift_range",
+    "vertex_resolution",
+    "xyz_to_lonlat",
+]

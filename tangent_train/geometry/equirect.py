@@ -1,0 +1,110 @@
+"""Equirectangular pixels; the convention is stated in `tangent_train.geometry`."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tangent_train.errors import SettingError
+from tangent_train.geometry.sphere import lonlat_to_xyz
+
+__all__ = [
+    "equirect_directions",
+    "equirect_latitudes",
+    "equirect_shape",
+    "equirect_solid_angles",
+    "equirect_to_lonlat",
+    "lonlat_to_equirect",
+]
+
+
+def equirect_shape(level: int) -> tuple[int, int]:
+    """Rows and columns of the panorama that matches a level-s icosahedron.
+
+    Args:
+        level: Level s, 0 or more.
+
+    Returns:
+        ``(2 ** (s + 1), 2 ** (s + 2))`` (paper, figure "icosahedral levels").
+
+    Raises:
+        SettingError: The level is negative.
+
+    >>> equirect_shape(10)
+    (2048, 4096)
+    """
+    if level < 0:
+        raise SettingError("level", found=level, expected="0 or more")
+    return 2 ** (level + 1), 2 ** (level + 2)
+
+
+def equirect_to_lonlat(pixels_xy: ArrayLike, shape: tuple[int, int]) -> NDArray[np.float64]:
+    """Longitude and latitude of ERP pixel positions.
+
+    Args:
+        pixels_xy: ``(..., 2)`` column u and row v; pixel centres are integers.
+        shape: ``(H, W)`` of the panorama.
+
+    Returns:
+        ``(..., 2)`` radians.
+    """
+    u, v = np.moveaxis(np.asarray(pixels_xy, np.float64), -1, 0)
+    height, width = shape
+    lon = (u + 0.5) / width * 2 * np.pi - np.pi
+    return np.stack([lon, np.pi / 2 - (v + 0.5) / height * np.pi], axis=-1)
+
+
+def lonlat_to_equirect(lonlat_rad: ArrayLike, shape: tuple[int, int]) -> NDArray[np.float64]:
+    """ERP pixel positions of longitudes and latitudes; inverse of `equirect_to_lonlat`.
+
+    Args:
+        lonlat_rad: ``(..., 2)`` radians, longitude in [−π, π].
+        shape: ``(H, W)`` of the panorama.
+
+    Returns:
+        ``(..., 2)`` column u in [−½, W − ½] and row v in [−½, H − ½].
+    """
+    lon, lat = np.moveaxis(np.asarray(lonlat_rad, np.float64), -1, 0)
+    height, width = shape
+    u = (lon + np.pi) / (2 * np.pi) * width - 0.5
+    return np.stack([u, (np.pi / 2 - lat) / np.pi * height - 0.5], axis=-1)
+
+
+def equirect_latitudes(height: int) -> NDArray[np.float64]:
+    """Latitude of every row's centre.
+
+    Args:
+        height: Rows H.
+
+    Returns:
+        ``(H,)`` radians, from north to south.
+    """
+    return np.pi / 2 - (np.arange(height) + 0.5) / height * np.pi
+
+
+def equirect_directions(shape: tuple[int, int]) -> NDArray[np.float64]:
+    """Direction of every ERP pixel centre.
+
+    Args:
+        shape: ``(H, W)``.
+
+    Returns:
+        ``(H, W, 3)`` unit vectors.
+    """
+    height, width = shape
+    lon = (np.arange(width) + 0.5) / width * 2 * np.pi - np.pi
+    return lonlat_to_xyz(np.stack(np.meshgrid(lon, equirect_latitudes(height)), axis=-1))
+
+
+def equirect_solid_angles(shape: tuple[int, int]) -> NDArray[np.float64]:
+    """Exact solid angle of one pixel of every row: ``2π/W · (sin φ_top − sin φ_bottom)``.
+
+    Args:
+        shape: ``(H, W)``.
+
+    Returns:
+        ``(H,)`` steradians; times W they add up to 4π.
+    """
+    height, width = shape
+    edges = np.sin(np.pi / 2 - np.arange(height + 1) / height * np.pi)
+    return 2 * np.pi / width * (edges[:-1] - edges[1:])
