@@ -1,0 +1,1 @@
+"""The commands: compose a config, build its objects, run them."""

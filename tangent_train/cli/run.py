@@ -1,0 +1,151 @@
+"""What the commands do, given a composed config."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import lightning
+from hydra.core.hydra_config import HydraConfig
+from hydra.utils import instantiate
+from lightning.pytorch.callbacks import LearningRateMonitor, RichProgressBar
+from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.utilities import rank_zero_only
+from omegaconf import DictConfig, OmegaConf
+from rich.console import Console
+
+from tangent_train.errors import SettingError
+from tangent_train.files import write_text
+from tangent_train.tasks.callbacks import (
+    CheckpointConfig,
+    LastCheckpoint,
+    PredictionPanels,
+    best_checkpoint,
+)
+from tangent_train.tasks.results import evaluation_results, results_table, write_results
+
+__all__ = ["evaluate", "prepare", "train"]
+
+
+def train(config: DictConfig) -> None:
+    """Train, then evaluate the best epoch of the validation split (else the last) on the test fold.
+
+    Args:
+        config: The composed ``train.yaml``.
+    """
+    folder = _run_folder()
+    checkpoints = folder / "checkpoints"
+    lightning.seed_everything(config.seed, workers=True, verbose=False)
+    data, task = build(config)
+    write_text(folder / "config.yaml", OmegaConf.to_yaml(config, resolve=True))
+    callbacks = [LastCheckpoint(checkpoints), LearningRateMonitor()]
+    best = best_checkpoint(checkpoints) if data.validation_fraction else None
+    if best is not None:
+        callbacks.append(best)
+    trainer = _trainer(config, folder, callbacks)
+    resumed = None if config.resume is None else checkpoints / "last.ckpt"
+    trainer.fit(task, datamodule=data, ckpt_path=resumed, weights_only=True)
+    chosen = best.best_model_path if best is not None else ""
+    _test(trainer, task, data, Path(chosen or checkpoints / "last.ckpt"), folder)
+
+
+def evaluate(config: DictConfig) -> None:
+    """Evaluate a checkpoint on the test fold of its data.
+
+    Args:
+        config: The config inside the checkpoint, with overrides, and ``checkpoint``.
+
+    Raises:
+        SettingError: No checkpoint is given.
+    """
+    if config.checkpoint is None:
+        raise SettingError(
+            "checkpoint",
+            found="none",
+            expected="a checkpoint written by tangent-train",
+            remedy="For example: tangent-evaluate checkpoint=runs/…/checkpoints/best.ckpt",
+        )
+    folder = _run_folder()
+    lightning.seed_everything(config.seed, workers=True, verbose=False)
+    data, task = build(config)
+    _test(_trainer(config, folder, []), task, data, Path(config.checkpoint), folder)
+
+
+def prepare(config: DictConfig) -> None:
+    """Make or check the data set.
+
+    Args:
+        config: The composed ``prepare.yaml``.
+    """
+    representation = instantiate(config.representation)
+    data = instantiate(config.data, representation=representation)
+    data.prepare_data()
+    data.setup("fit")
+    data.setup("test")
+    counts = ", ".join(f"{data.num_panoramas(s)} {s}" for s in ("train", "val", "test"))
+    _console().print(f"{data.root}: ready, panoramas of fold {data.fold}: {counts}")
+
+
+def build(config: DictConfig) -> tuple[Any, Any]:
+    """The data module and the task of a config.
+
+    Network settings that are null are taken from the data: ``in_channels``, ``num_classes``.
+
+    Args:
+        config: A composed config.
+
+    Returns:
+        Data module and task.
+    """
+    representation = instantiate(config.representation)
+    data = instantiate(config.data, representation=representation)
+    known = {"in_channels": data.in_channels, "num_classes": len(data.class_names)}
+    asked = {name: value for name, value in known.items() if config.network.get(name, 0) is None}
+    task = instantiate(
+        config.task,
+        network=instantiate(config.network, **asked),
+        representation=representation,
+        class_names=data.class_names,
+        optimizer=instantiate(config.optimizer),
+        scheduler=instantiate(config.scheduler),
+    )
+    return data, task
+
+
+def _trainer(config: DictConfig, folder: Path, callbacks: list[Any]) -> lightning.Trainer:
+    plain = OmegaConf.to_container(config, resolve=True)
+    panels = PredictionPanels(folder / "panels", config.panels)
+    common = [CheckpointConfig(plain), panels, RichProgressBar(leave=False)]  # type: ignore[arg-type]
+    return instantiate(  # type: ignore[no-any-return]
+        config.trainer,
+        default_root_dir=str(folder),
+        callbacks=[*callbacks, *common],
+        logger=TensorBoardLogger(folder, name="", version="tensorboard"),
+        # The data module's samplers count every panorama once on any number of processes.
+        use_distributed_sampler=False,
+    )
+
+
+def _test(trainer: lightning.Trainer, task: Any, data: Any, checkpoint: Path, folder: Path) -> None:
+    trainer.test(task, datamodule=data, ckpt_path=checkpoint, weights_only=True, verbose=False)
+    results = evaluation_results(task.matrices, task.class_names, task.absent_class)
+    total = data.num_panoramas("test")
+    if results["panoramas"] != total:
+        raise RuntimeError(f"{results['panoramas']} of {total} test panoramas were counted")
+    _report(results, checkpoint, folder)
+
+
+@rank_zero_only
+def _report(results: dict[str, Any], checkpoint: Path, folder: Path) -> None:
+    write_results(results, folder)
+    console = _console()
+    console.print(results_table(results))
+    console.print(f"Results, pictures and logs are in {folder} (checkpoint {checkpoint.name}).")
+
+
+def _run_folder() -> Path:
+    return Path(HydraConfig.get().runtime.output_dir)
+
+
+def _console() -> Console:
+    return Console(soft_wrap=True, highlight=False)

@@ -1,0 +1,173 @@
+"""One confusion matrix over the data set, and the scores read from it."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Integer
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+from torchmetrics import Metric
+
+from tangent_train.errors import SettingError
+from tangent_train.geometry import equirect_latitudes, equirect_solid_angles
+from tangent_train.tasks.losses import UNKNOWN
+
+__all__ = [
+    "BAND_EDGES_DEG",
+    "AbsentClass",
+    "ConfusionMatrices",
+    "ConfusionMatrix",
+    "SegmentationScores",
+    "segmentation_scores",
+]
+
+AbsentClass = Literal["skip", "zero"]
+"""What a class that no labelled pixel has does to a mean: nothing, or counts as 0."""
+
+BAND_EDGES_DEG = (90, 60, 30, 0, -30, -60, -90)
+"""Latitude bands, from north to south."""
+
+
+class SegmentationScores(NamedTuple):
+    """Scores of one confusion matrix; classes in order, the unknown class left out.
+
+    Attributes:
+        miou: Mean of `iou`.
+        macc: Mean of `accuracy`.
+        iou: ``(K,)`` intersection over union; NaN for absent classes that are skipped.
+        accuracy: ``(K,)`` share of a class's pixels that were found.
+        share: ``(K,)`` share of the labelled pixels that a class has.
+    """
+
+    miou: float
+    macc: float
+    iou: NDArray[np.float64]
+    accuracy: NDArray[np.float64]
+    share: NDArray[np.float64]
+
+
+def segmentation_scores(
+    confusion: ArrayLike, absent_class: AbsentClass = "skip"
+) -> SegmentationScores:
+    """Scores of a whole data set.
+
+    Args:
+        confusion: ``(K+1, K+1)`` counts or weights, rows truth, columns prediction, class 0 unknown
+            (pixels of unknown truth do not count).
+        absent_class: `skip` leaves classes absent from the truth out of the means; `zero` counts
+            them as 0, as the released code does.
+
+    Returns:
+        The scores; means are NaN when nothing is labelled and absent classes are skipped.
+    """
+    matrix = np.asarray(confusion, np.float64)[1:]
+    truth, hits = matrix.sum(axis=1), matrix[:, 1:].diagonal()
+    predicted = matrix[:, 1:].sum(axis=0)
+    present = truth > 0
+    missing = np.nan if absent_class == "skip" else 0.0
+    iou = np.full(len(truth), missing)
+    accuracy = iou.copy()
+    iou[present] = (hits / np.maximum(truth + predicted - hits, 1e-300))[present]
+    accuracy[present] = hits[present] / truth[present]
+    used = present | (absent_class == "zero")
+    mean = (float(v[used].mean()) if used.any() else float("nan") for v in (iou, accuracy))
+    share = truth / truth.sum() if present.any() else np.zeros_like(truth)
+    return SegmentationScores(*mean, iou, accuracy, share)
+
+
+class ConfusionMatrices(NamedTuple):
+    """What `ConfusionMatrix` has counted; rows truth, columns prediction, class 0 unknown.
+
+    Attributes:
+        erp: ``(K+1, K+1)`` pixels of the panoramas.
+        solid_angle: ``(K+1, K+1)`` steradians.
+        bands: ``(6, K+1, K+1)`` pixels of the latitude bands `BAND_EDGES_DEG`.
+        panoramas: Panoramas counted.
+    """
+
+    erp: NDArray[np.int64]
+    solid_angle: NDArray[np.float64]
+    bands: NDArray[np.int64]
+    panoramas: int
+
+
+class ConfusionMatrix(Metric):
+    """Confusion matrices of panoramas: integer pixel counts by latitude, and solid angles.
+
+    ERP pixels over-count the poles; the second matrix weighs every pixel by its solid angle.
+    Both are summed over processes.
+
+    Args:
+        num_classes: K + 1, the unknown class 0 included.
+
+    Attributes:
+        counts: ``(6, K+1, K+1)`` pixels per latitude band of 30°, north first; rows truth, columns
+            prediction.
+        steradians: ``(K+1, K+1)`` the same over all latitudes, in steradians.
+        panoramas: Panoramas seen.
+    """
+
+    full_state_update = False
+    counts: Tensor
+    steradians: Tensor
+    panoramas: Tensor
+
+    def __init__(self, num_classes: int) -> None:
+        super().__init__()
+        self.num_classes = num_classes
+        bands = len(BAND_EDGES_DEG) - 1
+        square = (num_classes, num_classes)
+        for name, default in (
+            ("counts", torch.zeros((bands, *square), dtype=torch.int64)),
+            ("steradians", torch.zeros(square, dtype=torch.float64)),
+            ("panoramas", torch.zeros((), dtype=torch.int64)),
+        ):
+            self.add_state(name, default, dist_reduce_fx="sum")
+
+    def update(
+        self,
+        prediction: Integer[Tensor, "rows columns"],
+        truth: Integer[Tensor, "rows columns"],
+    ) -> None:
+        """Count one panorama.
+
+        Args:
+            prediction: Class indices.
+            truth: Class indices; unknown (0) does not count.
+
+        Raises:
+            SettingError: The shapes differ or an index is out of range.
+        """
+        if prediction.shape != truth.shape:
+            raise SettingError(
+                "prediction", found=tuple(prediction.shape), expected=tuple(truth.shape)
+            )
+        k = self.num_classes
+        known = truth != UNKNOWN
+        rows = known.nonzero()[:, 0]
+        pairs = truth[known].long() * k + prediction[known].long()
+        if pairs.numel() and (int(prediction[known].max()) >= k or int(truth.max()) >= k):
+            raise SettingError("class index", found="one too large", expected=f"less than {k}")
+        height, width = truth.shape
+        latitudes = np.degrees(equirect_latitudes(height))
+        band_of_row = np.searchsorted(-np.array(BAND_EDGES_DEG[1:-1]), -latitudes, side="left")
+        bands = torch.as_tensor(band_of_row, device=truth.device)[rows]
+        angles = torch.as_tensor(equirect_solid_angles((height, width)), device=truth.device)
+        counts = torch.bincount(bands * k * k + pairs, minlength=self.counts.numel())
+        self.counts += counts.reshape(self.counts.shape)
+        weighed = torch.bincount(pairs, weights=angles[rows], minlength=k * k)
+        self.steradians += weighed.reshape(k, k)
+        self.panoramas += 1
+
+    def compute(self) -> ConfusionMatrices:
+        """The matrices of all processes, as arrays."""
+        counts = self.counts.cpu().numpy()
+        return ConfusionMatrices(
+            erp=counts.sum(axis=0),
+            solid_angle=self.steradians.cpu().numpy(),
+            bands=counts,
+            panoramas=int(self.panoramas),
+        )

@@ -1,0 +1,100 @@
+"""Pictures of predictions: input, truth, prediction and error of a panorama, with a legend."""
+
+from __future__ import annotations
+
+import colorsys
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tangent_train.tasks.losses import UNKNOWN
+
+__all__ = ["class_colors", "colorize", "prediction_panel"]
+
+_Image = NDArray[np.uint8]
+_MARGIN = 8
+
+
+def class_colors(num_classes: int) -> _Image:
+    """Distinct colours, black for the unknown class 0.
+
+    Args:
+        num_classes: K + 1.
+
+    Returns:
+        ``(K+1, 3)`` RGB: hues a golden ratio apart, in three brightnesses.
+    """
+    colors = [
+        colorsys.hsv_to_rgb(k * 0.618034 % 1, 0.45 + 0.4 * (k % 2), 0.95 - 0.15 * (k % 3))
+        for k in range(1, num_classes)
+    ]
+    return (np.array([(0, 0, 0), *colors]) * 255).round().astype(np.uint8)
+
+
+def colorize(labels: NDArray[np.integer], num_classes: int) -> _Image:
+    """Class indices ``(H, W)`` as RGB ``(H, W, 3)``.
+
+    Args:
+        labels: Class indices.
+        num_classes: K + 1.
+    """
+    return class_colors(num_classes)[labels]
+
+
+def prediction_panel(
+    rgb: _Image,
+    truth: NDArray[np.integer],
+    prediction: NDArray[np.integer],
+    class_names: Sequence[str],
+) -> _Image:
+    """Input, truth, prediction and error in a 2×2 grid, over a legend of the classes seen.
+
+    Args:
+        rgb: ``(H, W, 3)`` the panorama.
+        truth: ``(H, W)`` class indices, 0 unknown.
+        prediction: ``(H, W)`` class indices.
+        class_names: K + 1 names.
+
+    Returns:
+        RGB image, about 2W × 2H. Errors are red, unknown truth is grey.
+    """
+    count = len(class_names)
+    error = np.full((*truth.shape, 3), 255, np.uint8)
+    error[prediction != truth] = (214, 39, 40)
+    error[truth == UNKNOWN] = (160, 160, 160)
+    tiles = {
+        "input": rgb,
+        "truth": colorize(truth, count),
+        "prediction": colorize(prediction, count),
+        "error": error,
+    }
+    titled = [_titled(image, title) for title, image in tiles.items()]
+    gap = np.full((titled[0].shape[0], _MARGIN, 3), 255, np.uint8)
+    grid = np.concatenate([np.concatenate([titled[k], gap, titled[k + 1]], axis=1) for k in (0, 2)])
+    seen = np.union1d(np.unique(truth), np.unique(prediction))
+    return np.concatenate([grid, _legend(grid.shape[1], seen, class_names)])
+
+
+def _titled(image: _Image, title: str) -> _Image:
+    strip = np.full((22, image.shape[1], 3), 255, np.uint8)
+    return np.concatenate([_text(strip, title, (2, 16)), image])
+
+
+def _legend(width: int, classes: NDArray[np.integer], class_names: Sequence[str]) -> _Image:
+    cell, line = 104, 22
+    per_row = max(1, width // cell)
+    rows = -(-len(classes) // per_row)
+    legend = np.full((rows * line + _MARGIN, width, 3), 255, np.uint8)
+    colors = class_colors(len(class_names))
+    for k, index in enumerate(classes):
+        x, y = k % per_row * cell + 2, k // per_row * line + _MARGIN
+        legend[y : y + 14, x : x + 14] = colors[index]
+        _text(legend, class_names[index], (x + 19, y + 12))
+    return legend
+
+
+def _text(image: _Image, text: str, origin: tuple[int, int]) -> _Image:
+    cv2.putText(image, text, origin, cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
+    return image

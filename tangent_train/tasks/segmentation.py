@@ -1,0 +1,201 @@
+"""Semantic segmentation of panoramas."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
+
+import lightning
+import torch
+from jaxtyping import Float, Integer
+from torch import Tensor, nn
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LRScheduler
+
+from tangent_train.errors import SettingError
+from tangent_train.rendering import Representation
+from tangent_train.tasks.losses import LossSum, cross_entropy_sum
+from tangent_train.tasks.metrics import AbsentClass, ConfusionMatrix, segmentation_scores
+
+__all__ = ["SegmentationTask"]
+
+
+class SegmentationTask(lightning.LightningModule):
+    """Trains a network on views of panoramas and scores it on the panoramas.
+
+    The views of all panoramas of a batch, on all processes, make one gradient (paper, supplement,
+    "Semantic segmentation"): the loss is the sum over their labelled pixels divided by the sum of
+    those pixels' class weights. Validation and test see the whole sphere; the scores are rendered
+    back and compared with the panorama's own labels.
+
+    Args:
+        network: Any module ``(B, C, h, w) -> (B, K+1, h, w)`` or a dict with that under ``"out"``;
+            the first score belongs to the unknown class, which is never predicted.
+        representation: What made the images; it assembles the scores.
+        class_names: K + 1 names, the unknown class first.
+        optimizer: Makes the optimizer from parameters.
+        scheduler: Makes a learning rate scheduler from the optimizer, or None. When it takes
+            `total_steps`, it is told the length of the training and stepped every step.
+        class_weights: Weights of the loss: a name that the data module knows (``none``, ``log``,
+            ``sqrt``) or K + 1 numbers.
+        label_smoothing: Share of the target spread over all classes.
+        images_per_forward: Images evaluated at once, a bound on memory; training is not affected.
+        absent_class: What classes absent from the truth do to the means.
+        channels_last: Memory format of network and images, often faster.
+    """
+
+    class_weights: Tensor
+
+    def __init__(
+        self,
+        network: nn.Module,
+        representation: Representation,
+        class_names: Sequence[str],
+        optimizer: Callable[..., Optimizer],
+        scheduler: Callable[..., LRScheduler] | None = None,
+        class_weights: Literal["none", "log", "sqrt"] | Sequence[float] = "log",
+        label_smoothing: float = 0.0,
+        images_per_forward: int = 32,
+        absent_class: AbsentClass = "skip",
+        channels_last: bool = False,
+    ) -> None:
+        super().__init__()
+        if not 0 <= label_smoothing < 1:
+            raise SettingError("task.label_smoothing", found=label_smoothing, expected="0 to 1")
+        if images_per_forward < 1:
+            raise SettingError("task.images_per_forward", found=images_per_forward, expected="≥ 1")
+        if absent_class not in ("skip", "zero"):
+            raise SettingError("task.absent_class", found=absent_class, expected="skip or zero")
+        self.memory_format = torch.channels_last if channels_last else torch.contiguous_format
+        self.network: nn.Module = network.to(memory_format=self.memory_format)  # type: ignore[call-overload]
+        self.representation = representation
+        self.class_names = tuple(class_names)
+        self.make_optimizer = optimizer
+        self.make_scheduler = scheduler
+        self.weighting = class_weights
+        self.label_smoothing = label_smoothing
+        self.images_per_forward = images_per_forward
+        self.absent_class: AbsentClass = absent_class
+        self.register_buffer("class_weights", torch.ones(len(self.class_names)))
+        self.confusion = ConfusionMatrix(len(self.class_names))
+
+    def setup(self, stage: str) -> None:
+        """Fix the class weights before training; evaluation takes them from the checkpoint."""
+        if stage != "fit":
+            return
+        weights: Any = self.weighting
+        if isinstance(weights, str):
+            weights = self.trainer.datamodule.class_weights(weights)  # type: ignore[attr-defined]
+        weights = torch.as_tensor(weights, dtype=torch.float32)
+        if weights.shape != self.class_weights.shape:
+            raise SettingError(
+                "task.class_weights",
+                found=f"{weights.numel()} numbers",
+                expected=f"{len(self.class_names)}, one for each of {', '.join(self.class_names)}",
+            )
+        self.class_weights.copy_(weights)
+
+    def forward(
+        self, images: Float[Tensor, "images channels height width"]
+    ) -> Float[Tensor, "images classes height width"]:
+        """Scores of every pixel, the unknown class first.
+
+        Raises:
+            SettingError: The network's scores do not fit the images or the classes.
+        """
+        scores = self.network(images.contiguous(memory_format=self.memory_format))
+        if isinstance(scores, dict):
+            scores = scores["out"]
+        expected = (images.shape[0], len(self.class_names), *images.shape[-2:])
+        if tuple(scores.shape) != expected:
+            raise SettingError(
+                "scores of the network",
+                found=tuple(scores.shape),
+                expected=expected,
+                remedy="Set network.num_classes to the number of classes, unknown included.",
+            )
+        return scores
+
+    def training_step(self, batch: Any, batch_idx: int) -> Tensor:
+        """One gradient of the whole batch of spheres, over all processes."""
+        images, labels = batch.images.flatten(0, 1), batch.labels.flatten(0, 1)
+        loss = cross_entropy_sum(self(images), labels, self.class_weights, self.label_smoothing)
+        value = self._normalized(loss)
+        self.log("train/loss", value.detach(), prog_bar=True, on_step=True, on_epoch=True)
+        return value
+
+    def _normalized(self, loss: LossSum) -> Tensor:
+        """Divide by the norm of all processes; their gradients are averaged, hence the factor."""
+        norm = self.all_gather(loss.norm.detach()).sum()
+        return loss.total * self.trainer.world_size / norm.clamp(min=torch.finfo(norm.dtype).tiny)
+
+    @torch.no_grad()
+    def predict_panorama(
+        self, images: Float[Tensor, "images channels height width"], shape: tuple[int, int]
+    ) -> Integer[Tensor, "rows columns"]:
+        """Class index (never unknown) of every pixel of one panorama.
+
+        Args:
+            images: The representation's views of the whole sphere.
+            shape: ``(H, W)`` of the panorama.
+
+        Returns:
+            ``(H, W)`` class indices 1 … K.
+        """
+        parts = images.split(self.images_per_forward)
+        scores = torch.cat([self(part)[:, 1:].float() for part in parts])
+        return self.representation.to_labels(scores, shape) + 1
+
+    def _evaluate(self, batch: Any) -> Tensor:
+        """Score a batch of panoramas; returns the predictions."""
+        predictions = [
+            self.predict_panorama(images, (target.shape[0], target.shape[1]))
+            for images, target in zip(batch.images, batch.target, strict=True)
+        ]
+        for prediction, target in zip(predictions, batch.target, strict=True):
+            self.confusion.update(prediction, target)
+        return torch.stack(predictions)
+
+    def validation_step(self, batch: Any, batch_idx: int) -> None:
+        """Score panoramas."""
+        self._evaluate(batch)
+
+    def test_step(self, batch: Any, batch_idx: int) -> Tensor:
+        """Score panoramas and hand the predictions to the callbacks."""
+        return self._evaluate(batch)
+
+    def on_validation_epoch_end(self) -> None:
+        """Log the scores of the validation split."""
+        self._log_scores("val")
+
+    def on_test_epoch_end(self) -> None:
+        """Log the scores of the test split and keep the matrices for the results."""
+        self._log_scores("test")
+
+    def _log_scores(self, stage: str) -> None:
+        self.matrices = self.confusion.compute()
+        self.confusion.reset()
+        scores = {
+            "": segmentation_scores(self.matrices.erp, self.absent_class),
+            "_solid_angle": segmentation_scores(self.matrices.solid_angle, self.absent_class),
+        }
+        for suffix, score in scores.items():
+            on_bar = stage == "val" and not suffix
+            # Every process has the same number: the mean over processes changes nothing.
+            self.log(f"{stage}/miou{suffix}", score.miou, prog_bar=on_bar, sync_dist=True)
+            self.log(f"{stage}/macc{suffix}", score.macc, sync_dist=True)
+
+    def configure_optimizers(self) -> Any:
+        """Optimizer, and scheduler if there is one."""
+        optimizer = self.make_optimizer(self.parameters())
+        if self.make_scheduler is None:
+            return optimizer
+        by_step = "total_steps" in inspect.signature(self.make_scheduler).parameters
+        length = {"total_steps": int(self.trainer.estimated_stepping_batches)} if by_step else {}
+        scheduler = self.make_scheduler(optimizer, **length)
+        interval = "step" if by_step else "epoch"
+        return {
+            "optimizer": optimizer,
+            "lr_scheduler": {"scheduler": scheduler, "interval": interval},
+        }

@@ -1,0 +1,45 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from torch.nn import functional
+
+from tangent_train.tasks.losses import cross_entropy_sum
+
+
+@pytest.mark.parametrize("smoothing", [0.0, 0.1])
+def test_sum_over_norm_is_the_weighted_mean(smoothing: float) -> None:
+    generator = torch.Generator().manual_seed(0)
+    scores = torch.randn(4, 5, 6, 7, generator=generator, dtype=torch.float64)
+    labels = torch.randint(0, 5, (4, 6, 7), generator=generator).to(torch.uint8)
+    weights = torch.rand(5, generator=generator, dtype=torch.float64) + 0.1
+    loss = cross_entropy_sum(scores, labels, weights, smoothing)
+    expected = functional.cross_entropy(
+        scores, labels.long(), weights, ignore_index=0, label_smoothing=smoothing
+    )
+    torch.testing.assert_close(loss.total / loss.norm, expected)
+
+
+def test_parts_add_up_to_the_gradient_of_the_whole() -> None:
+    scores = torch.randn(6, 3, 4, 4, dtype=torch.float64, requires_grad=True)
+    labels = torch.randint(1, 3, (6, 4, 4)).to(torch.uint8)
+    labels[:4, :3] = 0  # unknown pixels spread unevenly
+    weights = torch.tensor([1.0, 0.5, 2.0], dtype=torch.float64)
+    whole = cross_entropy_sum(scores, labels, weights)
+    (expected,) = torch.autograd.grad(whole.total / whole.norm, scores)
+    parts = [
+        cross_entropy_sum(s, t, weights)
+        for s, t in zip(scores.split(2), labels.split(2), strict=True)
+    ]
+    norm = torch.stack([part.norm for part in parts]).sum()
+    (summed,) = torch.autograd.grad(sum(part.total for part in parts) / norm, scores)
+    torch.testing.assert_close(summed, expected)
+
+
+def test_nothing_labelled_gives_zero_and_no_nan() -> None:
+    scores = torch.randn(1, 3, 2, 2, requires_grad=True)
+    loss = cross_entropy_sum(scores, torch.zeros(1, 2, 2, dtype=torch.uint8), torch.ones(3))
+    assert float(loss.norm) == 0
+    loss.total.backward()
+    assert scores.grad is not None
+    assert float(scores.grad.abs().max()) == 0

@@ -1,0 +1,124 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from torchmetrics import JaccardIndex
+
+from tangent_train.errors import SettingError
+from tangent_train.tasks.metrics import ConfusionMatrix, segmentation_scores
+
+CLASSES = 5
+
+
+def _panoramas() -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    """Prediction and truth of panoramas of uneven sizes; truth has unknown pixels."""
+    rng = np.random.default_rng(3)
+    shapes = [(12, 24), (30, 60), (7, 15)]
+    return [(rng.integers(1, CLASSES, shape), rng.integers(0, CLASSES, shape)) for shape in shapes]
+
+
+def _counted(pairs: list[tuple[NDArray[np.int64], NDArray[np.int64]]]) -> ConfusionMatrix:
+    metric = ConfusionMatrix(CLASSES)
+    for prediction, truth in pairs:
+        metric.update(torch.from_numpy(prediction), torch.from_numpy(truth))
+    return metric
+
+
+def test_scores_equal_plain_numpy_over_the_whole_data_set() -> None:
+    pairs = _panoramas()
+    prediction = np.concatenate([p.ravel() for p, _ in pairs])
+    truth = np.concatenate([t.ravel() for _, t in pairs])
+    prediction, truth = prediction[truth > 0], truth[truth > 0]
+    scores = segmentation_scores(_counted(pairs).compute().erp)
+    for k in range(1, CLASSES):
+        hits = np.sum((prediction == k) & (truth == k))
+        union = np.sum((prediction == k) | (truth == k))
+        assert scores.iou[k - 1] == pytest.approx(hits / union)
+        assert scores.accuracy[k - 1] == pytest.approx(hits / np.sum(truth == k))
+        assert scores.share[k - 1] == pytest.approx(np.mean(truth == k))
+    assert scores.miou == pytest.approx(scores.iou.mean())
+    assert scores.macc == pytest.approx(scores.accuracy.mean())
+
+
+def test_iou_equals_torchmetrics() -> None:
+    reference = JaccardIndex("multiclass", num_classes=CLASSES, ignore_index=0, average="none")
+    for prediction, truth in _panoramas():
+        reference.update(torch.from_numpy(prediction), torch.from_numpy(truth))
+    scores = segmentation_scores(_counted(_panoramas()).compute().erp)
+    np.testing.assert_allclose(scores.iou, reference.compute()[1:].numpy(), rtol=1e-6)
+
+
+def test_the_mean_is_over_the_data_set_not_over_panoramas() -> None:
+    pairs = _panoramas()
+    single = [segmentation_scores(_counted([pair]).compute().erp).miou for pair in pairs]
+    whole = segmentation_scores(_counted(pairs).compute().erp).miou
+    assert abs(whole - np.mean(single)) > 1e-3
+
+
+@pytest.mark.parametrize(("absent", "mean"), [("skip", (1 + 0.5) / 2), ("zero", (1 + 0.5 + 0) / 3)])
+def test_absent_classes(absent: str, mean: float) -> None:
+    confusion = np.zeros((4, 4))
+    confusion[1, 1] = 10
+    confusion[2, 2], confusion[2, 3] = 5, 5
+    confusion[0, 3] = 100  # unknown truth counts for nothing
+    assert segmentation_scores(confusion, absent).miou == pytest.approx(mean)  # type: ignore[arg-type]
+
+
+def test_nothing_labelled() -> None:
+    empty = np.zeros((4, 4))
+    scores = segmentation_scores(empty)
+    assert np.isnan(scores.miou)
+    assert np.all(np.isnan(scores.iou))
+    assert np.all(scores.share == 0)
+    assert segmentation_scores(empty, "zero").miou == 0
+
+
+def test_solid_angle_weighs_a_hemisphere_as_half_whatever_its_rows() -> None:
+    height, width = 64, 128
+    truth = torch.ones(height, width, dtype=torch.int64)
+    truth[: height // 4] = 2  # above 45°: (1 − sin 45°)/2 of the sphere, a quarter of the rows
+    metric = ConfusionMatrix(3)
+    metric.update(truth, truth)
+    matrices = metric.compute()
+    share = matrices.solid_angle.diagonal()[1:] / (4 * np.pi)
+    np.testing.assert_allclose(share, [(1 + np.sqrt(0.5)) / 2, (1 - np.sqrt(0.5)) / 2], rtol=1e-12)
+    np.testing.assert_array_equal(matrices.erp.diagonal()[1:], [3 * 64 * 32, 64 * 32])
+
+
+def test_latitude_bands_go_from_north_to_south() -> None:
+    truth = torch.arange(1, 7).repeat_interleave(5)[:, None].expand(30, 60)
+    metric = ConfusionMatrix(7)
+    metric.update(truth, truth)
+    bands = metric.compute().bands
+    for k, band in enumerate(bands):
+        assert band[k + 1, k + 1] == 5 * 60
+        assert band.sum() == 5 * 60
+
+
+def test_matrices_add_up_over_processes_and_reset() -> None:
+    pairs = _panoramas()
+    parts = [_counted(pairs[:1]), _counted(pairs[1:])]
+    total = sum(part.compute().erp for part in parts)
+    whole = _counted(pairs)
+    np.testing.assert_array_equal(whole.compute().erp, total)
+    assert whole.compute().panoramas == 3
+    whole.reset()
+    assert whole.compute().erp.sum() == 0
+
+
+def test_bad_input_is_refused() -> None:
+    metric = ConfusionMatrix(3)
+    with pytest.raises(SettingError, match="prediction"):
+        metric.update(torch.ones(2, 4, dtype=torch.int64), torch.ones(2, 3, dtype=torch.int64))
+    with pytest.raises(SettingError, match="class index"):
+        metric.update(torch.full((2, 4), 3, dtype=torch.int64), torch.ones(2, 4, dtype=torch.int64))
+
+
+def test_an_all_unknown_panorama_counts_as_seen_and_adds_nothing() -> None:
+    metric = ConfusionMatrix(3)
+    unknown = torch.zeros(4, 8, dtype=torch.int64)
+    metric.update(unknown + 1, unknown)
+    assert metric.compute().erp.sum() == 0
+    assert metric.compute().panoramas == 1

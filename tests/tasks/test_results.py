@@ -1,0 +1,60 @@
+from __future__ import annotations
+
+import csv
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+
+from tangent_train.tasks.metrics import ConfusionMatrices
+from tangent_train.tasks.results import evaluation_results, results_table, write_results
+
+NAMES = ("unknown", "wall", "floor", "sofa")
+
+
+def _matrices() -> ConfusionMatrices:
+    """Walls found by 90 %, floors by half, no sofa."""
+    erp = np.zeros((4, 4), np.int64)
+    erp[1, 1], erp[1, 2] = 90, 10
+    erp[2, 2], erp[2, 1] = 50, 50
+    bands = np.zeros((6, 4, 4), np.int64)
+    bands[2] = erp
+    return ConfusionMatrices(erp, erp / 10, bands, 7)
+
+
+def test_results_are_plain_and_complete(tmp_path: Path) -> None:
+    results = evaluation_results(_matrices(), NAMES, "skip")
+    write_results(results, tmp_path)
+    read = json.loads((tmp_path / "results.json").read_text())
+    assert read == results
+    assert read["panoramas"] == 7
+    assert read["macc"] == (0.9 + 0.5) / 2
+    assert read["miou"] == (90 / 150 + 50 / 110) / 2
+    assert [c["class"] for c in read["classes"]] == ["wall", "floor", "sofa"]
+    assert read["classes"][2]["iou"] is None, "absent: not defined"
+    assert read["latitude_bands"][2]["latitude_deg"] == [0, 30]
+    assert read["latitude_bands"][2]["miou"] == read["miou"]
+    assert read["latitude_bands"][0]["miou"] is None
+    assert read["confusion"][1] == [0, 90, 10, 0]
+
+
+def test_csv_and_markdown_hold_the_same_figures(tmp_path: Path) -> None:
+    write_results(evaluation_results(_matrices(), NAMES, "zero"), tmp_path)
+    with (tmp_path / "results.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["class"] for row in rows] == ["wall", "floor", "sofa"]
+    assert float(rows[0]["iou"]) == 0.6
+    assert float(rows[2]["iou"]) == 0.0
+    text = (tmp_path / "results.md").read_text()
+    assert "| wall | 60.0 | 90.0 | 60.0 | 90.0 | 50.0 |" in text
+    assert "| 0° … 30° |" in text
+
+
+def test_the_table_shows_every_class_and_the_mean() -> None:
+    console = Console(width=120, record=True, file=io.StringIO())
+    console.print(results_table(evaluation_results(_matrices(), NAMES, "skip")))
+    text = console.export_text()
+    for word in ("7 panoramas", "wall", "60.0", "sofa", "–", "mean", "52.7"):
+        assert word in text
