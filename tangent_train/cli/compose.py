@@ -144,7 +144,7 @@ def _check_option(loader: ConfigLoader, override: Override) -> None:
         override.sweep_string_iterator() if override.is_sweep_override() else [override.value()]
     )
     for option in wanted:
-        if option is not None and str(option) not in options:
+        if str(option) not in options:
             _refuse(override.key_or_group, str(option), options)
 
 
@@ -171,7 +171,7 @@ def _group_names(loader: ConfigLoader) -> list[str]:
 
 def _dotted(config: DictConfig, prefix: str = "") -> Iterator[str]:
     for key in config:
-        name = f"{prefix}{key}"
+        name = prefix + str(key)
         yield name
         node = config._get_node(key)
         if isinstance(node, DictConfig) and not node._is_none() and not node._is_interpolation():

@@ -60,5 +60,6 @@ def _compose_and_run(command: str, typed: list[str]) -> None:
         except (DataError, SettingError) as error:
             sys.exit(f"tangent-{command}: {error}")
 
-    sys.argv[1:] = arguments
+    # Lightning prints its own messages; Hydra's handler would print them again.
+    sys.argv[1:] = [*arguments, "hydra/job_logging=none"]
     hydra.main(version_base="1.3", config_path=str(config_folder()), config_name=config_name)(job)()

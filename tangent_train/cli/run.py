@@ -8,7 +8,7 @@ from typing import Any
 import lightning
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
-from lightning.pytorch.callbacks import LearningRateMonitor, RichProgressBar
+from lightning.pytorch.callbacks import LearningRateMonitor
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, OmegaConf
@@ -20,6 +20,7 @@ from tangent_train.tasks.callbacks import (
     CheckpointConfig,
     LastCheckpoint,
     PredictionPanels,
+    ProgressBar,
     best_checkpoint,
 )
 from tangent_train.tasks.results import evaluation_results, results_table, write_results
@@ -82,8 +83,8 @@ def prepare(config: DictConfig) -> None:
     data.prepare_data()
     data.setup("fit")
     data.setup("test")
-    counts = ", ".join(f"{data.num_panoramas(s)} {s}" for s in ("train", "val", "test"))
-    _console().print(f"{data.root}: ready, panoramas of fold {data.fold}: {counts}")
+    counts = ", ".join(f"{len(data.open_split(s))} {s}" for s in ("train", "val", "test"))
+    _console().print(f"{data.root} is ready. Panoramas of fold {data.fold}: {counts}.")
 
 
 def build(config: DictConfig) -> tuple[Any, Any]:
@@ -113,10 +114,10 @@ def build(config: DictConfig) -> tuple[Any, Any]:
 
 
 def _trainer(config: DictConfig, folder: Path, callbacks: list[Any]) -> lightning.Trainer:
-    plain = OmegaConf.to_container(config, resolve=True)
+    plain: Any = OmegaConf.to_container(config, resolve=True)
     panels = PredictionPanels(folder / "panels", config.panels)
-    common = [CheckpointConfig(plain), panels, RichProgressBar(leave=False)]  # type: ignore[arg-type]
-    return instantiate(  # type: ignore[no-any-return]
+    common = [CheckpointConfig(plain), panels, ProgressBar()]
+    trainer: lightning.Trainer = instantiate(
         config.trainer,
         default_root_dir=str(folder),
         callbacks=[*callbacks, *common],
@@ -124,12 +125,13 @@ def _trainer(config: DictConfig, folder: Path, callbacks: list[Any]) -> lightnin
         # The data module's samplers count every panorama once on any number of processes.
         use_distributed_sampler=False,
     )
+    return trainer
 
 
 def _test(trainer: lightning.Trainer, task: Any, data: Any, checkpoint: Path, folder: Path) -> None:
     trainer.test(task, datamodule=data, ckpt_path=checkpoint, weights_only=True, verbose=False)
     results = evaluation_results(task.matrices, task.class_names, task.absent_class)
-    total = data.num_panoramas("test")
+    total = len(data.source("test"))
     if results["panoramas"] != total:
         raise RuntimeError(f"{results['panoramas']} of {total} test panoramas were counted")
     _report(results, checkpoint, folder)

@@ -8,14 +8,19 @@ from typing import Any
 import cv2
 import lightning
 import numpy as np
-from lightning.pytorch.callbacks import Callback, Checkpoint, ModelCheckpoint
+from lightning.pytorch.callbacks import Callback, Checkpoint, ModelCheckpoint, RichProgressBar
 from rich.console import Console
 
 from tangent_train.files import write_bytes
 from tangent_train.tasks.pictures import prediction_panel
-from tangent_train.tasks.segmentation import SegmentationTask
 
-__all__ = ["CheckpointConfig", "LastCheckpoint", "PredictionPanels", "best_checkpoint"]
+__all__ = [
+    "CheckpointConfig",
+    "LastCheckpoint",
+    "PredictionPanels",
+    "ProgressBar",
+    "best_checkpoint",
+]
 
 
 class CheckpointConfig(Callback):
@@ -59,24 +64,36 @@ class PredictionPanels(Callback):
         batch_idx: int,
         dataloader_idx: int = 0,
     ) -> None:
-        data: Any = trainer.datamodule  # type: ignore[attr-defined]
-        total = data.num_panoramas("test")
-        chosen = set(np.linspace(0, total - 1, min(self.count, total)).round().astype(int).tolist())
-        if not isinstance(pl_module, SegmentationTask):
-            return
+        source: Any = trainer.datamodule.source("test")  # type: ignore[attr-defined]
+        chosen = np.linspace(0, len(source) - 1, min(self.count, len(source))).round()
         for index, prediction, target in zip(
             batch.index.tolist(), outputs, batch.target, strict=True
         ):
             if index in chosen:
                 panel = prediction_panel(
-                    data.panorama("test", index).rgb,
+                    source.read(index).rgb,
                     target.cpu().numpy(),
                     prediction.cpu().numpy(),
-                    pl_module.class_names,
+                    pl_module.class_names,  # type: ignore[arg-type]
                 )
-                name = data.sample_name("test", index)
                 encoded = cv2.imencode(".png", cv2.cvtColor(panel, cv2.COLOR_RGB2BGR))[1]
+                name = source.name(index).replace("/", "_")
                 write_bytes(self.folder / f"{name}.png", encoded.tobytes())
+
+
+class ProgressBar(RichProgressBar):
+    """Lightning's bar with rate and time left, without the logger's version."""
+
+    def __init__(self) -> None:
+        super().__init__(leave=False)
+
+    def get_metrics(
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
+    ) -> dict[str, Any]:
+        """The figures behind the bar."""
+        figures = dict(super().get_metrics(trainer, pl_module))
+        figures.pop("v_num", None)
+        return figures
 
 
 class LastCheckpoint(Checkpoint):
@@ -97,13 +114,13 @@ class LastCheckpoint(Checkpoint):
     ) -> None:
         """Save the untrained state of a new run."""
         if trainer.global_step == 0:
-            trainer.save_checkpoint(self.path)
+            trainer.save_checkpoint(self.path, weights_only=False)
 
     def on_train_epoch_end(
         self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
     ) -> None:
         """Save the state after every epoch."""
-        trainer.save_checkpoint(self.path)
+        trainer.save_checkpoint(self.path, weights_only=False)
 
     def on_exception(
         self,

@@ -73,9 +73,9 @@ def segmentation_scores(
     iou[present] = (hits / np.maximum(truth + predicted - hits, 1e-300))[present]
     accuracy[present] = hits[present] / truth[present]
     used = present | (absent_class == "zero")
-    mean = (float(v[used].mean()) if used.any() else float("nan") for v in (iou, accuracy))
+    miou, macc = (float(v[used].mean()) if used.any() else np.nan for v in (iou, accuracy))
     share = truth / truth.sum() if present.any() else np.zeros_like(truth)
-    return SegmentationScores(*mean, iou, accuracy, share)
+    return SegmentationScores(miou, macc, iou, accuracy, share)
 
 
 class ConfusionMatrices(NamedTuple):

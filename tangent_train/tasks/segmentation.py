@@ -68,7 +68,7 @@ class SegmentationTask(lightning.LightningModule):
         if absent_class not in ("skip", "zero"):
             raise SettingError("task.absent_class", found=absent_class, expected="skip or zero")
         self.memory_format = torch.channels_last if channels_last else torch.contiguous_format
-        self.network: nn.Module = network.to(memory_format=self.memory_format)  # type: ignore[call-overload]
+        self.network: nn.Module = network.to(memory_format=self.memory_format)
         self.representation = representation
         self.class_names = tuple(class_names)
         self.make_optimizer = optimizer
@@ -122,12 +122,12 @@ class SegmentationTask(lightning.LightningModule):
         images, labels = batch.images.flatten(0, 1), batch.labels.flatten(0, 1)
         loss = cross_entropy_sum(self(images), labels, self.class_weights, self.label_smoothing)
         value = self._normalized(loss)
-        self.log("train/loss", value.detach(), prog_bar=True, on_step=True, on_epoch=True)
+        self.log("train/loss", value.detach(), prog_bar=True)
         return value
 
     def _normalized(self, loss: LossSum) -> Tensor:
         """Divide by the norm of all processes; their gradients are averaged, hence the factor."""
-        norm = self.all_gather(loss.norm.detach()).sum()
+        norm: Tensor = self.trainer.strategy.reduce(loss.norm.detach(), reduce_op="sum")
         return loss.total * self.trainer.world_size / norm.clamp(min=torch.finfo(norm.dtype).tiny)
 
     @torch.no_grad()
@@ -143,7 +143,8 @@ class SegmentationTask(lightning.LightningModule):
         Returns:
             ``(H, W)`` class indices 1 … K.
         """
-        parts = images.split(self.images_per_forward)
+        size = self.images_per_forward
+        parts = [images[start : start + size] for start in range(0, len(images), size)]
         scores = torch.cat([self(part)[:, 1:].float() for part in parts])
         return self.representation.to_labels(scores, shape) + 1
 

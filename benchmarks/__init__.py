@@ -1,0 +1,1 @@
+"""Side-by-side speed, one command per area: ``python -m benchmarks.rendering``."""

@@ -1,0 +1,97 @@
+"""The class table of Stanford2D3DS: what the colours of its `semantic` images mean."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tangent_train.errors import DataError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+__all__ = ["CLASSES", "UNKNOWN", "LabelTable"]
+
+CLASSES: tuple[str, ...] = (
+    "beam",
+    "board",
+    "bookcase",
+    "ceiling",
+    "chair",
+    "clutter",
+    "column",
+    "door",
+    "floor",
+    "sofa",
+    "table",
+    "wall",
+    "window",
+)
+"""The 13 classes; the label of a class is its place here plus one."""
+
+UNKNOWN = 0
+"""The label of pixels without a class: ignored in training and evaluation."""
+
+
+@dataclass(frozen=True, eq=False)
+class LabelTable:
+    """Class of every instance of the data set.
+
+    A pixel of a `semantic` image holds the index of an instance as the colour
+    R · 65536 + G · 256 + B. Missing labels are #0D0D0D = 855309, past the end of the table, so
+    every index past the end is unknown. (Leaving out R would turn them into instance 3341,
+    clutter.)
+
+    Attributes:
+        class_ids: ``(entries,)`` uint8, 1 to 13 in the order of `CLASSES`, or `UNKNOWN`.
+    """
+
+    class_ids: NDArray[np.uint8]
+
+    @classmethod
+    def from_json(cls, path: Path) -> LabelTable:
+        """Read `semantic_labels.json`, a list of names ``class_instance_room_number_area``.
+
+        Args:
+            path: The file.
+
+        Raises:
+            DataError: It cannot be read or is no such list.
+        """
+        expected = f"a JSON list of names that begin with {', '.join(CLASSES)} or <UNK>"
+        remedy = "Copy semantic_labels.json of the Stanford2D3DS release."
+        try:
+            names = json.loads(path.read_bytes())
+        except (OSError, ValueError) as error:
+            raise DataError(path, found=error, expected=expected, remedy=remedy) from error
+        if not isinstance(names, list) or not names:
+            raise DataError(path, found=type(names).__name__, expected=expected, remedy=remedy)
+        ids = {"<UNK>": UNKNOWN} | {name: i for i, name in enumerate(CLASSES, start=1)}
+        classes = [str(name).partition("_")[0] for name in names]
+        strange = sorted(set(classes) - set(ids))
+        if strange:
+            raise DataError(path, found=f"class {strange[0]!r}", expected=expected, remedy=remedy)
+        return cls(np.array([ids[name] for name in classes], np.uint8))
+
+    def decode(self, colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Labels of a `semantic` image.
+
+        Args:
+            colors: ``(H, W, 3)`` uint8 in RGB order.
+
+        Returns:
+            ``(H, W)`` uint8 labels.
+
+        >>> table = LabelTable(np.array([0, 1, 12], np.uint8))
+        >>> table.decode(np.array([[[0, 0, 2], [0, 0, 3], [13, 13, 13]]], np.uint8)).tolist()
+        [[12, 0, 0]]
+        """
+        red, green, blue = np.moveaxis(colors.astype(np.int32), -1, 0)
+        index: NDArray[Any] = (red << 16) | (green << 8) | blue
+        past_the_end = len(self.class_ids)
+        return np.append(self.class_ids, np.uint8(UNKNOWN))[np.minimum(index, past_the_end)]

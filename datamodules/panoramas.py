@@ -1,0 +1,246 @@
+"""Panoramas in memory, whatever data set they come from: sizes, masks, sources.
+
+Everything about one panorama (RGB, depth, labels) is brought to the size a run reads with **one**
+pixel grid: the outer edges of source and target agree, so target row i covers source rows
+``i · H / h`` to ``(i + 1) · H / h``. RGB is averaged over that area; labels and depth are taken
+from the source pixel at its centre.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol, TypeVar
+
+import cv2
+import numpy as np
+
+from datamodules.sampling import sample_rng
+from tangent_train.geometry import random_rotation, rotation_about
+from tangent_train.rendering import rotate_equirect
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+__all__ = [
+    "Mask",
+    "Panorama",
+    "PanoramaSource",
+    "RememberedPanoramas",
+    "Turn",
+    "TurnedPanoramas",
+    "mask_black",
+    "read_in_threads",
+    "resize_area",
+    "resize_depth",
+    "resize_nearest",
+    "steps_to_meters",
+]
+
+_Pixel = TypeVar("_Pixel", bound=np.generic)
+
+Mask = Literal["labels", "any_black", "all_black"]
+"""Which pixels count as unknown besides those without a label; see `mask_black`."""
+
+Turn = float | Literal["so3"] | None
+"""How test panoramas are turned: tilted by degrees, any way, or not; see `TurnedPanoramas`."""
+
+_STEPS_PER_M = 512
+
+
+class Panorama(NamedTuple):
+    """One panorama.
+
+    Attributes:
+        rgb: ``(H, W, 3)`` uint8.
+        depth_m: ``(H, W)`` float32 distance from the centre in metres, 0 where missing; or None.
+        labels: ``(H, W)`` uint8, 0 where unknown.
+    """
+
+    rgb: NDArray[np.uint8]
+    depth_m: NDArray[np.float32] | None
+    labels: NDArray[np.uint8]
+
+
+class PanoramaSource(Protocol):
+    """Panoramas by number."""
+
+    def __len__(self) -> int:
+        """How many there are."""
+        ...
+
+    def name(self, index: int) -> str:
+        """A short name of one of them."""
+        ...
+
+    def read(self, index: int) -> Panorama:
+        """One of them."""
+        ...
+
+
+def resize_area(image: NDArray[np.uint8], shape: tuple[int, int]) -> NDArray[np.uint8]:
+    """Shrink ``(H, W, 3)`` to ``shape`` by averaging areas: no aliasing."""
+    if image.shape[:2] == shape:
+        return image
+    return cv2.resize(image, (shape[1], shape[0]), interpolation=cv2.INTER_AREA)
+
+
+def resize_nearest(image: NDArray[_Pixel], shape: tuple[int, int]) -> NDArray[_Pixel]:
+    """Shrink ``(H, W[, C])`` to ``shape``, taking the pixel at the centre of each target pixel.
+
+    Where that is a corner of four pixels (even ratios) it is the lower right one.
+    """
+    if image.shape[:2] == shape:
+        return image
+    rows, columns = (
+        (2 * np.arange(target) + 1) * source // (2 * target)
+        for source, target in zip(image.shape, shape, strict=False)
+    )
+    return image[rows][:, columns]
+
+
+def resize_depth(depth: NDArray[np.uint16], shape: tuple[int, int]) -> NDArray[np.uint16]:
+    """Shrink raw depth ``(H, W)``, 0 where missing, without ever mixing two values.
+
+    As `resize_nearest`, but where that pixel is missing, the valid pixel nearest to the centre,
+    of those in the area of the target pixel, is taken instead.
+    """
+    small = resize_nearest(depth, shape)
+    holes = np.nonzero(small == 0)
+    scale = [source / target for source, target in zip(depth.shape, shape, strict=True)]
+    centers = [(i + 0.5) * s for i, s in zip(holes, scale, strict=True)]
+    # The first source pixel whose centre lies in the area of the target pixel.
+    first = [np.ceil(i * s - 0.5).astype(np.intp) for i, s in zip(holes, scale, strict=True)]
+    nearest = np.full(len(holes[0]), np.inf)
+    for step in np.ndindex(math.ceil(scale[0]), math.ceil(scale[1])):
+        pixel = [np.minimum(f + d, n - 1) for f, d, n in zip(first, step, depth.shape, strict=True)]
+        away = [np.abs(p + 0.5 - c) for p, c in zip(pixel, centers, strict=True)]
+        inside = (away[0] <= scale[0] / 2) & (away[1] <= scale[1] / 2)
+        distance = np.hypot(*away)
+        value = depth[pixel[0], pixel[1]]
+        better = inside & (value > 0) & (distance < nearest)
+        small[holes[0][better], holes[1][better]] = value[better]
+        nearest[better] = distance[better]
+    return small
+
+
+def mask_black(labels: NDArray[np.uint8], rgb: NDArray[np.uint8], mask: Mask) -> NDArray[np.uint8]:
+    """Make black pixels unknown.
+
+    The released code of the paper does `any_black`, in training and in evaluation alike, on the
+    pixels of the file before they are resized; so do we, at the pixels the labels are taken from.
+
+    Args:
+        labels: ``(H, W)``.
+        rgb: ``(H, W, 3)`` at the same pixels.
+        mask: `labels` changes nothing; `any_black` makes pixels unknown where any channel is 0,
+            `all_black` where all are.
+
+    Returns:
+        ``(H, W)`` labels.
+    """
+    if mask == "labels":
+        return labels
+    black = rgb == 0
+    return np.where(black.any(-1) if mask == "any_black" else black.all(-1), np.uint8(0), labels)
+
+
+def read_in_threads(source: PanoramaSource) -> Iterator[Panorama]:
+    """Read all panoramas in order, decoding on all cores (OpenCV and zlib free the GIL)."""
+    workers = os.cpu_count() or 1
+    with ThreadPoolExecutor(workers) as pool:
+        # A few at a time: the reader is never far ahead of who consumes them.
+        for start in range(0, len(source), 4 * workers):
+            yield from pool.map(source.read, range(start, min(start + 4 * workers, len(source))))
+
+
+class RememberedPanoramas:
+    """The panoramas of another source, read once, now, and kept in memory.
+
+    Made before the loader's workers start, which then share the memory (on systems that fork);
+    each process of a distributed run keeps its own. Depth is kept in steps of 1/512 m, which are
+    the steps of Stanford2D3DS's files: six bytes a pixel with depth, four without.
+
+    Args:
+        source: Where they come from.
+    """
+
+    def __init__(self, source: PanoramaSource) -> None:
+        self._source = source
+        self._kept = [
+            (panorama.rgb, _to_steps(panorama.depth_m), panorama.labels)
+            for panorama in read_in_threads(source)
+        ]
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    def name(self, index: int) -> str:
+        """The name in the source."""
+        return self._source.name(index)
+
+    def read(self, index: int) -> Panorama:
+        """The panorama as the source gave it; its arrays are shared, not to be written to."""
+        rgb, steps, labels = self._kept[index]
+        return Panorama(rgb, None if steps is None else steps_to_meters(steps), labels)
+
+
+class TurnedPanoramas:
+    """The panoramas of another source as seen by a camera that is not upright.
+
+    The labels turn with the image, so the score is that of the turned panorama. The same panorama
+    is turned the same way in every run with the same seed.
+
+    Args:
+        source: Where they come from.
+        rotation: Tilt in degrees about a random horizontal axis, after a random turn about the
+            vertical; or `so3`, uniform over all rotations.
+        seed: Seed of the turns.
+    """
+
+    def __init__(self, source: PanoramaSource, rotation: float | Literal["so3"], seed: int) -> None:
+        self._source = source
+        self._rotation = rotation
+        self._seed = seed
+
+    def __len__(self) -> int:
+        return len(self._source)
+
+    def name(self, index: int) -> str:
+        """The name in the source."""
+        return self._source.name(index)
+
+    def rotation(self, index: int) -> NDArray[np.float64]:
+        """The turn of one panorama, ``(3, 3)``: what was seen at d is now seen at R d."""
+        rng = sample_rng(self._seed, 0, index)
+        if self._rotation == "so3":
+            return random_rotation(rng)
+        yaw, azimuth = rng.uniform(0, 2 * math.pi, 2)
+        tilt = rotation_about(
+            (math.cos(azimuth), math.sin(azimuth), 0), math.radians(self._rotation)
+        )
+        return tilt @ rotation_about((0, 0, 1), yaw)
+
+    def read(self, index: int) -> Panorama:
+        """One turned panorama: RGB bilinear, depth and labels nearest."""
+        rgb, depth_m, labels = self._source.read(index)
+        rotation = self.rotation(index)
+        return Panorama(
+            rotate_equirect(rgb, rotation, "bilinear"),
+            None if depth_m is None else rotate_equirect(depth_m, rotation, "nearest"),
+            rotate_equirect(labels, rotation, "nearest"),
+        )
+
+
+def steps_to_meters(steps: NDArray[np.uint16]) -> NDArray[np.float32]:
+    """Depth in metres of raw depth in steps of 1/512 m."""
+    return steps.astype(np.float32) / np.float32(_STEPS_PER_M)
+
+
+def _to_steps(depth_m: NDArray[np.float32] | None) -> NDArray[np.uint16] | None:
+    if depth_m is None:
+        return None
+    return np.rint(np.clip(depth_m * _STEPS_PER_M, 0, np.iinfo(np.uint16).max)).astype(np.uint16)

@@ -1,0 +1,91 @@
+"""PNG files: what their header promises, checked without decoding, and their pixels."""
+
+from __future__ import annotations
+
+import os
+import struct
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import cv2
+import numpy as np
+
+from tangent_train.errors import DataError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+__all__ = ["PngHeader", "read_color_png", "read_depth_png", "read_png_header"]
+
+_START = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR"
+_END = b"\x00\x00\x00\x00IEND\xaeB`\x82"
+_HEADER_BYTES = 26  # the signature, IHDR's length and name, then its first ten bytes
+_COLOR_TYPES = {0: "grey", 2: "RGB", 3: "palette", 4: "grey with alpha", 6: "RGBA"}
+_REMEDY = "Copy or extract the file again."
+
+
+class PngHeader(NamedTuple):
+    """Size and pixel format of a PNG file."""
+
+    height: int
+    width: int
+    bits: int
+    color: str
+
+
+def read_png_header(path: Path) -> PngHeader:
+    """Read the first and last bytes of a PNG file.
+
+    Args:
+        path: The file.
+
+    Raises:
+        DataError: It cannot be read, is no PNG, or ends early.
+    """
+    try:
+        with path.open("rb") as file:
+            start = file.read(_HEADER_BYTES)
+            size = file.seek(0, os.SEEK_END)
+            file.seek(max(0, size - len(_END)))
+            end = file.read()
+    except OSError as error:
+        raise DataError(path, found=error, expected="a PNG file", remedy=_REMEDY) from error
+    if len(start) < _HEADER_BYTES or not start.startswith(_START):
+        raise DataError(path, found="no PNG header", expected="a PNG file", remedy=_REMEDY)
+    if end != _END:
+        raise DataError(
+            path, found=f"a PNG cut off after {size} bytes", expected="all of it", remedy=_REMEDY
+        )
+    width, height, bits, color = struct.unpack(">IIBB", start[len(_START) :])
+    return PngHeader(height, width, bits, _COLOR_TYPES.get(color, f"color type {color}"))
+
+
+def read_color_png(path: Path) -> NDArray[np.uint8]:
+    """Decode an 8-bit colour image, ``(H, W, 3)`` in RGB order; alpha is dropped.
+
+    Raises:
+        DataError: The file is broken.
+    """
+    return cv2.cvtColor(_decode(path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+
+
+def read_depth_png(path: Path) -> NDArray[np.uint16]:
+    """Decode a 16-bit grey image, ``(H, W)``.
+
+    Raises:
+        DataError: The file is broken.
+    """
+    return _decode(path, cv2.IMREAD_ANYDEPTH)
+
+
+def _decode(path: Path, flags: int) -> NDArray[Any]:
+    # Decoding from memory keeps "cannot open" and "cannot decode" apart, and any path works.
+    try:
+        content = np.frombuffer(path.read_bytes(), np.uint8)
+    except OSError as error:
+        raise DataError(path, found=error, expected="a PNG file", remedy=_REMEDY) from error
+    image = cv2.imdecode(content, flags) if content.size else None
+    if image is None:
+        raise DataError(path, found="a broken PNG", expected="one that decodes", remedy=_REMEDY)
+    return image

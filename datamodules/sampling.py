@@ -1,0 +1,96 @@
+"""Which panorama comes when, and the randomness of each sample.
+
+Everything random about a sample is drawn from a generator seeded by (seed, epoch, index), so a
+run shows the same faces for any number of workers, and after a resume. The epoch travels with
+the index, from the sampler to the workers: persistent workers need not be told about it.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from torch.utils.data import Sampler
+
+from tangent_train.errors import SettingError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+__all__ = ["EpochSampler", "sample_rng"]
+
+
+def sample_rng(seed: int, epoch: int, index: int) -> np.random.Generator:
+    """The source of randomness of one sample.
+
+    Args:
+        seed: Seed of the run, 0 or more.
+        epoch: Epoch, from 0.
+        index: Place of the sample in its data set.
+    """
+    # A spawn key, not a longer seed: NumPy pads short seeds with zeros, so [1, 2] is [1, 2, 0].
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(epoch, index)))
+
+
+class EpochSampler(Sampler[tuple[int, int]]):
+    """Yields (epoch, index).
+
+    * Shuffled (training), every process gets the same number of samples, as gradients are
+      exchanged at every step: the last few of the epoch's order, fewer than there are processes,
+      are dropped. They are others every epoch.
+    * In order (evaluation), process r gets r, r + world_size, …: every sample exactly once on any
+      number of processes, nothing repeated or dropped.
+
+    Lightning calls `set_epoch` by itself. It must not replace or wrap this sampler: make the
+    trainer with ``use_distributed_sampler=False``.
+
+    Args:
+        length: Number of samples in the data set.
+        seed: Seed of the order, 0 or more.
+        shuffle: A new random order every epoch.
+        rank: This process.
+        world_size: Number of processes.
+
+    Raises:
+        SettingError: Training with fewer samples than processes, or an impossible rank.
+    """
+
+    def __init__(
+        self, length: int, seed: int, shuffle: bool, rank: int = 0, world_size: int = 1
+    ) -> None:
+        if not 0 <= rank < world_size:
+            raise SettingError("rank", found=rank, expected=f"0 to {world_size - 1}")
+        if shuffle and length < world_size:
+            raise SettingError(
+                "trainer.devices",
+                found=f"{world_size} processes for {length} training samples",
+                expected="at least one sample each",
+                remedy="Train on fewer processes.",
+            )
+        self._length = length
+        self._seed = seed
+        self._shuffle = shuffle
+        self._rank = rank
+        self._world_size = world_size
+        self._epoch = 0
+
+    def set_epoch(self, epoch: int) -> None:
+        """Say which epoch the next iteration belongs to."""
+        self._epoch = epoch
+
+    def __len__(self) -> int:
+        return len(range(self._rank, self._used, self._world_size))
+
+    def __iter__(self) -> Iterator[tuple[int, int]]:
+        epoch = self._epoch
+        order = np.arange(self._length)
+        if self._shuffle:
+            order = np.random.default_rng(
+                np.random.SeedSequence(self._seed, spawn_key=(epoch,))
+            ).permutation(self._length)
+        for index in order[self._rank : self._used : self._world_size]:
+            yield epoch, int(index)
+
+    @property
+    def _used(self) -> int:
+        return self._length - (self._length % self._world_size if self._shuffle else 0)

@@ -1,0 +1,173 @@
+"""The files of Stanford2D3DS: their names, their partners, and what is expected of them."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, NamedTuple
+
+from datamodules.png import PngHeader, read_png_header
+from tangent_train.errors import DataError, SettingError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+__all__ = [
+    "AREAS",
+    "FOLDS",
+    "GET_IT",
+    "FileName",
+    "PanoramaFiles",
+    "check_panorama",
+    "list_panoramas",
+]
+
+AREAS: tuple[str, ...] = ("1", "2", "3", "4", "5a", "5b", "6")
+"""All areas; 5a and 5b are parts of one floor and share rooms."""
+
+FOLDS: dict[int, tuple[str, ...]] = {1: ("5a", "5b"), 2: ("2", "4"), 3: ("1", "3", "6")}
+"""Test areas of each fold; the other areas are for training."""
+
+GET_IT = (
+    "Get Stanford2D3DS from http://buildingparser.stanford.edu/dataset.html and point data.root at "
+    "the folder with area_1 … area_6, or train on data=synthrooms, which needs no download."
+)
+"""What to do when the data set is not there."""
+
+_NAME = re.compile(
+    r"camera_([0-9a-f]{32})_([A-Za-z]+)_(\d+)_frame_(equirectangular|\d+)"
+    r"_domain_([a-z]+(?:_[a-z]+)*)(\.\w+)"
+)
+_FORMATS = {"rgb": (8, ("RGB", "RGBA")), "semantic": (8, ("RGB", "RGBA")), "depth": (16, ("grey",))}
+
+
+class FileName(NamedTuple):
+    """The parts of a file's name; panoramas have the frame `equirectangular`."""
+
+    camera: str
+    room: str
+    room_number: int
+    frame: str
+    domain: str
+    suffix: str
+
+    @classmethod
+    def parse(cls, name: str) -> FileName:
+        """Take a file's name apart.
+
+        Args:
+            name: The name without folders.
+
+        Raises:
+            DataError: It is no name of the data set.
+
+        >>> FileName.parse(f"camera_{'0f' * 16}_office_7_frame_3_domain_rgb.png")[1:]
+        ('office', 7, '3', 'rgb', '.png')
+        """
+        match = _NAME.fullmatch(name)
+        if match is None:
+            raise DataError(
+                name,
+                found="an unknown file name",
+                expected="camera_<32 hex>_<room>_<n>_frame_<equirectangular or number>"
+                "_domain_<kind>.<ending>",
+                remedy="Move files that are not of the data set elsewhere.",
+            )
+        camera, room, number, frame, domain, suffix = match.groups()
+        return cls(camera, room, int(number), frame, domain, suffix)
+
+    def __str__(self) -> str:
+        return (
+            f"camera_{self.camera}_{self.room}_{self.room_number}"
+            f"_frame_{self.frame}_domain_{self.domain}{self.suffix}"
+        )
+
+
+class PanoramaFiles(NamedTuple):
+    """The files of one panorama."""
+
+    area: str
+    name: FileName
+    rgb: Path
+    semantic: Path
+    depth: Path | None
+
+    @property
+    def room(self) -> tuple[str, str, int]:
+        """Building, kind and number of the room: 5a and 5b are one building."""
+        return self.area.rstrip("ab"), self.name.room, self.name.room_number
+
+
+def list_panoramas(root: Path, area: str, with_depth: bool) -> list[PanoramaFiles]:
+    """The panoramas of one area, in the order of their names.
+
+    Args:
+        root: Folder of the data set.
+        area: One of `AREAS`.
+        with_depth: Whether depth is wanted.
+
+    Raises:
+        DataError: A folder or a partner of an RGB file is missing.
+    """
+    pano = root / f"area_{area}" / "pano"
+    found = []
+    # Hidden files are leftovers of archives made on a Mac.
+    for rgb in sorted(pano.glob("rgb/[!.]*.png")):
+        name = FileName.parse(rgb.name)
+        depth = pano / "depth" / str(name._replace(domain="depth"))
+        semantic = pano / "semantic" / str(name._replace(domain="semantic"))
+        found.append(PanoramaFiles(area, name, rgb, semantic, depth if with_depth else None))
+    if not found:
+        raise DataError(
+            pano / "rgb", found="no panoramas", expected="camera_….png files", remedy=GET_IT
+        )
+    return found
+
+
+def check_panorama(files: PanoramaFiles, erp_height: int) -> None:
+    """Check that all files are there, of one size and readable at `erp_height`; nothing is decoded.
+
+    Raises:
+        DataError: A file is missing, cut off, or of another size or pixel format.
+        SettingError: The panorama has fewer rows than wanted.
+    """
+    header = _check_png(files.rgb, "rgb")
+    height, width = header.height, header.width
+    if width != 2 * height:
+        raise DataError(
+            files.rgb,
+            found=f"{height}×{width} pixels",
+            expected="twice as wide as high",
+            remedy="Only full 360°×180° panoramas can be used.",
+        )
+    if height < erp_height:
+        raise SettingError(
+            "representation.erp_height",
+            found=erp_height,
+            expected=f"at most the {height} rows of {files.rgb}",
+            remedy="Choose a lower level, or larger panoramas.",
+        )
+    partners = [(files.semantic, "semantic")]
+    if files.depth is not None:
+        partners.append((files.depth, "depth"))
+    for path, domain in partners:
+        other = _check_png(path, domain)
+        if other[:2] != header[:2]:
+            raise DataError(
+                path,
+                found=f"{other.height}×{other.width} pixels",
+                expected=f"{height}×{width}, as {files.rgb.name}",
+                remedy="Copy or extract both files again.",
+            )
+
+
+def _check_png(path: Path, domain: str) -> PngHeader:
+    header = read_png_header(path)
+    bits, colors = _FORMATS[domain]
+    if header.bits != bits or header.color not in colors:
+        raise DataError(
+            path,
+            found=f"{header.bits}-bit {header.color}",
+            expected=f"{bits}-bit {' or '.join(colors)}",
+            remedy="Use the files as released; do not convert them.",
+        )
+    return header

@@ -1,0 +1,33 @@
+"""Equirectangular panoramas to tangent images and back.
+
+NumPy panoramas are sampled by OpenCV, tensors by differentiable sparse sums on any device, labels
+by compiled kernels. The geometry of all of them is `tangent_train.geometry`'s.
+"""
+
+from tangent_train.rendering.backward import Blend, tangent_to_equirect, tangent_to_labels
+from tangent_train.rendering.forward import Interpolation, equirect_to_tangent
+from tangent_train.rendering.representation import (
+    EquirectRepresentation,
+    Representation,
+    RotationAugmentation,
+    TangentRepresentation,
+    Views,
+)
+from tangent_train.rendering.rotate import equirect_to_perspective, rotate_equirect
+from tangent_train.rendering.tables import set_table_cache_limit
+
+__all__ = [
+    "Blend",
+    "EquirectRepresentation",
+    "Interpolation",
+    "Representation",
+    "RotationAugmentation",
+    "TangentRepresentation",
+    "Views",
+    "equirect_to_perspective",
+    "equirect_to_tangent",
+    "rotate_equirect",
+    "set_table_cache_limit",
+    "tangent_to_equirect",
+    "tangent_to_labels",
+]

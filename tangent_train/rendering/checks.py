@@ -1,0 +1,104 @@
+"""Checks of what callers hand to the renderers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from tangent_train.errors import SettingError
+from tangent_train.geometry import TangentGrid
+
+__all__ = [
+    "check_blend",
+    "check_interpolation",
+    "check_numpy_image",
+    "check_scores",
+    "check_shape",
+    "check_tangent_images",
+    "check_torch_image",
+]
+
+
+def check_interpolation(interpolation: str) -> None:
+    """Raise SettingError unless the interpolation is known."""
+    _check_choice("interpolation", interpolation, ("bilinear", "nearest"))
+
+
+def check_blend(blend: str) -> None:
+    """Raise SettingError unless the blend is known."""
+    _check_choice("blend", blend, ("nearest", "feather"))
+
+
+def _check_choice(name: str, value: str, allowed: tuple[str, ...]) -> None:
+    if value not in allowed:
+        raise SettingError(name, found=repr(value), expected=" or ".join(map(repr, allowed)))
+
+
+def check_shape(shape: Sequence[int]) -> tuple[int, int]:
+    """``(H, W)`` as two positive integers, or SettingError."""
+    whole = [isinstance(side, int | np.integer) and side > 0 for side in shape]
+    if len(whole) != 2 or not all(whole):
+        raise SettingError("shape", found=tuple(shape), expected="(height, width), both 1 or more")
+    return int(shape[0]), int(shape[1])
+
+
+def check_numpy_image(image: NDArray[np.generic], interpolation: str) -> None:
+    """Raise SettingError unless NumPy code can sample a panorama ``(H, W[, C])``."""
+    if image.ndim not in (2, 3) or 0 in image.shape:
+        raise SettingError("panorama", found=f"shape {image.shape}", expected="(H, W) or (H, W, C)")
+    kinds = "uif" if interpolation == "bilinear" else "buif"
+    if image.dtype.kind not in kinds:
+        raise SettingError(
+            "panorama",
+            found=f"dtype {image.dtype}",
+            expected=f"numbers that {interpolation} interpolation can use",
+            remedy="Convert it, or use interpolation='nearest' for labels and masks.",
+        )
+
+
+def check_torch_image(image: Tensor, interpolation: str) -> None:
+    """Raise SettingError unless torch code can sample a panorama ``(..., C, H, W)``."""
+    if image.ndim < 3 or 0 in image.shape[-2:]:
+        found = f"shape {tuple(image.shape)}"
+        raise SettingError("panorama", found=found, expected="(..., C, H, W)")
+    if interpolation == "bilinear":
+        _check_floating("panorama", image)
+
+
+def _check_floating(name: str, tensor: Tensor) -> None:
+    if not torch.is_floating_point(tensor):
+        raise SettingError(
+            name,
+            found=f"dtype {tensor.dtype}",
+            expected="a floating-point dtype",
+            remedy="Call .float() first.",
+        )
+
+
+def check_tangent_images(images: Tensor, grid: TangentGrid) -> None:
+    """Raise SettingError unless images are ``(..., N, C, d, d)`` floats that fit the grid."""
+    _check_stack("tangent images", images, grid)
+
+
+def check_scores(scores: Tensor, grid: TangentGrid) -> None:
+    """Raise SettingError unless scores are ``(..., N, K, d, d)`` floats that fit the grid."""
+    _check_stack("scores", scores, grid)
+    if scores.shape[-3] == 0:
+        raise SettingError("scores", found="no class", expected="one class or more")
+
+
+def _check_stack(name: str, images: Tensor, grid: TangentGrid) -> None:
+    shape = tuple(images.shape)
+    expected = (grid.num_images, grid.dim, grid.dim)
+    if len(shape) < 4 or (shape[-4], *shape[-2:]) != expected:
+        raise SettingError(
+            name,
+            found=f"shape {shape}",
+            expected="(..., {}, channels, {}, {}) for this grid".format(*expected),
+            remedy="All images of the grid are needed, in its order.",
+        )
+    _check_floating(name, images)

@@ -1,0 +1,125 @@
+"""From panoramas to tangent images."""
+
+from __future__ import annotations
+
+from typing import Literal, TypeVar, overload
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from tangent_train.geometry import TangentGrid
+from tangent_train.geometry.grid import Faces
+from tangent_train.rendering.checks import (
+    check_interpolation,
+    check_numpy_image,
+    check_torch_image,
+)
+from tangent_train.rendering.sampling import map_dtype
+from tangent_train.rendering.tables import forward_map, tensors_on
+from tangent_train.rendering.taps import bilinear_equirect_taps, nearest_equirect_index, sample
+
+__all__ = ["Interpolation", "equirect_to_tangent"]
+
+Interpolation = Literal["bilinear", "nearest"]
+
+Scalar = TypeVar("Scalar", bound=np.generic)
+
+_CHUNK = 2**20
+"""Positions whose taps torch holds at once."""
+
+
+@overload
+def equirect_to_tangent(
+    image: Tensor,
+    grid: TangentGrid,
+    faces: Faces | None = None,
+    interpolation: Interpolation = "bilinear",
+) -> Tensor: ...
+@overload
+def equirect_to_tangent(
+    image: NDArray[Scalar],
+    grid: TangentGrid,
+    faces: Faces | None = None,
+    interpolation: Interpolation = "bilinear",
+) -> NDArray[Scalar]: ...
+def equirect_to_tangent(
+    image: Tensor | NDArray[Scalar],
+    grid: TangentGrid,
+    faces: Faces | None = None,
+    interpolation: Interpolation = "bilinear",
+) -> Tensor | NDArray[Scalar]:
+    """Render tangent images from a panorama (paper, section 3.2).
+
+    Longitude wraps and rows reflect at the poles, for every interpolation. A panorama that is not
+    twice as wide as high is taken as the whole sphere, stretched.
+
+    Args:
+        image: A tensor ``(..., C, H, W)`` on any device, differentiable; or an array
+            ``(H, W[, C])``: uint8, uint16 and float32 go through `cv2.remap` (see
+            `EquirectMap.sample` about its precision), other dtypes are slower.
+        grid: The images.
+        faces: Images asked for, default all; only they are rendered.
+        interpolation: ``bilinear``, or ``nearest`` for labels and masks of any dtype.
+
+    Returns:
+        A tensor ``(..., n, C, d, d)`` or an array ``(n, d, d[, C])``, of the dtype of the image.
+
+    Raises:
+        SettingError: The panorama, a face or the interpolation cannot be used.
+    """
+    check_interpolation(interpolation)
+    indices = grid.face_indices(faces)
+    if isinstance(image, Tensor):
+        check_torch_image(image, interpolation)
+        return _render_tensor(image, grid, indices, interpolation)
+    check_numpy_image(image, interpolation)
+    image = np.ascontiguousarray(image)
+    out = np.empty((len(indices), grid.dim, grid.dim, *image.shape[2:]), image.dtype)
+    dtype = map_dtype(image.dtype == np.float64, interpolation)
+    for face, target in zip(indices, out, strict=True):
+        table = forward_map(grid, image.shape[:2], int(face), dtype)
+        table.sample(image, interpolation, target)
+    return out
+
+
+def _render_tensor(
+    image: Tensor, grid: TangentGrid, indices: NDArray[np.int64], interpolation: Interpolation
+) -> Tensor:
+    *batch, channels, height, width = image.shape
+    source = image.reshape(-1, height * width)
+    dtype = map_dtype(image.dtype == torch.float64, interpolation)
+    step = max(1, _CHUNK // grid.dim**2)
+    chunks = [image.new_empty((*batch, 0, channels, grid.dim, grid.dim))]
+    for start in range(0, len(indices), step):
+        u, v = _positions(grid, (height, width), indices[start : start + step], dtype, image.device)
+        if interpolation == "nearest":
+            index = nearest_equirect_index(u, v, (height, width))
+            values = source.gather(1, index.expand(len(source), -1))
+        else:
+            values = sample(source, bilinear_equirect_taps(u, v, (height, width)))
+        images = values.reshape(*batch, channels, -1, grid.dim, grid.dim)
+        chunks.append(images.movedim(-3, -4))
+    return torch.cat(chunks, dim=-4)
+
+
+def _positions(
+    grid: TangentGrid,
+    shape: tuple[int, int],
+    indices: NDArray[np.int64],
+    dtype: np.dtype[np.floating],
+    device: torch.device,
+) -> tuple[Tensor, Tensor]:
+    """Columns and rows of all pixels of some images, one after the other."""
+
+    def tensors(face: int) -> tuple[Tensor, ...]:
+        def arrays() -> tuple[NDArray[np.floating], ...]:
+            table = forward_map(grid, shape, face, dtype)
+            return table.u, table.v
+
+        return tensors_on(device, grid, ("forward", shape, face, dtype), arrays)
+
+    tables = [tensors(int(face)) for face in indices]
+    u, v = (torch.stack(lines).reshape(-1) for lines in zip(*tables, strict=True))
+    return u, v

@@ -1,0 +1,252 @@
+"""What a network sees of a panorama, and how its scores become labels of the panorama again.
+
+A *representation* turns panoramas into images a network can take: tangent images, or, as honest
+baselines, the equirectangular image itself or crops of it. It draws the *views* of one training
+sample (which images, turned and mirrored how), gives the views of the whole sphere for evaluation,
+and assembles the scores of the latter. Data modules and tasks know nothing else about it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol, TypeVar
+
+import numpy as np
+from jaxtyping import Float, Integer
+from numpy.typing import NDArray
+from torch import Tensor
+
+from tangent_train.errors import SettingError
+from tangent_train.geometry import TangentGrid, equirect_shape, random_rotation, rotation_about
+from tangent_train.rendering.backward import Blend, tangent_to_labels
+from tangent_train.rendering.forward import Interpolation, equirect_to_tangent
+from tangent_train.rendering.rotate import rotate_equirect
+
+__all__ = [
+    "EquirectRepresentation",
+    "Representation",
+    "RotationAugmentation",
+    "TangentRepresentation",
+    "Views",
+]
+
+RotationAugmentation = Literal["none", "yaw", "so3"]
+"""How training panoramas are turned: not, about the vertical, or any way."""
+
+Image = NDArray[Any]
+_Choice = TypeVar("_Choice", bound=str)
+
+
+class Views(Protocol):
+    """One way to look at one panorama."""
+
+    def render(self, image: Image, interpolation: Interpolation) -> Image:
+        """Render a panorama ``(H, W[, C])`` to images ``(n, h, w[, C])``, dtype kept."""
+        ...
+
+
+class Representation(Protocol):
+    """What a network sees of a panorama."""
+
+    @property
+    def erp_height(self) -> int:
+        """Rows of the panorama it reads and is scored on."""
+        ...
+
+    def sample(self, rng: np.random.Generator) -> Views:
+        """Views of one training sample: a random subset, augmented."""
+        ...
+
+    def whole(self) -> Views:
+        """Views of the whole sphere, in a fixed order."""
+        ...
+
+    def to_labels(
+        self, scores: Float[Tensor, "images classes height width"], shape: tuple[int, int]
+    ) -> Integer[Tensor, "rows columns"]:
+        """Class index of every pixel of the panorama, from the scores of `whole`."""
+        ...
+
+
+@dataclass(frozen=True)
+class _TangentViews:
+    grid: TangentGrid
+    faces: NDArray[np.int64] | None = None
+    mirrored: bool = False
+
+    def render(self, image: Image, interpolation: Interpolation) -> Image:
+        images = equirect_to_tangent(image, self.grid, self.faces, interpolation)
+        return np.ascontiguousarray(images[:, :, ::-1]) if self.mirrored else images
+
+
+class TangentRepresentation:
+    """Tangent images (paper, section 3.2).
+
+    Args:
+        base_level: Base level b: 20·4^b images.
+        level: Level s; it sets the angular resolution of the images.
+        dim: Side of the images in pixels, default 2^(s−b).
+        crop_multiple: Instead of `dim`: crop to the owned cells, the side rounded up to a multiple
+            of this (the network's stride).
+        faces_per_panorama: Images drawn at random for a training sample; all by default.
+        rotation: Rotation of the icosahedron while training.
+        mirror: Mirror half of the training samples left to right.
+        blend: How overlapping images are joined in evaluation: the scores of the owner
+            (`nearest`), or probabilities averaged with weights that fall to the borders
+            (`feather`).
+        erp_height: Rows of the panorama, default `equirect_shape(level)`.
+
+    Raises:
+        SettingError: An impossible combination.
+    """
+
+    def __init__(
+        self,
+        base_level: int,
+        level: int,
+        dim: int | None = None,
+        crop_multiple: int | None = None,
+        faces_per_panorama: int | None = None,
+        rotation: RotationAugmentation = "none",
+        mirror: bool = False,
+        blend: Blend = "nearest",
+        erp_height: int | None = None,
+    ) -> None:
+        if crop_multiple is not None:
+            if dim is not None:
+                raise SettingError(
+                    "representation.dim", found=dim, expected="null beside crop_multiple"
+                )
+            least = TangentGrid.least_dim(base_level, level)
+            dim = math.ceil(least / crop_multiple) * crop_multiple
+        self.grid = TangentGrid(base_level, level, dim)
+        count = self.grid.num_images
+        if faces_per_panorama is not None and not 1 <= faces_per_panorama <= count:
+            raise SettingError(
+                "representation.faces_per_panorama",
+                found=faces_per_panorama,
+                expected=f"1 to {count} at base level {base_level}, or null for all",
+            )
+        self.faces_per_panorama = faces_per_panorama
+        self.rotation = _checked_choice("rotation", rotation, ("none", "yaw", "so3"))
+        self.blend = _checked_choice("blend", blend, ("nearest", "feather"))
+        self.mirror = mirror
+        self.erp_height = erp_height or equirect_shape(level)[0]
+
+    def sample(self, rng: np.random.Generator) -> Views:
+        """A random subset of the faces of a (perhaps) turned icosahedron."""
+        grid = self.grid
+        rotation = _draw_rotation(self.rotation, rng)
+        if rotation is not None:
+            grid = TangentGrid(grid.base_level, grid.level, grid.dim, rotation)
+        faces = None
+        if self.faces_per_panorama is not None:
+            faces = rng.choice(grid.num_images, self.faces_per_panorama, replace=False)
+        return _TangentViews(grid, faces, self.mirror and bool(rng.random() < 0.5))
+
+    def whole(self) -> Views:
+        """All images."""
+        return _TangentViews(self.grid)
+
+    def to_labels(
+        self, scores: Float[Tensor, "images classes height width"], shape: tuple[int, int]
+    ) -> Integer[Tensor, "rows columns"]:
+        """Render the scores (not labels) back to the panorama, then take the best class."""
+        if self.blend == "feather":
+            scores = scores.softmax(dim=1)
+        labels: Tensor = tangent_to_labels(scores, self.grid, shape, self.blend)
+        return labels
+
+
+@dataclass(frozen=True)
+class _EquirectViews:
+    rotation: NDArray[np.float64] | None = None
+    columns: tuple[float, int] | None = None
+    mirrored: bool = False
+
+    def render(self, image: Image, interpolation: Interpolation) -> Image:
+        if self.rotation is not None:
+            image = rotate_equirect(image, self.rotation, interpolation)
+        if self.columns is not None:
+            start, width = self.columns
+            first = int(start * image.shape[1])
+            image = image.take(np.arange(first, first + width), axis=1, mode="wrap")
+        if self.mirrored:
+            image = image[:, ::-1]
+        return np.ascontiguousarray(image[None])
+
+
+class EquirectRepresentation:
+    """The baseline without tangent images: the equirectangular image, or random crops of it.
+
+    Evaluation always sees the whole image.
+
+    Args:
+        level: Level s of the panorama.
+        crop_deg: Width of the training crops in degrees of longitude, full height, at a random
+            longitude and across the seam; the whole image by default.
+        rotation: Rotation of the panorama while training.
+        mirror: Mirror half of the training samples left to right.
+        erp_height: Rows of the panorama, default `equirect_shape(level)`.
+
+    Raises:
+        SettingError: The crop is no part of the panorama.
+    """
+
+    def __init__(
+        self,
+        level: int,
+        crop_deg: float | None = None,
+        rotation: RotationAugmentation = "none",
+        mirror: bool = False,
+        erp_height: int | None = None,
+    ) -> None:
+        if crop_deg is not None and not 0 < crop_deg <= 360:
+            raise SettingError("representation.crop_deg", found=crop_deg, expected="0 to 360")
+        self.erp_height = erp_height or equirect_shape(level)[0]
+        self.crop_deg = crop_deg
+        self.rotation = _checked_choice("rotation", rotation, ("none", "yaw", "so3"))
+        self.mirror = mirror
+
+    def sample(self, rng: np.random.Generator) -> Views:
+        """The panorama or one crop of it, (perhaps) turned."""
+        columns = None
+        if self.crop_deg is not None:
+            columns = (rng.random(), round(2 * self.erp_height * self.crop_deg / 360))
+        rotation = _draw_rotation(self.rotation, rng)
+        return _EquirectViews(rotation, columns, self.mirror and bool(rng.random() < 0.5))
+
+    def whole(self) -> Views:
+        """The panorama as it is."""
+        return _EquirectViews()
+
+    def to_labels(
+        self, scores: Float[Tensor, "images classes height width"], shape: tuple[int, int]
+    ) -> Integer[Tensor, "rows columns"]:
+        """The best class of every pixel; the scores are already those of the panorama."""
+        if scores.shape[0] != 1 or tuple(scores.shape[-2:]) != tuple(shape):
+            raise SettingError(
+                "scores of an equirectangular network",
+                found=tuple(scores.shape),
+                expected=f"one image of {shape[0]}×{shape[1]}",
+            )
+        return scores[0].argmax(dim=0)
+
+
+def _draw_rotation(
+    kind: RotationAugmentation, rng: np.random.Generator
+) -> NDArray[np.float64] | None:
+    if kind == "none":
+        return None
+    if kind == "yaw":
+        return rotation_about((0, 0, 1), rng.uniform(0, 2 * math.pi))
+    return random_rotation(rng)
+
+
+def _checked_choice(name: str, value: _Choice, allowed: tuple[str, ...]) -> _Choice:
+    if value not in allowed:
+        raise SettingError(
+            f"representation.{name}", found=repr(value), expected=f"one of {', '.join(allowed)}"
+        )
+    return value

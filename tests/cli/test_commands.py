@@ -1,0 +1,154 @@
+"""The commands end to end on a few tiny made rooms: fit, interrupt, resume, evaluate."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import cv2
+import pytest
+import torch
+
+from tangent_train.cli import main
+from tangent_train.tasks.callbacks import LastCheckpoint
+
+AREAS = ("1", "2", "3", "4", "5a", "5b", "6")
+SETTINGS = [
+    "experiment=rooms/demo",
+    "level=4",
+    "representation.crop_multiple=null",
+    "network.widths=[4,8]",
+    "data.panoramas_per_step=2",
+    "data.validation_fraction=0.2",
+    "data.rooms.height=32",
+    *(f"data.rooms.rooms.{area}={n}" for area, n in zip(AREAS, (2, 2, 1, 1, 1, 1, 1), strict=True)),
+    "trainer.max_epochs=2",
+    "trainer.check_val_every_n_epoch=1",
+    "trainer.accelerator=cpu",
+    "panels=1",
+]
+
+
+def _run(monkeypatch: pytest.MonkeyPatch, command: str, *arguments: str) -> None:
+    monkeypatch.setattr(sys, "argv", [f"tangent-{command}", *arguments])
+    getattr(main, command)()
+
+
+@pytest.fixture(scope="module")
+def rooms(tmp_path_factory: pytest.TempPathFactory) -> str:
+    folder = tmp_path_factory.mktemp("rooms") / "made rooms"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder.parent)
+        _run(patch, "prepare", *SETTINGS, f"data.root='{folder}'")
+    return f"data.root='{folder}'"
+
+
+@pytest.fixture(scope="module")
+def run_folder(rooms: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run."""
+    folder = tmp_path_factory.mktemp("run")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        _run(patch, "train", *SETTINGS, rooms, "hydra.run.dir=finished")
+    return folder / "finished"
+
+
+def _results(folder: Path) -> dict[str, Any]:
+    results: dict[str, Any] = json.loads((folder / "results.json").read_text())
+    return results
+
+
+def test_a_run_leaves_everything_in_its_folder(run_folder: Path) -> None:
+    results = _results(run_folder)
+    assert results["panoramas"] == 2
+    assert len(results["classes"]) == 13
+    assert (run_folder / "results.md").read_text().count("\n") > 20
+    assert (run_folder / "results.csv").is_file()
+    assert list((run_folder / "tensorboard").glob("events.*"))
+    assert (run_folder / "config.yaml").is_file()
+    (panel,) = (run_folder / "panels").glob("*.png")
+    assert cv2.imread(str(panel)).shape[1] == 2 * 64 + 8
+
+
+def test_checkpoints_hold_tensors_and_plain_values_only(run_folder: Path) -> None:
+    for name in ("best", "last"):
+        path = run_folder / "checkpoints" / f"{name}.ckpt"
+        content = torch.load(path, weights_only=True)
+        assert content["config"]["level"] == 4
+        assert content["config"]["data"]["rooms"]["height"] == 32
+
+
+def test_evaluating_the_checkpoint_repeats_the_numbers_exactly(
+    run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    checkpoint = run_folder / "checkpoints" / "best.ckpt"
+    _run(monkeypatch, "evaluate", f"checkpoint={checkpoint}", "hydra.run.dir=again")
+    assert _results(tmp_path / "again") == _results(run_folder)
+
+
+def test_overrides_apply_to_the_checkpoints_config(
+    run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    checkpoint = run_folder / "checkpoints" / "best.ckpt"
+    arguments = [f"checkpoint={checkpoint}", "data.test_rotation=so3"]
+    _run(monkeypatch, "evaluate", *arguments, "hydra.run.dir=turned")
+    assert _results(tmp_path / "turned")["confusion"] != _results(run_folder)["confusion"]
+    with pytest.raises(SystemExit, match=r"Did you mean data\.test_rotation"):
+        _run(monkeypatch, "evaluate", arguments[0], "data.test_rotatio=so3")
+
+
+def test_an_interrupted_run_says_how_to_go_on_and_ends_the_same(
+    run_folder: Path,
+    rooms: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    original = LastCheckpoint.on_train_epoch_end
+
+    def interrupt(self: LastCheckpoint, trainer: Any, task: Any) -> None:
+        original(self, trainer, task)
+        if trainer.current_epoch == 0:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(LastCheckpoint, "on_train_epoch_end", interrupt)
+        with pytest.raises(SystemExit):
+            _run(patch, "train", *SETTINGS, rooms, "hydra.run.dir=cut")
+    assert "tangent-train resume=" in capsys.readouterr().err
+    _run(monkeypatch, "train", f"resume={tmp_path / 'cut'}")
+    assert _results(tmp_path / "cut") == _results(run_folder)
+
+
+def test_a_missing_data_set_is_an_error_before_training(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit, match=r"tangent-train: .*nowhere"):
+        _run(monkeypatch, "train", "data=stanford2d3ds", "data.root=nowhere")
+
+
+def test_evaluate_needs_a_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit, match="checkpoint: found none"):
+        _run(monkeypatch, "evaluate")
+
+
+def test_help_answers_before_anything_heavy_is_imported(tmp_path: Path) -> None:
+    code = (
+        "import sys; from tangent_train.cli.main import train\n"
+        "sys.argv = ['tangent-train', '--help']\n"
+        "train()\n"
+        "assert not {'torch', 'lightning', 'cv2', 'numba'} & set(sys.modules), 'heavy import'"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], check=False, cwd=tmp_path, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    assert "experiment=rooms/demo" in done.stdout

@@ -1,0 +1,119 @@
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from tangent_train.cli.compose import (
+    check_overrides,
+    checkpoint_config,
+    config_folder,
+    with_stored_config,
+)
+from tangent_train.errors import DataError, SettingError
+
+EXPERIMENTS = sorted(
+    str(path.relative_to(config_folder() / "experiment").with_suffix(""))
+    for path in (config_folder() / "experiment").rglob("*.yaml")
+)
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+def test_every_experiment_composes_and_instantiates(experiment: str) -> None:
+    from tangent_train.cli.run import build
+
+    with initialize_config_dir(str(config_folder()), version_base="1.3"):
+        config = compose("train", [f"experiment={experiment}"])
+    OmegaConf.resolve(config)
+    data, task = build(config)
+    assert task.network is not None
+    assert len(task.class_names) == len(data.class_names) == 14
+    optimizer = task.make_optimizer(task.parameters())
+    assert optimizer.param_groups[0]["lr"] > 0
+    assert config.name.replace("/", "_").endswith(experiment.rpartition("/")[2])
+
+
+@pytest.mark.parametrize("group", ["representation", "optimizer", "scheduler", "network", "data"])
+def test_every_option_of_every_group_composes(group: str) -> None:
+    for path in (config_folder() / group).glob("*.yaml"):
+        with initialize_config_dir(str(config_folder()), version_base="1.3"):
+            config = compose("train", [f"{group}={path.stem}"])
+        OmegaConf.resolve(config)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("trainer.max_epoch=3", "Did you mean trainer.max_epochs"),
+        ("experiment=rooms/demmo", "Did you mean rooms/demo"),
+        ("expriment=rooms/demo", "Did you mean experiment"),
+        ("data=synthroom", "Did you mean synthrooms"),
+        ("representation=erp,erb_crops", "found 'erb_crops'"),
+        ("nonsense", "override 'nonsense'"),
+        ("experiment=null", "unknown experiment"),
+        ("xyz=1", "(+xyz=… adds a setting"),
+    ],
+)
+def test_misspelt_overrides_are_refused_with_the_near_matches(override: str, message: str) -> None:
+    with pytest.raises(SettingError, match=re.escape(message)):
+        check_overrides("train", [override])
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["experiment=rooms/demo", "data.rooms.height=64", "network.widths=[4,8]"],
+        ["-m", "optimizer.lr=1e-3,1e-2", "representation=erp,tangent"],
+        ["+trainer.max_time=00:00:01:00", "hydra.run.dir=x", "~scheduler"],
+        ["representation=erp", "representation.crop_deg=45"],
+    ],
+)
+def test_good_overrides_pass(arguments: list[str]) -> None:
+    check_overrides("train", arguments)
+
+
+def test_a_command_without_a_stored_config_keeps_its_arguments() -> None:
+    assert with_stored_config("train", ["level=6"]) == ("train", ["level=6"])
+    assert with_stored_config("train", ["resume=null"])[0] == "train"
+    assert with_stored_config("evaluate", []) == ("evaluate", [])
+
+
+def test_resume_needs_a_run_that_has_begun(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="the folder of a run that has begun"):
+        with_stored_config("train", [f"resume={tmp_path}"])
+
+
+def _missing(path: Path) -> None:
+    del path
+
+
+def _garbage(path: Path) -> None:
+    path.write_bytes(b"not a checkpoint")
+
+
+def _foreign(path: Path) -> None:
+    torch.save({"weights": torch.zeros(2)}, path)
+
+
+def _pickle(path: Path) -> None:
+    torch.save({"config": {}, "state_dict": {}, "extra": Path("x")}, path)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (_missing, "no such file"),
+        (_garbage, "an unreadable file"),
+        (_foreign, "no config inside"),
+        (_pickle, "an unreadable file"),
+    ],
+)
+def test_what_is_no_checkpoint_is_refused(tmp_path: Path, make: object, message: str) -> None:
+    path = tmp_path / "x.ckpt"
+    make(path)  # type: ignore[operator]
+    with pytest.raises(DataError, match=message):
+        checkpoint_config(path)

@@ -1,0 +1,94 @@
+"""Data in the real on-disk formats, made on the spot."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from typing import TYPE_CHECKING, Any, Protocol
+
+import cv2
+import numpy as np
+import pytest
+
+from datamodules.label_table import CLASSES
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+INSTANCES_PER_CLASS = 40  # the table is longer than 256 entries: two bytes of the colour count
+ROOMS = {
+    "1": ("office_1", "office_1", "office_2", "hallway_1"),
+    "2": ("office_1", "conferenceRoom_1"),
+    "3": ("WC_1",),
+    "4": ("lobby_1",),
+    "5a": ("office_1", "office_1", "hallway_2"),
+    "5b": ("hallway_2", "office_3"),
+    "6": ("office_1",),
+}
+
+
+class FabricateStanford(Protocol):
+    """Writes a small data set; returns its root."""
+
+    def __call__(
+        self, root: Path, rooms: Mapping[str, Sequence[str]] = ROOMS, height: int = 32
+    ) -> Path: ...
+
+
+def _write_png(path: Path, image: NDArray[Any]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), image)
+
+
+def _fabricate(root: Path, rooms: Mapping[str, Sequence[str]] = ROOMS, height: int = 32) -> Path:
+    """Panoramas of boxes whose colour and depth tell their class, with every trap of the format.
+
+    Each has a missing region (label #0D0D0D, depth 65535, black), a patch with one black channel,
+    and every other one an alpha channel.
+    """
+    names = ["<UNK>_0_<UNK>_0_0"]
+    names += [f"{c}_{i}_office_1_1" for c in CLASSES for i in range(INSTANCES_PER_CLASS)]
+    root.mkdir(parents=True, exist_ok=True)
+    (root / "semantic_labels.json").write_text(json.dumps(names))
+    for area, area_rooms in rooms.items():
+        for number, room in enumerate(area_rooms):
+            camera = hashlib.md5(f"{area}/{number}".encode(), usedforsecurity=False).hexdigest()
+            rng = np.random.default_rng(int(camera[:8], 16))
+            stem = f"camera_{camera}_{room}_frame_equirectangular_domain"
+            pano = root / f"area_{area}" / "pano"
+            for domain, image in _panorama(rng, height, alpha=number % 2 == 1).items():
+                _write_png(pano / domain / f"{stem}_{domain}.png", image)
+    return root
+
+
+def _panorama(rng: np.random.Generator, height: int, *, alpha: bool) -> dict[str, NDArray[Any]]:
+    blocks = rng.integers(0, len(CLASSES), (height // 4, height // 2))
+    classes = np.kron(blocks, np.ones((4, 4), np.int64))
+    index = 1 + classes * INSTANCES_PER_CLASS + rng.integers(0, INSTANCES_PER_CLASS)
+    color = np.stack([index >> 16, index >> 8 & 255, index & 255], axis=-1).astype(np.uint8)
+    rgb = np.stack([20 + 15 * classes, 230 - 15 * classes, 100 + 5 * classes], axis=-1)
+    rgb = rgb.astype(np.uint8)
+    depth = (512 * (1 + classes / 4)).astype(np.uint16)
+    rgb[: height // 8], color[: height // 8], depth[: height // 8] = 0, 13, 65535
+    rgb[-height // 8 :, :8, 2] = 0
+    if alpha:
+        rgb = np.dstack([rgb, np.full(rgb.shape[:2], 255, np.uint8)])
+        bgr = cv2.cvtColor(rgb, cv2.COLOR_RGBA2BGRA)
+    else:
+        bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
+    return {"rgb": bgr, "semantic": color[..., ::-1], "depth": depth}
+
+
+@pytest.fixture(scope="session")
+def fabricate_stanford() -> FabricateStanford:
+    """Writes a small data set in the format of Stanford2D3DS."""
+    return _fabricate
+
+
+@pytest.fixture(scope="session")
+def stanford_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small data set in the format of Stanford2D3DS, 14 panoramas of 32×64; not to be changed."""
+    return _fabricate(tmp_path_factory.mktemp("stanford"))

@@ -1,0 +1,50 @@
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+import pytest
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+STRIPS = 4
+
+
+@dataclass(frozen=True)
+class StripViews:
+    """Vertical strips of the panorama after a roll."""
+
+    strips: tuple[int, ...]
+    shift: int = 0
+
+    def render(
+        self, image: NDArray[Any], interpolation: Literal["bilinear", "nearest"]
+    ) -> NDArray[Any]:
+        # Colours may be interpolated; depth and labels never.
+        assert (interpolation == "bilinear") is (image.ndim == 3)
+        parts = np.split(np.roll(image, self.shift, axis=1), STRIPS, axis=1)
+        return np.stack([parts[i] for i in self.strips])
+
+
+@dataclass(frozen=True)
+class StripRepresentation:
+    """The simplest representation: quarters of the panorama, two of them while training."""
+
+    erp_height: int = 16
+
+    def sample(self, rng: np.random.Generator) -> StripViews:
+        strips = rng.choice(STRIPS, 2, replace=False)
+        return StripViews(tuple(map(int, strips)), int(rng.integers(2 * self.erp_height)))
+
+    def whole(self) -> StripViews:
+        return StripViews(tuple(range(STRIPS)))
+
+    def to_labels(self, scores: Any, shape: tuple[int, int]) -> Any:
+        raise NotImplementedError
+
+
+@pytest.fixture
+def strips() -> StripRepresentation:
+    return StripRepresentation()

@@ -1,0 +1,287 @@
+from __future__ import annotations
+
+import hashlib
+import multiprocessing
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from lightning import LightningModule, Trainer
+
+from datamodules.panorama_module import Split
+from datamodules.panoramas import Panorama
+from datamodules.samples import RGB_NORMALIZATION, RGBD_NORMALIZATION, EvaluationSample
+from datamodules.stanford2d3ds import Stanford2D3DS
+from tangent_train.errors import SettingError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from datamodules.samples import TrainingSample
+
+    MakeModule = Callable[..., Stanford2D3DS]
+
+
+SPLITS: tuple[Split, ...] = ("train", "val", "test")
+
+
+@pytest.fixture
+def make_module(stanford_root: Path, strips: Any) -> MakeModule:
+    def make(**settings: Any) -> Stanford2D3DS:
+        return Stanford2D3DS(stanford_root, strips, **settings)
+
+    return make
+
+
+def _digest(batch: TrainingSample) -> str:
+    content = hashlib.sha256(batch.images.numpy().tobytes() + batch.labels.numpy().tobytes())
+    return f"{torch.as_tensor(batch.index).tolist()} {content.hexdigest()[:8]}"
+
+
+# --- loaders -----------------------------------------------------------------------------------
+
+
+def test_what_tasks_ask_for(make_module: MakeModule) -> None:
+    module = make_module()
+    assert module.class_names[:2] == ("unknown", "beam")
+    assert len(module.class_names) == 14
+    assert (module.in_channels, module.normalization, module.erp_height) == (
+        4,
+        RGBD_NORMALIZATION,
+        16,
+    )
+    rgb = make_module(inputs=["rgb"])
+    assert (rgb.in_channels, rgb.normalization) == (3, RGB_NORMALIZATION)
+    assert module.sample_name("test", 0).startswith("area_5a/")
+
+
+def test_training_batches(make_module: MakeModule) -> None:
+    batches = list(make_module(panoramas_per_step=4, validation_fraction=0).train_dataloader())
+    assert [len(batch.images) for batch in batches] == [4, 4, 1]
+    assert batches[0].images.shape == (4, 2, 4, 16, 8)
+    assert batches[0].labels.shape == (4, 2, 16, 8)
+    assert batches[0].labels.dtype == torch.uint8
+
+
+def test_evaluation_batches_are_whole_panoramas_in_order(make_module: MakeModule) -> None:
+    module = make_module(inputs=("rgb",))
+    loaders = {"val": module.val_dataloader(), "test": module.test_dataloader()}
+    for split in SPLITS[1:]:
+        batches = list(loaders[split])
+        assert all(isinstance(batch, EvaluationSample) for batch in batches)
+        assert [int(batch.index) for batch in batches] == list(range(len(module.source(split))))
+        assert batches[0].images.shape == (1, 4, 3, 16, 8)
+        expected = module.source(split).read(0).labels[None]
+        np.testing.assert_array_equal(batches[0].target.numpy(), expected)
+
+
+@pytest.mark.parametrize("in_memory", [False, True])
+def test_the_same_samples_for_any_number_of_workers(
+    make_module: MakeModule, in_memory: bool
+) -> None:
+    def two_epochs(num_workers: int) -> list[list[str]]:
+        loader = make_module(num_workers=num_workers, in_memory=in_memory).train_dataloader()
+        epochs = []
+        for epoch in (0, 1):
+            loader.sampler.set_epoch(epoch)  # type: ignore[attr-defined]
+            epochs.append([_digest(batch) for batch in loader])
+        return epochs
+
+    alone = two_epochs(0)
+    assert two_epochs(2) == alone  # persistent workers learn about the new epoch, too
+    assert alone[0] != alone[1]
+
+
+@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="needs fork")
+def test_workers_start_after_opencv_has_used_threads(make_module: MakeModule) -> None:
+    # cv2.setNumThreads(1) in a forked worker never returned.
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(2)
+    cv2.resize(np.zeros((2048, 4096, 3), np.uint8), (1000, 500), interpolation=cv2.INTER_AREA)
+    prepare = make_module().train_dataloader().worker_init_fn
+    worker = multiprocessing.get_context("fork").Process(target=prepare, args=(0,))
+    worker.start()
+    worker.join(20)
+    stuck = worker.is_alive()
+    worker.kill()
+    worker.join()
+    cv2.setNumThreads(before)
+    assert not stuck
+
+
+def test_in_memory_gives_the_same_samples(make_module: MakeModule) -> None:
+    on_disk, in_memory = (
+        [_digest(batch) for batch in make_module(in_memory=keep).train_dataloader()]
+        for keep in (False, True)
+    )
+    assert on_disk == in_memory
+
+
+def test_in_memory_reads_no_file_twice(
+    make_module: MakeModule, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module = make_module(in_memory=True)
+    list(module.train_dataloader())
+    monkeypatch.setattr("datamodules.stanford2d3ds.read_color_png", None)
+    assert len(list(module.train_dataloader())) > 0
+    assert module.class_weights("log").shape == (14,)
+
+
+def test_only_test_panoramas_turn(make_module: MakeModule) -> None:
+    plain, turned = make_module(), make_module(test_rotation=30)
+    for split in SPLITS:
+        before, after = plain.source(split).read(0), turned.source(split).read(0)
+        for i in range(len(Panorama._fields)):
+            same = np.array_equal(np.asarray(before[i]), np.asarray(after[i]))
+            assert same is (split != "test")
+    assert turned.sample_name("test", 1) == plain.sample_name("test", 1)
+
+
+@pytest.mark.parametrize("world_size", [2, 3])
+def test_processes_share_the_test_panoramas(
+    make_module: MakeModule, monkeypatch: pytest.MonkeyPatch, world_size: int
+) -> None:
+    monkeypatch.setattr("torch.distributed.is_initialized", lambda: True)
+    monkeypatch.setattr("torch.distributed.get_world_size", lambda: world_size)
+    seen = []
+    steps = set()
+    for rank in range(world_size):
+        monkeypatch.setattr("torch.distributed.get_rank", lambda rank=rank: rank)
+        module = make_module()
+        seen += [int(batch.index) for batch in module.test_dataloader()]
+        steps.add(len(module.train_dataloader()))
+    assert sorted(seen) == list(range(5))
+    assert len(steps) == 1
+
+
+# --- with a trainer ----------------------------------------------------------------------------
+
+
+class Recorder(LightningModule):
+    """Trains one number and writes down what it is shown."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.zeros(()))
+        self.seen: dict[int, list[str]] = {}
+        self.tested: list[int] = []
+
+    def training_step(self, batch: TrainingSample, batch_idx: int) -> torch.Tensor:
+        self.seen.setdefault(self.current_epoch, []).append(_digest(batch))
+        return self.weight * batch.images.mean()
+
+    def validation_step(self, batch: EvaluationSample, batch_idx: int) -> None:
+        pass
+
+    def test_step(self, batch: EvaluationSample, batch_idx: int) -> None:
+        self.tested.append(int(batch.index))
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        return torch.optim.SGD(self.parameters(), lr=0.1)
+
+
+def _trainer(folder: Path, epochs: int) -> Trainer:
+    return Trainer(
+        default_root_dir=folder,
+        accelerator="cpu",
+        max_epochs=epochs,
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        use_distributed_sampler=False,
+        log_every_n_steps=1,
+    )
+
+
+@pytest.mark.filterwarnings("ignore:.*does not have many workers")
+@pytest.mark.filterwarnings("ignore:GPU available but not used")
+# No validation split: the trainer makes sure it is meant.
+@pytest.mark.filterwarnings("ignore:Total length of `list` across ranks is zero")
+# Lightning 2.6 with torch 2.15.
+@pytest.mark.filterwarnings("ignore:.*LeafSpec:FutureWarning")
+@pytest.mark.parametrize("validation_fraction", [0, 0.3])
+def test_a_resumed_run_sees_what_the_whole_run_sees(
+    make_module: MakeModule, tmp_path: Path, validation_fraction: float
+) -> None:
+    def module() -> Stanford2D3DS:
+        return make_module(validation_fraction=validation_fraction)
+
+    whole, first, second = Recorder(), Recorder(), Recorder()
+    _trainer(tmp_path / "whole", 3).fit(whole, datamodule=module())
+    trainer = _trainer(tmp_path / "parts", 1)
+    trainer.fit(first, datamodule=module())
+    trainer.save_checkpoint(tmp_path / "last.ckpt")
+    resumed = _trainer(tmp_path / "parts", 3)
+    resumed.fit(second, datamodule=module(), ckpt_path=tmp_path / "last.ckpt", weights_only=True)
+    assert list(whole.seen) == [0, 1, 2]
+    assert len({tuple(epoch) for epoch in whole.seen.values()}) == 3
+    assert first.seen | second.seen == whole.seen
+    resumed.test(second, datamodule=module(), verbose=False)
+    assert second.tested == [0, 1, 2, 3, 4]
+
+
+# --- class weights -----------------------------------------------------------------------------
+
+
+def _shares(module: Stanford2D3DS) -> np.ndarray[Any, Any]:
+    source = module.source("train")
+    labels = np.concatenate([source.read(i).labels.ravel() for i in range(len(source))])
+    known = labels[labels > 0]
+    return np.array([(known == c).mean() for c in range(1, 14)])
+
+
+def test_class_weights_against_their_formulas(make_module: MakeModule) -> None:
+    module = make_module()
+    shares = _shares(module)
+    log, sqrt, none = (module.class_weights(kind) for kind in ("log", "sqrt", "none"))
+    np.testing.assert_allclose(log[1:], 1 / np.log(1.02 + shares), rtol=1e-5)
+    np.testing.assert_allclose(sqrt[1:], shares**-0.5 / np.mean(shares**-0.5), rtol=1e-5)
+    assert none.tolist() == [0] + [1] * 13
+    assert log.dtype == torch.float32
+    assert log[0] == sqrt[0] == 0
+
+
+def test_classes_never_seen_weigh_nothing(
+    make_module: MakeModule, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module = make_module()
+    source = module.source("train")
+    read = source.read
+    monkeypatch.setattr(
+        source, "read", lambda i: read(i)._replace(labels=read(i).labels // 13 * 13)
+    )
+    for kind in ("log", "sqrt"):
+        weights = module.class_weights(kind)
+        assert weights.nonzero().ravel().tolist() == [13]
+        assert torch.isfinite(weights).all()
+
+
+def test_class_weights_of_another_kind(make_module: MakeModule) -> None:
+    with pytest.raises(SettingError, match="log, sqrt or none"):
+        make_module().class_weights("cbrt")  # type: ignore[arg-type]
+
+
+# --- settings ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("inputs", ("depth",)),
+        ("inputs", ("rgb", "hha")),
+        ("panoramas_per_step", 0),
+        ("num_workers", -1),
+        ("seed", -1),
+        ("normalization", RGB_NORMALIZATION),
+        ("test_rotation", "yaw"),
+        ("test_rotation", 200),
+        ("test_rotation", -1),
+    ],
+)
+def test_impossible_settings(make_module: MakeModule, name: str, value: Any) -> None:
+    with pytest.raises(SettingError, match=rf"data\.{name}"):
+        make_module(**{name: value})

@@ -1,0 +1,40 @@
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from datamodules import SynthRooms
+from datamodules.synthrooms.settings import RoomSettings
+from tangent_train.errors import DataError, SettingError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+ROOMS = {"rooms": {"1": 2, "3": 0, "5a": 1}, "height": 16, "supersample": 1}
+
+
+@pytest.mark.slow
+def test_rooms_are_made_then_read_like_the_real_set(tmp_path: Path, strips: Any) -> None:
+    module = SynthRooms(tmp_path / "rooms", strips, rooms=ROOMS, validation_fraction=0.5)
+    with pytest.raises(DataError, match="no such folder"):
+        module.setup()
+    module.prepare_data()
+    module.setup("fit")
+    assert module.areas == ("1", "5a")
+    assert len(list(module.train_dataloader())) == 1
+    (sample,) = module.test_dataloader()
+    assert sample.images.shape == (1, 4, 4, 16, 8)
+    assert sample.target.max() > 0
+    assert module.sample_name("test", 0).startswith("area_5a/")
+
+
+def test_settings_as_a_mapping_or_ready_made(tmp_path: Path, strips: Any) -> None:
+    mapping = SynthRooms(tmp_path, strips, rooms=ROOMS, fold=1)
+    ready = SynthRooms(tmp_path, strips, rooms=RoomSettings(**ROOMS))  # type: ignore[arg-type]
+    assert mapping.rooms == ready.rooms
+
+
+def test_a_fold_without_test_rooms(tmp_path: Path, strips: Any) -> None:
+    with pytest.raises(SettingError, match="fold 2: 2, 4"):
+        SynthRooms(tmp_path, strips, rooms=ROOMS, fold=2)

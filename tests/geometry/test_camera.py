@@ -1,0 +1,165 @@
+"""Perspective cameras against the equations of the paper's supplement, section 2.1.
+
+The paper counts pixels from the corner of the image (c' = W'/2); ours are counted from the centre
+of the first pixel, so that ``c_paper = c + ½``.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from tangent_train.errors import SettingError
+from tangent_train.geometry import (
+    camera_matrix_from_fov,
+    normalize_camera,
+    perspective_directions,
+    shift_range,
+)
+
+SIZE = (480, 760)  # height, width: not square, mistake 5 of the released code swaps them
+K = np.array([[560.0, 0, 370.25], [0, 520.0, 244.0], [0, 0, 1]])
+CORNER = np.array([[1.0, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
+"""From pixels counted from centres to pixels counted from corners."""
+
+
+def paper_shift_range(
+    matrix: NDArray[np.float64], size: tuple[int, int], fov_deg: float, dim: int
+) -> NDArray[np.float64]:
+    """Least and greatest (δx, δy), the supplement's last formula, in its own pixels."""
+    (f_x, _, c_x), (_, f_y, c_y), _ = CORNER @ matrix
+    height, width = size
+    focal = dim / (2 * math.tan(math.radians(fov_deg) / 2))
+    center = dim / 2
+    return np.array([
+        [f_x / focal * center - c_x, f_y / focal * center - c_y],
+        [width - c_x - f_x / focal * (dim - center), height - c_y - f_y / focal * (dim - center)],
+    ])  # fmt: skip
+
+
+@given(
+    focal=st.tuples(st.floats(300, 900), st.floats(300, 900)),
+    size=st.tuples(st.integers(400, 800), st.integers(400, 800)),
+    off_center=st.tuples(st.floats(-20, 20), st.floats(-20, 20)),
+    fov_deg=st.floats(5, 24),
+    dim=st.integers(8, 256),
+)
+def test_shift_range_is_the_papers(
+    focal: tuple[float, float],
+    size: tuple[int, int],
+    off_center: tuple[float, float],
+    fov_deg: float,
+    dim: int,
+) -> None:
+    height, width = size
+    matrix = np.array([
+        [focal[0], 0, width / 2 + off_center[0]], [0, focal[1], height / 2 + off_center[1]],
+        [0, 0, 1],
+    ])  # fmt: skip
+    expected = paper_shift_range(matrix, size, fov_deg, dim)
+    np.testing.assert_allclose(shift_range(matrix, size, fov_deg), expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("least_x", [True, False])
+@pytest.mark.parametrize("least_y", [True, False])
+def test_crops_at_the_ends_of_the_range_touch_the_border_of_the_image(
+    least_x: bool, least_y: bool
+) -> None:
+    least, greatest = shift_range(K, SIZE)
+    shift = np.where([least_x, least_y], least, greatest)
+    old_from_new = np.linalg.inv(normalize_camera(K, SIZE, shift=tuple(shift)).homography)
+    corners = np.array([[-0.5, -0.5], [127.5, 127.5]])
+    old = np.column_stack([corners, [1, 1]]) @ old_from_new.T
+    height, width = SIZE
+    assert old[0 if least_x else 1, 0] == pytest.approx(-0.5 if least_x else width - 0.5)
+    assert old[0 if least_y else 1, 1] == pytest.approx(-0.5 if least_y else height - 0.5)
+    assert (old[:, :2] > -0.5 - 1e-9).all()
+    assert (old[:, :2] < np.array([width, height]) - 0.5 + 1e-9).all()
+
+
+def test_common_camera_of_level_8() -> None:
+    matrix = normalize_camera(K, SIZE).camera_matrix
+    focal = 128 / (2 * math.tan(math.pi / 8))
+    np.testing.assert_allclose(matrix, [[focal, 0, 63.5], [0, focal, 63.5], [0, 0, 1.0]])
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (90.0, -3.5), (-100.0, 2.0)])
+def test_homography_is_the_papers_in_its_own_pixels(shift: tuple[float, float]) -> None:
+    camera = normalize_camera(K, SIZE, fov=40.0, dim=96, shift=shift)
+    delta = np.zeros((3, 3))
+    delta[:2, 2] = shift
+    expected = CORNER @ camera.camera_matrix @ np.linalg.inv(CORNER @ K + delta)
+    np.testing.assert_allclose(CORNER @ camera.homography @ np.linalg.inv(CORNER), expected,
+                               atol=1e-12)  # fmt: skip
+
+
+def test_without_shift_a_ray_stays_a_ray() -> None:
+    camera = normalize_camera(K, SIZE)
+    ray = np.array([0.1, -0.2, 1])
+    old, new = K @ ray, camera.camera_matrix @ ray
+    np.testing.assert_allclose(camera.homography @ old, new, atol=1e-10)
+
+
+@pytest.mark.parametrize("fov_deg", [10.0, 45.0, 90.0, 150.0])
+@pytest.mark.parametrize("size", [(4, 6), (11, 7)])
+def test_fov_is_between_the_outer_pixel_edges(fov_deg: float, size: tuple[int, int]) -> None:
+    matrix = camera_matrix_from_fov(fov_deg, size)
+    height, width = size
+    edges = np.array([[-0.5, (height - 1) / 2, 1], [width - 0.5, (height - 1) / 2, 1]])
+    left, right = edges @ np.linalg.inv(matrix).T
+    cosine = left @ right / np.linalg.norm(left) / np.linalg.norm(right)
+    assert math.degrees(math.acos(cosine)) == pytest.approx(fov_deg, abs=1e-9)
+    assert left[1] == pytest.approx(0)  # the middle row looks neither up nor down
+    assert matrix[0, 0] == matrix[1, 1]
+
+
+@pytest.mark.parametrize("fov_deg", [0, -5, 180, 270, math.nan])
+def test_impossible_fields_of_view_are_refused(fov_deg: float) -> None:
+    with pytest.raises(SettingError, match=r"fov_deg: found .*; expected more than 0 and less"):
+        camera_matrix_from_fov(fov_deg, (4, 4))
+
+
+def test_perspective_directions_hit_their_own_pixel() -> None:
+    directions = perspective_directions(K, SIZE)
+    assert directions.shape == (*SIZE, 3)
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=-1), 1)
+    pixels = directions @ K.T
+    pixels = pixels[..., :2] / pixels[..., 2:]
+    rows, columns = np.mgrid[: SIZE[0], : SIZE[1]]
+    np.testing.assert_allclose(pixels, np.stack([columns, rows], axis=-1), atol=1e-9)
+    assert (directions[-1, -1] > 0).all()  # x right, y down, z forward
+
+
+def test_exact_fit_leaves_no_room_to_shift() -> None:
+    matrix = camera_matrix_from_fov(45, (128, 128))
+    least, greatest = shift_range(matrix, (128, 128))
+    np.testing.assert_allclose([least, greatest], 0, atol=1e-9)
+    np.testing.assert_allclose(normalize_camera(matrix, (128, 128)).homography, np.eye(3),
+                               atol=1e-12)  # fmt: skip
+
+
+def test_rounding_never_turns_the_shift_range_round() -> None:
+    # A range of nothing must still be one to draw from, for every exact fit.
+    for fov_deg in np.linspace(20, 80, 61):
+        least, greatest = shift_range(camera_matrix_from_fov(fov_deg, (96, 96)), (96, 96), fov_deg)
+        assert (greatest >= least).all()
+
+
+@pytest.mark.parametrize("size", [(300, 760), (760, 300)])
+def test_image_too_small_either_way_is_refused(size: tuple[int, int]) -> None:
+    matrix = K.copy()
+    matrix[:2, 2] = size[1] / 2, size[0] / 2
+    with pytest.raises(SettingError, match="field of view: found 45° for an image that spans"):
+        normalize_camera(matrix, size)
+
+
+@pytest.mark.parametrize("shift", [(1e3, 0), (-1e3, 0), (0, 100), (0, -100)])
+def test_shift_out_of_the_image_is_refused(shift: Any) -> None:
+    with pytest.raises(SettingError, match="shift: found"):
+        normalize_camera(K, SIZE, shift=shift)

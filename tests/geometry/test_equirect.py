@@ -1,0 +1,102 @@
+"""Equirectangular pixels: the convention of `tangent_train.geometry`, the seam and the poles."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.integrate import quad
+
+from tangent_train.errors import SettingError
+from tangent_train.geometry import (
+    equirect_directions,
+    equirect_latitudes,
+    equirect_shape,
+    equirect_solid_angles,
+    equirect_to_lonlat,
+    lonlat_to_equirect,
+    lonlat_to_xyz,
+)
+
+Shape = tuple[int, int]
+SHAPES = [(1, 1), (2, 4), (50, 100), (63, 126), (7, 9)]
+
+
+@pytest.mark.parametrize(
+    ("level", "shape"), [(0, (2, 4)), (5, (64, 128)), (7, (256, 512)), (8, (512, 1024)),
+                         (10, (2048, 4096))]
+)  # fmt: skip
+def test_shape_of_a_level(level: int, shape: Shape) -> None:
+    assert equirect_shape(level) == shape
+
+
+def test_negative_level_is_refused() -> None:
+    with pytest.raises(SettingError, match="level: found -1; expected 0 or more"):
+        equirect_shape(-1)
+
+
+@pytest.mark.parametrize(
+    ("pixel", "lonlat_deg"),
+    [
+        ((0, 0), (-135, 45)),
+        ((3, 1), (135, -45)),
+        ((1.5, 0.5), (0, 0)),
+        ((-0.5, -0.5), (-180, 90)),
+        ((3.5, 1.5), (180, -90)),
+    ],
+)
+def test_pixels_of_a_panorama_of_two_rows(
+    pixel: tuple[float, float], lonlat_deg: tuple[float, float]
+) -> None:
+    lonlat = np.radians(lonlat_deg)
+    np.testing.assert_allclose(equirect_to_lonlat(pixel, (2, 4)), lonlat, atol=1e-15)
+    np.testing.assert_allclose(lonlat_to_equirect(lonlat, (2, 4)), pixel, atol=1e-15)
+
+
+@given(
+    st.floats(-math.pi, math.pi),
+    st.floats(-math.pi / 2, math.pi / 2),
+    st.tuples(st.integers(1, 5000), st.integers(1, 5000)),
+)
+def test_pixels_and_lonlat_are_inverse(lon: float, lat: float, shape: Shape) -> None:
+    pixel = lonlat_to_equirect([lon, lat], shape)
+    np.testing.assert_allclose(equirect_to_lonlat(pixel, shape), [lon, lat], atol=1e-12)
+    height, width = shape
+    assert -0.5 - 1e-9 <= pixel[0] <= width - 0.5 + 1e-9
+    assert -0.5 - 1e-9 <= pixel[1] <= height - 0.5 + 1e-9
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_directions_are_those_of_the_pixel_centres(shape: Shape) -> None:
+    height, width = shape
+    rows, columns = np.mgrid[:height, :width]
+    lonlat = equirect_to_lonlat(np.stack([columns, rows], axis=-1), shape)
+    directions = equirect_directions(shape)
+    assert directions.shape == (*shape, 3)
+    np.testing.assert_allclose(directions, lonlat_to_xyz(lonlat), atol=1e-14)
+    np.testing.assert_allclose(equirect_latitudes(height), lonlat[:, 0, 1], atol=1e-15)
+
+
+def test_a_quarter_turn_is_a_shift_by_a_quarter_of_the_columns() -> None:
+    directions = equirect_directions((6, 12))
+    quarter_turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    np.testing.assert_allclose(
+        directions @ quarter_turn.T, np.roll(directions, -3, axis=1), atol=1e-15
+    )
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_solid_angles_add_up_to_the_sphere(shape: Shape) -> None:
+    width = shape[1]
+    assert (equirect_solid_angles(shape) * width).sum() == pytest.approx(4 * math.pi, rel=1e-13)
+
+
+def test_solid_angle_of_a_row_is_the_integral_of_cos_latitude() -> None:
+    height, width = 9, 16
+    for row, angle in enumerate(equirect_solid_angles((height, width))):
+        top = math.pi / 2 - row / height * math.pi
+        area, _ = quad(math.cos, top - math.pi / height, top)
+        assert angle == pytest.approx(area * 2 * math.pi / width, rel=1e-12)

@@ -1,0 +1,124 @@
+"""Who owns a direction, how far owned cells reach, and the walk to the owner."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial import SphericalVoronoi
+
+from tangent_train.errors import SettingError
+from tangent_train.geometry import TangentGrid, icosphere, rotation_about, xyz_to_lonlat
+
+BASE_LEVELS = range(5)
+
+
+def random_directions(count: int, seed: int = 0) -> NDArray[np.float64]:
+    directions = np.random.default_rng(seed).normal(size=(count, 3))
+    return np.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True))
+
+
+@lru_cache
+def voronoi_extent(base_level: int) -> float:
+    """Largest |x| or |y| of a cell corner on its own tangent plane, by textbook projection."""
+    centers = TangentGrid(base_level, base_level + 6).centers_xyz
+    voronoi = SphericalVoronoi(centers, threshold=1e-9)
+    cell = np.repeat(np.arange(len(centers)), [len(region) for region in voronoi.regions])
+    corners = voronoi.vertices[np.concatenate(voronoi.regions).astype(int)]
+    (lon_0, lat_0), (lon, lat) = xyz_to_lonlat(centers)[cell].T, xyz_to_lonlat(corners).T
+    cos_c = np.sin(lat_0) * np.sin(lat) + np.cos(lat_0) * np.cos(lat) * np.cos(lon - lon_0)
+    x = np.cos(lat) * np.sin(lon - lon_0) / cos_c
+    y = (np.cos(lat_0) * np.sin(lat) - np.sin(lat_0) * np.cos(lat) * np.cos(lon - lon_0)) / cos_c
+    return float(np.abs([x, y]).max())
+
+
+@pytest.mark.parametrize("base_level", BASE_LEVELS)
+@pytest.mark.parametrize("finer", [3, 4, 6])
+def test_least_dim_covers_the_voronoi_cells_exactly(base_level: int, finer: int) -> None:
+    level = base_level + finer
+    pitch = TangentGrid(base_level, level).pitch
+    least = math.ceil(2 * voronoi_extent(base_level) / pitch) + 1
+    with pytest.raises(SettingError, match=f"dim: found {least - 1}; expected at least {least} "):
+        TangentGrid(base_level, level, least - 1)
+    assert TangentGrid(base_level, level, least).half_extent >= voronoi_extent(base_level)
+    assert TangentGrid.least_dim(base_level, level) == least
+
+
+@pytest.mark.parametrize("base_level", BASE_LEVELS)
+@pytest.mark.parametrize("finer", [0, 1])
+def test_default_images_of_one_or_two_pixels_do_not_cover(base_level: int, finer: int) -> None:
+    with pytest.raises(SettingError, match=f"dim: found {2**finer}; expected at least"):
+        TangentGrid(base_level, base_level + finer)
+
+
+@pytest.mark.parametrize("base_level", BASE_LEVELS)
+@pytest.mark.parametrize("finer", [2, 3, 5])
+def test_default_images_cover_the_sphere(base_level: int, finer: int) -> None:
+    grid = TangentGrid(base_level, base_level + finer)
+    directions = random_directions(5000)
+    pixels = grid.project(directions, grid.owners(directions))
+    assert pixels.min() >= -1e-9
+    assert pixels.max() <= grid.dim - 1 + 1e-9
+
+
+def test_at_base_level_0_15_percent_of_the_pixels_is_owned() -> None:
+    grid = TangentGrid(0, 7)
+    owned = grid.owners(grid.directions()) == np.arange(20)[:, None, None]
+    assert owned.mean() == pytest.approx(0.15, abs=0.005)
+
+
+@pytest.mark.parametrize("rotation", [None, rotation_about((1, 1, 0), 2.0)])
+def test_owner_has_the_nearest_centre(rotation: NDArray[np.float64] | None) -> None:
+    grid = TangentGrid(1, 5, rotation=rotation)
+    directions = random_directions(600)
+    angles = np.arccos(np.clip(directions @ grid.centers_xyz.T, -1, 1))
+    expected = angles.argmin(axis=1)
+    np.testing.assert_array_equal(grid.owners(directions), expected)
+    # Vectors of any length and shape.
+    np.testing.assert_array_equal(
+        grid.owners(3 * directions.reshape(20, 30, 3)), expected.reshape(20, 30)
+    )
+
+
+def test_owners_of_many_directions_are_found_in_parts() -> None:
+    grid = TangentGrid(4, 7)  # 5120 faces: more than one part of 2^24 products
+    directions = random_directions(3500)
+    pixels = grid.owners(directions)
+    np.testing.assert_array_equal(pixels[3300:], grid.owners(directions[3300:]))
+    np.testing.assert_array_equal(grid.owners(grid.centers_xyz), np.arange(5120))
+
+
+@pytest.mark.parametrize("base_level", BASE_LEVELS)
+def test_neighbours_are_the_faces_that_share_a_vertex(base_level: int) -> None:
+    neighbors = TangentGrid(base_level, base_level + 4).neighbors
+    faces = icosphere(base_level).faces
+    assert neighbors.shape == (len(faces), 12)
+    around: dict[int, set[int]] = {}
+    for face, corners in enumerate(faces.tolist()):
+        for vertex in corners:
+            around.setdefault(vertex, set()).add(face)
+    for face, corners in enumerate(faces.tolist()):
+        expected = set.union(*(around[vertex] for vertex in corners)) - {face}
+        listed = neighbors[face].tolist()
+        assert sorted(listed) == sorted([*expected, *[face] * (12 - len(expected))])
+
+
+@pytest.mark.parametrize("base_level", BASE_LEVELS)
+@pytest.mark.parametrize("rotation", [None, rotation_about((3, 1, 2), 0.7)])
+def test_greedy_walk_over_neighbours_ends_at_the_owner(
+    base_level: int, rotation: NDArray[np.float64] | None
+) -> None:
+    grid = TangentGrid(base_level, base_level + 4, rotation=rotation)
+    directions = random_directions(3000, seed=base_level)
+    face = np.random.default_rng(1).integers(grid.num_images, size=len(directions))
+    for _ in range(grid.num_images):
+        candidates = np.concatenate([face[:, None], grid.neighbors[face]], axis=1)
+        closeness = np.einsum("nkc,nc->nk", grid.centers_xyz[candidates], directions)
+        nearer = candidates[np.arange(len(face)), closeness.argmax(axis=1)]
+        if (nearer == face).all():
+            break
+        face = nearer
+    np.testing.assert_array_equal(face, grid.owners(directions))

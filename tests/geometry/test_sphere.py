@@ -1,0 +1,108 @@
+"""Directions, longitude and latitude, rotations, against closed forms."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from tangent_train.geometry import (
+    FLIP_Y,
+    lonlat_to_xyz,
+    random_rotation,
+    rotation_about,
+    xyz_to_lonlat,
+)
+
+longitudes = st.floats(-math.pi, math.pi)
+latitudes = st.floats(-math.pi / 2, math.pi / 2)
+components = st.floats(-10, 10)
+
+
+@pytest.mark.parametrize(
+    ("lon_deg", "lat_deg", "xyz"),
+    [
+        (0, 0, (1, 0, 0)),
+        (90, 0, (0, 1, 0)),
+        (-90, 0, (0, -1, 0)),
+        (180, 0, (-1, 0, 0)),
+        (-180, 0, (-1, 0, 0)),
+        (0, 90, (0, 0, 1)),
+        (77, -90, (0, 0, -1)),
+        (45, 30, (math.sqrt(3 / 8), math.sqrt(3 / 8), 0.5)),
+    ],
+)
+def test_axes(lon_deg: float, lat_deg: float, xyz: tuple[float, float, float]) -> None:
+    np.testing.assert_allclose(lonlat_to_xyz(np.radians([lon_deg, lat_deg])), xyz, atol=1e-15)
+
+
+@given(longitudes, latitudes)
+def test_lonlat_survives_the_way_through_xyz(lon: float, lat: float) -> None:
+    xyz = lonlat_to_xyz([lon, lat])
+    lon_back, lat_back = xyz_to_lonlat(xyz)
+    assert np.linalg.norm(xyz) == pytest.approx(1, abs=1e-14)
+    assert lat_back == pytest.approx(lat, abs=1e-12)
+    # Near a pole longitude means little: compare what it moves on the sphere.
+    assert math.cos(lat) * math.sin((lon_back - lon) / 2) == pytest.approx(0, abs=1e-12)
+    assert -math.pi <= lon_back <= math.pi
+
+
+@given(st.tuples(components, components, components).filter(lambda v: math.hypot(*v) > 1e-3))
+def test_xyz_of_any_length_survives_the_way_through_lonlat(xyz: tuple[float, float, float]) -> None:
+    unit = np.array(xyz) / math.hypot(*xyz)
+    np.testing.assert_allclose(lonlat_to_xyz(xyz_to_lonlat(xyz)), unit, atol=1e-14)
+
+
+def test_latitude_is_precise_at_the_poles() -> None:
+    # asin(z) would lose half the digits here.
+    lat = np.pi / 2 - np.array([1e-9, 1e-8, 1e-7])
+    back = xyz_to_lonlat(lonlat_to_xyz(np.stack([np.full(3, 0.3), lat], axis=-1)))[..., 1]
+    np.testing.assert_allclose(np.pi / 2 - back, [1e-9, 1e-8, 1e-7], rtol=1e-6)
+
+
+def test_arrays_keep_their_shape() -> None:
+    lonlat = np.random.default_rng(0).uniform(-1, 1, (3, 4, 2))
+    assert lonlat_to_xyz(lonlat).shape == (3, 4, 3)
+    np.testing.assert_allclose(xyz_to_lonlat(lonlat_to_xyz(lonlat)), lonlat, atol=1e-14)
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(-7, 7))
+def test_rotation_about_an_axis_is_scipys(seed: int, angle: float) -> None:
+    axis = np.random.default_rng(seed).normal(size=3)
+    unit = axis / np.linalg.norm(axis)
+    expected = Rotation.from_rotvec(angle * unit).as_matrix()
+    np.testing.assert_allclose(rotation_about(axis, angle), expected, atol=1e-12)
+
+
+def test_a_positive_angle_about_the_vertical_adds_to_the_longitude() -> None:
+    turned = rotation_about((0, 0, 2), 0.4) @ lonlat_to_xyz([0.1, 0.7])
+    np.testing.assert_allclose(xyz_to_lonlat(turned), [0.5, 0.7], atol=1e-14)
+
+
+def test_random_rotations_are_proper_and_uniform() -> None:
+    rng = np.random.default_rng(3)
+    rotations = np.stack([random_rotation(rng) for _ in range(4000)])
+    unity = rotations @ rotations.transpose(0, 2, 1)
+    np.testing.assert_allclose(unity, np.broadcast_to(np.eye(3), unity.shape), atol=1e-12)
+    np.testing.assert_allclose(np.linalg.det(rotations), 1, atol=1e-12)
+    # Uniform on SO(3): E[R] = 0, E[R_ij²] = 1/3, and the angle ω has density (1 − cos ω)/π.
+    np.testing.assert_allclose(rotations.mean(axis=0), 0, atol=0.05)
+    np.testing.assert_allclose((rotations**2).mean(axis=0), 1 / 3, atol=0.03)
+    angle = np.arccos(np.clip((np.trace(rotations, axis1=1, axis2=2) - 1) / 2, -1, 1))
+    assert angle.mean() == pytest.approx(math.pi / 2 + 2 / math.pi, abs=0.05)
+
+
+def test_random_rotations_repeat_with_the_seed() -> None:
+    first, second = (random_rotation(np.random.default_rng(5)) for _ in range(2))
+    np.testing.assert_array_equal(first, second)
+
+
+def test_flip_y_mirrors_left_and_right_only() -> None:
+    np.testing.assert_array_equal(FLIP_Y @ [1, 2, 3], [1, -2, 3])
+    np.testing.assert_array_equal(FLIP_Y @ FLIP_Y, np.eye(3))
+    with pytest.raises(ValueError, match="read-only"):
+        FLIP_Y[0, 0] = 2

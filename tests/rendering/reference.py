@@ -1,0 +1,268 @@
+"""Tangent images once more: slow, float64, written from the paper (section 3.2) and nothing else.
+
+No line here is shared with the library, which is tested against it. Everything goes through
+longitude and latitude and the textbook formulas of the gnomonic projection (Snyder 1987, chapter
+22), where the library works with camera matrices. Faces come in an order of their own:
+`ReferenceGrid.order` matches them by their centres.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+Triangles = list[tuple[int, int, int]]
+
+
+def icosahedron() -> tuple[list[Array], Triangles]:
+    """Twelve vertices, poles included; faces are the triples of mutual neighbours."""
+    ring = math.atan(0.5)
+    lonlat = [(0.0, math.pi / 2), (0.0, -math.pi / 2)]
+    lonlat += [(math.radians(72 * k), ring) for k in range(5)]
+    lonlat += [(math.radians(72 * k + 36), -ring) for k in range(5)]
+    vertices = [to_xyz(np.array(position)) for position in lonlat]
+    edge = 1 / math.sin(math.radians(72))
+    faces = [
+        triple
+        for triple in itertools.combinations(range(12), 3)
+        if all(
+            math.isclose(np.linalg.norm(vertices[a] - vertices[b]), edge)
+            for a, b in itertools.combinations(triple, 2)
+        )
+    ]
+    return vertices, faces
+
+
+def neighbors(count: int, faces: Triangles) -> list[set[int]]:
+    """The vertices joined to each vertex by an edge."""
+    found: list[set[int]] = [set() for _ in range(count)]
+    for a, b, c in faces:
+        found[a] |= {b, c}
+        found[b] |= {c, a}
+        found[c] |= {a, b}
+    return found
+
+
+def loop_subdivision(vertices: list[Array], faces: Triangles) -> tuple[list[Array], Triangles]:
+    """Loop's masks (1987): 3/8 3/8 1/8 1/8 on edges, 1 − kβ and β around a vertex of valence k."""
+    around = neighbors(len(vertices), faces)
+    points = []
+    for vertex, joined in zip(vertices, around, strict=True):
+        k = len(joined)
+        beta = (5 / 8 - (3 / 8 + math.cos(2 * math.pi / k) / 4) ** 2) / k
+        points.append((1 - k * beta) * vertex + beta * sum(vertices[w] for w in joined))
+    middle: dict[frozenset[int], int] = {}
+    for a, joined in enumerate(around):
+        for b in joined:
+            if a < b:
+                left, right = joined & around[b]  # a closed mesh: two triangles at every edge
+                ends, wings = vertices[a] + vertices[b], vertices[left] + vertices[right]
+                middle[frozenset((a, b))] = len(points)
+                points.append((3 * ends + wings) / 8)
+    refined = []
+    for a, b, c in faces:
+        ab, bc, ca = (middle[frozenset(edge)] for edge in ((a, b), (b, c), (c, a)))
+        refined += [(a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca)]
+    return points, refined
+
+
+def subdivided_icosahedron(level: int) -> tuple[list[Array], Triangles]:
+    """S(b)."""
+    mesh = icosahedron()
+    for _ in range(level):
+        mesh = loop_subdivision(*mesh)
+    return mesh
+
+
+def vertex_resolution(level: int) -> float:
+    """R_v(b), in radians."""
+    if level == -1:
+        return 2 * vertex_resolution(0)
+    vertices, faces = subdivided_icosahedron(level)
+    units = [vertex / np.linalg.norm(vertex) for vertex in vertices]
+    means = []
+    for v, joined in enumerate(neighbors(len(vertices), faces)):
+        means.append(np.mean([math.acos(units[v] @ units[w]) for w in joined]))
+    return float(np.mean(means))
+
+
+def to_xyz(lonlat: Array) -> Array:
+    """x = cos φ cos λ, y = cos φ sin λ, z = sin φ."""
+    lon, lat = lonlat[..., 0], lonlat[..., 1]
+    return np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=-1)
+
+
+def to_lonlat(xyz: Array) -> Array:
+    """Inverse of `to_xyz`; asin(z) would lose half the digits at the poles."""
+    x, y, z = xyz[..., 0], xyz[..., 1], xyz[..., 2]
+    return np.stack([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))], axis=-1)
+
+
+def panorama_lonlat(shape: tuple[int, int]) -> Array:
+    """``(H, W, 2)`` of the pixel centres."""
+    height, width = shape
+    result = np.empty((height, width, 2))
+    for row in range(height):
+        result[row, :, 1] = math.pi / 2 - (row + 0.5) / height * math.pi
+    for column in range(width):
+        result[:, column, 0] = (column + 0.5) / width * 2 * math.pi - math.pi
+    return result
+
+
+def panorama_position(lonlat: Array, shape: tuple[int, int]) -> tuple[Array, Array]:
+    """Row and column, pixel centres at integers."""
+    height, width = shape
+    row = (math.pi / 2 - lonlat[..., 1]) / math.pi * height - 0.5
+    return row, (lonlat[..., 0] + math.pi) / (2 * math.pi) * width - 0.5
+
+
+def panorama_row(image: Array, row: NDArray[np.int64], column: Array) -> Array:
+    """Linear along a row. A row beyond a pole is the same row on the other side, half a turn on."""
+    height, width = image.shape[:2]
+    beyond = (row < 0) | (row >= height)
+    column = np.where(beyond, column + width / 2, column)
+    row = np.where(row < 0, -1 - row, np.where(row >= height, 2 * height - 1 - row, row))
+    left = np.floor(column).astype(int)
+    right = (column - left)[..., None]
+    return (1 - right) * image[row, left % width] + right * image[row, (left + 1) % width]
+
+
+def sample_panorama(image: Array, lonlat: Array, interpolation: str) -> Array:
+    """``(H, W, C)`` at ``(..., 2)`` -> ``(..., C)``."""
+    height, width = image.shape[:2]
+    row, column = panorama_position(lonlat, (height, width))
+    if interpolation == "nearest":
+        nearest = np.clip(np.floor(row + 0.5), 0, height - 1).astype(int)
+        return image[nearest, np.floor(column + 0.5).astype(int) % width]
+    top = np.floor(row).astype(int)
+    down = (row - top)[..., None]
+    above, below = panorama_row(image, top, column), panorama_row(image, top + 1, column)
+    return np.asarray((1 - down) * above + down * below)
+
+
+@dataclass(frozen=True)
+class ReferenceGrid:
+    """All tangent images; `rotation` turns the icosahedron."""
+
+    base_level: int
+    level: int
+    dim: int
+    rotation: Array = field(default_factory=lambda: np.eye(3))
+
+    @cached_property
+    def centers_lonlat(self) -> Array:
+        """``(N, 2)`` barycentres of the faces, not turned."""
+        vertices, faces = subdivided_icosahedron(self.base_level)
+        centers = np.array([sum(vertices[v] for v in face) for face in faces])
+        return to_lonlat(centers / np.linalg.norm(centers, axis=1, keepdims=True))
+
+    @cached_property
+    def pitch(self) -> float:
+        """The paper's half extent (d−1)/(2d)·R_v(b−1) of the default d over its (d−1)/2 pixels."""
+        return vertex_resolution(self.base_level - 1) / 2 ** (self.level - self.base_level)
+
+    def order(self, centers_xyz: ArrayLike) -> NDArray[np.int64]:
+        """For each given centre the face here that has it."""
+        own = to_xyz(self.centers_lonlat) @ self.rotation.T
+        closeness = np.asarray(centers_xyz) @ own.T
+        order = closeness.argmax(axis=1)
+        if closeness.max(axis=1).min() < 1 - 1e-12 or len(set(order.tolist())) != len(own):
+            raise AssertionError("the centres of the faces differ")
+        return order
+
+    def lonlat(self, face: int) -> Array:
+        """``(d, d, 2)`` where the pixels of an image are on the sphere: inverse gnomonic."""
+        lon_0, lat_0 = self.centers_lonlat[face]
+        steps = (np.arange(self.dim) - (self.dim - 1) / 2) * self.pitch
+        x, y = np.meshgrid(steps, -steps)
+        rho = np.maximum(np.hypot(x, y), 1e-300)
+        c = np.arctan(rho)
+        lat = np.arcsin(np.cos(c) * np.sin(lat_0) + y * np.sin(c) * np.cos(lat_0) / rho)
+        lon = lon_0 + np.arctan2(
+            x * np.sin(c), rho * np.cos(lat_0) * np.cos(c) - y * np.sin(lat_0) * np.sin(c)
+        )
+        return to_lonlat(to_xyz(np.stack([lon, lat], axis=-1)) @ self.rotation.T)
+
+    def forward(self, image: Array, interpolation: str = "bilinear") -> Array:
+        """``(H, W, C)`` -> ``(N, d, d, C)``."""
+        faces = range(len(self.centers_lonlat))
+        return np.stack([sample_panorama(image, self.lonlat(f), interpolation) for f in faces])
+
+    def nearness(self, shape: tuple[int, int]) -> Array:
+        """``(H, W, N)`` cosine of the angle from every panorama pixel to every centre."""
+        return self._unturned(shape) @ to_xyz(self.centers_lonlat).T
+
+    def _unturned(self, shape: tuple[int, int]) -> Array:
+        return np.asarray(to_xyz(panorama_lonlat(shape)) @ self.rotation)
+
+    def positions(self, shape: tuple[int, int], face: NDArray[np.int64]) -> tuple[Array, Array]:
+        """Row and column of every panorama pixel in the image of a face: gnomonic projection."""
+        lonlat = to_lonlat(self._unturned(shape))
+        lon, lat = lonlat[..., 0], lonlat[..., 1]
+        lon_0, lat_0 = self.centers_lonlat[face, 0], self.centers_lonlat[face, 1]
+        turn = np.cos(lon - lon_0)
+        cos_c = np.sin(lat_0) * np.sin(lat) + np.cos(lat_0) * np.cos(lat) * turn
+        x = np.cos(lat) * np.sin(lon - lon_0) / cos_c
+        y = (np.cos(lat_0) * np.sin(lat) - np.sin(lat_0) * np.cos(lat) * turn) / cos_c
+        middle = (self.dim - 1) / 2
+        return middle - y / self.pitch, middle + x / self.pitch
+
+    def _sampled(self, images: Array, face: NDArray[np.int64], row: Array, column: Array) -> Array:
+        """Bilinear; off the outermost pixel centres their values continue."""
+        row, column = np.clip(row, 0, self.dim - 1), np.clip(column, 0, self.dim - 1)
+        top = np.minimum(np.floor(row), self.dim - 2).astype(int)
+        left = np.minimum(np.floor(column), self.dim - 2).astype(int)
+        down, right = (row - top)[..., None], (column - left)[..., None]
+        above = (1 - right) * images[face, top, left] + right * images[face, top, left + 1]
+        top = top + 1
+        below = (1 - right) * images[face, top, left] + right * images[face, top, left + 1]
+        return np.asarray((1 - down) * above + down * below)
+
+    def backward(self, images: Array, shape: tuple[int, int]) -> Array:
+        """``(N, d, d, C)`` -> ``(H, W, C)`` from the image with the nearest centre."""
+        owner = self.nearness(shape).argmax(axis=-1)
+        return self._sampled(images, owner, *self.positions(shape, owner))
+
+    def feathered(self, images: Array, shape: tuple[int, int]) -> Array:
+        """Mean of all images that see a pixel, weights ((1 − a²)(1 − b²))⁴.
+
+        a and b are the offsets from the middle in half sides d/2, so that the weight falls to 0 at
+        the outer edges of the outermost pixels.
+        """
+        total = np.zeros((*shape, images.shape[-1]))
+        weights = np.zeros((*shape, 1))
+        nearness = self.nearness(shape)
+        for face in range(len(images)):
+            row, column = self.positions(shape, np.full(shape, face))
+            a, b = ((line - (self.dim - 1) / 2) / (self.dim / 2) for line in (column, row))
+            seen = (nearness[..., face] > 0) & (np.abs(a) < 1) & (np.abs(b) < 1)
+            weight = np.where(seen, ((1 - a**2) * (1 - b**2)) ** 4, 0)[..., None]
+            total += weight * self._sampled(images, np.full(shape, face), row, column)
+            weights += weight
+        return total / weights
+
+    def clear(self, shape: tuple[int, int]) -> NDArray[np.bool_]:
+        """Panorama pixels that are not half-way between two centres: their owner is certain."""
+        second, first = np.moveaxis(np.sort(self.nearness(shape), axis=-1)[..., -2:], -1, 0)
+        return np.asarray(first - second > 1e-9)
+
+
+def certain_nearest(lonlat: Array, shape: tuple[int, int], margin: float) -> NDArray[np.bool_]:
+    """Positions whose nearest panorama pixel is not decided by rounding."""
+    row, column = panorama_position(lonlat, shape)
+    return np.asarray(
+        (np.abs(row - np.floor(row) - 0.5) > margin)
+        & (np.abs(column - np.floor(column) - 0.5) > margin)
+    )
+
+
+def certain_labels(logits: Array, margin: float) -> NDArray[np.bool_]:
+    """Pixels whose best class leads by more than rounding."""
+    second, first = np.moveaxis(np.sort(logits, axis=-1)[..., -2:], -1, 0)
+    return np.asarray(first - second > margin)

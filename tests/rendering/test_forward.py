@@ -1,0 +1,188 @@
+"""Panoramas to tangent images."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from tangent_train.errors import SettingError
+from tangent_train.geometry import (
+    TangentGrid,
+    equirect_directions,
+    lonlat_to_equirect,
+    random_rotation,
+    xyz_to_lonlat,
+)
+from tangent_train.rendering import equirect_to_tangent, sampling
+
+Array = NDArray[Any]
+SHAPES = [(64, 128), (63, 125), (50, 70)]
+TURNED = TangentGrid(0, 5, rotation=random_rotation(np.random.default_rng(1)))
+
+
+def _random(shape: tuple[int, ...], dtype: Any = np.float64) -> Array:
+    values = np.random.default_rng(0).random(shape)
+    return (values * 250).astype(dtype) if np.dtype(dtype).kind in "ui" else values.astype(dtype)
+
+
+def _smooth(directions: Array) -> Array:
+    """A band-limited function on the sphere (degree 3) with second derivatives below 10."""
+    x, y, z = np.moveaxis(directions, -1, 0)
+    return 0.3 * x + 0.2 * y * z + 0.4 * z + x * y * z
+
+
+@pytest.mark.parametrize("shape", [(128, 256), (101, 203)])
+@pytest.mark.parametrize("grid", [TangentGrid(0, 5), TangentGrid(1, 5), TURNED])
+def test_a_smooth_function_is_rendered_within_the_bilinear_bound(
+    grid: TangentGrid, shape: tuple[int, int]
+) -> None:
+    images = equirect_to_tangent(_smooth(equirect_directions(shape)), grid)
+    # h²/8 · |f''| in each axis; longitude is at most as curved as the function itself.
+    bound = (np.pi / shape[0]) ** 2 / 8 * 10 * 2
+    np.testing.assert_allclose(images, _smooth(grid.directions()), rtol=0, atol=bound)
+
+
+def test_a_ramp_across_the_seam_has_no_step() -> None:
+    shape, grid = (64, 128), TangentGrid(1, 5)
+    columns = np.arange(128)
+    ramp = np.minimum(columns, 127 - columns).astype(np.float64)  # continuous at ±180°
+    images = equirect_to_tangent(np.broadcast_to(ramp, shape).copy(), grid)
+    pixels = lonlat_to_equirect(xyz_to_lonlat(grid.directions()), shape)
+    u, v = np.moveaxis(pixels, -1, 0)
+    expected = np.interp(u, np.arange(-1, 129), np.concatenate([[0], ramp, [0]]))
+    inner = (v >= 0) & (v <= 63)
+    np.testing.assert_allclose(images[inner], expected[inner], atol=1e-9)
+    assert np.any(inner & ((u < 0) | (u > 127)))
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("interpolation", ["bilinear", "nearest"])
+def test_numpy_and_torch_agree(shape: tuple[int, int], interpolation: Any) -> None:
+    image = _random((*shape, 3))
+    for grid in (TangentGrid(0, 5), TURNED):
+        expected = equirect_to_tangent(torch.from_numpy(image).movedim(-1, 0), grid, [0, 7, 19],
+                                       interpolation)  # fmt: skip
+        for dtype, tolerance in ((np.float64, 1e-12), (np.float32, 2e-5)):
+            found = equirect_to_tangent(image.astype(dtype), grid, [0, 7, 19], interpolation)
+            exact = 1e-7 if interpolation == "nearest" else tolerance
+            np.testing.assert_allclose(found, expected.movedim(1, -1).numpy(), atol=exact)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int32])
+@pytest.mark.parametrize("channels", [(), (1,), (2,), (3,), (4,), (5,), (7,)])
+def test_integers_are_the_rounded_exact_values(dtype: Any, channels: tuple[int, ...]) -> None:
+    image = _random((40, 80, *channels), dtype)
+    grid = TangentGrid(0, 5)
+    found = equirect_to_tangent(image, grid)
+    exact = equirect_to_tangent(image.astype(np.float64), grid)
+    assert found.dtype == dtype
+    assert found.shape == (20, 32, 32, *channels)
+    assert np.abs(found - exact).max() <= 0.5 + 1e-2
+
+
+@pytest.mark.parametrize("dtype", [bool, np.int8, np.uint16, np.int32, np.int64, np.float64])
+def test_nearest_takes_the_nearest_pixel_and_wraps(dtype: Any) -> None:
+    shape, grid = (16, 32), TangentGrid(0, 4)
+    image = _random((*shape, 3), np.int8).astype(dtype)
+    pixels = lonlat_to_equirect(xyz_to_lonlat(grid.directions()), shape).astype(np.float32)
+    columns, rows = np.moveaxis(np.rint(pixels).astype(int), -1, 0)
+    assert columns.max() == 32  # some are nearest to column 0 across the seam
+    found = equirect_to_tangent(image, grid, interpolation="nearest")
+    np.testing.assert_array_equal(found, image[rows.clip(0, 15), columns % 32])
+    tensor = equirect_to_tangent(
+        torch.from_numpy(image).movedim(-1, 0), grid, interpolation="nearest"
+    )
+    np.testing.assert_array_equal(tensor.movedim(1, -1).numpy(), found)
+
+
+def test_rows_beyond_a_pole_reflect_with_a_half_turn() -> None:
+    # Looking straight up at the north pole of a 4-column panorama: half-way between the first row
+    # and its reflection.
+    image = np.zeros((8, 4))
+    image[0] = [1, 2, 4, 8]
+    overhead = sampling.EquirectMap(np.array([[0.0, 1.0]]), np.array([[-0.5, -0.25]]), (8, 4))
+    out = np.empty((1, 2))
+    overhead.sample(image, "bilinear", out)
+    np.testing.assert_allclose(out, [[(1 + 4) / 2, 0.75 * 2 + 0.25 * 8]])
+    odd = sampling.EquirectMap(np.array([[0.0]]), np.array([[7.5]]), (8, 5))
+    image = np.zeros((8, 5))
+    image[7] = [1, 2, 4, 8, 16]
+    out = np.empty((1, 1))
+    odd.sample(image, "bilinear", out)
+    np.testing.assert_allclose(out, [[(1 + (4 + 8) / 2) / 2]])
+
+
+@pytest.mark.parametrize("interpolation", ["bilinear", "nearest"])
+@pytest.mark.parametrize("dtype", [np.uint8, np.float32])
+def test_panoramas_too_large_for_opencv(
+    monkeypatch: pytest.MonkeyPatch, interpolation: Any, dtype: Any
+) -> None:
+    image, grid = _random((32, 64, 3), dtype), TangentGrid(0, 4)
+    expected = equirect_to_tangent(image, grid, interpolation=interpolation)
+    monkeypatch.setattr(sampling, "_REMAP_LIMIT", 64)
+    monkeypatch.setattr(sampling, "_BLOCK", 100)
+    found = equirect_to_tangent(image, grid, interpolation=interpolation)
+    np.testing.assert_allclose(found, expected, atol=1 if dtype == np.uint8 else 1e-5)
+
+
+def test_a_smaller_dim_is_the_centre_crop() -> None:
+    image = _random((64, 128, 3), np.float32)
+    whole = equirect_to_tangent(image, TangentGrid(0, 5))
+    cropped = equirect_to_tangent(image, TangentGrid(0, 5, dim=26))
+    np.testing.assert_allclose(cropped, whole[:, 3:-3, 3:-3], atol=1e-4)
+
+
+def test_only_the_asked_faces_in_their_order() -> None:
+    image, grid = _random((64, 128), np.uint8), TangentGrid(0, 5)
+    whole = equirect_to_tangent(image, grid)
+    np.testing.assert_array_equal(equirect_to_tangent(image, grid, [7, 2, 2]), whole[[7, 2, 2]])
+    assert equirect_to_tangent(image, grid, []).shape == (0, 32, 32)
+    assert equirect_to_tangent(torch.rand(2, 3, 8, 16), grid, []).shape == (2, 0, 3, 32, 32)
+
+
+def test_views_of_memory_and_read_only_arrays() -> None:
+    image, grid = _random((64, 128, 4), np.uint8), TangentGrid(0, 5)
+    view = image[::-1, :, 1::2]
+    view.setflags(write=False)
+    expected = equirect_to_tangent(view.copy(), grid, [3])
+    np.testing.assert_array_equal(equirect_to_tangent(view, grid, [3]), expected)
+
+
+def test_tensors_keep_batch_dtype_and_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
+    image, grid = torch.rand(2, 5, 3, 16, 32), TangentGrid(0, 4)
+    images = equirect_to_tangent(image, grid)
+    assert images.shape == (2, 5, 20, 3, 16, 16)
+    half = equirect_to_tangent(image.half(), grid)
+    assert half.dtype == torch.float16
+    torch.testing.assert_close(half.float(), images, atol=2e-3, rtol=0)
+    monkeypatch.setattr("tangent_train.rendering.forward._CHUNK", 300)
+    torch.testing.assert_close(equirect_to_tangent(image, grid), images, atol=0, rtol=0)
+
+
+@pytest.mark.parametrize("shape", [(6, 12), (5, 11)])
+def test_gradients(shape: tuple[int, int]) -> None:
+    image = torch.rand(1, *shape, dtype=torch.float64, requires_grad=True)
+    grid = TangentGrid(0, 3)
+    assert torch.autograd.gradcheck(lambda x: equirect_to_tangent(x, grid, [0, 12]), image)
+
+
+@pytest.mark.parametrize(
+    ("image", "arguments", "message"),
+    [
+        (np.zeros(3), {}, "panorama"),
+        (np.zeros((4, 8, 0)), {}, "panorama"),
+        (np.zeros((4, 8), bool), {}, "nearest"),
+        (np.zeros((4, 8), complex), {"interpolation": "nearest"}, "complex"),
+        (np.zeros((4, 8)), {"interpolation": "cubic"}, "interpolation: found 'cubic'"),
+        (np.zeros((4, 8)), {"faces": [20]}, "faces"),
+        (torch.zeros(4, 8), {}, "panorama"),
+        (torch.zeros(1, 4, 8, dtype=torch.uint8), {}, "float"),
+    ],
+)
+def test_errors(image: Any, arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(SettingError, match=message):
+        equirect_to_tangent(image, TangentGrid(0, 4), **arguments)

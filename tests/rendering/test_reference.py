@@ -1,0 +1,290 @@
+"""Rendering against the slow reference written from the paper (`tests.rendering.reference`)."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from tangent_train.geometry import TangentGrid, rotation_about
+from tangent_train.rendering import (
+    Blend,
+    Interpolation,
+    equirect_to_perspective,
+    equirect_to_tangent,
+    rotate_equirect,
+    tangent_to_equirect,
+    tangent_to_labels,
+)
+from tests.rendering.reference import (
+    Array,
+    ReferenceGrid,
+    certain_labels,
+    certain_nearest,
+    panorama_lonlat,
+    sample_panorama,
+    to_lonlat,
+    to_xyz,
+)
+
+CLASSES = 5
+POSITION_ERROR = 0.0 if int(cv2.__version__.split(".")[0]) >= 5 else 1 / 64
+"""OpenCV 4 rounds positions to 1/32 px, up to 1/64 px off each way; OpenCV 5 does not."""
+TURN = rotation_about((1, -2, 0.5), 2.3)
+
+
+class Case(NamedTuple):
+    """A set of tangent images and a panorama size that is not the level's own."""
+
+    base_level: int
+    level: int
+    dim: int | None
+    shape: tuple[int, int]
+    turned: bool = False
+
+
+CASES = [
+    Case(0, 4, None, (50, 100)),  # the paper's extent
+    Case(0, 5, 24, (63, 126)),  # cropped to the least; odd rows: one on the equator
+    Case(0, 3, 12, (33, 67), turned=True),  # with a margin; half a turn is no whole column
+    Case(1, 4, None, (50, 100), turned=True),
+    Case(1, 5, 13, (63, 126)),
+    Case(2, 5, None, (32, 64)),
+]
+
+
+class Pair(NamedTuple):
+    """Ours, the reference, and which face there each of ours is."""
+
+    ours: TangentGrid
+    theirs: ReferenceGrid
+    order: NDArray[np.int64]
+
+
+@pytest.fixture(params=CASES, ids=str)
+def case(request: pytest.FixtureRequest) -> Case:
+    assert isinstance(request.param, Case)
+    return request.param
+
+
+@lru_cache
+def pair_of(case: Case) -> Pair:
+    rotation = TURN if case.turned else np.eye(3)
+    ours = TangentGrid(case.base_level, case.level, case.dim, TURN if case.turned else None)
+    theirs = ReferenceGrid(case.base_level, case.level, ours.dim, rotation)
+    return Pair(ours, theirs, theirs.order(ours.centers_xyz))
+
+
+def noise(*shape: int, seed: int = 0) -> Array:
+    """White noise in 0 to 1: any pixel fetched from a wrong place shows."""
+    return np.random.default_rng(seed).random(shape)
+
+
+def waves(shape: tuple[int, int]) -> Array:
+    """A smooth panorama ``(H, W, 3)`` in 0 to 1, smooth across the seam and the poles too."""
+    x, y, z = np.moveaxis(to_xyz(panorama_lonlat(shape)), -1, 0)
+    channels = [np.sin(4 * x + y), np.cos(3 * y - 2 * z), np.sin(5 * z + 2 * x * y)]
+    return np.asarray((np.stack(channels, axis=-1) + 1) / 2)
+
+
+def certain_pixels(pair: Pair, case: Case, interpolation: Interpolation) -> NDArray[np.bool_]:
+    """Pixels ``(n, d, d)`` of our images that do not hang on the rounding of a position."""
+    if interpolation == "bilinear":
+        return np.ones((len(pair.order), pair.ours.dim, pair.ours.dim), bool)
+    lonlat = np.stack([pair.theirs.lonlat(face) for face in pair.order])
+    # Nearest takes a pixel of an image smaller than 2^7: float32 rounds positions to 2^-17.
+    certain = certain_nearest(lonlat, case.shape, margin=1e-4)
+    assert certain.mean() > 0.9
+    return certain
+
+
+@pytest.mark.parametrize("interpolation", ["bilinear", "nearest"])
+def test_forward_in_torch(case: Case, interpolation: Interpolation) -> None:
+    pair = pair_of(case)
+    image = noise(*case.shape, 3)
+    expected = pair.theirs.forward(image, interpolation)[pair.order]
+    certain = certain_pixels(pair, case, interpolation)
+    for dtype, tolerance in ((torch.float64, 1e-9), (torch.float32, 2e-4)):
+        tensor = torch.from_numpy(image).permute(2, 0, 1).to(dtype)
+        result = equirect_to_tangent(tensor, pair.ours, interpolation=interpolation)
+        assert result.dtype == dtype
+        assert result.shape == (len(pair.order), 3, pair.ours.dim, pair.ours.dim)
+        error = np.abs(result.permute(0, 2, 3, 1).double().numpy() - expected)
+        assert error[certain].max() < tolerance
+
+
+@pytest.mark.parametrize("interpolation", ["bilinear", "nearest"])
+def test_forward_of_float32_arrays(case: Case, interpolation: Interpolation) -> None:
+    pair = pair_of(case)
+    image = noise(*case.shape, 3).astype(np.float32)
+    expected = pair.theirs.forward(image.astype(np.float64), interpolation)[pair.order]
+    result = equirect_to_tangent(image, pair.ours, interpolation=interpolation)
+    assert result.dtype == np.float32
+    error = np.abs(result - expected)[certain_pixels(pair, case, interpolation)]
+    assert error.max() < 2e-4 + 2 * POSITION_ERROR
+
+
+def test_forward_of_uint8_arrays(case: Case) -> None:
+    pair = pair_of(case)
+    image = np.round(255 * waves(case.shape)).astype(np.uint8)
+    expected = pair.theirs.forward(image.astype(np.float64))[pair.order]
+    result = equirect_to_tangent(image, pair.ours)
+    assert result.dtype == np.uint8
+    steps = [np.abs(np.diff(image.astype(float), axis=axis)).max() for axis in (0, 1)]
+    error = result - expected
+    assert np.abs(error).max() < 0.501 + 2 * POSITION_ERROR * sum(steps)
+    assert abs(error.mean()) < 0.1  # no bias
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_forward_of_labels_is_the_nearest_label(case: Case, dtype: type[np.integer]) -> None:
+    pair = pair_of(case)
+    labels = (noise(*case.shape) * np.iinfo(dtype).max).astype(dtype)
+    lonlat = np.stack([pair.theirs.lonlat(face) for face in pair.order])
+    certain = certain_nearest(lonlat, case.shape, margin=1e-4)
+    expected = pair.theirs.forward(labels[..., None].astype(np.float64), "nearest")[pair.order]
+    result = equirect_to_tangent(labels, pair.ours, interpolation="nearest")
+    assert result.dtype == dtype
+    assert result.shape == expected.shape[:-1]
+    np.testing.assert_array_equal(result[certain], expected[..., 0][certain])
+
+
+@pytest.mark.parametrize("channels", [0, 1, 2, 4, 5, 7, 13])  # 0: an image (H, W)
+@pytest.mark.parametrize(
+    ("dtype", "largest", "tolerance"),
+    [("uint8", 255, 0.501), ("uint16", 65535, 1.0), ("float32", 1, 2e-4), ("float64", 1, 1e-9)],
+)
+def test_forward_of_any_number_of_channels(
+    channels: int, dtype: str, largest: int, tolerance: float
+) -> None:
+    pair = pair_of(CASES[0])
+    shape = (50, 100, channels) if channels else (50, 100)
+    # Noise has steps of `largest` both ways; float32 positions near 100 are good to 4e-6 px.
+    tolerance += (dtype != "float64") * 2 * POSITION_ERROR * largest
+    image = (largest * noise(*shape)).astype(dtype)
+    exact = image.reshape(50, 100, -1).astype(np.float64)
+    expected = pair.theirs.forward(exact)[pair.order].reshape(20, 16, 16, *shape[2:])
+    result = equirect_to_tangent(image, pair.ours)
+    assert result.shape == expected.shape
+    assert np.abs(result - expected).max() < tolerance
+
+
+@pytest.mark.parametrize("interpolation", ["bilinear", "nearest"])
+@pytest.mark.parametrize("shape", [(50, 100), (33, 67)])
+def test_turned_panorama(shape: tuple[int, int], interpolation: Interpolation) -> None:
+    image = noise(*shape, 3)
+    seen_from = to_lonlat(to_xyz(panorama_lonlat(shape)) @ TURN)  # R⁻¹ d
+    expected = sample_panorama(image, seen_from, interpolation)
+    certain = certain_nearest(seen_from, shape, margin=1e-4) | (interpolation == "bilinear")
+    error = np.abs(rotate_equirect(image, TURN, interpolation) - expected)
+    assert error[certain].max() < 1e-9
+
+
+@pytest.mark.parametrize("interpolation", ["bilinear", "nearest"])
+@pytest.mark.parametrize(
+    ("lon_deg", "lat_deg"), [(180, 0), (-175, -30), (20, 90), (60, 80), (0, -90)]
+)
+def test_perspective_views_of_the_seam_and_the_poles(
+    lon_deg: float, lat_deg: float, interpolation: Interpolation
+) -> None:
+    shape, size, focal = (63, 126), (11, 16), 9.0
+    lon, lat = np.radians([lon_deg, lat_deg])
+    ahead = to_xyz(np.array([lon, lat]))
+    east = np.array([-np.sin(lon), np.cos(lon), 0])
+    south = np.array([np.sin(lat) * np.cos(lon), np.sin(lat) * np.sin(lon), -np.cos(lat)])
+    rows, columns = np.mgrid[: size[0], : size[1]]
+    right, down = ((columns - 7.5) / focal)[..., None], ((rows - 5.0) / focal)[..., None]
+    rays = ahead + right * east + down * south
+    lonlat = to_lonlat(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
+    image = noise(*shape, 3)
+    expected = sample_panorama(image, lonlat, interpolation)
+    certain = certain_nearest(lonlat, shape, margin=1e-4) | (interpolation == "bilinear")
+    matrix = np.array([[focal, 0, 7.5], [0, focal, 5.0], [0, 0, 1]])
+    axes = np.stack([east, south, ahead], axis=-1)
+    result = equirect_to_perspective(image, matrix, size, axes, interpolation)
+    assert np.abs(result - expected)[certain].max() < 1e-9
+
+
+def test_some_faces_are_those_of_all_in_the_order_asked_for(case: Case) -> None:
+    grid = pair_of(case).ours
+    image = noise(*case.shape, 2).astype(np.float32)
+    chosen = [7, 19, 0]
+    every = equirect_to_tangent(image, grid)
+    np.testing.assert_array_equal(equirect_to_tangent(image, grid, chosen), every[chosen])
+    tensor = torch.from_numpy(image).permute(2, 0, 1)
+    torch.testing.assert_close(
+        equirect_to_tangent(tensor, grid, chosen), equirect_to_tangent(tensor, grid)[chosen]
+    )
+
+
+def rendered_back(pair: Pair, images: Array, shape: tuple[int, int], blend: Blend) -> Array:
+    """The reference's panorama of our images ``(n, d, d, C)``."""
+    in_their_order = np.empty_like(images)
+    in_their_order[pair.order] = images
+    if blend == "feather":
+        return pair.theirs.feathered(in_their_order, shape)
+    return pair.theirs.backward(in_their_order, shape)
+
+
+def clear_pixels(pair: Pair, shape: tuple[int, int], blend: Blend) -> NDArray[np.bool_]:
+    """Panorama pixels whose owner does not hang on rounding; a feathered one has no owner."""
+    clear = pair.theirs.clear(shape) if blend == "nearest" else np.ones(shape, bool)
+    assert clear.mean() > 0.95
+    return clear
+
+
+@pytest.mark.parametrize("blend", ["nearest", "feather"])
+def test_backward_in_torch(case: Case, blend: Blend) -> None:
+    pair = pair_of(case)
+    images = noise(len(pair.order), pair.ours.dim, pair.ours.dim, 3)
+    clear = clear_pixels(pair, case.shape, blend)
+    expected = rendered_back(pair, images, case.shape, blend)[clear]
+    for dtype, tolerance in ((torch.float64, 1e-9), (torch.float32, 2e-5)):
+        tensor = torch.from_numpy(images).permute(0, 3, 1, 2).to(dtype)
+        result = tangent_to_equirect(tensor, pair.ours, case.shape, blend)
+        assert (result.dtype, result.shape) == (dtype, (3, *case.shape))
+        error = result.permute(1, 2, 0).double().numpy()[clear] - expected
+        assert np.abs(error).max() < tolerance
+
+
+@pytest.mark.parametrize("blend", ["nearest", "feather"])
+def test_labels_are_the_best_interpolated_logits(case: Case, blend: Blend) -> None:
+    pair = pair_of(case)
+    logits = noise(len(pair.order), pair.ours.dim, pair.ours.dim, CLASSES)
+    rendered = rendered_back(pair, logits, case.shape, blend)
+    clear = clear_pixels(pair, case.shape, blend)
+    for dtype, margin in ((torch.float64, 1e-9), (torch.float32, 4e-5)):
+        tensor = torch.from_numpy(logits).permute(0, 3, 1, 2).to(dtype)
+        labels = tangent_to_labels(tensor, pair.ours, case.shape, blend).numpy()
+        certain = clear & certain_labels(rendered, margin)
+        assert certain.mean() > 0.95
+        np.testing.assert_array_equal(labels[certain], rendered.argmax(axis=-1)[certain])
+
+
+@pytest.mark.parametrize("blend", ["nearest", "feather"])
+def test_smooth_panorama_survives_the_round_trip(case: Case, blend: Blend) -> None:
+    image = waves(case.shape)
+    pair = pair_of(case)
+    tensor = torch.from_numpy(image).permute(2, 0, 1)
+    images = equirect_to_tangent(tensor, pair.ours)
+    back = tangent_to_equirect(images, pair.ours, case.shape, blend)
+    # Linear interpolation errs by f″h²/8: f″ up to 15 both ways, h of either image.
+    pitch = np.hypot(2 * np.pi / case.shape[1], pair.ours.pitch)
+    assert (back - tensor).abs().max() < 30 * pitch**2 / 8
+
+
+@pytest.mark.parametrize("height", [32, 33])
+@pytest.mark.parametrize("interpolation", ["bilinear", "nearest"])
+def test_the_very_pole_is_seen_in_the_row_next_to_it(
+    height: int, interpolation: Interpolation
+) -> None:
+    rows = np.repeat(np.arange(height, dtype=np.float32)[:, None], 2 * height, axis=1)
+    for up, row in ((1.0, 0), (-1.0, height - 1)):
+        axes = np.array([[0, -up, 0], [1, 0, 0], [0, 0, up]])
+        view = equirect_to_perspective(rows, np.eye(3), (1, 1), axes, interpolation)
+        assert view.item() == row

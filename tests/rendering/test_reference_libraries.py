@@ -1,0 +1,119 @@
+"""Perspective views against py360convert and pyequilib, test-only dependencies.
+
+Their conventions, translated to ours (centres of pixels are integers, row 0 on top, yaw to the
+right, pitch up):
+
+* **py360convert 1.0**: panorama pixels as ours. A perspective image of n pixels spans its field of
+  view from the *centre* of the first pixel to the centre of the last: ``f = (n−1) / (2 tan(Ω/2))``
+  for width and height each, principal point (n−1)/2. ``u_deg`` is yaw, to the right; ``v_deg`` is
+  pitch, up. It samples with OpenCV at positions rounded to 1/32 px.
+* **pyequilib 0.6**: the principal point is n/2 for integer pixel centres, half a pixel off the
+  middle, with ``f = W / (2 tan(Ω/2))``; and the panorama pixel ``(u, v)`` stands where our
+  ``(u−1, v−1)`` does: it gets a panorama rolled by one row and one column. With ``z_down=True`` yaw
+  turns right and pitch up. It wraps rows at the poles, so the views stay away from them.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import py360convert
+import pytest
+from equilib import Equi2Pers
+from numpy.typing import NDArray
+
+from tangent_train.geometry import TangentGrid, rotation_about, xyz_to_lonlat
+from tangent_train.rendering import equirect_to_perspective, equirect_to_tangent
+from tests.rendering.reference import panorama_lonlat, to_xyz
+
+SHAPE = (128, 256)
+SIZE = (40, 60)
+POSES_DEG = [(0, 0), (30, 20), (-100, -35), (75, 50)]  # yaw, pitch; no view crosses the seam
+Image = NDArray[np.float32]
+
+
+@pytest.fixture(scope="module")
+def panorama() -> Image:
+    """Smooth waves ``(H, W, 3)``, different in every direction."""
+    x, y, z = np.moveaxis(to_xyz(panorama_lonlat(SHAPE)), -1, 0)
+    channels = [np.sin(3 * x + y), np.cos(4 * y - z), x * y + np.sin(5 * z)]
+    return np.stack(channels, axis=-1).astype(np.float32)
+
+
+def one_64th_pixel(panorama: Image) -> float:
+    """How much a value can change over 1/64 pixel each way: OpenCV's rounding of positions."""
+    steps = [np.abs(np.diff(panorama, axis=axis)).max() for axis in (0, 1)]
+    return float(sum(steps)) / 64
+
+
+def level_camera(yaw_deg: float, pitch_deg: float) -> NDArray[np.float64]:
+    """World from camera: x right, y down, z forward, first pitched up, then turned right."""
+    ahead = np.array([[0.0, 0, 1], [1, 0, 0], [0, -1, 0]])  # columns: right +y, down −z, forward +x
+    pitched = rotation_about((0, 1, 0), -math.radians(pitch_deg)) @ ahead
+    return np.asarray(rotation_about((0, 0, 1), math.radians(yaw_deg)) @ pitched)
+
+
+def focal_length(pixels: float, fov_deg: float) -> float:
+    return pixels / (2 * math.tan(math.radians(fov_deg) / 2))
+
+
+def equilib_view(
+    panorama: Image, size: tuple[int, int], fov_deg: float, pose_deg: tuple[float, float]
+) -> NDArray[Any]:
+    yaw, pitch = np.radians(pose_deg)
+    rolled = np.roll(panorama, (1, 1), axis=(0, 1)).transpose(2, 0, 1)
+    render = Equi2Pers(height=size[0], width=size[1], fov_x=fov_deg, z_down=True)
+    view = render(rolled.astype(np.float64), {"yaw": yaw, "pitch": pitch, "roll": 0.0})
+    return np.asarray(view).transpose(1, 2, 0)
+
+
+@pytest.mark.parametrize("pose_deg", POSES_DEG)
+def test_perspective_view_is_py360converts(panorama: Image, pose_deg: tuple[int, int]) -> None:
+    fov_x, fov_y = 70.0, 50.0
+    height, width = SIZE
+    matrix = np.array([
+        [focal_length(width - 1, fov_x), 0, (width - 1) / 2],
+        [0, focal_length(height - 1, fov_y), (height - 1) / 2],
+        [0, 0, 1],
+    ])  # fmt: skip
+    theirs = py360convert.e2p(panorama, (fov_x, fov_y), *pose_deg, SIZE)
+    ours = equirect_to_perspective(panorama, matrix, SIZE, level_camera(*pose_deg), "bilinear")
+    assert ours.shape == theirs.shape
+    assert np.abs(ours - theirs).max() < one_64th_pixel(panorama) + 1e-5
+
+
+@pytest.mark.parametrize("pose_deg", POSES_DEG)
+def test_perspective_view_is_equilibs(panorama: Image, pose_deg: tuple[int, int]) -> None:
+    height, width = SIZE
+    focal = focal_length(width, 70.0)
+    matrix = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    theirs = equilib_view(panorama, SIZE, 70.0, pose_deg)
+    ours = equirect_to_perspective(panorama, matrix, SIZE, level_camera(*pose_deg), "bilinear")
+    assert np.abs(ours - theirs).max() < 2e-5
+
+
+@pytest.mark.parametrize("base_level", [0, 1])
+def test_tangent_images_are_perspective_views_of_both(panorama: Image, base_level: int) -> None:
+    grid = TangentGrid(base_level, 6)
+    size = (grid.dim, grid.dim)
+    images = equirect_to_tangent(panorama, grid)
+    width_deg = math.degrees(2 * math.atan(grid.half_extent))
+    compared = 0
+    for face, pose_deg in enumerate(np.degrees(xyz_to_lonlat(grid.centers_xyz))):
+        own = equirect_to_perspective(
+            panorama, grid.camera_matrix, size, grid.world_from_camera[face], "bilinear"
+        )
+        np.testing.assert_allclose(images[face], own, atol=2e-5)
+        if abs(pose_deg[0]) > 100 or abs(pose_deg[1]) > 30:
+            continue  # their seam and poles
+        theirs = py360convert.e2p(panorama, width_deg, *pose_deg, size)
+        assert np.abs(images[face] - theirs).max() < one_64th_pixel(panorama) + 1e-5
+        # One pixel smaller, equilib's principal point n/2 is the middle (d−1)/2 of our image.
+        smaller = grid.dim - 1
+        fov_deg = math.degrees(2 * math.atan(smaller / 2 * grid.pitch))
+        theirs = equilib_view(panorama, (smaller, smaller), fov_deg, tuple(pose_deg))
+        assert np.abs(images[face, :-1, :-1] - theirs).max() < 2e-5
+        compared += 1
+    assert compared >= 4

@@ -1,0 +1,160 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from tangent_train.errors import SettingError
+from tangent_train.geometry import equirect_directions
+from tangent_train.rendering import (
+    EquirectRepresentation,
+    Representation,
+    TangentRepresentation,
+)
+
+SHAPE = (64, 128)
+
+
+def _labels() -> NDArray[np.uint8]:
+    """Eight octants of the sphere, 1 to 8."""
+    positive = equirect_directions(SHAPE) @ [[1, 2, 0], [2, -1, 0], [0, 0.5, 1]] > 0
+    return (positive @ [1, 2, 4] + 1).astype(np.uint8)
+
+
+def _scores(labels: NDArray[np.uint8]) -> torch.Tensor:
+    return torch.nn.functional.one_hot(torch.from_numpy(labels).long(), 9).movedim(-1, 1).float()
+
+
+def _rng(seed: int = 0) -> np.random.Generator:
+    return np.random.default_rng(seed)
+
+
+REPRESENTATIONS: list[Representation] = [
+    TangentRepresentation(0, 5),
+    TangentRepresentation(1, 5, blend="feather"),
+    TangentRepresentation(0, 5, crop_multiple=8, rotation="so3", mirror=True),
+    EquirectRepresentation(5),
+    EquirectRepresentation(5, crop_deg=90, rotation="yaw", mirror=True),
+]
+
+
+@pytest.mark.parametrize("representation", REPRESENTATIONS)
+def test_labels_come_back_from_the_views_of_the_whole_sphere(
+    representation: Representation,
+) -> None:
+    labels = _labels()
+    views = representation.whole().render(labels, "nearest")
+    back = representation.to_labels(_scores(views), SHAPE).numpy()
+    assert back.shape == SHAPE
+    assert np.mean(back == labels) > 0.96, "all but the borders between classes"
+
+
+@pytest.mark.parametrize("representation", REPRESENTATIONS)
+def test_whole_views_are_not_augmented(representation: Representation) -> None:
+    image = _rng().integers(0, 256, (*SHAPE, 3), np.uint8)
+    first, second = (representation.whole().render(image, "bilinear") for _ in range(2))
+    np.testing.assert_array_equal(first, second)
+
+
+def test_the_equirectangular_view_is_the_panorama() -> None:
+    image = _rng().integers(0, 256, (*SHAPE, 3), np.uint8)
+    np.testing.assert_array_equal(
+        EquirectRepresentation(5).whole().render(image, "bilinear"), image[None]
+    )
+
+
+@pytest.mark.parametrize(
+    "representation",
+    [
+        TangentRepresentation(0, 5, faces_per_panorama=5, rotation="so3", mirror=True),
+        EquirectRepresentation(5, crop_deg=60, rotation="yaw", mirror=True),
+        EquirectRepresentation(5, rotation="so3"),
+    ],
+)
+def test_a_sample_depends_on_its_generator_alone_and_keeps_image_and_labels_together(
+    representation: Representation,
+) -> None:
+    labels = _labels()
+    image = labels.astype(np.float32)
+    seen = []
+    for seed in (0, 0, 1):
+        views = representation.sample(_rng(seed))
+        image_views, label_views = (views.render(x, "nearest") for x in (image, labels))
+        np.testing.assert_array_equal(image_views, label_views)
+        assert label_views.flags.c_contiguous
+        assert label_views.dtype == np.uint8
+        seen.append(label_views)
+    np.testing.assert_array_equal(seen[0], seen[1])
+    assert not np.array_equal(seen[0], seen[2])
+
+
+def test_faces_are_drawn_without_repetition_and_all_of_them_sooner_or_later() -> None:
+    representation = TangentRepresentation(0, 5, faces_per_panorama=5)
+    x = np.arange(64 * 128, dtype=np.float32).reshape(SHAPE)
+    whole = representation.whole().render(x, "nearest")
+    drawn = set()
+    for seed in range(30):
+        views = representation.sample(_rng(seed)).render(x, "nearest")
+        faces = [int(np.flatnonzero((whole == v).all(axis=(1, 2)))[0]) for v in views]
+        assert len(set(faces)) == 5
+        drawn.update(faces)
+    assert drawn == set(range(20))
+
+
+def test_mirroring_flips_half_of_the_samples() -> None:
+    x = np.tile(np.arange(128, dtype=np.float32), (64, 1))
+    representation = EquirectRepresentation(5, mirror=True)
+    views = [representation.sample(_rng(seed)).render(x, "nearest")[0] for seed in range(60)]
+    flipped = [np.array_equal(v, x[:, ::-1]) for v in views]
+    assert all(f or np.array_equal(v, x) for f, v in zip(flipped, views, strict=True))
+    assert 15 < sum(flipped) < 45
+
+
+def test_crops_are_whole_columns_at_random_longitudes_and_cross_the_seam() -> None:
+    x = np.tile(np.arange(128), (64, 1)).astype(np.uint8)
+    representation = EquirectRepresentation(5, crop_deg=90)
+    starts, crossing = set(), 0
+    for seed in range(50):
+        (view,) = representation.sample(_rng(seed)).render(x, "nearest")
+        assert view.shape == (64, 32)
+        first = int(view[0, 0])
+        np.testing.assert_array_equal(view[0], (first + np.arange(32)) % 128)
+        starts.add(first)
+        crossing += first > 96
+    assert len(starts) > 20
+    assert crossing > 3
+
+
+def test_cropping_takes_the_least_covering_side_that_is_a_multiple() -> None:
+    assert TangentRepresentation(0, 6, crop_multiple=16).grid.dim == 48
+    assert TangentRepresentation(0, 7, crop_multiple=32).grid.dim == 96
+    assert TangentRepresentation(0, 6, crop_multiple=1).grid.dim == 46
+
+
+def test_the_panorama_may_be_larger_than_the_level() -> None:
+    assert TangentRepresentation(0, 5, erp_height=512).erp_height == 512
+    assert TangentRepresentation(0, 5).erp_height == EquirectRepresentation(5).erp_height == 64
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"dim": 64, "crop_multiple": 16}, "representation.dim"),
+        ({"dim": 8}, "dim: found 8; expected at least 24"),
+        ({"faces_per_panorama": 21}, "1 to 20"),
+        ({"faces_per_panorama": 0}, "1 to 20"),
+        ({"rotation": "tilt"}, "one of none, yaw, so3"),
+        ({"blend": "average"}, "one of nearest, feather"),
+    ],
+)
+def test_impossible_tangent_settings_are_refused(settings: dict[str, object], message: str) -> None:
+    with pytest.raises(SettingError, match=message):
+        TangentRepresentation(0, 5, **settings)  # type: ignore[arg-type]
+
+
+def test_impossible_equirectangular_settings_are_refused() -> None:
+    with pytest.raises(SettingError, match="crop_deg"):
+        EquirectRepresentation(5, crop_deg=400)
+    with pytest.raises(SettingError, match="expected one image of 64×128"):
+        EquirectRepresentation(5).to_labels(torch.zeros(1, 3, 32, 64), SHAPE)

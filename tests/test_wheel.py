@@ -1,0 +1,87 @@
+"""The wheel, installed in a clean environment and used from another folder."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import sysconfig
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("wheel")
+    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(folder)]
+    subprocess.run([*command, str(ROOT)], check=True, capture_output=True)
+    (built,) = folder.glob("*.whl")
+    return built
+
+
+@pytest.fixture(scope="module")
+def scripts(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Console scripts of an environment that holds the wheel and, beside it, its dependencies."""
+    environment = tmp_path_factory.mktemp("environment")
+    venv.create(environment, with_pip=False)
+    (site,) = environment.glob("lib/python*/site-packages")
+    command = [sys.executable, "-m", "pip", "--python", str(environment / "bin" / "python")]
+    subprocess.run(
+        [*command, "install", "--quiet", "--no-deps", "--no-index", str(wheel)], check=True
+    )
+    # Files named *.pth in a folder added this way are not read: this checkout stays out of reach.
+    (site / "dependencies.pth").write_text(sysconfig.get_path("purelib"))
+    return environment / "bin"
+
+
+def test_the_wheel_holds_the_packages_and_the_configs(wheel: Path) -> None:
+    names = zipfile.ZipFile(wheel).namelist()
+    wanted = (
+        "tangent_train/configs/train.yaml",
+        "tangent_train/configs/experiment/rooms/demo.yaml",
+        "tangent_train/py.typed",
+        "datamodules/stanford2d3ds.py",
+        "datamodules/synthrooms/generate.py",
+        "models/unet.py",
+    )
+    assert set(wanted) <= set(names)
+    assert not [name for name in names if name.startswith(("tests", "benchmarks", "data/"))]
+
+
+@pytest.mark.parametrize("command", ["tangent-train", "tangent-evaluate", "tangent-prepare"])
+def test_the_commands_answer_from_another_folder(
+    scripts: Path, command: str, tmp_path: Path
+) -> None:
+    clean = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+    done = subprocess.run(
+        [scripts / command, "--help"],
+        check=False,
+        cwd=tmp_path,
+        env=clean,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    assert command in done.stdout
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_installed_modules_are_those_of_the_wheel(scripts: Path, tmp_path: Path) -> None:
+    code = (
+        "import datamodules, models, tangent_train;"
+        "print(*(m.__file__ for m in (datamodules, models, tangent_train)))"
+    )
+    python = scripts / "python"
+    done = subprocess.run(
+        [python, "-c", code], check=False, cwd=tmp_path, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    for file in done.stdout.split():
+        assert Path(file).is_relative_to(scripts.parent.resolve()), file
