@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Any
 
 import lightning
+import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from lightning.pytorch.callbacks import LearningRateMonitor
@@ -45,7 +47,10 @@ def train(config: DictConfig) -> None:
         callbacks.append(best)
     trainer = _trainer(config, folder, callbacks)
     resumed = None if config.resume is None else checkpoints / "last.ckpt"
-    trainer.fit(task, datamodule=data, ckpt_path=resumed, weights_only=True)
+    with warnings.catch_warnings():
+        # The checkpoints of a resumed run are meant to be there.
+        warnings.filterwarnings("ignore", "Checkpoint directory .* exists and is not empty")
+        trainer.fit(task, datamodule=data, ckpt_path=resumed, weights_only=True)
     chosen = best.best_model_path if best is not None else ""
     _test(trainer, task, data, Path(chosen or checkpoints / "last.ckpt"), folder)
 
@@ -129,7 +134,9 @@ def _trainer(config: DictConfig, folder: Path, callbacks: list[Any]) -> lightnin
 
 
 def _test(trainer: lightning.Trainer, task: Any, data: Any, checkpoint: Path, folder: Path) -> None:
-    trainer.test(task, datamodule=data, ckpt_path=checkpoint, weights_only=True, verbose=False)
+    content = torch.load(checkpoint, map_location="cpu", weights_only=True)
+    task.load_state_dict(content["state_dict"])
+    trainer.test(task, datamodule=data, verbose=False)
     results = evaluation_results(task.matrices, task.class_names, task.absent_class)
     total = len(data.source("test"))
     if results["panoramas"] != total:

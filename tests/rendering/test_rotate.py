@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry import (
@@ -31,7 +32,7 @@ def test_a_tangent_image_is_a_perspective_view() -> None:
 def test_perspective_views_may_be_oblong() -> None:
     image = np.arange(32, dtype=np.uint8)[:, None].repeat(64, axis=1)  # the row number
     world_from_camera = np.array([[0, 0, 1.0], [1, 0, 0], [0, -1, 0]])
-    matrix = np.array([[10.0, 0, 2], [0, 10, 1], [0, 0, 1]])
+    matrix = np.array([[20.0, 0, 2], [0, 20, 1], [0, 0, 1]])
     view = equirect_to_perspective(image, matrix, (3, 5), world_from_camera, "nearest")
     assert view.shape == (3, 5)
     np.testing.assert_array_equal(view[[0, 2], 2], [15, 16])
@@ -62,6 +63,6 @@ def test_turning_the_panorama_and_the_grid_cancel() -> None:
 
 
 @pytest.mark.parametrize("rotation", [np.eye(2), 2 * np.eye(3), np.diag([1.0, -1, 1])])
-def test_errors(rotation: np.ndarray) -> None:
+def test_errors(rotation: NDArray[np.float64]) -> None:
     with pytest.raises(SettingError, match="rotation"):
         rotate_equirect(np.zeros((4, 8)), rotation)

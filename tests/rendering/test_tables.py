@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import os
-import threading
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
+from torch.utils.data import DataLoader, Dataset
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry import TangentGrid, equirect_directions, random_rotation
@@ -27,7 +27,7 @@ TURN = random_rotation(np.random.default_rng(2))
 
 
 @pytest.fixture
-def cache(monkeypatch: pytest.MonkeyPatch) -> Iterator[tables.TableCache]:
+def cache(monkeypatch: pytest.MonkeyPatch) -> tables.TableCache:
     fresh = tables.TableCache(limit=2**24)
     monkeypatch.setattr(tables, "TABLES", fresh)
     return fresh
@@ -37,7 +37,7 @@ def cache(monkeypatch: pytest.MonkeyPatch) -> Iterator[tables.TableCache]:
 @pytest.mark.parametrize("rotation", [None, TURN])
 @pytest.mark.parametrize("shape", [(64, 128), (63, 125)])
 def test_owners_are_the_nearest_centres(
-    base_level: int, rotation: np.ndarray | None, shape: tuple[int, int]
+    base_level: int, rotation: NDArray[np.float64] | None, shape: tuple[int, int]
 ) -> None:
     grid = TangentGrid(base_level, base_level + 5, rotation=rotation)
     table = tables.owner_table(grid, shape, FLOAT64)
@@ -68,16 +68,16 @@ def test_feathering_knows_every_image_that_sees_a_pixel(grid: TangentGrid) -> No
     np.testing.assert_allclose(found, raw / raw.sum(axis=0), atol=1e-12)
 
 
-def test_feather_bands_are_parts_of_the_whole() -> None:
+@pytest.mark.parametrize("blend", ["feather", "nearest"])
+def test_bands_are_parts_of_the_whole(monkeypatch: pytest.MonkeyPatch, blend: Any) -> None:
     grid, shape = TangentGrid(0, 5), (32, 64)
-    image = torch.rand(20, 1, 32, 32, dtype=torch.float64)
-    whole = tangent_to_equirect(image, grid, shape, "feather")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("tangent_train.rendering.backward._BAND", 64 * 5)
-        for blend in ("feather", "nearest"):
-            whole = tangent_to_equirect(image, grid, shape, blend)
-            bands = tangent_to_equirect(image, grid, shape, blend)
-            torch.testing.assert_close(bands, whole, atol=1e-14, rtol=0)
+    images = torch.rand(20, 2, 32, 32, dtype=torch.float64)
+    whole = tangent_to_equirect(images, grid, shape, blend)
+    labels = tangent_to_labels(images, grid, shape, blend)
+    monkeypatch.setattr("tangent_train.rendering.backward._BAND", 64 * 5)
+    bands = tangent_to_equirect(images, grid, shape, blend)
+    torch.testing.assert_close(bands, whole, atol=1e-14, rtol=0)
+    torch.testing.assert_close(tangent_to_labels(images, grid, shape, blend), labels)
 
 
 def test_tables_are_reused(cache: tables.TableCache) -> None:
@@ -143,28 +143,32 @@ def test_threads_may_render_at_the_same_time() -> None:
     assert all(np.array_equal(run.result(), expected) for run in runs)
 
 
-def test_forked_processes_render_after_their_parent() -> None:
-    grid, shape = TangentGrid(0, 6), (256, 512)
-    rng = np.random.default_rng(0)
-    scores = rng.random((20, 5, 64, 64), np.float32)
-    image = rng.integers(0, 255, (*shape, 3), np.uint8)
-    labels, images = tangent_to_labels(scores, grid, shape), equirect_to_tangent(image, grid)
-    with tables.TABLES._lock:  # held as another thread of the parent might
-        with pytest.warns(DeprecationWarning) if _warns_about_forks() else _nothing():
-            child = os.fork()
-        if child == 0:
-            try:
-                again = tangent_to_labels(scores, TangentGrid(0, 6), shape)
-                good = np.array_equal(again, labels)
-                good &= np.array_equal(equirect_to_tangent(image, grid), images)
-            except BaseException:
-                good = False
-            os._exit(0 if good else 1)
-    killer = threading.Timer(60, os.kill, (child, 9))
-    killer.start()
-    _, status = os.waitpid(child, 0)
-    killer.cancel()
-    assert status == 0
+class _Rendered(Dataset[tuple[Any, Any]]):
+    def __init__(self) -> None:
+        rng = np.random.default_rng(0)
+        self.grid, self.shape = TangentGrid(0, 6), (256, 512)
+        self.scores = rng.random((20, 5, 64, 64), np.float32)
+        self.image = rng.integers(0, 255, (*self.shape, 3), np.uint8)
+
+    def __len__(self) -> int:
+        return 1
+
+    def __getitem__(self, index: int) -> tuple[Any, Any]:
+        labels = tangent_to_labels(self.scores, self.grid, self.shape)
+        return labels, equirect_to_tangent(self.image, self.grid)
+
+
+@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")  # Python 3.12 warns of forks
+def test_forked_workers_render_after_their_parent() -> None:
+    rendered = _Rendered()
+    expected = rendered[0]
+    loader = DataLoader(
+        rendered, batch_size=None, num_workers=1, multiprocessing_context="fork", timeout=60
+    )
+    with tables.TABLES._lock:  # as held by another thread of the parent when it forks
+        found = next(iter(loader))
+    for mine, theirs in zip(expected, found, strict=True):
+        np.testing.assert_array_equal(mine, theirs)
 
 
 def test_rows_are_covered_once_and_errors_surface() -> None:

@@ -1,0 +1,185 @@
+"""Clutter: things on tables, on the floor, on walls, and lamps; a few nobody labelled."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from datamodules.synthrooms.layout import Frame
+from datamodules.synthrooms.palette import Pattern
+from datamodules.synthrooms.room import UNKNOWN, Item, Light, Room
+
+__all__ = ["add_desk_things", "add_floor_clutter", "add_lamp", "add_wall_clutter"]
+
+_UNLABELLED = 0.12
+
+
+def _new(room: Room, frame: Frame) -> Item:
+    return room.item(UNKNOWN if room.chance(_UNLABELLED) else "clutter", frame)
+
+
+def add_desk_things(room: Room, frame: Frame, size: tuple[float, float, float]) -> None:
+    """Put up to four things on a table top of ``(width, depth, height)`` metres."""
+    wide, deep, high = size
+    number = room.count(0, 4)
+    for k in range(number):
+        x = wide * 0.8 * ((k + 0.5) / number - 0.5)
+        y = deep * room.rng.uniform(-0.2, 0.2)
+        turn = room.rng.normal(0, 0.4)
+        _build_desk_thing(room, _new(room, frame.at(x, y, high, yaw=turn)))
+
+
+def _build_desk_thing(room: Room, thing: Item) -> None:
+    """A monitor, a pile of books, a vase, a box, or a desk lamp."""
+    rng = room.rng
+    material = room.palette.material()
+    kind = room.pick((0.4, 0.2, 0.15, 0.15, 0.1))
+    if kind == 0:
+        wide, high = rng.uniform(0.45, 0.65), rng.uniform(0.32, 0.42)
+        plastic = room.palette.material(Pattern.PLAIN)
+        thing.box(plastic, (0, 0, 0.12 + high / 2), (wide, 0.05, high))
+        thing.box(
+            material.shaded(0.8), (0, -0.027, 0.12 + high / 2), (wide - 0.05, 0.006, high - 0.05)
+        )
+        thing.box(plastic, (0, 0.02, 0.08), (0.06, 0.05, 0.16))
+        thing.box(plastic, (0, 0, 0.01), (0.24, 0.18, 0.02))
+    elif kind == 1:
+        for k in range(room.count(3, 6)):
+            cover = room.palette.material(Pattern.PLAIN)
+            thing.box(
+                cover, (0, 0, 0.025 + 0.05 * k), (0.32, 0.24, 0.05), yaw=rng.uniform(-0.4, 0.4)
+            )
+    elif kind == 2:
+        thing.cylinder(material, (0, 0, 0.12), (0.14, 0.14, 0.24))
+        thing.ball(room.palette.material(Pattern.SPECKLE), (0, 0, 0.36), (0.34, 0.34, 0.3))
+    elif kind == 3:
+        high = rng.uniform(0.18, 0.36)
+        thing.box(
+            material, (0, 0, high / 2), (rng.uniform(0.2, 0.42), rng.uniform(0.2, 0.34), high)
+        )
+    else:
+        thing.cylinder(material, (0, 0, 0.015), (0.18, 0.18, 0.03))
+        thing.cylinder(material, (0, 0, 0.2), (0.03, 0.03, 0.4))
+        thing.cylinder(room.palette.material(Pattern.PLAIN), (0, 0, 0.44), (0.26, 0.26, 0.18))
+
+
+def add_floor_clutter(room: Room) -> None:
+    """Add a thing on the floor: boxes, a plant, a bin, a cabinet, a standing lamp, or a ball."""
+    rng = room.rng
+    size = rng.uniform(0.4, 0.65)
+    if room.chance(0.6):
+        frame = room.plan.against_wall(rng, size + 0.1, size, "low")
+        frame = frame and frame.at(0, size / 2 + 0.02)
+    else:
+        frame = room.plan.in_the_open(rng, size, size)
+    if frame is None:
+        return
+    build = _FLOOR_THINGS[room.pick(_FLOOR_SHARES)]
+    build(room, _new(room, frame), size)
+
+
+def _build_boxes(room: Room, thing: Item, size: float) -> None:
+    for k in range(room.count(1, 3)):
+        side = size * (0.95 - 0.15 * k)
+        center = (0, 0, size * (0.35 + 0.7 * k))
+        yaw = room.rng.normal(0, 0.08)
+        thing.box(room.palette.material(), center, (side, side, size * 0.7), yaw)
+
+
+def _build_plant(room: Room, thing: Item, size: float) -> None:
+    thing.cylinder(room.palette.material(), (0, 0, 0.18), (size * 0.7, size * 0.7, 0.36))
+    leaves = room.palette.material(Pattern.SPECKLE, frequency=(3, 8))
+    for z, wide in ((0.6, 0.85), (0.95, 1.0), (1.25, 0.75)):
+        x, y = room.rng.uniform(-0.05, 0.05, 2)
+        thing.ball(leaves, (x, y, z), (size * wide, size * wide, 0.5))
+
+
+def _build_bin(room: Room, thing: Item, size: float) -> None:
+    thing.cylinder(room.palette.material(), (0, 0, size * 0.5), (size * 0.7, size * 0.7, size))
+
+
+def _build_cabinet(room: Room, thing: Item, size: float) -> None:
+    material = room.palette.material()
+    high = room.rng.uniform(0.6, 1.25)
+    thing.box(material, (0, 0, high / 2), (size, size, high))
+    for z in (0.25, 0.5, 0.75):
+        thing.box(material.shaded(0.6), (0, 0, high * z), (size + 0.01, size + 0.01, 0.02))
+
+
+def _build_standing_lamp(room: Room, thing: Item, size: float) -> None:
+    material = room.palette.material()
+    thing.cylinder(material, (0, 0, 0.03), (0.36, 0.36, 0.06))
+    thing.cylinder(material, (0, 0, 0.75), (0.05, 0.05, 1.5))
+    thing.cylinder(
+        room.palette.material(Pattern.PLAIN), (0, 0, 1.6), (size * 0.8, size * 0.8, 0.32)
+    )
+
+
+def _build_ball(room: Room, thing: Item, size: float) -> None:
+    thing.ball(room.palette.material(), (0, 0, size / 2), (size, size, size))
+
+
+_FLOOR_THINGS = (
+    _build_boxes,
+    _build_plant,
+    _build_bin,
+    _build_cabinet,
+    _build_standing_lamp,
+    _build_ball,
+)
+_FLOOR_SHARES = (0.25, 0.2, 0.1, 0.25, 0.1, 0.1)
+
+
+def add_wall_clutter(room: Room) -> None:
+    """Hang something on a wall: a picture, a screen, a wall cupboard, or a clock."""
+    rng = room.rng
+    wide, high = rng.uniform(0.5, 1.3), rng.uniform(0.45, 0.9)
+    kind = room.pick((0.4, 0.25, 0.2, 0.15))
+    frame = room.plan.against_wall(rng, wide, 0, "high")
+    if frame is None:
+        return
+    z = min(rng.uniform(1.45, 1.75), room.plan.height - high / 2 - 0.1)
+    thing = _new(room, frame)
+    face, trim = room.palette.material(), room.palette.material(Pattern.PLAIN)
+    if kind == 0:
+        thing.box(trim, (0, 0.015, z), (wide, 0.03, high))
+        thing.box(face, (0, 0.033, z), (wide - 0.09, 0.006, high - 0.09))
+    elif kind == 1:
+        thing.box(trim, (0, 0.04, z), (wide, 0.08, wide * 0.58))
+        thing.box(face.shaded(0.4), (0, 0.082, z), (wide - 0.06, 0.004, wide * 0.58 - 0.06))
+    elif kind == 2:
+        thing.box(face, (0, 0.16, z), (wide, 0.32, high))
+        thing.box(trim, (0, 0.322, z), (0.02, 0.006, high))
+    else:
+        thing.ball(trim, (0, 0.02, z), (0.5, 0.06, 0.5))
+        thing.ball(face, (0, 0.03, z), (0.42, 0.06, 0.42))
+
+
+def add_lamp(room: Room) -> None:
+    """Add a ceiling lamp: a panel, a long tube, a disc, or a hanging ball; it lights the room."""
+    rng, plan = room.rng, room.plan
+    area = plan.floors[rng.integers(len(plan.floors))]
+    x = area.x0 + (area.x1 - area.x0) * rng.uniform(0.3, 0.7)
+    y = area.y0 + (area.y1 - area.y0) * rng.uniform(0.3, 0.7)
+    if any(math.hypot(x - lamp.center[0], y - lamp.center[1]) < 1.3 for lamp in room.lights):
+        return
+    design = room.pick((0.35, 0.3, 0.2, 0.15))
+    size = ((0.6, 0.6), (1.4, 0.25), (0.5, 0.5), (0.4, 0.4))[design]
+    drop = rng.uniform(0.3, 0.6) if design == 3 else 0.07
+    z = plan.height - drop
+    tint = room.palette.hsv((0.08, 0.16), (0, 0.15), (0.95, 1.0))
+    glow = room.palette.material(Pattern.PLAIN, color=tint, emission=rng.uniform(1.0, 1.6))
+    lamp = room.item("clutter", Frame(x, y))
+    if design == 3:
+        lamp.ball(glow, (0, 0, z + 0.2), (0.4, 0.4, 0.4))
+        lamp.cylinder(
+            room.palette.material(Pattern.PLAIN), (0, 0, plan.height - 0.1), (0.04, 0.04, 0.2)
+        )
+    else:
+        add = lamp.cylinder if design == 2 else lamp.box
+        add(glow, (0, 0, z + 0.035), (*size, 0.07))
+    sides = np.array([[size[0] * 0.45, 0, 0], [0, size[1] * 0.45, 0]])
+    down = np.array([0.0, 0.0, -1.0])
+    strength = rng.uniform(0.7, 1.3)
+    room.lights.append(Light(np.array([x, y, z - 0.02]), sides, down, strength))

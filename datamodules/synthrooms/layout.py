@@ -1,0 +1,200 @@
+"""Floor plans: rectangles and L-shapes, their walls, and what is still free.
+
+Room coordinates are right-handed, in metres, z up; the floor is z = 0.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+__all__ = ["FloorPlan", "Frame", "Rectangle", "Wall", "Zone"]
+
+Zone = Literal["low", "high", "full"]
+"""Part of a wall's height that something takes: up to about a metre, above it, or all of it."""
+
+_TRIES = 24
+_GAP = 0.06
+
+
+class Frame(NamedTuple):
+    """A place: an origin in the room and a turn about the vertical.
+
+    Attributes:
+        x: Origin in metres.
+        y: Origin in metres.
+        z: Origin in metres.
+        yaw: Counterclockwise turn seen from above, in radians.
+    """
+
+    x: float
+    y: float
+    z: float = 0.0
+    yaw: float = 0.0
+
+    def at(self, x: float, y: float, z: float = 0.0, yaw: float = 0.0) -> Frame:
+        """The frame at (x, y, z) of this one, turned by `yaw` more."""
+        cos, sin = math.cos(self.yaw), math.sin(self.yaw)
+        return Frame(
+            self.x + cos * x - sin * y, self.y + sin * x + cos * y, self.z + z, self.yaw + yaw
+        )
+
+
+class Rectangle(NamedTuple):
+    """An axis-aligned rectangle on the floor: its least and greatest x and y."""
+
+    x0: float
+    y0: float
+    x1: float
+    y1: float
+
+    def meets(self, other: Rectangle, gap: float = 0.0) -> bool:
+        """Whether the two come closer than `gap` metres along both axes."""
+        return (
+            self.x0 < other.x1 + gap
+            and other.x0 < self.x1 + gap
+            and self.y0 < other.y1 + gap
+            and other.y0 < self.y1 + gap
+        )
+
+    @classmethod
+    def around(cls, frame: Frame, x: tuple[float, float], y: tuple[float, float]) -> Rectangle:
+        """The smallest one around ``x[0] … x[1]`` by ``y[0] … y[1]`` in `frame`."""
+        corners = [frame.at(a, b) for a in x for b in y]
+        xs, ys = [c.x for c in corners], [c.y for c in corners]
+        return cls(min(xs), min(ys), max(xs), max(ys))
+
+
+@dataclass
+class Wall:
+    """One straight wall.
+
+    Attributes:
+        frame: At the wall's start; x runs along it, y into the room.
+        length: In metres.
+    """
+
+    frame: Frame
+    length: float
+    _taken: list[tuple[float, float, Zone]] = field(default_factory=list)
+
+    def is_free(self, start: float, end: float, zone: Zone) -> bool:
+        """Whether nothing hangs or stands between two positions along the wall."""
+        return not any(
+            start < b + _GAP and a < end + _GAP and (zone == other or "full" in (zone, other))
+            for a, b, other in self._taken
+        )
+
+    def take(self, start: float, end: float, zone: Zone) -> None:
+        """Mark a stretch as taken."""
+        self._taken.append((start, end, zone))
+
+
+class FloorPlan:
+    """A rectangle, or an L: the rectangle without its corner of greatest x and y.
+
+    Args:
+        size: Width (x), depth (y) and height (z) of the room in metres.
+        notch: Width and depth of the missing corner; None for a plain rectangle.
+    """
+
+    def __init__(
+        self, size: tuple[float, float, float], notch: tuple[float, float] | None = None
+    ) -> None:
+        self.width, self.depth, self.height = size
+        self._taken: list[Rectangle] = []
+        x, y = self.width, self.depth
+        self.notch: Rectangle | None = None
+        corners = [(0.0, 0.0), (x, 0.0), (x, y), (0.0, y)]
+        if notch is not None:
+            a, b = x - notch[0], y - notch[1]
+            self.notch = Rectangle(a, b, x, y)
+            corners[2:3] = [(x, b), (a, b), (a, y)]
+        self.walls = [
+            _wall_between(start, end)
+            for start, end in zip(corners, [*corners[1:], corners[0]], strict=True)
+        ]
+
+    @property
+    def floors(self) -> list[Rectangle]:
+        """One or two rectangles that together make the floor."""
+        if self.notch is None:
+            return [Rectangle(0, 0, self.width, self.depth)]
+        return [
+            Rectangle(0, 0, self.width, self.notch.y0),
+            Rectangle(0, self.notch.y0, self.notch.x0, self.depth),
+        ]
+
+    @property
+    def floor_area(self) -> float:
+        """In square metres."""
+        return sum((r.x1 - r.x0) * (r.y1 - r.y0) for r in self.floors)
+
+    def contains(self, area: Rectangle, margin: float = 0.0) -> bool:
+        """Whether a rectangle lies inside, `margin` metres away from every wall."""
+        inside = (
+            area.x0 >= margin
+            and area.y0 >= margin
+            and area.x1 <= self.width - margin
+            and area.y1 <= self.depth - margin
+        )
+        return inside and not (self.notch is not None and area.meets(self.notch, margin))
+
+    def is_free(self, area: Rectangle, gap: float = 0.0) -> bool:
+        """Whether nothing stands within `gap` metres of a rectangle."""
+        return not any(area.meets(other, gap) for other in self._taken)
+
+    def take(self, area: Rectangle) -> None:
+        """Mark a rectangle of the floor as taken."""
+        self._taken.append(area)
+
+    def against_wall(
+        self, rng: np.random.Generator, width: float, depth: float, zone: Zone
+    ) -> Frame | None:
+        """Find and take a place at a wall.
+
+        Args:
+            rng: Source of randomness.
+            width: Metres along the wall.
+            depth: Metres of floor in front of it that must be and stay free; 0 for what hangs.
+            zone: Which part of the wall's height.
+
+        Returns:
+            Frame at the middle of the stretch on the floor, x along the wall, y into the room; None
+            when no place was found.
+        """
+        lengths = np.array([wall.length for wall in self.walls])
+        for _ in range(_TRIES):
+            wall = self.walls[rng.choice(len(lengths), p=lengths / lengths.sum())]
+            room = wall.length - width - 0.24
+            middle = width / 2 + 0.12 + rng.random() * max(room, 0)
+            start, end = middle - width / 2, middle + width / 2
+            frame = wall.frame.at(middle, 0)
+            area = Rectangle.around(frame, (-width / 2, width / 2), (0.005, max(depth, 0.01)))
+            fits = room > 0 and wall.is_free(start, end, zone) and self.contains(area)
+            if fits and (depth == 0 or self.is_free(area)):
+                wall.take(start, end, zone)
+                if depth > 0:
+                    self.take(area)
+                return frame
+        return None
+
+    def in_the_open(
+        self, rng: np.random.Generator, width: float, depth: float, gap: float = 0.12
+    ) -> Frame | None:
+        """Find and take a place away from the walls, ``width × depth`` metres, not turned."""
+        for _ in range(_TRIES):
+            frame = Frame(rng.uniform(0, self.width), rng.uniform(0, self.depth))
+            area = Rectangle.around(frame, (-width / 2, width / 2), (-depth / 2, depth / 2))
+            if self.contains(area, margin=0.1) and self.is_free(area, gap):
+                self.take(area)
+                return frame
+        return None
+
+
+def _wall_between(start: tuple[float, float], end: tuple[float, float]) -> Wall:
+    dx, dy = end[0] - start[0], end[1] - start[1]
+    return Wall(Frame(*start, yaw=math.atan2(dy, dx)), math.hypot(dx, dy))

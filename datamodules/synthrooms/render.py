@@ -1,0 +1,210 @@
+"""Taking pictures: exposure, noise, anti-aliasing, and what a scanner misses."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from datamodules.synthrooms.raycast import even_directions
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+    from datamodules.synthrooms.camera import View
+    from datamodules.synthrooms.layout import FloorPlan
+    from datamodules.synthrooms.raycast import Hits, RayScene
+
+    Floats = NDArray[np.float32]
+
+__all__ = ["MISSING", "Camera", "Holes", "Picture", "draw_camera", "draw_holes", "render"]
+
+MISSING = -1
+"""Item number where nothing was scanned."""
+
+_RAYS_AT_ONCE = 1 << 17  # keeps a 2048 × 4096 panorama within 200 MB, and the caches warm
+_GRAZING = 0.04  # cosine below which a depth camera gets nothing back
+_WHITE = 9.0  # square of the light, in units of exposure, that becomes white
+_HEIGHTS = (1.3, 1.7)
+_CLEAR = 0.55  # metres around a camera that should be free
+_APART = 1.2  # metres between the cameras of a room
+_PLACES = 60  # tried for every camera
+
+
+class Picture(NamedTuple):
+    """One rendered view.
+
+    Attributes:
+        rgb: ``(h, w, 3)`` uint8.
+        depth_m: ``(h, w)`` float32; NaN where missing.
+        items: ``(h, w)`` int64, position in `Room.items`; `MISSING` where missing.
+    """
+
+    rgb: NDArray[np.uint8]
+    depth_m: Floats
+    items: NDArray[np.int64]
+
+
+class Holes(NamedTuple):
+    """Balls in the room within which the scan has no surface.
+
+    Attributes:
+        centers: ``(n, 3)`` metres.
+        radii: ``(n,)`` metres.
+    """
+
+    centers: NDArray[np.float64]
+    radii: NDArray[np.float64]
+
+    def cover(self, points: Floats) -> NDArray[np.bool_]:
+        """Which of ``(n, 3)`` points lie in a hole; the rims are ragged."""
+        ragged = 1 + 0.25 * np.sin(points @ np.array([23.0, 29.0, 31.0], np.float32))
+        covered = np.zeros(len(points), np.bool_)
+        for center, radius in zip(self.centers, self.radii, strict=True):
+            away = points - center.astype(np.float32)
+            covered |= np.einsum("ij,ij->i", away, away) < ragged * np.float32(radius**2)
+        return covered
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A place to take pictures from, and how the sensor there behaves in all of them.
+
+    Attributes:
+        location: ``(3,)`` metres.
+        heading: Of the panorama, radians counterclockwise from the room's x axis.
+        caps: Radians around the zenith and the nadir that were not photographed.
+        gain: ``(3,)`` exposure times white balance.
+        noise: Standard deviation of the sensor's noise, display values.
+    """
+
+    location: NDArray[np.float64]
+    heading: float
+    caps: tuple[float, float]
+    gain: Floats
+    noise: float
+
+
+def draw_holes(rng: np.random.Generator, scene: RayScene) -> Holes:
+    """Draw up to six holes of 10 to 35 cm on the room's surfaces."""
+    count = int(rng.integers(0, 7))
+    return Holes(scene.surface_points(rng, count), rng.uniform(0.1, 0.35, count))
+
+
+def draw_camera(
+    rng: np.random.Generator, scene: RayScene, plan: FloorPlan, others: list[Camera]
+) -> Camera:
+    """Draw a camera with free space around it, away from the others, and expose it."""
+    location = _draw_location(rng, scene, plan, [camera.location for camera in others])
+    caps = tuple(math.radians(rng.uniform(6, 15)) if rng.random() < 0.7 else 0.0 for _ in range(2))
+    around = scene.cast(location, even_directions(1024))
+    light = scene.radiance(around, (0.0, 0.0), even_directions(1)[0]).mean(axis=1)
+    typical = math.exp(float(np.log(light + 1e-3).mean()))
+    exposure = 0.26 * rng.uniform(0.75, 1.35) / typical
+    gain = (exposure * rng.uniform(0.92, 1.08, 3)).astype(np.float32)
+    heading, noise = rng.uniform(-math.pi, math.pi), rng.uniform(0.004, 0.012)
+    return Camera(location, heading, (caps[0], caps[1]), gain, noise)
+
+
+def _draw_location(
+    rng: np.random.Generator,
+    scene: RayScene,
+    plan: FloorPlan,
+    others: list[NDArray[np.float64]],
+) -> NDArray[np.float64]:
+    """The first place with enough room around it, else the best of those tried."""
+    directions = even_directions(192)
+    best, most = np.zeros(3), -math.inf
+    for _ in range(_PLACES):
+        area = plan.floors[rng.integers(len(plan.floors))]
+        x, y = rng.uniform(area.x0, area.x1), rng.uniform(area.y0, area.y1)
+        place = np.array([x, y, rng.uniform(*_HEIGHTS)])
+        clear = float(scene.cast(place, directions).distance.min()) / _CLEAR
+        apart = min((float(np.linalg.norm(place - other)) for other in others), default=math.inf)
+        free = min(clear, apart / _APART)
+        if free > most:
+            best, most = place, free
+        if most >= 1:
+            break
+    return best
+
+
+def render(
+    scene: RayScene,
+    view: View,
+    camera: Camera,
+    holes: Holes,
+    supersample: int,
+    rng: np.random.Generator,
+) -> Picture:
+    """Take a picture.
+
+    Colours are the mean of ``supersample²`` rays per pixel, spread evenly over it, each through the
+    tone curve; labels and depth come from one ray through the pixel's centre.
+
+    Args:
+        scene: The room.
+        view: The picture's pixels; it must look from the camera's place.
+        camera: The sensor.
+        holes: What the scan misses.
+        supersample: Rays per pixel side.
+        rng: Source of the sensor's noise.
+    """
+    rays = view.rays()
+    shape = (rays.shape[0], rays.shape[1])
+    distance, items = np.empty(shape, np.float32), np.empty(shape, np.int64)
+    for rows in _bands(shape):
+        hits = scene.cast(camera.location, rays[rows].reshape(-1, 3))
+        missing = _unscanned(scene, hits, holes)
+        distance[rows] = np.where(missing, np.nan, hits.distance).reshape(-1, shape[1])
+        found = np.where(missing, MISSING, scene.item_of_part[hits.part])
+        items[rows] = found.reshape(-1, shape[1])
+    zenith, nadir = camera.caps
+    black = (rays[..., 2] > math.cos(zenith)) & (zenith > 0)
+    black |= (rays[..., 2] < -math.cos(nadir)) & (nadir > 0)
+    items[black] = MISSING
+    distance[black] = np.nan
+    color = _colors(scene, view, camera, shape, supersample)
+    color += rng.normal(0, camera.noise, color.shape).astype(np.float32)
+    rgb = np.clip(color * 255 + 0.5, 0, 255).astype(np.uint8)
+    rgb[black] = 0
+    return Picture(rgb, view.depth_m(distance, rays), items)
+
+
+def _colors(
+    scene: RayScene, view: View, camera: Camera, shape: tuple[int, int], supersample: int
+) -> Floats:
+    """Display values ``(h, w, 3)``."""
+    steps = (np.arange(supersample) + 0.5) / supersample - 0.5
+    spreads = even_directions(supersample**2)
+    color = np.zeros((*shape, 3), np.float32)
+    for k, spread in enumerate(spreads):
+        dx, dy = float(steps[k % supersample]), float(steps[k // supersample])
+        rays = view.rays(dx, dy)
+        for rows in _bands(shape):
+            hits = scene.cast(camera.location, rays[rows].reshape(-1, 3))
+            light = scene.radiance(hits, (2 * dx, 2 * dy), spread) * camera.gain
+            color[rows] += _display(light).reshape(color[rows].shape)
+    return color / np.float32(len(spreads))
+
+
+def _display(light: Floats) -> Floats:
+    """Tone curve (Reinhard et al. 2002, equation 4) and a gamma of 2."""
+    return np.sqrt(np.minimum(light * (1 + light / np.float32(_WHITE)) / (1 + light), 1))
+
+
+def _unscanned(scene: RayScene, hits: Hits, holes: Holes) -> NDArray[np.bool_]:
+    missing = ~hits.found | (hits.cosine < _GRAZING) | holes.cover(hits.points)
+    return missing | scene.materials.unscanned[hits.part]
+
+
+def _bands(shape: tuple[int, int]) -> Iterator[slice]:
+    """Slices of rows that together make a picture, few enough rays in each."""
+    height, width = shape
+    step = max(1, _RAYS_AT_ONCE // width)
+    for start in range(0, height, step):
+        yield slice(start, start + step)

@@ -1,0 +1,107 @@
+"""Which room it is, how large, and what stands in it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from datamodules.synthrooms.furniture.clutter import add_floor_clutter, add_lamp, add_wall_clutter
+from datamodules.synthrooms.furniture.openings import add_door, add_window
+from datamodules.synthrooms.furniture.seating import add_chair, add_sofa
+from datamodules.synthrooms.furniture.storage import add_board, add_bookcase
+from datamodules.synthrooms.furniture.structure import (
+    add_beams,
+    add_ceiling,
+    add_column,
+    add_floor,
+    add_walls,
+)
+from datamodules.synthrooms.furniture.tables import add_desk, add_table
+from datamodules.synthrooms.layout import FloorPlan
+from datamodules.synthrooms.palette import Palette
+from datamodules.synthrooms.room import Room
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+__all__ = ["ROOM_TYPES", "draw_room_type", "furnish", "shell"]
+
+_HEIGHTS = (2.5, 3.3)
+_L_SHAPED = 0.35
+
+
+class _RoomType(NamedTuple):
+    share: float
+    long: tuple[float, float]
+    short: tuple[float, float]
+
+
+ROOM_TYPES = {
+    "office": _RoomType(0.36, (4.0, 6.0), (3.4, 5.0)),
+    "hallway": _RoomType(0.1, (6.0, 8.5), (2.7, 3.4)),
+    "conferenceRoom": _RoomType(0.12, (5.0, 7.0), (4.0, 5.5)),
+    "lounge": _RoomType(0.09, (4.5, 6.5), (4.0, 5.5)),
+    "storage": _RoomType(0.06, (3.6, 5.0), (3.2, 4.2)),
+    "WC": _RoomType(0.04, (3.4, 4.6), (3.0, 3.8)),
+    "copyRoom": _RoomType(0.05, (3.8, 5.0), (3.2, 4.4)),
+    "lobby": _RoomType(0.06, (5.5, 7.5), (4.5, 6.0)),
+    "pantry": _RoomType(0.05, (3.8, 5.2), (3.2, 4.4)),
+    "openspace": _RoomType(0.04, (6.0, 8.0), (5.0, 6.5)),
+    "auditorium": _RoomType(0.03, (6.5, 8.5), (5.5, 7.0)),
+}
+"""The real set's room types: share of rooms, limits of the long and the short side in metres."""
+
+_PROGRAM: tuple[tuple[Callable[[Room], None], float, int, int], ...] = (
+    (add_column, 0.75, 1, 2),
+    (add_door, 1.0, 1, 2),
+    (add_bookcase, 0.85, 1, 2),
+    (add_board, 0.9, 1, 2),
+    (add_window, 0.95, 1, 2),
+    (add_sofa, 0.85, 1, 2),
+    (add_beams, 0.75, 1, 1),
+    (add_lamp, 1.0, 1, 2),
+    (add_table, 0.95, 1, 2),
+    (add_desk, 0.75, 1, 2),
+    (add_chair, 0.8, 1, 3),
+    (add_floor_clutter, 1.0, 2, 5),
+    (add_wall_clutter, 0.9, 1, 3),
+)
+"""Furniture in order of placement: how, in which share of rooms, how many (least and most)."""
+
+
+def draw_room_type(rng: np.random.Generator) -> str:
+    """Draw one of `ROOM_TYPES`."""
+    shares = np.array([kind.share for kind in ROOM_TYPES.values()])
+    return list(ROOM_TYPES)[rng.choice(len(shares), p=shares / shares.sum())]
+
+
+def shell(rng: np.random.Generator, plan: FloorPlan) -> Room:
+    """An empty room: floor, ceiling and walls."""
+    room = Room(rng, plan, Palette(rng))
+    materials = (add_floor(room), add_ceiling(room), add_walls(room))
+    room.reflectance = np.mean([material.color**2 for material in materials], axis=0)
+    return room
+
+
+def furnish(rng: np.random.Generator, room_type: str) -> Room:
+    """A furnished room.
+
+    Args:
+        rng: The room's source of randomness.
+        room_type: One of `ROOM_TYPES`.
+    """
+    room = shell(rng, _draw_plan(rng, ROOM_TYPES[room_type]))
+    for add, share, least, most in _PROGRAM:
+        if room.chance(share):
+            for _ in range(room.count(least, most)):
+                add(room)
+    return room
+
+
+def _draw_plan(rng: np.random.Generator, kind: _RoomType) -> FloorPlan:
+    long, short = rng.uniform(*kind.long), rng.uniform(*kind.short)
+    size = (long, short, rng.uniform(*_HEIGHTS))
+    if rng.random() >= _L_SHAPED or short < 3.2:
+        return FloorPlan(size)
+    return FloorPlan(size, notch=(long * rng.uniform(0.25, 0.5), short * rng.uniform(0.25, 0.45)))

@@ -1,0 +1,205 @@
+"""Stanford2D3DS's files: names, label table, pictures and poses.
+
+Every picture is four files in ``area_<a>/<pano|data>/<kind>/``, named
+``camera_<uuid>_<room>_frame_<frame>_domain_<kind>.<png|json>``. A panorama's frame is
+``equirectangular``, a perspective view's is its number.
+"""
+
+from __future__ import annotations
+
+import math
+import uuid
+from pathlib import PurePosixPath
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import cv2
+import numpy as np
+
+from datamodules.synthrooms.camera import PanoramaView, Pose, euler_angles
+from datamodules.synthrooms.render import MISSING
+from datamodules.synthrooms.room import UNKNOWN
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from datamodules.synthrooms.camera import PerspectiveView
+    from datamodules.synthrooms.render import Picture
+
+__all__ = [
+    "INSTANCES",
+    "KINDS",
+    "PictureName",
+    "RoomName",
+    "encode_picture",
+    "label_indices",
+    "label_strings",
+    "pose_record",
+]
+
+KINDS = {"rgb": ".png", "depth": ".png", "semantic": ".png", "pose": ".json"}
+"""What is written of every picture, with the suffix."""
+
+INSTANCES = {
+    "beam": 8,
+    "board": 4,
+    "bookcase": 4,
+    "ceiling": 1,
+    "chair": 24,
+    "clutter": 40,
+    "column": 4,
+    "door": 4,
+    "floor": 1,
+    "sofa": 4,
+    "table": 8,
+    "wall": 8,
+    "window": 4,
+}
+"""The classes, and how many of each a room has in the label table whether it uses them or not.
+
+So every room knows its indices without the other rooms. Further instances share the last number.
+"""
+
+_MISSING_LABEL = 0x0D0D0D
+_MISSING_DEPTH = 65535
+_DEPTH_UNITS = 512  # per metre
+_NAMESPACE = uuid.UUID("8f2b5b54-6d1f-4a3e-9a44-2d6d0c3f7a10")
+_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
+
+
+class RoomName(NamedTuple):
+    """Which room it is.
+
+    Attributes:
+        area: ``"1"`` to ``"6"``, with ``"5a"`` and ``"5b"``.
+        kind: Room type, as ``office``.
+        number: From 1, unique in the area; 5a and 5b count as one area here, as in the real set.
+        order: Place of the room in the label table, from 0.
+    """
+
+    area: str
+    kind: str
+    number: int
+    order: int
+
+    def __str__(self) -> str:
+        return f"{self.kind}_{self.number}"
+
+
+class PictureName(NamedTuple):
+    """Which picture it is.
+
+    Attributes:
+        room: Where.
+        camera: 32 hexadecimal digits.
+        frame: Number of a perspective view; None for the panorama.
+    """
+
+    room: RoomName
+    camera: str
+    frame: int | None = None
+
+    @classmethod
+    def of_camera(cls, seed: int, room: RoomName, number: int) -> PictureName:
+        """The panorama of a room's camera; its identifier follows from seed, room and number."""
+        text = f"{seed}/{room.area}/{room}/{number}"
+        return cls(room, uuid.uuid5(_NAMESPACE, text).hex)
+
+    @property
+    def frame_text(self) -> str:
+        """The frame as in file names and poses."""
+        return "equirectangular" if self.frame is None else str(self.frame)
+
+    def file(self, kind: str) -> PurePosixPath:
+        """Path of one of `KINDS`, relative to the data set's folder."""
+        name = f"camera_{self.camera}_{self.room}_frame_{self.frame_text}_domain_{kind}"
+        group = "pano" if self.frame is None else "data"
+        return PurePosixPath(f"area_{self.room.area}", group, kind, name + KINDS[kind])
+
+
+def label_strings(rooms: Sequence[RoomName]) -> list[str]:
+    """The label table: ``class_instance_roomtype_roomnumber_area``, the unknown first."""
+    labels = [f"{UNKNOWN}_0_{UNKNOWN}_0_0"]
+    for room in rooms:
+        labels += [
+            f"{name}_{instance}_{room}_{room.area[0]}"
+            for name, count in INSTANCES.items()
+            for instance in range(1, count + 1)
+        ]
+    return labels
+
+
+def label_indices(room: RoomName, items: Sequence[str]) -> NDArray[np.uint32]:
+    """Index into the label table of every item of a room, ``(n,)``."""
+    first = 1 + room.order * sum(INSTANCES.values())
+    starts = dict(zip(INSTANCES, np.cumsum([first, *INSTANCES.values()]).tolist(), strict=False))
+    seen = dict.fromkeys(INSTANCES, 0)
+    indices = np.zeros(len(items), np.uint32)
+    for k, name in enumerate(items):
+        if name != UNKNOWN:
+            indices[k] = starts[name] + min(seen[name], INSTANCES[name] - 1)
+            seen[name] += 1
+    return indices
+
+
+def encode_picture(picture: Picture, labels: NDArray[np.uint32]) -> dict[str, bytes]:
+    """PNG files of a picture.
+
+    Args:
+        picture: What was rendered.
+        labels: Index into the label table of every item.
+
+    Returns:
+        File content of ``rgb`` (8 bit), ``depth`` (16 bit, 1/512 m, 65535 missing) and
+        ``semantic`` (24-bit index R·65536 + G·256 + B, #0D0D0D missing).
+    """
+    missing = picture.items == MISSING
+    index = np.where(missing, _MISSING_LABEL, labels[picture.items])
+    blue_first = np.stack([index, index >> 8, index >> 16], axis=-1) & 0xFF
+    depth = np.nan_to_num(picture.depth_m * _DEPTH_UNITS, nan=_MISSING_DEPTH)
+    return {
+        "rgb": _encode_png(picture.rgb[..., ::-1]),
+        "depth": _encode_png(np.clip(depth + 0.5, 0, _MISSING_DEPTH).astype(np.uint16)),
+        "semantic": _encode_png(blue_first.astype(np.uint8)),
+    }
+
+
+def _encode_png(image: NDArray[Any]) -> bytes:
+    return cv2.imencode(".png", np.ascontiguousarray(image), _PNG)[1].tobytes()
+
+
+def pose_record(
+    name: PictureName, view: PanoramaView | PerspectiveView, original: Pose
+) -> dict[str, Any]:
+    """Pose file of a picture, with all keys of the real set.
+
+    `datamodules.synthrooms.camera` states the formulas. The camera matrix counts from pixel corners
+    (the middle of n pixels is n/2), as the real set's. A panorama has, as there, the field of view
+    of 90° and the camera matrix of one face of the cube around it.
+
+    Args:
+        name: The picture's name.
+        view: How it was taken.
+        original: Pose of the panorama of the same camera.
+    """
+    pose = view.pose
+    if isinstance(view, PanoramaView):
+        fov, size = math.pi / 2, view.height
+    else:
+        fov, size = view.fov_rad, view.size
+    focal = size / (2 * math.tan(fov / 2))
+    turn = pose.world_from_camera @ original.world_from_camera.T
+    return {
+        "camera_k_matrix": [[focal, 0.0, size / 2], [0.0, focal, size / 2], [0.0, 0.0, 1.0]],
+        "field_of_view_rads": fov,
+        "camera_original_rotation": original.euler_angles.tolist(),
+        "rotation_from_original_to_point": euler_angles(turn).tolist(),
+        "point_uuid": name.camera,
+        "camera_location": pose.location.tolist(),
+        "frame_num": name.frame_text,
+        "camera_rt_matrix": pose.rt_matrix.tolist(),
+        "final_camera_rotation": pose.euler_angles.tolist(),
+        "camera_uuid": name.camera,
+        "room": str(name.room),
+    }

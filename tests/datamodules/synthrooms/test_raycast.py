@@ -1,0 +1,160 @@
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from datamodules.synthrooms.camera import PanoramaView, PerspectiveView, Pose
+from datamodules.synthrooms.layout import FloorPlan, Frame
+from datamodules.synthrooms.palette import Palette, Pattern
+from datamodules.synthrooms.raycast import RayScene, even_directions
+from datamodules.synthrooms.render import MISSING, Camera, Holes, Picture, render
+from datamodules.synthrooms.room import Light, Room
+from datamodules.synthrooms.scene import shell
+
+SIZE = np.array([5.0, 4.0, 3.0])
+HERE = np.array([1.5, 2.2, 1.4])
+NO_HOLES = Holes(np.zeros((0, 3)), np.zeros(0))
+
+
+def empty_room() -> Room:
+    rng = np.random.default_rng(0)
+    room = shell(rng, FloorPlan((5.0, 4.0, 3.0)))
+    room.parts[:] = [
+        part for part in room.parts if len(part.triangles) and _is_slab(part.triangles)
+    ]
+    return room
+
+
+def _is_slab(triangles: NDArray[Any]) -> bool:
+    """Walls, floor and ceiling are 10 cm thick; carpets and skirting are not."""
+    return bool(np.isclose(np.ptp(triangles, axis=(0, 1)).min(), 0.1))
+
+
+def lit_room(*, shade: bool) -> Room:
+    """A lamp under the ceiling; with `shade`, a small board halfway down."""
+    room = empty_room()
+    down = np.array([0, 0, -1.0])
+    sides = np.array([[0.2, 0, 0], [0, 0.2, 0]])
+    room.lights.append(Light(np.array([2.5, 2.0, 2.9]), sides, down, 2.0))
+    if shade:
+        board = room.item("table", Frame(2.5, 2.0))
+        board.box(Palette(room.rng).material(Pattern.PLAIN), (0, 0, 1.5), (1.0, 1.0, 0.02))
+    return room
+
+
+def take(
+    room: Room, view: PanoramaView | PerspectiveView, holes: Holes = NO_HOLES, **camera: object
+) -> Picture:
+    settings: dict[str, object] = {
+        "location": HERE,
+        "heading": 0.0,
+        "caps": (0.0, 0.0),
+        "gain": np.full(3, 3.0, np.float32),
+        "noise": 0.0,
+    }
+    sensor = Camera(**{**settings, **camera})  # type: ignore[arg-type]
+    return render(RayScene(room), view, sensor, holes, 2, np.random.default_rng(0))
+
+
+def wall_distance(rays: NDArray[Any]) -> NDArray[Any]:
+    """Distance from `HERE` to the walls of the box along `rays`, in closed form."""
+    with np.errstate(divide="ignore"):
+        along = np.where(rays > 0, (SIZE - HERE) / rays, -HERE / rays)
+    return along.min(axis=-1)
+
+
+def test_distances_in_an_empty_box_are_those_of_its_planes() -> None:
+    view = PanoramaView(Pose.looking(HERE, heading=0.7), 64)
+    rays = view.rays().astype(np.float64)
+    depth = take(empty_room(), view).depth_m
+    seen = ~np.isnan(depth)
+    assert seen.mean() > 0.99
+    np.testing.assert_allclose(depth[seen], wall_distance(rays)[seen], atol=1e-4)
+
+
+def test_perspective_depth_is_along_the_optical_axis() -> None:
+    view = PerspectiveView(Pose.looking(HERE, heading=0.0), 32, math.radians(60))
+    depth = take(empty_room(), view).depth_m
+    # The camera faces the wall x = 5 m: all of it is 3.5 m ahead.
+    np.testing.assert_allclose(depth[8:24, 8:24], 3.5, atol=1e-4)
+
+
+def test_light_follows_the_inverse_square_and_the_cosines() -> None:
+    room = lit_room(shade=False)
+    scene = RayScene(room)
+    targets = np.array([[2.5, 2.0, 0.0], [3.5, 2.0, 0.0]])
+    rays = targets - HERE
+    hits = scene.cast(HERE, (rays / np.linalg.norm(rays, axis=1)[:, None]).astype(np.float32))
+    lamp = room.lights[0]
+    lifted = hits.points + 1e-3 * hits.normals
+    direct = scene._direct(lamp, lifted, hits.normals, (0.0, 0.0))
+    away = np.array([2.9**2, 2.9**2 + 1])
+    np.testing.assert_allclose(direct, 2.0 * (2.9**2 / away) / away, rtol=1e-3)
+
+
+def test_things_throw_shadows_with_soft_rims_and_the_ceiling_gets_bounced_light() -> None:
+    view = PanoramaView(Pose.looking(HERE, 0.0), 128)
+    bright, shaded = (take(lit_room(shade=shade), view) for shade in (False, True))
+    # The same floor pixels with and without the board in between.
+    floor = np.array([2.5, 2.0, 0.0]) - HERE
+    at = np.argmax(view.rays() @ (floor / np.linalg.norm(floor)))
+    before, after = (p.rgb.reshape(-1, 3)[at].astype(float).mean() for p in (bright, shaded))
+    assert after < 0.9 * before
+    ceiling = bright.rgb[2].mean()
+    assert 40 < ceiling < 255
+    scene = RayScene(lit_room(shade=True))
+    hits = scene.cast(HERE, view.rays().reshape(-1, 3))
+    corners = [(x, y) for x in (-0.5, 0.5) for y in (-0.5, 0.5)]
+    lamp = lit_room(shade=True).lights[0]
+    lifted = hits.points + 1e-3 * hits.normals
+    lit = [scene._direct(lamp, lifted, hits.normals, c) > 0 for c in corners]
+    share = np.mean(lit, axis=0)
+    assert ((share > 0) & (share < 1)).any()
+
+
+def test_what_was_not_scanned_has_neither_label_nor_depth_but_a_colour() -> None:
+    view = PanoramaView(Pose.looking(HERE, 0.0), 64)
+    whole = take(lit_room(shade=False), view)
+    wall = HERE + np.array([3.5, 0, 0])
+    holed = take(lit_room(shade=False), view, Holes(wall[None], np.array([0.5])))
+    # The ball meets the wall in a disc; its ragged radius is between 0.43 and 0.56 m.
+    points = HERE + view.rays() * np.nan_to_num(whole.depth_m)[..., None]
+    away = np.linalg.norm(points - wall, axis=-1)
+    assert np.isnan(holed.depth_m[away < 0.4]).all()
+    assert (holed.items[away < 0.4] == MISSING).all()
+    np.testing.assert_array_equal(holed.items[away > 0.6], whole.items[away > 0.6])
+    np.testing.assert_array_equal(holed.rgb, whole.rgb)
+
+
+def test_unscanned_glass_and_grazing_rays_are_missing() -> None:
+    room = empty_room()
+    glass = Palette(room.rng).material(Pattern.OUTSIDE, unscanned=True, emission=1.0)
+    room.item("window", Frame(4.9, 2.0)).box(glass, (0, 0, 1.5), (0.02, 1.0, 1.0))
+    view = PerspectiveView(Pose.looking(HERE, 0.0), 32, math.radians(20))
+    picture = take(room, view)
+    assert (picture.items[12:20, 12:20] == MISSING).all()
+    assert np.isnan(picture.depth_m[12:20, 12:20]).all()
+    low = np.array([0.3, 2.0, 0.05])  # over a long floor, 5 cm up: most of it is seen edge-on
+    grazing = take(empty_room(), PanoramaView(Pose.looking(low, 0.0), 64), location=low)
+    # 1.4° below the horizon rays meet the floor 2 m away at a cosine of 0.025; 4.2° below, 0.07.
+    assert np.isnan(grazing.depth_m[32, 56:72]).all()
+    assert not np.isnan(grazing.depth_m[33, 56:72]).any()
+
+
+@pytest.mark.parametrize(("caps", "rows"), [((0.4, 0.0), [0]), ((0.0, 0.4), [-1]), ((0, 0), [])])
+def test_caps_are_black_and_missing(caps: tuple[float, float], rows: list[int]) -> None:
+    picture = take(lit_room(shade=False), PanoramaView(Pose.looking(HERE, 0), 32), caps=caps)
+    black = (picture.rgb == 0).all(axis=(1, 2))
+    missing = (picture.items == MISSING).all(axis=1) & np.isnan(picture.depth_m).all(axis=1)
+    for row in (0, -1):
+        assert black[row] == missing[row] == (row in rows)
+
+
+def test_even_directions_are_units_that_cancel() -> None:
+    directions = even_directions(500)
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-6)
+    np.testing.assert_allclose(directions.mean(axis=0), 0, atol=0.01)

@@ -1,0 +1,90 @@
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from datamodules.synthrooms.camera import PanoramaView, Pose
+from datamodules.synthrooms.raycast import RayScene
+from datamodules.synthrooms.render import MISSING, draw_camera, draw_holes, render
+from datamodules.synthrooms.room import UNKNOWN, Room
+from datamodules.synthrooms.scene import ROOM_TYPES, draw_room_type, furnish
+from datamodules.synthrooms.writer import INSTANCES
+
+SEEDS = range(120)
+
+
+@pytest.fixture(scope="module")
+def rooms() -> list[Room]:
+    made = []
+    for seed in SEEDS:
+        rng = np.random.default_rng(seed)
+        made.append(furnish(rng, draw_room_type(rng)))
+    return made
+
+
+def test_rooms_are_of_all_types_sizes_and_both_shapes(rooms: list[Room]) -> None:
+    rng = np.random.default_rng(0)
+    assert {draw_room_type(rng) for _ in range(500)} == set(ROOM_TYPES)
+    assert 0.1 < np.mean([room.plan.notch is not None for room in rooms]) < 0.6
+    areas = [room.plan.floor_area for room in rooms]
+    assert max(areas) > 2.5 * min(areas)
+
+
+def test_everything_stands_inside(rooms: list[Room]) -> None:
+    for room in rooms:
+        corners = np.concatenate([part.triangles.reshape(-1, 3) for part in room.parts])
+        size = (room.plan.width, room.plan.depth, room.plan.height)
+        # Walls are 10 cm thick; bases of columns at walls reach a little further into them.
+        assert (corners > -0.13).all()
+        assert (corners < np.add(size, 0.13)).all()
+
+
+def test_instances_fit_the_label_table(rooms: list[Room]) -> None:
+    for room in rooms:
+        counts = Counter(room.items)
+        assert set(counts) <= {UNKNOWN, *INSTANCES}
+        assert all(counts[name] <= limit for name, limit in INSTANCES.items())
+
+
+def test_every_class_covers_enough_pixels_in_enough_rooms(rooms: list[Room]) -> None:
+    names = list(INSTANCES)
+    pixels, present = np.zeros(len(names)), np.zeros(len(names))
+    total, unknown, missing = 0, 0, 0
+    for room in rooms:
+        scene = RayScene(room)
+        holes = draw_holes(room.rng, scene)
+        camera = draw_camera(room.rng, scene, room.plan, [])
+        view = PanoramaView(Pose.looking(camera.location, camera.heading), 32)
+        items = render(scene, view, camera, holes, 1, room.rng).items
+        seen = Counter(room.items[k] for k in items[items != MISSING])
+        counts = np.array([seen[name] for name in names])
+        pixels, present = pixels + counts, present + (counts > 0)
+        total += items.size
+        unknown += seen[UNKNOWN]
+        missing += int((items == MISSING).sum())
+    shares = dict(zip(names, pixels / total, strict=True))
+    assert min(shares.values()) > 0.015, shares
+    assert (present / len(rooms)).min() > 0.45
+    assert unknown > 0
+    assert 0.02 < missing / total < 0.15
+
+
+def test_colour_alone_does_not_give_the_class(rooms: list[Room]) -> None:
+    """The nearest mean colour of a class, learned on half the rooms, hardly beats guessing."""
+    samples = [
+        (room.items[part.item], part.material.color, k % 2)
+        for k, room in enumerate(rooms)
+        for part in room.parts
+        if room.items[part.item] != UNKNOWN
+    ]
+    names = np.array([name for name, _, _ in samples])
+    values = np.array([color for _, color, _ in samples])
+    half = np.array([h for _, _, h in samples])
+    means = np.array([values[(names == c) & (half == 0)].mean(axis=0) for c in INSTANCES])
+    nearest = np.linalg.norm(values[half == 1][:, None] - means, axis=-1).argmin(axis=1)
+    truth = names[half == 1]
+    guessed = np.array(list(INSTANCES))[nearest]
+    recall = [np.mean(guessed[truth == c] == c) for c in INSTANCES]
+    assert np.mean(recall) < 0.3  # guessing: 0.08

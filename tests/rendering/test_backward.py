@@ -1,0 +1,164 @@
+"""Tangent images back to panoramas."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from tangent_train.errors import SettingError
+from tangent_train.geometry import TangentGrid, equirect_directions, random_rotation
+from tangent_train.rendering import equirect_to_tangent, tangent_to_equirect, tangent_to_labels
+
+BLENDS = ["nearest", "feather"]
+SHAPES = [(64, 128), (63, 125), (50, 70)]
+TURNED = TangentGrid(0, 5, dim=28, rotation=random_rotation(np.random.default_rng(1)))
+GRIDS = [TangentGrid(0, 5), TangentGrid(1, 6, dim=24), TURNED]
+
+
+@pytest.mark.parametrize("blend", BLENDS)
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("grid", GRIDS)
+def test_constants_stay_constant(grid: TangentGrid, shape: tuple[int, int], blend: Any) -> None:
+    ones = torch.ones(grid.num_images, 1, grid.dim, grid.dim, dtype=torch.float64)
+    panorama = tangent_to_equirect(ones, grid, shape, blend)
+    torch.testing.assert_close(panorama, torch.ones(1, *shape, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("blend", BLENDS)
+@pytest.mark.parametrize("grid", GRIDS)
+def test_round_trip_of_a_smooth_panorama(grid: TangentGrid, blend: Any) -> None:
+    x, y, z = np.moveaxis(equirect_directions((64, 128)), -1, 0)
+    image = np.stack([x * y + z, y - z * x, x], axis=-1)
+    again = tangent_to_equirect(equirect_to_tangent(image, grid), grid, (64, 128), blend)
+    # Twice bilinear, and feathering reads half a pixel beyond the outermost centres.
+    np.testing.assert_allclose(again, image, atol=6e-3)
+
+
+@pytest.mark.parametrize("base_level", range(5))
+@pytest.mark.parametrize("shape", [(32, 64), (31, 63)])
+def test_one_class_everywhere(base_level: int, shape: tuple[int, int]) -> None:
+    """No other value anywhere: not at the poles, not at the seam, not between images."""
+    grid = TangentGrid(base_level, base_level + 4)
+    panorama = np.full(shape, 3, np.uint8)
+    for interpolation in ("nearest", "bilinear"):
+        images = equirect_to_tangent(panorama, grid, interpolation=interpolation)
+        assert (images == 3).all()
+    scores = np.eye(5, dtype=np.float32)[images].transpose(0, 3, 1, 2)
+    for blend in ("nearest", "feather"):
+        assert (tangent_to_labels(scores, grid, shape, blend) == 3).all()
+
+
+@pytest.mark.parametrize("blend", BLENDS)
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("grid", GRIDS)
+def test_labels_are_the_argmax_of_the_rendered_scores(
+    grid: TangentGrid, shape: tuple[int, int], blend: Any
+) -> None:
+    rng = np.random.default_rng(0)
+    scores = rng.standard_normal((2, grid.num_images, 6, grid.dim, grid.dim), np.float32)
+    rendered = tangent_to_equirect(torch.from_numpy(scores).double(), grid, shape, blend)
+    best, expected = rendered.max(dim=1)
+    compiled = tangent_to_labels(scores, grid, shape, blend)
+    assert compiled.dtype == np.uint8
+    assert compiled.shape == (2, *shape)
+    chosen = torch.from_numpy(compiled)[:, None].long()
+    torch.testing.assert_close(rendered.gather(1, chosen)[:, 0], best, atol=1e-5, rtol=0)
+    tensor = tangent_to_labels(torch.from_numpy(scores), grid, shape, blend)
+    assert tensor.dtype == torch.int64
+    np.testing.assert_array_equal(tensor.numpy(), compiled)
+    exact = tangent_to_labels(torch.from_numpy(scores).double(), grid, shape, blend)
+    torch.testing.assert_close(exact, expected)
+
+
+def test_equal_and_infinite_scores() -> None:
+    grid = TangentGrid(0, 4)
+    scores = np.zeros((20, 3, 16, 16), np.float32)
+    assert not tangent_to_labels(scores, grid, (16, 32)).any()
+    scores[:, 0] = -np.inf
+    for blend in ("nearest", "feather"):
+        labels = tangent_to_labels(scores, grid, (16, 32), blend)
+        assert (labels == 1).all()
+
+
+def test_many_classes() -> None:
+    grid = TangentGrid(0, 3)
+    scores = np.zeros((20, 300, 8, 8), np.float32)
+    scores[:, 299] = 1
+    labels = tangent_to_labels(scores, grid, (8, 16))
+    assert labels.dtype == np.uint16
+    assert (labels == 299).all()
+
+
+def test_feathering_is_continuous_across_borders() -> None:
+    """Along a meridian, no step is larger than a smooth function of these images would make."""
+    grid = TangentGrid(0, 4)
+    values = torch.arange(20, dtype=torch.float64)[:, None, None, None].expand(20, 1, 16, 16)
+    steps = []
+    for height in (512, 1024):
+        panorama = tangent_to_equirect(values, grid, (height, 4), "feather")
+        steps.append(panorama.diff(dim=1).abs().max().item())
+    assert steps[1] == pytest.approx(steps[0] / 2, rel=0.05)  # a jump would stay as it is
+    sharp = tangent_to_equirect(values, grid, (1024, 4), "nearest")
+    assert sharp.diff(dim=1).abs().max() >= 1
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int32, np.float32, np.float64])
+@pytest.mark.parametrize("channels", [(), (2,)])
+@pytest.mark.parametrize("blend", BLENDS)
+def test_arrays_agree_with_tensors(dtype: Any, channels: tuple[int, ...], blend: Any) -> None:
+    grid = TangentGrid(0, 4)
+    images = (np.random.default_rng(0).random((20, 16, 16, *channels)) * 250).astype(dtype)
+    images.setflags(write=False)
+    tensor = torch.from_numpy(images.astype(np.float64).reshape(20, 16, 16, -1)).movedim(-1, 1)
+    expected = tangent_to_equirect(tensor, grid, (15, 32), blend).movedim(0, -1).numpy()
+    found = tangent_to_equirect(images, grid, (15, 32), blend)
+    assert (found.dtype, found.shape) == (dtype, (15, 32, *channels))
+    tolerance = 0.501 if np.dtype(dtype).kind in "ui" else 1e-4
+    np.testing.assert_allclose(found.reshape(expected.shape), expected, atol=tolerance)
+
+
+def test_batches_and_dtypes_are_kept() -> None:
+    grid = TangentGrid(0, 4)
+    images = torch.rand(2, 3, 20, 4, 16, 16)
+    panorama = tangent_to_equirect(images, grid, (16, 32))
+    assert panorama.shape == (2, 3, 4, 16, 32)
+    torch.testing.assert_close(panorama[1, 2], tangent_to_equirect(images[1, 2], grid, (16, 32)))
+    half = tangent_to_equirect(images.bfloat16(), grid, (16, 32))
+    assert half.dtype == torch.bfloat16
+    assert tangent_to_labels(images[:0], grid, (16, 32)).shape == (0, 3, 16, 32)
+
+
+@pytest.mark.parametrize("blend", BLENDS)
+def test_gradients(blend: Any) -> None:
+    grid = TangentGrid(0, 3)
+    images = torch.rand(20, 1, 8, 8, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(
+        lambda x: tangent_to_equirect(x, grid, (5, 9), blend), images, fast_mode=True
+    )
+
+
+@pytest.mark.parametrize(
+    ("images", "shape", "blend", "message"),
+    [
+        (torch.zeros(19, 1, 16, 16), (8, 16), "nearest", r"expected \(..., 20, channels, 16, 16\)"),
+        (torch.zeros(20, 16, 16), (8, 16), "nearest", "tangent images: found shape|scores"),
+        (np.zeros((20, 1, 16, 15), np.float32), (8, 16), "nearest", "found shape"),
+        (torch.zeros(20, 1, 16, 16, dtype=torch.int64), (8, 16), "nearest", "int64"),
+        (torch.zeros(20, 1, 16, 16), (0, 16), "nearest", "shape"),
+        (torch.zeros(20, 1, 16, 16), (8, 16, 3), "nearest", "shape"),
+        (torch.zeros(20, 1, 16, 16), (8.0, 16), "nearest", "shape"),
+        (torch.zeros(20, 1, 16, 16), (8, 16), "linear", "blend"),
+    ],
+)
+@pytest.mark.parametrize("render", [tangent_to_equirect, tangent_to_labels])
+def test_errors(render: Any, images: Any, shape: Any, blend: Any, message: str) -> None:
+    with pytest.raises(SettingError, match=message):
+        render(images, TangentGrid(0, 4), shape, blend)
+
+
+def test_scores_need_a_class() -> None:
+    with pytest.raises(SettingError, match="no class"):
+        tangent_to_labels(np.zeros((20, 0, 16, 16), np.float32), TangentGrid(0, 4), (8, 16))
