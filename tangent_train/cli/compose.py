@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hydra import compose, initialize_config_dir
+from hydra._internal.utils import get_args_parser
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -51,15 +52,16 @@ def with_stored_config(command: str, arguments: list[str]) -> tuple[str, list[st
     if command == "train" and given.get("resume") not in (None, "", "null"):
         folder = Path(given["resume"]).absolute()
         stored = _run_config(folder)
+        stored["resume"] = str(folder)
         arguments = [a for a in arguments if not a.startswith("resume=")]
-        arguments += [f"resume='{folder}'", f"hydra.run.dir='{folder}'"]
+        run_folder = str(folder)
     elif command == "evaluate" and given.get("checkpoint") not in (None, ""):
         stored = checkpoint_config(Path(given["checkpoint"]))
         stored["checkpoint"] = None
-        folder_now = "runs/evaluate/${now:%Y-%m-%d_%H-%M-%S}"
-        stored["hydra"] = {"run": {"dir": folder_now}, "sweep": {"dir": folder_now}}
+        run_folder = "runs/evaluate/${now:%Y-%m-%d_%H-%M-%S}"
     else:
         return command, arguments
+    stored["hydra"] = {"run": {"dir": run_folder}, "sweep": {"dir": run_folder}}
     ConfigStore.instance().store(f"stored_{command}", stored)
     return f"stored_{command}", arguments
 
@@ -116,7 +118,7 @@ def check_overrides(config_name: str, arguments: list[str]) -> None:
     Raises:
         SettingError: A setting, group or option is unknown, or an override cannot be parsed.
     """
-    texts = [argument for argument in arguments if not argument.startswith("-")]
+    texts = get_args_parser().parse_args(arguments).overrides
     with initialize_config_dir(str(config_folder()), version_base="1.3"):
         loader = GlobalHydra.instance().config_loader()
         try:

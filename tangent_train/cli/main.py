@@ -60,6 +60,8 @@ def _compose_and_run(command: str, typed: list[str]) -> None:
         except (DataError, SettingError) as error:
             sys.exit(f"tangent-{command}: {error}")
 
-    # Lightning prints its own messages; Hydra's handler would print them again.
-    sys.argv[1:] = [*arguments, "hydra/job_logging=none"]
+    # Lightning prints its own messages: Hydra's handlers would print them again. argparse wants all
+    # overrides in one place.
+    place = next((i for i, a in enumerate(arguments) if "=" in a and a[0] != "-"), len(arguments))
+    sys.argv[1:] = [*arguments[:place], "hydra/job_logging=none", *arguments[place:]]
     hydra.main(version_base="1.3", config_path=str(config_folder()), config_name=config_name)(job)()
