@@ -201,5 +201,5 @@ def pose_record(
         "camera_rt_matrix": pose.rt_matrix.tolist(),
         "final_camera_rotation": pose.euler_angles.tolist(),
         "camera_uuid": name.camera,
-        "room": str(name.room),
+        "room": f"{name.room}_{name.room.area[0]}",
     }

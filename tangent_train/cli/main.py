@@ -62,6 +62,7 @@ def _compose_and_run(command: str, typed: list[str]) -> None:
 
     # Lightning prints its own messages: Hydra's handlers would print them again. argparse wants all
     # overrides in one place.
+    quiet = ["hydra/job_logging=none", "hydra/hydra_logging=none"]
     place = next((i for i, a in enumerate(arguments) if "=" in a and a[0] != "-"), len(arguments))
-    sys.argv[1:] = [*arguments[:place], "hydra/job_logging=none", *arguments[place:]]
+    sys.argv[1:] = [*arguments[:place], *quiet, *arguments[place:]]
     hydra.main(version_base="1.3", config_path=str(config_folder()), config_name=config_name)(job)()

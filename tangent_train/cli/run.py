@@ -27,7 +27,10 @@ from tangent_train.tasks.callbacks import (
 )
 from tangent_train.tasks.results import evaluation_results, results_table, write_results
 
-__all__ = ["evaluate", "prepare", "train"]
+__all__ = ["build", "evaluate", "prepare", "train"]
+
+# lightning 2.6 asks torch's tree library in a way torch ≥ 2.13 deprecates: nothing to do about it.
+warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)`", FutureWarning)
 
 
 def train(config: DictConfig) -> None:

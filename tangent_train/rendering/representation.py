@@ -137,9 +137,11 @@ class TangentRepresentation:
     def sample(self, rng: np.random.Generator) -> Views:
         """A random subset of the faces of a (perhaps) turned icosahedron."""
         grid = self.grid
-        rotation = _draw_rotation(self.rotation, rng)
-        if rotation is not None:
-            grid = TangentGrid(grid.base_level, grid.level, grid.dim, rotation)
+        if self.rotation != "none":
+            yaw = self.rotation == "yaw"
+            angle = rng.uniform(0, 2 * math.pi)
+            turn = rotation_about((0, 0, 1), angle) if yaw else random_rotation(rng)
+            grid = TangentGrid(grid.base_level, grid.level, grid.dim, turn)
         faces = None
         if self.faces_per_panorama is not None:
             faces = rng.choice(grid.num_images, self.faces_per_panorama, replace=False)
@@ -186,7 +188,7 @@ class EquirectRepresentation:
         level: Level s of the panorama.
         crop_deg: Width of the training crops in degrees of longitude, full height, at a random
             longitude and across the seam; the whole image by default.
-        rotation: Rotation of the panorama while training.
+        rotation: Rotation of the panorama while training; about the vertical by whole columns.
         mirror: Mirror half of the training samples left to right.
         erp_height: Rows of the panorama, default `equirect_shape(level)`.
 
@@ -212,9 +214,10 @@ class EquirectRepresentation:
     def sample(self, rng: np.random.Generator) -> Views:
         """The panorama or one crop of it, (perhaps) turned."""
         columns = None
-        if self.crop_deg is not None:
-            columns = (rng.random(), round(2 * self.erp_height * self.crop_deg / 360))
-        rotation = _draw_rotation(self.rotation, rng)
+        if self.crop_deg is not None or self.rotation == "yaw":
+            width = round(2 * self.erp_height * (self.crop_deg or 360) / 360)
+            columns = (rng.random(), width)
+        rotation = random_rotation(rng) if self.rotation == "so3" else None
         return _EquirectViews(rotation, columns, self.mirror and bool(rng.random() < 0.5))
 
     def whole(self) -> Views:
@@ -232,16 +235,6 @@ class EquirectRepresentation:
                 expected=f"one image of {shape[0]}×{shape[1]}",
             )
         return scores[0].argmax(dim=0)
-
-
-def _draw_rotation(
-    kind: RotationAugmentation, rng: np.random.Generator
-) -> NDArray[np.float64] | None:
-    if kind == "none":
-        return None
-    if kind == "yaw":
-        return rotation_about((0, 0, 1), rng.uniform(0, 2 * math.pi))
-    return random_rotation(rng)
 
 
 def _checked_choice(name: str, value: _Choice, allowed: tuple[str, ...]) -> _Choice:

@@ -24,7 +24,10 @@ SETTINGS = [
     "data.panoramas_per_step=2",
     "data.validation_fraction=0.2",
     "data.rooms.height=32",
-    *(f"data.rooms.rooms.area_{area}={n}" for area, n in zip(AREAS, (2, 2, 1, 1, 1, 1, 1), strict=True)),
+    *(
+        f"data.rooms.rooms.area_{area}={n}"
+        for area, n in zip(AREAS, (2, 2, 1, 1, 1, 1, 1), strict=True)
+    ),
     "trainer.max_epochs=2",
     "trainer.check_val_every_n_epoch=1",
     "trainer.accelerator=cpu",

@@ -64,10 +64,11 @@ def test_a_ramp_across_the_seam_has_no_step() -> None:
 def test_numpy_and_torch_agree(shape: tuple[int, int], interpolation: Any) -> None:
     image = _random((*shape, 3))
     for grid in (TangentGrid(0, 5), TURNED):
-        expected = equirect_to_tangent(torch.from_numpy(image).movedim(-1, 0), grid, [0, 7, 19],
-                                       interpolation)  # fmt: skip
+        tensor = torch.from_numpy(image).movedim(-1, 0)
+        expected = equirect_to_tangent(tensor, grid, [0, 7, 19], interpolation)
         for dtype, tolerance in ((np.float64, 1e-12), (np.float32, 2e-5)):
-            found = equirect_to_tangent(image.astype(dtype), grid, [0, 7, 19], interpolation)
+            array: Array = image.astype(dtype)
+            found = equirect_to_tangent(array, grid, [0, 7, 19], interpolation)
             exact = 1e-7 if interpolation == "nearest" else tolerance
             np.testing.assert_allclose(found, expected.movedim(1, -1).numpy(), atol=exact)
 

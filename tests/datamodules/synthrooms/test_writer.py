@@ -101,7 +101,7 @@ def test_poses_have_every_key_and_agree_with_themselves(panorama: bool) -> None:
         "room",
     }
     assert record["camera_uuid"] == record["point_uuid"] == NAME.camera
-    assert record["room"] == "WC_17"
+    assert record["room"] == "WC_17_5"
     assert record["frame_num"] == ("equirectangular" if panorama else "4")
     # As the real set's: Blender's camera looks along -z with +y up.
     final = euler_rotation(np.array(record["final_camera_rotation"]))
