@@ -73,7 +73,9 @@ def test_a_run_leaves_everything_in_its_folder(run_folder: Path) -> None:
     assert list((run_folder / "tensorboard").glob("events.*"))
     assert (run_folder / "config.yaml").is_file()
     (panel,) = (run_folder / "panels").glob("*.png")
-    assert cv2.imread(str(panel)).shape[1] == 2 * 64 + 8
+    picture = cv2.imread(str(panel))
+    assert picture is not None
+    assert picture.shape[1] == 2 * 64 + 8
 
 
 def test_checkpoints_hold_tensors_and_plain_values_only(run_folder: Path) -> None:

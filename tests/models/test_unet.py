@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 from torch import nn
@@ -29,7 +31,7 @@ def test_scores_have_the_size_of_the_images(size: tuple[int, int]) -> None:
 def test_averaging_first_equals_halving_after_the_first_convolution() -> None:
     down = _Down(6, 10).eval()
     x = torch.randn(2, 6, 8, 12)
-    residual = down[1]
+    residual: Any = down[1]
     first, *rest = residual.body
 
     def halve(y: torch.Tensor) -> torch.Tensor:

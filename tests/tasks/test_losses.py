@@ -27,10 +27,7 @@ def test_parts_add_up_to_the_gradient_of_the_whole() -> None:
     weights = torch.tensor([1.0, 0.5, 2.0], dtype=torch.float64)
     whole = cross_entropy_sum(scores, labels, weights)
     (expected,) = torch.autograd.grad(whole.total / whole.norm, scores)
-    parts = [
-        cross_entropy_sum(s, t, weights)
-        for s, t in zip(scores.split(2), labels.split(2), strict=True)
-    ]
+    parts = [cross_entropy_sum(scores[k : k + 2], labels[k : k + 2], weights) for k in (0, 2, 4)]
     norm = torch.stack([part.norm for part in parts]).sum()
     (summed,) = torch.autograd.grad(sum(part.total for part in parts) / norm, scores)
     torch.testing.assert_close(summed, expected)
@@ -40,6 +37,5 @@ def test_nothing_labelled_gives_zero_and_no_nan() -> None:
     scores = torch.randn(1, 3, 2, 2, requires_grad=True)
     loss = cross_entropy_sum(scores, torch.zeros(1, 2, 2, dtype=torch.uint8), torch.ones(3))
     assert float(loss.norm) == 0
-    loss.total.backward()
-    assert scores.grad is not None
-    assert float(scores.grad.abs().max()) == 0
+    (gradient,) = torch.autograd.grad(loss.total, scores)
+    assert float(gradient.abs().max()) == 0

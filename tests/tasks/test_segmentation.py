@@ -22,13 +22,13 @@ SHAPE = (32, 64)
 class Training(NamedTuple):
     images: Tensor
     labels: Tensor
-    index: int
+    index: int  # type: ignore[assignment]  # nobody needs tuple.index
 
 
 class Evaluation(NamedTuple):
     images: Tensor
     target: Tensor
-    index: int
+    index: int  # type: ignore[assignment]  # nobody needs tuple.index
 
 
 class Data(lightning.LightningDataModule):
