@@ -15,6 +15,7 @@ __all__ = ["class_colors", "colorize", "prediction_panel"]
 
 _Image = NDArray[np.uint8]
 _MARGIN = 8
+_LEAST_ROWS = 256
 
 
 def class_colors(num_classes: int) -> _Image:
@@ -58,7 +59,8 @@ def prediction_panel(
         class_names: K + 1 names.
 
     Returns:
-        RGB image, about 2W × 2H. Errors are red, unknown truth is grey.
+        RGB image, about 2W × 2H; panoramas of less than 256 rows are shown in whole multiples of
+        their size. Errors are red, unknown truth is grey.
     """
     count = len(class_names)
     error = np.full((*truth.shape, 3), 255, np.uint8)
@@ -70,7 +72,11 @@ def prediction_panel(
         "prediction": colorize(prediction, count),
         "error": error,
     }
-    titled = [_titled(image, title) for title, image in tiles.items()]
+    scale = max(1, _LEAST_ROWS // truth.shape[0])
+    titled = [
+        _titled(image.repeat(scale, axis=0).repeat(scale, axis=1), title)
+        for title, image in tiles.items()
+    ]
     gap = np.full((titled[0].shape[0], _MARGIN, 3), 255, np.uint8)
     grid = np.concatenate([np.concatenate([titled[k], gap, titled[k + 1]], axis=1) for k in (0, 2)])
     seen = np.union1d(np.unique(truth), np.unique(prediction))

@@ -75,7 +75,7 @@ def test_a_run_leaves_everything_in_its_folder(run_folder: Path) -> None:
     (panel,) = (run_folder / "panels").glob("*.png")
     picture = cv2.imread(str(panel))
     assert picture is not None
-    assert picture.shape[1] == 2 * 64 + 8
+    assert picture.shape[1] == 2 * 512 + 8
 
 
 def test_checkpoints_hold_tensors_and_plain_values_only(run_folder: Path) -> None:

@@ -16,14 +16,18 @@ def test_colours_are_distinct_and_unknown_is_black(count: int) -> None:
     assert distances.min() > 15
 
 
-def test_the_panel_shows_input_truth_prediction_and_error() -> None:
+@pytest.mark.parametrize(("rows", "scale"), [(100, 2), (256, 1), (300, 1)])
+def test_the_panel_shows_input_truth_prediction_and_error(rows: int, scale: int) -> None:
     rng = np.random.default_rng(0)
-    rgb = rng.integers(0, 256, (40, 80, 3), np.uint8)
-    truth = rng.integers(0, 3, (40, 80))
+    rgb = rng.integers(0, 256, (rows, 2 * rows, 3), np.uint8)
+    truth = rng.integers(0, 3, (rows, 2 * rows))
     prediction = np.where(truth == 0, 1, truth)
     prediction[:, :10] = 3
     panel = prediction_panel(rgb, truth, prediction, NAMES)
-    top, bottom, left, right = slice(22, 62), slice(84, 124), slice(0, 80), slice(88, 168)
+    height, width = scale * rows, scale * 2 * rows
+    top, left = slice(22, 22 + height, scale), slice(0, width, scale)
+    bottom = slice(44 + height, 44 + 2 * height, scale)
+    right = slice(width + 8, 2 * width + 8, scale)
     np.testing.assert_array_equal(panel[top, left], rgb)
     np.testing.assert_array_equal(panel[top, right], colorize(truth, 4))
     np.testing.assert_array_equal(panel[bottom, left], colorize(prediction, 4))
@@ -31,4 +35,4 @@ def test_the_panel_shows_input_truth_prediction_and_error() -> None:
     assert np.all(error[(truth == 0)] == 160)
     assert np.all(error[(truth != 0) & (prediction == truth)] == 255)
     assert np.all(error[(truth != 0) & (prediction != truth)] == (214, 39, 40))
-    assert panel.shape[0] > 124, "a legend follows"
+    assert panel.shape[0] > 44 + 2 * height, "a legend follows"
