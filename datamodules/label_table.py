@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,8 +12,6 @@ import numpy as np
 from tangent_train.errors import DataError
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from numpy.typing import NDArray
 
 __all__ = ["CLASSES", "UNKNOWN", "LabelTable"]
@@ -54,7 +53,7 @@ class LabelTable:
     class_ids: NDArray[np.uint8]
 
     @classmethod
-    def from_json(cls, path: Path) -> LabelTable:
+    def from_json(cls, path: str | Path) -> LabelTable:
         """Read `semantic_labels.json`, a list of names ``class_instance_room_number_area``.
 
         Args:
@@ -66,7 +65,7 @@ class LabelTable:
         expected = f"a JSON list of names that begin with {', '.join(CLASSES)} or <UNK>"
         remedy = "Copy semantic_labels.json of the Stanford2D3DS release."
         try:
-            names = json.loads(path.read_bytes())
+            names = json.loads(Path(path).read_bytes())
         except (OSError, ValueError) as error:
             raise DataError(path, found=error, expected=expected, remedy=remedy) from error
         if not isinstance(names, list) or not names:

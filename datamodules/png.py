@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import struct
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 
 import cv2
 import numpy as np
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 __all__ = ["PngHeader", "read_color_png", "read_depth_png", "read_png_header"]
 
 _START = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR"
-_END = b"\x00\x00\x00\x00IEND\xaeB`\x82"
 _HEADER_BYTES = 26  # the signature, IHDR's length and name, then its first ten bytes
 _COLOR_TYPES = {0: "grey", 2: "RGB", 3: "palette", 4: "grey with alpha", 6: "RGBA"}
 _REMEDY = "Copy or extract the file again."
@@ -35,30 +34,42 @@ class PngHeader(NamedTuple):
 
 
 def read_png_header(path: Path) -> PngHeader:
-    """Read the first and last bytes of a PNG file.
+    """Read the header of a PNG file and follow its chunks to the end, decoding nothing.
 
     Args:
         path: The file.
 
     Raises:
-        DataError: It cannot be read, is no PNG, or ends early.
+        DataError: It cannot be read, is no PNG, or parts are missing.
     """
     try:
         with path.open("rb") as file:
             start = file.read(_HEADER_BYTES)
             size = file.seek(0, os.SEEK_END)
-            file.seek(max(0, size - len(_END)))
-            end = file.read()
+            whole = _chunks_end(file) == size
     except OSError as error:
         raise DataError(path, found=error, expected="a PNG file", remedy=_REMEDY) from error
     if len(start) < _HEADER_BYTES or not start.startswith(_START):
         raise DataError(path, found="no PNG header", expected="a PNG file", remedy=_REMEDY)
-    if end != _END:
+    if not whole:
         raise DataError(
-            path, found=f"a PNG cut off after {size} bytes", expected="all of it", remedy=_REMEDY
+            path, found=f"{size} bytes, parts missing", expected="a whole PNG", remedy=_REMEDY
         )
     width, height, bits, color = struct.unpack(">IIBB", start[len(_START) :])
     return PngHeader(height, width, bits, _COLOR_TYPES.get(color, f"color type {color}"))
+
+
+def _chunks_end(file: BinaryIO) -> int | None:
+    """Where the IEND chunk ends, following the lengths of the chunks; None if there is none."""
+    position = 8
+    while True:
+        file.seek(position)
+        head = file.read(8)
+        if len(head) < 8 or not head[4:].isalpha():
+            return None
+        position += 12 + int.from_bytes(head[:4], "big")
+        if head[4:] == b"IEND":
+            return position
 
 
 def read_color_png(path: Path) -> NDArray[np.uint8]:

@@ -52,7 +52,7 @@ class EpochSampler(Sampler[tuple[int, int]]):
         world_size: Number of processes.
 
     Raises:
-        SettingError: Training with fewer samples than processes, or an impossible rank.
+        SettingError: Fewer samples than processes, or an impossible rank.
     """
 
     def __init__(
@@ -60,12 +60,12 @@ class EpochSampler(Sampler[tuple[int, int]]):
     ) -> None:
         if not 0 <= rank < world_size:
             raise SettingError("rank", found=rank, expected=f"0 to {world_size - 1}")
-        if shuffle and length < world_size:
+        if length < world_size:
             raise SettingError(
                 "trainer.devices",
-                found=f"{world_size} processes for {length} training samples",
-                expected="at least one sample each",
-                remedy="Train on fewer processes.",
+                found=f"{world_size} processes for {length} samples",
+                expected="at least one sample each, in every split",
+                remedy="Use fewer processes.",
             )
         self._length = length
         self._seed = seed

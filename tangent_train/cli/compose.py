@@ -25,6 +25,10 @@ if TYPE_CHECKING:
 __all__ = ["check_overrides", "checkpoint_config", "config_folder", "with_stored_config"]
 
 
+_STORED = "stored_"
+"""Begins the names of configs that come from a run or a checkpoint."""
+
+
 def config_folder() -> Path:
     """The Hydra tree: the copy inside the wheel first, the checkout's second."""
     package = Path(__file__).resolve().parents[1]
@@ -56,14 +60,16 @@ def with_stored_config(command: str, arguments: list[str]) -> tuple[str, list[st
         arguments = [a for a in arguments if not a.startswith("resume=")]
         run_folder = str(folder)
     elif command == "evaluate" and given.get("checkpoint") not in (None, ""):
-        stored = checkpoint_config(Path(given["checkpoint"]))
-        stored["checkpoint"] = None
+        path = Path(given["checkpoint"]).absolute()
+        stored = checkpoint_config(path)
+        stored["checkpoint"] = str(path)
+        arguments = [a for a in arguments if not a.startswith("checkpoint=")]
         run_folder = "runs/evaluate/${now:%Y-%m-%d_%H-%M-%S}"
     else:
         return command, arguments
     stored["hydra"] = {"run": {"dir": run_folder}, "sweep": {"dir": run_folder}}
-    ConfigStore.instance().store(f"stored_{command}", stored)
-    return f"stored_{command}", arguments
+    ConfigStore.instance().store(_STORED + command, stored)
+    return _STORED + command, arguments
 
 
 def _run_config(folder: Path) -> dict[str, Any]:
@@ -118,7 +124,10 @@ def check_overrides(config_name: str, arguments: list[str]) -> None:
     Raises:
         SettingError: A setting, group or option is unknown, or an override cannot be parsed.
     """
-    texts = get_args_parser().parse_args(arguments).overrides
+    options = get_args_parser().parse_args(arguments)
+    texts = options.overrides
+    if options.config_dir:
+        texts = [*texts, f"hydra.searchpath=['file://{Path(options.config_dir).absolute()}']"]
     with initialize_config_dir(str(config_folder()), version_base="1.3"):
         loader = GlobalHydra.instance().config_loader()
         try:
@@ -128,20 +137,26 @@ def check_overrides(config_name: str, arguments: list[str]) -> None:
                 f"override '{error.override}'", found="no override", expected="setting=value"
             ) from error
         plain = [o for o in overrides if not (o.is_add() or o.is_delete() or o.is_hydra_override())]
-        groups = [o for o in plain if _options(loader, o.key_or_group)]
+        search = [str(o.input_line) for o in overrides if o.key_or_group == "hydra.searchpath"]
+        groups = [o for o in plain if _options(loader, o.key_or_group, search)]
+        if groups and config_name.startswith(_STORED):
+            raise SettingError(
+                groups[0].key_or_group,
+                found=f"'{groups[0].input_line}'",
+                expected="overrides of single settings, as in data.fold=2",
+                remedy="A stored config has its choices made; start a new run for others.",
+            )
         for override in groups:
-            _check_option(loader, override)
-        config = compose(
-            config_name, [str(o.input_line) for o in groups if not o.is_sweep_override()]
-        )
+            _check_option(override, _options(loader, override.key_or_group, search))
+        chosen = [str(o.input_line) for o in groups if not o.is_sweep_override()]
+        config = compose(config_name, [*search, *chosen])
     names = list(dict.fromkeys([*_dotted(config), *_group_names(loader)]))
     for override in plain:
         if override not in groups and override.key_or_group not in names:
             _refuse("setting", override.key_or_group, names)
 
 
-def _check_option(loader: ConfigLoader, override: Override) -> None:
-    options = _options(loader, override.key_or_group)
+def _check_option(override: Override, options: list[str]) -> None:
     wanted = (
         override.sweep_string_iterator() if override.is_sweep_override() else [override.value()]
     )
@@ -159,11 +174,13 @@ def _refuse(kind: str, found: str, known: list[str]) -> None:
     raise SettingError(f"unknown {kind}", found=f"'{found}'", expected=listed, remedy=remedy)
 
 
-def _options(loader: ConfigLoader, group: str) -> list[str]:
+def _options(loader: ConfigLoader, group: str, search: list[str]) -> list[str]:
     """Options of a config group, those of its sub-folders as ``folder/option``."""
-    options = list(loader.get_group_options(group))
+    options = list(loader.get_group_options(group, overrides=search))
     for folder in loader.list_groups(group):
-        options += [f"{folder}/{option}" for option in _options(loader, f"{group}/{folder}")]
+        options += [
+            f"{folder}/{option}" for option in _options(loader, f"{group}/{folder}", search)
+        ]
     return options
 
 

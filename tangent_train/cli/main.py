@@ -44,6 +44,7 @@ def _main(command: str) -> None:
 
 def _compose_and_run(command: str, typed: list[str]) -> None:
     import hydra
+    from hydra.errors import InstantiationException
 
     from tangent_train.cli.compose import check_overrides, config_folder, with_stored_config
 
@@ -59,6 +60,10 @@ def _compose_and_run(command: str, typed: list[str]) -> None:
             getattr(run, command)(config)
         except (DataError, SettingError) as error:
             sys.exit(f"tangent-{command}: {error}")
+        except InstantiationException as error:
+            if isinstance(error.__cause__, DataError | SettingError):
+                sys.exit(f"tangent-{command}: {error.__cause__}")
+            raise
 
     # Lightning prints its own messages: Hydra's handlers would print them again. argparse wants all
     # overrides in one place.

@@ -7,8 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import lightning
+import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from hydra.utils import instantiate
 from lightning.pytorch.callbacks import LearningRateMonitor
 from lightning.pytorch.loggers import TensorBoardLogger
@@ -18,6 +20,7 @@ from rich.console import Console
 
 from tangent_train.errors import SettingError
 from tangent_train.files import write_text
+from tangent_train.rendering import Representation
 from tangent_train.tasks.callbacks import (
     CheckpointConfig,
     LastCheckpoint,
@@ -45,17 +48,23 @@ def train(config: DictConfig) -> None:
     data, task = build(config)
     write_text(folder / "config.yaml", OmegaConf.to_yaml(config, resolve=True))
     callbacks = [LastCheckpoint(checkpoints), LearningRateMonitor()]
-    best = best_checkpoint(checkpoints) if data.validation_fraction else None
-    if best is not None:
-        callbacks.append(best)
+    if data.validation_fraction:
+        callbacks.append(best_checkpoint(checkpoints))
     trainer = _trainer(config, folder, callbacks)
+    if HydraConfig.get().mode == RunMode.MULTIRUN and trainer.num_devices > 1:
+        raise SettingError(
+            "trainer.devices",
+            found=f"{trainer.num_devices} devices in a sweep",
+            expected="1: further processes would each run the whole sweep",
+            remedy="Start the runs one by one.",
+        )
     resumed = None if config.resume is None else checkpoints / "last.ckpt"
     with warnings.catch_warnings():
         # The checkpoints of a resumed run are meant to be there.
         warnings.filterwarnings("ignore", "Checkpoint directory .* exists and is not empty")
         trainer.fit(task, datamodule=data, ckpt_path=resumed, weights_only=True)
-    chosen = best.best_model_path if best is not None else ""
-    _test(trainer, task, data, Path(chosen or checkpoints / "last.ckpt"), folder)
+    best = checkpoints / "best.ckpt"
+    _test(trainer, task, data, best if best.exists() else checkpoints / "last.ckpt", folder)
 
 
 def evaluate(config: DictConfig) -> None:
@@ -118,11 +127,23 @@ def build(config: DictConfig) -> tuple[Any, Any]:
         optimizer=instantiate(config.optimizer),
         scheduler=instantiate(config.scheduler),
     )
+    _try_network(task, representation, data.in_channels)
     return data, task
 
 
+def _try_network(task: Any, representation: Representation, channels: int) -> None:
+    """Run the network on one empty image: what does not fit shows before any data is made."""
+    panorama = np.zeros((representation.erp_height, 2 * representation.erp_height), np.uint8)
+    size = representation.whole().render(panorama, "nearest").shape[1:]
+    task.eval()
+    with torch.no_grad():
+        task(torch.zeros(1, channels, *size))
+    task.train()
+
+
 def _trainer(config: DictConfig, folder: Path, callbacks: list[Any]) -> lightning.Trainer:
-    plain: Any = OmegaConf.to_container(config, resolve=True)
+    # Not resolved: an override of level or seed still reaches everything that refers to it.
+    plain: Any = OmegaConf.to_container(config)
     panels = PredictionPanels(folder / "panels", config.panels)
     common = [CheckpointConfig(plain), panels, ProgressBar()]
     trainer: lightning.Trainer = instantiate(
@@ -138,7 +159,14 @@ def _trainer(config: DictConfig, folder: Path, callbacks: list[Any]) -> lightnin
 
 def _test(trainer: lightning.Trainer, task: Any, data: Any, checkpoint: Path, folder: Path) -> None:
     content = torch.load(checkpoint, map_location="cpu", weights_only=True)
-    task.load_state_dict(content["state_dict"])
+    try:
+        task.load_state_dict(content["state_dict"])
+    except RuntimeError as error:
+        raise SettingError(
+            "network",
+            found=f"other tensors than in {checkpoint} ({error})",
+            expected="the network and inputs of the checkpoint",
+        ) from error
     trainer.test(task, datamodule=data, verbose=False)
     results = evaluation_results(task.matrices, task.class_names, task.absent_class)
     total = len(data.source("test"))

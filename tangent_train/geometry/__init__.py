@@ -32,6 +32,7 @@ from tangent_train.geometry.grid import TangentGrid
 from tangent_train.geometry.icosphere import Icosphere, icosphere, vertex_resolution
 from tangent_train.geometry.sphere import (
     FLIP_Y,
+    checked_rotation,
     lonlat_to_xyz,
     random_rotation,
     rotation_about,
@@ -43,6 +44,7 @@ __all__ = [
     "Icosphere",
     "TangentGrid",
     "camera_matrix_from_fov",
+    "checked_rotation",
     "equirect_directions",
     "equirect_latitudes",
     "equirect_shape",

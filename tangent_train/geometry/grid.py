@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry.icosphere import icosphere, vertex_resolution
+from tangent_train.geometry.sphere import checked_rotation
 
 __all__ = ["Faces", "TangentGrid"]
 
@@ -127,7 +128,7 @@ class TangentGrid:
             "base_level": base_level,
             "level": level,
             "dim": 2 ** (level - base_level) if dim is None else dim,
-            "rotation": None if rotation is None else _checked_rotation(rotation),
+            "rotation": None if rotation is None else checked_rotation(rotation),
         }
         for name, value in values.items():
             object.__setattr__(self, name, value)
@@ -283,14 +284,3 @@ class TangentGrid:
 
 def _pitch(base_level: int, level: int) -> float:
     return vertex_resolution(base_level - 1) / float(2 ** (level - base_level))
-
-
-def _checked_rotation(rotation: ArrayLike) -> NDArray[np.float64]:
-    matrix = np.array(rotation, np.float64)
-    proper = matrix.shape == (3, 3) and np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-6)
-    if not proper or np.linalg.det(matrix) < 0:
-        raise SettingError(
-            "rotation", found=matrix.tolist(), expected="a 3×3 rotation matrix of determinant +1"
-        )
-    matrix.setflags(write=False)
-    return matrix

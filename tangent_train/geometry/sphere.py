@@ -5,7 +5,16 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["FLIP_Y", "lonlat_to_xyz", "random_rotation", "rotation_about", "xyz_to_lonlat"]
+from tangent_train.errors import SettingError
+
+__all__ = [
+    "FLIP_Y",
+    "checked_rotation",
+    "lonlat_to_xyz",
+    "random_rotation",
+    "rotation_about",
+    "xyz_to_lonlat",
+]
 
 FLIP_Y: NDArray[np.float64] = np.diag([1.0, -1.0, 1.0])
 """Sphere frame (y right) <-> right-handed room frame (y left); its own inverse."""
@@ -74,3 +83,22 @@ def random_rotation(rng: np.random.Generator) -> NDArray[np.float64]:
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
+
+
+def checked_rotation(rotation: ArrayLike) -> NDArray[np.float64]:
+    """A read-only copy of a rotation matrix.
+
+    Args:
+        rotation: ``(3, 3)``.
+
+    Raises:
+        SettingError: It is no proper rotation.
+    """
+    matrix = np.array(rotation, np.float64)
+    proper = matrix.shape == (3, 3) and np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-6)
+    if not proper or np.linalg.det(matrix) < 0:
+        raise SettingError(
+            "rotation", found=matrix.tolist(), expected="a 3×3 rotation matrix of determinant +1"
+        )
+    matrix.setflags(write=False)
+    return matrix

@@ -114,6 +114,7 @@ class TangentRepresentation:
         erp_height: int | None = None,
     ) -> None:
         if crop_multiple is not None:
+            _at_least("crop_multiple", crop_multiple, 1)
             if dim is not None:
                 raise SettingError(
                     "representation.dim", found=dim, expected="null beside crop_multiple"
@@ -132,7 +133,7 @@ class TangentRepresentation:
         self.rotation = _checked_choice("rotation", rotation, ("none", "yaw", "so3"))
         self.blend = _checked_choice("blend", blend, ("nearest", "feather"))
         self.mirror = mirror
-        self.erp_height = erp_height or equirect_shape(level)[0]
+        self.erp_height = _erp_height(erp_height, level)
 
     def sample(self, rng: np.random.Generator) -> Views:
         """A random subset of the faces of a (perhaps) turned icosahedron."""
@@ -206,7 +207,7 @@ class EquirectRepresentation:
     ) -> None:
         if crop_deg is not None and not 0 < crop_deg <= 360:
             raise SettingError("representation.crop_deg", found=crop_deg, expected="0 to 360")
-        self.erp_height = erp_height or equirect_shape(level)[0]
+        self.erp_height = _erp_height(erp_height, level)
         self.crop_deg = crop_deg
         self.rotation = _checked_choice("rotation", rotation, ("none", "yaw", "so3"))
         self.mirror = mirror
@@ -235,6 +236,16 @@ class EquirectRepresentation:
                 expected=f"one image of {shape[0]}×{shape[1]}",
             )
         return scores[0].argmax(dim=0)
+
+
+def _erp_height(rows: int | None, level: int) -> int:
+    return equirect_shape(level)[0] if rows is None else _at_least("erp_height", rows, 2)
+
+
+def _at_least(name: str, value: int, least: int) -> int:
+    if value < least:
+        raise SettingError(f"representation.{name}", found=value, expected=f"{least} or more")
+    return value
 
 
 def _checked_choice(name: str, value: _Choice, allowed: tuple[str, ...]) -> _Choice:

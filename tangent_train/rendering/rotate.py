@@ -7,7 +7,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tangent_train.errors import SettingError
+from tangent_train.geometry import checked_rotation
 from tangent_train.rendering.checks import check_interpolation, check_numpy_image
 from tangent_train.rendering.forward import Interpolation
 from tangent_train.rendering.kernels import directions_of_rows, rotation_map
@@ -69,13 +69,9 @@ def rotate_equirect(
     """
     check_interpolation(interpolation)
     check_numpy_image(image, interpolation)
-    matrix = np.asarray(rotation, np.float64)
-    proper = matrix.shape == (3, 3) and np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-6)
-    if not proper or np.linalg.det(matrix) < 0:
-        raise SettingError("rotation", found=matrix.tolist(), expected="a 3×3 rotation matrix")
     shape = image.shape[:2]
     u, v = np.empty((2, *shape), map_dtype(image.dtype == np.float64, interpolation))
-    inverse = np.ascontiguousarray(matrix.T)
+    inverse = np.ascontiguousarray(checked_rotation(rotation).T)
     over_rows(rotation_map, shape, inverse, *directions_of_rows(*shape), u, v)
     return _sampled(image, EquirectMap(u, v, shape), interpolation)
 

@@ -24,7 +24,7 @@ __all__ = [
 
 
 class CheckpointConfig(Callback):
-    """Puts the resolved config into every checkpoint, as plain values.
+    """Puts the config into every checkpoint, as plain values.
 
     Args:
         config: Nested dicts and lists of plain values.
@@ -128,12 +128,12 @@ class LastCheckpoint(Checkpoint):
         pl_module: lightning.LightningModule,
         exception: BaseException,
     ) -> None:
-        """Say how to go on."""
-        if trainer.is_global_zero and self.path.exists():
+        """Say how to go on after Ctrl-C; an error says for itself what to do."""
+        interrupted = isinstance(exception, KeyboardInterrupt) and trainer.is_global_zero
+        if interrupted and self.path.exists():
             run_folder = self.path.parent.parent
             Console(stderr=True).print(
-                f"Interrupted in epoch {trainer.current_epoch + 1} of {trainer.max_epochs}. "
-                f"Everything up to the epoch before is in {self.path}; go on with\n"
+                f"Interrupted. All finished epochs are in {self.path}; go on with\n"
                 f"  tangent-train resume={run_folder}",
                 soft_wrap=True,
                 highlight=False,

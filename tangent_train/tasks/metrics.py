@@ -154,12 +154,13 @@ class ConfusionMatrix(Metric):
         height, width = truth.shape
         latitudes = np.degrees(equirect_latitudes(height))
         band_of_row = np.searchsorted(-np.array(BAND_EDGES_DEG[1:-1]), -latitudes, side="left")
-        bands = torch.as_tensor(band_of_row, device=truth.device)[rows]
+        # Integers first, sums of them after: the same figures in any order, on any device.
+        by_row = torch.bincount(rows * k * k + pairs, minlength=height * k * k).reshape(
+            height, k, k
+        )
+        self.counts.index_add_(0, torch.as_tensor(band_of_row, device=truth.device), by_row)
         angles = torch.as_tensor(equirect_solid_angles((height, width)), device=truth.device)
-        counts = torch.bincount(bands * k * k + pairs, minlength=self.counts.numel())
-        self.counts += counts.reshape(self.counts.shape)
-        weighed = torch.bincount(pairs, weights=angles[rows], minlength=k * k)
-        self.steradians += weighed.reshape(k, k)
+        self.steradians += torch.tensordot(angles, by_row.double(), dims=1)
         self.panoramas += 1
 
     def compute(self) -> ConfusionMatrices:

@@ -81,8 +81,8 @@ class SegmentationTask(lightning.LightningModule):
         self.confusion = ConfusionMatrix(len(self.class_names))
 
     def setup(self, stage: str) -> None:
-        """Fix the class weights before training; evaluation takes them from the checkpoint."""
-        if stage != "fit":
+        """Fix the class weights before training; a checkpoint brings its own."""
+        if stage != "fit" or self.trainer.ckpt_path:
             return
         weights: Any = self.weighting
         if isinstance(weights, str):
@@ -116,6 +116,23 @@ class SegmentationTask(lightning.LightningModule):
                 remedy="Set network.num_classes to the number of classes, unknown included.",
             )
         return scores
+
+    def on_train_start(self) -> None:
+        """Refuse to resume a schedule that was made for another length of training.
+
+        Raises:
+            SettingError: The length has changed.
+        """
+        steps = int(self.trainer.estimated_stepping_batches)
+        for config in self.trainer.lr_scheduler_configs:
+            planned = getattr(config.scheduler, "total_steps", steps)
+            if planned != steps:
+                raise SettingError(
+                    "trainer.max_epochs",
+                    found=f"{steps} steps of training",
+                    expected=f"{planned}, which the schedule of the resumed run was made for",
+                    remedy="Resume with the same length, or start a new run.",
+                )
 
     def training_step(self, batch: Any, batch_idx: int) -> Tensor:
         """One gradient of the whole batch of spheres, over all processes."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -129,6 +130,73 @@ def test_an_interrupted_run_says_how_to_go_on_and_ends_the_same(
     assert "tangent-train resume=" in capsys.readouterr().err
     _run(monkeypatch, "train", f"resume={tmp_path / 'cut'}")
     assert _results(tmp_path / "cut") == _results(run_folder)
+
+
+def test_settings_of_the_checkpoint_reach_what_refers_to_them(
+    run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    odd = tmp_path / "a=b (1)" / "x.ckpt"
+    odd.parent.mkdir()
+    odd.write_bytes((run_folder / "checkpoints" / "best.ckpt").read_bytes())
+    arguments = [f"checkpoint={odd}", "data.test_rotation=so3"]
+    for seed in (1, 2):
+        _run(monkeypatch, "evaluate", *arguments, f"seed={seed}", f"hydra.run.dir={seed}")
+    first, second = (_results(tmp_path / str(seed))["confusion"] for seed in (1, 2))
+    assert first != second, "the seed of the test rotations"
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("representation=erp", "expected overrides of single settings"),
+        ("data.inputs=[rgb]", "network: found other tensors"),
+    ],
+)
+def test_what_a_checkpoint_cannot_do_is_refused(
+    run_folder: Path, override: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    checkpoint = run_folder / "checkpoints" / "best.ckpt"
+    with pytest.raises(SystemExit, match=message):
+        _run(monkeypatch, "evaluate", f"checkpoint={checkpoint}", override)
+
+
+@pytest.mark.filterwarnings("ignore:The dirpath has changed:UserWarning")
+def test_a_schedule_cannot_be_resumed_with_another_length(
+    run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(run_folder, copy)
+    with pytest.raises(SystemExit, match=r"trainer\.max_epochs: found .* steps of training"):
+        _run(monkeypatch, "train", f"resume={copy}", "trainer.max_epochs=3")
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["representation.faces_per_panorama=99"], "representation.faces_per_panorama: found 99"),
+        (["network=unet"], "image size for the UNet: found 48×48"),
+        (["network.num_classes=5"], "scores of the network"),
+        (["data.fold=4"], "data.fold: found 4"),
+    ],
+)
+def test_impossible_settings_are_refused_before_any_data_is_made(
+    overrides: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit, match=rf"^tangent-train: {message}"):
+        _run(monkeypatch, "train", "experiment=rooms/demo", *overrides)
+    assert not (tmp_path / "data").exists()
+
+
+def test_a_sweep_runs_one_run_after_the_other(
+    rooms: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    sweep = ["-m", "trainer.max_epochs=1", "optimizer.lr=1e-3,1e-2", "hydra.sweep.dir=sweep"]
+    _run(monkeypatch, "train", *sweep, *SETTINGS, rooms)
+    assert {path.parent.name for path in tmp_path.glob("sweep/*/results.json")} == {"0", "1"}
 
 
 def test_a_missing_data_set_is_an_error_before_training(

@@ -76,6 +76,15 @@ def test_good_overrides_pass(arguments: list[str]) -> None:
     check_overrides("train", arguments)
 
 
+def test_options_of_a_users_own_config_folder_are_known(tmp_path: Path) -> None:
+    (tmp_path / "network").mkdir()
+    (tmp_path / "network" / "mine.yaml").write_text("_target_: my.Network\nsize: 3\n")
+    own = ["--config-dir", str(tmp_path)]
+    check_overrides("train", ["network=mine", "network.size=4", *own])
+    with pytest.raises(SettingError, match=r"Did you mean network\.size"):
+        check_overrides("train", ["network=mine", "network.sizes=4", *own])
+
+
 def test_a_command_without_a_stored_config_keeps_its_arguments() -> None:
     assert with_stored_config("train", ["level=6"]) == ("train", ["level=6"])
     assert with_stored_config("train", ["resume=null"])[0] == "train"

@@ -57,11 +57,14 @@ def test_no_png(tmp_path: Path, content: bytes) -> None:
         read_color_png(path)
 
 
-def test_cut_off(tmp_path: Path) -> None:
-    path = _write(tmp_path / "image.png", np.zeros((64, 128, 3), np.uint8))
-    content = path.read_bytes()
-    path.write_bytes(content[:-20])
-    with pytest.raises(DataError, match="cut off after"):
+@pytest.mark.parametrize("missing", [slice(-20, None), slice(-1, None), slice(1000, 3000)])
+def test_parts_are_missing(tmp_path: Path, missing: slice) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (64, 128, 3), np.uint8)
+    path = _write(tmp_path / "image.png", noise)
+    content = bytearray(path.read_bytes())
+    del content[missing]
+    path.write_bytes(content)
+    with pytest.raises(DataError, match="parts missing"):
         read_png_header(path)
     with pytest.raises(DataError, match="broken PNG"):
         read_color_png(path)

@@ -144,6 +144,8 @@ def test_the_panorama_may_be_larger_than_the_level() -> None:
         ({"dim": 8}, "dim: found 8; expected at least 24"),
         ({"faces_per_panorama": 21}, "1 to 20"),
         ({"faces_per_panorama": 0}, "1 to 20"),
+        ({"crop_multiple": 0}, "crop_multiple: found 0"),
+        ({"erp_height": 0}, "erp_height: found 0"),
         ({"rotation": "tilt"}, "one of none, yaw, so3"),
         ({"blend": "average"}, "one of nearest, feather"),
     ],
