@@ -3,6 +3,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
+DEMO := runs/make_demo
 
 .PHONY: install demo test lint bench
 
@@ -16,8 +17,16 @@ $(READY): pyproject.toml constraints.txt
 	@touch $@
 
 demo: install
-	@echo "Making rooms, training and evaluating (about 6 minutes on two cores) …"
-	$(BIN)/tangent-train experiment=rooms/demo
+	@if [ -f $(DEMO)/results.md ]; then \
+		cat $(DEMO)/results.md; \
+		echo; echo "The demo has run; its pictures are in $(DEMO)/panels. Delete $(DEMO) to run it again."; \
+	elif [ -f $(DEMO)/checkpoints/last.ckpt ]; then \
+		echo "Going on with the interrupted demo …"; \
+		$(BIN)/tangent-train resume=$(DEMO); \
+	else \
+		echo "Making rooms, training and evaluating (about 4 minutes on two cores) …"; \
+		$(BIN)/tangent-train experiment=rooms/demo hydra.run.dir=$(DEMO); \
+	fi
 
 test: install
 	@echo "Running the whole test suite (some minutes on two cores) …"

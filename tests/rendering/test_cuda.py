@@ -1,0 +1,67 @@
+"""What runs on the CPU gives the same on a GPU."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from tangent_train.geometry import TangentGrid, equirect_shape
+from tangent_train.rendering import (
+    Blend,
+    Interpolation,
+    equirect_to_tangent,
+    tangent_to_equirect,
+    tangent_to_labels,
+)
+from tangent_train.tasks import ConfusionMatrix
+
+pytestmark = [
+    pytest.mark.gpu,
+    pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device"),
+]
+
+GRID = TangentGrid(1, 6)
+SHAPE = equirect_shape(6)
+
+
+def _random(*shape: int) -> torch.Tensor:
+    return torch.from_numpy(np.random.default_rng(0).standard_normal(shape))
+
+
+@pytest.mark.parametrize("interpolation", ["bilinear", "nearest"])
+def test_to_tangent_images(interpolation: Interpolation) -> None:
+    panorama = _random(2, 3, *SHAPE)
+    expected = equirect_to_tangent(panorama, GRID, [0, 7], interpolation)
+    on_gpu = equirect_to_tangent(panorama.cuda(), GRID, [0, 7], interpolation)
+    torch.testing.assert_close(on_gpu.cpu(), expected)
+
+
+@pytest.mark.parametrize("blend", ["nearest", "feather"])
+def test_to_the_panorama_and_its_gradient(blend: Blend) -> None:
+    images = _random(GRID.num_images, 2, GRID.dim, GRID.dim)
+    weights = _random(2, *SHAPE)
+    gradients = []
+    for device in ("cpu", "cuda"):
+        source = images.to(device).requires_grad_()
+        panorama = tangent_to_equirect(source, GRID, SHAPE, blend)
+        (gradient,) = torch.autograd.grad((panorama * weights.to(device)).sum(), source)
+        gradients += [panorama.detach().cpu(), gradient.cpu()]
+    torch.testing.assert_close(gradients[2:], gradients[:2])
+
+
+@pytest.mark.parametrize("blend", ["nearest", "feather"])
+def test_labels(blend: Blend) -> None:
+    scores = _random(GRID.num_images, 5, GRID.dim, GRID.dim).float()
+    expected = tangent_to_labels(scores, GRID, SHAPE, blend)
+    on_gpu = tangent_to_labels(scores.cuda(), GRID, SHAPE, blend).cpu()
+    assert (on_gpu == expected).double().mean() > 0.9999, "all but ties of rounding"
+
+
+def test_confusion_matrices() -> None:
+    prediction, truth = (_random(2, *SHAPE).abs() * 2).long().clamp(max=4)
+    on_cpu, on_gpu = ConfusionMatrix(5), ConfusionMatrix(5).cuda()
+    on_cpu.update(prediction, truth)
+    on_gpu.update(prediction.cuda(), truth.cuda())
+    np.testing.assert_array_equal(on_gpu.compute().bands, on_cpu.compute().bands)
+    np.testing.assert_allclose(on_gpu.compute().solid_angle, on_cpu.compute().solid_angle)
