@@ -17,7 +17,7 @@ from datamodules.panoramas import (
     RememberedPanoramas,
     Turn,
     TurnedPanoramas,
-    read_in_threads,
+    in_threads,
 )
 from datamodules.samples import (
     RGB_NORMALIZATION,
@@ -158,8 +158,9 @@ class PanoramaDataModule(LightningDataModule, ABC):
         weights = np.ones(len(self.class_names))
         if kind != "none":
             counts = np.zeros(len(self.class_names), np.int64)
-            for panorama in read_in_threads(self.source("train")):
-                counts += np.bincount(panorama.labels.ravel(), minlength=len(counts))
+            source = self.source("train")
+            for labels in in_threads(source.read_labels, len(source)):
+                counts += np.bincount(labels.ravel(), minlength=len(counts))
             counts[0] = 0
             seen = counts > 0
             ratio = counts[seen] / counts.sum()

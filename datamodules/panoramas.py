@@ -21,7 +21,7 @@ from tangent_train.geometry import random_rotation, rotation_about
 from tangent_train.rendering import rotate_equirect
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from numpy.typing import NDArray
 
@@ -32,8 +32,8 @@ __all__ = [
     "RememberedPanoramas",
     "Turn",
     "TurnedPanoramas",
+    "in_threads",
     "mask_black",
-    "read_in_threads",
     "resize_area",
     "resize_depth",
     "resize_nearest",
@@ -41,6 +41,7 @@ __all__ = [
 ]
 
 _Pixel = TypeVar("_Pixel", bound=np.generic)
+_Read = TypeVar("_Read")
 
 Mask = Literal["labels", "any_black", "all_black"]
 """Which pixels count as unknown besides those without a label; see `mask_black`."""
@@ -78,6 +79,10 @@ class PanoramaSource(Protocol):
 
     def read(self, index: int) -> Panorama:
         """One of them."""
+        ...
+
+    def read_labels(self, index: int) -> NDArray[np.uint8]:
+        """Its labels alone, for less than the price of all."""
         ...
 
 
@@ -148,13 +153,13 @@ def mask_black(labels: NDArray[np.uint8], rgb: NDArray[np.uint8], mask: Mask) ->
     return np.where(black.any(-1) if mask == "any_black" else black.all(-1), np.uint8(0), labels)
 
 
-def read_in_threads(source: PanoramaSource) -> Iterator[Panorama]:
-    """Read all panoramas in order, decoding on all cores (OpenCV and zlib free the GIL)."""
+def in_threads(read: Callable[[int], _Read], count: int) -> Iterator[_Read]:
+    """``read(0)`` … ``read(count - 1)``, on all cores (OpenCV and zlib free the GIL)."""
     workers = os.cpu_count() or 1
     with ThreadPoolExecutor(workers) as pool:
         # A few at a time: the reader is never far ahead of who consumes them.
-        for start in range(0, len(source), 4 * workers):
-            yield from pool.map(source.read, range(start, min(start + 4 * workers, len(source))))
+        for start in range(0, count, 4 * workers):
+            yield from pool.map(read, range(start, min(start + 4 * workers, count)))
 
 
 class RememberedPanoramas:
@@ -172,7 +177,7 @@ class RememberedPanoramas:
         self._source = source
         self._kept = [
             (panorama.rgb, _to_steps(panorama.depth_m), panorama.labels)
-            for panorama in read_in_threads(source)
+            for panorama in in_threads(source.read, len(source))
         ]
 
     def __len__(self) -> int:
@@ -186,6 +191,10 @@ class RememberedPanoramas:
         """The panorama as the source gave it; its arrays are shared, not to be written to."""
         rgb, steps, labels = self._kept[index]
         return Panorama(rgb, None if steps is None else steps_to_meters(steps), labels)
+
+    def read_labels(self, index: int) -> NDArray[np.uint8]:
+        """The labels as the source gave them."""
+        return self._kept[index][2]
 
 
 class TurnedPanoramas:
@@ -233,6 +242,10 @@ class TurnedPanoramas:
             None if depth_m is None else rotate_equirect(depth_m, rotation, "nearest"),
             rotate_equirect(labels, rotation, "nearest"),
         )
+
+    def read_labels(self, index: int) -> NDArray[np.uint8]:
+        """The labels of one turned panorama."""
+        return rotate_equirect(self._source.read_labels(index), self.rotation(index), "nearest")
 
 
 def steps_to_meters(steps: NDArray[np.uint16]) -> NDArray[np.float32]:

@@ -102,11 +102,23 @@ class StanfordPanoramas:
         """
         files = self._files[index]
         rgb = read_color_png(files.rgb)
-        labels = self._table.decode(resize_nearest(read_color_png(files.semantic), self._shape))
-        if self._mask != "labels":
-            labels = mask_black(labels, resize_nearest(rgb, self._shape), self._mask)
         depth_m = None if files.depth is None else self._read_depth(files.depth)
-        return Panorama(resize_area(rgb, self._shape), depth_m, labels)
+        return Panorama(resize_area(rgb, self._shape), depth_m, self._labels(files, rgb))
+
+    def read_labels(self, index: int) -> NDArray[np.uint8]:
+        """The labels of one panorama.
+
+        Raises:
+            DataError: A file is broken.
+        """
+        files = self._files[index]
+        return self._labels(files, None if self._mask == "labels" else read_color_png(files.rgb))
+
+    def _labels(self, files: PanoramaFiles, rgb: NDArray[np.uint8] | None) -> NDArray[np.uint8]:
+        labels = self._table.decode(resize_nearest(read_color_png(files.semantic), self._shape))
+        if rgb is None or self._mask == "labels":
+            return labels
+        return mask_black(labels, resize_nearest(rgb, self._shape), self._mask)
 
     def _read_depth(self, path: Path) -> NDArray[np.float32]:
         steps = read_depth_png(path)

@@ -9,8 +9,8 @@ from datamodules.panoramas import (
     Panorama,
     RememberedPanoramas,
     TurnedPanoramas,
+    in_threads,
     mask_black,
-    read_in_threads,
     resize_area,
     resize_depth,
     resize_nearest,
@@ -37,6 +37,9 @@ class Memory:
     def read(self, index: int) -> Panorama:
         self.reads[index] += 1
         return self.panoramas[index]
+
+    def read_labels(self, index: int) -> NDArray[np.uint8]:
+        return self.read(index).labels
 
 
 def _panorama(rng: np.random.Generator, *, depth: bool = True) -> Panorama:
@@ -145,7 +148,7 @@ def test_masks(mask: Literal["labels", "any_black", "all_black"], expected: list
 def test_threads_keep_the_order() -> None:
     rng = np.random.default_rng(0)
     panoramas = [_panorama(rng) for _ in range(100)]
-    read = list(read_in_threads(Memory(panoramas)))
+    read = list(in_threads(Memory(panoramas).read, 100))
     assert all(a is b for a, b in zip(read, panoramas, strict=True))
 
 
@@ -163,6 +166,9 @@ def test_remembered_panoramas_are_the_same_and_read_once(depth: bool) -> None:
                 assert kept is not None
                 assert kept.dtype == original.dtype
                 np.testing.assert_array_equal(kept, original)
+            np.testing.assert_array_equal(
+                remembered.read_labels(index), source.panoramas[index].labels
+            )
     assert source.reads == [1, 1, 1]
     assert remembered.name(1) == "panorama 1"
 
@@ -200,6 +206,7 @@ def test_image_depth_and_labels_turn_together(rotation: float | Literal["so3"]) 
     height = equirect_directions((32, 64)) @ turned.rotation(0)[:, 2]
     np.testing.assert_allclose(labels.astype(float), 100 + 100 * height, atol=8)
     np.testing.assert_allclose(rgb[..., 1].astype(float), 100 + 100 * height, atol=8)
+    np.testing.assert_array_equal(turned.read_labels(0), labels)
     assert depth_m is not None
     np.testing.assert_array_equal(depth_m, labels)  # both nearest: the same source pixels
     assert (len(turned), turned.name(0)) == (1, "panorama 0")

@@ -21,6 +21,8 @@ from datamodules.samples import (
 from tangent_train.errors import SettingError
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from datamodules.panoramas import PanoramaSource
     from tangent_train.rendering.representation import Representation
 
@@ -41,6 +43,9 @@ class Positions:
         labels = (place + index).astype(np.uint8)
         rgb = np.stack([labels, labels, labels], axis=-1)
         return Panorama(rgb, labels.astype(np.float32) / np.float32(100), labels)
+
+    def read_labels(self, index: int) -> NDArray[np.uint8]:
+        return self.read(index).labels
 
 
 # --- normalization -----------------------------------------------------------------------------

@@ -171,7 +171,9 @@ def test_masks_are_applied_on_reading(stanford_root: Path, strips: Any) -> None:
     unknown = {}
     for mask in ("labels", "any_black", "all_black"):
         module = Stanford2D3DS(stanford_root, strips, mask=mask)
-        unknown[mask] = module.source("train").read(0).labels == 0
+        source = module.source("train")
+        unknown[mask] = source.read(0).labels == 0
+        np.testing.assert_array_equal(source.read_labels(0), source.read(0).labels)
     # The fabricated black region has no labels; one more patch has no blue.
     np.testing.assert_array_equal(unknown["labels"], unknown["all_black"])
     assert unknown["any_black"][-2:, :4].all()
