@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol, TypeVar
+from typing import Any, Literal, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Integer
@@ -46,6 +46,7 @@ class Views(Protocol):
         ...
 
 
+@runtime_checkable
 class Representation(Protocol):
     """What a network sees of a panorama."""
 
