@@ -17,7 +17,7 @@ http://buildingparser.stanford.edu/dataset.html (`2D-3D-Semantics`, the `noXYZ` 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -26,7 +26,6 @@ from datamodules.panorama_module import PanoramaDataModule, Split
 from datamodules.panoramas import (
     Mask,
     Panorama,
-    Turn,
     mask_black,
     resize_area,
     resize_depth,
@@ -50,7 +49,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from datamodules.samples import Normalization
     from tangent_train.rendering.representation import Representation
 
 __all__ = [
@@ -141,13 +139,7 @@ class Stanford2D3DS(PanoramaDataModule):
         validation_fraction: Share of the training rooms for validation: at least one room, never
             all; 0 for no validation.
         label_table: The class table, when it is not where the release has it.
-        inputs: See `PanoramaDataModule`, also for all that follow.
-        panoramas_per_step: Panoramas per training step and process.
-        num_workers: Worker processes of a loader.
-        seed: Seed, also of the choice of validation rooms.
-        in_memory: Keep decoded panoramas in memory.
-        normalization: Of the input channels.
-        test_rotation: Turn the test panoramas.
+        **settings: All others of `PanoramaDataModule`; the seed also chooses the validation rooms.
 
     Raises:
         SettingError: A setting that cannot work.
@@ -165,24 +157,9 @@ class Stanford2D3DS(PanoramaDataModule):
         mask: Mask = "labels",
         validation_fraction: float = 0.1,
         label_table: str | Path | None = None,
-        inputs: Sequence[str] = ("rgb", "depth"),
-        panoramas_per_step: int = 4,
-        num_workers: int = 0,
-        seed: int = 0,
-        in_memory: bool = False,
-        normalization: Normalization | None = None,
-        test_rotation: Turn = None,
+        **settings: Any,
     ) -> None:
-        super().__init__(
-            representation,
-            inputs=inputs,
-            panoramas_per_step=panoramas_per_step,
-            num_workers=num_workers,
-            seed=seed,
-            in_memory=in_memory,
-            normalization=normalization,
-            test_rotation=test_rotation,
-        )
+        super().__init__(representation, **settings)
         if fold not in FOLDS:
             raise SettingError("data.fold", found=repr(fold), expected="1, 2 or 3")
         if mask not in ("labels", "any_black", "all_black"):

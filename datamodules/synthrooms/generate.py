@@ -14,11 +14,12 @@ import cv2
 import numpy as np
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from datamodules.stanford_files import AREAS
 from datamodules.synthrooms.camera import PanoramaView, PerspectiveView, Pose, draw_view
 from datamodules.synthrooms.raycast import RayScene
 from datamodules.synthrooms.render import draw_camera, draw_holes, render
 from datamodules.synthrooms.scene import draw_room_type, furnish
-from datamodules.synthrooms.settings import AREAS, RoomSettings
+from datamodules.synthrooms.settings import RoomSettings
 from datamodules.synthrooms.writer import (
     KINDS,
     PictureName,

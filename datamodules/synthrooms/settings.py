@@ -5,15 +5,13 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
+from datamodules.stanford_files import AREAS
 from tangent_train.errors import SettingError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-__all__ = ["AREAS", "RoomSettings", "ViewKind"]
-
-AREAS = ("1", "2", "3", "4", "5a", "5b", "6")
-"""Areas of Stanford2D3DS: the folds are made of them."""
+__all__ = ["RoomSettings", "ViewKind"]
 
 ViewKind = Literal["stanford", "uniform"]
 

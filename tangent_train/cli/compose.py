@@ -138,7 +138,8 @@ def check_overrides(config_name: str, arguments: list[str]) -> None:
             ) from error
         plain = [o for o in overrides if not (o.is_add() or o.is_delete() or o.is_hydra_override())]
         search = [str(o.input_line) for o in overrides if o.key_or_group == "hydra.searchpath"]
-        groups = [o for o in plain if _options(loader, o.key_or_group, search)]
+        options_of = {o.key_or_group: _options(loader, o.key_or_group, search) for o in plain}
+        groups = [o for o in plain if options_of[o.key_or_group]]
         if groups and config_name.startswith(_STORED):
             raise SettingError(
                 groups[0].key_or_group,
@@ -147,7 +148,7 @@ def check_overrides(config_name: str, arguments: list[str]) -> None:
                 remedy="A stored config has its choices made; start a new run for others.",
             )
         for override in groups:
-            _check_option(override, _options(loader, override.key_or_group, search))
+            _check_option(override, options_of[override.key_or_group])
         chosen = [str(o.input_line) for o in groups if not o.is_sweep_override()]
         config = compose(config_name, [*search, *chosen])
     names = list(dict.fromkeys([*_dotted(config), *_group_names(loader)]))
