@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tangent_train.geometry import TangentGrid
-from tangent_train.rendering import label_kernels
+from tangent_train.rendering import feather_kernels, label_kernels
 from tangent_train.rendering.checks import (
     check_blend,
     check_scores,
@@ -22,6 +22,7 @@ from tangent_train.rendering.sampling import map_dtype
 from tangent_train.rendering.tables import (
     feather_arguments,
     feather_table,
+    owner_arguments,
     owner_table,
     tensors_on,
 )
@@ -107,8 +108,8 @@ def tangent_to_labels(
             direction, weighted as in `tangent_to_equirect`; meant for softmax scores.
 
     Returns:
-        ``(..., H, W)`` class indices; of equal scores the first class. An int64 tensor on the
-        device of the logits, or an array, uint8 up to 256 classes and uint16 above.
+        ``(..., H, W)`` class indices; of equal scores the first class, and NaN never wins. An int64
+        tensor on the device of the logits, or an array, uint8 up to 256 classes and uint16 above.
 
     Raises:
         SettingError: The logits, the shape or the blend cannot be used.
@@ -128,6 +129,7 @@ def _render_labels(
     small = torch.uint8 if logits.shape[-3] <= 256 else torch.uint16
     stacks = logits.reshape(-1, *logits.shape[-4:])
     compiled = logits.device.type == "cpu" and logits.dtype == torch.float32
+    compiled = compiled and grid.dim >= label_kernels.LANES
     render = _compiled_labels if compiled else _torch_labels
     result = torch.empty((len(stacks), *shape), dtype=small, device=logits.device)
     for stack, labels in zip(stacks, result, strict=True):
@@ -183,10 +185,11 @@ def _compiled_labels(scores: Tensor, grid: TangentGrid, blend: Blend, labels: Te
     array, out = scores.contiguous().numpy(), labels.numpy()
     shape = check_shape(labels.shape)
     if blend == "feather":
-        over_rows(label_kernels.feather_labels, shape, array, *feather_arguments(grid, shape), out)
+        over_rows(
+            feather_kernels.feather_labels, shape, array, *feather_arguments(grid, shape), out
+        )
     else:
-        face, u, v, _ = owner_table(grid, shape, np.dtype(np.float32))
-        over_rows(label_kernels.owner_labels, shape, array, face[0], u[0], v[0], out)
+        over_rows(label_kernels.owner_labels, shape, array, *owner_arguments(grid, shape), out)
 
 
 def _torch_labels(scores: Tensor, grid: TangentGrid, blend: Blend, labels: Tensor) -> None:
@@ -197,11 +200,11 @@ def _torch_labels(scores: Tensor, grid: TangentGrid, blend: Blend, labels: Tenso
     for source, weight in _bands(
         scores, grid, check_shape(labels.shape), blend, num_classes * size
     ):
-        best = sample(flat, Taps(source, weight))
-        label = torch.zeros_like(best, dtype=torch.int64)
-        for k in range(1, num_classes):
+        label = source.new_zeros((1, source.shape[-1]))
+        best = torch.full_like(label, -torch.inf, dtype=scores.dtype)
+        for k in range(num_classes):
             score = sample(flat, Taps(source + k * size, weight))
             label.masked_fill_(score > best, k)
-            best = torch.maximum(best, score)
+            best = torch.fmax(best, score)
         labels.view(-1)[start : start + label.shape[1]] = label[0].to(labels.dtype)
         start += label.shape[1]

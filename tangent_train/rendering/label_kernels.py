@@ -1,93 +1,251 @@
-"""Compiled loops over the images that see a panorama's pixels: label rendering and feathering."""
+"""Compiled label rendering: the class of the largest score in the owner's image.
+
+All classes of a pixel are interpolated and compared at once, in vector registers. Numba turns
+loops over neighbouring pixels into vector code, not these; so the two steps that need it are
+written in LLVM's vector types, which any processor runs: with AVX-512 a vector is one register,
+elsewhere two or four.
+"""
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from tangent_train.rendering.compiled import njit_exact, njit_fast
+from tangent_train.rendering.compiled import njit_fast
 
-__all__ = ["feather_labels", "feather_table", "owner_labels"]
+__all__ = ["LANES", "owner_labels"]
 
-_TILE = (32, 64)
-"""Rows and columns rendered at once, so that a class plane's part of it stays in the cache."""
+LANES = 16
+"""Classes compared at once, and the smallest side of an image."""
+
+_TILE = (64, 64)
+"""Rows and columns rendered at once, so that their scores stay in the cache."""
+
+_INDEX = ir.IntType(64)
+_VECTOR = ir.VectorType(ir.FloatType(), LANES)
+
+
+def _order(lanes: list[int]) -> ir.Constant:
+    return ir.Constant(ir.VectorType(ir.IntType(32), LANES), lanes)
+
+
+def _address(context: Any, builder: Any, kind: Any, array: Any, index: Any) -> Any:
+    """Address of the `LANES` floats of a flat array that start at an index."""
+    data = context.make_array(kind)(context, builder, array).data
+    return builder.bitcast(builder.gep(data, [index]), _VECTOR.as_pointer())
+
+
+def _load(builder: Any, address: Any) -> Any:
+    value = builder.load(address)
+    value.align = 4
+    return value
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def _copy_transposed(
+    typing: Any, scores: Any, start: Any, size: Any, count: Any, patch: Any, at: Any, width: Any
+) -> Any:
+    """Copy `LANES` pixels of `LANES` class planes so that the classes of a pixel lie together.
+
+    ``patch[at + i * width + k] = scores[start + min(k, count - 1) * size + i]`` for i, k < LANES:
+    where fewer classes are left the last is repeated, which wins no comparison it ties.
+    """
+
+    def code(context: Any, builder: Any, signature: Any, values: list[Any]) -> Any:
+        scores, start, size, count, patch, at, width = values
+        kinds = signature.args
+        rows = []
+        for k in range(LANES):
+            address = _address(context, builder, kinds[0], scores, start)
+            rows.append(_load(builder, address))
+            more = builder.icmp_unsigned("<", _INDEX(k + 1), count)
+            start = builder.add(start, builder.select(more, size, _INDEX(0)))
+        # Transposed by exchanging, bit by bit, that bit of the row and of the lane.
+        for bit in (1 << b for b in range(LANES.bit_length() - 1)):
+            even = _order([LANES + (i ^ bit) if i & bit else i for i in range(LANES)])
+            odd = _order([LANES + i if i & bit else i | bit for i in range(LANES)])
+            for i in range(LANES):
+                if not i & bit:
+                    pair = rows[i], rows[i | bit]
+                    rows[i] = builder.shuffle_vector(*pair, even)
+                    rows[i | bit] = builder.shuffle_vector(*pair, odd)
+        for row in rows:
+            address = _address(context, builder, kinds[4], patch, at)
+            builder.store(row, address).align = 4
+            at = builder.add(at, width)
+        return context.get_dummy_value()
+
+    index = types.uint64
+    return types.void(scores, index, index, index, patch, index, index), code
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def _best_class(
+    typing: Any, patch: Any, corner: Any, right: Any, below: Any, share: Any, share_below: Any
+) -> Any:
+    """First class of the largest of `LANES` bilinear scores, and that score.
+
+    Interpolates between the vectors of ``patch`` at ``corner``, ``corner + right`` and the two
+    that lie ``below`` floats further on.
+    """
+
+    def code(context: Any, builder: Any, signature: Any, values: list[Any]) -> Any:
+        patch, corner, right, below, share, share_below = values
+        undefined = ir.Constant(_VECTOR, ir.Undefined)
+
+        def spread(value: Any) -> Any:
+            first = builder.insert_element(undefined, value, ir.IntType(32)(0))
+            return builder.shuffle_vector(first, undefined, _order([0] * LANES))
+
+        def load(index: Any) -> Any:
+            return _load(builder, _address(context, builder, signature.args[0], patch, index))
+
+        def between(first: Any, second: Any, share: Any) -> Any:
+            flags = ("contract",)
+            step = builder.fsub(second, first, flags=flags)
+            return builder.fadd(first, builder.fmul(share, step, flags=flags), flags=flags)
+
+        upper, lower = (
+            between(load(left), load(builder.add(left, right)), spread(share))
+            for left in (corner, builder.add(corner, below))
+        )
+        scores = between(upper, lower, spread(share_below))
+        # Between two scores of −∞ lies NaN: never the largest.
+        lowest = ir.Constant(_VECTOR, [float("-inf")] * LANES)
+        scores = builder.select(builder.fcmp_ordered("ord", scores, scores), scores, lowest)
+        best = scores
+        for step in (LANES >> b for b in range(1, LANES.bit_length())):
+            turned = _order([(i + step) % LANES for i in range(LANES)])
+            other = builder.shuffle_vector(best, undefined, turned)
+            best = builder.select(builder.fcmp_ordered(">", best, other), best, other)
+        reached = builder.bitcast(builder.fcmp_ordered("==", scores, best), ir.IntType(LANES))
+        first = builder.zext(builder.cttz(reached, ir.IntType(1)(1)), _INDEX)
+        value = builder.extract_element(best, ir.IntType(32)(0))
+        return context.make_tuple(builder, signature.return_type, [first, value])
+
+    index, real = types.uint64, types.float32
+    result = types.Tuple((index, real))
+    return result(patch, index, index, index, real, real), code
 
 
 @njit_fast
-def _corner(
-    u: float,
-    v: float,
-    dim: int,
-) -> tuple[int, np.float32, np.float32]:
-    """First of the four pixels around a position, as a flat index, and the two fractions."""
-    x = min(max(u, 0.0), dim - 1.0)
-    y = min(max(v, 0.0), dim - 1.0)
-    left = min(int(x), dim - 2)
-    top = min(int(y), dim - 2)
-    return top * dim + left, np.float32(x - left), np.float32(y - top)
-
-
-@njit_fast
-def _blend(
-    plane: NDArray[np.float32],
-    c: np.uint64,
-    step: np.uint64,
-    right: np.float32,
-    below: np.float32,
-) -> np.float32:
-    """Bilinear sample of a flat plane; unsigned indices spare numba's test for negative ones."""
-    one = np.uint64(1)
-    upper = plane[c] + right * (plane[c + one] - plane[c])
-    c += step
-    lower = plane[c] + right * (plane[c + one] - plane[c])
-    return upper + below * (lower - upper)
-
-
-@njit_fast
-def _interpolate(
-    plane: NDArray[np.float32],
-    dim: int,
-    corner: NDArray[np.uint64],
-    right: NDArray[np.float32],
-    below: NDArray[np.float32],
-    scores: NDArray[np.float32],
+def _project(
+    axes: NDArray[np.float64],
+    focal: float,
+    middle: float,
+    columns: NDArray[np.float64],
+    cosine: float,
+    sine: float,
+    u: NDArray[np.float64],
+    v: NDArray[np.float64],
 ) -> None:
-    """Bilinear samples of a flat plane."""
-    step = np.uint64(dim)
-    for p in range(scores.shape[0]):
-        scores[p] = _blend(plane, corner[p], step, right[p], below[p])
+    """Positions in an image of ERP pixels of one row, of latitude ``cosine`` and ``sine``.
+
+    Unbounded where the image does not see them. Only sums, in a loop of its own: vector code.
+    """
+    scale = focal * cosine
+    ux, uy, uz = scale * axes[0, 0], scale * axes[1, 0], focal * sine * axes[2, 0]
+    vx, vy, vz = scale * axes[0, 1], scale * axes[1, 1], focal * sine * axes[2, 1]
+    zx, zy, zz = cosine * axes[0, 2], cosine * axes[1, 2], sine * axes[2, 2]
+    for j in range(u.shape[0]):
+        x, y = columns[j, 0], columns[j, 1]
+        nearness = 1 / (zx * x + zy * y + zz)
+        u[j] = (ux * x + uy * y + uz) * nearness + middle
+        v[j] = (vx * x + vy * y + vz) * nearness + middle
 
 
 @njit_fast
-def _interpolate_two(
-    first: NDArray[np.float32],
-    second: NDArray[np.float32],
+def _split(
+    position: NDArray[np.float64],
     dim: int,
-    corner: NDArray[np.uint64],
-    right: NDArray[np.float32],
-    below: NDArray[np.float32],
-    scores: NDArray[np.float32],
+    first: NDArray[np.int32],
+    share: NDArray[np.float32],
 ) -> None:
-    """Bilinear samples of two flat planes, positions read once: a sixth faster than one by one."""
-    step = np.uint64(dim)
-    for p in range(scores.shape[1]):
-        scores[0, p] = _blend(first, corner[p], step, right[p], below[p])
-        scores[1, p] = _blend(second, corner[p], step, right[p], below[p])
+    """First of the two pixels around a position, clamped to the image, and the second's share."""
+    end = np.int32(dim - 2)
+    for p in range(position.shape[0]):
+        x = min(max(position[p], 0.0), dim - 1.0)
+        pixel = min(np.int32(x), end)
+        first[p] = pixel
+        share[p] = x - pixel
 
 
 @njit_fast
-def _keep_better(
+def _range(
+    values: NDArray[np.int32],
+    owners: NDArray[np.int32],
+    owner: int,
+) -> tuple[int, int]:
+    """Smallest and largest value where an image is the owner."""
+    most = np.int32(2**31 - 1)
+    low, high = most, np.int32(-1)
+    for p in range(values.shape[0]):
+        own = owners[p] == owner
+        low = min(low, values[p] if own else most)
+        high = max(high, values[p] if own else np.int32(-1))
+    return int(low), int(high)
+
+
+@njit_fast
+def _copy_patch(
     scores: NDArray[np.float32],
-    k: int,
-    best: NDArray[np.float32],
-    label: NDArray[np.integer],
-) -> None:
-    """Branch-free running argmax; a loop of its own, so that it compiles to vector code."""
-    for p in range(scores.shape[0]):
-        score, before, kept = scores[p], best[p], label[p]
-        better = score > before
-        best[p] = score if better else before
-        label[p] = k if better else kept
+    start: int,
+    num_classes: int,
+    dim: int,
+    height: int,
+    width: int,
+    patch: NDArray[np.float32],
+) -> np.uint64:
+    """Copy a part of an image to ``(height, width, vectors of LANES classes)``, flat.
+
+    Args:
+        scores: Flat ``(K, d, d)`` scores of all images.
+        start: First element of the part.
+        num_classes: K.
+        dim: d.
+        height: Rows of the part.
+        width: Columns of the part, at least `LANES`.
+        patch: Written.
+
+    Returns:
+        Floats per pixel of the patch.
+    """
+    size = np.uint64(dim * dim)
+    pixel = np.uint64((num_classes + LANES - 1) // LANES * LANES)
+    for y in range(height):
+        for x in range(0, width, LANES):
+            left = min(x, width - LANES)
+            for k in range(0, num_classes, LANES):
+                source = np.uint64(start + k * dim * dim + y * dim + left)
+                at = np.uint64(y * width + left) * pixel + np.uint64(k)
+                count = np.uint64(num_classes - k)
+                _copy_transposed(scores, source, size, count, patch, at, pixel)
+    return pixel
+
+
+@njit_fast
+def _class_at(
+    patch: NDArray[np.float32],
+    corner: np.uint64,
+    right: np.uint64,
+    below: np.uint64,
+    share: np.float32,
+    share_below: np.float32,
+    num_classes: int,
+) -> np.uint64:
+    """`_best_class` of any number of classes."""
+    found, best = _best_class(patch, corner, right, below, share, share_below)
+    for k in range(LANES, num_classes, LANES):
+        start = np.uint64(k)
+        other, score = _best_class(patch, corner + start, right, below, share, share_below)
+        if score > best:
+            found, best = start + other, score
+    return found
 
 
 @njit_fast
@@ -95,9 +253,11 @@ def owner_labels(
     start: int,
     stop: int,
     scores: NDArray[np.float32],
-    face: NDArray[np.integer],
-    u: NDArray[np.floating],
-    v: NDArray[np.floating],
+    owners: NDArray[np.integer],
+    axes: NDArray[np.float64],
+    focal: float,
+    columns: NDArray[np.float64],
+    rows: NDArray[np.float64],
     labels: NDArray[np.integer],
 ) -> None:
     """Class of the largest bilinear score in the owner's image, rows ``start:stop``.
@@ -105,271 +265,63 @@ def owner_labels(
     Args:
         start: First row.
         stop: One past the last row.
-        scores: ``(N, K, d, d)`` float32.
-        face: ``(H, W)`` owners.
-        u: ``(H, W)`` columns in the owner's image.
-        v: ``(H, W)`` rows in the owner's image.
-        labels: ``(H, W)`` class indices, written.
-    """
-    num_classes, dim = scores.shape[1], scores.shape[2]
-    size = dim * dim
-    flat = scores.reshape(-1)
-    corner = np.empty(_TILE[0] * _TILE[1], np.uint64)
-    right = np.empty(len(corner), np.float32)
-    below = np.empty(len(corner), np.float32)
-    score = np.empty((2, len(corner)), np.float32)
-    best = np.empty(len(corner), np.float32)
-    label = np.empty(len(corner), np.int32)
-    for top in range(start, stop, _TILE[0]):
-        bottom = min(stop, top + _TILE[0])
-        for left in range(0, face.shape[1], _TILE[1]):
-            end = min(face.shape[1], left + _TILE[1])
-            n = 0
-            for i in range(top, bottom):
-                for j in range(left, end):
-                    c, right[n], below[n] = _corner(u[i, j], v[i, j], dim)
-                    corner[n] = np.uint64(int(face[i, j]) * num_classes * size + c)
-                    n += 1
-            best[:] = -np.inf
-            label[:] = 0
-            for k in range(0, num_classes, 2):
-                # Of an odd number the last class is its own partner: a tie changes nothing.
-                other = min(k + 1, num_classes - 1)
-                planes = flat[k * size :], flat[other * size :]
-                _interpolate_two(*planes, dim, corner, right, below, score[:, :n])
-                _keep_better(score[0, :n], k, best, label)
-                _keep_better(score[1, :n], other, best, label)
-            labels[top:bottom, left:end] = label[:n].reshape(bottom - top, end - left)
-
-
-@njit_exact
-def _list_images(
-    owners: NDArray[np.integer],
-    near: NDArray[np.integer],
-    listed: NDArray[np.bool_],
-    images: NDArray[np.integer],
-) -> int:
-    """List the images that can see a tile.
-
-    Args:
-        owners: ``(h, w)`` owners of the tile.
-        near: ``(N, M)`` images that can see something a face owns, filled up with −1.
-        listed: ``(N,)`` scratch, all False before and after.
-        images: ``(N,)`` list, written.
-
-    Returns:
-        Their number.
-    """
-    count = 0
-    previous = -1
-    for i in range(owners.shape[0]):
-        for j in range(owners.shape[1]):
-            own = owners[i, j]
-            if own == previous:
-                continue
-            previous = own
-            for image in near[own]:
-                if image >= 0 and not listed[image]:
-                    listed[image] = True
-                    images[count] = image
-                    count += 1
-    for n in range(count):
-        listed[images[n]] = False
-    return count
-
-
-@njit_fast
-def _list_seen(
-    axes: NDArray[np.float64],
-    focal: float,
-    half: float,
-    power: int,
-    columns: NDArray[np.float64],
-    rows: NDArray[np.float64],
-    pixel: NDArray[np.integer],
-    u: NDArray[np.floating],
-    v: NDArray[np.floating],
-    weight: NDArray[np.floating],
-) -> int:
-    """List the pixels of a tile that an image sees, with their positions in it and weights.
-
-    The weight is 1 in the middle of the image and falls to 0 at the outer edges of its outermost
-    pixels: half a pixel beyond the centres, so that every direction has an image of weight > 0.
-
-    Args:
-        axes: ``(3, 3)`` camera axes of the image, as columns.
-        focal: Focal length in pixels.
-        half: Half the side in pixels.
-        power: Exponent of the weights.
-        columns: ``(w, 2)`` from `directions_of_rows`.
-        rows: ``(h, 2)`` from `directions_of_rows`.
-        pixel: List of flat indices in the tile, written.
-        u: Columns in the image, written.
-        v: Rows in the image, written.
-        weight: Weights, written.
-
-    Returns:
-        Number of pixels listed.
-    """
-    count = 0
-    for i in range(rows.shape[0]):
-        z = rows[i, 1]
-        for j in range(columns.shape[0]):
-            x = rows[i, 0] * columns[j, 0]
-            y = rows[i, 0] * columns[j, 1]
-            depth = axes[0, 2] * x + axes[1, 2] * y + axes[2, 2] * z
-            if depth <= 0:
-                continue
-            scale = focal / depth
-            a = (axes[0, 0] * x + axes[1, 0] * y + axes[2, 0] * z) * scale
-            b = (axes[0, 1] * x + axes[1, 1] * y + axes[2, 1] * z) * scale
-            if abs(a) < half and abs(b) < half:
-                pixel[count] = i * columns.shape[0] + j
-                u[count] = a + half - 0.5
-                v[count] = b + half - 0.5
-                weight[count] = ((1 - (a / half) ** 2) * (1 - (b / half) ** 2)) ** power
-                count += 1
-    return count
-
-
-@njit_fast
-def feather_labels(
-    start: int,
-    stop: int,
-    scores: NDArray[np.float32],
-    owners: NDArray[np.integer],
-    near: NDArray[np.integer],
-    axes: NDArray[np.float64],
-    focal: float,
-    power: int,
-    columns: NDArray[np.float64],
-    rows: NDArray[np.float64],
-    labels: NDArray[np.integer],
-) -> None:
-    """Class of the largest weighted sum of scores of all images that see a pixel.
-
-    Args:
-        start: First row.
-        stop: One past the last row.
-        scores: ``(N, K, d, d)`` float32.
+        scores: ``(N, K, d, d)`` float32, d at least `LANES`.
         owners: ``(H, W)`` owners.
-        near: ``(N, M)`` images that can see something a face owns, filled up with −1.
         axes: ``(N, 3, 3)`` camera axes of the images, as columns.
         focal: Focal length of the images in pixels.
-        power: Exponent of the weights.
         columns: From `directions_of_rows`.
         rows: From `directions_of_rows`.
         labels: ``(H, W)`` class indices, written.
     """
     num_images, num_classes, dim = scores.shape[:3]
-    planes = scores.reshape(num_images, num_classes, dim * dim)
-    listed, images = np.zeros(num_images, np.bool_), np.empty(num_images, np.int64)
-    pixel = np.empty(_TILE[0] * _TILE[1], np.int64)
-    u, v, weight = np.empty((3, len(pixel)))
-    corner = np.empty(len(pixel), np.uint64)
-    right, below, score, best = np.empty((4, len(pixel)), np.float32)
-    total = np.empty((num_classes, len(pixel)), np.float32)
-    label = np.empty(len(pixel), np.int32)
+    flat = scores.reshape(-1)
+    u, v = np.empty(_TILE[0] * _TILE[1]), np.empty(_TILE[0] * _TILE[1])
+    column, row = np.empty(len(u), np.int32), np.empty(len(u), np.int32)
+    right, below = np.empty(len(u), np.float32), np.empty(len(u), np.float32)
+    owner, label = np.empty(len(u), np.int32), np.empty(len(u), np.int32)
+    patch = np.empty(0, np.float32)
+    done = np.empty(num_images, np.bool_)
     for top in range(start, stop, _TILE[0]):
-        bottom = min(stop, top + _TILE[0])
+        height = min(stop - top, _TILE[0])
         for left in range(0, owners.shape[1], _TILE[1]):
-            end = min(owners.shape[1], left + _TILE[1])
-            n = (bottom - top) * (end - left)
-            total[:] = 0
-            for m in range(_list_images(owners[top:bottom, left:end], near, listed, images)):
-                image = images[m]
-                seen = _list_seen(
-                    axes[image], focal, dim / 2, power, columns[left:end], rows[top:bottom],
-                    pixel, u, v, weight,
-                )  # fmt: skip
-                for q in range(seen):
-                    corner[q], right[q], below[q] = _corner(u[q], v[q], dim)
-                for k in range(num_classes):
-                    _interpolate(planes[image, k], dim, corner, right, below, score[:seen])
-                    for q in range(seen):
-                        total[k, pixel[q]] += np.float32(weight[q]) * score[q]
-            best[:] = -np.inf
-            label[:] = 0
-            for k in range(num_classes):
-                _keep_better(total[k, :n], k, best, label)
-            labels[top:bottom, left:end] = label[:n].reshape(bottom - top, end - left)
-
-
-@njit_exact
-def feather_table(
-    start: int,
-    stop: int,
-    owners: NDArray[np.integer],
-    near: NDArray[np.integer],
-    axes: NDArray[np.float64],
-    focal: float,
-    half: float,
-    power: int,
-    columns: NDArray[np.float64],
-    rows: NDArray[np.float64],
-    count: NDArray[np.integer],
-    face: NDArray[np.integer],
-    u: NDArray[np.floating],
-    v: NDArray[np.floating],
-    weight: NDArray[np.floating],
-) -> None:
-    """All images that see a pixel, positions and weights, for the rows ``start:stop``.
-
-    Args:
-        start: First row.
-        stop: One past the last row.
-        owners: ``(H, W)`` owners.
-        near: ``(N, M)`` images that can see something a face owns, filled up with −1.
-        axes: ``(N, 3, 3)`` camera axes of the images, as columns.
-        focal: Focal length of the images in pixels.
-        half: Half the side of the images in pixels.
-        power: Exponent of the weights.
-        columns: From `directions_of_rows`.
-        rows: From `directions_of_rows`, those of `owners`.
-        count: ``(H, W)`` number of images that see a pixel, 0 before, written.
-        face: ``(R, H, W)`` images, written; with R = 0 pixels are only counted. A pixel seen by
-            fewer repeats its first one with weight 0.
-        u: ``(R, H, W)`` columns in the images, written.
-        v: ``(R, H, W)`` rows in the images, written.
-        weight: ``(R, H, W)`` weights, 0 before, written: they add up to 1.
-    """
-    num_images, width = axes.shape[0], owners.shape[1]
-    listed, images = np.zeros(num_images, np.bool_), np.empty(num_images, np.int64)
-    pixel = np.empty(_TILE[0] * width, np.int64)
-    line_u, line_v, line_w = np.empty((3, len(pixel)))
-    for top in range(start, stop):
-        for left in range(0, width, _TILE[1]):
-            end = min(width, left + _TILE[1])
-            for m in range(_list_images(owners[top : top + 1, left:end], near, listed, images)):
-                seen = _list_seen(
-                    axes[images[m]], focal, half, power, columns[left:end], rows[top : top + 1],
-                    pixel, line_u, line_v, line_w,
-                )  # fmt: skip
-                for q in range(seen):
-                    p = left + pixel[q]
-                    rank = count[top, p]
-                    count[top, p] += 1
-                    if rank < face.shape[0]:
-                        face[rank, top, p] = images[m]
-                        u[rank, top, p] = line_u[q]
-                        v[rank, top, p] = line_v[q]
-                        weight[rank, top, p] = line_w[q]
-        for p in range(width):
-            _finish_ranks(count[top, p], face[:, top, p], u[:, top, p], v[:, top, p],
-                          weight[:, top, p])  # fmt: skip
-
-
-@njit_exact
-def _finish_ranks(
-    count: int,
-    face: NDArray[np.integer],
-    u: NDArray[np.floating],
-    v: NDArray[np.floating],
-    weight: NDArray[np.floating],
-) -> None:
-    """Scale the weights of one pixel to sum 1 and fill up the images."""
-    total = weight.sum()
-    for rank in range(len(face)):
-        weight[rank] /= total
-        if rank >= count:
-            face[rank], u[rank], v[rank] = face[0], u[0], v[0]
+            width = min(owners.shape[1] - left, _TILE[1])
+            n = height * width
+            for i in range(height):
+                owner[i * width : (i + 1) * width] = owners[top + i, left : left + width]
+            done[:] = False
+            previous = -1
+            for p in range(n):
+                own = owner[p]
+                if own == previous or done[own]:
+                    continue
+                previous = own
+                done[own] = True
+                for i in range(height):
+                    line = slice(i * width, (i + 1) * width)
+                    _project(
+                        axes[own], focal, (dim - 1) / 2, columns[left : left + width],
+                        rows[top + i, 0], rows[top + i, 1], u[line], v[line],
+                    )  # fmt: skip
+                _split(u[:n], dim, column, right)
+                _split(v[:n], dim, row, below)
+                first_row, last_row = _range(row[:n], owner, own)
+                first_column, last_column = _range(column[:n], owner, own)
+                patch_height = last_row - first_row + 2
+                patch_width = max(last_column - first_column + 2, LANES)
+                first_column = min(first_column, dim - patch_width)
+                needed = patch_height * patch_width * (num_classes + LANES)
+                if len(patch) < needed:
+                    patch = np.empty(needed, np.float32)
+                source = (own * num_classes * dim + first_row) * dim + first_column
+                pixel = _copy_patch(
+                    flat, source, num_classes, dim, patch_height, patch_width, patch
+                )
+                for q in range(p, n):
+                    if owner[q] != own:
+                        continue
+                    at = (row[q] - first_row) * patch_width + column[q] - first_column
+                    corner, line_step = np.uint64(at) * pixel, np.uint64(patch_width) * pixel
+                    label[q] = _class_at(
+                        patch, corner, pixel, line_step, right[q], below[q], num_classes
+                    )
+            labels[top : top + height, left : left + width] = label[:n].reshape(height, width)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry import TangentGrid
-from tangent_train.rendering import kernels, label_kernels
+from tangent_train.rendering import feather_kernels, kernels
 from tangent_train.rendering.sampling import EquirectMap, pinhole_equirect_map
 from tangent_train.rendering.threads import over_rows
 
@@ -26,6 +26,7 @@ __all__ = [
     "feather_arguments",
     "feather_table",
     "forward_map",
+    "owner_arguments",
     "owner_table",
     "set_table_cache_limit",
     "tensors_on",
@@ -223,7 +224,7 @@ def feather_table(
             face, (u, v) = np.empty(size, owners.dtype), np.empty((2, *size), dtype)
             weight = np.zeros(size, dtype)
             over_rows(
-                label_kernels.feather_table, part.shape, *arguments, count, face, u, v, weight
+                feather_kernels.feather_table, part.shape, *arguments, count, face, u, v, weight
             )
         return ImageTable(face, u, v, weight)
 
@@ -234,9 +235,14 @@ def feather_table(
 
 def feather_arguments(grid: TangentGrid, shape: tuple[int, int]) -> tuple[Any, ...]:
     """Owners, near images, axes, focal length, power, columns and rows, for the kernels."""
+    owners, axes, focal, *rays = owner_arguments(grid, shape)
+    return owners, _near_images(grid), axes, focal, FEATHER_POWER, *rays
+
+
+def owner_arguments(grid: TangentGrid, shape: tuple[int, int]) -> tuple[Any, ...]:
+    """Owners, axes, focal length, columns and rows, for the kernels."""
     owners = owner_table(grid, shape, np.dtype(np.float32)).face[0]
-    rays = kernels.directions_of_rows(*shape)
-    return owners, _near_images(grid), _axes(grid), 1 / grid.pitch, FEATHER_POWER, *rays
+    return owners, _axes(grid), 1 / grid.pitch, *kernels.directions_of_rows(*shape)
 
 
 def tensors_on(

@@ -83,9 +83,30 @@ def test_equal_and_infinite_scores() -> None:
         assert (labels == 1).all()
 
 
-def test_many_classes() -> None:
-    grid = TangentGrid(0, 3)
-    scores = np.zeros((20, 300, 8, 8), np.float32)
+@pytest.mark.parametrize("dim", [8, 16])
+def test_scores_that_are_no_numbers_are_never_the_largest(dim: int) -> None:
+    grid = TangentGrid(0, dim.bit_length() - 1)
+    scores = np.full((20, 18, dim, dim), np.nan, np.float32)
+    assert not tangent_to_labels(scores, grid, (16, 32)).any()
+    scores[:, 17] = -5
+    assert (tangent_to_labels(scores, grid, (16, 32)) == 17).all()
+
+
+@pytest.mark.parametrize("num_classes", [1, 15, 16, 17, 40])
+@pytest.mark.parametrize("shape", [(9, 20), (70, 141)])
+def test_any_number_of_classes(num_classes: int, shape: tuple[int, int]) -> None:
+    """The compiled kernel compares 16 at once; images may be finer or coarser than the panorama."""
+    grid = TangentGrid(0, 5)
+    size = (grid.num_images, num_classes, grid.dim, grid.dim)
+    scores = np.random.default_rng(0).standard_normal(size, np.float32)
+    exact = tangent_to_labels(torch.from_numpy(scores).double(), grid, shape)
+    np.testing.assert_array_equal(tangent_to_labels(scores, grid, shape), exact.numpy())
+
+
+@pytest.mark.parametrize("dim", [8, 16])
+def test_many_classes(dim: int) -> None:
+    grid = TangentGrid(0, dim.bit_length() - 1)
+    scores = np.zeros((20, 300, dim, dim), np.float32)
     scores[:, 299] = 1
     labels = tangent_to_labels(scores, grid, (8, 16))
     assert labels.dtype == np.uint16

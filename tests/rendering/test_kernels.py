@@ -9,8 +9,8 @@ import pytest
 
 from tangent_train.geometry import TangentGrid, equirect_directions, lonlat_to_equirect
 from tangent_train.geometry.sphere import xyz_to_lonlat
-from tangent_train.rendering import kernels, label_kernels
-from tangent_train.rendering.tables import feather_arguments, owner_table
+from tangent_train.rendering import feather_kernels, kernels, label_kernels
+from tangent_train.rendering.tables import feather_arguments, owner_arguments
 
 
 def test_directions_of_rows_are_the_panoramas() -> None:
@@ -35,10 +35,9 @@ def test_pinhole_map_writes_only_its_rows() -> None:
 def test_label_rows_need_not_fill_tiles(rows: tuple[int, int]) -> None:
     grid, shape = TangentGrid(0, 4), (41, 83)
     scores = np.random.default_rng(0).random((20, 4, 16, 16), np.float32)
-    face, u, v, _ = owner_table(grid, shape, np.dtype(np.float32))
     calls: list[tuple[Any, tuple[Any, ...]]] = [
-        (label_kernels.owner_labels, (face[0], u[0], v[0])),
-        (label_kernels.feather_labels, feather_arguments(grid, shape)),
+        (label_kernels.owner_labels, owner_arguments(grid, shape)),
+        (feather_kernels.feather_labels, feather_arguments(grid, shape)),
     ]
     for kernel, arguments in calls:
         whole, part = np.full((2, *shape), 9, np.uint8)
