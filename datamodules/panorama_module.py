@@ -115,6 +115,7 @@ class PanoramaDataModule(LightningDataModule, ABC):
         self.in_memory = in_memory
         self.test_rotation = _checked_rotation(test_rotation)
         self._sources: dict[Split, PanoramaSource] = {}
+        self._start = (0, 0)
 
     @property
     def with_depth(self) -> bool:
@@ -173,11 +174,46 @@ class PanoramaDataModule(LightningDataModule, ABC):
         weights[0] = 0
         return torch.from_numpy(weights.astype(np.float32))
 
+    def state_dict(self) -> dict[str, int]:
+        """Where training is: the epoch, and the batches of it that are done."""
+        trainer = self.trainer
+        if trainer is None:
+            return {}
+        epoch = trainer.current_epoch
+        batches = trainer.fit_loop.epoch_loop.batch_progress.current.ready
+        if batches >= trainer.num_training_batches:
+            epoch, batches = epoch + 1, 0
+        return {
+            "epoch": epoch,
+            "batches": batches,
+            "panoramas_per_step": self.panoramas_per_step,
+            "processes": trainer.world_size,
+        }
+
+    def load_state_dict(self, state_dict: dict[str, int]) -> None:
+        """Let the next training loader go on there, in the same order with the same faces.
+
+        Raises:
+            SettingError: Other processes or batches would divide the epoch differently.
+        """
+        processes = 1 if self.trainer is None else self.trainer.world_size
+        now = {"panoramas_per_step": self.panoramas_per_step, "processes": processes}
+        before = {name: state_dict[name] for name in now}
+        if state_dict["batches"] and now != before:
+            raise SettingError(
+                "trainer.devices and data.panoramas_per_step",
+                found=f"{processes} processes of {self.panoramas_per_step} panoramas",
+                expected="{processes} of {panoramas_per_step}, as before".format(**before),
+                remedy="Within an epoch, resume as the run was started.",
+            )
+        self._start = state_dict["epoch"], state_dict["batches"] * self.panoramas_per_step
+
     def train_dataloader(self) -> DataLoader[TrainingSample]:
         """Batches of `TrainingSample`."""
         source = self.source("train")
         dataset = TrainingPanoramas(source, self.representation, self.normalization, self.seed)
-        return self._loader(dataset, len(source), self.panoramas_per_step, shuffle=True)
+        size = self.panoramas_per_step
+        return self._loader(dataset, len(source), size, self._start, shuffle=True)
 
     def val_dataloader(self) -> DataLoader[EvaluationSample] | list[DataLoader[EvaluationSample]]:
         """Batches of one `EvaluationSample`; no loader when there is no validation split."""
@@ -190,16 +226,24 @@ class PanoramaDataModule(LightningDataModule, ABC):
     def _evaluation_loader(self, split: Split) -> DataLoader[EvaluationSample]:
         source = self.source(split)
         dataset = EvaluationPanoramas(source, self.representation, self.normalization)
-        return self._loader(dataset, len(source), batch_size=1, shuffle=False)
+        return self._loader(dataset, len(source), 1, shuffle=False)
 
     def _loader(
-        self, dataset: Dataset[_Sample], length: int, batch_size: int, *, shuffle: bool
+        self,
+        dataset: Dataset[_Sample],
+        length: int,
+        batch_size: int,
+        start: tuple[int, int] = (0, 0),
+        *,
+        shuffle: bool,
     ) -> DataLoader[_Sample]:
         rank, world_size = _process()
         return DataLoader(
             dataset,
             batch_size=batch_size,
-            sampler=EpochSampler(length, self.seed, shuffle, rank, world_size),
+            sampler=EpochSampler(length, self.seed, shuffle, rank, world_size, start),
+            # Its own: the loader draws seeds for its workers, which would shift those of dropout.
+            generator=torch.Generator().manual_seed(self.seed),
             num_workers=self.num_workers,
             persistent_workers=self.num_workers > 0,
             pin_memory=torch.cuda.is_available(),

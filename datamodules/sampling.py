@@ -50,13 +50,21 @@ class EpochSampler(Sampler[tuple[int, int]]):
         shuffle: A new random order every epoch.
         rank: This process.
         world_size: Number of processes.
+        start: An epoch and how many of its samples this process has had already: a resumed run
+            goes on behind them. The length stays that of a whole epoch.
 
     Raises:
         SettingError: Fewer samples than processes, or an impossible rank.
     """
 
     def __init__(
-        self, length: int, seed: int, shuffle: bool, rank: int = 0, world_size: int = 1
+        self,
+        length: int,
+        seed: int,
+        shuffle: bool,
+        rank: int = 0,
+        world_size: int = 1,
+        start: tuple[int, int] = (0, 0),
     ) -> None:
         if not 0 <= rank < world_size:
             raise SettingError("rank", found=rank, expected=f"0 to {world_size - 1}")
@@ -72,7 +80,9 @@ class EpochSampler(Sampler[tuple[int, int]]):
         self._shuffle = shuffle
         self._rank = rank
         self._world_size = world_size
-        self._epoch = 0
+        self._start = start
+        # Workers of a resumed run start to fetch before Lightning says the epoch.
+        self._epoch = start[0]
 
     def set_epoch(self, epoch: int) -> None:
         """Say which epoch the next iteration belongs to."""
@@ -88,7 +98,9 @@ class EpochSampler(Sampler[tuple[int, int]]):
             order = np.random.default_rng(
                 np.random.SeedSequence(self._seed, spawn_key=(epoch,))
             ).permutation(self._length)
-        for index in order[self._rank : self._used : self._world_size]:
+        start_epoch, had = self._start
+        mine = order[self._rank : self._used : self._world_size]
+        for index in mine[had if epoch == start_epoch else 0 :]:
             yield epoch, int(index)
 
     @property

@@ -12,7 +12,7 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
-from hydra.errors import OverrideParseException
+from hydra.errors import MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 
 from tangent_train.errors import DataError, SettingError
@@ -28,6 +28,9 @@ __all__ = ["check_overrides", "checkpoint_config", "config_folder", "with_stored
 _STORED = "stored_"
 """Begins the names of configs that come from a run or a checkpoint."""
 
+_PLUGINS = {"hydra/launcher/": "hydra-submitit-launcher", "hydra/sweeper/": "hydra-optuna-sweeper"}
+"""Packages of the extra ``sweep``, by the config group they add options to."""
+
 
 def config_folder() -> Path:
     """The Hydra tree: the copy inside the wheel first, the checkout's second."""
@@ -39,8 +42,8 @@ def config_folder() -> Path:
 def with_stored_config(command: str, arguments: list[str]) -> tuple[str, list[str]]:
     """Start from a stored config where the command goes on from one.
 
-    ``tangent-train resume=<run folder>`` takes the run's own config, ``tangent-evaluate
-    checkpoint=<file>`` the one inside the checkpoint; overrides then apply to that.
+    ``tangent-train resume=<run folder>`` takes the config inside the run's last checkpoint,
+    ``tangent-evaluate checkpoint=<file>`` the one inside that; overrides then apply to it.
 
     Args:
         command: train, evaluate or prepare.
@@ -55,7 +58,7 @@ def with_stored_config(command: str, arguments: list[str]) -> tuple[str, list[st
     given = dict(argument.partition("=")[::2] for argument in arguments)
     if command == "train" and given.get("resume") not in (None, "", "null"):
         folder = Path(given["resume"]).absolute()
-        stored = _run_config(folder)
+        stored = checkpoint_config(_last_checkpoint(folder))
         stored["resume"] = str(folder)
         arguments = [a for a in arguments if not a.startswith("resume=")]
         run_folder = str(folder)
@@ -72,16 +75,16 @@ def with_stored_config(command: str, arguments: list[str]) -> tuple[str, list[st
     return _STORED + command, arguments
 
 
-def _run_config(folder: Path) -> dict[str, Any]:
-    path = folder / ".hydra" / "config.yaml"
-    if not path.is_file() or not (folder / "checkpoints" / "last.ckpt").is_file():
+def _last_checkpoint(folder: Path) -> Path:
+    path = folder / "checkpoints" / "last.ckpt"
+    if not path.is_file():
         raise DataError(
             folder,
-            found="no .hydra/config.yaml and checkpoints/last.ckpt",
+            found="no checkpoints/last.ckpt",
             expected="the folder of a run that has begun",
             remedy="Give resume= the folder that tangent-train printed.",
         )
-    return _plain(OmegaConf.load(path))
+    return path
 
 
 def checkpoint_config(path: Path) -> dict[str, Any]:
@@ -150,11 +153,27 @@ def check_overrides(config_name: str, arguments: list[str]) -> None:
         for override in groups:
             _check_option(override, options_of[override.key_or_group])
         chosen = [str(o.input_line) for o in groups if not o.is_sweep_override()]
-        config = compose(config_name, [*search, *chosen])
+        config = _compose(config_name, [*search, *chosen])
     names = list(dict.fromkeys([*_dotted(config), *_group_names(loader)]))
     for override in plain:
         if override not in groups and override.key_or_group not in names:
             _refuse("setting", override.key_or_group, names)
+
+
+def _compose(config_name: str, overrides: list[str]) -> DictConfig:
+    try:
+        return compose(config_name, overrides)
+    except MissingConfigException as error:
+        missing = str(error.missing_cfg_file)
+        for group, package in _PLUGINS.items():
+            if missing.startswith(group):
+                raise SettingError(
+                    missing,
+                    found=f"no {package}",
+                    expected="the packages for sweeps",
+                    remedy="Run: pip install 'tangent-train[sweep]'",
+                ) from error
+        raise
 
 
 def _check_option(override: Override, options: list[str]) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+import sys
 import warnings
 from pathlib import Path
 from typing import Any
@@ -15,17 +17,19 @@ from hydra.utils import instantiate
 from lightning.pytorch.callbacks import LearningRateMonitor
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
+from lightning.pytorch.utilities.exceptions import SIGTERMException
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
+from tangent_train.cli.resume import check_resumed
 from tangent_train.errors import SettingError
 from tangent_train.files import write_text
 from tangent_train.rendering import Representation
-from tangent_train.tasks.callbacks import (
-    CheckpointConfig,
+from tangent_train.tasks.callbacks import PredictionPanels, ProgressBar
+from tangent_train.tasks.checkpoints import (
+    AtomicCheckpointIO,
+    CheckpointContents,
     LastCheckpoint,
-    PredictionPanels,
-    ProgressBar,
     best_checkpoint,
 )
 from tangent_train.tasks.results import evaluation_results, results_table, write_results
@@ -45,12 +49,16 @@ def train(config: DictConfig) -> None:
     folder = _run_folder()
     checkpoints = folder / "checkpoints"
     lightning.seed_everything(config.seed, workers=True, verbose=False)
+    resumed = None if config.resume is None else checkpoints / "last.ckpt"
+    if resumed is not None:
+        check_resumed(_resolved(config), _checkpoint(resumed)["resolved_config"])
     data, task = build(config)
     write_text(folder / "config.yaml", OmegaConf.to_yaml(config, resolve=True))
-    callbacks = [LastCheckpoint(checkpoints), LearningRateMonitor()]
+    last = LastCheckpoint(checkpoints, config.checkpoint_every_n_steps)
+    callbacks = [last, LearningRateMonitor()]
     if data.validation_fraction:
         callbacks.append(best_checkpoint(checkpoints))
-    trainer = _trainer(config, folder, callbacks)
+    trainer = _trainer(config, folder, data, callbacks)
     if HydraConfig.get().mode == RunMode.MULTIRUN and trainer.num_devices > 1:
         raise SettingError(
             "trainer.devices",
@@ -58,11 +66,15 @@ def train(config: DictConfig) -> None:
             expected="1: further processes would each run the whole sweep",
             remedy="Start the runs one by one.",
         )
-    resumed = None if config.resume is None else checkpoints / "last.ckpt"
     with warnings.catch_warnings():
         # The checkpoints of a resumed run are meant to be there.
         warnings.filterwarnings("ignore", "Checkpoint directory .* exists and is not empty")
-        trainer.fit(task, datamodule=data, ckpt_path=resumed, weights_only=True)
+        # Lightning looks for this in the loader; here the data module knows where to go on.
+        warnings.filterwarnings("ignore", ".* your dataloader is not resumable")
+        try:
+            trainer.fit(task, datamodule=data, ckpt_path=resumed, weights_only=True)
+        except SIGTERMException:
+            sys.exit(128 + signal.SIGTERM)
     best = checkpoints / "best.ckpt"
     _test(trainer, task, data, best if best.exists() else checkpoints / "last.ckpt", folder)
 
@@ -86,7 +98,7 @@ def evaluate(config: DictConfig) -> None:
     folder = _run_folder()
     lightning.seed_everything(config.seed, workers=True, verbose=False)
     data, task = build(config)
-    _test(_trainer(config, folder, []), task, data, Path(config.checkpoint), folder)
+    _test(_trainer(config, folder, data, []), task, data, Path(config.checkpoint), folder)
 
 
 def prepare(config: DictConfig) -> None:
@@ -141,26 +153,46 @@ def _try_network(task: Any, representation: Representation, channels: int) -> No
     task.train()
 
 
-def _trainer(config: DictConfig, folder: Path, callbacks: list[Any]) -> lightning.Trainer:
-    # Not resolved: an override of level or seed still reaches everything that refers to it.
-    plain: Any = OmegaConf.to_container(config)
+def _trainer(
+    config: DictConfig, folder: Path, data: Any, callbacks: list[Any]
+) -> lightning.Trainer:
+    contents = {
+        # Not resolved: an override of level or seed still reaches everything that refers to it.
+        "config": OmegaConf.to_container(config),
+        "resolved_config": _resolved(config),
+        "class_names": list(data.class_names),
+        "normalization": {
+            "mean": list(data.normalization.mean),
+            "std": list(data.normalization.std),
+        },
+    }
     panels = PredictionPanels(folder / "panels", config.panels)
-    common = [CheckpointConfig(plain), panels, ProgressBar()]
+    common = [CheckpointContents(contents), panels, ProgressBar()]
     trainer: lightning.Trainer = instantiate(
         config.trainer,
         default_root_dir=str(folder),
         callbacks=[*callbacks, *common],
         logger=TensorBoardLogger(folder, name="", version="tensorboard"),
+        plugins=[AtomicCheckpointIO()],
         # The data module's samplers count every panorama once on any number of processes.
         use_distributed_sampler=False,
     )
     return trainer
 
 
+def _resolved(config: DictConfig) -> dict[str, Any]:
+    plain: Any = OmegaConf.to_container(config, resolve=True)
+    return plain
+
+
+def _checkpoint(path: Path) -> dict[str, Any]:
+    content: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+    return content
+
+
 def _test(trainer: lightning.Trainer, task: Any, data: Any, checkpoint: Path, folder: Path) -> None:
-    content = torch.load(checkpoint, map_location="cpu", weights_only=True)
     try:
-        task.load_state_dict(content["state_dict"])
+        task.load_state_dict(_checkpoint(checkpoint)["state_dict"])
     except RuntimeError as error:
         raise SettingError(
             "network",

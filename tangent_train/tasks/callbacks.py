@@ -1,4 +1,4 @@
-"""What happens around training: pictures, the config in the checkpoint, the way on."""
+"""What happens around training: pictures and progress."""
 
 from __future__ import annotations
 
@@ -8,39 +8,12 @@ from typing import Any
 import cv2
 import lightning
 import numpy as np
-from lightning.pytorch.callbacks import Callback, Checkpoint, ModelCheckpoint, RichProgressBar
-from rich.console import Console
+from lightning.pytorch.callbacks import Callback, RichProgressBar
 
 from tangent_train.files import write_bytes
 from tangent_train.tasks.pictures import prediction_panel
 
-__all__ = [
-    "CheckpointConfig",
-    "LastCheckpoint",
-    "PredictionPanels",
-    "ProgressBar",
-    "best_checkpoint",
-]
-
-
-class CheckpointConfig(Callback):
-    """Puts the config into every checkpoint, as plain values.
-
-    Args:
-        config: Nested dicts and lists of plain values.
-    """
-
-    def __init__(self, config: dict[str, Any]) -> None:
-        self.config = config
-
-    def on_save_checkpoint(
-        self,
-        trainer: lightning.Trainer,
-        pl_module: lightning.LightningModule,
-        checkpoint: dict[str, Any],
-    ) -> None:
-        """Add the config under ``config``."""
-        checkpoint["config"] = self.config
+__all__ = ["PredictionPanels", "ProgressBar"]
 
 
 class PredictionPanels(Callback):
@@ -94,64 +67,3 @@ class ProgressBar(RichProgressBar):
         figures = dict(super().get_metrics(trainer, pl_module))
         figures.pop("v_num", None)
         return figures
-
-
-class LastCheckpoint(Checkpoint):
-    """Keeps ``last.ckpt`` at the newest state training can go on from: the end of an epoch.
-
-    The first one is written before the first step, so that an interrupted run can always be
-    resumed; the way to do that is said when it is interrupted.
-
-    Args:
-        folder: Where to; the checkpoints' folder of a run.
-    """
-
-    def __init__(self, folder: Path | str) -> None:
-        self.path = Path(folder) / "last.ckpt"
-
-    def on_train_start(
-        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
-    ) -> None:
-        """Save the untrained state of a new run."""
-        if trainer.global_step == 0:
-            trainer.save_checkpoint(self.path, weights_only=False)
-
-    def on_train_epoch_end(
-        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
-    ) -> None:
-        """Save the state after every epoch."""
-        trainer.save_checkpoint(self.path, weights_only=False)
-
-    def on_exception(
-        self,
-        trainer: lightning.Trainer,
-        pl_module: lightning.LightningModule,
-        exception: BaseException,
-    ) -> None:
-        """Say how to go on after Ctrl-C; an error says for itself what to do."""
-        interrupted = isinstance(exception, KeyboardInterrupt) and trainer.is_global_zero
-        if interrupted and self.path.exists():
-            run_folder = self.path.parent.parent
-            Console(stderr=True).print(
-                f"Interrupted. All finished epochs are in {self.path}; go on with\n"
-                f"  tangent-train resume={run_folder}",
-                soft_wrap=True,
-                highlight=False,
-            )
-
-
-def best_checkpoint(folder: Path | str, monitor: str = "val/miou") -> ModelCheckpoint:
-    """Keeps ``best.ckpt``, the epoch with the highest figure of the validation split.
-
-    Args:
-        folder: Where to.
-        monitor: The figure.
-    """
-    return ModelCheckpoint(
-        dirpath=folder,
-        filename="best",
-        monitor=monitor,
-        mode="max",
-        auto_insert_metric_name=False,
-        enable_version_counter=False,
-    )

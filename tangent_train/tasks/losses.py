@@ -2,28 +2,15 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
+import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 from torch.nn import functional
 
-__all__ = ["UNKNOWN", "LossSum", "cross_entropy_sum"]
+__all__ = ["UNKNOWN", "cross_entropy_norm", "cross_entropy_sum"]
 
 UNKNOWN = 0
 """Class index of unlabelled pixels, everywhere."""
-
-
-class LossSum(NamedTuple):
-    """A loss not yet divided by its norm.
-
-    Attributes:
-        total: Sum over the labelled pixels.
-        norm: What to divide the sum by: the class weights of the labelled pixels, added up.
-    """
-
-    total: Tensor
-    norm: Tensor
 
 
 def cross_entropy_sum(
@@ -31,29 +18,31 @@ def cross_entropy_sum(
     labels: UInt8[Tensor, "images height width"],
     class_weights: Float[Tensor, " classes"],
     label_smoothing: float = 0.0,
-) -> LossSum:
-    """Weighted cross-entropy; unknown pixels (class 0) count for nothing.
+) -> Tensor:
+    """Weighted cross-entropy, summed; unknown pixels (class 0) count for nothing.
 
-    ``total / norm`` over one batch is torch's weighted mean. Dividing by the norm of *all* images,
-    chunks and processes instead makes them one batch.
+    Divided by the `cross_entropy_norm` of the same images it is torch's weighted mean. Divided by
+    the norm of *all* images, chunks and processes instead, it is their share of one mean.
 
     Args:
         scores: Logits.
         labels: Class indices; 0 is unknown.
         class_weights: Weight of every class.
         label_smoothing: Share of the target spread evenly over the classes.
-
-    Returns:
-        Sum and norm.
     """
-    target = labels.long()
-    total = functional.cross_entropy(
+    return functional.cross_entropy(
         scores,
-        target,
+        labels.long(),
         class_weights,
         ignore_index=UNKNOWN,
         reduction="sum",
         label_smoothing=label_smoothing,
     )
-    known = target != UNKNOWN
-    return LossSum(total, class_weights[target[known]].sum())
+
+
+def cross_entropy_norm(
+    labels: UInt8[Tensor, "images height width"], class_weights: Float[Tensor, " classes"]
+) -> Tensor:
+    """The class weights of the labelled pixels, added up: known before any network has run."""
+    pixels = torch.bincount(labels.flatten(), minlength=len(class_weights))
+    return pixels[UNKNOWN + 1 :].to(class_weights) @ class_weights[UNKNOWN + 1 :]

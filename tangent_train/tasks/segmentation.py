@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
 import lightning
@@ -15,7 +15,7 @@ from torch.optim.lr_scheduler import LRScheduler
 
 from tangent_train.errors import SettingError
 from tangent_train.rendering import Representation
-from tangent_train.tasks.losses import LossSum, cross_entropy_sum
+from tangent_train.tasks.losses import cross_entropy_norm, cross_entropy_sum
 from tangent_train.tasks.metrics import AbsentClass, ConfusionMatrix, segmentation_scores
 
 __all__ = ["SegmentationTask"]
@@ -26,8 +26,9 @@ class SegmentationTask(lightning.LightningModule):
 
     The views of all panoramas of a batch, on all processes, make one gradient (paper, supplement,
     "Semantic segmentation"): the loss is the sum over their labelled pixels divided by the sum of
-    those pixels' class weights. Validation and test see the whole sphere; the scores are rendered
-    back and compared with the panorama's own labels.
+    those pixels' class weights. `images_per_chunk` bounds the memory that takes; the gradient stays
+    the same, but batch normalization sees one chunk at a time. Validation and test see the whole
+    sphere; the scores are rendered back and compared with the panorama's own labels.
 
     Args:
         network: Any module ``(B, C, h, w) -> (B, K+1, h, w)`` or a dict with that under ``"out"``;
@@ -40,9 +41,11 @@ class SegmentationTask(lightning.LightningModule):
         class_weights: Weights of the loss: a name that the data module knows (``none``, ``log``,
             ``sqrt``) or K + 1 numbers.
         label_smoothing: Share of the target spread over all classes.
+        images_per_chunk: Images trained at once, a bound on memory; None for the whole batch.
         images_per_forward: Images evaluated at once, a bound on memory; training is not affected.
         absent_class: What classes absent from the truth do to the means.
         channels_last: Memory format of network and images, often faster.
+        compile: Arguments of `torch.compile` for the network, empty for its defaults; None not to.
     """
 
     class_weights: Tensor
@@ -56,25 +59,32 @@ class SegmentationTask(lightning.LightningModule):
         scheduler: Callable[..., LRScheduler] | None = None,
         class_weights: Literal["none", "log", "sqrt"] | Sequence[float] = "log",
         label_smoothing: float = 0.0,
+        images_per_chunk: int | None = None,
         images_per_forward: int = 32,
         absent_class: AbsentClass = "skip",
         channels_last: bool = False,
+        compile: Mapping[str, Any] | None = None,  # noqa: A002 - torch's own word
     ) -> None:
         super().__init__()
         if not 0 <= label_smoothing < 1:
             raise SettingError("task.label_smoothing", found=label_smoothing, expected="0 to 1")
-        if images_per_forward < 1:
-            raise SettingError("task.images_per_forward", found=images_per_forward, expected="≥ 1")
+        at_once = {"images_per_chunk": images_per_chunk, "images_per_forward": images_per_forward}
+        for name, count in at_once.items():
+            if count is not None and count < 1:
+                raise SettingError(f"task.{name}", found=count, expected="1 or more")
         if absent_class not in ("skip", "zero"):
             raise SettingError("task.absent_class", found=absent_class, expected="skip or zero")
         self.memory_format = torch.channels_last if channels_last else torch.contiguous_format
         self.network: nn.Module = network.to(memory_format=self.memory_format)
+        if compile is not None:
+            self.network.compile(**compile)  # in place: names of tensors stay as they are
         self.representation = representation
         self.class_names = tuple(class_names)
         self.make_optimizer = optimizer
         self.make_scheduler = scheduler
         self.weighting = class_weights
         self.label_smoothing = label_smoothing
+        self.images_per_chunk = images_per_chunk
         self.images_per_forward = images_per_forward
         self.absent_class: AbsentClass = absent_class
         self.register_buffer("class_weights", torch.ones(len(self.class_names)))
@@ -135,17 +145,41 @@ class SegmentationTask(lightning.LightningModule):
                 )
 
     def training_step(self, batch: Any, batch_idx: int) -> Tensor:
-        """One gradient of the whole batch of spheres, over all processes."""
-        images, labels = batch.images.flatten(0, 1), batch.labels.flatten(0, 1)
-        loss = cross_entropy_sum(self(images), labels, self.class_weights, self.label_smoothing)
-        value = self._normalized(loss)
-        self.log("train/loss", value.detach(), prog_bar=True)
-        return value
+        """One gradient of the whole batch of spheres, over all chunks and processes.
 
-    def _normalized(self, loss: LossSum) -> Tensor:
-        """Divide by the norm of all processes; their gradients are averaged, hence the factor."""
-        norm: Tensor = self.trainer.strategy.reduce(loss.norm.detach(), reduce_op="sum")
-        return loss.total * self.trainer.world_size / norm.clamp(min=torch.finfo(norm.dtype).tiny)
+        All chunks but the last are back-propagated here, Lightning does the last one. On several
+        processes this is still inside `DistributedDataParallel.forward`, which exchanges gradients
+        only in a backward pass that follows it: once, after the last chunk.
+        """
+        images, labels = batch.images.flatten(0, 1), batch.labels.flatten(0, 1)
+        norm = self._whole_norm(labels)
+        batches = self.trainer.accumulate_grad_batches
+        if batch_idx % batches == 0:
+            self.trainer.optimizers[0].zero_grad()
+        size = self.images_per_chunk or len(images)
+        *chunks, last = zip(images.split(size), labels.split(size), strict=True)
+        value = torch.zeros_like(norm)
+        for chunk in chunks:
+            loss = self._loss(*chunk, norm)
+            self.trainer.strategy.backward(loss / batches, None)
+            value += loss.detach()
+        loss = self._loss(*last, norm)
+        self.log("train/loss", value + loss.detach(), prog_bar=True)
+        return loss
+
+    def optimizer_zero_grad(self, *_: Any) -> None:
+        """Nothing: `training_step` clears the gradients before its first chunk."""
+
+    def _whole_norm(self, labels: Tensor) -> Tensor:
+        """Norm of the loss over all processes; as their gradients are averaged, its mean."""
+        norm = cross_entropy_norm(labels, self.class_weights)
+        mean: Tensor = self.trainer.strategy.reduce(norm, reduce_op="mean")
+        return mean.clamp(min=torch.finfo(norm.dtype).tiny)
+
+    def _loss(self, images: Tensor, labels: Tensor, norm: Tensor) -> Tensor:
+        scores = self(images)
+        total = cross_entropy_sum(scores, labels, self.class_weights, self.label_smoothing)
+        return total / norm
 
     @torch.no_grad()
     def predict_panorama(

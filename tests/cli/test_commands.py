@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from tangent_train.cli import main
-from tangent_train.tasks.callbacks import LastCheckpoint
+from tangent_train.tasks.checkpoints import LastCheckpoint
 
 AREAS = ("1", "2", "3", "4", "5a", "5b", "6")
 SETTINGS = [

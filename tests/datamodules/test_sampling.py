@@ -61,3 +61,13 @@ def test_impossible_processes() -> None:
             EpochSampler(1, 0, shuffle, rank=0, world_size=2)
     with pytest.raises(SettingError, match="rank: found 2"):
         EpochSampler(5, 0, shuffle=True, rank=2, world_size=2)
+
+
+def test_a_resumed_epoch_goes_on_behind_what_was_had() -> None:
+    whole, resumed = EpochSampler(9, 3, True, 1, 2), EpochSampler(9, 3, True, 1, 2, start=(4, 3))
+    for epoch in (4, 5):
+        whole.set_epoch(epoch)
+        if epoch > 4:  # the first time its epoch is known from the start
+            resumed.set_epoch(epoch)
+        assert list(resumed) == list(whole)[3 if epoch == 4 else 0 :]
+        assert len(resumed) == len(whole) == 4

@@ -1,0 +1,75 @@
+"""What may change when a run is resumed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from tangent_train.errors import SettingError
+
+__all__ = ["check_resumed"]
+
+_FREE = (
+    "checkpoint_every_n_steps",
+    "data.in_memory",
+    "data.label_table",
+    "data.num_workers",
+    "data.root",
+    "data.store",
+    "data.test_rotation",
+    "launcher",
+    "name",
+    "panels",
+    "resume",
+    "sweep",
+    "task.absent_class",
+    "task.channels_last",
+    "task.compile",
+    "task.images_per_chunk",
+    "task.images_per_forward",
+    "trainer",
+)
+"""Settings, with all below them, that say where and how a run is computed, not what."""
+
+_REASONS = {
+    "network": "the checkpoint holds the tensors of its own network",
+    "data": "it would be another training set",
+    "representation": "it would be another training set",
+    "seed": "order and faces would be others",
+    "optimizer": "its state and learning rate come from the checkpoint",
+    "scheduler": "its state comes from the checkpoint",
+    "task": "it would be another loss",
+}
+
+
+def check_resumed(config: Mapping[str, Any], before: Mapping[str, Any]) -> None:
+    """Refuse to resume a run as another one.
+
+    Args:
+        config: The resolved config.
+        before: The resolved config in the checkpoint.
+
+    Raises:
+        SettingError: A setting differs that makes the run what it is.
+    """
+    now, then = dict(_flat(config)), dict(_flat(before))
+    for name in sorted(now.keys() | then.keys()):
+        free = any(name == free or name.startswith(f"{free}.") for free in _FREE)
+        if free or now.get(name) == then.get(name):
+            continue
+        reason = _REASONS.get(name.partition(".")[0], "it would be another run")
+        raise SettingError(
+            name,
+            found=f"{now.get(name)!r} for a run that began with {then.get(name)!r}",
+            expected=f"no other than before: {reason}",
+            remedy="Start a new run for it.",
+        )
+
+
+def _flat(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in config.items():
+        name = f"{prefix}{key}"
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{name}.")
+        else:
+            yield name, value

@@ -1,0 +1,194 @@
+"""Checkpoints: what is in them, when they are written, and going on exactly where one was."""
+
+from __future__ import annotations
+
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import lightning
+import torch
+from lightning.fabric.plugins import TorchCheckpointIO
+from lightning.pytorch.callbacks import Callback, Checkpoint, ModelCheckpoint
+from lightning.pytorch.utilities.exceptions import SIGTERMException
+from rich.console import Console
+
+from tangent_train.errors import SettingError
+from tangent_train.files import atomic_path
+
+__all__ = [
+    "AtomicCheckpointIO",
+    "CheckpointContents",
+    "LastCheckpoint",
+    "best_checkpoint",
+]
+
+
+class AtomicCheckpointIO(TorchCheckpointIO):
+    """Writes beside the old checkpoint and renames.
+
+    Lightning's own writes to the system's temporary folder, often another disk: moving from there
+    is a copy that a kill cuts off.
+    """
+
+    def save_checkpoint(
+        self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None
+    ) -> None:
+        """Save atomically.
+
+        Args:
+            checkpoint: Tensors and plain values.
+            path: The file.
+            storage_options: Not used.
+        """
+        with atomic_path(Path(path)) as temporary:
+            torch.save(checkpoint, temporary)
+
+
+class CheckpointContents(Callback):
+    """Puts all that later commands need into every checkpoint, and the state of the randomness.
+
+    Args:
+        contents: Nested dicts and lists of plain values, by name.
+    """
+
+    def __init__(self, contents: dict[str, Any]) -> None:
+        self.contents = contents | {"tangent_train_version": version("tangent-train")}
+        self._random_states: list[dict[str, Any]] | None = None
+
+    def on_save_checkpoint(
+        self,
+        trainer: lightning.Trainer,
+        pl_module: lightning.LightningModule,
+        checkpoint: dict[str, Any],
+    ) -> None:
+        """Add the contents, and under ``random`` the generators of every process."""
+        checkpoint.update(self.contents)
+        checkpoint["random"] = _of_all_processes(trainer, _random_state())
+
+    def on_load_checkpoint(
+        self,
+        trainer: lightning.Trainer,
+        pl_module: lightning.LightningModule,
+        checkpoint: dict[str, Any],
+    ) -> None:
+        """Take the generators' states."""
+        self._random_states = checkpoint.get("random")
+
+    def on_train_start(
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
+    ) -> None:
+        """Restore them: what a network draws (dropout) goes on, on as many processes as before."""
+        states = self._random_states
+        if states is not None and len(states) == trainer.world_size:
+            state = states[trainer.global_rank]
+            torch.set_rng_state(state["cpu"])
+            if torch.cuda.is_available() and state["cuda"]:
+                torch.cuda.set_rng_state(state["cuda"][0])
+
+
+def _random_state() -> dict[str, Any]:
+    """Of this process; the data draws from its own generators, see `sample_rng`."""
+    cuda = [torch.cuda.get_rng_state()] if torch.cuda.is_available() else []
+    return {"cpu": torch.get_rng_state(), "cuda": cuda}
+
+
+def _of_all_processes(trainer: lightning.Trainer, value: Any) -> list[Any]:
+    if trainer.world_size == 1:
+        return [value]
+    values: list[Any] = [None] * trainer.world_size
+    torch.distributed.all_gather_object(values, value)
+    return values
+
+
+class LastCheckpoint(Checkpoint):
+    """Keeps ``last.ckpt`` at the newest state training can go on from.
+
+    Written before the first step, after every epoch, every so many steps, and on SIGTERM (what a
+    cluster sends before it kills): a run can always be resumed, exactly where it was. How to do
+    that is said when it is interrupted.
+
+    Args:
+        folder: Where to; the checkpoints' folder of a run.
+        every_n_steps: Optimizer steps between checkpoints within an epoch; None for none.
+
+    Raises:
+        SettingError: Fewer than one step.
+    """
+
+    def __init__(self, folder: Path | str, every_n_steps: int | None = None) -> None:
+        if every_n_steps is not None and every_n_steps < 1:
+            raise SettingError("checkpoint_every_n_steps", found=every_n_steps, expected="≥ 1")
+        self.path = Path(folder) / "last.ckpt"
+        self.every_n_steps = every_n_steps
+
+    def on_train_start(
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
+    ) -> None:
+        """Save the untrained state of a new run."""
+        if trainer.global_step == 0:
+            self._save(trainer)
+
+    def on_train_batch_end(  # noqa: D102 - a hook of Lightning
+        self,
+        trainer: lightning.Trainer,
+        pl_module: lightning.LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+    ) -> None:
+        stepped = (batch_idx + 1) % trainer.accumulate_grad_batches == 0
+        ends_epoch = batch_idx + 1 == trainer.num_training_batches  # saved in a moment
+        due = bool(self.every_n_steps) and trainer.global_step % (self.every_n_steps or 1) == 0
+        if due and stepped and not ends_epoch:
+            self._save(trainer)
+
+    def on_train_epoch_end(
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
+    ) -> None:
+        """Save the state after every epoch."""
+        self._save(trainer)
+
+    def on_exception(
+        self,
+        trainer: lightning.Trainer,
+        pl_module: lightning.LightningModule,
+        exception: BaseException,
+    ) -> None:
+        """Save on SIGTERM, which ends a run between two steps; say how to go on after Ctrl-C too.
+
+        An error says for itself what to do.
+        """
+        terminated = isinstance(exception, SIGTERMException)
+        if terminated and trainer.training:
+            self._save(trainer)
+        interrupted = terminated or isinstance(exception, KeyboardInterrupt)
+        if interrupted and trainer.is_global_zero and self.path.exists():
+            run_folder = self.path.parent.parent
+            Console(stderr=True).print(
+                f"Interrupted. {self.path} has all up to "
+                f"{'here' if terminated else 'the last checkpoint'}; go on with\n"
+                f"  tangent-train resume={run_folder}",
+                soft_wrap=True,
+                highlight=False,
+            )
+
+    def _save(self, trainer: lightning.Trainer) -> None:
+        trainer.save_checkpoint(self.path, weights_only=False)
+
+
+def best_checkpoint(folder: Path | str, monitor: str = "val/miou") -> ModelCheckpoint:
+    """Keeps ``best.ckpt``, the epoch with the highest figure of the validation split.
+
+    Args:
+        folder: Where to.
+        monitor: The figure.
+    """
+    return ModelCheckpoint(
+        dirpath=folder,
+        filename="best",
+        monitor=monitor,
+        mode="max",
+        auto_insert_metric_name=False,
+        enable_version_counter=False,
+    )

@@ -1,0 +1,236 @@
+"""Runs that are killed, terminated and resumed, and runs of several processes."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from tangent_train.cli import main
+from tangent_train.cli.resume import check_resumed
+from tangent_train.errors import SettingError
+
+# No batch statistics. Dropout draws from torch's generator at every step.
+NETWORKS = {
+    "plain": """
+_target_: torch.nn.Conv2d
+in_channels: 4
+out_channels: 14
+kernel_size: 3
+padding: 1
+""",
+    "dropout": """
+_target_: torch.nn.Sequential
+_args_:
+  - {_target_: torch.nn.Conv2d, in_channels: 4, out_channels: 14, kernel_size: 3, padding: 1}
+  - {_target_: torch.nn.Dropout2d}
+""",
+}
+SETTINGS = [
+    "experiment=rooms/demo",
+    "level=4",
+    "representation.crop_multiple=null",
+    "data.panoramas_per_step=1",
+    "data.validation_fraction=0.2",
+    "data.rooms.height=32",
+    *(f"data.rooms.rooms.area_{area}=1" for area in ("1", "2", "3", "4", "6")),
+    "data.rooms.rooms.area_5a=2",
+    "data.rooms.rooms.area_5b=1",
+    "trainer.accelerator=cpu",
+    "trainer.log_every_n_steps=1",
+    "panels=1",
+]
+COMMAND = Path(sys.executable).parent / "tangent-train"
+
+CUT_SHORT = """
+import os, signal, sys
+from tangent_train.cli.main import train
+from tangent_train.tasks.checkpoints import LastCheckpoint
+
+original = LastCheckpoint.on_train_batch_end
+
+def cut_short(self, trainer, *rest):
+    original(self, trainer, *rest)
+    if trainer.global_step == int(os.environ["STEP"]):
+        os.kill(os.getpid(), int(os.environ["SIGNAL"]))
+
+LastCheckpoint.on_train_batch_end = cut_short
+train()
+"""
+
+
+def _run(monkeypatch: pytest.MonkeyPatch, command: str, *arguments: str) -> None:
+    monkeypatch.setattr(sys, "argv", [f"tangent-{command}", *arguments])
+    getattr(main, command)()
+
+
+def _last(folder: Path) -> dict[str, Any]:
+    content: dict[str, Any] = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
+    return content
+
+
+@pytest.fixture(scope="module")
+def settings(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    """With the networks above as options, and the rooms made."""
+    folder = tmp_path_factory.mktemp("settings")
+    (folder / "network").mkdir()
+    for name, config in NETWORKS.items():
+        (folder / "network" / f"{name}.yaml").write_text(config)
+    settings = ["--config-dir", str(folder), *SETTINGS, f"data.root={folder / 'rooms'}"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        _run(patch, "prepare", *settings, "network=plain")
+    return settings
+
+
+@pytest.fixture(scope="module")
+def arguments(settings: list[str]) -> list[str]:
+    return [*settings, "network=dropout", "trainer.max_epochs=3", "checkpoint_every_n_steps=2"]
+
+
+@pytest.fixture(scope="module")
+def undisturbed(arguments: list[str], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("run")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        _run(patch, "train", *arguments, "hydra.run.dir=undisturbed")
+    return folder / "undisturbed"
+
+
+def _cut(
+    arguments: list[str], folder: Path, how: signal.Signals, step: int
+) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", CUT_SHORT, *arguments, "hydra.run.dir=cut"],
+        check=False,
+        cwd=folder,
+        env=os.environ | {"STEP": str(step), "SIGNAL": str(int(how)), "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+    )
+
+
+def _assert_same_end(run: Path, other: Path) -> None:
+    found, expected = _last(run), _last(other)
+    assert found["global_step"] == expected["global_step"]
+    for part in ("state_dict", "optimizer_states"):
+        torch.testing.assert_close(found[part], expected[part], rtol=0, atol=0)
+    assert found["lr_schedulers"] == expected["lr_schedulers"]
+    assert json.loads((run / "results.json").read_text()) == json.loads(
+        (other / "results.json").read_text()
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("how", "step", "workers"),
+    [(signal.SIGKILL, 3, 0), (signal.SIGKILL, 9, 2), (signal.SIGTERM, 3, 0)],
+    ids=["killed", "killed in a later epoch", "terminated"],
+)
+def test_a_run_cut_short_goes_on_as_if_nothing_had_happened(
+    how: signal.Signals,
+    step: int,
+    workers: int,
+    undisturbed: Path,
+    arguments: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    cut = _cut(arguments, tmp_path, how, step)
+    steps = _last(undisturbed)["global_step"] // 3
+    assert step % steps not in (0, 1), "cut within an epoch"
+    if how == signal.SIGTERM:
+        assert cut.returncode == 128 + signal.SIGTERM, cut.stderr
+        assert "tangent-train resume=" in cut.stderr
+        assert "Traceback" not in cut.stderr
+        assert _last(tmp_path / "cut")["global_step"] == step, "saved when it was told to end"
+    else:
+        assert cut.returncode == -signal.SIGKILL, cut.stderr
+        assert _last(tmp_path / "cut")["global_step"] == step - 1
+    _run(monkeypatch, "train", f"resume={tmp_path / 'cut'}", f"data.num_workers={workers}")
+    _assert_same_end(tmp_path / "cut", undisturbed)
+
+
+def test_checkpoints_say_all_that_later_commands_need(undisturbed: Path) -> None:
+    content = _last(undisturbed)
+    assert content["resolved_config"]["representation"]["level"] == 4
+    assert content["class_names"][:2] == ["unknown", "beam"]
+    assert len(content["normalization"]["mean"]) == 4
+    assert content["tangent_train_version"]
+    assert not list(undisturbed.glob("checkpoints/.partial*"))
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("optimizer.lr=1", r"optimizer\.lr: found 1 .*learning rate come from the checkpoint"),
+        ("data.fold=2", r"data\.fold: found 2 for a run that began with 1"),
+        ("seed=3", r"data\.seed: found 3 for a run that began with 0"),
+    ],
+)
+def test_a_run_is_not_resumed_as_another(
+    undisturbed: Path, override: str, message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(SystemExit, match=message):
+        _run(monkeypatch, "train", f"resume={undisturbed}", override)
+
+
+def test_where_and_how_it_is_computed_may_change() -> None:
+    before = {"data": {"root": "a", "fold": 1}, "trainer": {"devices": 1}, "network": {"x": 1}}
+    after = {"data": {"root": "b", "fold": 1}, "trainer": {"devices": 2}, "network": {"x": 1}}
+    check_resumed(after, before)
+    with pytest.raises(SettingError, match=r"network\.y.*tensors of its own network"):
+        check_resumed(after | {"network": {"x": 1, "y": 2}}, before)
+
+
+def _processes(folder: Path, *arguments: str, command: Path = COMMAND) -> None:
+    done = subprocess.run(
+        [str(command), *arguments],
+        check=False,
+        cwd=folder,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.slow
+def test_two_processes_make_the_steps_and_figures_of_one(
+    settings: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    common = [*settings, "network=plain", "trainer.max_steps=3", "optimizer=adam"]
+    _run(monkeypatch, "train", *common, "data.panoramas_per_step=2", "hydra.run.dir=one")
+    two = ["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2", "trainer.max_steps=3"]
+    _processes(
+        tmp_path, *common, *two, "data.panoramas_per_step=1", "task.images_per_chunk=2",
+        "hydra.run.dir=two",
+    )  # fmt: skip
+    assert {path.name for path in tmp_path.iterdir()} == {"one", "two"}, "one folder each"
+    assert len(list((tmp_path / "two" / "tensorboard").glob("events*"))) <= 2
+    one, other = _last(tmp_path / "one"), _last(tmp_path / "two")
+    assert one["global_step"] == other["global_step"] == 3
+    torch.testing.assert_close(other["state_dict"], one["state_dict"], rtol=0, atol=1e-6)
+    checkpoint = f"checkpoint={tmp_path / 'one' / 'checkpoints' / 'last.ckpt'}"
+    _processes(
+        tmp_path, checkpoint, "trainer.devices=2", "+trainer.strategy=ddp",
+        "hydra.run.dir=evaluated", command=COMMAND.with_name("tangent-evaluate"),
+    )  # fmt: skip
+    _run(monkeypatch, "evaluate", checkpoint, "hydra.run.dir=again")
+    figures = [
+        json.loads((tmp_path / folder / "results.json").read_text())
+        for folder in ("again", "evaluated")
+    ]
+    assert figures[0]["confusion"] == figures[1]["confusion"]
+    assert figures[0]["miou"] == figures[1]["miou"]
+    solid_angle = [figure["miou_solid_angle"] for figure in figures]  # added up in another order
+    assert solid_angle[0] == pytest.approx(solid_angle[1], rel=1e-12)
+    assert figures[0]["panoramas"] % 2 == 1, "not the same number on both processes"

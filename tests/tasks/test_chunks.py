@@ -1,0 +1,139 @@
+"""The gradient of a batch of spheres, computed a few images at a time."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import lightning
+import pytest
+import torch
+from torch import Tensor, nn
+from torch.utils.data import DataLoader
+
+from tangent_train.rendering import TangentRepresentation
+from tangent_train.tasks import SegmentationTask
+
+
+class Sample(NamedTuple):
+    images: Tensor
+    labels: Tensor
+
+
+class Data(lightning.LightningDataModule):
+    """Three spheres of 20 images; the first images are almost all unknown."""
+
+    def __init__(self, batch_size: int) -> None:
+        super().__init__()
+        self.batch_size = batch_size
+
+    def train_dataloader(self) -> DataLoader[Any]:
+        generator = torch.Generator().manual_seed(0)
+        images = torch.randn(3, 20, 2, 16, 16, generator=generator)
+        labels = torch.randint(0, 4, (3, 20, 16, 16), generator=generator).to(torch.uint8)
+        labels[:, :7, 1:] = 0
+        labels[1] = 0
+        samples: Any = [Sample(*pair) for pair in zip(images, labels, strict=True)]
+        return DataLoader(samples, self.batch_size)
+
+
+class Gradients(lightning.Callback):
+    """Keeps the gradients that the optimizer has used."""
+
+    def on_train_batch_end(self, trainer: Any, pl_module: Any, *_: Any) -> None:
+        self.found = [p.grad.clone() for p in pl_module.parameters()]
+        self.loss = trainer.callback_metrics["train/loss"]
+
+
+pytestmark = pytest.mark.filterwarnings("ignore:You defined a `validation_step`:UserWarning")
+
+
+def _network() -> nn.Module:
+    torch.manual_seed(0)
+    return nn.Sequential(
+        nn.Conv2d(2, 8, 3, padding=1), nn.ReLU(), nn.GroupNorm(2, 8), nn.Conv2d(8, 4, 3, padding=1)
+    )
+
+
+def _gradients(
+    images_per_chunk: int | None, trainer: dict[str, Any], **settings: Any
+) -> tuple[list[Tensor], Tensor]:
+    task = SegmentationTask(
+        _network(),
+        TangentRepresentation(base_level=0, level=4),
+        ("unknown", "a", "b", "c"),
+        partial(torch.optim.SGD, lr=0.1),
+        class_weights=[0.0, 1.0, 3.0, 0.2],
+        label_smoothing=0.1,
+        images_per_chunk=images_per_chunk,
+        **settings,
+    )
+    gradients = Gradients()
+    # Accumulated: two steps, of two panoramas and of the third one.
+    batch_size = 1 if "accumulate_grad_batches" in trainer else 3
+    lightning.Trainer(
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        accelerator="cpu",
+        callbacks=[gradients],
+        limit_val_batches=0,
+        **trainer,
+    ).fit(task, datamodule=Data(batch_size))
+    return gradients.found, gradients.loss
+
+
+@pytest.mark.parametrize("size", [1, 7, 59, 1000])
+@pytest.mark.parametrize(
+    "trainer",
+    [
+        {"max_steps": 1},
+        {"max_steps": 3, "gradient_clip_val": 0.01},
+        {"max_epochs": 1, "accumulate_grad_batches": 2},
+    ],
+    ids=["plain", "clipped", "accumulated"],
+)
+def test_chunks_give_the_gradient_of_the_whole_batch(size: int, trainer: dict[str, Any]) -> None:
+    whole, loss = _gradients(None, trainer)
+    chunked, chunked_loss = _gradients(size, trainer)
+    for expected, found in zip(whole, chunked, strict=True):
+        assert float((found - expected).norm() / expected.norm()) < 1e-5
+    torch.testing.assert_close(chunked_loss, loss, rtol=1e-5, atol=0)
+    if "gradient_clip_val" in trainer:
+        norm = torch.cat([found.flatten() for found in chunked]).norm()
+        assert float(norm) == pytest.approx(0.01, rel=1e-3), "clipped once, as a whole"
+
+
+@pytest.mark.parametrize(
+    ("trainer", "settings"),
+    [
+        ({"precision": "bf16-mixed"}, {}),
+        ({}, {"channels_last": True}),
+        ({}, {"compile": {"backend": "aot_eager"}}),
+        ({"precision": "bf16-mixed"}, {"channels_last": True, "compile": {"backend": "aot_eager"}}),
+    ],
+    ids=["bf16", "channels_last", "compiled", "all"],
+)
+@pytest.mark.filterwarnings("ignore::DeprecationWarning:torch")
+def test_faster_arithmetic_works_in_chunks(
+    trainer: dict[str, Any], settings: dict[str, Any]
+) -> None:
+    exact, _ = _gradients(None, {"max_steps": 1})
+    fast, _ = _gradients(8, {"max_steps": 1} | trainer, **settings)
+    tolerance = 3e-2 if "precision" in trainer else 1e-5
+    for expected, found in zip(exact, fast, strict=True):
+        assert float((found - expected).norm() / expected.norm()) < tolerance
+
+
+def test_compiling_keeps_the_names_of_the_tensors() -> None:
+    task = SegmentationTask(
+        _network(),
+        TangentRepresentation(base_level=0, level=4),
+        ("unknown", "a", "b", "c"),
+        partial(torch.optim.SGD, lr=0.1),
+        compile={"backend": "aot_eager"},
+    )
+    assert {name for name in task.state_dict() if name.startswith("network")} == {
+        f"network.{name}" for name in _network().state_dict()
+    }
