@@ -1,5 +1,9 @@
 """Networks; any other `nn.Module` that maps images to scores works too, named by `_target_`."""
 
+from models.fcn_resnet import FCNResNet
+from models.hexunet import HexUNet
+from models.initialize import initialize
+from models.stem import widen_stem
 from models.unet import UNet
 
-__all__ = ["UNet"]
+__all__ = ["FCNResNet", "HexUNet", "UNet", "initialize", "widen_stem"]

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from models.stride import check_sides
 from tangent_train.errors import SettingError
 
 __all__ = ["UNet"]
@@ -110,14 +111,7 @@ class UNet(nn.Module):
         Raises:
             SettingError: A side is no multiple of the network's stride (32 by default).
         """
-        height, width = images.shape[-2:]
-        if height % self.stride or width % self.stride:
-            raise SettingError(
-                "image size for the UNet",
-                found=f"{height}×{width}",
-                expected=f"sides that are multiples of {self.stride}",
-                remedy="Choose another representation.dim or level, or fewer network.widths.",
-            )
+        check_sides(images, self.stride, "UNet", remedy=", or fewer network.widths")
         skips = [self.stem(images)]
         for down in self.downs:
             skips.append(down(skips[-1]))

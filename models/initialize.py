@@ -1,0 +1,133 @@
+"""Starting a network from the tensors of another one: what fits, adapted where only ends differ."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from rich.table import Table
+from torch import Tensor, nn
+
+from models.pretrained import read_tensors
+from tangent_train.errors import DataError
+
+__all__ = ["Origins", "initialize", "origins_table"]
+
+_LISTED = 8
+
+
+class Origins(NamedTuple):
+    """Where the tensors of a network come from.
+
+    Attributes:
+        loaded: Names of those taken as they are.
+        adapted: Of those changed to fit, how.
+        fresh: Of those left as they were, why.
+        unused: Names in the file that the network does not have.
+    """
+
+    loaded: tuple[str, ...]
+    adapted: dict[str, str]
+    fresh: dict[str, str]
+    unused: tuple[str, ...]
+
+
+def initialize(network: nn.Module, path: Path | str) -> Origins:
+    """Load what fits from a checkpoint, a state dict or a safetensors file, in place.
+
+    Names are compared behind the prefix under which most of them are the network's (``module.``,
+    ``network.``, …). Of the first convolution, filters of further input channels start at zero, so
+    RGB-D begins as RGB; ones the network has no channel for are left out. Other tensors of another
+    shape stay as they are: the last layer, for another number of classes.
+
+    Args:
+        network: Into which.
+        path: The file. Nothing but tensors and plain values is unpickled.
+
+    Raises:
+        DataError: The file cannot be read, or nothing in it fits.
+    """
+    path = Path(path)
+    own = network.state_dict()
+    found = _without_prefix(read_tensors(path), own)
+    stem = _stem_name(network)
+    loaded: dict[str, Tensor] = {}
+    adapted: dict[str, str] = {}
+    fresh: dict[str, str] = {}
+    for name, tensor in own.items():
+        given = found.get(name)
+        if given is None:
+            fresh[name] = "not in the file"
+        elif given.shape == tensor.shape:
+            loaded[name] = given
+        elif name == stem and _differ_in_channels_only(given, tensor):
+            loaded[name] = _with_channels(given, tensor.shape[1])
+            adapted[name] = f"{given.shape[1]} → {tensor.shape[1]} channels"
+        else:
+            fresh[name] = f"{tuple(given.shape)} in the file, {tuple(tensor.shape)} here"
+    if not any(name in loaded for name, _ in network.named_parameters()):
+        raise DataError(
+            path,
+            found="no tensor that fits" + (f", but {next(iter(found))}" if found else ""),
+            expected=f"tensors of {type(network).__name__}, {next(iter(own))} for one",
+            remedy="Is it a checkpoint of the same network, with the same settings?",
+        )
+    network.load_state_dict({**own, **loaded})
+    plain = tuple(name for name in loaded if name not in adapted)
+    return Origins(plain, adapted, fresh, tuple(name for name in found if name not in own))
+
+
+def origins_table(origins: Origins, path: Path | str) -> Table:
+    """What was loaded, adapted and left fresh, for the terminal.
+
+    Args:
+        origins: From `initialize`.
+        path: The file, for the title.
+    """
+    table = Table(title=f"Tensors from {path}", title_justify="left")
+    for heading in ("", "tensors", "which"):
+        table.add_column(heading, justify="right" if heading == "tensors" else "left")
+    table.add_row("loaded", str(len(origins.loaded)), "")
+    for kind, reasons in (("adapted", origins.adapted), ("fresh", origins.fresh)):
+        lines = [f"{name}: {reason}" for name, reason in reasons.items()]
+        table.add_row(kind, str(len(lines)), _listed(lines))
+    table.add_row("not used", str(len(origins.unused)), _listed(list(origins.unused)))
+    return table
+
+
+def _without_prefix(tensors: Mapping[str, Tensor], own: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The tensors behind the prefix under which most are the network's; the shortest such."""
+    counts = Counter(
+        name[: len(name) - len(wanted)]
+        for name in tensors
+        for wanted in own
+        if name == wanted or name.endswith(f".{wanted}")
+    )
+    prefix = min(counts, key=lambda prefix: (-counts[prefix], len(prefix)), default="")
+    return {n.removeprefix(prefix): t for n, t in tensors.items() if n.startswith(prefix)}
+
+
+def _stem_name(network: nn.Module) -> str | None:
+    """The weight of the first convolution, in the order of definition."""
+    for name, module in network.named_modules():
+        if isinstance(module, nn.Conv2d):
+            return f"{name}.weight" if name else "weight"
+    return None
+
+
+def _differ_in_channels_only(given: Tensor, wanted: Tensor) -> bool:
+    return given.shape[:1] + given.shape[2:] == wanted.shape[:1] + wanted.shape[2:]
+
+
+def _with_channels(weight: Tensor, channels: int) -> Tensor:
+    further = max(0, channels - weight.shape[1])
+    zeros = weight.new_zeros(weight.shape[0], further, *weight.shape[2:])
+    return torch.cat([weight[:, :channels], zeros], dim=1)
+
+
+def _listed(lines: list[str]) -> str:
+    more = [f"and {len(lines) - _LISTED} more"] if len(lines) > _LISTED else []
+    return "\n".join(lines[:_LISTED] + more)

@@ -1,0 +1,46 @@
+"""RGB networks for images with further channels."""
+
+from __future__ import annotations
+
+import torch
+from torch import nn
+
+from tangent_train.errors import SettingError
+
+__all__ = ["widen_stem"]
+
+_RGB = 3
+
+
+def widen_stem(network: nn.Module, in_channels: int) -> nn.Module:
+    """Let a network for RGB images take further channels, depth for example.
+
+    The filters of the further channels start at zero (paper, supplement, "Level 10 parameters"):
+    at first the network does with RGB-D exactly what it did with RGB.
+
+    Args:
+        network: Any; its first convolution, in the order of definition, must be that of the image.
+        in_channels: Channels wanted, red, green and blue first.
+
+    Returns:
+        The same network, changed in place unless `in_channels` is 3.
+
+    Raises:
+        SettingError: Less than three channels, or the first convolution does not take three.
+    """
+    if in_channels < _RGB:
+        raise SettingError("network.in_channels", found=in_channels, expected="3 or more")
+    stem = next((module for module in network.modules() if isinstance(module, nn.Conv2d)), None)
+    if stem is None or stem.in_channels != _RGB or stem.groups != 1:
+        raise SettingError(
+            f"first convolution of {type(network).__name__}",
+            found=stem or "none",
+            expected="one that takes the three channels of an RGB image",
+        )
+    further = in_channels - _RGB
+    if further:
+        filters = stem.weight.detach()
+        zeros = torch.zeros_like(filters[:, :1]).repeat(1, further, 1, 1)
+        stem.weight = nn.Parameter(torch.cat([filters, zeros], dim=1))
+        stem.in_channels = in_channels
+    return network
