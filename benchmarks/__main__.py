@@ -1,5 +1,7 @@
 """All benchmarks: ``python -m benchmarks``."""
 
-from benchmarks.rendering import main
+from benchmarks import loader, rendering
 
-main()
+rendering.main()
+print()
+loader.main()

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING, ClassVar, Literal, TypeVar
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar
 
 import cv2
 import numpy as np
 import torch
 from lightning import LightningDataModule
+from lightning.pytorch.trainer.states import TrainerFn
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from datamodules.panoramas import (
+    FileSource,
     PanoramaSource,
     RememberedPanoramas,
     Turn,
@@ -24,11 +27,15 @@ from datamodules.samples import (
     RGBD_NORMALIZATION,
     EvaluationPanoramas,
     EvaluationSample,
+    Inputs,
     Normalization,
     TrainingPanoramas,
     TrainingSample,
+    collate,
+    normalize,
 )
 from datamodules.sampling import EpochSampler
+from datamodules.store import PreparedPanoramas, prepare_store
 from tangent_train.errors import SettingError
 
 if TYPE_CHECKING:
@@ -44,6 +51,7 @@ Split = Literal["train", "val", "test"]
 ClassWeights = Literal["log", "sqrt", "none"]
 """How the loss weighs classes; see `PanoramaDataModule.class_weights`."""
 
+_SPLITS: tuple[Split, ...] = ("train", "val", "test")
 _LOG_OFFSET = 1.02
 _HALF_TURN_DEG = 180
 _INPUTS = (("rgb",), ("rgb", "depth"))
@@ -64,6 +72,9 @@ class PanoramaDataModule(LightningDataModule, ABC):
         num_workers: Worker processes of a loader; the samples are the same for any number.
         seed: Seed of order, faces, augmentation and turns, 0 or more.
         in_memory: Keep decoded panoramas in memory, see `RememberedPanoramas`.
+        store: Folder of a prepared store, see `store`: panoramas are decoded once, then read from
+            there. The samples are the same without.
+        color_jitter: Strength of the colour augmentation, 0 (none) to 1, see `jitter_colors`.
         normalization: Of the input channels; by default that of Stanford2D3DS.
         test_rotation: Turn the test panoramas: tilt in degrees, or `so3`, see `TurnedPanoramas`.
 
@@ -89,6 +100,8 @@ class PanoramaDataModule(LightningDataModule, ABC):
         num_workers: int = 0,
         seed: int = 0,
         in_memory: bool = False,
+        store: str | Path | None = None,
+        color_jitter: float = 0.0,
         normalization: Normalization | None = None,
         test_rotation: Turn = None,
     ) -> None:
@@ -113,6 +126,10 @@ class PanoramaDataModule(LightningDataModule, ABC):
         self.num_workers = _at_least("data.num_workers", num_workers, 0)
         self.seed = _at_least("data.seed", seed, 0)
         self.in_memory = in_memory
+        self.store = None if store is None else Path(store)
+        if not 0 <= color_jitter <= 1:
+            raise SettingError("data.color_jitter", found=color_jitter, expected="0 to 1")
+        self.color_jitter = color_jitter
         self.test_rotation = _checked_rotation(test_rotation)
         self._sources: dict[Split, PanoramaSource] = {}
         self._start = (0, 0)
@@ -123,13 +140,38 @@ class PanoramaDataModule(LightningDataModule, ABC):
         return "depth" in self.inputs
 
     @abstractmethod
-    def open_split(self, split: Split) -> PanoramaSource:
+    def open_split(self, split: Split) -> FileSource:
         """The panoramas of one split as they are on disk."""
 
+    def prepare_data(self) -> None:
+        """Prepare what the store lacks, if there is to be one.
+
+        An evaluation prepares the panoramas of the test split only.
+        """
+        testing = self.trainer is not None and self.trainer.state.fn == TrainerFn.TESTING
+        self.prepare_store(("test",) if testing else _SPLITS)
+
+    def prepare_store(self, splits: Sequence[Split] = _SPLITS, *, content: bool = False) -> None:
+        """Make the panoramas that the store lacks; nothing without a store.
+
+        Args:
+            splits: Which.
+            content: Whether to read the whole store, for damage that does not show otherwise.
+
+        Raises:
+            DataError: The disk is too full, or a file of the data set is broken.
+        """
+        if self.store is not None:
+            sources = [PreparedPanoramas(self.open_split(s), self.store) for s in splits]
+            prepare_store(sources, content=content)
+
     def source(self, split: Split) -> PanoramaSource:
-        """The panoramas of one split: turned if asked for, in memory if asked for."""
+        """The panoramas of one split: from the store, turned, in memory, if asked for."""
         if split not in self._sources:
-            source = self.open_split(split)
+            files = self.open_split(split)
+            source: PanoramaSource = files
+            if self.store is not None:
+                source = PreparedPanoramas(files, self.store)
             if split == "test" and self.test_rotation is not None:
                 source = TurnedPanoramas(source, self.test_rotation, self.seed)
             self._sources[split] = RememberedPanoramas(source) if self.in_memory else source
@@ -160,8 +202,8 @@ class PanoramaDataModule(LightningDataModule, ABC):
         if kind != "none":
             counts = np.zeros(len(self.class_names), np.int64)
             source = self.source("train")
-            for labels in in_threads(source.read_labels, len(source)):
-                counts += np.bincount(labels.ravel(), minlength=len(counts))
+            for found in in_threads(source.label_counts, len(source)):
+                counts += found[: len(counts)]
             counts[0] = 0
             seen = counts > 0
             ratio = counts[seen] / counts.sum()
@@ -208,24 +250,41 @@ class PanoramaDataModule(LightningDataModule, ABC):
             )
         self._start = state_dict["epoch"], state_dict["batches"] * self.panoramas_per_step
 
-    def train_dataloader(self) -> DataLoader[TrainingSample]:
+    def on_after_batch_transfer(self, batch: Any, dataloader_idx: int) -> Any:
+        """Normalize the images of a batch, on the device they are on now.
+
+        Args:
+            batch: A `TrainingSample` or `EvaluationSample` of a loader.
+            dataloader_idx: Ignored.
+
+        Returns:
+            The same with float32 images, channels first.
+        """
+        images = normalize(batch.images, self.normalization)
+        if self.trainer is not None:  # which converted the batch when it had no float images yet
+            images = self.trainer.precision_plugin.convert_input(images)
+        return batch._replace(images=images)
+
+    def train_dataloader(self) -> DataLoader[TrainingSample[Inputs]]:
         """Batches of `TrainingSample`."""
         source = self.source("train")
-        dataset = TrainingPanoramas(source, self.representation, self.normalization, self.seed)
+        dataset = TrainingPanoramas(source, self.representation, self.seed, self.color_jitter)
         size = self.panoramas_per_step
         return self._loader(dataset, len(source), size, self._start, shuffle=True)
 
-    def val_dataloader(self) -> DataLoader[EvaluationSample] | list[DataLoader[EvaluationSample]]:
+    def val_dataloader(
+        self,
+    ) -> DataLoader[EvaluationSample[Inputs]] | list[DataLoader[EvaluationSample[Inputs]]]:
         """Batches of one `EvaluationSample`; no loader when there is no validation split."""
         return self._evaluation_loader("val") if len(self.source("val")) else []
 
-    def test_dataloader(self) -> DataLoader[EvaluationSample]:
+    def test_dataloader(self) -> DataLoader[EvaluationSample[Inputs]]:
         """Batches of one `EvaluationSample`."""
         return self._evaluation_loader("test")
 
-    def _evaluation_loader(self, split: Split) -> DataLoader[EvaluationSample]:
+    def _evaluation_loader(self, split: Split) -> DataLoader[EvaluationSample[Inputs]]:
         source = self.source(split)
-        dataset = EvaluationPanoramas(source, self.representation, self.normalization)
+        dataset = EvaluationPanoramas(source, self.representation)
         return self._loader(dataset, len(source), 1, shuffle=False)
 
     def _loader(
@@ -248,6 +307,7 @@ class PanoramaDataModule(LightningDataModule, ABC):
             persistent_workers=self.num_workers > 0,
             pin_memory=torch.cuda.is_available(),
             worker_init_fn=_opencv_without_threads,
+            collate_fn=collate,
         )
 
 

@@ -21,17 +21,21 @@ from tangent_train.geometry import random_rotation, rotation_about
 from tangent_train.rendering import rotate_equirect
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Generator, Mapping
+    from pathlib import Path
 
     from numpy.typing import NDArray
 
 __all__ = [
+    "STEPS_PER_M",
+    "FileSource",
     "Mask",
     "Panorama",
     "PanoramaSource",
     "RememberedPanoramas",
     "Turn",
     "TurnedPanoramas",
+    "count_labels",
     "in_threads",
     "mask_black",
     "resize_area",
@@ -49,7 +53,8 @@ Mask = Literal["labels", "any_black", "all_black"]
 Turn = float | Literal["so3"] | None
 """How test panoramas are turned: tilted by degrees, any way, or not; see `TurnedPanoramas`."""
 
-_STEPS_PER_M = 512
+STEPS_PER_M = 512
+"""Depth is in steps of 1/512 m, as in the files of Stanford2D3DS."""
 
 
 class Panorama(NamedTuple):
@@ -57,12 +62,15 @@ class Panorama(NamedTuple):
 
     Attributes:
         rgb: ``(H, W, 3)`` uint8.
-        depth_m: ``(H, W)`` float32 distance from the centre in metres, 0 where missing; or None.
+        depth: ``(H, W)`` uint16 distance from the centre in steps of 1/512 m, 0 where missing; or
+            None. See `steps_to_meters`.
         labels: ``(H, W)`` uint8, 0 where unknown.
+
+    The arrays may be shared or read-only: not to be written to.
     """
 
     rgb: NDArray[np.uint8]
-    depth_m: NDArray[np.float32] | None
+    depth: NDArray[np.uint16] | None
     labels: NDArray[np.uint8]
 
 
@@ -74,16 +82,47 @@ class PanoramaSource(Protocol):
         ...
 
     def name(self, index: int) -> str:
-        """A short name of one of them."""
+        """A short name of one of them, which no other has; with ``/`` between groups."""
         ...
 
     def read(self, index: int) -> Panorama:
         """One of them."""
         ...
 
-    def read_labels(self, index: int) -> NDArray[np.uint8]:
-        """Its labels alone, for less than the price of all."""
+    def label_counts(self, index: int) -> NDArray[np.int64]:
+        """Its pixels of every label, ``(256,)``, for less than the price of reading all of it."""
         ...
+
+
+class FileSource(PanoramaSource, Protocol):
+    """Panoramas of one size decoded from files: what a prepared store is made of."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the panoramas."""
+        ...
+
+    @property
+    def variant(self) -> str:
+        """A name for the settings that runs of the same data differ in, such as the size.
+
+        Each has its own folder in a store.
+        """
+        ...
+
+    @property
+    def settings(self) -> Mapping[str, str]:
+        """What decides the pixels besides the files, by name."""
+        ...
+
+    def files(self, index: int) -> Mapping[str, Path]:
+        """The file of every part of one panorama: `rgb`, `labels` and, where read, `depth`."""
+        ...
+
+
+def count_labels(labels: NDArray[np.uint8]) -> NDArray[np.int64]:
+    """Number of pixels of every label, ``(256,)``."""
+    return np.bincount(labels.ravel(), minlength=256)
 
 
 def resize_area(image: NDArray[np.uint8], shape: tuple[int, int]) -> NDArray[np.uint8]:
@@ -153,7 +192,7 @@ def mask_black(labels: NDArray[np.uint8], rgb: NDArray[np.uint8], mask: Mask) ->
     return np.where(black.any(-1) if mask == "any_black" else black.all(-1), np.uint8(0), labels)
 
 
-def in_threads(read: Callable[[int], _Read], count: int) -> Iterator[_Read]:
+def in_threads(read: Callable[[int], _Read], count: int) -> Generator[_Read]:
     """``read(0)`` … ``read(count - 1)``, on all cores (OpenCV and zlib free the GIL)."""
     workers = os.cpu_count() or 1
     with ThreadPoolExecutor(workers) as pool:
@@ -166,8 +205,7 @@ class RememberedPanoramas:
     """The panoramas of another source, read once, now, and kept in memory.
 
     Made before the loader's workers start, which then share the memory (on systems that fork);
-    each process of a distributed run keeps its own. Depth is kept in steps of 1/512 m, which are
-    the steps of Stanford2D3DS's files: six bytes a pixel with depth, four without.
+    each process of a distributed run keeps its own: six bytes a pixel with depth, four without.
 
     Args:
         source: Where they come from.
@@ -175,10 +213,7 @@ class RememberedPanoramas:
 
     def __init__(self, source: PanoramaSource) -> None:
         self._source = source
-        self._kept = [
-            (panorama.rgb, _to_steps(panorama.depth_m), panorama.labels)
-            for panorama in in_threads(source.read, len(source))
-        ]
+        self._kept = list(in_threads(self._read, len(source)))
 
     def __len__(self) -> int:
         return len(self._kept)
@@ -188,13 +223,17 @@ class RememberedPanoramas:
         return self._source.name(index)
 
     def read(self, index: int) -> Panorama:
-        """The panorama as the source gave it; its arrays are shared, not to be written to."""
-        rgb, steps, labels = self._kept[index]
-        return Panorama(rgb, None if steps is None else steps_to_meters(steps), labels)
+        """The panorama as the source gave it."""
+        return self._kept[index]
 
-    def read_labels(self, index: int) -> NDArray[np.uint8]:
-        """The labels as the source gave them."""
-        return self._kept[index][2]
+    def label_counts(self, index: int) -> NDArray[np.int64]:
+        """Its pixels of every label."""
+        return count_labels(self._kept[index].labels)
+
+    def _read(self, index: int) -> Panorama:
+        # Copies: arrays that are views of a file would keep it open.
+        rgb, depth, labels = self._source.read(index)
+        return Panorama(np.array(rgb), None if depth is None else np.array(depth), np.array(labels))
 
 
 class TurnedPanoramas:
@@ -235,25 +274,19 @@ class TurnedPanoramas:
 
     def read(self, index: int) -> Panorama:
         """One turned panorama: RGB bilinear, depth and labels nearest."""
-        rgb, depth_m, labels = self._source.read(index)
+        rgb, depth, labels = self._source.read(index)
         rotation = self.rotation(index)
         return Panorama(
             rotate_equirect(rgb, rotation, "bilinear"),
-            None if depth_m is None else rotate_equirect(depth_m, rotation, "nearest"),
+            None if depth is None else rotate_equirect(depth, rotation, "nearest"),
             rotate_equirect(labels, rotation, "nearest"),
         )
 
-    def read_labels(self, index: int) -> NDArray[np.uint8]:
-        """The labels of one turned panorama."""
-        return rotate_equirect(self._source.read_labels(index), self.rotation(index), "nearest")
+    def label_counts(self, index: int) -> NDArray[np.int64]:
+        """The pixels of every label of one turned panorama."""
+        return count_labels(self.read(index).labels)
 
 
 def steps_to_meters(steps: NDArray[np.uint16]) -> NDArray[np.float32]:
-    """Depth in metres of raw depth in steps of 1/512 m."""
-    return steps.astype(np.float32) / np.float32(_STEPS_PER_M)
-
-
-def _to_steps(depth_m: NDArray[np.float32] | None) -> NDArray[np.uint16] | None:
-    if depth_m is None:
-        return None
-    return np.rint(np.clip(depth_m * _STEPS_PER_M, 0, np.iinfo(np.uint16).max)).astype(np.uint16)
+    """Depth in metres, float32, of depth in steps of 1/512 m."""
+    return steps.astype(np.float32) / np.float32(STEPS_PER_M)

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.data import Dataset
+from torch.utils.data import Dataset, default_collate
 
+from datamodules.colors import jitter_colors
+from datamodules.panoramas import STEPS_PER_M
 from datamodules.sampling import sample_rng
 from tangent_train.errors import SettingError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from numpy.typing import NDArray
 
     from datamodules.panoramas import Panorama, PanoramaSource
@@ -27,14 +28,22 @@ __all__ = [
     "RGB_NORMALIZATION",
     "EvaluationPanoramas",
     "EvaluationSample",
+    "Inputs",
     "Normalization",
     "TrainingPanoramas",
     "TrainingSample",
+    "collate",
     "normalize",
 ]
 
 MAX_DEPTH_M = 4.0
 """Depth is clipped to this (released code of the paper)."""
+
+Inputs = Sequence[Tensor]
+"""RGB and perhaps depth as they were rendered, see `TrainingSample`."""
+
+_Images = TypeVar("_Images", Inputs, Tensor)
+_Sample = TypeVar("_Sample", "TrainingSample[Inputs]", "EvaluationSample[Inputs]")
 
 
 @dataclass(frozen=True)
@@ -85,134 +94,153 @@ RGBD_NORMALIZATION = Normalization(
 """Stanford2D3DS with depth (ugscnn, used by the released code of the paper)."""
 
 
-def normalize(
-    rgb: NDArray[np.uint8], depth_m: NDArray[np.float32] | None, normalization: Normalization
-) -> NDArray[np.float32]:
+def normalize(inputs: Sequence[Tensor], normalization: Normalization) -> Tensor:
     """What a network takes, channels first.
 
     Args:
-        rgb: ``(n, h, w, 3)`` uint8.
-        depth_m: ``(n, h, w)`` metres, 0 where missing; None for a normalization without depth.
+        inputs: RGB ``(..., h, w, 3)`` uint8, and perhaps depth ``(..., h, w)`` in steps of 1/512 m,
+            0 where missing, at most `MAX_DEPTH_M`.
         normalization: Of as many channels as there are.
 
     Returns:
-        ``(n, 3 or 4, h, w)`` float32.
+        ``(..., 3 or 4, h, w)`` float32, on the same device.
 
     Raises:
         SettingError: The normalization is one of other channels.
     """
-    channels = 3 if depth_m is None else 4
+    rgb, *depth = inputs
+    channels = 3 + len(depth)
     if normalization.channels != channels:
         raise SettingError(
             "normalization",
             found=f"{normalization.channels} channels",
             expected=f"{channels}, as the inputs have",
         )
-    images = np.empty((len(rgb), channels, *rgb.shape[1:3]), np.float32)
-    for channel in range(3):
-        images[:, channel] = rgb[..., channel]
+    *batch, height, width, _ = rgb.shape
+    images = rgb.new_empty((*batch, channels, height, width), dtype=torch.float32)
+    images[..., :3, :, :] = rgb.movedim(-1, -3)
+    for steps in depth:
+        images[..., 3, :, :] = steps
     # One multiplication and one addition per value: (v / unit − mean) / std.
-    unit = np.full(channels, 255.0)
-    if depth_m is not None:
-        np.clip(depth_m, 0, MAX_DEPTH_M, out=images[:, 3])
-        unit[3] = 1.0
-    mean, std = np.array(normalization.mean), np.array(normalization.std)
-    images *= (1 / (unit * std)).astype(np.float32)[:, None, None]
-    images -= (mean / std).astype(np.float32)[:, None, None]
-    return images
+    unit = [255] * 3 + [STEPS_PER_M] * len(depth)
+    scale = zip(unit, normalization.mean, normalization.std, strict=True)
+    values = images.new_tensor([(1 / (step * std), mean / std) for step, mean, std in scale])
+    factor, offset = values.T[..., None, None]
+    return images.mul_(factor).sub_(offset)
 
 
-class TrainingSample(NamedTuple):
+class TrainingSample(NamedTuple, Generic[_Images]):
     """One panorama seen through P images; collated, each has a leading batch dimension.
 
     Attributes:
-        images: ``(P, C, h, w)`` float32.
+        images: From the loader what was rendered, RGB ``(P, h, w, 3)`` uint8 and perhaps depth
+            ``(P, h, w)`` int16: a third of the bytes. On the device `normalize` makes them
+            ``(P, C, h, w)`` float32.
         labels: ``(P, h, w)`` uint8, 0 where unknown.
         index: Place of the panorama in its split.
     """
 
-    images: Tensor
+    images: _Images
     labels: Tensor
     index: int  # type: ignore[assignment]  # nobody needs tuple.index
 
 
-class EvaluationSample(NamedTuple):
+class EvaluationSample(NamedTuple, Generic[_Images]):
     """One whole panorama; collated, each has a leading batch dimension.
 
     Attributes:
-        images: ``(N, C, h, w)`` float32, all of the sphere.
+        images: N images of all of the sphere, as in `TrainingSample`.
         target: ``(H, W)`` uint8 labels of the panorama itself, 0 where unknown.
         index: Place of the panorama in its split.
     """
 
-    images: Tensor
+    images: _Images
     target: Tensor
     index: int  # type: ignore[assignment]  # nobody needs tuple.index
 
 
-class TrainingPanoramas(Dataset[TrainingSample]):
+class TrainingPanoramas(Dataset[TrainingSample[Inputs]]):
     """Random views of panoramas, by (epoch, index).
 
     Args:
         source: The panoramas.
         representation: What the network sees of them.
-        normalization: Of the channels the source has.
         seed: Seed of the run, 0 or more.
+        color_jitter: Strength of the colour augmentation, 0 to 1, see `jitter_colors`.
     """
 
     def __init__(
         self,
         source: PanoramaSource,
         representation: Representation,
-        normalization: Normalization,
         seed: int,
+        color_jitter: float = 0.0,
     ) -> None:
         self._source = source
         self._representation = representation
-        self._normalization = normalization
         self._seed = seed
+        self._color_jitter = color_jitter
 
     def __len__(self) -> int:
         return len(self._source)
 
-    def __getitem__(self, key: tuple[int, int]) -> TrainingSample:
+    def __getitem__(self, key: tuple[int, int]) -> TrainingSample[Inputs]:
         epoch, index = key
         panorama = self._source.read(index)
-        views = self._representation.sample(sample_rng(self._seed, epoch, index))
+        rng = sample_rng(self._seed, epoch, index)
+        views = self._representation.sample(rng)
+        rgb, *depth = _render(panorama, views)
+        if self._color_jitter:
+            rgb = jitter_colors(rgb, self._color_jitter, rng)
         return TrainingSample(
-            _render_images(panorama, views, self._normalization),
-            torch.from_numpy(views.render(panorama.labels, "nearest")),
+            (rgb, *depth),
+            _tensor(views.render(panorama.labels, "nearest")),
             index,
         )
 
 
-class EvaluationPanoramas(Dataset[EvaluationSample]):
+class EvaluationPanoramas(Dataset[EvaluationSample[Inputs]]):
     """Whole panoramas, by (epoch, index); the epoch changes nothing.
 
     Args:
         source: The panoramas.
         representation: What the network sees of them.
-        normalization: Of the channels the source has.
     """
 
-    def __init__(
-        self, source: PanoramaSource, representation: Representation, normalization: Normalization
-    ) -> None:
+    def __init__(self, source: PanoramaSource, representation: Representation) -> None:
         self._source = source
         self._representation = representation
-        self._normalization = normalization
 
     def __len__(self) -> int:
         return len(self._source)
 
-    def __getitem__(self, key: tuple[int, int]) -> EvaluationSample:
+    def __getitem__(self, key: tuple[int, int]) -> EvaluationSample[Inputs]:
         _, index = key
         panorama = self._source.read(index)
-        images = _render_images(panorama, self._representation.whole(), self._normalization)
-        return EvaluationSample(images, torch.from_numpy(panorama.labels), index)
+        images = _render(panorama, self._representation.whole())
+        return EvaluationSample(images, torch.tensor(panorama.labels), index)
 
 
-def _render_images(panorama: Panorama, views: Views, normalization: Normalization) -> Tensor:
-    rgb = views.render(panorama.rgb, "bilinear")
-    depth_m = None if panorama.depth_m is None else views.render(panorama.depth_m, "nearest")
-    return torch.from_numpy(normalize(rgb, depth_m, normalization))
+def collate(samples: list[_Sample]) -> _Sample:
+    """A batch of `TrainingSample` or `EvaluationSample`, with a leading dimension.
+
+    As torch's own function, but one sample alone is not copied.
+    """
+    if len(samples) > 1:
+        return default_collate(samples)
+    images, labels, index = samples[0]
+    kind: Any = type(samples[0])
+    return kind([image[None] for image in images], labels[None], torch.tensor([index]))
+
+
+def _render(panorama: Panorama, views: Views) -> tuple[Tensor, ...]:
+    rgb = _tensor(views.render(panorama.rgb, "bilinear"))
+    if panorama.depth is None:
+        return (rgb,)
+    steps = np.minimum(views.render(panorama.depth, "nearest"), int(MAX_DEPTH_M * STEPS_PER_M))
+    return rgb, torch.from_numpy(steps.view(np.int16))  # torch hardly knows uint16
+
+
+def _tensor(array: NDArray[np.uint8]) -> Tensor:
+    # What is rendered may be the panorama itself, shared or a read-only file: that is copied.
+    return torch.from_numpy(array) if array.flags.owndata else torch.tensor(array)

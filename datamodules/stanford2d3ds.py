@@ -16,6 +16,7 @@ http://buildingparser.stanford.edu/dataset.html (`2D-3D-Semantics`, the `noXYZ` 
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -26,11 +27,11 @@ from datamodules.panorama_module import PanoramaDataModule, Split
 from datamodules.panoramas import (
     Mask,
     Panorama,
+    count_labels,
     mask_black,
     resize_area,
     resize_depth,
     resize_nearest,
-    steps_to_meters,
 )
 from datamodules.png import read_color_png, read_depth_png
 from datamodules.stanford_files import (
@@ -84,6 +85,28 @@ class StanfordPanoramas:
         self._shape = (erp_height, 2 * erp_height)
         self._mask = mask
 
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the panoramas."""
+        return self._shape
+
+    @property
+    def variant(self) -> str:
+        """Size and mask."""
+        return f"{self._shape[0]}x{self._shape[1]}_{self._mask}"
+
+    @property
+    def settings(self) -> dict[str, str]:
+        """Size, mask, and the class table in short."""
+        classes = hashlib.sha256(self._table.class_ids.tobytes()).hexdigest()
+        return {"size and mask": self.variant, "class table": classes[:16]}
+
+    def files(self, index: int) -> dict[str, Path]:
+        """The file of every part of one panorama."""
+        files = self._files[index]
+        depth = {} if files.depth is None else {"depth": files.depth}
+        return {"rgb": files.rgb, "labels": files.semantic, **depth}
+
     def __len__(self) -> int:
         return len(self._files)
 
@@ -100,17 +123,18 @@ class StanfordPanoramas:
         """
         files = self._files[index]
         rgb = read_color_png(files.rgb)
-        depth_m = None if files.depth is None else self._read_depth(files.depth)
-        return Panorama(resize_area(rgb, self._shape), depth_m, self._labels(files, rgb))
+        depth = None if files.depth is None else self._read_depth(files.depth)
+        return Panorama(resize_area(rgb, self._shape), depth, self._labels(files, rgb))
 
-    def read_labels(self, index: int) -> NDArray[np.uint8]:
-        """The labels of one panorama.
+    def label_counts(self, index: int) -> NDArray[np.int64]:
+        """The pixels of every label of one panorama, ``(256,)``.
 
         Raises:
             DataError: A file is broken.
         """
         files = self._files[index]
-        return self._labels(files, None if self._mask == "labels" else read_color_png(files.rgb))
+        rgb = None if self._mask == "labels" else read_color_png(files.rgb)
+        return count_labels(self._labels(files, rgb))
 
     def _labels(self, files: PanoramaFiles, rgb: NDArray[np.uint8] | None) -> NDArray[np.uint8]:
         labels = self._table.decode(resize_nearest(read_color_png(files.semantic), self._shape))
@@ -118,10 +142,10 @@ class StanfordPanoramas:
             return labels
         return mask_black(labels, resize_nearest(rgb, self._shape), self._mask)
 
-    def _read_depth(self, path: Path) -> NDArray[np.float32]:
+    def _read_depth(self, path: Path) -> NDArray[np.uint16]:
         steps = read_depth_png(path)
         steps[steps == _MISSING_DEPTH] = 0
-        return steps_to_meters(resize_depth(steps, self._shape))
+        return resize_depth(steps, self._shape)
 
 
 class Stanford2D3DS(PanoramaDataModule):

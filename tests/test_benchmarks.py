@@ -1,13 +1,15 @@
 from __future__ import annotations
 
+import re
+
 import pytest
 
-from benchmarks.rendering import main
+from benchmarks import loader, rendering
 
 
 @pytest.mark.slow
 def test_the_benchmark_runs_and_both_ways_agree(capsys: pytest.CaptureFixture[str]) -> None:
-    main(["--quick"])
+    rendering.main(["--quick"])
     printed = capsys.readouterr().out
     for row in ("bare cv2.remap", "equirect_to_tangent, 4 images", "owners", "tangent_to_labels"):
         assert row in printed
@@ -17,3 +19,13 @@ def test_the_benchmark_runs_and_both_ways_agree(capsys: pytest.CaptureFixture[st
         if word.endswith("%")
     )
     assert min(plain, careful) > 99.5
+
+
+@pytest.mark.slow
+def test_the_loader_benchmark_measures_both_ways(capsys: pytest.CaptureFixture[str]) -> None:
+    loader.main(["--quick"])
+    printed = capsys.readouterr().out
+    png, store, first = map(float, re.findall(r"([\d.]+) samples/s", printed))
+    assert min(png, store, first) > 0
+    assert len(re.findall(r"worker: \d+ MB of its own, \d+ MB at most", printed)) == 2
+    assert re.search(r"80 of 80 images .* as long", printed)

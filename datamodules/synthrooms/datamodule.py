@@ -41,7 +41,8 @@ class SynthRooms(Stanford2D3DS):
         super().__init__(root, representation, areas=areas, **settings)
 
     def prepare_data(self) -> None:
-        """Make the files, unless they are there."""
+        """Make the files, unless they are there, and what the store lacks."""
         from datamodules.synthrooms.generate import generate_rooms
 
         generate_rooms(self.root, self.rooms)
+        super().prepare_data()

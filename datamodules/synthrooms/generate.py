@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import cv2
 import numpy as np
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from datamodules.progress import show_progress
 from datamodules.stanford_files import AREAS
 from datamodules.synthrooms.camera import PanoramaView, PerspectiveView, Pose, draw_view
 from datamodules.synthrooms.raycast import RayScene
@@ -120,19 +120,14 @@ def generate_rooms(
         return
     processes = min(os.cpu_count() or 1 if workers is None else workers, len(unfinished))
     done = _in_processes if processes > 1 else _in_this_process
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[rate]}"),
-        TimeRemainingColumn(),
+    show_progress(
+        done(root, settings, unfinished, processes),
+        "Making rooms",
+        "rooms",
+        len(plans),
+        before=len(plans) - len(unfinished),
+        show=progress,
     )
-    with Progress(*columns, disable=not progress) as bar:
-        task = bar.add_task("Making rooms", total=len(plans), rate="")
-        bar.advance(task, len(plans) - len(unfinished))
-        for _ in done(root, settings, unfinished, processes):
-            speed = bar.tasks[task].speed
-            bar.update(task, advance=1, rate=f"{speed:.1f} rooms/s" if speed else "")
 
 
 def _claim(root: Path, settings: RoomSettings) -> None:

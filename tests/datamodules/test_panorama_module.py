@@ -12,7 +12,7 @@ from lightning import LightningModule, Trainer
 
 from datamodules.panorama_module import Split
 from datamodules.panoramas import Panorama
-from datamodules.samples import RGB_NORMALIZATION, RGBD_NORMALIZATION, EvaluationSample
+from datamodules.samples import RGB_NORMALIZATION, RGBD_NORMALIZATION, EvaluationSample, normalize
 from datamodules.stanford2d3ds import Stanford2D3DS
 from tangent_train.errors import SettingError
 
@@ -36,8 +36,10 @@ def make_module(stanford_root: Path, strips: Any) -> MakeModule:
     return make
 
 
-def _digest(batch: TrainingSample) -> str:
-    content = hashlib.sha256(batch.images.numpy().tobytes() + batch.labels.numpy().tobytes())
+def _digest(batch: TrainingSample[Any]) -> str:
+    images = [batch.images] if isinstance(batch.images, torch.Tensor) else batch.images
+    arrays = [tensor.numpy() for tensor in (*images, batch.labels)]
+    content = hashlib.sha256(b"".join(array.tobytes() for array in arrays))
     return f"{torch.as_tensor(batch.index).tolist()} {content.hexdigest()[:8]}"
 
 
@@ -59,9 +61,12 @@ def test_what_tasks_ask_for(make_module: MakeModule) -> None:
 
 
 def test_training_batches(make_module: MakeModule) -> None:
-    batches = list(make_module(panoramas_per_step=4, validation_fraction=0).train_dataloader())
-    assert [len(batch.images) for batch in batches] == [4, 4, 1]
-    assert batches[0].images.shape == (4, 2, 4, 16, 8)
+    module = make_module(panoramas_per_step=4, validation_fraction=0)
+    batches = list(module.train_dataloader())
+    assert [len(batch.labels) for batch in batches] == [4, 4, 1]
+    assert [image.shape for image in batches[0].images] == [(4, 2, 16, 8, 3), (4, 2, 16, 8)]
+    images = module.on_after_batch_transfer(batches[0], 0).images
+    torch.testing.assert_close(images, normalize(batches[0].images, module.normalization))
     assert batches[0].labels.shape == (4, 2, 16, 8)
     assert batches[0].labels.dtype == torch.uint8
 
@@ -73,7 +78,8 @@ def test_evaluation_batches_are_whole_panoramas_in_order(make_module: MakeModule
         batches = list(loaders[split])
         assert all(isinstance(batch, EvaluationSample) for batch in batches)
         assert [int(batch.index) for batch in batches] == list(range(len(module.source(split))))
-        assert batches[0].images.shape == (1, 4, 3, 16, 8)
+        images = module.on_after_batch_transfer(batches[0], 0).images
+        assert images.shape == (1, 4, 3, 16, 8)
         expected = module.source(split).read(0).labels[None]
         np.testing.assert_array_equal(batches[0].target.numpy(), expected)
 
@@ -169,22 +175,24 @@ class Recorder(LightningModule):
         self.seen: dict[int, list[str]] = {}
         self.tested: list[int] = []
 
-    def training_step(self, batch: TrainingSample, batch_idx: int) -> torch.Tensor:
+    def training_step(self, batch: TrainingSample[torch.Tensor], batch_idx: int) -> torch.Tensor:
+        assert batch.images.shape[2:] == (4, 16, 8)
         self.seen.setdefault(self.current_epoch, []).append(_digest(batch))
         return self.weight * batch.images.mean()
 
-    def validation_step(self, batch: EvaluationSample, batch_idx: int) -> None:
+    def validation_step(self, batch: EvaluationSample[torch.Tensor], batch_idx: int) -> None:
         pass
 
-    def test_step(self, batch: EvaluationSample, batch_idx: int) -> None:
+    def test_step(self, batch: EvaluationSample[torch.Tensor], batch_idx: int) -> None:
         self.tested.append(int(batch.index))
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         return torch.optim.SGD(self.parameters(), lr=0.1)
 
 
-def _trainer(folder: Path, epochs: int) -> Trainer:
+def _trainer(folder: Path, epochs: int, precision: Any = None) -> Trainer:
     return Trainer(
+        precision=precision,
         default_root_dir=folder,
         accelerator="cpu",
         max_epochs=epochs,
@@ -224,6 +232,24 @@ def test_a_resumed_run_sees_what_the_whole_run_sees(
     assert second.tested == [0, 1, 2, 3, 4]
 
 
+@pytest.mark.filterwarnings("ignore:.*LeafSpec:FutureWarning")
+@pytest.mark.parametrize(
+    ("precision", "dtype"), [("32-true", "float32"), ("bf16-true", "bfloat16")]
+)
+def test_images_have_the_precision_of_the_run(
+    make_module: MakeModule, tmp_path: Path, precision: Any, dtype: str
+) -> None:
+    seen = []
+
+    class Watcher(Recorder):
+        def test_step(self, batch: EvaluationSample[torch.Tensor], batch_idx: int) -> None:
+            seen.append(batch.images.dtype)
+
+    trainer = _trainer(tmp_path, 1, precision=precision)
+    trainer.test(Watcher(), datamodule=make_module(), verbose=False)
+    assert set(seen) == {getattr(torch, dtype)}
+
+
 # --- class weights -----------------------------------------------------------------------------
 
 
@@ -250,8 +276,10 @@ def test_classes_never_seen_weigh_nothing(
 ) -> None:
     module = make_module()
     source = module.source("train")
-    read = source.read_labels
-    monkeypatch.setattr(source, "read_labels", lambda i: read(i) // 13 * 13)
+    read = source.label_counts
+    monkeypatch.setattr(
+        source, "label_counts", lambda i: np.where(np.arange(256) == 13, read(i), 0)
+    )
     for kind in ("log", "sqrt"):
         weights = module.class_weights(kind)
         assert weights.nonzero().ravel().tolist() == [13]
@@ -275,6 +303,8 @@ def test_class_weights_of_another_kind(make_module: MakeModule) -> None:
         ("num_workers", -1),
         ("seed", -1),
         ("normalization", RGB_NORMALIZATION),
+        ("color_jitter", -0.1),
+        ("color_jitter", 1.1),
         ("test_rotation", "yaw"),
         ("test_rotation", 200),
         ("test_rotation", -1),

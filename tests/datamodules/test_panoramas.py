@@ -9,11 +9,13 @@ from datamodules.panoramas import (
     Panorama,
     RememberedPanoramas,
     TurnedPanoramas,
+    count_labels,
     in_threads,
     mask_black,
     resize_area,
     resize_depth,
     resize_nearest,
+    steps_to_meters,
 )
 from tangent_train.geometry import equirect_directions
 
@@ -38,14 +40,14 @@ class Memory:
         self.reads[index] += 1
         return self.panoramas[index]
 
-    def read_labels(self, index: int) -> NDArray[np.uint8]:
-        return self.read(index).labels
+    def label_counts(self, index: int) -> NDArray[np.int64]:
+        return count_labels(self.read(index).labels)
 
 
 def _panorama(rng: np.random.Generator, *, depth: bool = True) -> Panorama:
     return Panorama(
         rng.integers(0, 256, (8, 16, 3), np.uint8),
-        (rng.integers(0, 65535, (8, 16)) / np.float32(512)).astype(np.float32) if depth else None,
+        rng.integers(0, 65535, (8, 16), np.uint16) if depth else None,
         rng.integers(0, 14, (8, 16), np.uint8),
     )
 
@@ -167,7 +169,7 @@ def test_remembered_panoramas_are_the_same_and_read_once(depth: bool) -> None:
                 assert kept.dtype == original.dtype
                 np.testing.assert_array_equal(kept, original)
             np.testing.assert_array_equal(
-                remembered.read_labels(index), source.panoramas[index].labels
+                remembered.label_counts(index), count_labels(source.panoramas[index].labels)
             )
     assert source.reads == [1, 1, 1]
     assert remembered.name(1) == "panorama 1"
@@ -177,7 +179,7 @@ def _positions() -> Panorama:
     """A panorama whose labels, colours and depth tell the direction's height z."""
     z = np.round(100 + 100 * equirect_directions((32, 64))[..., 2])
     labels = z.astype(np.uint8)
-    return Panorama(np.stack([labels] * 3, axis=-1), z.astype(np.float32), labels)
+    return Panorama(np.stack([labels] * 3, axis=-1), z.astype(np.uint16), labels)
 
 
 @pytest.mark.parametrize("tilt", [0.0, 30.0, 90.0, 180.0])
@@ -201,17 +203,30 @@ def test_turns_are_those_of_seed_and_index() -> None:
 @pytest.mark.parametrize("rotation", [40.0, "so3"])
 def test_image_depth_and_labels_turn_together(rotation: float | Literal["so3"]) -> None:
     turned = TurnedPanoramas(Memory([_positions()]), rotation, seed=5)
-    rgb, depth_m, labels = turned.read(0)
+    rgb, depth, labels = turned.read(0)
     # The output direction d shows the input at Rᵀd, whose height is the third row of Rᵀ times d.
     height = equirect_directions((32, 64)) @ turned.rotation(0)[:, 2]
     np.testing.assert_allclose(labels.astype(float), 100 + 100 * height, atol=8)
     np.testing.assert_allclose(rgb[..., 1].astype(float), 100 + 100 * height, atol=8)
-    np.testing.assert_array_equal(turned.read_labels(0), labels)
-    assert depth_m is not None
-    np.testing.assert_array_equal(depth_m, labels)  # both nearest: the same source pixels
+    np.testing.assert_array_equal(turned.label_counts(0), count_labels(labels))
+    assert depth is not None
+    np.testing.assert_array_equal(depth, labels)  # both nearest: the same source pixels
     assert (len(turned), turned.name(0)) == (1, "panorama 0")
 
 
 def test_turning_without_depth() -> None:
     source = Memory([_panorama(np.random.default_rng(0), depth=False)])
-    assert TurnedPanoramas(source, "so3", 0).read(0).depth_m is None
+    assert TurnedPanoramas(source, "so3", 0).read(0).depth is None
+
+
+def test_labels_are_counted() -> None:
+    labels = np.array([[0, 3, 3], [13, 3, 255]], np.uint8)
+    counts = count_labels(labels)
+    assert counts.shape == (256,)
+    assert {label: counts[label] for label in np.flatnonzero(counts)} == {0: 1, 3: 3, 13: 1, 255: 1}
+
+
+def test_depth_in_meters() -> None:
+    depth_m = steps_to_meters(np.array([0, 1, 512, 65535], np.uint16))
+    assert depth_m.dtype == np.float32
+    assert depth_m.tolist() == [0, 1 / 512, 1, 65535 / 512]

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import colorsys
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 import torch
 from torch.utils.data import default_collate
 
+from datamodules.colors import jitter_colors
 from datamodules.panoramas import Panorama
 from datamodules.samples import (
     RGB_NORMALIZATION,
@@ -16,9 +18,11 @@ from datamodules.samples import (
     Normalization,
     TrainingPanoramas,
     TrainingSample,
+    collate,
     normalize,
 )
 from tangent_train.errors import SettingError
+from tangent_train.rendering.representation import EquirectRepresentation
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -42,10 +46,10 @@ class Positions:
         place = np.arange(16 * 32).reshape(16, 32) % 251
         labels = (place + index).astype(np.uint8)
         rgb = np.stack([labels, labels, labels], axis=-1)
-        return Panorama(rgb, labels.astype(np.float32) / np.float32(100), labels)
+        return Panorama(rgb, labels.astype(np.uint16) * 4, labels)
 
-    def read_labels(self, index: int) -> NDArray[np.uint8]:
-        return self.read(index).labels
+    def label_counts(self, index: int) -> NDArray[np.int64]:
+        raise NotImplementedError
 
 
 # --- normalization -----------------------------------------------------------------------------
@@ -54,25 +58,17 @@ class Positions:
 @pytest.mark.parametrize("depth", [True, False])
 def test_normalize_against_the_formula(depth: bool) -> None:
     rng = np.random.default_rng(0)
-    rgb = rng.integers(0, 256, (2, 4, 5, 3), np.uint8)
-    depth_m = rng.uniform(0, 8, (2, 4, 5)).astype(np.float32) if depth else None
+    rgb = rng.integers(0, 256, (3, 2, 4, 5, 3), np.uint8)
+    steps = rng.integers(0, 2049, (3, 2, 4, 5)).astype(np.int16)
+    inputs = [torch.from_numpy(array) for array in ((rgb, steps) if depth else (rgb,))]
     normalization = RGBD_NORMALIZATION if depth else RGB_NORMALIZATION
-    images = normalize(rgb, depth_m, normalization)
-    assert images.shape == (2, 4 if depth else 3, 4, 5)
-    assert images.dtype == np.float32
-    assert images.flags.c_contiguous
+    images = normalize(inputs, normalization)
+    assert images.shape == (3, 2, 4 if depth else 3, 4, 5)
+    assert images.dtype == torch.float32
+    assert images.is_contiguous()
     for channel, (mean, std) in enumerate(zip(normalization.mean, normalization.std, strict=True)):
-        if channel < 3:
-            value = rgb[..., channel] / 255
-        else:
-            assert depth_m is not None
-            value = np.minimum(depth_m, 4)
-        np.testing.assert_allclose(images[:, channel], (value - mean) / std, atol=1e-5)
-
-
-def test_missing_depth_counts_as_zero() -> None:
-    images = normalize(np.zeros((1, 1, 1, 3), np.uint8), np.zeros((1, 1, 1), np.float32), IDENTITY)
-    assert images.ravel().tolist() == [0, 0, 0, 0]
+        value = rgb[..., channel] / 255 if channel < 3 else steps / 512
+        np.testing.assert_allclose(images[:, :, channel], (value - mean) / std, atol=1e-5)
 
 
 def test_a_config_brings_lists() -> None:
@@ -99,9 +95,10 @@ def test_impossible_normalization(mean: Any, std: Any) -> None:
 
 @pytest.mark.parametrize(("depth", "normalization"), [(True, RGB_NORMALIZATION), (False, IDENTITY)])
 def test_normalization_of_other_channels(depth: bool, normalization: Normalization) -> None:
-    rgb = np.zeros((1, 2, 2, 3), np.uint8)
+    inputs = [torch.zeros((1, 2, 2, 3), dtype=torch.uint8)]
+    inputs += [torch.zeros((1, 2, 2), dtype=torch.int16)] * depth
     with pytest.raises(SettingError, match="channels"):
-        normalize(rgb, np.zeros((1, 2, 2), np.float32) if depth else None, normalization)
+        normalize(inputs, normalization)
 
 
 # --- samples -----------------------------------------------------------------------------------
@@ -109,18 +106,31 @@ def test_normalization_of_other_channels(depth: bool, normalization: Normalizati
 
 def _training(strips: Representation, seed: int = 0) -> TrainingPanoramas:
     source: PanoramaSource = Positions()
-    return TrainingPanoramas(source, strips, IDENTITY, seed)
+    return TrainingPanoramas(source, strips, seed)
 
 
 def test_training_sample(strips: Representation) -> None:
     sample = _training(strips)[4, 1]
-    assert sample.images.shape == (2, 4, 16, 8)
-    assert (sample.images.dtype, sample.labels.dtype) == (torch.float32, torch.uint8)
-    assert sample.labels.shape == (2, 16, 8)
+    rgb, depth = sample.images
+    assert (rgb.shape, rgb.dtype) == ((2, 16, 8, 3), torch.uint8)
+    assert (depth.shape, depth.dtype) == ((2, 16, 8), torch.int16)
+    assert (sample.labels.shape, sample.labels.dtype) == ((2, 16, 8), torch.uint8)
     assert sample.index == 1
     # The same pixels in all channels.
-    torch.testing.assert_close(sample.images[:, 0], sample.labels.float())
-    torch.testing.assert_close(sample.images[:, 3], sample.labels.float() / 100)
+    for channel in range(3):
+        torch.testing.assert_close(rgb[..., channel], sample.labels)
+    torch.testing.assert_close(depth, sample.labels.short() * 4)
+
+
+def test_depth_is_clipped_and_missing_is_zero(
+    strips: Representation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steps = np.tile(np.array([0, 1, 2047, 2048, 2049, 32768, 65535, 0], np.uint16), (16, 4))
+    panorama = Positions().read(0)._replace(depth=steps)
+    monkeypatch.setattr(Positions, "read", lambda *_: panorama)
+    images = EvaluationPanoramas(Positions(), strips)[0, 0].images
+    assert images[1][0, 0].tolist() == [0, 1, 2047, 2048, 2048, 2048, 2048, 0]
+    assert normalize(images, IDENTITY)[0, 3, 0, 3] == 4  # metres
 
 
 def test_views_are_those_of_seed_epoch_and_index(strips: Representation) -> None:
@@ -131,23 +141,97 @@ def test_views_are_those_of_seed_epoch_and_index(strips: Representation) -> None
 
 
 def test_evaluation_sample(strips: Representation) -> None:
-    dataset = EvaluationPanoramas(Positions(), strips, IDENTITY)
+    dataset = EvaluationPanoramas(Positions(), strips)
     sample = dataset[0, 2]
     assert len(dataset) == len(_training(strips)) == 3
-    assert sample.images.shape == (4, 4, 16, 8)
+    images = normalize(sample.images, IDENTITY)
+    assert images.shape == (4, 4, 16, 8)
     assert sample.index == 2
     np.testing.assert_array_equal(sample.target.numpy(), Positions().read(2).labels)
-    joined = torch.cat(list(sample.images[:, 0]), dim=1)
+    joined = torch.cat(list(images[:, 0]), dim=1)
     torch.testing.assert_close(joined, sample.target.float())
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_batches_are_those_of_torch(strips: Representation, count: int) -> None:
+    training: Any = _training(strips)
+    evaluation: Any = EvaluationPanoramas(Positions(), strips)
+    for samples in ([d[0, i] for i in range(count)] for d in (training, evaluation)):
+        found, expected = collate(samples), default_collate(samples)
+        assert type(found) is type(expected)
+        assert torch.equal(found[1], expected[1])
+        assert torch.equal(torch.as_tensor(found.index), torch.as_tensor(expected.index))
+        for image, wanted in zip(found.images, expected.images, strict=True):
+            assert torch.equal(image, wanted)
+
+
+def test_samples_share_no_memory_with_panoramas(
+    strips: Representation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    panorama = Positions().read(0)
+    monkeypatch.setattr(Positions, "read", lambda *_: panorama)
+    whole = EquirectRepresentation(level=3)
+    for dataset in (
+        TrainingPanoramas(Positions(), whole, 0),
+        EvaluationPanoramas(Positions(), whole),
+    ):
+        for tensor in (*(sample := dataset[0, 0]).images, sample[1]):
+            assert not any(np.shares_memory(tensor.numpy(), part) for part in panorama)
 
 
 def test_samples_collate(strips: Representation) -> None:
     training = _training(strips)
     batch = default_collate([training[0, 0], training[0, 2]])
     assert isinstance(batch, TrainingSample)
-    assert batch.images.shape == (2, 2, 4, 16, 8)
+    assert [image.shape for image in batch.images] == [(2, 2, 16, 8, 3), (2, 2, 16, 8)]
     assert batch.labels.dtype == torch.uint8
     assert torch.as_tensor(batch.index).tolist() == [0, 2]
-    whole = default_collate([EvaluationPanoramas(Positions(), strips, IDENTITY)[0, 1]])
+    whole = default_collate([EvaluationPanoramas(Positions(), strips)[0, 1]])
     assert isinstance(whole, EvaluationSample)
     assert whole.target.shape == (1, 16, 32)
+
+
+# --- colours -----------------------------------------------------------------------------------
+
+
+def test_jitter_changes_the_colours_and_nothing_else(strips: Representation) -> None:
+    plain, jittered = (
+        TrainingPanoramas(Positions(), strips, 0),
+        TrainingPanoramas(Positions(), strips, 0, 0.5),
+    )
+    for epoch in range(3):
+        before, after = plain[epoch, 1], jittered[epoch, 1]
+        assert not torch.equal(before.images[0], after.images[0])
+        assert torch.equal(before.images[1], after.images[1])
+        assert torch.equal(before.labels, after.labels)
+        assert torch.equal(after.images[0], jittered[epoch, 1].images[0])
+
+
+@pytest.mark.parametrize("strength", [0.1, 0.4])
+def test_jitter_against_slow_formulas(strength: float) -> None:
+    rgb = np.random.default_rng(1).integers(40, 160, (2, 3, 5, 3), np.uint8)
+    found = jitter_colors(torch.from_numpy(rgb), strength, np.random.default_rng(7)).numpy()
+    rng = np.random.default_rng(7)
+    brightness, contrast, saturation = (rng.uniform(1 - strength, 1 + strength) for _ in range(3))
+    hue = rng.uniform(-1, 1) * strength / 10
+
+    def grey(colors: NDArray[np.floating]) -> NDArray[np.floating]:
+        return colors @ [0.2989, 0.587, 0.114]
+
+    colors = np.minimum(rgb / 255 * brightness, 1)
+    colors = np.clip(contrast * colors + (1 - contrast) * grey(colors).mean(), 0, 1)
+    colors = np.clip(saturation * colors + (1 - saturation) * grey(colors)[..., None], 0, 1)
+    for place in np.ndindex(rgb.shape[:3]):
+        h, s, v = colorsys.rgb_to_hsv(*colors[place])
+        expected = colorsys.hsv_to_rgb((h + hue) % 1, s, v)
+        np.testing.assert_allclose(found[place] / 255, expected, atol=4 / 255)
+
+
+def test_jitter_of_neighbouring_images_agrees() -> None:
+    # The same colour in a dark and in a bright image stays the same colour.
+    rgb = torch.zeros((2, 4, 4, 3), dtype=torch.uint8)
+    rgb[1] = 200
+    rgb[:, 0] = torch.tensor([90, 120, 60], dtype=torch.uint8)
+    found = jitter_colors(rgb, 0.5, np.random.default_rng(3))
+    assert torch.equal(found[0, 0], found[1, 0])
+    assert not torch.equal(found[0, 0], rgb[0, 0])

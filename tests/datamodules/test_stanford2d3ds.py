@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from datamodules.panoramas import steps_to_meters
 from datamodules.stanford2d3ds import AREAS, CLASSES, FOLDS, FileName, Stanford2D3DS
 from tangent_train.errors import DataError, SettingError
 
@@ -146,9 +147,9 @@ def test_reads_what_was_written(stanford_root: Path, strips: Any, erp_height: in
     folder = stanford_root / area / "pano"
     panorama = source.read(1)
     assert panorama.rgb.shape == (erp_height, 2 * erp_height, 3)
-    assert panorama.depth_m is not None
-    dtypes = [a.dtype.name for a in (panorama.rgb, panorama.depth_m, panorama.labels)]
-    assert dtypes == ["uint8", "float32", "uint8"]
+    assert panorama.depth is not None
+    dtypes = [a.dtype.name for a in (panorama.rgb, panorama.depth, panorama.labels)]
+    assert dtypes == ["uint8", "uint16", "uint8"]
     # Blocks of 4×4 pixels: at these sizes every pixel is one block's.
     step = 32 // erp_height
     stem = f"camera_{camera}_{room}_frame_equirectangular_domain"
@@ -161,7 +162,9 @@ def test_reads_what_was_written(stanford_root: Path, strips: Any, erp_height: in
     assert classes.max() > 1
     np.testing.assert_array_equal(panorama.labels, classes)
     known = classes > 0
-    np.testing.assert_array_equal(panorama.depth_m, np.where(known, 1 + (classes - 1) / 4, 0))
+    np.testing.assert_array_equal(
+        steps_to_meters(panorama.depth), np.where(known, 1 + (classes - 1) / 4, 0)
+    )
     np.testing.assert_array_equal(panorama.rgb[..., 0], np.where(known, 5 + 15 * classes, 0))
     np.testing.assert_array_equal(panorama.rgb[..., 1], np.where(known, 245 - 15 * classes, 0))
     assert known.mean() == 7 / 8
@@ -173,7 +176,12 @@ def test_masks_are_applied_on_reading(stanford_root: Path, strips: Any) -> None:
         module = Stanford2D3DS(stanford_root, strips, mask=mask)
         source = module.source("train")
         unknown[mask] = source.read(0).labels == 0
-        np.testing.assert_array_equal(source.read_labels(0), source.read(0).labels)
+        counts = source.label_counts(0)
+        assert counts.shape == (256,)
+        values, expected = np.unique(source.read(0).labels, return_counts=True)
+        assert {v: counts[v] for v in np.flatnonzero(counts)} == dict(
+            zip(values, expected, strict=True)
+        )
     # The fabricated black region has no labels; one more patch has no blue.
     np.testing.assert_array_equal(unknown["labels"], unknown["all_black"])
     assert unknown["any_black"][-2:, :4].all()
@@ -184,7 +192,7 @@ def test_without_depth_its_files_are_not_needed(broken_root: Path, strips: Any) 
     for path in broken_root.glob("area_*/pano/depth/*.png"):
         path.unlink()
     module = Stanford2D3DS(broken_root, strips, inputs=("rgb",))
-    assert module.source("test").read(0).depth_m is None
+    assert module.source("test").read(0).depth is None
     with pytest.raises(DataError, match=r"depth\.png"):
         Stanford2D3DS(broken_root, strips).setup()
 

@@ -1,0 +1,46 @@
+"""A progress bar for making files."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+__all__ = ["show_progress"]
+
+
+def show_progress(
+    done: Iterable[object],
+    description: str,
+    unit: str,
+    total: int,
+    *,
+    before: int = 0,
+    show: bool = True,
+) -> None:
+    """Take what comes, one piece of the work at a time, and show how far it is.
+
+    Args:
+        done: Yields something whenever a piece is done.
+        description: What is being done.
+        unit: Pieces, in the plural.
+        total: Number of pieces.
+        before: Pieces that were done before.
+        show: Whether to show anything.
+    """
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[rate]}"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, disable=not show) as bar:
+        task = bar.add_task(description, total=total, rate="")
+        bar.advance(task, before)
+        for _ in done:
+            speed = bar.tasks[task].speed
+            bar.update(task, advance=1, rate=f"{speed:.1f} {unit}/s" if speed else "")
