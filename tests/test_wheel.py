@@ -55,7 +55,9 @@ def test_the_wheel_holds_the_packages_and_the_configs(wheel: Path) -> None:
     assert not [name for name in names if name.startswith(("tests", "benchmarks", "data/"))]
 
 
-@pytest.mark.parametrize("command", ["tangent-train", "tangent-evaluate", "tangent-prepare"])
+@pytest.mark.parametrize(
+    "command", ["tangent-train", "tangent-evaluate", "tangent-prepare", "tangent-report"]
+)
 def test_the_commands_answer_from_another_folder(
     scripts: Path, command: str, tmp_path: Path
 ) -> None:

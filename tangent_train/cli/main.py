@@ -1,11 +1,12 @@
 """Entry points of the console scripts.
 
 Nothing heavy is imported before the settings are known to be right: ``--help`` and a misspelt
-override answer at once.
+override answer at once. ``python -m tangent_train.cli.main train …`` is ``tangent-train …``.
 """
 
 from __future__ import annotations
 
+import os
 import sys
 from typing import TYPE_CHECKING
 
@@ -14,7 +15,7 @@ from tangent_train.errors import DataError, SettingError
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
-__all__ = ["evaluate", "prepare", "train"]
+__all__ = ["evaluate", "prepare", "report", "train"]
 
 
 def train() -> None:
@@ -32,42 +33,71 @@ def prepare() -> None:
     _main("prepare")
 
 
+def report() -> None:
+    """``tangent-report <run folders>``: tables and a chart over runs."""
+    from tangent_train.cli.report import report as write_report
+
+    try:
+        write_report(sys.argv[1:])
+    except (DataError, SettingError) as error:
+        sys.exit(f"tangent-report: {error}")
+
+
 def _main(command: str) -> None:
     typed = sys.argv[1:]
     try:
         _compose_and_run(command, typed)
     except (DataError, SettingError) as error:
         sys.exit(f"tangent-{command}: {error}")
+    except KeyboardInterrupt:
+        sys.exit(130)  # as a shell says it; runs have said how to go on
     finally:
         sys.argv[1:] = typed
 
 
 def _compose_and_run(command: str, typed: list[str]) -> None:
     import hydra
+    from hydra._internal.utils import get_args_parser
     from hydra.errors import InstantiationException
 
     from tangent_train.cli.compose import check_overrides, config_folder, with_stored_config
 
-    config_name, arguments = with_stored_config(command, typed)
+    as_module = __name__ == "__main__"
+    settings = typed[1:] if as_module else typed
+    config_name, arguments = with_stored_config(command, settings)
     check_overrides(config_name, arguments)
+    visible_gpus = os.environ.get("CUDA_VISIBLE_DEVICES")
 
-    def job(config: DictConfig) -> None:
+    def job(config: DictConfig) -> float | None:
         # Lightning starts further processes with this command line: it must be the typed one.
         sys.argv[1:] = typed
-        from tangent_train.cli import run
+        from tangent_train.cli.sweep import in_sweep, leave_warnings_to_the_sweep, run_job
 
         try:
-            getattr(run, command)(config)
+            if in_sweep():
+                return run_job(command, settings, visible_gpus, config)
+            leave_warnings_to_the_sweep()
+            from tangent_train.cli import run
+
+            result: float | None = getattr(run, command)(config)
         except (DataError, SettingError) as error:
             sys.exit(f"tangent-{command}: {error}")
         except InstantiationException as error:
             if isinstance(error.__cause__, DataError | SettingError):
                 sys.exit(f"tangent-{command}: {error.__cause__}")
             raise
+        return result
 
-    # Lightning prints its own messages: Hydra's handlers would print them again. argparse wants all
-    # overrides in one place.
-    quiet = ["hydra/job_logging=none", "hydra/hydra_logging=none"]
-    place = next((i for i, a in enumerate(arguments) if "=" in a and a[0] != "-"), len(arguments))
+    # Lightning prints its own messages: Hydra's handlers would print them again. A sweep has only
+    # Hydra's. argparse wants all overrides in one place.
+    quiet = ["hydra/job_logging=none"]
+    if not get_args_parser().parse_args(arguments).multirun:
+        quiet.append("hydra/hydra_logging=none")
+    places = (i for i, a in enumerate(arguments) if a[:1] == "~" or ("=" in a and a[0] != "-"))
+    place = next(places, len(arguments))
     sys.argv[1:] = [*arguments[:place], *quiet, *arguments[place:]]
     hydra.main(version_base="1.3", config_path=str(config_folder()), config_name=config_name)(job)()
+
+
+if __name__ == "__main__":
+    _main(sys.argv[1])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import json
 import signal
 import sys
 import warnings
@@ -12,16 +14,17 @@ import lightning
 import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
 from hydra.utils import instantiate
-from lightning.pytorch.callbacks import LearningRateMonitor
+from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
+from models.initialize import initialize, origins_table
 from tangent_train.cli.resume import check_resumed
+from tangent_train.cli.sweep import OBJECTIVE_FILE
 from tangent_train.errors import SettingError
 from tangent_train.files import write_text
 from tangent_train.rendering import Representation
@@ -36,15 +39,21 @@ from tangent_train.tasks.results import evaluation_results, results_table, write
 
 __all__ = ["build", "evaluate", "prepare", "train"]
 
+_PRETRAINED = ("weights", "weights_backbone", "encoder_weights")
+"""Settings that name trained weights, in models, torchvision and segmentation-models-pytorch."""
+
 # lightning 2.6 asks torch's tree library in a way torch ≥ 2.13 deprecates: nothing to do about it.
 warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)`", FutureWarning)
 
 
-def train(config: DictConfig) -> None:
+def train(config: DictConfig) -> float | None:
     """Train, then evaluate the best epoch of the validation split (else the last) on the test fold.
 
     Args:
         config: The composed ``train.yaml``.
+
+    Returns:
+        The best figure on the validation split, what sweeps compare; None without such a split.
     """
     folder = _run_folder()
     checkpoints = folder / "checkpoints"
@@ -53,19 +62,15 @@ def train(config: DictConfig) -> None:
     if resumed is not None:
         check_resumed(_resolved(config), _checkpoint(resumed)["resolved_config"])
     data, task = build(config)
+    if config.init_from is not None and resumed is None:
+        origins = initialize(task.network, config.init_from)
+        rank_zero_only(_console().print)(origins_table(origins, config.init_from))
     write_text(folder / "config.yaml", OmegaConf.to_yaml(config, resolve=True))
     last = LastCheckpoint(checkpoints, config.checkpoint_every_n_steps)
     callbacks = [last, LearningRateMonitor()]
     if data.validation_fraction:
         callbacks.append(best_checkpoint(checkpoints))
     trainer = _trainer(config, folder, data, callbacks)
-    if HydraConfig.get().mode == RunMode.MULTIRUN and trainer.num_devices > 1:
-        raise SettingError(
-            "trainer.devices",
-            found=f"{trainer.num_devices} devices in a sweep",
-            expected="1: further processes would each run the whole sweep",
-            remedy="Start the runs one by one.",
-        )
     with warnings.catch_warnings():
         # The checkpoints of a resumed run are meant to be there.
         warnings.filterwarnings("ignore", "Checkpoint directory .* exists and is not empty")
@@ -77,6 +82,7 @@ def train(config: DictConfig) -> None:
             sys.exit(128 + signal.SIGTERM)
     best = checkpoints / "best.ckpt"
     _test(trainer, task, data, best if best.exists() else checkpoints / "last.ckpt", folder)
+    return _best_on_validation(trainer, folder)
 
 
 def evaluate(config: DictConfig) -> None:
@@ -102,7 +108,7 @@ def evaluate(config: DictConfig) -> None:
 
 
 def prepare(config: DictConfig) -> None:
-    """Make or check the data set.
+    """Make or check the data set, and its prepared store if one is set.
 
     Args:
         config: The composed ``prepare.yaml``.
@@ -112,6 +118,7 @@ def prepare(config: DictConfig) -> None:
     data.prepare_data()
     data.setup("fit")
     data.setup("test")
+    data.prepare_store(content=True)
     counts = ", ".join(f"{len(data.open_split(s))} {s}" for s in ("train", "val", "test"))
     _console().print(f"{data.root} is ready. Panoramas of fold {data.fold}: {counts}.")
 
@@ -119,7 +126,9 @@ def prepare(config: DictConfig) -> None:
 def build(config: DictConfig) -> tuple[Any, Any]:
     """The data module and the task of a config.
 
-    Network settings that are null are taken from the data: ``in_channels``, ``num_classes``.
+    Network settings that are null are taken from the data: ``in_channels``, and ``num_classes`` or
+    ``classes``, also of a network inside the network's settings. Where a checkpoint will bring the
+    tensors, no others are fetched first.
 
     Args:
         config: A composed config.
@@ -129,11 +138,13 @@ def build(config: DictConfig) -> tuple[Any, Any]:
     """
     representation = instantiate(config.representation)
     data = instantiate(config.data, representation=representation)
-    known = {"in_channels": data.in_channels, "num_classes": len(data.class_names)}
-    asked = {name: value for name, value in known.items() if config.network.get(name, 0) is None}
+    known = dict.fromkeys(("num_classes", "classes"), len(data.class_names))
+    known["in_channels"] = data.in_channels
+    restored = config.get("resume") is not None or config.get("checkpoint") is not None
+    network = OmegaConf.to_container(config.network, resolve=True)
     task = instantiate(
         config.task,
-        network=instantiate(config.network, **asked),
+        network=instantiate(_completed(network, known, restored=restored)),
         representation=representation,
         class_names=data.class_names,
         optimizer=instantiate(config.optimizer),
@@ -143,14 +154,30 @@ def build(config: DictConfig) -> tuple[Any, Any]:
     return data, task
 
 
+def _completed(settings: Any, known: dict[str, int], *, restored: bool) -> Any:
+    """Settings of a network and of those inside it, with what is `known` where they are null."""
+    if not isinstance(settings, dict):
+        return settings
+    unwanted = _PRETRAINED if restored else ()
+    return {
+        name: known.get(name)
+        if value is None or name in unwanted
+        else _completed(value, known, restored=restored)
+        for name, value in settings.items()
+    }
+
+
 def _try_network(task: Any, representation: Representation, channels: int) -> None:
     """Run the network on one empty image: what does not fit shows before any data is made."""
     panorama = np.zeros((representation.erp_height, 2 * representation.erp_height), np.uint8)
     size = representation.whole().render(panorama, "nearest").shape[1:]
-    task.eval()
+    probe = copy.deepcopy(task).to("meta").eval()  # shapes only: nothing is computed
     with torch.no_grad():
-        task(torch.zeros(1, channels, *size))
-    task.train()
+        try:
+            probe(torch.zeros(1, channels, *size, device="meta"))
+        except NotImplementedError:  # by an operation that only computes
+            probe = copy.deepcopy(task).eval()
+            probe(torch.zeros(1, channels, *size))
 
 
 def _trainer(
@@ -205,6 +232,17 @@ def _test(trainer: lightning.Trainer, task: Any, data: Any, checkpoint: Path, fo
     if results["panoramas"] != total:
         raise RuntimeError(f"{results['panoramas']} of {total} test panoramas were counted")
     _report(results, checkpoint, folder)
+
+
+def _best_on_validation(trainer: lightning.Trainer, folder: Path) -> float | None:
+    best = next((c for c in trainer.checkpoint_callbacks if isinstance(c, ModelCheckpoint)), None)
+    if best is None or best.best_model_score is None:
+        return None
+    score = float(best.best_model_score)
+    if trainer.is_global_zero:
+        content = {"figure": best.monitor, "best": score}
+        write_text(folder / OBJECTIVE_FILE, json.dumps(content) + "\n")
+    return score
 
 
 @rank_zero_only

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -132,6 +133,27 @@ def test_an_interrupted_run_says_how_to_go_on_and_ends_the_same(
     assert _results(tmp_path / "cut") == _results(run_folder)
 
 
+def test_a_run_starts_from_the_network_of_another(
+    run_folder: Path,
+    rooms: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    checkpoint = run_folder / "checkpoints" / "best.ckpt"
+    rgb = ["data.inputs=[rgb]", "trainer.max_epochs=1", "hydra.run.dir=begun"]
+    _run(monkeypatch, "train", *SETTINGS, rooms, *rgb, f"init_from={checkpoint}")
+    table = capsys.readouterr().out
+    assert "4 → 3 channels" in table
+    assert re.search(r"fresh +│ +0 ", table)
+    assert _results(tmp_path / "begun")["panoramas"] == 2
+    foreign = tmp_path / "foreign.pt"
+    torch.save({"x": torch.zeros(1)}, foreign)
+    with pytest.raises(SystemExit, match=r"foreign\.pt: found no tensor that fits, but x"):
+        _run(monkeypatch, "train", *SETTINGS, rooms, f"init_from={foreign}")
+
+
 def test_settings_of_the_checkpoint_reach_what_refers_to_them(
     run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -188,15 +210,6 @@ def test_impossible_settings_are_refused_before_any_data_is_made(
     with pytest.raises(SystemExit, match=rf"^tangent-train: {message}"):
         _run(monkeypatch, "train", "experiment=rooms/demo", *overrides)
     assert not (tmp_path / "data").exists()
-
-
-def test_a_sweep_runs_one_run_after_the_other(
-    rooms: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    sweep = ["-m", "trainer.max_epochs=1", "optimizer.lr=1e-3,1e-2", "hydra.sweep.dir=sweep"]
-    _run(monkeypatch, "train", *sweep, *SETTINGS, rooms)
-    assert {path.parent.name for path in tmp_path.glob("sweep/*/results.json")} == {"0", "1"}
 
 
 def test_a_missing_data_set_is_an_error_before_training(

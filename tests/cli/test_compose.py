@@ -16,26 +16,6 @@ from tangent_train.cli.compose import (
 )
 from tangent_train.errors import DataError, SettingError
 
-EXPERIMENTS = sorted(
-    str(path.relative_to(config_folder() / "experiment").with_suffix(""))
-    for path in (config_folder() / "experiment").rglob("*.yaml")
-)
-
-
-@pytest.mark.parametrize("experiment", EXPERIMENTS)
-def test_every_experiment_composes_and_instantiates(experiment: str) -> None:
-    from tangent_train.cli.run import build
-
-    with initialize_config_dir(str(config_folder()), version_base="1.3"):
-        config = compose("train", [f"experiment={experiment}"])
-    OmegaConf.resolve(config)
-    data, task = build(config)
-    assert task.network is not None
-    assert len(task.class_names) == len(data.class_names) == 14
-    optimizer = task.make_optimizer(task.parameters())
-    assert optimizer.param_groups[0]["lr"] > 0
-    assert config.name.replace("/", "_").endswith(experiment.rpartition("/")[2])
-
 
 @pytest.mark.parametrize("group", ["representation", "optimizer", "scheduler", "network", "data"])
 def test_every_option_of_every_group_composes(group: str) -> None:

@@ -8,7 +8,9 @@ from typing import Any, NamedTuple
 import lightning
 import pytest
 import torch
+from lightning.pytorch.strategies import DDPStrategy
 from torch import Tensor, nn
+from torch.distributed.algorithms.ddp_comm_hooks import default_hooks
 from torch.utils.data import DataLoader
 
 from tangent_train.rendering import TangentRepresentation
@@ -77,9 +79,8 @@ def _gradients(
         enable_progress_bar=False,
         enable_model_summary=False,
         accelerator="cpu",
-        callbacks=[gradients],
         limit_val_batches=0,
-        **trainer,
+        **trainer | {"callbacks": [gradients, *trainer.get("callbacks", [])]},
     ).fit(task, datamodule=Data(batch_size))
     return gradients.found, gradients.loss
 
@@ -124,6 +125,33 @@ def test_faster_arithmetic_works_in_chunks(
     tolerance = 3e-2 if "precision" in trainer else 1e-5
     for expected, found in zip(exact, fast, strict=True):
         assert float((found - expected).norm() / expected.norm()) < tolerance
+
+
+class Exchanges(lightning.Callback):
+    """Counts the times that gradients are exchanged between processes."""
+
+    count = 0
+
+    def on_train_start(self, trainer: Any, pl_module: Any) -> None:
+        def exchange(state: Any, bucket: Any) -> Any:
+            self.count += 1
+            return default_hooks.allreduce_hook(state, bucket)
+
+        exchange.__annotations__.clear()  # torch reads them, and strings it does not know
+        trainer.strategy.model.register_comm_hook(None, exchange)
+
+    def teardown(self, trainer: Any, pl_module: Any, stage: str) -> None:
+        torch.distributed.destroy_process_group()
+
+
+def test_processes_exchange_gradients_once_after_the_last_chunk() -> None:
+    exchanges = Exchanges()
+    strategy = DDPStrategy(process_group_backend="gloo")
+    trainer = {"max_steps": 1, "devices": 1, "strategy": strategy, "callbacks": [exchanges]}
+    expected, _ = _gradients(None, {"max_steps": 1})
+    found, _ = _gradients(7, trainer)
+    assert exchanges.count == 1
+    torch.testing.assert_close(found, expected)
 
 
 def test_compiling_keeps_the_names_of_the_tensors() -> None:

@@ -1,0 +1,120 @@
+"""The report over runs as a picture: bars, spread over folds, the paper's figures as marks."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure as Canvas
+
+from tangent_train.tasks.report import Figure, Group
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+__all__ = ["report_png"]
+
+# Okabe and Ito's colours: told apart by people who do not see all colours.
+_COLORS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#999999")
+_LABEL_LENGTH = 60
+
+
+def report_png(groups: Sequence[Group]) -> bytes:
+    """Bars of mIoU and mAcc, and of every class, one colour per group.
+
+    Error bars are the standard deviation over folds, else over seeds; diamonds the paper's figures
+    for the same data, resolution, base level and inputs.
+
+    Args:
+        groups: From `report.group_runs`.
+
+    Returns:
+        A PNG file.
+    """
+    names = groups[0].class_names
+    width = max(9.0, 0.75 * len(names) * max(1.0, len(groups) / 3))
+    figure = Canvas(figsize=(width, 10.5 + 0.1 * len(groups)), dpi=120, layout="constrained")
+    FigureCanvasAgg(figure)
+    means, iou, accuracy = figure.subplots(3, 1)
+    overall = ("miou", "macc", "miou_solid_angle", "macc_solid_angle")
+    ticks = ("mIoU", "mAcc", "mIoU by solid angle", "mAcc by solid angle")
+    _bars(
+        means,
+        groups,
+        ticks,
+        [[group.figure(name) for name in overall] for group in groups],
+        [[getattr(group.paper, name, None) for name in overall] for group in groups],
+    )
+    for axes, name, title in ((iou, "iou", "IoU"), (accuracy, "accuracy", "Accuracy")):
+        _bars(
+            axes,
+            groups,
+            names,
+            [[group.figure(name, k) for k in range(len(names))] for group in groups],
+            [list(getattr(group.paper, name, ())) or [None] * len(names) for group in groups],
+        )
+        axes.set_title(f"{title} of each class", loc="left")
+    means.set_title("All classes (± standard deviation over folds, else over seeds)", loc="left")
+    handles, labels = means.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper left", frameon=False, ncols=2)
+    file = io.BytesIO()
+    figure.savefig(file, format="png", metadata={"Software": "tangent-report"})
+    return file.getvalue()
+
+
+def _bars(
+    axes: Axes,
+    groups: Sequence[Group],
+    ticks: Sequence[str],
+    figures: Sequence[Sequence[Figure]],
+    printed: Sequence[Sequence[float | None]],
+) -> None:
+    places = np.arange(len(ticks))
+    width = 0.8 / len(groups)
+    marked = False
+    for k, (group, row, paper) in enumerate(zip(groups, figures, printed, strict=True)):
+        at = places + (k - (len(groups) - 1) / 2) * width
+        axes.bar(
+            at,
+            _percent([figure.mean for figure in row]),
+            0.92 * width,
+            yerr=_percent([_spread(figure) for figure in row]),
+            color=_COLORS[k % len(_COLORS)],
+            hatch=("", "//", "..")[k // len(_COLORS) % 3],
+            label=_short(group),
+            error_kw={"elinewidth": 1.2, "capsize": min(4.0, 14 * width), "ecolor": "#333333"},
+        )
+        marks: Any = [np.nan if value is None else value for value in paper]
+        if any(value is not None for value in paper):
+            label = None if marked else "the paper (mean of 3 folds)"
+            axes.plot(at, marks, "D", ms=5.5, color="white", markeredgecolor="black", label=label)
+            marked = True
+    axes.set_xticks(places, ticks)
+    axes.set_ylim(0, 105)
+    axes.set_yticks(range(0, 101, 20))
+    axes.set_ylabel("%")
+    axes.margins(x=0.01)
+    axes.grid(axis="y", color="#dddddd")
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def _spread(figure: Figure) -> float | None:
+    return figure.over_seeds if figure.over_folds is None else figure.over_folds
+
+
+def _percent(shares: Sequence[float | None]) -> list[float]:
+    return [np.nan if share is None else 100 * share for share in shares]
+
+
+def _short(group: Group) -> str:
+    """The label for the legend; its end, where settings differ, matters more than its middle."""
+    label = group.label
+    if len(label) > _LABEL_LENGTH:
+        label = f"{label[: _LABEL_LENGTH // 2 - 1]} … {label[1 - _LABEL_LENGTH // 2 :]}"
+    folds = f"fold {', '.join(map(str, group.folds))}; " if group.folds else ""
+    runs = len(group.runs)
+    return f"{group.data}: {label} ({folds}{runs} run{'s' if runs > 1 else ''})"

@@ -1,0 +1,149 @@
+"""Finished runs on disk: their results and settings, read and checked."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+
+from tangent_train.errors import DataError
+
+__all__ = ["MEANS", "PER_CLASS", "RESULTS_FILE", "Run", "find_runs", "load_run", "unfinished_runs"]
+
+RESULTS_FILE = "results.json"
+
+MEANS = ("miou", "macc", "miou_solid_angle", "macc_solid_angle")
+"""Figures over all classes, as named in the results."""
+
+PER_CLASS = ("iou", "accuracy", "iou_solid_angle", "accuracy_solid_angle")
+"""Figures of a class, likewise."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished run or evaluation.
+
+    Attributes:
+        folder: Where it is.
+        settings: Its resolved config, ``section.setting`` → value.
+        results: Its ``results.json``.
+    """
+
+    folder: Path
+    settings: Mapping[str, Any]
+    results: Mapping[str, Any]
+
+    @property
+    def fold(self) -> int | None:
+        """The fold it was tested on; None for data without folds."""
+        fold = self.settings.get("data.fold")
+        return None if fold is None else int(fold)
+
+    @property
+    def class_names(self) -> tuple[str, ...]:
+        """The classes of its results."""
+        return tuple(entry["class"] for entry in self.results["classes"])
+
+    def figure(self, name: str, class_index: int | None = None) -> float | None:
+        """A figure of all classes, or of one; a share of 1, None where it is not defined."""
+        source = self.results if class_index is None else self.results["classes"][class_index]
+        value = source[name]
+        return None if value is None else float(value)
+
+
+def find_runs(folders: Sequence[Path]) -> list[Path]:
+    """The folders of runs in and below the given ones, each once, sorted within each.
+
+    Raises:
+        DataError: A folder is missing or holds no results.
+    """
+    found: dict[Path, None] = {}
+    for folder in folders:
+        if not folder.is_dir():
+            raise DataError(folder, found="no such folder", expected="a run, or a folder of runs")
+        inside = [folder] if (folder / RESULTS_FILE).exists() else _below(folder, RESULTS_FILE)
+        if not inside:
+            begun = (folder / "checkpoints").is_dir()
+            raise DataError(
+                folder / RESULTS_FILE,
+                found="no such file" + ("" if begun else ", nor any below"),
+                expected="the results of a finished run",
+                remedy=f"Finish it: tangent-train resume={folder}" if begun else "",
+            )
+        found.update(dict.fromkeys(path.resolve() for path in inside))
+    return list(found)
+
+
+def unfinished_runs(folders: Sequence[Path]) -> list[Path]:
+    """Folders of runs in and below the given ones that have begun and have no results."""
+    begun = [path for folder in folders for path in _below(folder, "checkpoints")]
+    return sorted({path.resolve() for path in begun if not (path / RESULTS_FILE).exists()})
+
+
+def _below(folder: Path, name: str) -> list[Path]:
+    return sorted(path.parent for path in folder.rglob(name))
+
+
+def load_run(folder: Path) -> Run:
+    """Read a run's results and settings.
+
+    Raises:
+        DataError: One of the files is missing or not what ``tangent-train`` writes.
+    """
+    results = _results(folder / RESULTS_FILE)
+    path = folder / "config.yaml"
+    if not path.is_file():
+        path = folder / ".hydra" / "config.yaml"  # of tangent-evaluate
+    if not path.is_file():
+        raise DataError(
+            folder / "config.yaml",
+            found="no such file",
+            expected="the settings of the run, beside its results",
+        )
+    try:
+        config = OmegaConf.to_container(OmegaConf.load(path), resolve=True)
+    except Exception as error:
+        raise DataError(path, found=_first_line(error), expected="the settings of a run") from error
+    if not isinstance(config, dict):
+        raise DataError(path, found=type(config).__name__, expected="the settings of a run")
+    return Run(folder, dict(_flat(config)), results)
+
+
+def _results(path: Path) -> dict[str, Any]:
+    expected = "results written by tangent-train or tangent-evaluate"
+    if not path.is_file():
+        raise DataError(path, found="no such file", expected=expected)
+    try:
+        results = json.loads(path.read_text())
+        figures = [results[name] for name in MEANS]
+        for entry in results["classes"]:
+            str(entry["class"])
+            figures += [entry[name] for name in PER_CLASS]
+    except (OSError, ValueError) as error:
+        raise DataError(path, found=_first_line(error), expected=expected) from error
+    except KeyError as error:
+        raise DataError(path, found=f"no {error}", expected=expected) from error
+    except TypeError as error:
+        raise DataError(path, found="other lists and mappings", expected=expected) from error
+    for value in figures:
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        if value is not None and not (number and 0 <= value <= 1):
+            raise DataError(path, found=f"{value!r}", expected="shares of 1, or null")
+    return dict(results)
+
+
+def _first_line(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}".partition("\n")[0]
+
+
+def _flat(config: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in config.items():
+        name = f"{prefix}{key}"
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{name}.")
+        else:
+            yield name, value
