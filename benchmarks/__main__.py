@@ -1,7 +1,7 @@
 """All benchmarks: ``python -m benchmarks``."""
 
-from benchmarks import loader, rendering
+from benchmarks import loader, memory, rendering, training
 
-rendering.main()
-print()
-loader.main()
+for benchmark in (rendering, loader, memory, training):
+    benchmark.main()
+    print()

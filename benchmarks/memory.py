@@ -46,11 +46,12 @@ class Step(NamedTuple):
 def main(arguments: list[str] | None = None) -> None:
     """Print one row per number of panoramas and chunk size."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="small images")
-    level = 5 if parser.parse_args(arguments).quick else 7
+    parser.add_argument("--quick", action="store_true", help="small images of one panorama")
+    quick = parser.parse_args(arguments).quick
+    level = 6 if quick else 7
     print(f"\nUNet, images of {2**level}², {IMAGES} per panorama")
-    for panoramas in (1, 2, 4):
-        for chunk in (1, 4, None):
+    for panoramas in (1,) if quick else (1, 2, 4):
+        for chunk in (1, None) if quick else (1, 4, None):
             with ProcessPoolExecutor(1, get_context("spawn")) as process:
                 step = process.submit(measure, panoramas, chunk, level).result()
             name = f"{panoramas} panoramas, images_per_chunk={chunk or 'null'}"

@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from benchmarks import loader, rendering
+from benchmarks import loader, memory, rendering, training
 
 
 @pytest.mark.slow
@@ -29,3 +29,18 @@ def test_the_loader_benchmark_measures_both_ways(capsys: pytest.CaptureFixture[s
     assert min(png, store, first) > 0
     assert len(re.findall(r"worker: \d+ MB of its own, \d+ MB at most", printed)) == 2
     assert re.search(r"80 of 80 images .* as long", printed)
+
+
+@pytest.mark.slow
+def test_chunks_need_less_memory_than_the_batch(capsys: pytest.CaptureFixture[str]) -> None:
+    memory.main(["--quick"])
+    one, batch = map(float, re.findall(r"(\d+) MiB", capsys.readouterr().out))
+    assert one < batch
+
+
+@pytest.mark.slow
+def test_the_training_benchmark_steps_in_both_precisions(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    training.main(["--quick"])
+    assert len(re.findall(r"ms +[\d.]+× as fast", capsys.readouterr().out)) == 2
