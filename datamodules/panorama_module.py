@@ -127,7 +127,7 @@ class PanoramaDataModule(LightningDataModule, ABC):
         self.seed = _at_least("data.seed", seed, 0)
         self.in_memory = in_memory
         self.store = None if store is None else Path(store)
-        if not 0 <= color_jitter <= 1:
+        if not isinstance(color_jitter, int | float) or not 0 <= color_jitter <= 1:
             raise SettingError("data.color_jitter", found=color_jitter, expected="0 to 1")
         self.color_jitter = color_jitter
         self.test_rotation = _checked_rotation(test_rotation)
@@ -146,24 +146,29 @@ class PanoramaDataModule(LightningDataModule, ABC):
     def prepare_data(self) -> None:
         """Prepare what the store lacks, if there is to be one.
 
-        An evaluation prepares the panoramas of the test split only.
+        An evaluation prepares the panoramas of the test split only. Before training, those that are
+        opened long after its beginning are read whole: damage shows now, and is mended.
         """
-        testing = self.trainer is not None and self.trainer.state.fn == TrainerFn.TESTING
-        self.prepare_store(("test",) if testing else _SPLITS)
+        if self.trainer is not None and self.trainer.state.fn == TrainerFn.TESTING:
+            self.prepare_store(("test",))
+        else:
+            self.prepare_store(whole=("val", "test"))
 
-    def prepare_store(self, splits: Sequence[Split] = _SPLITS, *, content: bool = False) -> None:
+    def prepare_store(
+        self, splits: Sequence[Split] = _SPLITS, *, whole: Sequence[Split] = ()
+    ) -> None:
         """Make the panoramas that the store lacks; nothing without a store.
 
         Args:
             splits: Which.
-            content: Whether to read the whole store, for damage that does not show otherwise.
+            whole: Those of them whose files are read, for damage that does not show otherwise.
 
         Raises:
             DataError: The disk is too full, or a file of the data set is broken.
         """
         if self.store is not None:
-            sources = [PreparedPanoramas(self.open_split(s), self.store) for s in splits]
-            prepare_store(sources, content=content)
+            sources = {s: PreparedPanoramas(self.open_split(s), self.store) for s in splits}
+            prepare_store(list(sources.values()), whole=[sources[split] for split in whole])
 
     def source(self, split: Split) -> PanoramaSource:
         """The panoramas of one split: from the store, turned, in memory, if asked for."""

@@ -8,6 +8,7 @@ it is broken. One made with depth also serves runs without.
 
 from __future__ import annotations
 
+import os
 import shutil
 from contextlib import closing
 from pathlib import Path
@@ -46,7 +47,7 @@ class PreparedPanoramas:
     def __init__(self, source: FileSource, store: str | Path) -> None:
         self._source = source
         self._folder = Path(store) / source.variant
-        self._checked: set[int] = set()
+        self._checked: dict[int, int] = {}
 
     def __len__(self) -> int:
         return len(self._source)
@@ -71,11 +72,10 @@ class PreparedPanoramas:
         Raises:
             DataError: It is not prepared, is broken, or was made from other files or settings.
         """
-        if index in self._checked:
-            stored = open_stored(self.path(index))
-        else:
+        stored = open_stored(self.path(index))
+        if self._checked.get(index) != stored.checksum:  # the first time, or made anew meanwhile
             stored = self.checked(index, content=True)
-            self._checked.add(index)
+            self._checked[index] = stored.checksum
         with_depth = "depth" in self._source.files(index)
         return stored.panorama if with_depth else stored.panorama._replace(depth=None)
 
@@ -133,7 +133,10 @@ def _flat(made_from: dict[str, dict[str, str]]) -> dict[str, str]:
 
 
 def prepare_store(
-    splits: Sequence[PreparedPanoramas], *, content: bool = False, progress: bool = True
+    splits: Sequence[PreparedPanoramas],
+    *,
+    whole: Sequence[PreparedPanoramas] = (),
+    progress: bool = True,
 ) -> int:
     """Make the files that are missing, broken or out of date, on all cores.
 
@@ -141,7 +144,7 @@ def prepare_store(
 
     Args:
         splits: What to make.
-        content: Whether to read the files that are there, for what header and size do not show.
+        whole: Those of them whose files are read, for damage that header and size do not show.
         progress: Whether to show progress bars.
 
     Returns:
@@ -157,11 +160,11 @@ def prepare_store(
     def check(place: int) -> None:
         split, index = wanted[place]
         try:
-            split.checked(index, content=content)
+            split.checked(index, content=split in whole)
         except DataError:
             lacking.add(place)
 
-    _follow(check, "Checking the store", len(wanted), show=progress and content)
+    _follow(check, "Checking the store", len(wanted), show=progress and bool(whole))
     missing = [wanted[place] for place in sorted(lacking)]
 
     def make(place: int) -> None:
@@ -184,7 +187,10 @@ def _follow(
 
 def _check_disk(missing: Iterable[tuple[PreparedPanoramas, int]]) -> None:
     files = [(split.path(index), split.nbytes(index)) for split, index in missing]
-    folder = next(parent for parent in files[0][0].absolute().parents if parent.is_dir())
+    folder = next(parent for parent in files[0][0].absolute().parents if parent.exists())
+    if not folder.is_dir() or not os.access(folder, os.W_OK):
+        kind = "a folder that may not be written to" if folder.is_dir() else "a file"
+        raise DataError(folder, found=kind, expected="a folder for data.store")
     needed, free = sum(size for _, size in files), shutil.disk_usage(folder).free
     if needed > free:
         raise DataError(

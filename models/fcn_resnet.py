@@ -36,8 +36,20 @@ _LAST = "classifier.4."
 _DROPPED = (_LAST, "aux_classifier.", "backbone.fc.")
 
 
-class _FrozenStatistics(nn.BatchNorm2d):
-    """Batch normalization by the statistics it has, while training too; the rest is learned."""
+class _FrozenStatistics(nn.Module):
+    """Batch normalization by the statistics it has, while training too; the rest is learned.
+
+    No subclass of torch's, which Lightning's `sync_batchnorm` would replace.
+    """
+
+    running_mean: Tensor
+    running_var: Tensor
+
+    def __init__(self, learned: nn.BatchNorm2d) -> None:
+        super().__init__()
+        self.weight, self.bias, self.eps = learned.weight, learned.bias, learned.eps
+        for name, buffer in learned.named_buffers():
+            self.register_buffer(name, buffer)
 
     def forward(self, x: Tensor) -> Tensor:
         return functional.batch_norm(
@@ -53,9 +65,7 @@ def _freeze_statistics(network: nn.Module) -> None:
     for module in list(network.modules()):
         for name, child in module.named_children():
             if isinstance(child, nn.BatchNorm2d):
-                frozen = _FrozenStatistics(child.num_features, child.eps)
-                frozen.load_state_dict(child.state_dict())
-                module.add_module(name, frozen)
+                module.add_module(name, _FrozenStatistics(child))
             elif isinstance(child, nn.Dropout):
                 child.p = 0.0
 

@@ -24,12 +24,14 @@ class Origins(NamedTuple):
 
     Attributes:
         loaded: Names of those taken as they are.
+        share: Of the network's numbers, the part that came from the file.
         adapted: Of those changed to fit, how.
         fresh: Of those left as they were, why.
         unused: Names in the file that the network does not have.
     """
 
     loaded: tuple[str, ...]
+    share: float
     adapted: dict[str, str]
     fresh: dict[str, str]
     unused: tuple[str, ...]
@@ -77,7 +79,9 @@ def initialize(network: nn.Module, path: Path | str) -> Origins:
         )
     network.load_state_dict({**own, **loaded})
     plain = tuple(name for name in loaded if name not in adapted)
-    return Origins(plain, adapted, fresh, tuple(name for name in found if name not in own))
+    numbers = sum(tensor.numel() for tensor in own.values())
+    share = sum(tensor.numel() for tensor in loaded.values()) / numbers
+    return Origins(plain, share, adapted, fresh, tuple(name for name in found if name not in own))
 
 
 def origins_table(origins: Origins, path: Path | str) -> Table:
@@ -90,7 +94,8 @@ def origins_table(origins: Origins, path: Path | str) -> Table:
     table = Table(title=f"Tensors from {path}", title_justify="left")
     for heading in ("", "tensors", "which"):
         table.add_column(heading, justify="right" if heading == "tensors" else "left")
-    table.add_row("loaded", str(len(origins.loaded)), "")
+    share = f"{origins.share:.0%} of the network's numbers, with the adapted ones"
+    table.add_row("loaded", str(len(origins.loaded)), share)
     for kind, reasons in (("adapted", origins.adapted), ("fresh", origins.fresh)):
         lines = [f"{name}: {reason}" for name, reason in reasons.items()]
         table.add_row(kind, str(len(lines)), _listed(lines))

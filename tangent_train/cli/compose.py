@@ -58,6 +58,16 @@ def with_stored_config(command: str, arguments: list[str]) -> tuple[str, list[st
     given = dict(argument.partition("=")[::2] for argument in arguments)
     if command == "train" and given.get("resume") not in (None, "", "null"):
         folder = Path(given["resume"]).absolute()
+        # Lightning starts further processes with the run's own folder.
+        its_own = Path(given.get("hydra.run.dir", str(folder)).strip("'\"")).absolute() == folder
+        elsewhere = [a for a in arguments if a in ("-m", "--multirun")]
+        elsewhere += [] if its_own else [f"hydra.run.dir={given['hydra.run.dir']}"]
+        if elsewhere:
+            raise SettingError(
+                f"resume={given['resume']}",
+                found=f"{elsewhere[0]} beside it",
+                expected="neither a sweep nor another folder: a run goes on in its own",
+            )
         stored = checkpoint_config(_last_checkpoint(folder))
         stored["resume"] = str(folder)
         arguments = [a for a in arguments if not a.startswith("resume=")]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -76,7 +77,11 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _check_output(folder: Path) -> None:
-    """Refuse to write over files that no report left there."""
+    """Refuse to write where no folder can be, and over files that no report left there."""
+    parent = next(path for path in folder.absolute().parents if path.exists())
+    place = folder if folder.exists() else parent
+    if not place.is_dir() or not os.access(place, os.W_OK):
+        raise SettingError("--output", found=str(folder), expected="a folder that can be written")
     there = [name for name in _FILES if (folder / name).exists()]
     if there and not _is_report(folder / "report.json"):
         raise SettingError(

@@ -17,11 +17,9 @@ _FREE = (
     "data.root",
     "data.store",
     "data.test_rotation",
-    "launcher",
     "name",
     "panels",
     "resume",
-    "sweep",
     "task.absent_class",
     "task.channels_last",
     "task.compile",
@@ -31,6 +29,20 @@ _FREE = (
 )
 """Settings, with all below them, that say where and how a run is computed, not what."""
 
+_NOT_FREE = tuple(
+    f"trainer.{name}"
+    for name in (
+        "accumulate_grad_batches",
+        "gradient_clip_algorithm",
+        "gradient_clip_val",
+        "limit_train_batches",
+        "overfit_batches",
+        "precision",
+        "sync_batchnorm",
+    )
+)
+"""Except these."""
+
 _REASONS = {
     "network": "the checkpoint holds the tensors of its own network",
     "data": "it would be another training set",
@@ -39,6 +51,7 @@ _REASONS = {
     "optimizer": "its state and learning rate come from the checkpoint",
     "scheduler": "its state comes from the checkpoint",
     "task": "it would be another loss",
+    "trainer": "it would take other steps",
 }
 
 
@@ -55,7 +68,7 @@ def check_resumed(config: Mapping[str, Any], before: Mapping[str, Any]) -> None:
     now, then = dict(_flat(config)), dict(_flat(before))
     for name in sorted(now.keys() | then.keys()):
         free = any(name == free or name.startswith(f"{free}.") for free in _FREE)
-        if free or now.get(name) == then.get(name):
+        if (free and name not in _NOT_FREE) or now.get(name) == then.get(name):
             continue
         reason = _REASONS.get(name.partition(".")[0], "it would be another run")
         raise SettingError(

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import copy
 import json
+import os
+import shutil
 import signal
 import sys
 import warnings
@@ -78,10 +80,11 @@ def train(config: DictConfig) -> float | None:
         warnings.filterwarnings("ignore", ".* your dataloader is not resumable")
         try:
             trainer.fit(task, datamodule=data, ckpt_path=resumed, weights_only=True)
+            best = checkpoints / "best.ckpt"
+            best = best if best.exists() else checkpoints / "last.ckpt"
+            _test(trainer, task, data, best, folder)
         except SIGTERMException:
             sys.exit(128 + signal.SIGTERM)
-    best = checkpoints / "best.ckpt"
-    _test(trainer, task, data, best if best.exists() else checkpoints / "last.ckpt", folder)
     return _best_on_validation(trainer, folder)
 
 
@@ -118,7 +121,7 @@ def prepare(config: DictConfig) -> None:
     data.prepare_data()
     data.setup("fit")
     data.setup("test")
-    data.prepare_store(content=True)
+    data.prepare_store(whole=("train", "val", "test"))
     counts = ", ".join(f"{len(data.open_split(s))} {s}" for s in ("train", "val", "test"))
     _console().print(f"{data.root} is ready. Panoramas of fold {data.fold}: {counts}.")
 
@@ -136,6 +139,7 @@ def build(config: DictConfig) -> tuple[Any, Any]:
     Returns:
         Data module and task.
     """
+    _check_compiler(config.task.get("compile"))
     representation = instantiate(config.representation)
     data = instantiate(config.data, representation=representation)
     known = dict.fromkeys(("num_classes", "classes"), len(data.class_names))
@@ -152,6 +156,20 @@ def build(config: DictConfig) -> tuple[Any, Any]:
     )
     _try_network(task, representation, data.in_channels)
     return data, task
+
+
+def _check_compiler(compiling: Any) -> None:
+    """`torch.compile` writes C++; without a compiler it says so in 170 lines, after the data."""
+    if compiling is None or compiling.get("backend", "inductor") != "inductor":
+        return
+    compilers = (os.environ.get("CXX", "g++"), "clang++")
+    if not any(map(shutil.which, compilers)):
+        raise SettingError(
+            "task.compile",
+            found=f"no C++ compiler ({' or '.join(compilers)})",
+            expected="one, for torch.compile",
+            remedy="Install one (g++), name it in CXX, or set task.compile=null.",
+        )
 
 
 def _completed(settings: Any, known: dict[str, int], *, restored: bool) -> Any:
@@ -195,8 +213,11 @@ def _trainer(
     }
     panels = PredictionPanels(folder / "panels", config.panels)
     common = [CheckpointContents(contents), panels, ProgressBar()]
+    every, epochs = config.trainer.check_val_every_n_epoch, config.trainer.max_epochs
     trainer: lightning.Trainer = instantiate(
         config.trainer,
+        # A run shorter than that is validated at its end.
+        check_val_every_n_epoch=min(every, epochs) if every and epochs and epochs > 0 else every,
         default_root_dir=str(folder),
         callbacks=[*callbacks, *common],
         logger=TensorBoardLogger(folder, name="", version="tensorboard"),

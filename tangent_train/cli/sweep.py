@@ -113,7 +113,8 @@ def run_job(
         raise JobError("\n".join([f"tangent-{command}: {job}", *errors]))
     if objective.is_file():
         return float(json.loads(objective.read_text())["best"])
-    if needs_figure:
+    first_task = os.environ.get("SLURM_PROCID", "0") == "0"  # which writes it, perhaps later
+    if needs_figure and first_task:
         raise JobError(
             f"tangent-{command}: {objective}: found no validation figure; expected one per run. "
             "Does trainer.check_val_every_n_epoch exceed trainer.max_epochs?"

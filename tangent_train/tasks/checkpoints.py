@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+import threading
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -18,6 +20,7 @@ from tangent_train.files import atomic_path
 
 __all__ = [
     "AtomicCheckpointIO",
+    "BestCheckpoint",
     "CheckpointContents",
     "LastCheckpoint",
     "best_checkpoint",
@@ -105,8 +108,9 @@ class LastCheckpoint(Checkpoint):
     """Keeps ``last.ckpt`` at the newest state training can go on from.
 
     Written before the first step, after every epoch, every so many steps, and on SIGTERM (what a
-    cluster sends before it kills): a run can always be resumed, exactly where it was. How to do
-    that is said when it is interrupted.
+    cluster sends before it kills): after the running step, or at the end of the epoch when its
+    steps are done. A run can always be resumed, exactly where it was. How to do that is said when
+    it is interrupted.
 
     Args:
         folder: Where to; the checkpoints' folder of a run.
@@ -121,11 +125,28 @@ class LastCheckpoint(Checkpoint):
             raise SettingError("checkpoint_every_n_steps", found=every_n_steps, expected="≥ 1")
         self.path = Path(folder) / "last.ckpt"
         self.every_n_steps = every_n_steps
+        self._told_to_end = False
+        self._processes: Any = None
 
     def on_train_start(
         self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
     ) -> None:
-        """Save the untrained state of a new run."""
+        """Save the untrained state of a new run, and listen for SIGTERM.
+
+        Not by Lightning's handler: it talks to the other processes from within the signal, in the
+        middle of what they are saying, and all may wait for ever.
+        """
+
+        def listen(number: int, _: object) -> None:
+            if trainer.strategy.launcher is not None:
+                trainer.strategy.launcher.kill(number)
+            self._told_to_end = True
+
+        self._told_to_end = False
+        if trainer.world_size > 1:  # a group of its own on the CPU: no waiting for a GPU
+            self._processes = torch.distributed.new_group(backend="gloo")
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, listen)  # Lightning puts back what there was before
         if trainer.global_step == 0:
             self._save(trainer)
 
@@ -139,15 +160,22 @@ class LastCheckpoint(Checkpoint):
     ) -> None:
         stepped = (batch_idx + 1) % trainer.accumulate_grad_batches == 0
         ends_epoch = batch_idx + 1 == trainer.num_training_batches  # saved in a moment
+        if not stepped or ends_epoch:
+            return
         due = bool(self.every_n_steps) and trainer.global_step % (self.every_n_steps or 1) == 0
-        if due and stepped and not ends_epoch:
+        ending = self._any_told_to_end(trainer)
+        if due or ending:
             self._save(trainer)
+        if ending:
+            raise SIGTERMException
 
     def on_train_epoch_end(
         self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
     ) -> None:
         """Save the state after every epoch."""
         self._save(trainer)
+        if self._any_told_to_end(trainer):
+            raise SIGTERMException
 
     def on_exception(
         self,
@@ -155,13 +183,8 @@ class LastCheckpoint(Checkpoint):
         pl_module: lightning.LightningModule,
         exception: BaseException,
     ) -> None:
-        """Save on SIGTERM, which ends a run between two steps; say how to go on after Ctrl-C too.
-
-        An error says for itself what to do.
-        """
+        """Say how to go on after SIGTERM and Ctrl-C; an error says for itself what to do."""
         terminated = isinstance(exception, SIGTERMException)
-        if terminated and trainer.training:
-            self._save(trainer)
         interrupted = terminated or isinstance(exception, KeyboardInterrupt)
         if interrupted and trainer.is_global_zero and self.path.exists():
             run_folder = self.path.parent.parent
@@ -173,8 +196,34 @@ class LastCheckpoint(Checkpoint):
                 highlight=False,
             )
 
+    def _any_told_to_end(self, trainer: lightning.Trainer) -> bool:
+        """Whether some process got SIGTERM: all end after the same step."""
+        told = torch.tensor(int(self._told_to_end))
+        if trainer.world_size > 1:
+            torch.distributed.all_reduce(told, group=self._processes)
+        return bool(told)
+
     def _save(self, trainer: lightning.Trainer) -> None:
         trainer.save_checkpoint(self.path, weights_only=False)
+
+
+class BestCheckpoint(ModelCheckpoint):
+    """Keeps the best epoch so far when the run's folder was moved before it is resumed."""
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Take the state, with its files in this folder."""
+        folder = Path(self.dirpath or state_dict["dirpath"])
+
+        def here(path: str) -> str:
+            return path and str(folder / Path(path).name)
+
+        paths = ("best_model_path", "kth_best_model_path", "last_model_path")
+        super().load_state_dict(
+            state_dict
+            | {"dirpath": str(folder)}
+            | {name: here(state_dict[name]) for name in paths}
+            | {"best_k_models": {here(p): s for p, s in state_dict["best_k_models"].items()}}
+        )
 
 
 def best_checkpoint(folder: Path | str, monitor: str = "val/miou") -> ModelCheckpoint:
@@ -184,7 +233,7 @@ def best_checkpoint(folder: Path | str, monitor: str = "val/miou") -> ModelCheck
         folder: Where to.
         monitor: The figure.
     """
-    return ModelCheckpoint(
+    return BestCheckpoint(
         dirpath=folder,
         filename="best",
         monitor=monitor,

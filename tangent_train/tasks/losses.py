@@ -30,10 +30,12 @@ def cross_entropy_sum(
         class_weights: Weight of every class.
         label_smoothing: Share of the target spread evenly over the classes.
     """
+    # A sum of millions of pixels: never in half precision.
+    exact = torch.promote_types(scores.dtype, torch.float32)
     return functional.cross_entropy(
-        scores,
+        scores.to(exact),
         labels.long(),
-        class_weights,
+        class_weights.to(exact),
         ignore_index=UNKNOWN,
         reduction="sum",
         label_smoothing=label_smoothing,
@@ -45,4 +47,5 @@ def cross_entropy_norm(
 ) -> Tensor:
     """The class weights of the labelled pixels, added up: known before any network has run."""
     pixels = torch.bincount(labels.flatten(), minlength=len(class_weights))
-    return pixels[UNKNOWN + 1 :].to(class_weights) @ class_weights[UNKNOWN + 1 :]
+    weights = class_weights.to(torch.promote_types(class_weights.dtype, torch.float32))
+    return pixels[UNKNOWN + 1 :].to(weights) @ weights[UNKNOWN + 1 :]

@@ -70,8 +70,8 @@ class SegmentationTask(lightning.LightningModule):
             raise SettingError("task.label_smoothing", found=label_smoothing, expected="0 to 1")
         at_once = {"images_per_chunk": images_per_chunk, "images_per_forward": images_per_forward}
         for name, count in at_once.items():
-            if count is not None and count < 1:
-                raise SettingError(f"task.{name}", found=count, expected="1 or more")
+            if count is not None and (not isinstance(count, int) or count < 1):
+                raise SettingError(f"task.{name}", found=count, expected="a whole number from 1")
         if absent_class not in ("skip", "zero"):
             raise SettingError("task.absent_class", found=absent_class, expected="skip or zero")
         self.memory_format = torch.channels_last if channels_last else torch.contiguous_format
@@ -138,10 +138,10 @@ class SegmentationTask(lightning.LightningModule):
             planned = getattr(config.scheduler, "total_steps", steps)
             if planned != steps:
                 raise SettingError(
-                    "trainer.max_epochs",
+                    "trainer.max_epochs, trainer.devices and data.panoramas_per_step",
                     found=f"{steps} steps of training",
                     expected=f"{planned}, which the schedule of the resumed run was made for",
-                    remedy="Resume with the same length, or start a new run.",
+                    remedy="Resume with the same, or start a new run.",
                 )
 
     def training_step(self, batch: Any, batch_idx: int) -> Tensor:
@@ -164,7 +164,8 @@ class SegmentationTask(lightning.LightningModule):
             self.trainer.strategy.backward(loss / batches, None)
             value += loss.detach()
         loss = self._loss(*last, norm)
-        self.log("train/loss", value + loss.detach(), prog_bar=True)
+        # The mean over processes, each divided by the mean norm, is the loss of the whole batch.
+        self.log("train/loss", value + loss.detach(), prog_bar=True, sync_dist=True)
         return loss
 
     def optimizer_zero_grad(self, *_: Any) -> None:

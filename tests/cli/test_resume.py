@@ -57,12 +57,17 @@ from tangent_train.tasks.checkpoints import LastCheckpoint
 original = LastCheckpoint.on_train_batch_end
 
 def cut_short(self, trainer, *rest):
+    how = int(os.environ["SIGNAL"])
+    now = trainer.global_step == int(os.environ["STEP"]) and trainer.is_global_zero
+    if now and how == signal.SIGTERM:
+        os.kill(os.getpid(), how)
     original(self, trainer, *rest)
-    if trainer.global_step == int(os.environ["STEP"]):
-        os.kill(os.getpid(), int(os.environ["SIGNAL"]))
+    if now and how == signal.SIGKILL:
+        os.kill(os.getpid(), how)
 
 LastCheckpoint.on_train_batch_end = cut_short
-train()
+if __name__ == "__main__":
+    train()
 """
 
 
@@ -107,11 +112,12 @@ def undisturbed(arguments: list[str], tmp_path_factory: pytest.TempPathFactory) 
 def _cut(
     arguments: list[str], folder: Path, how: signal.Signals, step: int
 ) -> subprocess.CompletedProcess[str]:
+    (folder / "cut_short.py").write_text(CUT_SHORT)
     return subprocess.run(
-        [sys.executable, "-c", CUT_SHORT, *arguments, "hydra.run.dir=cut"],
+        [sys.executable, "cut_short.py", *arguments, "hydra.run.dir=cut"],
         check=False,
         cwd=folder,
-        env=os.environ | {"STEP": str(step), "SIGNAL": str(int(how)), "OMP_NUM_THREADS": "1"},
+        env=os.environ | {"STEP": str(step), "SIGNAL": str(int(how))},
         capture_output=True,
         text=True,
     )
@@ -131,8 +137,13 @@ def _assert_same_end(run: Path, other: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("how", "step", "workers"),
-    [(signal.SIGKILL, 3, 0), (signal.SIGKILL, 9, 2), (signal.SIGTERM, 3, 0)],
-    ids=["killed", "killed in a later epoch", "terminated"],
+    [
+        (signal.SIGKILL, 3, 0),
+        (signal.SIGKILL, 9, 2),
+        (signal.SIGTERM, 3, 0),
+        (signal.SIGTERM, 5, 2),
+    ],
+    ids=["killed", "killed in a later epoch", "terminated", "terminated at an epoch's end"],
 )
 def test_a_run_cut_short_goes_on_as_if_nothing_had_happened(
     how: signal.Signals,
@@ -144,8 +155,7 @@ def test_a_run_cut_short_goes_on_as_if_nothing_had_happened(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     cut = _cut(arguments, tmp_path, how, step)
-    steps = _last(undisturbed)["global_step"] // 3
-    assert step % steps not in (0, 1), "cut within an epoch"
+    assert _last(undisturbed)["global_step"] == 15, "three epochs of five steps"
     if how == signal.SIGTERM:
         assert cut.returncode == 128 + signal.SIGTERM, cut.stderr
         assert "tangent-train resume=" in cut.stderr
@@ -173,6 +183,8 @@ def test_checkpoints_say_all_that_later_commands_need(undisturbed: Path) -> None
         ("optimizer.lr=1", r"optimizer\.lr: found 1 .*learning rate come from the checkpoint"),
         ("data.fold=2", r"data\.fold: found 2 for a run that began with 1"),
         ("seed=3", r"data\.seed: found 3 for a run that began with 0"),
+        ("trainer.accumulate_grad_batches=2", "it would take other steps"),
+        ("hydra.run.dir=elsewhere", r"found hydra\.run\.dir=elsewhere beside it"),
     ],
 )
 def test_a_run_is_not_resumed_as_another(
@@ -195,7 +207,6 @@ def _processes(folder: Path, *arguments: str, command: Path = COMMAND) -> None:
         [str(command), *arguments],
         check=False,
         cwd=folder,
-        env=os.environ | {"OMP_NUM_THREADS": "1"},
         capture_output=True,
         text=True,
     )
@@ -219,6 +230,12 @@ def test_two_processes_make_the_steps_and_figures_of_one(
     one, other = _last(tmp_path / "one"), _last(tmp_path / "two")
     assert one["global_step"] == other["global_step"] == 3
     torch.testing.assert_close(other["state_dict"], one["state_dict"], rtol=0, atol=1e-6)
+    arguments = [*common, *two, "data.panoramas_per_step=1", "task.images_per_chunk=2"]
+    cut = _cut(arguments, tmp_path, signal.SIGTERM, 2)
+    assert cut.returncode == 128 + signal.SIGTERM, cut.stderr
+    assert _last(tmp_path / "cut")["global_step"] == 2, "all ended after the step"
+    _processes(tmp_path, f"resume={tmp_path / 'cut'}")
+    _assert_same_end(tmp_path / "cut", tmp_path / "two")
     checkpoint = f"checkpoint={tmp_path / 'one' / 'checkpoints' / 'last.ckpt'}"
     _processes(
         tmp_path, checkpoint, "trainer.devices=2", "+trainer.strategy=ddp",

@@ -168,7 +168,7 @@ def test_damage_is_found_on_opening_and_repaired(
     with pytest.raises(DataError, match=rf"{re.escape(str(path))}: {message}.*tangent-prepare"):
         source.read(1)
     again = make_module()
-    again.prepare_store(content=True)
+    again.prepare_store(whole=("train", "val", "test"))
     assert path.read_bytes() == whole
     assert _made(store, before) == {path}
     again.source("test").read(1)
@@ -221,7 +221,7 @@ def test_nothing_is_made_twice(make_module: MakeModule, store: Path) -> None:
     module.prepare_data()
     before = _times(store)
     assert len(before) == PANORAMAS
-    make_module().prepare_store(content=True)
+    make_module().prepare_store(whole=("train", "val", "test"))
     make_module(fold=2, seed=1).prepare_data()  # other splits of the same panoramas
     assert _times(store) == before
 
@@ -294,6 +294,38 @@ def test_another_class_table_is_noticed(make_module: MakeModule, root: Path, sto
     assert len(_made(store, before)) == PANORAMAS
 
 
+def test_a_store_that_is_made_anew_for_others_is_not_read_on(
+    make_module: MakeModule, root: Path
+) -> None:
+    module = make_module()
+    module.prepare_data()
+    source = module.source("test")
+    source.read(0)
+    table = root / "semantic_labels.json"
+    table.write_text(table.read_text().replace("sofa", "clutter"))
+    make_module().prepare_data()
+    with pytest.raises(DataError, match="found made from class table"):
+        source.read(0)
+
+
+def test_damage_in_what_is_read_late_is_mended_before_training(
+    make_module: MakeModule, store: Path
+) -> None:
+    module = make_module()
+    module.prepare_data()
+    path = store / "16x32_labels" / f"{module.sample_name('test', 1)}.panorama"
+    whole = path.read_bytes()
+    _flip(-1)(path)
+    make_module().prepare_data()
+    assert path.read_bytes() == whole
+
+
+def test_a_store_that_cannot_be_a_folder(make_module: MakeModule, store: Path) -> None:
+    store.write_text("a file")
+    with pytest.raises(DataError, match=r"found a file; expected a folder for data\.store"):
+        make_module().prepare_data()
+
+
 def test_a_store_that_is_not_there(make_module: MakeModule) -> None:
     with pytest.raises(DataError, match=r"no such file.*Run tangent-prepare .*data\.store"):
         make_module().source("train").read(0)
@@ -335,7 +367,7 @@ def test_an_interrupt_leaves_whole_files_and_work_goes_on(
             module.prepare_data()
     before = _times(store)
     assert set(before) == set(written)
-    module.prepare_store(content=True)
+    module.prepare_store(whole=("train", "val", "test"))
     assert len(_made(store, before)) == PANORAMAS - 3
     assert len(_files(store)) == PANORAMAS
 
@@ -356,10 +388,10 @@ def test_a_full_disk_is_found_before_anything_is_written(
     assert len(_files(store)) == PANORAMAS
 
 
-def test_progress_is_shown_once(
-    make_module: MakeModule, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_progress_is_shown(make_module: MakeModule, capsys: pytest.CaptureFixture[str]) -> None:
     make_module().prepare_data()
     assert f"{PANORAMAS}/{PANORAMAS}" in capsys.readouterr().out
     make_module().prepare_data()
-    assert capsys.readouterr().out == ""
+    again = capsys.readouterr().out
+    assert "Checking the store" in again
+    assert "Preparing" not in again

@@ -252,6 +252,9 @@ def test_frozen_statistics_train_as_in_evaluation(fcn_file: Path, frozen: bool) 
     training.sum().backward()
     assert network.get_parameter("backbone.bn1.weight").grad is not None
     assert torch.equal(training, network.eval()(images)) is frozen
+    converted = nn.SyncBatchNorm.convert_sync_batchnorm(network)  # type: ignore[no-untyped-call]
+    names = {type(module).__name__ for module in converted.modules()}
+    assert ("SyncBatchNorm" in names) is not frozen, "trainer.sync_batchnorm leaves them alone"
     plain = FCNResNet(3, 14, 50).eval()
     plain.load_state_dict(network.state_dict())
     assert torch.equal(network(images), plain(images))

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from torch.nn import functional
@@ -40,3 +42,13 @@ def test_nothing_labelled_gives_zero_and_no_nan() -> None:
     assert float(cross_entropy_norm(labels, weights)) == 0
     (gradient,) = torch.autograd.grad(cross_entropy_sum(scores, labels, weights), scores)
     assert float(gradient.abs().max()) == 0
+
+
+def test_half_precision_does_not_overflow() -> None:
+    labels = torch.full((2, 300, 300), 2, dtype=torch.uint8)
+    weights = torch.tensor([0.0, 1.0, 3.0], dtype=torch.float16)
+    norm = cross_entropy_norm(labels, weights)
+    assert float(norm) == 3 * labels.numel()
+    scores = torch.zeros(2, 3, 300, 300, dtype=torch.float16)
+    mean = cross_entropy_sum(scores, labels, weights) / norm
+    assert float(mean) == pytest.approx(math.log(3), rel=1e-5)
