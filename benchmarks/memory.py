@@ -1,6 +1,6 @@
-"""Memory and time of one training step in chunks: ``python -m benchmarks.memory``.
+"""Memory and time of one training step in chunks: ``python -m benchmarks.memory``, on Linux.
 
-For Linux. Every row is a process of its own that trains the paper's UNet on tangent images of made-up
+Every row is a process of its own that trains the paper's UNet on tangent images of made-up
 panoramas, RGB-D, float32. Counted is what the steps add to the process's peak memory.
 """
 
