@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from tangent_train.errors import SettingError
+from tangent_train.tasks.runs import flat_settings
 
 __all__ = ["check_resumed"]
 
@@ -65,7 +66,7 @@ def check_resumed(config: Mapping[str, Any], before: Mapping[str, Any]) -> None:
     Raises:
         SettingError: A setting differs that makes the run what it is.
     """
-    now, then = dict(_flat(config)), dict(_flat(before))
+    now, then = dict(flat_settings(config)), dict(flat_settings(before))
     for name in sorted(now.keys() | then.keys()):
         free = any(name == free or name.startswith(f"{free}.") for free in _FREE)
         if (free and name not in _NOT_FREE) or now.get(name) == then.get(name):
@@ -77,12 +78,3 @@ def check_resumed(config: Mapping[str, Any], before: Mapping[str, Any]) -> None:
             expected=f"no other than before: {reason}",
             remedy="Start a new run for it.",
         )
-
-
-def _flat(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in config.items():
-        name = f"{prefix}{key}"
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{name}.")
-        else:
-            yield name, value

@@ -12,7 +12,16 @@ from omegaconf import OmegaConf
 
 from tangent_train.errors import DataError
 
-__all__ = ["MEANS", "PER_CLASS", "RESULTS_FILE", "Run", "find_runs", "load_run", "unfinished_runs"]
+__all__ = [
+    "MEANS",
+    "PER_CLASS",
+    "RESULTS_FILE",
+    "Run",
+    "find_runs",
+    "flat_settings",
+    "load_run",
+    "unfinished_runs",
+]
 
 RESULTS_FILE = "results.json"
 
@@ -110,7 +119,7 @@ def load_run(folder: Path) -> Run:
         raise DataError(path, found=_first_line(error), expected="the settings of a run") from error
     if not isinstance(config, dict):
         raise DataError(path, found=type(config).__name__, expected="the settings of a run")
-    return Run(folder, dict(_flat(config)), results)
+    return Run(folder, dict(flat_settings(config)), results)
 
 
 def _results(path: Path) -> dict[str, Any]:
@@ -140,10 +149,11 @@ def _first_line(error: Exception) -> str:
     return f"{type(error).__name__}: {error}".partition("\n")[0]
 
 
-def _flat(config: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def flat_settings(config: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Settings of nested sections as ``section.setting``, with their values."""
     for key, value in config.items():
         name = f"{prefix}{key}"
         if isinstance(value, Mapping):
-            yield from _flat(value, f"{name}.")
+            yield from flat_settings(value, f"{name}.")
         else:
             yield name, value
