@@ -17,7 +17,7 @@ from torchvision.models.segmentation import (
 )
 
 from models.pretrained import fetch_tensors, load_tensors, read_tensors
-from models.stem import widen_stem
+from models.stem import widen_stem, with_channels
 from tangent_train.errors import SettingError
 
 __all__ = ["FCNResNet"]
@@ -143,4 +143,4 @@ def _widened(tensors: Mapping[str, Tensor], in_channels: int) -> dict[str, Tenso
     stem = tensors.get(_STEM)
     if stem is None or stem.shape[1:2] != (3,):
         return dict(tensors)
-    return {**tensors, _STEM: functional.pad(stem, (0, 0, 0, 0, 0, in_channels - 3))}
+    return {**tensors, _STEM: with_channels(stem, in_channels)}

@@ -7,11 +7,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-import torch
 from rich.table import Table
 from torch import Tensor, nn
 
 from models.pretrained import read_tensors
+from models.stem import with_channels
 from tangent_train.errors import DataError
 
 __all__ = ["Origins", "initialize", "origins_table"]
@@ -66,7 +66,7 @@ def initialize(network: nn.Module, path: Path | str) -> Origins:
         elif given.shape == tensor.shape:
             loaded[name] = given
         elif name == stem and _differ_in_channels_only(given, tensor):
-            loaded[name] = _with_channels(given, tensor.shape[1])
+            loaded[name] = with_channels(given, tensor.shape[1])
             adapted[name] = f"{given.shape[1]} → {tensor.shape[1]} channels"
         else:
             fresh[name] = f"{tuple(given.shape)} in the file, {tuple(tensor.shape)} here"
@@ -125,12 +125,6 @@ def _stem_name(network: nn.Module) -> str | None:
 
 def _differ_in_channels_only(given: Tensor, wanted: Tensor) -> bool:
     return given.shape[:1] + given.shape[2:] == wanted.shape[:1] + wanted.shape[2:]
-
-
-def _with_channels(weight: Tensor, channels: int) -> Tensor:
-    further = max(0, channels - weight.shape[1])
-    zeros = weight.new_zeros(weight.shape[0], further, *weight.shape[2:])
-    return torch.cat([weight[:, :channels], zeros], dim=1)
 
 
 def _listed(lines: list[str]) -> str:

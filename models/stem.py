@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from tangent_train.errors import SettingError
 
-__all__ = ["widen_stem"]
+__all__ = ["widen_stem", "with_channels"]
 
 _RGB = 3
 
@@ -37,10 +37,22 @@ def widen_stem(network: nn.Module, in_channels: int) -> nn.Module:
             found=stem or "none",
             expected="one that takes the three channels of an RGB image",
         )
-    further = in_channels - _RGB
-    if further:
-        filters = stem.weight.detach()
-        zeros = torch.zeros_like(filters[:, :1]).repeat(1, further, 1, 1)
-        stem.weight = nn.Parameter(torch.cat([filters, zeros], dim=1))
+    if in_channels > _RGB:
+        stem.weight = nn.Parameter(with_channels(stem.weight.detach(), in_channels))
         stem.in_channels = in_channels
     return network
+
+
+def with_channels(weight: Tensor, channels: int) -> Tensor:
+    """Filters for so many input channels: those of further ones are zero, others are left out.
+
+    Args:
+        weight: ``(out, in, h, w)``.
+        channels: Input channels wanted.
+
+    Returns:
+        ``(out, channels, h, w)``.
+    """
+    further = max(0, channels - weight.shape[1])
+    zeros = weight.new_zeros(weight.shape[0], further, *weight.shape[2:])
+    return torch.cat([weight[:, :channels], zeros], dim=1)
