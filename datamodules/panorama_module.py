@@ -143,12 +143,16 @@ class PanoramaDataModule(LightningDataModule, ABC):
     def open_split(self, split: Split) -> FileSource:
         """The panoramas of one split as they are on disk."""
 
+    def make_files(self) -> None:
+        """Make the files of the data set, where it is one that is made."""
+
     def prepare_data(self) -> None:
-        """Prepare what the store lacks, if there is to be one.
+        """Make the files, and what the store lacks if there is to be one.
 
         An evaluation prepares the panoramas of the test split only. Before training, those that are
         opened long after its beginning are read whole: damage shows now, and is mended.
         """
+        self.make_files()
         if self.trainer is not None and self.trainer.state.fn == TrainerFn.TESTING:
             self.prepare_store(("test",))
         else:

@@ -40,9 +40,8 @@ class SynthRooms(Stanford2D3DS):
         areas = [area for area, count in self.rooms.rooms.items() if count]
         super().__init__(root, representation, areas=areas, **settings)
 
-    def prepare_data(self) -> None:
-        """Make the files, unless they are there, and what the store lacks."""
+    def make_files(self) -> None:
+        """Make the files, unless they are there."""
         from datamodules.synthrooms.generate import generate_rooms
 
         generate_rooms(self.root, self.rooms)
-        super().prepare_data()

@@ -118,7 +118,7 @@ def prepare(config: DictConfig) -> None:
     """
     representation = instantiate(config.representation)
     data = instantiate(config.data, representation=representation)
-    data.prepare_data()
+    data.make_files()
     data.setup("fit")
     data.setup("test")
     data.prepare_store(whole=("train", "val", "test"))
