@@ -20,6 +20,7 @@ from tangent_train.geometry.camera import (
     perspective_directions,
     shift_range,
 )
+from tangent_train.geometry.cube import CubeGrid
 from tangent_train.geometry.equirect import (
     equirect_directions,
     equirect_latitudes,
@@ -30,6 +31,7 @@ from tangent_train.geometry.equirect import (
 )
 from tangent_train.geometry.grid import TangentGrid
 from tangent_train.geometry.icosphere import Icosphere, icosphere, vertex_resolution
+from tangent_train.geometry.pinhole_grid import PinholeGrid
 from tangent_train.geometry.sphere import (
     FLIP_Y,
     checked_rotation,
@@ -41,7 +43,9 @@ from tangent_train.geometry.sphere import (
 
 __all__ = [
     "FLIP_Y",
+    "CubeGrid",
     "Icosphere",
+    "PinholeGrid",
     "TangentGrid",
     "camera_matrix_from_fov",
     "checked_rotation",

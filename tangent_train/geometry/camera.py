@@ -70,7 +70,10 @@ def perspective_directions(camera_matrix: ArrayLike, size: tuple[int, int]) -> N
 
 
 def shift_range(
-    camera_matrix: ArrayLike, size: tuple[int, int], fov_deg: float = 45.0
+    camera_matrix: ArrayLike,
+    size: tuple[int, int],
+    fov_deg: float = 45.0,
+    dim: int | tuple[int, int] = 128,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Shifts of the principal point that keep the normalised crop inside the image.
 
@@ -80,7 +83,9 @@ def shift_range(
     Args:
         camera_matrix: ``(3, 3)`` K of the image, integer pixel centres, without skew.
         size: ``(height, width)`` of the image.
-        fov_deg: Field of view Ω' of the crop, both ways.
+        fov_deg: Horizontal field of view Ω' of the crop.
+        dim: Side of the crop, or its ``(height, width)``; pixels are square, so that only their
+            ratio counts.
 
     Returns:
         Least and greatest ``(δx, δy)`` in pixels.
@@ -89,15 +94,17 @@ def shift_range(
         SettingError: The image is too small for the field of view.
     """
     matrix = np.asarray(camera_matrix, np.float64)
-    extent = np.diag(matrix)[:2] * math.tan(math.radians(fov_deg) / 2)
-    center = matrix[:2, 2]
+    focal, center = np.diag(matrix)[:2], matrix[:2, 2]
+    half_sides = np.array(_height_width(dim)[::-1]) / 2
+    extent = focal * math.tan(math.radians(fov_deg) / 2) * half_sides / half_sides[0]
     least = extent - center - 0.5
     greatest = np.array(size[::-1]) - 0.5 - extent - center
     if np.any(least > greatest + 1e-9):
-        widest = np.degrees(2 * np.arctan(np.array(size[::-1]) / (2 * np.diag(matrix)[:2])))
+        wanted = np.degrees(2 * np.arctan(extent / focal))
+        widest = np.degrees(2 * np.arctan(np.array(size[::-1]) / (2 * focal)))
         raise SettingError(
             "field of view",
-            found=f"{fov_deg:g}° for an image that spans {widest[0]:.1f}° × {widest[1]:.1f}°",
+            found=f"{_degrees(wanted)} for an image that spans {_degrees(widest)}",
             expected="a field of view inside the image",
             remedy="Ask for less, or leave the image out.",
         )
@@ -108,7 +115,7 @@ def normalize_camera(
     K: ArrayLike,
     size: tuple[int, int],
     fov: float = 45.0,
-    dim: int = 128,
+    dim: int | tuple[int, int] = 128,
     shift: tuple[float, float] = (0.0, 0.0),
 ) -> NormalizedCamera:
     """The common camera with the panorama's angular resolution, and the homography to it.
@@ -119,8 +126,8 @@ def normalize_camera(
     Args:
         K: ``(3, 3)`` camera matrix of the image, integer pixel centres.
         size: ``(height, width)`` of the image.
-        fov: Field of view Ω' in degrees, both ways.
-        dim: Side W' = H' in pixels: 128 for level 8 at 45°.
+        fov: Horizontal field of view Ω' in degrees; the vertical one follows from square pixels.
+        dim: Side W' = H' in pixels, 128 for level 8 at 45°; or ``(H', W')``.
         shift: ``(δx, δy)`` added to the principal point, within `shift_range`.
 
     Returns:
@@ -129,7 +136,7 @@ def normalize_camera(
     Raises:
         SettingError: The image is too small for the field of view, or the shift leaves it.
     """
-    least, greatest = shift_range(K, size, fov)
+    least, greatest = shift_range(K, size, fov, dim)
     delta = np.asarray(shift, np.float64)
     if np.any(delta < least - 1e-9) or np.any(delta > greatest + 1e-9):
         raise SettingError(
@@ -137,5 +144,13 @@ def normalize_camera(
         )
     moved = np.array(K, np.float64)
     moved[:2, 2] += delta
-    target = camera_matrix_from_fov(fov, (dim, dim))
+    target = camera_matrix_from_fov(fov, _height_width(dim))
     return NormalizedCamera(target, target @ np.linalg.inv(moved))
+
+
+def _height_width(dim: int | tuple[int, int]) -> tuple[int, int]:
+    return (dim, dim) if isinstance(dim, int) else dim
+
+
+def _degrees(width_height: NDArray[np.float64]) -> str:
+    return f"{width_height[0]:.4g}° × {width_height[1]:.4g}°"

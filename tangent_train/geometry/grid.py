@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import combinations
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry.icosphere import icosphere, vertex_resolution
+from tangent_train.geometry.pinhole_grid import PinholeGrid
 from tangent_train.geometry.sphere import checked_rotation
 
-__all__ = ["Faces", "TangentGrid"]
-
-Faces = Sequence[int] | NDArray[np.integer]
-"""Indices of tangent images."""
+__all__ = ["TangentGrid"]
 
 
 class _FaceTable:
@@ -85,7 +83,7 @@ def _face_table(base_level: int) -> _FaceTable:
 
 
 @dataclass(frozen=True, eq=False, init=False)
-class TangentGrid:
+class TangentGrid(PinholeGrid):
     """N = 20·4^b pinhole images tangent to the faces of a level-b icosahedron.
 
     Pixel (row i, column j) of an image sits on its tangent plane at ``x = (j − (d−1)/2)·p`` to the
@@ -161,41 +159,6 @@ class TangentGrid:
         return _pitch(self.base_level, self.level)
 
     @property
-    def half_extent(self) -> float:
-        """Half extent h = (d−1)/2·p: where the outermost pixel centres are on the tangent plane."""
-        return (self.dim - 1) / 2 * self.pitch
-
-    @property
-    def fov_deg(self) -> float:
-        """Angle between adjacent corners in degrees: acos(1 / (1 + 2h²)) (paper, table of FOV)."""
-        return math.degrees(math.acos(1 / (1 + 2 * self.half_extent**2)))
-
-    @property
-    def camera_matrix(self) -> NDArray[np.float64]:
-        """``(3, 3)`` pinhole matrix of every image: focal length 1/p, centre (d−1)/2."""
-        center = (self.dim - 1) / 2
-        return np.array([[1 / self.pitch, 0, center], [0, 1 / self.pitch, center], [0, 0, 1]])
-
-    @cached_property
-    def centers_xyz(self) -> NDArray[np.float64]:
-        """``(N, 3)`` directions of the images' centres."""
-        return self.world_from_camera[..., 2]
-
-    @cached_property
-    def world_from_camera(self) -> NDArray[np.float64]:
-        """``(N, 3, 3)`` camera axes (x right, y down, z forward) as columns.
-
-        The determinant is −1, because the sphere frame is mirrored (see `tangent_train.geometry`);
-        ``FLIP_Y @ world_from_camera`` are proper rotations in a right-handed room.
-        """
-        axes = _face_table(self.base_level).world_from_camera
-        if self.rotation is not None:
-            axes = self.rotation @ axes
-        axes = axes.copy()
-        axes.setflags(write=False)
-        return axes
-
-    @property
     def neighbors(self) -> NDArray[np.int32]:
         """``(N, 12)`` faces that share a vertex with a face, filled up with the face itself.
 
@@ -203,83 +166,24 @@ class TangentGrid:
         """
         return _face_table(self.base_level).neighbors
 
-    def directions(self, faces: Faces | None = None) -> NDArray[np.float64]:
-        """Directions of the pixel centres.
+    @property
+    def overlapping(self) -> bool:
+        """True: even the least images reach half a pixel beyond the owned cells."""
+        return True
 
-        Args:
-            faces: Images asked for, default all.
-
-        Returns:
-            ``(n, d, d, 3)`` unit vectors.
-
-        Raises:
-            SettingError: A face is out of range.
-        """
-        line = (np.arange(self.dim) - (self.dim - 1) / 2) * self.pitch
-        x, y = np.meshgrid(line, line)
-        rays = np.stack([x, y, np.ones_like(x)], axis=-1)
-        rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-        axes = self.world_from_camera[self.face_indices(faces)]
-        return np.einsum("nwc,ijc->nijw", axes, rays)
-
-    def face_indices(self, faces: Faces | None = None) -> NDArray[np.int64]:
-        """Checked indices of images, default all.
+    def with_rotation(self, rotation: ArrayLike | None) -> Self:
+        """The same images on an icosahedron turned by this rotation instead of its own.
 
         Raises:
-            SettingError: A face is out of range or no whole number.
+            SettingError: The rotation is none.
         """
-        if faces is None:
-            return np.arange(self.num_images)
-        indices = np.atleast_1d(np.asarray(faces))
-        whole = indices.size == 0 or np.issubdtype(indices.dtype, np.integer)
-        if not whole or indices.ndim != 1 or np.any((indices < 0) | (indices >= self.num_images)):
-            raise SettingError("faces", found=faces, expected=f"indices 0 to {self.num_images - 1}")
-        return indices.astype(np.int64)
+        return type(self)(self.base_level, self.level, self.dim, rotation)
 
-    def owners(self, directions_xyz: ArrayLike) -> NDArray[np.int64]:
-        """The face that owns each direction: the one with the nearest centre.
-
-        Args:
-            directions_xyz: ``(..., 3)`` vectors of any length.
-
-        Returns:
-            ``(...)`` face indices.
-        """
-        directions = np.asarray(directions_xyz, np.float64)
-        flat = directions.reshape(-1, 3)
-        owner = np.empty(len(flat), np.int64)
-        step = max(1, 2**24 // self.num_images)
-        for start in range(0, len(flat), step):
-            part = slice(start, start + step)
-            owner[part] = (flat[part] @ self.centers_xyz.T).argmax(axis=1)
-        return owner.reshape(directions.shape[:-1])
-
-    def project(self, directions_xyz: ArrayLike, faces: ArrayLike) -> NDArray[np.float64]:
-        """Pixel positions of directions in given tangent images.
-
-        Args:
-            directions_xyz: ``(..., 3)`` vectors of any length.
-            faces: Face of each direction, broadcast against ``(...)``.
-
-        Returns:
-            ``(..., 2)`` column and row; NaN where the direction is behind the image.
-        """
-        axes = self.world_from_camera[np.asarray(faces)]
-        x, y, z = np.moveaxis(
-            np.einsum("...w,...wc->...c", np.asarray(directions_xyz, np.float64), axes), -1, 0
-        )
-        depth = np.where(z > 0, z, np.nan)
-        return np.stack([x / depth, y / depth], axis=-1) / self.pitch + (self.dim - 1) / 2
+    def _unturned_axes(self) -> NDArray[np.float64]:
+        return _face_table(self.base_level).world_from_camera
 
     def _key(self) -> tuple[object, ...]:
-        rotation = None if self.rotation is None else self.rotation.tobytes()
-        return self.base_level, self.level, self.dim, rotation
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, TangentGrid) and self._key() == other._key()
-
-    def __hash__(self) -> int:
-        return hash(self._key())
+        return self.base_level, self.level, self.dim
 
 
 def _pitch(base_level: int, level: int) -> float:

@@ -1,12 +1,15 @@
-"""Equirectangular panoramas to tangent images and back.
+"""Equirectangular panoramas to tangent images, or the faces of a cube, and back.
 
 NumPy panoramas are sampled by OpenCV, tensors by differentiable sparse sums on any device, labels
 by compiled kernels. The geometry of all of them is `tangent_train.geometry`'s.
 """
 
 from tangent_train.rendering.backward import Blend, tangent_to_equirect, tangent_to_labels
+from tangent_train.rendering.cubemap import CubemapRepresentation
 from tangent_train.rendering.forward import Interpolation, equirect_to_tangent
+from tangent_train.rendering.perspective import PerspectiveRepresentation
 from tangent_train.rendering.representation import (
+    Assembler,
     EquirectRepresentation,
     Representation,
     RotationAugmentation,
@@ -17,9 +20,12 @@ from tangent_train.rendering.rotate import equirect_to_perspective, rotate_equir
 from tangent_train.rendering.tables import set_table_cache_limit
 
 __all__ = [
+    "Assembler",
     "Blend",
+    "CubemapRepresentation",
     "EquirectRepresentation",
     "Interpolation",
+    "PerspectiveRepresentation",
     "Representation",
     "RotationAugmentation",
     "TangentRepresentation",

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tangent_train.geometry import TangentGrid
+from tangent_train.geometry import PinholeGrid
 from tangent_train.rendering import feather_kernels, label_kernels
 from tangent_train.rendering.checks import (
     check_blend,
@@ -39,15 +39,15 @@ _BAND = 2**20
 
 @overload
 def tangent_to_equirect(
-    images: Tensor, grid: TangentGrid, shape: tuple[int, int], blend: Blend = "nearest"
+    images: Tensor, grid: PinholeGrid, shape: tuple[int, int], blend: Blend = "nearest"
 ) -> Tensor: ...
 @overload
 def tangent_to_equirect(
-    images: NDArray[Any], grid: TangentGrid, shape: tuple[int, int], blend: Blend = "nearest"
+    images: NDArray[Any], grid: PinholeGrid, shape: tuple[int, int], blend: Blend = "nearest"
 ) -> NDArray[Any]: ...
 def tangent_to_equirect(
     images: Tensor | NDArray[Any],
-    grid: TangentGrid,
+    grid: PinholeGrid,
     shape: tuple[int, int],
     blend: Blend = "nearest",
 ) -> Tensor | NDArray[Any]:
@@ -59,7 +59,8 @@ def tangent_to_equirect(
         grid: The images' geometry.
         shape: ``(H, W)`` of the panorama.
         blend: ``nearest``: every direction is taken from its owner. ``feather``: the average of
-            all images that see it, weights falling to 0 at the images' borders: no seams.
+            all images that see it, weights falling to 0 at the images' borders: no seams. Only
+            for images that overlap, not for a cube's.
 
     Returns:
         A tensor ``(..., C, H, W)`` or an array ``(H, W[, C])``, of the dtype of the images.
@@ -67,7 +68,7 @@ def tangent_to_equirect(
     Raises:
         SettingError: The images, the shape or the blend cannot be used.
     """
-    check_blend(blend)
+    check_blend(blend, grid)
     height, width = check_shape(shape)
     if isinstance(images, np.ndarray):
         return _from_arrays(images, grid, (height, width), blend)
@@ -80,18 +81,18 @@ def tangent_to_equirect(
 
 @overload
 def tangent_to_labels(
-    logits: Tensor, grid: TangentGrid, shape: tuple[int, int], blend: Blend = "nearest"
+    logits: Tensor, grid: PinholeGrid, shape: tuple[int, int], blend: Blend = "nearest"
 ) -> Tensor: ...
 @overload
 def tangent_to_labels(
     logits: NDArray[np.floating],
-    grid: TangentGrid,
+    grid: PinholeGrid,
     shape: tuple[int, int],
     blend: Blend = "nearest",
 ) -> NDArray[np.unsignedinteger]: ...
 def tangent_to_labels(
     logits: Tensor | NDArray[np.floating],
-    grid: TangentGrid,
+    grid: PinholeGrid,
     shape: tuple[int, int],
     blend: Blend = "nearest",
 ) -> Tensor | NDArray[np.unsignedinteger]:
@@ -114,7 +115,7 @@ def tangent_to_labels(
     Raises:
         SettingError: The logits, the shape or the blend cannot be used.
     """
-    check_blend(blend)
+    check_blend(blend, grid)
     height, width = check_shape(shape)
     if isinstance(logits, np.ndarray):
         return _render_labels(_tensor(logits), grid, (height, width), blend).numpy()
@@ -122,7 +123,7 @@ def tangent_to_labels(
 
 
 def _render_labels(
-    logits: Tensor, grid: TangentGrid, shape: tuple[int, int], blend: Blend
+    logits: Tensor, grid: PinholeGrid, shape: tuple[int, int], blend: Blend
 ) -> Tensor:
     """`tangent_to_labels` in the smallest unsigned integers."""
     check_scores(logits, grid)
@@ -144,7 +145,7 @@ def _tensor(array: NDArray[Any]) -> Tensor:
 
 
 def _from_arrays(
-    images: NDArray[Any], grid: TangentGrid, shape: tuple[int, int], blend: Blend
+    images: NDArray[Any], grid: PinholeGrid, shape: tuple[int, int], blend: Blend
 ) -> NDArray[Any]:
     """`tangent_to_equirect` of arrays ``(N, d, d[, C])``; integers are rounded."""
     exact = (images.dtype.kind in "ui" and images.dtype.itemsize > 2) or images.dtype == np.float64
@@ -159,7 +160,7 @@ def _from_arrays(
 
 
 def _bands(
-    images: Tensor, grid: TangentGrid, shape: tuple[int, int], blend: Blend, image_size: int
+    images: Tensor, grid: PinholeGrid, shape: tuple[int, int], blend: Blend, image_size: int
 ) -> Iterator[Taps]:
     """Taps of the panorama's rows, band by band."""
     dtype = map_dtype(images.dtype == torch.float64, "bilinear")
@@ -180,7 +181,7 @@ def _bands(
         yield image_taps(face, u, v, grid.dim, weight[0] if weight else None, image_size)
 
 
-def _compiled_labels(scores: Tensor, grid: TangentGrid, blend: Blend, labels: Tensor) -> None:
+def _compiled_labels(scores: Tensor, grid: PinholeGrid, blend: Blend, labels: Tensor) -> None:
     """Labels ``(H, W)`` of ``(N, K, d, d)`` float32 scores on the CPU."""
     array, out = scores.contiguous().numpy(), labels.numpy()
     shape = check_shape(labels.shape)
@@ -192,7 +193,7 @@ def _compiled_labels(scores: Tensor, grid: TangentGrid, blend: Blend, labels: Te
         over_rows(label_kernels.owner_labels, shape, array, *owner_arguments(grid, shape), out)
 
 
-def _torch_labels(scores: Tensor, grid: TangentGrid, blend: Blend, labels: Tensor) -> None:
+def _torch_labels(scores: Tensor, grid: PinholeGrid, blend: Blend, labels: Tensor) -> None:
     """Labels ``(H, W)`` of ``(N, K, d, d)`` scores of any device and dtype, class by class."""
     num_classes, size = scores.shape[1], grid.dim**2
     flat = scores.reshape(1, -1)

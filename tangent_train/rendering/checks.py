@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tangent_train.errors import SettingError
-from tangent_train.geometry import TangentGrid
+from tangent_train.geometry import PinholeGrid
 
 __all__ = [
     "check_blend",
@@ -28,9 +28,16 @@ def check_interpolation(interpolation: str) -> None:
     _check_choice("interpolation", interpolation, ("bilinear", "nearest"))
 
 
-def check_blend(blend: str) -> None:
-    """Raise SettingError unless the blend is known."""
+def check_blend(blend: str, grid: PinholeGrid) -> None:
+    """Raise SettingError unless the blend is known and the images can be blended so."""
     _check_choice("blend", blend, ("nearest", "feather"))
+    if blend == "feather" and not grid.overlapping:
+        raise SettingError(
+            "blend",
+            found="'feather'",
+            expected="'nearest' for images that do not overlap",
+            remedy="All weights are 0 on the edges where they meet.",
+        )
 
 
 def _check_choice(name: str, value: str, allowed: tuple[str, ...]) -> None:
@@ -79,19 +86,19 @@ def _check_floating(name: str, tensor: Tensor) -> None:
         )
 
 
-def check_tangent_images(images: Tensor, grid: TangentGrid) -> None:
+def check_tangent_images(images: Tensor, grid: PinholeGrid) -> None:
     """Raise SettingError unless images are ``(..., N, C, d, d)`` floats that fit the grid."""
     _check_stack("tangent images", images, grid)
 
 
-def check_scores(scores: Tensor, grid: TangentGrid) -> None:
+def check_scores(scores: Tensor, grid: PinholeGrid) -> None:
     """Raise SettingError unless scores are ``(..., N, K, d, d)`` floats that fit the grid."""
     _check_stack("scores", scores, grid)
     if scores.shape[-3] == 0:
         raise SettingError("scores", found="no class", expected="one class or more")
 
 
-def _check_stack(name: str, images: Tensor, grid: TangentGrid) -> None:
+def _check_stack(name: str, images: Tensor, grid: PinholeGrid) -> None:
     shape = tuple(images.shape)
     expected = (grid.num_images, grid.dim, grid.dim)
     if len(shape) < 4 or (shape[-4], *shape[-2:]) != expected:

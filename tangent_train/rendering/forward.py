@@ -9,8 +9,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tangent_train.geometry import TangentGrid
-from tangent_train.geometry.grid import Faces
+from tangent_train.geometry import PinholeGrid
+from tangent_train.geometry.pinhole_grid import Faces
 from tangent_train.rendering.checks import (
     check_interpolation,
     check_numpy_image,
@@ -33,20 +33,20 @@ _CHUNK = 2**20
 @overload
 def equirect_to_tangent(
     image: Tensor,
-    grid: TangentGrid,
+    grid: PinholeGrid,
     faces: Faces | None = None,
     interpolation: Interpolation = "bilinear",
 ) -> Tensor: ...
 @overload
 def equirect_to_tangent(
     image: NDArray[Scalar],
-    grid: TangentGrid,
+    grid: PinholeGrid,
     faces: Faces | None = None,
     interpolation: Interpolation = "bilinear",
 ) -> NDArray[Scalar]: ...
 def equirect_to_tangent(
     image: Tensor | NDArray[Scalar],
-    grid: TangentGrid,
+    grid: PinholeGrid,
     faces: Faces | None = None,
     interpolation: Interpolation = "bilinear",
 ) -> Tensor | NDArray[Scalar]:
@@ -59,7 +59,7 @@ def equirect_to_tangent(
         image: A tensor ``(..., C, H, W)`` on any device, differentiable; or an array
             ``(H, W[, C])``: uint8, uint16 and float32 go through `cv2.remap` (see
             `EquirectMap.sample` about its precision), other dtypes are slower.
-        grid: The images.
+        grid: The images, a `TangentGrid` or a `CubeGrid`.
         faces: Images asked for, default all; only they are rendered.
         interpolation: ``bilinear``, or ``nearest`` for labels and masks of any dtype.
 
@@ -85,7 +85,7 @@ def equirect_to_tangent(
 
 
 def _render_tensor(
-    image: Tensor, grid: TangentGrid, indices: NDArray[np.int64], interpolation: Interpolation
+    image: Tensor, grid: PinholeGrid, indices: NDArray[np.int64], interpolation: Interpolation
 ) -> Tensor:
     *batch, channels, height, width = image.shape
     source = image.reshape(-1, height * width)
@@ -105,7 +105,7 @@ def _render_tensor(
 
 
 def _positions(
-    grid: TangentGrid,
+    grid: PinholeGrid,
     shape: tuple[int, int],
     indices: NDArray[np.int64],
     dtype: np.dtype[np.floating],

@@ -1,32 +1,39 @@
 """What a network sees of a panorama, and how its scores become labels of the panorama again.
 
 A *representation* turns panoramas into images a network can take: tangent images, or, as honest
-baselines, the equirectangular image itself or crops of it. It draws the *views* of one training
-sample (which images, turned and mirrored how), gives the views of the whole sphere for evaluation,
-and assembles the scores of the latter. Data modules and tasks know nothing else about it.
+baselines, the faces of a cube, the equirectangular image itself or crops of it. It draws the
+*views* of one training sample (which images, turned and mirrored how), gives the views of the whole
+sphere for evaluation, and assembles the scores of the latter. Data modules and tasks know nothing
+else about it.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any, Literal, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Integer
-from numpy.typing import NDArray
 from torch import Tensor
 
 from tangent_train.errors import SettingError
-from tangent_train.geometry import TangentGrid, equirect_shape, random_rotation, rotation_about
+from tangent_train.geometry import (
+    PinholeGrid,
+    TangentGrid,
+    equirect_shape,
+    random_rotation,
+    rotation_about,
+)
 from tangent_train.rendering.backward import Blend, tangent_to_labels
-from tangent_train.rendering.forward import Interpolation, equirect_to_tangent
-from tangent_train.rendering.rotate import rotate_equirect
+from tangent_train.rendering.views import EquirectViews, PinholeViews, Views
 
 __all__ = [
+    "Assembler",
     "EquirectRepresentation",
+    "PinholeRepresentation",
     "Representation",
     "RotationAugmentation",
+    "Sampler",
     "TangentRepresentation",
     "Views",
 ]
@@ -34,26 +41,11 @@ __all__ = [
 RotationAugmentation = Literal["none", "yaw", "so3"]
 """How training panoramas are turned: not, about the vertical, or any way."""
 
-Image = NDArray[Any]
 _Choice = TypeVar("_Choice", bound=str)
 
 
-class Views(Protocol):
-    """One way to look at one panorama."""
-
-    def render(self, image: Image, interpolation: Interpolation) -> Image:
-        """Render a panorama ``(H, W[, C])`` to images ``(n, h, w[, C])``, dtype kept."""
-        ...
-
-
-@runtime_checkable
-class Representation(Protocol):
-    """What a network sees of a panorama."""
-
-    @property
-    def erp_height(self) -> int:
-        """Rows of the panorama it reads and is scored on."""
-        ...
+class Sampler(Protocol):
+    """What draws views."""
 
     def sample(self, rng: np.random.Generator) -> Views:
         """Views of one training sample: a random subset, augmented."""
@@ -63,6 +55,30 @@ class Representation(Protocol):
         """Views of the whole sphere, in a fixed order."""
         ...
 
+
+@runtime_checkable
+class Assembler(Protocol):
+    """What becomes of scores: all that a task knows of a representation."""
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """Rows and columns of the images."""
+        ...
+
+    def to_labels(self, scores: Tensor, shape: Any) -> Tensor:
+        """Class indices of the shape of the truth, from the scores of all images."""
+        ...
+
+
+@runtime_checkable
+class Representation(Sampler, Assembler, Protocol):
+    """What a network sees of a panorama."""
+
+    @property
+    def erp_height(self) -> int:
+        """Rows of the panorama it reads and is scored on."""
+        ...
+
     def to_labels(
         self, scores: Float[Tensor, "images classes height width"], shape: tuple[int, int]
     ) -> Integer[Tensor, "rows columns"]:
@@ -70,18 +86,72 @@ class Representation(Protocol):
         ...
 
 
-@dataclass(frozen=True)
-class _TangentViews:
-    grid: TangentGrid
-    faces: NDArray[np.int64] | None = None
-    mirrored: bool = False
+class PinholeRepresentation:
+    """Pinhole images around the centre: what tangent images and the faces of a cube share.
 
-    def render(self, image: Image, interpolation: Interpolation) -> Image:
-        images = equirect_to_tangent(image, self.grid, self.faces, interpolation)
-        return np.ascontiguousarray(images[:, :, ::-1]) if self.mirrored else images
+    Args:
+        grid: The images, not turned.
+        level: Level s of the panorama.
+        rotation: Rotation of the images as a whole while training.
+        mirror: Mirror half of the training samples left to right.
+        erp_height: Rows of the panorama, default `equirect_shape(level)`.
+        blend: How overlapping images are joined in evaluation.
+        faces_per_panorama: Images drawn at random for a training sample; all by default.
+
+    Raises:
+        SettingError: A value is impossible.
+    """
+
+    def __init__(
+        self,
+        grid: PinholeGrid,
+        level: int,
+        rotation: RotationAugmentation,
+        mirror: bool,
+        erp_height: int | None,
+        blend: Blend = "nearest",
+        faces_per_panorama: int | None = None,
+    ) -> None:
+        self.grid = grid
+        self.rotation = _checked_choice("rotation", rotation, ("none", "yaw", "so3"))
+        self.mirror = mirror
+        self.erp_height = _erp_height(erp_height, level)
+        self.blend = _checked_choice("blend", blend, ("nearest", "feather"))
+        self.faces_per_panorama = faces_per_panorama
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """Rows and columns of the images."""
+        return self.grid.dim, self.grid.dim
+
+    def sample(self, rng: np.random.Generator) -> Views:
+        """All images or a random subset, (perhaps) turned as a whole and mirrored one by one."""
+        grid = self.grid
+        if self.rotation != "none":
+            yaw = self.rotation == "yaw"
+            angle = rng.uniform(0, 2 * math.pi)
+            turn = rotation_about((0, 0, 1), angle) if yaw else random_rotation(rng)
+            grid = grid.with_rotation(turn)
+        faces = None
+        if self.faces_per_panorama is not None:
+            faces = rng.choice(grid.num_images, self.faces_per_panorama, replace=False)
+        return PinholeViews(grid, faces, self.mirror and bool(rng.random() < 0.5))
+
+    def whole(self) -> Views:
+        """All images."""
+        return PinholeViews(self.grid)
+
+    def to_labels(
+        self, scores: Float[Tensor, "images classes height width"], shape: tuple[int, int]
+    ) -> Integer[Tensor, "rows columns"]:
+        """Render the scores (not labels) back to the panorama, then take the best class."""
+        if self.blend == "feather":
+            scores = scores.softmax(dim=1)
+        labels: Tensor = tangent_to_labels(scores, self.grid, shape, self.blend)
+        return labels
 
 
-class TangentRepresentation:
+class TangentRepresentation(PinholeRepresentation):
     """Tangent images (paper, section 3.2).
 
     Args:
@@ -101,6 +171,8 @@ class TangentRepresentation:
     Raises:
         SettingError: An impossible combination.
     """
+
+    grid: TangentGrid
 
     def __init__(
         self,
@@ -122,63 +194,15 @@ class TangentRepresentation:
                 )
             least = TangentGrid.least_dim(base_level, level)
             dim = math.ceil(least / crop_multiple) * crop_multiple
-        self.grid = TangentGrid(base_level, level, dim)
-        count = self.grid.num_images
+        grid = TangentGrid(base_level, level, dim)
+        count = grid.num_images
         if faces_per_panorama is not None and not 1 <= faces_per_panorama <= count:
             raise SettingError(
                 "representation.faces_per_panorama",
                 found=faces_per_panorama,
                 expected=f"1 to {count} at base level {base_level}, or null for all",
             )
-        self.faces_per_panorama = faces_per_panorama
-        self.rotation = _checked_choice("rotation", rotation, ("none", "yaw", "so3"))
-        self.blend = _checked_choice("blend", blend, ("nearest", "feather"))
-        self.mirror = mirror
-        self.erp_height = _erp_height(erp_height, level)
-
-    def sample(self, rng: np.random.Generator) -> Views:
-        """A random subset of the faces of a (perhaps) turned icosahedron."""
-        grid = self.grid
-        if self.rotation != "none":
-            yaw = self.rotation == "yaw"
-            angle = rng.uniform(0, 2 * math.pi)
-            turn = rotation_about((0, 0, 1), angle) if yaw else random_rotation(rng)
-            grid = TangentGrid(grid.base_level, grid.level, grid.dim, turn)
-        faces = None
-        if self.faces_per_panorama is not None:
-            faces = rng.choice(grid.num_images, self.faces_per_panorama, replace=False)
-        return _TangentViews(grid, faces, self.mirror and bool(rng.random() < 0.5))
-
-    def whole(self) -> Views:
-        """All images."""
-        return _TangentViews(self.grid)
-
-    def to_labels(
-        self, scores: Float[Tensor, "images classes height width"], shape: tuple[int, int]
-    ) -> Integer[Tensor, "rows columns"]:
-        """Render the scores (not labels) back to the panorama, then take the best class."""
-        if self.blend == "feather":
-            scores = scores.softmax(dim=1)
-        labels: Tensor = tangent_to_labels(scores, self.grid, shape, self.blend)
-        return labels
-
-
-@dataclass(frozen=True)
-class _EquirectViews:
-    rotation: NDArray[np.float64] | None = None
-    columns: tuple[float, int] | None = None
-    mirrored: bool = False
-
-    def render(self, image: Image, interpolation: Interpolation) -> Image:
-        if self.rotation is not None:
-            image = rotate_equirect(image, self.rotation, interpolation)
-        if self.columns is not None:
-            start, width = self.columns
-            first = int(start * image.shape[1])
-            image = image.take(np.arange(first, first + width), axis=1, mode="wrap")
-        if self.mirrored:
-            image = image[:, ::-1]
-        return np.ascontiguousarray(image[None])
+        super().__init__(grid, level, rotation, mirror, erp_height, blend, faces_per_panorama)
 
 
 class EquirectRepresentation:
@@ -213,6 +237,11 @@ class EquirectRepresentation:
         self.rotation = _checked_choice("rotation", rotation, ("none", "yaw", "so3"))
         self.mirror = mirror
 
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """Rows and columns of the panorama, which evaluation sees."""
+        return self.erp_height, 2 * self.erp_height
+
     def sample(self, rng: np.random.Generator) -> Views:
         """The panorama or one crop of it, (perhaps) turned."""
         columns = None
@@ -220,11 +249,11 @@ class EquirectRepresentation:
             width = round(2 * self.erp_height * (self.crop_deg or 360) / 360)
             columns = (rng.random(), width)
         rotation = random_rotation(rng) if self.rotation == "so3" else None
-        return _EquirectViews(rotation, columns, self.mirror and bool(rng.random() < 0.5))
+        return EquirectViews(rotation, columns, self.mirror and bool(rng.random() < 0.5))
 
     def whole(self) -> Views:
         """The panorama as it is."""
-        return _EquirectViews()
+        return EquirectViews()
 
     def to_labels(
         self, scores: Float[Tensor, "images classes height width"], shape: tuple[int, int]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tangent_train.errors import SettingError
-from tangent_train.geometry import TangentGrid
+from tangent_train.geometry import PinholeGrid
 from tangent_train.rendering import feather_kernels, kernels
 from tangent_train.rendering.sampling import EquirectMap, pinhole_equirect_map
 from tangent_train.rendering.threads import over_rows
@@ -142,7 +142,7 @@ def set_table_cache_limit(nbytes: int) -> None:
 
 
 def _cached(
-    grid: TangentGrid,
+    grid: PinholeGrid,
     key: tuple[Hashable, ...],
     build: Callable[[], Value],
     nbytes: Callable[[Value], int],
@@ -154,7 +154,7 @@ def _cached(
 
 
 def forward_map(
-    grid: TangentGrid, shape: tuple[int, int], face: int, dtype: np.dtype[np.floating]
+    grid: PinholeGrid, shape: tuple[int, int], face: int, dtype: np.dtype[np.floating]
 ) -> EquirectMap:
     """Where the pixels of a tangent image are in the ERP.
 
@@ -173,7 +173,7 @@ def forward_map(
 
 
 def owner_table(
-    grid: TangentGrid, shape: tuple[int, int], dtype: np.dtype[np.floating]
+    grid: PinholeGrid, shape: tuple[int, int], dtype: np.dtype[np.floating]
 ) -> ImageTable:
     """The owner of every ERP pixel, and where it is in the owner's image.
 
@@ -199,7 +199,7 @@ def owner_table(
 
 
 def feather_table(
-    grid: TangentGrid, shape: tuple[int, int], dtype: np.dtype[np.floating], rows: slice
+    grid: PinholeGrid, shape: tuple[int, int], dtype: np.dtype[np.floating], rows: slice
 ) -> ImageTable:
     """All images that see the ERP pixels of some rows; kept where they are all rows.
 
@@ -233,13 +233,13 @@ def feather_table(
     return _cached(grid, ("feather", shape, dtype), build, lambda table: table.nbytes)
 
 
-def feather_arguments(grid: TangentGrid, shape: tuple[int, int]) -> tuple[Any, ...]:
+def feather_arguments(grid: PinholeGrid, shape: tuple[int, int]) -> tuple[Any, ...]:
     """Owners, near images, axes, focal length, power, columns and rows, for the kernels."""
     owners, axes, focal, *rays = owner_arguments(grid, shape)
     return owners, _near_images(grid), axes, focal, FEATHER_POWER, *rays
 
 
-def owner_arguments(grid: TangentGrid, shape: tuple[int, int]) -> tuple[Any, ...]:
+def owner_arguments(grid: PinholeGrid, shape: tuple[int, int]) -> tuple[Any, ...]:
     """Owners, axes, focal length, columns and rows, for the kernels."""
     owners = owner_table(grid, shape, np.dtype(np.float32)).face[0]
     return owners, _axes(grid), 1 / grid.pitch, *kernels.directions_of_rows(*shape)
@@ -247,7 +247,7 @@ def owner_arguments(grid: TangentGrid, shape: tuple[int, int]) -> tuple[Any, ...
 
 def tensors_on(
     device: torch.device,
-    grid: TangentGrid,
+    grid: PinholeGrid,
     key: tuple[Hashable, ...] | None,
     build: Callable[[], tuple[NDArray[Any], ...]],
 ) -> tuple[Tensor, ...]:
@@ -269,18 +269,18 @@ def tensors_on(
     return _cached(grid, key, tensors, lambda parts: sum(part.nbytes for part in parts))
 
 
-def _axes(grid: TangentGrid) -> NDArray[np.float64]:
+def _axes(grid: PinholeGrid) -> NDArray[np.float64]:
     return np.ascontiguousarray(grid.world_from_camera)
 
 
-def _face_dtype(grid: TangentGrid) -> type[np.integer]:
+def _face_dtype(grid: PinholeGrid) -> type[np.integer]:
     """The smallest integer for face indices that torch can convert (it hardly knows uint16)."""
     return next(
         kind for kind in (np.uint8, np.int16, np.int32) if grid.num_images <= np.iinfo(kind).max + 1
     )
 
 
-def _inner_cosine(grid: TangentGrid) -> float:
+def _inner_cosine(grid: PinholeGrid) -> float:
     """Cosine of half the angle between the nearest two centres: nearer to one is the nearest."""
     centers, around = grid.centers_xyz, grid.neighbors
     cosines = np.einsum("nkc,nc->nk", centers[around], centers)
@@ -288,7 +288,7 @@ def _inner_cosine(grid: TangentGrid) -> float:
     return float(np.cos(np.arccos(cosines[others].max()) / 2))
 
 
-def _near_images(grid: TangentGrid) -> NDArray[np.int32]:
+def _near_images(grid: PinholeGrid) -> NDArray[np.int32]:
     """``(N, M)`` images that can see something a face owns, filled up with −1.
 
     What a face owns and what an image sees both lie inside an image's corners.

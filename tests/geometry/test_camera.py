@@ -155,7 +155,7 @@ def test_rounding_never_turns_the_shift_range_round() -> None:
 def test_image_too_small_either_way_is_refused(size: tuple[int, int]) -> None:
     matrix = K.copy()
     matrix[:2, 2] = size[1] / 2, size[0] / 2
-    with pytest.raises(SettingError, match="field of view: found 45° for an image that spans"):
+    with pytest.raises(SettingError, match="field of view: found 45° × 45° for an image that"):
         normalize_camera(matrix, size)
 
 

@@ -146,6 +146,19 @@ def sample_panorama(image: Array, lonlat: Array, interpolation: str) -> Array:
     return np.asarray((1 - down) * above + down * below)
 
 
+def sample_images(images: Array, face: NDArray[np.int64], row: Array, column: Array) -> Array:
+    """``(N, d, d, C)`` bilinear; off the outermost pixel centres their values continue."""
+    dim = images.shape[1]
+    row, column = np.clip(row, 0, dim - 1), np.clip(column, 0, dim - 1)
+    top = np.minimum(np.floor(row), dim - 2).astype(int)
+    left = np.minimum(np.floor(column), dim - 2).astype(int)
+    down, right = (row - top)[..., None], (column - left)[..., None]
+    above = (1 - right) * images[face, top, left] + right * images[face, top, left + 1]
+    top = top + 1
+    below = (1 - right) * images[face, top, left] + right * images[face, top, left + 1]
+    return np.asarray((1 - down) * above + down * below)
+
+
 @dataclass(frozen=True)
 class ReferenceGrid:
     """All tangent images; `rotation` turns the icosahedron."""
@@ -213,21 +226,10 @@ class ReferenceGrid:
         middle = (self.dim - 1) / 2
         return middle - y / self.pitch, middle + x / self.pitch
 
-    def _sampled(self, images: Array, face: NDArray[np.int64], row: Array, column: Array) -> Array:
-        """Bilinear; off the outermost pixel centres their values continue."""
-        row, column = np.clip(row, 0, self.dim - 1), np.clip(column, 0, self.dim - 1)
-        top = np.minimum(np.floor(row), self.dim - 2).astype(int)
-        left = np.minimum(np.floor(column), self.dim - 2).astype(int)
-        down, right = (row - top)[..., None], (column - left)[..., None]
-        above = (1 - right) * images[face, top, left] + right * images[face, top, left + 1]
-        top = top + 1
-        below = (1 - right) * images[face, top, left] + right * images[face, top, left + 1]
-        return np.asarray((1 - down) * above + down * below)
-
     def backward(self, images: Array, shape: tuple[int, int]) -> Array:
         """``(N, d, d, C)`` -> ``(H, W, C)`` from the image with the nearest centre."""
         owner = self.nearness(shape).argmax(axis=-1)
-        return self._sampled(images, owner, *self.positions(shape, owner))
+        return sample_images(images, owner, *self.positions(shape, owner))
 
     def feathered(self, images: Array, shape: tuple[int, int]) -> Array:
         """Mean of all images that see a pixel, weights ((1 − a²)(1 − b²))⁴.
@@ -243,14 +245,13 @@ class ReferenceGrid:
             a, b = ((line - (self.dim - 1) / 2) / (self.dim / 2) for line in (column, row))
             seen = (nearness[..., face] > 0) & (np.abs(a) < 1) & (np.abs(b) < 1)
             weight = np.where(seen, ((1 - a**2) * (1 - b**2)) ** 4, 0)[..., None]
-            total += weight * self._sampled(images, np.full(shape, face), row, column)
+            total += weight * sample_images(images, np.full(shape, face), row, column)
             weights += weight
         return total / weights
 
     def clear(self, shape: tuple[int, int]) -> NDArray[np.bool_]:
         """Panorama pixels that are not half-way between two centres: their owner is certain."""
-        second, first = np.moveaxis(np.sort(self.nearness(shape), axis=-1)[..., -2:], -1, 0)
-        return np.asarray(first - second > 1e-9)
+        return certain_labels(self.nearness(shape), margin=1e-9)
 
 
 def certain_nearest(lonlat: Array, shape: tuple[int, int], margin: float) -> NDArray[np.bool_]:

@@ -1,4 +1,4 @@
-"""Perspective views against py360convert and pyequilib, test-only dependencies.
+"""Perspective views and cube maps against py360convert and pyequilib, test-only dependencies.
 
 Their conventions, translated to ours (centres of pixels are integers, row 0 on top, yaw to the
 right, pitch up):
@@ -6,7 +6,8 @@ right, pitch up):
 * **py360convert 1.0**: panorama pixels as ours. A perspective image of n pixels spans its field of
   view from the *centre* of the first pixel to the centre of the last: ``f = (n−1) / (2 tan(Ω/2))``
   for width and height each, principal point (n−1)/2. ``u_deg`` is yaw, to the right; ``v_deg`` is
-  pitch, up. It samples with OpenCV at positions rounded to 1/32 px.
+  pitch, up. It samples with OpenCV at positions rounded to 1/32 px. The faces of its cube maps span
+  the 90° between pixel *centres* too; their order is ours.
 * **pyequilib 0.6**: the principal point is n/2 for integer pixel centres, half a pixel off the
   middle, with ``f = W / (2 tan(Ω/2))``; and the panorama pixel ``(u, v)`` stands where our
   ``(u−1, v−1)`` does: it gets a panorama rolled by one row and one column. With ``z_down=True`` yaw
@@ -24,7 +25,7 @@ import pytest
 from equilib import Equi2Pers
 from numpy.typing import NDArray
 
-from tangent_train.geometry import TangentGrid, rotation_about, xyz_to_lonlat
+from tangent_train.geometry import CubeGrid, TangentGrid, rotation_about, xyz_to_lonlat
 from tangent_train.rendering import equirect_to_perspective, equirect_to_tangent
 from tests.rendering.reference import panorama_lonlat, to_xyz
 
@@ -117,3 +118,24 @@ def test_tangent_images_are_perspective_views_of_both(panorama: Image, base_leve
         assert np.abs(images[face, :-1, :-1] - theirs).max() < 2e-5
         compared += 1
     assert compared >= 4
+
+
+@pytest.mark.parametrize("dim", [16, 25])
+def test_faces_of_a_cube_are_py360converts(panorama: Image, dim: int) -> None:
+    # Their 2d + 1 pixel centres from edge to edge: every second one is one of our d.
+    theirs = py360convert.e2c(panorama, 2 * dim + 1, cube_format="list")
+    ours = equirect_to_tangent(panorama, CubeGrid(dim))
+    for our_face, their_face in zip(ours, theirs, strict=True):
+        error = np.abs(our_face - their_face[1::2, 1::2])
+        assert error.max() < one_64th_pixel(panorama) + 1e-5
+
+
+def test_faces_of_a_cube_are_equilibs_views(panorama: Image) -> None:
+    dim = 33
+    ours = equirect_to_tangent(panorama, CubeGrid(dim))
+    # One pixel smaller, equilib's principal point n/2 is the middle (d−1)/2 of our image.
+    smaller = dim - 1
+    fov_deg = math.degrees(2 * math.atan(smaller / dim))
+    for face, yaw_deg in ((0, 0), (1, 90), (3, -90)):  # without its seam and its poles
+        theirs = equilib_view(panorama, (smaller, smaller), fov_deg, (yaw_deg, 0))
+        assert np.abs(ours[face, :-1, :-1] - theirs).max() < 2e-5

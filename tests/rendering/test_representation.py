@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_directions
 from tangent_train.rendering import (
+    CubemapRepresentation,
     EquirectRepresentation,
     Representation,
     TangentRepresentation,
@@ -34,6 +35,8 @@ REPRESENTATIONS: list[Representation] = [
     TangentRepresentation(0, 5),
     TangentRepresentation(1, 5, blend="feather"),
     TangentRepresentation(0, 5, crop_multiple=8, rotation="so3", mirror=True),
+    CubemapRepresentation(5),
+    CubemapRepresentation(5, dim=41, rotation="so3", mirror=True),
     EquirectRepresentation(5),
     EquirectRepresentation(5, crop_deg=90, rotation="yaw", mirror=True),
 ]
@@ -57,6 +60,23 @@ def test_whole_views_are_not_augmented(representation: Representation) -> None:
     np.testing.assert_array_equal(first, second)
 
 
+@pytest.mark.parametrize("representation", REPRESENTATIONS)
+def test_image_size_is_that_of_the_whole_views(representation: Representation) -> None:
+    height = representation.erp_height
+    panorama = np.zeros((height, 2 * height, 3), np.uint8)
+    views = representation.whole().render(panorama, "bilinear")
+    assert views.shape[1:] == (*representation.image_size, 3)
+
+
+def test_image_sizes_by_hand() -> None:
+    assert TangentRepresentation(1, 6).image_size == (32, 32)
+    assert TangentRepresentation(0, 6, crop_multiple=16).image_size == (48, 48)
+    assert CubemapRepresentation(6).image_size == (64, 64)
+    assert CubemapRepresentation(6, dim=50, erp_height=300).image_size == (50, 50)
+    assert EquirectRepresentation(6, crop_deg=90).image_size == (128, 256)
+    assert EquirectRepresentation(6, erp_height=300).image_size == (300, 600)
+
+
 def test_the_equirectangular_view_is_the_panorama() -> None:
     image = _rng().integers(0, 256, (*SHAPE, 3), np.uint8)
     np.testing.assert_array_equal(
@@ -68,6 +88,8 @@ def test_the_equirectangular_view_is_the_panorama() -> None:
     "representation",
     [
         TangentRepresentation(0, 5, faces_per_panorama=5, rotation="so3", mirror=True),
+        CubemapRepresentation(5, rotation="yaw", mirror=True),
+        CubemapRepresentation(5, rotation="so3"),
         EquirectRepresentation(5, crop_deg=60, rotation="yaw", mirror=True),
         EquirectRepresentation(5, rotation="so3"),
     ],
@@ -134,7 +156,9 @@ def test_cropping_takes_the_least_covering_side_that_is_a_multiple() -> None:
 
 def test_the_panorama_may_be_larger_than_the_level() -> None:
     assert TangentRepresentation(0, 5, erp_height=512).erp_height == 512
-    assert TangentRepresentation(0, 5).erp_height == EquirectRepresentation(5).erp_height == 64
+    assert CubemapRepresentation(5, erp_height=512).erp_height == 512
+    for representation in (TangentRepresentation(0, 5), CubemapRepresentation(5)):
+        assert representation.erp_height == EquirectRepresentation(5).erp_height == 64
 
 
 @pytest.mark.parametrize(
@@ -160,3 +184,18 @@ def test_impossible_equirectangular_settings_are_refused() -> None:
         EquirectRepresentation(5, crop_deg=400)
     with pytest.raises(SettingError, match="expected one image of 64×128"):
         EquirectRepresentation(5).to_labels(torch.zeros(1, 3, 32, 64), SHAPE)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"dim": 1}, "dim: found 1; expected a whole number, 2 or more"),
+        ({"level": 0}, "dim: found 1; expected a whole number, 2 or more"),
+        ({"level": -1}, "level: found -1"),
+        ({"erp_height": 0}, "erp_height: found 0"),
+        ({"rotation": "tilt"}, "one of none, yaw, so3"),
+    ],
+)
+def test_impossible_cubes_are_refused(settings: dict[str, object], message: str) -> None:
+    with pytest.raises(SettingError, match=message):
+        CubemapRepresentation(**{"level": 5, **settings})  # type: ignore[arg-type]

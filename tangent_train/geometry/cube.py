@@ -1,0 +1,109 @@
+"""The six images of a cube map, a baseline beside tangent images."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tangent_train.errors import SettingError
+from tangent_train.geometry.pinhole_grid import PinholeGrid
+from tangent_train.geometry.sphere import checked_rotation
+
+__all__ = ["CubeGrid"]
+
+_X, _Y, _Z = np.eye(3)
+
+_AXES = np.stack(
+    [
+        np.stack(axes, axis=-1)
+        for axes in (  # right, down, forward
+            (_Y, -_Z, _X),
+            (-_X, -_Z, _Y),
+            (-_Y, -_Z, -_X),
+            (_X, -_Z, -_Y),
+            (_Y, _X, _Z),
+            (_Y, -_X, -_Z),
+        )
+    ]
+)
+
+_NEIGHBORS = np.nonzero(_AXES[..., 2] @ _AXES[..., 2].T == 0)[1].reshape(6, 4).astype(np.int32)
+_NEIGHBORS.setflags(write=False)
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class CubeGrid(PinholeGrid):
+    """The six faces of a cube around the centre, pinhole images of 90°.
+
+    In this order: front (+x, the middle of the panorama), right (+y), back (−x), left (−y), up (+z)
+    and down (−z). The first four stand upright. Up and down are the front camera tilted up and
+    down: columns grow to +y in both, rows towards the front (+x) in up and towards the back (−x) in
+    down, so that up fits above and down below the front, as in a cross of unfolded faces.
+
+    The outer *edges* of the outermost pixels meet those of the neighbours: d pixels span the 90°,
+    the pitch is ``p = 2/d`` and the outermost pixel centres are half a pixel inside. The images do
+    not overlap; what a face owns reaches half a pixel beyond its outermost pixel centres.
+    `fov_deg`, between pixel centres as everywhere, is a little less than the 70.5° between adjacent
+    corners of the cube.
+
+    Args:
+        dim: Side d in pixels, 2 or more; 2^s is 90° of a panorama of level s.
+        rotation: ``(3, 3)`` proper rotation R that turns the whole cube: directions become R·d.
+
+    Raises:
+        SettingError: The side is too small or no whole number, or the rotation is none.
+
+    >>> grid = CubeGrid(dim=32)
+    >>> grid.num_images, grid.pitch, grid.half_extent
+    (6, 0.0625, 0.96875)
+    """
+
+    dim: int
+    rotation: NDArray[np.float64] | None
+
+    def __init__(self, dim: int, rotation: ArrayLike | None = None) -> None:
+        if not isinstance(dim, int | np.integer) or dim < 2:
+            raise SettingError("dim", found=dim, expected="a whole number, 2 or more")
+        object.__setattr__(self, "dim", int(dim))
+        turn = None if rotation is None else checked_rotation(rotation)
+        object.__setattr__(self, "rotation", turn)
+
+    @property
+    def num_images(self) -> int:
+        """6."""
+        return 6
+
+    @property
+    def pitch(self) -> float:
+        """Distance of neighbouring pixels on the face, in focal lengths: 2/d."""
+        return 2 / self.dim
+
+    @property
+    def neighbors(self) -> NDArray[np.int32]:
+        """``(6, 4)`` faces that share an edge with a face: all but itself and the opposite one.
+
+        Walking to ever nearer centres over these neighbours ends at the owner.
+        """
+        return _NEIGHBORS
+
+    @property
+    def overlapping(self) -> bool:
+        """False: neighbours meet at their outer edges."""
+        return False
+
+    def with_rotation(self, rotation: ArrayLike | None) -> Self:
+        """The same cube, turned by this rotation instead of its own.
+
+        Raises:
+            SettingError: The rotation is none.
+        """
+        return type(self)(self.dim, rotation)
+
+    def _unturned_axes(self) -> NDArray[np.float64]:
+        return _AXES
+
+    def _key(self) -> tuple[object, ...]:
+        return (self.dim,)

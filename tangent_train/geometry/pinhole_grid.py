@@ -1,0 +1,188 @@
+"""Square pinhole images around a point: what tangent images and the faces of a cube share."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tangent_train.errors import SettingError
+
+__all__ = ["Faces", "PinholeGrid"]
+
+Faces = Sequence[int] | NDArray[np.integer]
+"""Indices of images."""
+
+
+class PinholeGrid(ABC):
+    """N square pinhole images of one pitch, which together see every direction.
+
+    Pixel (row i, column j) of an image sits on the plane at distance 1 in front of the camera, at
+    ``(j − (d−1)/2)·p`` to the right and ``(i − (d−1)/2)·p`` down. Every direction is *owned* by the
+    image with the nearest centre, which sees it at most half a pixel off its outermost pixel
+    centres.
+
+    Attributes:
+        dim: Side d in pixels.
+        rotation: ``(3, 3)`` proper rotation R that turns all images: directions become R·d.
+    """
+
+    dim: int
+    rotation: NDArray[np.float64] | None
+
+    @property
+    @abstractmethod
+    def num_images(self) -> int:
+        """N."""
+
+    @property
+    @abstractmethod
+    def pitch(self) -> float:
+        """Distance p of neighbouring pixels on the image plane, in focal lengths."""
+
+    @property
+    @abstractmethod
+    def neighbors(self) -> NDArray[np.int32]:
+        """``(N, k)`` images around an image, filled up with the image itself.
+
+        Walking to ever nearer centres over these neighbours ends at the owner.
+        """
+
+    @property
+    @abstractmethod
+    def overlapping(self) -> bool:
+        """Whether every direction is inside an image, not only on its outer edge."""
+
+    @abstractmethod
+    def with_rotation(self, rotation: ArrayLike | None) -> Self:
+        """The same images, turned by this rotation instead of their own.
+
+        Raises:
+            SettingError: The rotation is none.
+        """
+
+    @abstractmethod
+    def _unturned_axes(self) -> NDArray[np.float64]:
+        """``(N, 3, 3)`` camera axes before the rotation."""
+
+    @abstractmethod
+    def _key(self) -> tuple[object, ...]:
+        """What makes two grids of this class equal, beside the rotation."""
+
+    @property
+    def half_extent(self) -> float:
+        """Half extent h = (d−1)/2·p: where the outermost pixel centres are on the image plane."""
+        return (self.dim - 1) / 2 * self.pitch
+
+    @property
+    def fov_deg(self) -> float:
+        """Angle between adjacent corners in degrees: acos(1 / (1 + 2h²)) (paper, table of FOV)."""
+        return math.degrees(math.acos(1 / (1 + 2 * self.half_extent**2)))
+
+    @property
+    def camera_matrix(self) -> NDArray[np.float64]:
+        """``(3, 3)`` pinhole matrix of every image: focal length 1/p, centre (d−1)/2."""
+        center = (self.dim - 1) / 2
+        return np.array([[1 / self.pitch, 0, center], [0, 1 / self.pitch, center], [0, 0, 1]])
+
+    @cached_property
+    def centers_xyz(self) -> NDArray[np.float64]:
+        """``(N, 3)`` directions of the images' centres."""
+        return self.world_from_camera[..., 2]
+
+    @cached_property
+    def world_from_camera(self) -> NDArray[np.float64]:
+        """``(N, 3, 3)`` camera axes (x right, y down, z forward) as columns.
+
+        The determinant is −1, because the sphere frame is mirrored (see `tangent_train.geometry`);
+        ``FLIP_Y @ world_from_camera`` are proper rotations in a right-handed room.
+        """
+        axes = self._unturned_axes()
+        if self.rotation is not None:
+            axes = self.rotation @ axes
+        axes = axes.copy()
+        axes.setflags(write=False)
+        return axes
+
+    def directions(self, faces: Faces | None = None) -> NDArray[np.float64]:
+        """Directions of the pixel centres.
+
+        Args:
+            faces: Images asked for, default all.
+
+        Returns:
+            ``(n, d, d, 3)`` unit vectors.
+
+        Raises:
+            SettingError: A face is out of range.
+        """
+        line = (np.arange(self.dim) - (self.dim - 1) / 2) * self.pitch
+        x, y = np.meshgrid(line, line)
+        rays = np.stack([x, y, np.ones_like(x)], axis=-1)
+        rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+        axes = self.world_from_camera[self.face_indices(faces)]
+        return np.einsum("nwc,ijc->nijw", axes, rays)
+
+    def face_indices(self, faces: Faces | None = None) -> NDArray[np.int64]:
+        """Checked indices of images, default all.
+
+        Raises:
+            SettingError: A face is out of range or no whole number.
+        """
+        if faces is None:
+            return np.arange(self.num_images)
+        indices = np.atleast_1d(np.asarray(faces))
+        whole = indices.size == 0 or np.issubdtype(indices.dtype, np.integer)
+        if not whole or indices.ndim != 1 or np.any((indices < 0) | (indices >= self.num_images)):
+            raise SettingError("faces", found=faces, expected=f"indices 0 to {self.num_images - 1}")
+        return indices.astype(np.int64)
+
+    def owners(self, directions_xyz: ArrayLike) -> NDArray[np.int64]:
+        """The face that owns each direction: the one with the nearest centre.
+
+        Args:
+            directions_xyz: ``(..., 3)`` vectors of any length.
+
+        Returns:
+            ``(...)`` face indices.
+        """
+        directions = np.asarray(directions_xyz, np.float64)
+        flat = directions.reshape(-1, 3)
+        owner = np.empty(len(flat), np.int64)
+        step = max(1, 2**24 // self.num_images)
+        for start in range(0, len(flat), step):
+            part = slice(start, start + step)
+            owner[part] = (flat[part] @ self.centers_xyz.T).argmax(axis=1)
+        return owner.reshape(directions.shape[:-1])
+
+    def project(self, directions_xyz: ArrayLike, faces: ArrayLike) -> NDArray[np.float64]:
+        """Pixel positions of directions in given images.
+
+        Args:
+            directions_xyz: ``(..., 3)`` vectors of any length.
+            faces: Face of each direction, broadcast against ``(...)``.
+
+        Returns:
+            ``(..., 2)`` column and row; NaN where the direction is behind the image.
+        """
+        axes = self.world_from_camera[np.asarray(faces)]
+        x, y, z = np.moveaxis(
+            np.einsum("...w,...wc->...c", np.asarray(directions_xyz, np.float64), axes), -1, 0
+        )
+        depth = np.where(z > 0, z, np.nan)
+        return np.stack([x / depth, y / depth], axis=-1) / self.pitch + (self.dim - 1) / 2
+
+    def _whole_key(self) -> tuple[object, ...]:
+        rotation = None if self.rotation is None else self.rotation.tobytes()
+        return type(self), *self._key(), rotation
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, PinholeGrid) and self._whole_key() == other._whole_key()
+
+    def __hash__(self) -> int:
+        return hash(self._whole_key())

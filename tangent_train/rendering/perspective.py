@@ -1,0 +1,205 @@
+"""What a network sees of a photo: crops of one common camera (paper, supplement, section 2.1).
+
+Photos of any camera become images of the same angular resolution as a panorama's, so that a network
+trained on them knows objects at the size they will have in tangent images. The common camera has
+the side W' = H' and the field of view Ω': ``f' = W' / (2 tan(Ω'/2))``; a crop is
+``x' = K'(K+Δ)⁻¹x`` with a shift Δ that keeps it inside the photo.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float, Integer
+from numpy.typing import NDArray
+from PIL import Image
+from torch import Tensor
+
+from tangent_train.errors import SettingError
+from tangent_train.geometry import normalize_camera, shift_range
+from tangent_train.rendering.forward import Interpolation
+
+__all__ = ["PerspectiveRepresentation", "PhotoCrops", "PhotoSampler"]
+
+Crops = Literal["grid", "center"]
+"""Where the crops of an evaluation are: all over the photo, or one in the middle."""
+
+
+@dataclass(frozen=True)
+class PhotoCrops:
+    """Crops of one photo.
+
+    Attributes:
+        boxes: ``(n, 4)`` left, top, right and bottom in the photo, in pixels from its corner.
+        dim: Side of the crops in pixels.
+        mirrored: Whether they are mirrored left to right.
+    """
+
+    boxes: NDArray[np.float64]
+    dim: int
+    mirrored: bool = False
+
+    def render(self, image: NDArray[Any], interpolation: Interpolation) -> NDArray[Any]:
+        """Render a photo ``(H, W[, C])`` to crops ``(n, d, d[, C])``, dtype kept.
+
+        Args:
+            image: The photo; for `bilinear` uint8.
+            interpolation: `bilinear` averages when it shrinks (a triangle as wide as two pixels of
+                the crop): no aliasing. `nearest` takes the pixel at the centre.
+        """
+        draw = _nearest if interpolation == "nearest" else _smooth
+        crops = np.stack([draw(image, box, self.dim) for box in self.boxes])
+        return np.ascontiguousarray(crops[:, :, ::-1]) if self.mirrored else crops
+
+    def owned(self) -> NDArray[np.bool_]:
+        """Which pixels of a crop lie nearer to its centre than to any other's, ``(n, d, d)``.
+
+        So every place of the photo is counted once, however much the crops overlap.
+        """
+        across, down = (self._owned_along(axis) for axis in (0, 1))
+        return down[:, :, None] & across[:, None, :]
+
+    def _owned_along(self, axis: int) -> NDArray[np.bool_]:
+        near, far = self.boxes[:, axis], self.boxes[:, axis + 2]
+        centers, own = np.unique(np.round((near + far) / 2, 6), return_inverse=True)
+        places = np.linspace(near, far, 2 * self.dim + 1, axis=1)[:, 1::2]
+        owner: NDArray[np.int64] = np.abs(places[..., None] - centers).argmin(axis=-1)
+        return owner == own[:, None]
+
+
+def _smooth(image: NDArray[Any], box: NDArray[np.float64], dim: int) -> NDArray[Any]:
+    resized = Image.fromarray(image).resize(
+        (dim, dim), Image.Resampling.BILINEAR, box=tuple(box.tolist())
+    )
+    return np.asarray(resized)
+
+
+def _nearest(image: NDArray[Any], box: NDArray[np.float64], dim: int) -> NDArray[Any]:
+    columns, rows = (
+        np.linspace(near, far, 2 * dim + 1)[1::2].astype(np.intp)
+        for near, far in box.reshape(2, 2).T
+    )
+    return image[rows][:, columns]
+
+
+@dataclass(frozen=True)
+class PhotoSampler:
+    """Draws crops of photos of one camera.
+
+    Attributes:
+        camera_matrix: ``(3, 3)`` K, integer pixel centres.
+        size: ``(height, width)`` of the photo.
+        representation: The common camera, and which crops to take.
+    """
+
+    camera_matrix: NDArray[np.float64]
+    size: tuple[int, int]
+    representation: PerspectiveRepresentation
+
+    def sample(self, rng: np.random.Generator) -> PhotoCrops:
+        """Crops anywhere in the photo."""
+        wanted = self.representation
+        least, greatest = self._shifts()
+        shifts = rng.uniform(least, greatest, (wanted.crops_per_photo, 2))
+        return self._crops(shifts, mirrored=wanted.mirror and bool(rng.random() < 0.5))
+
+    def whole(self) -> PhotoCrops:
+        """As few crops as cover the photo, evenly spread; or the one in the middle."""
+        least, greatest = self._shifts()
+        if self.representation.evaluation == "center":
+            return self._crops(np.clip(np.zeros((1, 2)), least, greatest))
+        focal = np.diag(self.camera_matrix)[:2]
+        extent = 2 * focal * math.tan(math.radians(self.representation.fov_deg) / 2)
+        count = 1 + np.ceil((greatest - least) / extent - 1e-9).astype(int)
+        across, down = (
+            np.linspace(a, b, n) if n > 1 else np.clip([0.0], a, b)
+            for a, b, n in zip(least, greatest, count, strict=True)
+        )
+        return self._crops(np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2))
+
+    def _shifts(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        return shift_range(self.camera_matrix, self.size, self.representation.fov_deg)
+
+    def _crops(self, shifts: NDArray[np.float64], *, mirrored: bool = False) -> PhotoCrops:
+        wanted = self.representation
+        corners = np.array([[-0.5, -0.5, 1], [wanted.dim - 0.5, wanted.dim - 0.5, 1]])
+        boxes = []
+        for dx, dy in shifts:
+            camera = normalize_camera(
+                self.camera_matrix, self.size, wanted.fov_deg, wanted.dim, (dx, dy)
+            )
+            box = (corners @ np.linalg.inv(camera.homography).T)[:, :2] + 0.5
+            boxes.append(np.clip(box, 0, self.size[::-1]).ravel())  # rounding may lead outside
+        return PhotoCrops(np.array(boxes), wanted.dim, mirrored)
+
+
+class PerspectiveRepresentation:
+    """Crops of photos, all of one camera.
+
+    Args:
+        level: Level s of the panoramas whose angular resolution the crops have.
+        fov_deg: Field of view Ω' of a crop in degrees, both ways.
+        dim: Side W' of a crop in pixels, default the paper's 2^(s−1): with 45°, 128 at level 8.
+        crops_per_photo: Crops drawn at random for a training sample.
+        mirror: Mirror half of the training samples left to right.
+        evaluation: `grid` covers the photo with crops, each place counted once; `center` takes the
+            crop in the middle.
+
+    Raises:
+        SettingError: A setting that cannot work.
+    """
+
+    def __init__(
+        self,
+        level: int,
+        fov_deg: float = 45.0,
+        dim: int | None = None,
+        crops_per_photo: int = 1,
+        mirror: bool = False,
+        evaluation: Crops = "grid",
+    ) -> None:
+        self.dim = 2 ** (level - 1) if dim is None else dim
+        for name, value in (("dim", self.dim), ("crops_per_photo", crops_per_photo)):
+            if value < 1:
+                raise SettingError(f"representation.{name}", found=value, expected="1 or more")
+        if not 0 < fov_deg < 180:
+            raise SettingError(
+                "representation.fov_deg", found=fov_deg, expected="more than 0 and less than 180"
+            )
+        if evaluation not in ("grid", "center"):
+            raise SettingError(
+                "representation.evaluation", found=repr(evaluation), expected="grid or center"
+            )
+        self.fov_deg = fov_deg
+        self.crops_per_photo = crops_per_photo
+        self.mirror = mirror
+        self.evaluation = evaluation
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """Rows and columns of a crop."""
+        return self.dim, self.dim
+
+    def of_camera(self, camera_matrix: NDArray[np.float64], size: tuple[int, int]) -> PhotoSampler:
+        """What draws the crops of a photo.
+
+        Args:
+            camera_matrix: ``(3, 3)`` K of the photo, integer pixel centres, without skew.
+            size: ``(height, width)`` of the photo.
+        """
+        return PhotoSampler(camera_matrix, size, self)
+
+    def to_labels(
+        self, scores: Float[Tensor, "images classes height width"], shape: tuple[int, ...]
+    ) -> Integer[Tensor, "images height width"]:
+        """The best class of every pixel of every crop.
+
+        Raises:
+            SettingError: The scores are not those of the crops.
+        """
+        if (scores.shape[0], *scores.shape[-2:]) != tuple(shape):
+            raise SettingError("scores of crops", found=tuple(scores.shape), expected=shape)
+        return scores.argmax(dim=1)

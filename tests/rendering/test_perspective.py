@@ -1,0 +1,212 @@
+"""Crops of photos against slow float64 references."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from tangent_train.errors import SettingError
+from tangent_train.geometry import camera_matrix_from_fov, normalize_camera, shift_range
+from tangent_train.rendering import PerspectiveRepresentation
+
+SIZE = (90, 140)
+K = np.array([[150.0, 0, 66.3], [0, 145.0, 47.1], [0, 0, 1]])
+
+
+def _photo(seed: int = 0, size: tuple[int, int] = SIZE) -> NDArray[np.uint8]:
+    """Smooth noise, so that interpolation is well defined."""
+    noise = np.random.default_rng(seed).integers(0, 256, (*size, 3)).astype(np.uint8)
+    smooth: NDArray[Any] = cv2.GaussianBlur(noise, (0, 0), 1.5)
+    return cv2.normalize(smooth, smooth.copy(), 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+
+
+def _triangle(image: NDArray[np.uint8], homography: NDArray[np.float64], dim: int) -> NDArray[Any]:
+    """Every pixel of a crop in float64: a weighted mean over a triangle around its place.
+
+    The triangle is as wide as two pixels of the crop, at least two of the photo: then it is
+    bilinear interpolation.
+    """
+    old_from_new = np.linalg.inv(homography)
+    places = old_from_new @ np.stack([np.arange(dim), np.arange(dim), np.ones(dim)])
+    weights = []
+    for axis, count in enumerate(image.shape[1::-1]):
+        away = np.abs(np.arange(count) - places[axis][:, None])
+        weight = np.maximum(0, 1 - away / max(old_from_new[axis, axis], 1))
+        weights.append(weight / weight.sum(axis=1, keepdims=True))
+    across, down = weights
+    return np.einsum("ih,hwc,jw->ijc", down, image.astype(np.float64), across, optimize=True)
+
+
+@pytest.mark.parametrize("dim", [9, 16, 31, 64])
+@pytest.mark.parametrize("fov_deg", [17.3, 30.0])
+def test_crops_against_the_slow_reference(dim: int, fov_deg: float) -> None:
+    photo = _photo()
+    sampler = PerspectiveRepresentation(7, fov_deg, dim, crops_per_photo=3).of_camera(K, SIZE)
+    crops = sampler.sample(np.random.default_rng(1))
+    rendered = crops.render(photo, "bilinear")
+    assert rendered.shape == (3, dim, dim, 3)
+    assert rendered.dtype == np.uint8
+    for box, image in zip(crops.boxes, rendered, strict=True):
+        scale = dim / (box[2:] - box[:2])
+        homography = np.diag([*scale, 1.0])
+        homography[:2, 2] = scale * (0.5 - box[:2]) - 0.5
+        assert np.abs(image - _triangle(photo, homography, dim)).max() < 1.01
+
+
+def test_the_crop_in_the_middle_is_the_papers_homography() -> None:
+    photo = _photo()
+    representation = PerspectiveRepresentation(6, 30.0, 32, evaluation="center")
+    crop = representation.of_camera(K, SIZE).whole().render(photo, "bilinear")
+    homography = normalize_camera(K, SIZE, 30.0, 32).homography
+    assert np.abs(crop[0] - _triangle(photo, homography, 32)).max() < 1.01
+
+
+def test_fine_stripes_become_grey_not_moire() -> None:
+    stripes = np.zeros((512, 512, 3), np.uint8)
+    stripes[:, ::2] = 255
+    camera = camera_matrix_from_fov(60, (512, 512))
+    crop = PerspectiveRepresentation(7, dim=64).of_camera(camera, (512, 512)).whole()
+    grey = crop.render(stripes, "bilinear")
+    assert 115 < grey.min() <= grey.max() < 140
+
+
+def test_labels_come_from_the_pixel_at_the_centre() -> None:
+    labels = np.random.default_rng(0).integers(0, 14, SIZE).astype(np.uint8)
+    depth = labels.astype(np.uint16) * 300
+    crops = (
+        PerspectiveRepresentation(6, 30.0, 16).of_camera(K, SIZE).sample(np.random.default_rng(3))
+    )
+    (left, top, right, bottom) = crops.boxes[0]
+    rendered = crops.render(labels, "nearest")
+    for i, j in np.ndindex(16, 16):
+        row = math.floor(top + (i + 0.5) * (bottom - top) / 16)
+        column = math.floor(left + (j + 0.5) * (right - left) / 16)
+        assert rendered[0, i, j] == labels[row, column]
+    np.testing.assert_array_equal(crops.render(depth, "nearest"), rendered.astype(np.uint16) * 300)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    focal=st.tuples(st.floats(60, 900), st.floats(60, 900)),
+    size=st.tuples(st.integers(64, 800), st.integers(64, 800)),
+    off_center=st.tuples(st.floats(-0.2, 0.2), st.floats(-0.2, 0.2)),
+    share=st.floats(0.05, 1),
+    level=st.integers(4, 9),
+    seed=st.integers(0, 100),
+)
+def test_crops_never_leave_the_photo_and_the_grid_counts_every_place_once(
+    focal: tuple[float, float],
+    size: tuple[int, int],
+    off_center: tuple[float, float],
+    share: float,
+    level: int,
+    seed: int,
+) -> None:
+    height, width = size
+    matrix = np.array([
+        [focal[0], 0, width * (0.5 + off_center[0])], [0, focal[1], height * (0.5 + off_center[1])],
+        [0, 0, 1],
+    ])  # fmt: skip
+    widest = min(math.atan(width / 2 / focal[0]), math.atan(height / 2 / focal[1]))
+    representation = PerspectiveRepresentation(
+        level, 2 * math.degrees(widest) * share * (1 - 1e-9), crops_per_photo=4
+    )
+    sampler = representation.of_camera(matrix, size)
+    random, grid = sampler.sample(np.random.default_rng(seed)), sampler.whole()
+    extent = 2 * np.diag(matrix)[:2] * math.tan(math.radians(representation.fov_deg) / 2)
+    for crops in (random, grid):
+        assert (crops.boxes >= 0).all()
+        assert (crops.boxes[:, 2:] <= (width, height)).all()
+        sides = crops.boxes[:, 2:] - crops.boxes[:, :2]
+        np.testing.assert_allclose(sides, np.broadcast_to(extent, sides.shape))
+    # Together they reach from border to border, and owned pixels add up to the photo's area.
+    np.testing.assert_allclose(grid.boxes[:, :2].min(axis=0), 0, atol=1e-6)
+    np.testing.assert_allclose(grid.boxes[:, 2:].max(axis=0), (width, height), atol=1e-6)
+    columns, rows = (len(np.unique(grid.boxes[:, axis].round(6))) for axis in (0, 1))
+    assert len(grid.boxes) == columns * rows
+    assert (columns - 1) * extent[0] < width, "no more than needed"
+    assert (rows - 1) * extent[1] < height, "no more than needed"
+    area = grid.owned().sum() * np.prod(extent / representation.dim)
+    slack = 2 * (columns + rows) * max(width, height) * max(extent) / representation.dim
+    assert abs(area - width * height) <= slack
+
+
+def test_owned_pixels_of_overlapping_crops_are_disjoint() -> None:
+    representation = PerspectiveRepresentation(8, 30.0, 64)
+    crops = representation.of_camera(K, SIZE).whole()
+    owned = crops.owned()
+    assert len(crops.boxes) > 1
+    seen: set[tuple[int, int]] = set()
+    for (left, top, right, bottom), mine in zip(crops.boxes, owned, strict=True):
+        x = left + (np.arange(64) + 0.5) * (right - left) / 64
+        y = top + (np.arange(64) + 0.5) * (bottom - top) / 64
+        middle = (left + right) / 2, (top + bottom) / 2
+        rows, columns = np.nonzero(mine)
+        for i, j in zip(rows, columns, strict=True):
+            others = np.hypot(
+                (crops.boxes[:, 0] + crops.boxes[:, 2]) / 2 - x[j],
+                (crops.boxes[:, 1] + crops.boxes[:, 3]) / 2 - y[i],
+            )
+            assert np.hypot(middle[0] - x[j], middle[1] - y[i]) <= others.min() + 1e-9
+        cells = {(round(a * 1e6), round(b * 1e6)) for a, b in zip(x[columns], y[rows], strict=True)}
+        assert not cells & seen
+        seen |= cells
+
+
+def test_a_photo_that_just_fits_has_one_crop_and_owns_all_of_it() -> None:
+    camera = camera_matrix_from_fov(45, (80, 80))
+    crops = PerspectiveRepresentation(7).of_camera(camera, (80, 80)).whole()
+    np.testing.assert_allclose(crops.boxes, [[0, 0, 80, 80]], atol=1e-9)
+    assert crops.owned().all()
+
+
+def test_mirrored_crops() -> None:
+    photo = _photo()
+    representation = PerspectiveRepresentation(6, 30.0, 16, mirror=True)
+    sampler = representation.of_camera(K, SIZE)
+    drawn = [sampler.sample(np.random.default_rng(seed)) for seed in range(20)]
+    assert {crops.mirrored for crops in drawn} == {True, False}
+    mirrored = next(crops for crops in drawn if crops.mirrored)
+    plain = type(mirrored)(mirrored.boxes, mirrored.dim)
+    np.testing.assert_array_equal(
+        mirrored.render(photo, "bilinear"), plain.render(photo, "bilinear")[:, :, ::-1]
+    )
+
+
+def test_the_side_follows_from_the_level() -> None:
+    sides = {level: PerspectiveRepresentation(level).image_size for level in (6, 7, 8)}
+    assert sides == {6: (32, 32), 7: (64, 64), 8: (128, 128)}, "paper: 128 for level 8"
+
+
+def test_shifts_of_synthia_cameras() -> None:
+    # 1280×760, f = 532.740352, the middle at (640, 380) from the corner: ±419 and ±159 pixels.
+    camera = np.array([[532.740352, 0, 639.5], [0, 532.740352, 379.5], [0, 0, 1]])
+    least, greatest = shift_range(camera, (760, 1280))
+    np.testing.assert_allclose(greatest, [419.33, 159.33], atol=0.01)
+    np.testing.assert_allclose(least, -greatest)
+
+
+def test_labels_of_crops() -> None:
+    scores = torch.randn(3, 5, 8, 8)
+    representation = PerspectiveRepresentation(4)
+    labels = representation.to_labels(scores, (3, 8, 8))
+    np.testing.assert_array_equal(labels.numpy(), scores.numpy().argmax(axis=1))
+    with pytest.raises(SettingError, match="scores of crops"):
+        representation.to_labels(scores, (2, 8, 8))
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [("fov_deg", 0), ("fov_deg", 180), ("dim", 0), ("crops_per_photo", 0), ("evaluation", "all")],
+)
+def test_impossible_settings(setting: str, value: Any) -> None:
+    with pytest.raises(SettingError, match=f"representation.{setting}"):
+        PerspectiveRepresentation(7, **{setting: value})
