@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import cv2
 
-from datamodules.samples import TrainingPanoramas
+from datamodules.samples import TrainingImages
 from datamodules.stanford2d3ds import FileName, Stanford2D3DS
 from datamodules.synthrooms.generate import generate_rooms
 from datamodules.synthrooms.settings import RoomSettings
@@ -138,7 +138,7 @@ def compare_samples(store: Stanford2D3DS, rounds: int) -> None:
     source = store.source("train")
 
     def sampler(representation: TangentRepresentation) -> Callable[[int], object]:
-        panoramas = TrainingPanoramas(source, representation, 0)
+        panoramas = TrainingImages(source, representation, 0)
         return lambda epoch: panoramas[epoch, epoch % len(panoramas)]
 
     few, everything = sampler(store.representation), sampler(whole)  # type: ignore[arg-type]

@@ -1,7 +1,8 @@
 """Data sets as Lightning data modules.
 
-`panoramas`, `samples`, `sampling` and `panorama_module` serve any data set of panoramas; a data
-set adds one module that finds and reads its files, like `stanford2d3ds`.
+`segmentation_module`, `sources`, `samples` and `sampling` serve any labelled images, `panoramas`
+and `panorama_module` panoramas, `photos` and `photo_module` photos. A data set adds modules that
+find and read its files, like `stanford2d3ds` and `stanford_perspective`.
 """
 
 from __future__ import annotations
@@ -10,25 +11,44 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from datamodules.omnisynthia import OmniSynthia
     from datamodules.panoramas import Panorama
+    from datamodules.photos import Photo
     from datamodules.samples import EvaluationSample, Normalization, TrainingSample, normalize
     from datamodules.sampling import EpochSampler, sample_rng
     from datamodules.stanford2d3ds import Stanford2D3DS
-    from datamodules.synthrooms.datamodule import SynthRooms
+    from datamodules.stanford_perspective import Stanford2D3DSPerspective
+    from datamodules.synthia_perspective import SynthiaPerspective
+    from datamodules.synthrooms.datamodule import SynthRooms, SynthRoomsPerspective
 
 __all__ = [
     "EpochSampler",
     "EvaluationSample",
     "Normalization",
+    "OmniSynthia",
     "Panorama",
+    "Photo",
     "Stanford2D3DS",
+    "Stanford2D3DSPerspective",
     "SynthRooms",
+    "SynthRoomsPerspective",
+    "SynthiaPerspective",
     "TrainingSample",
     "normalize",
     "sample_rng",
 ]
 
-_MODULES = ("panoramas", "samples", "sampling", "stanford2d3ds", "synthrooms.datamodule")
+_MODULES = (
+    "omnisynthia",
+    "panoramas",
+    "photos",
+    "samples",
+    "sampling",
+    "stanford2d3ds",
+    "stanford_perspective",
+    "synthia_perspective",
+    "synthrooms.datamodule",
+)
 
 
 def __getattr__(name: str) -> Any:

@@ -9,34 +9,31 @@ from the source pixel at its centre.
 from __future__ import annotations
 
 import math
-import os
-from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol, TypeVar
 
 import cv2
 import numpy as np
 
 from datamodules.sampling import sample_rng
+from datamodules.sources import ImageSource, count_labels
 from tangent_train.geometry import random_rotation, rotation_about
 from tangent_train.rendering import rotate_equirect
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Mapping
+    from collections.abc import Mapping
     from pathlib import Path
 
     from numpy.typing import NDArray
+
+    from tangent_train.rendering.representation import Representation, Sampler
 
 __all__ = [
     "STEPS_PER_M",
     "FileSource",
     "Mask",
     "Panorama",
-    "PanoramaSource",
-    "RememberedPanoramas",
     "Turn",
     "TurnedPanoramas",
-    "count_labels",
-    "in_threads",
     "mask_black",
     "resize_area",
     "resize_depth",
@@ -45,7 +42,6 @@ __all__ = [
 ]
 
 _Pixel = TypeVar("_Pixel", bound=np.generic)
-_Read = TypeVar("_Read")
 
 Mask = Literal["labels", "any_black", "all_black"]
 """Which pixels count as unknown besides those without a label; see `mask_black`."""
@@ -73,28 +69,17 @@ class Panorama(NamedTuple):
     depth: NDArray[np.uint16] | None
     labels: NDArray[np.uint8]
 
+    def sampler(self, representation: Representation) -> Sampler:
+        """What draws its views: the representation, which is the same for all panoramas."""
+        return representation
 
-class PanoramaSource(Protocol):
-    """Panoramas by number."""
-
-    def __len__(self) -> int:
-        """How many there are."""
-        ...
-
-    def name(self, index: int) -> str:
-        """A short name of one of them, which no other has; with ``/`` between groups."""
-        ...
-
-    def read(self, index: int) -> Panorama:
-        """One of them."""
-        ...
-
-    def label_counts(self, index: int) -> NDArray[np.int64]:
-        """Its pixels of every label, ``(256,)``, for less than the price of reading all of it."""
-        ...
+    def target(self, representation: Representation) -> NDArray[np.uint8]:
+        """All labels: predictions are rendered back to the panorama."""
+        del representation
+        return self.labels
 
 
-class FileSource(PanoramaSource, Protocol):
+class FileSource(ImageSource["Panorama"], Protocol):
     """Panoramas of one size decoded from files: what a prepared store is made of."""
 
     @property
@@ -118,11 +103,6 @@ class FileSource(PanoramaSource, Protocol):
     def files(self, index: int) -> Mapping[str, Path]:
         """The file of every part of one panorama: `rgb`, `labels` and, where read, `depth`."""
         ...
-
-
-def count_labels(labels: NDArray[np.uint8]) -> NDArray[np.int64]:
-    """Number of pixels of every label, ``(256,)``."""
-    return np.bincount(labels.ravel(), minlength=256)
 
 
 def resize_area(image: NDArray[np.uint8], shape: tuple[int, int]) -> NDArray[np.uint8]:
@@ -192,50 +172,6 @@ def mask_black(labels: NDArray[np.uint8], rgb: NDArray[np.uint8], mask: Mask) ->
     return np.where(black.any(-1) if mask == "any_black" else black.all(-1), np.uint8(0), labels)
 
 
-def in_threads(read: Callable[[int], _Read], count: int) -> Generator[_Read]:
-    """``read(0)`` … ``read(count - 1)``, on all cores (OpenCV and zlib free the GIL)."""
-    workers = os.cpu_count() or 1
-    with ThreadPoolExecutor(workers) as pool:
-        # A few at a time: the reader is never far ahead of who consumes them.
-        for start in range(0, count, 4 * workers):
-            yield from pool.map(read, range(start, min(start + 4 * workers, count)))
-
-
-class RememberedPanoramas:
-    """The panoramas of another source, read once, now, and kept in memory.
-
-    Made before the loader's workers start, which then share the memory (on systems that fork);
-    each process of a distributed run keeps its own: six bytes a pixel with depth, four without.
-
-    Args:
-        source: Where they come from.
-    """
-
-    def __init__(self, source: PanoramaSource) -> None:
-        self._source = source
-        self._kept = list(in_threads(self._read, len(source)))
-
-    def __len__(self) -> int:
-        return len(self._kept)
-
-    def name(self, index: int) -> str:
-        """The name in the source."""
-        return self._source.name(index)
-
-    def read(self, index: int) -> Panorama:
-        """The panorama as the source gave it."""
-        return self._kept[index]
-
-    def label_counts(self, index: int) -> NDArray[np.int64]:
-        """Its pixels of every label."""
-        return count_labels(self._kept[index].labels)
-
-    def _read(self, index: int) -> Panorama:
-        # Copies: arrays that are views of a file would keep it open.
-        rgb, depth, labels = self._source.read(index)
-        return Panorama(np.array(rgb), None if depth is None else np.array(depth), np.array(labels))
-
-
 class TurnedPanoramas:
     """The panoramas of another source as seen by a camera that is not upright.
 
@@ -249,7 +185,9 @@ class TurnedPanoramas:
         seed: Seed of the turns.
     """
 
-    def __init__(self, source: PanoramaSource, rotation: float | Literal["so3"], seed: int) -> None:
+    def __init__(
+        self, source: ImageSource[Panorama], rotation: float | Literal["so3"], seed: int
+    ) -> None:
         self._source = source
         self._rotation = rotation
         self._seed = seed

@@ -1,4 +1,4 @@
-"""From panoramas to what a network is trained and evaluated on."""
+"""From labelled images to what a network is trained and evaluated on."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from tangent_train.errors import SettingError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from datamodules.panoramas import Panorama, PanoramaSource
-    from tangent_train.rendering.representation import Representation, Views
+    from datamodules.sources import ImageSource, LabelledImage
+    from tangent_train.rendering.representation import Views
 
 __all__ = [
     "RGBD_NORMALIZATION",
     "RGB_NORMALIZATION",
-    "EvaluationPanoramas",
+    "EvaluationImages",
     "EvaluationSample",
     "Inputs",
     "Normalization",
-    "TrainingPanoramas",
+    "TrainingImages",
     "TrainingSample",
     "collate",
     "normalize",
@@ -130,14 +130,14 @@ def normalize(inputs: Sequence[Tensor], normalization: Normalization) -> Tensor:
 
 
 class TrainingSample(NamedTuple, Generic[_Images]):
-    """One panorama seen through P images; collated, each has a leading batch dimension.
+    """One panorama or photo seen through P images; collated, each has a leading batch dimension.
 
     Attributes:
         images: From the loader what was rendered, RGB ``(P, h, w, 3)`` uint8 and perhaps depth
             ``(P, h, w)`` int16: a third of the bytes. On the device `normalize` makes them
             ``(P, C, h, w)`` float32.
         labels: ``(P, h, w)`` uint8, 0 where unknown.
-        index: Place of the panorama in its split.
+        index: Place in its split.
     """
 
     images: _Images
@@ -146,12 +146,13 @@ class TrainingSample(NamedTuple, Generic[_Images]):
 
 
 class EvaluationSample(NamedTuple, Generic[_Images]):
-    """One whole panorama; collated, each has a leading batch dimension.
+    """One whole panorama or photo; collated, each has a leading batch dimension.
 
     Attributes:
-        images: N images of all of the sphere, as in `TrainingSample`.
-        target: ``(H, W)`` uint8 labels of the panorama itself, 0 where unknown.
-        index: Place of the panorama in its split.
+        images: N images of all of it, as in `TrainingSample`.
+        target: uint8 labels, 0 where unknown: ``(H, W)`` of the panorama itself; ``(N, h, w)`` of
+            the crops of a photo.
+        index: Place in its split.
     """
 
     images: _Images
@@ -159,11 +160,11 @@ class EvaluationSample(NamedTuple, Generic[_Images]):
     index: int  # type: ignore[assignment]  # nobody needs tuple.index
 
 
-class TrainingPanoramas(Dataset[TrainingSample[Inputs]]):
-    """Random views of panoramas, by (epoch, index).
+class TrainingImages(Dataset[TrainingSample[Inputs]]):
+    """Random views of images, by (epoch, index).
 
     Args:
-        source: The panoramas.
+        source: The images.
         representation: What the network sees of them.
         seed: Seed of the run, 0 or more.
         color_jitter: Strength of the colour augmentation, 0 to 1, see `jitter_colors`.
@@ -171,8 +172,8 @@ class TrainingPanoramas(Dataset[TrainingSample[Inputs]]):
 
     def __init__(
         self,
-        source: PanoramaSource,
-        representation: Representation,
+        source: ImageSource[LabelledImage],
+        representation: Any,
         seed: int,
         color_jitter: float = 0.0,
     ) -> None:
@@ -186,28 +187,28 @@ class TrainingPanoramas(Dataset[TrainingSample[Inputs]]):
 
     def __getitem__(self, key: tuple[int, int]) -> TrainingSample[Inputs]:
         epoch, index = key
-        panorama = self._source.read(index)
+        image = self._source.read(index)
         rng = sample_rng(self._seed, epoch, index)
-        views = self._representation.sample(rng)
-        rgb, *depth = _render(panorama, views)
+        views = image.sampler(self._representation).sample(rng)
+        rgb, *depth = _render(image, views)
         if self._color_jitter:
             rgb = jitter_colors(rgb, self._color_jitter, rng)
         return TrainingSample(
             (rgb, *depth),
-            _tensor(views.render(panorama.labels, "nearest")),
+            _tensor(views.render(image.labels, "nearest")),
             index,
         )
 
 
-class EvaluationPanoramas(Dataset[EvaluationSample[Inputs]]):
-    """Whole panoramas, by (epoch, index); the epoch changes nothing.
+class EvaluationImages(Dataset[EvaluationSample[Inputs]]):
+    """Whole images, by (epoch, index); the epoch changes nothing.
 
     Args:
-        source: The panoramas.
+        source: The images.
         representation: What the network sees of them.
     """
 
-    def __init__(self, source: PanoramaSource, representation: Representation) -> None:
+    def __init__(self, source: ImageSource[LabelledImage], representation: Any) -> None:
         self._source = source
         self._representation = representation
 
@@ -216,9 +217,10 @@ class EvaluationPanoramas(Dataset[EvaluationSample[Inputs]]):
 
     def __getitem__(self, key: tuple[int, int]) -> EvaluationSample[Inputs]:
         _, index = key
-        panorama = self._source.read(index)
-        images = _render(panorama, self._representation.whole())
-        return EvaluationSample(images, torch.tensor(panorama.labels), index)
+        image = self._source.read(index)
+        images = _render(image, image.sampler(self._representation).whole())
+        target = image.target(self._representation)
+        return EvaluationSample(images, torch.tensor(target), index)
 
 
 def collate(samples: list[_Sample]) -> _Sample:
@@ -233,11 +235,11 @@ def collate(samples: list[_Sample]) -> _Sample:
     return kind([image[None] for image in images], labels[None], torch.tensor([index]))
 
 
-def _render(panorama: Panorama, views: Views) -> tuple[Tensor, ...]:
-    rgb = _tensor(views.render(panorama.rgb, "bilinear"))
-    if panorama.depth is None:
+def _render(image: LabelledImage, views: Views) -> tuple[Tensor, ...]:
+    rgb = _tensor(views.render(image.rgb, "bilinear"))
+    if image.depth is None:
         return (rgb,)
-    steps = np.minimum(views.render(panorama.depth, "nearest"), int(MAX_DEPTH_M * STEPS_PER_M))
+    steps = np.minimum(views.render(image.depth, "nearest"), int(MAX_DEPTH_M * STEPS_PER_M))
     return rgb, torch.from_numpy(steps.view(np.int16))  # torch hardly knows uint16
 
 

@@ -27,23 +27,24 @@ from datamodules.panorama_module import PanoramaDataModule, Split
 from datamodules.panoramas import (
     Mask,
     Panorama,
-    count_labels,
     mask_black,
     resize_area,
     resize_depth,
     resize_nearest,
 )
 from datamodules.png import read_color_png, read_depth_png
+from datamodules.sources import count_labels
 from datamodules.stanford_files import (
     AREAS,
     FOLDS,
-    GET_IT,
+    MISSING_DEPTH,
     FileName,
-    PanoramaFiles,
+    PictureFiles,
     check_panorama,
-    list_panoramas,
+    list_pictures,
 )
-from tangent_train.errors import DataError, SettingError
+from datamodules.stanford_splits import StanfordSplits
+from tangent_train.errors import SettingError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -58,13 +59,10 @@ __all__ = [
     "FOLDS",
     "FileName",
     "LabelTable",
-    "PanoramaFiles",
+    "PictureFiles",
     "Stanford2D3DS",
     "StanfordPanoramas",
 ]
-
-_MISSING_DEPTH = 65535
-_TABLE_NAME = "semantic_labels.json"
 
 
 class StanfordPanoramas:
@@ -78,7 +76,7 @@ class StanfordPanoramas:
     """
 
     def __init__(
-        self, files: Sequence[PanoramaFiles], table: LabelTable, erp_height: int, mask: Mask
+        self, files: Sequence[PictureFiles], table: LabelTable, erp_height: int, mask: Mask
     ) -> None:
         self._files = tuple(files)
         self._table = table
@@ -112,8 +110,7 @@ class StanfordPanoramas:
 
     def name(self, index: int) -> str:
         """Area, room and camera of a panorama, as ``area_3/office_2/<32 hex>``."""
-        area, name = self._files[index][:2]
-        return f"area_{area}/{name.room}_{name.room_number}/{name.camera}"
+        return self._files[index].short_name
 
     def read(self, index: int) -> Panorama:
         """One panorama.
@@ -136,7 +133,7 @@ class StanfordPanoramas:
         rgb = None if self._mask == "labels" else read_color_png(files.rgb)
         return count_labels(self._labels(files, rgb))
 
-    def _labels(self, files: PanoramaFiles, rgb: NDArray[np.uint8] | None) -> NDArray[np.uint8]:
+    def _labels(self, files: PictureFiles, rgb: NDArray[np.uint8] | None) -> NDArray[np.uint8]:
         labels = self._table.decode(resize_nearest(read_color_png(files.semantic), self._shape))
         if rgb is None or self._mask == "labels":
             return labels
@@ -144,15 +141,12 @@ class StanfordPanoramas:
 
     def _read_depth(self, path: Path) -> NDArray[np.uint16]:
         steps = read_depth_png(path)
-        steps[steps == _MISSING_DEPTH] = 0
+        steps[steps == MISSING_DEPTH] = 0
         return resize_depth(steps, self._shape)
 
 
 class Stanford2D3DS(PanoramaDataModule):
     """Stanford2D3DS, 13 classes, in the three folds of its authors.
-
-    Validation panoramas are those of whole rooms drawn from the training areas, so that nothing
-    is ever chosen by the test areas.
 
     Args:
         root: Folder with ``area_1`` … ``area_6``.
@@ -160,8 +154,7 @@ class Stanford2D3DS(PanoramaDataModule):
         fold: 1, 2 or 3, see `FOLDS`.
         areas: Areas to use, all of which must be there; by default all there are.
         mask: Which pixels count as unknown, see `mask_black`.
-        validation_fraction: Share of the training rooms for validation: at least one room, never
-            all; 0 for no validation.
+        validation_fraction: Share of the training rooms for validation, see `StanfordSplits`.
         label_table: The class table, when it is not where the release has it.
         **settings: All others of `PanoramaDataModule`; the seed also chooses the validation rooms.
 
@@ -184,30 +177,21 @@ class Stanford2D3DS(PanoramaDataModule):
         **settings: Any,
     ) -> None:
         super().__init__(representation, **settings)
-        if fold not in FOLDS:
-            raise SettingError("data.fold", found=repr(fold), expected="1, 2 or 3")
         if mask not in ("labels", "any_black", "all_black"):
             raise SettingError(
                 "data.mask", found=repr(mask), expected="labels, any_black or all_black"
             )
-        if not 0 <= validation_fraction < 1:
-            raise SettingError(
-                "data.validation_fraction", found=validation_fraction, expected="0 to below 1"
-            )
-        testing = set(FOLDS[fold])
-        if not set(areas) <= set(AREAS) or not testing & set(areas) or set(areas) <= testing:
-            raise SettingError(
-                "data.areas",
-                found=list(areas),
-                expected=f"some of {', '.join(AREAS)}: for testing (fold {fold}: "
-                f"{', '.join(FOLDS[fold])}) and for training (others)",
-            )
         self.root = Path(root)
-        self.fold = fold
-        self.areas = tuple(areas)
         self.mask = mask
         self.validation_fraction = validation_fraction
-        self._label_table = None if label_table is None else Path(label_table)
+        self._division = StanfordSplits(
+            root,
+            fold=fold,
+            areas=areas,
+            validation_fraction=validation_fraction,
+            seed=self.seed,
+            label_table=label_table,
+        )
         self._splits: dict[Split, StanfordPanoramas] = {}
 
     def setup(self, stage: str | None = None) -> None:
@@ -222,71 +206,18 @@ class Stanford2D3DS(PanoramaDataModule):
         """
         if self._splits:
             return
-        self._check_layout()
-        table = LabelTable.from_json(self._find_table())
-        files = [f for area in self.areas for f in list_panoramas(self.root, area, self.with_depth)]
-        for panorama in files:
+        table = self._division.read_label_table()
+        files = self._division.divide(
+            lambda area: list_pictures(self.root, area, "pano", self.with_depth)
+        )
+        for panorama in (picture for pictures in files.values() for picture in pictures):
             check_panorama(panorama, self.erp_height)
-        testing = [f for f in files if f.area in FOLDS[self.fold]]
-        training = [f for f in files if f.area not in FOLDS[self.fold]]
-        rooms = self._choose_rooms(training)
-        splits: dict[Split, list[PanoramaFiles]] = {
-            "train": [f for f in training if f.room not in rooms],
-            "val": [f for f in training if f.room in rooms],
-            "test": testing,
-        }
         self._splits = {
             split: StanfordPanoramas(chosen, table, self.erp_height, self.mask)
-            for split, chosen in splits.items()
+            for split, chosen in files.items()
         }
 
     def open_split(self, split: Split) -> StanfordPanoramas:
         """The panoramas of one split."""
         self.setup()
         return self._splits[split]
-
-    def _check_layout(self) -> None:
-        if not self.root.is_dir():
-            raise DataError(
-                self.root, found="no such folder", expected="the data set", remedy=GET_IT
-            )
-        missing = [
-            f"area_{area}" for area in self.areas if not (self.root / f"area_{area}").is_dir()
-        ]
-        if missing:
-            raise DataError(
-                self.root,
-                found="no " + ", ".join(missing),
-                expected="all of " + ", ".join(f"area_{area}" for area in self.areas),
-                remedy=GET_IT,
-            )
-
-    def _find_table(self) -> Path:
-        if self._label_table is not None:
-            return self._label_table
-        places = (self.root / _TABLE_NAME, self.root / "assets" / _TABLE_NAME)
-        for place in places:
-            if place.is_file():
-                return place
-        raise DataError(
-            places[0],
-            found="no class table",
-            expected=f"it there or at {places[1]}",
-            remedy="Copy it from the release (assets), or name it in data.label_table.",
-        )
-
-    def _choose_rooms(self, files: Sequence[PanoramaFiles]) -> set[tuple[str, str, int]]:
-        """Draw the rooms for validation, the same for the same seed."""
-        if self.validation_fraction == 0:
-            return set()
-        rooms = sorted({panorama.room for panorama in files})
-        if len(rooms) == 1:
-            raise DataError(
-                self.root,
-                found="one training room",
-                expected="two or more, to keep some for validation",
-                remedy="Set data.validation_fraction=0, or use more rooms.",
-            )
-        count = min(max(1, round(self.validation_fraction * len(rooms))), len(rooms) - 1)
-        order = np.random.default_rng(self.seed).permutation(len(rooms))
-        return {rooms[i] for i in order[:count]}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from datamodules.png import PngHeader, read_png_header
 from tangent_train.errors import DataError, SettingError
@@ -15,10 +15,12 @@ __all__ = [
     "AREAS",
     "FOLDS",
     "GET_IT",
+    "MISSING_DEPTH",
     "FileName",
-    "PanoramaFiles",
+    "PictureFiles",
     "check_panorama",
-    "list_panoramas",
+    "check_picture",
+    "list_pictures",
 ]
 
 AREAS: tuple[str, ...] = ("1", "2", "3", "4", "5a", "5b", "6")
@@ -32,6 +34,9 @@ GET_IT = (
     "the folder with area_1 … area_6, or train on data=synthrooms, which needs no download."
 )
 """What to do when the data set is not there."""
+
+MISSING_DEPTH = 65535
+"""Marks pixels without depth in depth files."""
 
 _NAME = re.compile(
     r"camera_([0-9a-f]{32})_([A-Za-z]+)_(\d+)_frame_(equirectangular|\d+)"
@@ -82,8 +87,8 @@ class FileName(NamedTuple):
         )
 
 
-class PanoramaFiles(NamedTuple):
-    """The files of one panorama."""
+class PictureFiles(NamedTuple):
+    """The files of one panorama (`pano`) or photo (`data`)."""
 
     area: str
     name: FileName
@@ -96,34 +101,50 @@ class PanoramaFiles(NamedTuple):
         """Building, kind and number of the room: 5a and 5b are one building."""
         return self.area.rstrip("ab"), self.name.room, self.name.room_number
 
+    @property
+    def short_name(self) -> str:
+        """Area, room and camera, as ``area_3/office_2/<32 hex>``."""
+        room = f"{self.name.room}_{self.name.room_number}"
+        return f"area_{self.area}/{room}/{self.name.camera}"
 
-def list_panoramas(root: Path, area: str, with_depth: bool) -> list[PanoramaFiles]:
-    """The panoramas of one area, in the order of their names.
+    @property
+    def pose(self) -> Path:
+        """Camera and pose."""
+        name = self.name._replace(domain="pose", suffix=".json")
+        return self.rgb.parents[1] / "pose" / str(name)
+
+
+def list_pictures(
+    root: Path, area: str, group: Literal["pano", "data"], with_depth: bool
+) -> list[PictureFiles]:
+    """The panoramas or photos of one area, in the order of their names.
 
     Args:
         root: Folder of the data set.
         area: One of `AREAS`.
+        group: Panoramas or photos.
         with_depth: Whether depth is wanted.
 
     Raises:
         DataError: A folder or a partner of an RGB file is missing.
     """
-    pano = root / f"area_{area}" / "pano"
+    folder = root / f"area_{area}" / group
     found = []
     # Hidden files are leftovers of archives made on a Mac.
-    for rgb in sorted(pano.glob("rgb/[!.]*.png")):
+    for rgb in sorted(folder.glob("rgb/[!.]*.png")):
         name = FileName.parse(rgb.name)
-        depth = pano / "depth" / str(name._replace(domain="depth"))
-        semantic = pano / "semantic" / str(name._replace(domain="semantic"))
-        found.append(PanoramaFiles(area, name, rgb, semantic, depth if with_depth else None))
+        depth = folder / "depth" / str(name._replace(domain="depth"))
+        semantic = folder / "semantic" / str(name._replace(domain="semantic"))
+        found.append(PictureFiles(area, name, rgb, semantic, depth if with_depth else None))
     if not found:
+        kind = "panoramas" if group == "pano" else "photos"
         raise DataError(
-            pano / "rgb", found="no panoramas", expected="camera_….png files", remedy=GET_IT
+            folder / "rgb", found=f"no {kind}", expected="camera_….png files", remedy=GET_IT
         )
     return found
 
 
-def check_panorama(files: PanoramaFiles, erp_height: int) -> None:
+def check_panorama(files: PictureFiles, erp_height: int) -> None:
     """Check that all files are there, of one size and readable at `erp_height`; nothing is decoded.
 
     Raises:
@@ -146,6 +167,20 @@ def check_panorama(files: PanoramaFiles, erp_height: int) -> None:
             expected=f"at most the {height} rows of {files.rgb}",
             remedy="Choose a lower level, or larger panoramas.",
         )
+    check_picture(files)
+
+
+def check_picture(files: PictureFiles) -> tuple[int, int]:
+    """Check that all images are there and of one size; nothing is decoded.
+
+    Returns:
+        Rows and columns.
+
+    Raises:
+        DataError: A file is missing, cut off, or of another size or pixel format.
+    """
+    header = _check_png(files.rgb, "rgb")
+    height, width = header.height, header.width
     partners = [(files.semantic, "semantic")]
     if files.depth is not None:
         partners.append((files.depth, "depth"))
@@ -158,6 +193,7 @@ def check_panorama(files: PanoramaFiles, erp_height: int) -> None:
                 expected=f"{height}×{width}, as {files.rgb.name}",
                 remedy="Copy or extract both files again.",
             )
+    return height, width
 
 
 def _check_png(path: Path, domain: str) -> PngHeader:

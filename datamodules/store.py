@@ -14,8 +14,9 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from datamodules.panoramas import Panorama, in_threads
+from datamodules.panoramas import Panorama
 from datamodules.progress import show_progress
+from datamodules.sources import in_threads
 from datamodules.store_files import PAGE, StoredPanorama, broken, open_stored, write_stored
 from tangent_train.errors import DataError
 

@@ -22,7 +22,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from datamodules.panoramas import Panorama, count_labels
+from datamodules.panoramas import Panorama
+from datamodules.sources import count_labels
 from tangent_train.errors import DataError
 from tangent_train.files import atomic_path
 

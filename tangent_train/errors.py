@@ -23,6 +23,7 @@ class _ExplainedError(ValueError):
         if found is not None:
             message = f"{subject}: found {found}; expected {expected}. {remedy}".rstrip()
         super().__init__(message)
+        self.found = found
 
 
 class SettingError(_ExplainedError):

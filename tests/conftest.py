@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from typing import TYPE_CHECKING, Any, Protocol
 
 import cv2
@@ -34,7 +35,11 @@ class FabricateStanford(Protocol):
     """Writes a small data set; returns its root."""
 
     def __call__(
-        self, root: Path, rooms: Mapping[str, Sequence[str]] = ROOMS, height: int = 32
+        self,
+        root: Path,
+        rooms: Mapping[str, Sequence[str]] = ROOMS,
+        height: int = 32,
+        photos: int = 0,
     ) -> Path: ...
 
 
@@ -43,11 +48,17 @@ def _write_png(path: Path, image: NDArray[Any]) -> None:
     assert cv2.imwrite(str(path), image)
 
 
-def _fabricate(root: Path, rooms: Mapping[str, Sequence[str]] = ROOMS, height: int = 32) -> Path:
+def _fabricate(
+    root: Path,
+    rooms: Mapping[str, Sequence[str]] = ROOMS,
+    height: int = 32,
+    photos: int = 0,
+) -> Path:
     """Panoramas of boxes whose colour and depth tell their class, with every trap of the format.
 
     Each has a missing region (label #0D0D0D, depth 65535, black), a patch with one black channel,
-    and every other one an alpha channel.
+    and every other one an alpha channel. Photos likewise: the left half of a panorama, with a pose
+    file whose camera sees 60° of it; the next one 2° more.
     """
     names = ["<UNK>_0_<UNK>_0_0"]
     names += [f"{c}_{i}_office_1_1" for c in CLASSES for i in range(INSTANCES_PER_CLASS)]
@@ -61,6 +72,16 @@ def _fabricate(root: Path, rooms: Mapping[str, Sequence[str]] = ROOMS, height: i
             pano = root / f"area_{area}" / "pano"
             for domain, image in _panorama(rng, height, alpha=number % 2 == 1).items():
                 _write_png(pano / domain / f"{stem}_{domain}.png", image)
+            for frame in range(photos):
+                stem = f"camera_{camera}_{room}_frame_{frame}_domain"
+                data = root / f"area_{area}" / "data"
+                for domain, image in _panorama(rng, height, alpha=False).items():
+                    _write_png(data / domain / f"{stem}_{domain}.png", image[:, :height])
+                focal = height / (2 * math.tan(math.radians(60 + 2 * frame) / 2))
+                matrix = [[focal, 0, height / 2], [0, focal, height / 2], [0, 0, 1]]
+                (data / "pose").mkdir(exist_ok=True)
+                pose = json.dumps({"camera_k_matrix": matrix})
+                (data / "pose" / f"{stem}_pose.json").write_text(pose)
     return root
 
 

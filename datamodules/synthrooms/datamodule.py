@@ -1,19 +1,22 @@
-"""SynthRooms as a data module: Stanford2D3DS's own, after making the files."""
+"""SynthRooms as data modules: Stanford2D3DS's own, after making the files."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
 from datamodules.stanford2d3ds import Stanford2D3DS
+from datamodules.stanford_perspective import Stanford2D3DSPerspective
 from datamodules.synthrooms.settings import RoomSettings
+from tangent_train.errors import SettingError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
+    from tangent_train.rendering.perspective import PerspectiveRepresentation
     from tangent_train.rendering.representation import Representation
 
-__all__ = ["SynthRooms"]
+__all__ = ["SynthRooms", "SynthRoomsPerspective"]
 
 
 class SynthRooms(Stanford2D3DS):
@@ -36,12 +39,53 @@ class SynthRooms(Stanford2D3DS):
         rooms: RoomSettings | Mapping[str, Any],
         **settings: Any,
     ) -> None:
-        self.rooms = rooms if isinstance(rooms, RoomSettings) else RoomSettings(**rooms)
-        areas = [area for area, count in self.rooms.rooms.items() if count]
-        super().__init__(root, representation, areas=areas, **settings)
+        self.rooms = _room_settings(rooms)
+        super().__init__(root, representation, areas=_areas(self.rooms), **settings)
 
     def make_files(self) -> None:
         """Make the files, unless they are there."""
-        from datamodules.synthrooms.generate import generate_rooms
+        _make_files(self.root, self.rooms)
 
-        generate_rooms(self.root, self.rooms)
+
+class SynthRoomsPerspective(Stanford2D3DSPerspective):
+    """Photos of the same rooms, read as those of Stanford2D3DS.
+
+    Args:
+        root: Folder for the files, which may be that of `SynthRooms` of the same rooms.
+        representation: The camera that all photos are brought to.
+        rooms: Which rooms to make, with photos; their areas are the areas used.
+        **settings: All others of `Stanford2D3DSPerspective`.
+
+    Raises:
+        SettingError: A setting that cannot work.
+    """
+
+    def __init__(
+        self,
+        root: str | Path,
+        representation: PerspectiveRepresentation,
+        rooms: RoomSettings | Mapping[str, Any],
+        **settings: Any,
+    ) -> None:
+        self.rooms = _room_settings(rooms)
+        if not self.rooms.views_per_camera:
+            raise SettingError("data.rooms.views_per_camera", found=0, expected="1 or more photos")
+        super().__init__(root, representation, areas=_areas(self.rooms), **settings)
+
+    def make_files(self) -> None:
+        """Make the files, unless they are there."""
+        _make_files(self.root, self.rooms)
+
+
+def _room_settings(rooms: RoomSettings | Mapping[str, Any]) -> RoomSettings:
+    return rooms if isinstance(rooms, RoomSettings) else RoomSettings(**rooms)
+
+
+def _areas(rooms: RoomSettings) -> list[str]:
+    return [area for area, count in rooms.rooms.items() if count]
+
+
+def _make_files(root: Path, rooms: RoomSettings) -> None:
+    from datamodules.synthrooms.generate import generate_rooms
+
+    generate_rooms(root, rooms)

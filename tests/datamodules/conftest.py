@@ -34,6 +34,10 @@ class StripRepresentation:
 
     erp_height: int = 16
 
+    @property
+    def image_size(self) -> tuple[int, int]:
+        return self.erp_height, 2 * self.erp_height // STRIPS
+
     def sample(self, rng: np.random.Generator) -> StripViews:
         strips = rng.choice(STRIPS, 2, replace=False)
         return StripViews(tuple(map(int, strips)), int(rng.integers(2 * self.erp_height)))

@@ -7,16 +7,14 @@ import pytest
 
 from datamodules.panoramas import (
     Panorama,
-    RememberedPanoramas,
     TurnedPanoramas,
-    count_labels,
-    in_threads,
     mask_black,
     resize_area,
     resize_depth,
     resize_nearest,
     steps_to_meters,
 )
+from datamodules.sources import RememberedImages, count_labels, in_threads
 from tangent_train.geometry import equirect_directions
 
 if TYPE_CHECKING:
@@ -158,7 +156,7 @@ def test_threads_keep_the_order() -> None:
 def test_remembered_panoramas_are_the_same_and_read_once(depth: bool) -> None:
     rng = np.random.default_rng(0)
     source = Memory([_panorama(rng, depth=depth) for _ in range(3)])
-    remembered = RememberedPanoramas(source)
+    remembered = RememberedImages(source)
     for _ in range(2):
         for index in range(len(remembered)):
             for kept, original in zip(remembered.read(index), source.panoramas[index], strict=True):

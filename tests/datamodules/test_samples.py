@@ -13,10 +13,10 @@ from datamodules.panoramas import Panorama
 from datamodules.samples import (
     RGB_NORMALIZATION,
     RGBD_NORMALIZATION,
-    EvaluationPanoramas,
+    EvaluationImages,
     EvaluationSample,
     Normalization,
-    TrainingPanoramas,
+    TrainingImages,
     TrainingSample,
     collate,
     normalize,
@@ -27,7 +27,7 @@ from tangent_train.rendering.representation import EquirectRepresentation
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from datamodules.panoramas import PanoramaSource
+    from datamodules.sources import ImageSource
     from tangent_train.rendering.representation import Representation
 
 IDENTITY = Normalization((0, 0, 0, 0), (1 / 255, 1 / 255, 1 / 255, 1))
@@ -104,9 +104,9 @@ def test_normalization_of_other_channels(depth: bool, normalization: Normalizati
 # --- samples -----------------------------------------------------------------------------------
 
 
-def _training(strips: Representation, seed: int = 0) -> TrainingPanoramas:
-    source: PanoramaSource = Positions()
-    return TrainingPanoramas(source, strips, seed)
+def _training(strips: Representation, seed: int = 0) -> TrainingImages:
+    source: ImageSource[Panorama] = Positions()
+    return TrainingImages(source, strips, seed)
 
 
 def test_training_sample(strips: Representation) -> None:
@@ -128,7 +128,7 @@ def test_depth_is_clipped_and_missing_is_zero(
     steps = np.tile(np.array([0, 1, 2047, 2048, 2049, 32768, 65535, 0], np.uint16), (16, 4))
     panorama = Positions().read(0)._replace(depth=steps)
     monkeypatch.setattr(Positions, "read", lambda *_: panorama)
-    images = EvaluationPanoramas(Positions(), strips)[0, 0].images
+    images = EvaluationImages(Positions(), strips)[0, 0].images
     assert images[1][0, 0].tolist() == [0, 1, 2047, 2048, 2048, 2048, 2048, 0]
     assert normalize(images, IDENTITY)[0, 3, 0, 3] == 4  # metres
 
@@ -141,7 +141,7 @@ def test_views_are_those_of_seed_epoch_and_index(strips: Representation) -> None
 
 
 def test_evaluation_sample(strips: Representation) -> None:
-    dataset = EvaluationPanoramas(Positions(), strips)
+    dataset = EvaluationImages(Positions(), strips)
     sample = dataset[0, 2]
     assert len(dataset) == len(_training(strips)) == 3
     images = normalize(sample.images, IDENTITY)
@@ -155,7 +155,7 @@ def test_evaluation_sample(strips: Representation) -> None:
 @pytest.mark.parametrize("count", [1, 2])
 def test_batches_are_those_of_torch(strips: Representation, count: int) -> None:
     training: Any = _training(strips)
-    evaluation: Any = EvaluationPanoramas(Positions(), strips)
+    evaluation: Any = EvaluationImages(Positions(), strips)
     for samples in ([d[0, i] for i in range(count)] for d in (training, evaluation)):
         found, expected = collate(samples), default_collate(samples)
         assert type(found) is type(expected)
@@ -172,8 +172,8 @@ def test_samples_share_no_memory_with_panoramas(
     monkeypatch.setattr(Positions, "read", lambda *_: panorama)
     whole = EquirectRepresentation(level=3)
     for dataset in (
-        TrainingPanoramas(Positions(), whole, 0),
-        EvaluationPanoramas(Positions(), whole),
+        TrainingImages(Positions(), whole, 0),
+        EvaluationImages(Positions(), whole),
     ):
         for tensor in (*(sample := dataset[0, 0]).images, sample[1]):
             assert not any(np.shares_memory(tensor.numpy(), part) for part in panorama)
@@ -186,7 +186,7 @@ def test_samples_collate(strips: Representation) -> None:
     assert [image.shape for image in batch.images] == [(2, 2, 16, 8, 3), (2, 2, 16, 8)]
     assert batch.labels.dtype == torch.uint8
     assert torch.as_tensor(batch.index).tolist() == [0, 2]
-    whole = default_collate([EvaluationPanoramas(Positions(), strips)[0, 1]])
+    whole = default_collate([EvaluationImages(Positions(), strips)[0, 1]])
     assert isinstance(whole, EvaluationSample)
     assert whole.target.shape == (1, 16, 32)
 
@@ -196,8 +196,8 @@ def test_samples_collate(strips: Representation) -> None:
 
 def test_jitter_changes_the_colours_and_nothing_else(strips: Representation) -> None:
     plain, jittered = (
-        TrainingPanoramas(Positions(), strips, 0),
-        TrainingPanoramas(Positions(), strips, 0, 0.5),
+        TrainingImages(Positions(), strips, 0),
+        TrainingImages(Positions(), strips, 0, 0.5),
     )
     for epoch in range(3):
         before, after = plain[epoch, 1], jittered[epoch, 1]

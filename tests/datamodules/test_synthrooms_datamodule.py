@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from datamodules import SynthRooms
+from datamodules.segmentation_module import Split
 from datamodules.synthrooms.settings import RoomSettings
 from tangent_train.errors import DataError, SettingError
 
@@ -21,7 +22,9 @@ def test_rooms_are_made_then_read_like_the_real_set(tmp_path: Path, strips: Any)
         module.setup()
     module.prepare_data()
     module.setup("fit")
-    assert module.areas == ("1", "5a")
+    splits: tuple[Split, ...] = ("train", "val", "test")
+    names = [module.sample_name(s, i) for s in splits for i in range(len(module.source(s)))]
+    assert {name.partition("/")[0] for name in names} == {"area_1", "area_5a"}
     assert len(list(module.train_dataloader())) == 1
     (sample,) = module.test_dataloader()
     assert [image.shape for image in sample.images] == [(1, 4, 16, 8, 3), (1, 4, 16, 8)]

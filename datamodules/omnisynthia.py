@@ -1,0 +1,238 @@
+"""OmniSYNTHIA (Zhang et al. 2019): panoramas of virtual streets, from SYNTHIA (Ros et al. 2016).
+
+On disk the panoramas are 2096×4192, see `synthia_files`. They show what four cameras saw: a band
+around the horizon, black and unknown above and below. Where there are none yet, they are made from
+the four views of SYNTHIA's sequences 01, 02, 04, 05 and 06 SUMMER, which are free for research:
+http://synthia-dataset.net.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+
+from datamodules.panorama_module import PanoramaDataModule, Split
+from datamodules.panoramas import Panorama, resize_area, resize_depth, resize_nearest
+from datamodules.png import read_color_png
+from datamodules.sources import count_labels
+from datamodules.synthia_files import (
+    GET_IT,
+    PANORAMA_FORMATS,
+    PictureFiles,
+    check_files,
+    check_root,
+    list_panoramas,
+    panorama_files,
+    sequence_folder,
+)
+from datamodules.synthia_panoramas import HEIGHT, make_panoramas
+from datamodules.synthia_pixels import (
+    CLASSES,
+    decode_labels,
+    default_normalization,
+    depth_steps,
+    read_first_channel,
+)
+from datamodules.synthia_splits import FRAMES, TEST, TRAIN, SequenceSplits
+from tangent_train.errors import DataError, SettingError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from datamodules.samples import Normalization
+    from tangent_train.rendering.representation import Representation
+
+__all__ = ["OmniSynthia", "SynthiaPanoramas"]
+
+
+class _PanoramaName(NamedTuple):
+    """Which panorama it is, and its files."""
+
+    sequence: str
+    frame: str
+    files: PictureFiles
+
+
+class SynthiaPanoramas:
+    """Reads panoramas at one size.
+
+    Args:
+        panoramas: Which.
+        erp_height: Rows to read.
+    """
+
+    def __init__(self, panoramas: Sequence[_PanoramaName], erp_height: int) -> None:
+        self._panoramas = tuple(panoramas)
+        self._shape = (erp_height, 2 * erp_height)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the panoramas."""
+        return self._shape
+
+    @property
+    def variant(self) -> str:
+        """The size."""
+        return f"{self._shape[0]}x{self._shape[1]}"
+
+    @property
+    def settings(self) -> dict[str, str]:
+        """The size."""
+        return {"size": self.variant}
+
+    def files(self, index: int) -> dict[str, Path]:
+        """The file of every part of one panorama."""
+        return dict(self._panoramas[index].files.parts)
+
+    def __len__(self) -> int:
+        return len(self._panoramas)
+
+    def name(self, index: int) -> str:
+        """Sequence and frame of a panorama, as ``sequence_01/000000``."""
+        sequence, frame, _ = self._panoramas[index]
+        return f"sequence_{sequence}/{frame}"
+
+    def read(self, index: int) -> Panorama:
+        """One panorama.
+
+        Raises:
+            DataError: A file is broken or holds strange labels.
+        """
+        files = self._panoramas[index].files
+        rgb = resize_area(read_color_png(files.rgb), self._shape)
+        depth = None
+        if files.depth is not None:
+            depth = depth_steps(resize_depth(read_first_channel(files.depth), self._shape))
+        return Panorama(rgb, depth, self._labels(files.labels))
+
+    def label_counts(self, index: int) -> NDArray[np.int64]:
+        """The pixels of every label of one panorama, ``(256,)``.
+
+        Raises:
+            DataError: A file is broken or holds strange labels.
+        """
+        return count_labels(self._labels(self._panoramas[index].files.labels))
+
+    def _labels(self, path: Path) -> NDArray[np.uint8]:
+        return resize_nearest(decode_labels(read_first_channel(path), path), self._shape)
+
+
+class OmniSynthia(PanoramaDataModule):
+    """OmniSYNTHIA, 13 classes, with the training and test sequences of its authors.
+
+    Args:
+        root: Folder with ``SYNTHIA-SEQS-01-SUMMER`` …, each with the four views or with panoramas.
+        representation: What the network sees of a panorama.
+        train_sequences: As ``01``.
+        test_sequences: As ``04``.
+        validation_fraction: Share of the training panoramas for validation: the last ones of each
+            sequence, at least one, never all; 0 for no validation.
+        frames: About how many panoramas of each sequence to make, see `choose_frames`.
+        panorama_height: Rows of those that are made.
+        inputs: `rgb`, or `rgb` and `depth`. Depth is clipped to 4 m, which is little in a street;
+            the published panoramas have the z-depth of the views instead of distance.
+        normalization: Of the input channels, see `default_normalization`.
+        **settings: All others of `PanoramaDataModule`.
+
+    Raises:
+        SettingError: A setting that cannot work.
+    """
+
+    class_names: ClassVar[tuple[str, ...]] = ("unknown", *CLASSES)
+
+    def __init__(
+        self,
+        root: str | Path,
+        representation: Representation,
+        *,
+        train_sequences: Sequence[str] = TRAIN,
+        test_sequences: Sequence[str] = TEST,
+        validation_fraction: float = 0.1,
+        frames: int = FRAMES,
+        panorama_height: int = HEIGHT,
+        inputs: Sequence[str] = ("rgb",),
+        normalization: Normalization | None = None,
+        **settings: Any,
+    ) -> None:
+        normalization = normalization or default_normalization(inputs)
+        super().__init__(representation, inputs=inputs, normalization=normalization, **settings)
+        self._division = SequenceSplits(
+            tuple(train_sequences), tuple(test_sequences), validation_fraction
+        )
+        self.root = Path(root)
+        self.validation_fraction = validation_fraction
+        self.frames = frames
+        self.panorama_height = panorama_height
+        self._splits: dict[Split, SynthiaPanoramas] = {}
+
+    def make_files(self) -> None:
+        """Make the panoramas of sequences that have none yet, or are not finished.
+
+        Raises:
+            DataError: There is nothing to make them from, or it is broken.
+        """
+        check_root(self.root)
+        make_panoramas(
+            self.root, self._division.sequences, frames=self.frames, height=self.panorama_height
+        )
+
+    def setup(self, stage: str | None = None) -> None:
+        """Find the files and check all that can be checked without decoding them.
+
+        Args:
+            stage: Ignored: what a test will need is checked before training already.
+
+        Raises:
+            DataError: Something is missing or cannot be used.
+            SettingError: The panoramas are too small for the representation.
+        """
+        if self._splits:
+            return
+        check_root(self.root)
+        self._splits = {
+            split: SynthiaPanoramas(panoramas, self.erp_height)
+            for split, panoramas in self._division.divide(self._panoramas).items()
+        }
+
+    def open_split(self, split: Split) -> SynthiaPanoramas:
+        """The panoramas of one split."""
+        self.setup()
+        return self._splits[split]
+
+    def _panoramas(self, sequence: str) -> list[_PanoramaName]:
+        """The panoramas of a sequence, all of them checked."""
+        folder = sequence_folder(self.root, sequence)
+        frames = list_panoramas(folder)
+        if not frames:
+            raise DataError(
+                folder / "pano" / "RGB",
+                found="no panoramas",
+                expected="000000.png and others",
+                remedy=f"Run tangent-prepare to make them from the views. {GET_IT}",
+            )
+        found = []
+        for frame in frames:
+            files = panorama_files(folder, frame, with_depth=self.with_depth)
+            self._check_size(files, check_files(files, PANORAMA_FORMATS))
+            found.append(_PanoramaName(sequence, frame, files))
+        return found
+
+    def _check_size(self, files: PictureFiles, size: tuple[int, int]) -> None:
+        height, width = size
+        if width != 2 * height:
+            raise DataError(
+                files.rgb,
+                found=f"{height}×{width} pixels",
+                expected="twice as wide as high",
+                remedy="Only full 360°×180° panoramas can be used.",
+            )
+        if height < self.erp_height:
+            raise SettingError(
+                "representation.erp_height",
+                found=self.erp_height,
+                expected=f"at most the {height} rows of {files.rgb}",
+                remedy="Choose a lower level, or larger panoramas.",
+            )

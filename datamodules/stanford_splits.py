@@ -1,0 +1,143 @@
+"""Which pictures of Stanford2D3DS are for training, validation and test."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from datamodules.label_table import LabelTable
+from datamodules.segmentation_module import Split
+from datamodules.stanford_files import AREAS, FOLDS, GET_IT, PictureFiles
+from tangent_train.errors import DataError, SettingError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+__all__ = ["StanfordSplits"]
+
+_TABLE_NAME = "semantic_labels.json"
+
+
+class StanfordSplits:
+    """The three folds of the authors of the data set, with rooms for validation.
+
+    Validation pictures are those of whole rooms drawn from the training areas, so that nothing is
+    ever chosen by the test areas.
+
+    Args:
+        root: Folder with ``area_1`` … ``area_6``.
+        fold: 1, 2 or 3, see `FOLDS`.
+        areas: Areas to use, all of which must be there.
+        validation_fraction: Share of the training rooms for validation: at least one room, never
+            all; 0 for no validation.
+        seed: Chooses the validation rooms.
+        label_table: The class table, when it is not where the release has it.
+
+    Raises:
+        SettingError: A setting that cannot work.
+    """
+
+    def __init__(
+        self,
+        root: str | Path,
+        *,
+        fold: int = 1,
+        areas: Sequence[str] = AREAS,
+        validation_fraction: float = 0.1,
+        seed: int = 0,
+        label_table: str | Path | None = None,
+    ) -> None:
+        if fold not in FOLDS:
+            raise SettingError("data.fold", found=repr(fold), expected="1, 2 or 3")
+        if not 0 <= validation_fraction < 1:
+            raise SettingError(
+                "data.validation_fraction", found=validation_fraction, expected="0 to below 1"
+            )
+        testing = set(FOLDS[fold])
+        if not set(areas) <= set(AREAS) or not testing & set(areas) or set(areas) <= testing:
+            raise SettingError(
+                "data.areas",
+                found=list(areas),
+                expected=f"some of {', '.join(AREAS)}: for testing (fold {fold}: "
+                f"{', '.join(FOLDS[fold])}) and for training (others)",
+            )
+        self.root = Path(root)
+        self.areas = tuple(areas)
+        self._testing = testing
+        self._fraction = validation_fraction
+        self._seed = seed
+        self._label_table = None if label_table is None else Path(label_table)
+
+    def read_label_table(self) -> LabelTable:
+        """The class table, after a look at the folders.
+
+        Raises:
+            DataError: An area or the table is missing, or the table cannot be used.
+        """
+        if not self.root.is_dir():
+            raise DataError(
+                self.root, found="no such folder", expected="the data set", remedy=GET_IT
+            )
+        missing = [
+            f"area_{area}" for area in self.areas if not (self.root / f"area_{area}").is_dir()
+        ]
+        if missing:
+            raise DataError(
+                self.root,
+                found="no " + ", ".join(missing),
+                expected="all of " + ", ".join(f"area_{area}" for area in self.areas),
+                remedy=GET_IT,
+            )
+        return LabelTable.from_json(self._find_table())
+
+    def divide(
+        self, list_area: Callable[[str], list[PictureFiles]]
+    ) -> dict[Split, list[PictureFiles]]:
+        """The pictures of every split.
+
+        Args:
+            list_area: Gives those of an area.
+
+        Raises:
+            DataError: There is only one room to train on, and one is wanted for validation.
+        """
+        files = [picture for area in self.areas for picture in list_area(area)]
+        training = [picture for picture in files if picture.area not in self._testing]
+        rooms = self._choose_rooms(training)
+        return {
+            "train": [picture for picture in training if picture.room not in rooms],
+            "val": [picture for picture in training if picture.room in rooms],
+            "test": [picture for picture in files if picture.area in self._testing],
+        }
+
+    def _find_table(self) -> Path:
+        if self._label_table is not None:
+            return self._label_table
+        places = (self.root / _TABLE_NAME, self.root / "assets" / _TABLE_NAME)
+        for place in places:
+            if place.is_file():
+                return place
+        raise DataError(
+            places[0],
+            found="no class table",
+            expected=f"it there or at {places[1]}",
+            remedy="Copy it from the release (assets), or name it in data.label_table.",
+        )
+
+    def _choose_rooms(self, files: Sequence[PictureFiles]) -> set[tuple[str, str, int]]:
+        """Draw the rooms for validation, the same for the same seed."""
+        if self._fraction == 0:
+            return set()
+        rooms = sorted({picture.room for picture in files})
+        if len(rooms) == 1:
+            raise DataError(
+                self.root,
+                found="one training room",
+                expected="two or more, to keep some for validation",
+                remedy="Set data.validation_fraction=0, or use more rooms.",
+            )
+        count = min(max(1, round(self._fraction * len(rooms))), len(rooms) - 1)
+        order = np.random.default_rng(self._seed).permutation(len(rooms))
+        return {rooms[i] for i in order[:count]}
