@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import lightning
-import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
@@ -29,7 +28,7 @@ from tangent_train.cli.resume import check_resumed
 from tangent_train.cli.sweep import OBJECTIVE_FILE
 from tangent_train.errors import SettingError
 from tangent_train.files import write_text
-from tangent_train.rendering import Representation
+from tangent_train.rendering import Assembler
 from tangent_train.tasks.callbacks import PredictionPanels, ProgressBar
 from tangent_train.tasks.checkpoints import (
     AtomicCheckpointIO,
@@ -118,12 +117,9 @@ def prepare(config: DictConfig) -> None:
     """
     representation = instantiate(config.representation)
     data = instantiate(config.data, representation=representation)
-    data.make_files()
-    data.setup("fit")
-    data.setup("test")
-    data.prepare_store(whole=("train", "val", "test"))
+    data.prepare_all()
     counts = ", ".join(f"{len(data.open_split(s))} {s}" for s in ("train", "val", "test"))
-    _console().print(f"{data.root} is ready. Panoramas of fold {data.fold}: {counts}.")
+    _console().print(f"{data.root} is ready. {data.noun.capitalize()}: {counts}.")
 
 
 def build(config: DictConfig) -> tuple[Any, Any]:
@@ -185,10 +181,9 @@ def _completed(settings: Any, known: dict[str, int], *, restored: bool) -> Any:
     }
 
 
-def _try_network(task: Any, representation: Representation, channels: int) -> None:
+def _try_network(task: Any, representation: Assembler, channels: int) -> None:
     """Run the network on one empty image: what does not fit shows before any data is made."""
-    panorama = np.zeros((representation.erp_height, 2 * representation.erp_height), np.uint8)
-    size = representation.whole().render(panorama, "nearest").shape[1:]
+    size = representation.image_size
     probe = copy.deepcopy(task).to("meta").eval()  # shapes only: nothing is computed
     with torch.no_grad():
         try:
@@ -248,10 +243,10 @@ def _test(trainer: lightning.Trainer, task: Any, data: Any, checkpoint: Path, fo
             expected="the network and inputs of the checkpoint",
         ) from error
     trainer.test(task, datamodule=data, verbose=False)
-    results = evaluation_results(task.matrices, task.class_names, task.absent_class)
+    results = evaluation_results(task.matrices, task.class_names, task.absent_class, data.noun)
     total = len(data.source("test"))
-    if results["panoramas"] != total:
-        raise RuntimeError(f"{results['panoramas']} of {total} test panoramas were counted")
+    if results["images"] != total:
+        raise RuntimeError(f"{results['images']} of {total} test {data.noun} were counted")
     _report(results, checkpoint, folder)
 
 

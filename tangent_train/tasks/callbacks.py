@@ -15,13 +15,15 @@ from tangent_train.tasks.pictures import prediction_panel
 
 __all__ = ["PredictionPanels", "ProgressBar"]
 
+_PANORAMA_DIMENSIONS = 2
+
 
 class PredictionPanels(Callback):
-    """Writes pictures of test panoramas: input, truth, prediction, error.
+    """Writes pictures of test panoramas or photos: input, truth, prediction, error.
 
     Args:
         folder: Where to.
-        count: How many panoramas, spread over the test split.
+        count: How many of them, spread over the test split.
     """
 
     def __init__(self, folder: Path | str, count: int = 6) -> None:
@@ -43,12 +45,14 @@ class PredictionPanels(Callback):
             batch.index.tolist(), outputs, batch.target, strict=True
         ):
             if index in chosen:
-                panel = prediction_panel(
-                    source.read(index).rgb,
-                    target.cpu().numpy(),
-                    prediction.cpu().numpy(),
-                    pl_module.class_names,  # type: ignore[arg-type]
-                )
+                image: Any = source.read(index)
+                shown = image.rgb, target.cpu().numpy(), prediction.cpu().numpy()
+                if target.ndim > _PANORAMA_DIMENSIONS:  # crops of a photo, side by side
+                    crops = image.sampler(pl_module.representation).whole()
+                    rgb = crops.render(image.rgb, "bilinear")
+                    shown = np.hstack(rgb), np.hstack(shown[1]), np.hstack(shown[2])
+                class_names: Any = pl_module.class_names
+                panel = prediction_panel(*shown, class_names)
                 encoded = cv2.imencode(".png", cv2.cvtColor(panel, cv2.COLOR_RGB2BGR))[1]
                 name = source.name(index).replace("/", "_")
                 write_bytes(self.folder / f"{name}.png", encoded.tobytes())

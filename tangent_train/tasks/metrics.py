@@ -30,6 +30,8 @@ AbsentClass = Literal["skip", "zero"]
 BAND_EDGES_DEG = (90, 60, 30, 0, -30, -60, -90)
 """Latitude bands, from north to south."""
 
+_PANORAMA_DIMENSIONS = 2
+
 
 class SegmentationScores(NamedTuple):
     """Scores of one confusion matrix; classes in order, the unknown class left out.
@@ -82,38 +84,39 @@ class ConfusionMatrices(NamedTuple):
     """What `ConfusionMatrix` has counted; rows truth, columns prediction, class 0 unknown.
 
     Attributes:
-        erp: ``(K+1, K+1)`` pixels of the panoramas.
-        solid_angle: ``(K+1, K+1)`` steradians.
-        bands: ``(6, K+1, K+1)`` pixels of the latitude bands `BAND_EDGES_DEG`.
-        panoramas: Panoramas counted.
+        pixels: ``(K+1, K+1)`` pixels of panoramas and photos.
+        solid_angle: ``(K+1, K+1)`` steradians of panoramas; all 0 for photos.
+        bands: ``(6, K+1, K+1)`` pixels of the latitude bands `BAND_EDGES_DEG`, likewise.
+        images: Panoramas or photos counted.
     """
 
-    erp: NDArray[np.int64]
+    pixels: NDArray[np.int64]
     solid_angle: NDArray[np.float64]
     bands: NDArray[np.int64]
-    panoramas: int
+    images: int
 
 
 class ConfusionMatrix(Metric):
-    """Confusion matrices of panoramas: integer pixel counts by latitude, and solid angles.
+    """Confusion matrices: integer pixel counts, and of panoramas also by latitude and solid angle.
 
-    ERP pixels over-count the poles; the second matrix weighs every pixel by its solid angle.
-    Both are summed over processes.
+    ERP pixels over-count the poles; the matrix of solid angles weighs every pixel by its own.
+    All are summed over processes.
 
     Args:
         num_classes: K + 1, the unknown class 0 included.
 
     Attributes:
-        counts: ``(6, K+1, K+1)`` pixels per latitude band of 30°, north first; rows truth, columns
-            prediction.
+        pixels: ``(K+1, K+1)`` pixels; rows truth, columns prediction.
+        bands: ``(6, K+1, K+1)`` pixels per latitude band of 30°, north first.
         steradians: ``(K+1, K+1)`` the same over all latitudes, in steradians.
-        panoramas: Panoramas seen.
+        images: Panoramas and photos seen.
     """
 
     full_state_update = False
-    counts: Tensor
+    pixels: Tensor
+    bands: Tensor
     steradians: Tensor
-    panoramas: Tensor
+    images: Tensor
 
     def __init__(self, num_classes: int) -> None:
         super().__init__()
@@ -121,18 +124,19 @@ class ConfusionMatrix(Metric):
         bands = len(BAND_EDGES_DEG) - 1
         square = (num_classes, num_classes)
         for name, default in (
-            ("counts", torch.zeros((bands, *square), dtype=torch.int64)),
+            ("pixels", torch.zeros(square, dtype=torch.int64)),
+            ("bands", torch.zeros((bands, *square), dtype=torch.int64)),
             ("steradians", torch.zeros(square, dtype=torch.float64)),
-            ("panoramas", torch.zeros((), dtype=torch.int64)),
+            ("images", torch.zeros((), dtype=torch.int64)),
         ):
             self.add_state(name, default, dist_reduce_fx="sum")
 
     def update(
         self,
-        prediction: Integer[Tensor, "rows columns"],
-        truth: Integer[Tensor, "rows columns"],
+        prediction: Integer[Tensor, "*shape"],
+        truth: Integer[Tensor, "*shape"],
     ) -> None:
-        """Count one panorama.
+        """Count one panorama ``(H, W)``, or the crops of one photo ``(n, h, w)``.
 
         Args:
             prediction: Class indices.
@@ -147,28 +151,35 @@ class ConfusionMatrix(Metric):
             )
         k = self.num_classes
         known = truth != UNKNOWN
-        rows = known.nonzero()[:, 0]
         pairs = truth[known].long() * k + prediction[known].long()
         if pairs.numel() and (int(prediction[known].max()) >= k or int(truth.max()) >= k):
             raise SettingError("class index", found="one too large", expected=f"less than {k}")
-        height, width = truth.shape
+        self.images += 1
+        if truth.ndim == _PANORAMA_DIMENSIONS:
+            self._count_panorama(pairs, known)
+        else:
+            self.pixels += torch.bincount(pairs, minlength=k * k).reshape(k, k)
+
+    def _count_panorama(self, pairs: Tensor, known: Tensor) -> None:
+        k = self.num_classes
+        rows = known.nonzero()[:, 0]
+        height, width = known.shape
         latitudes = np.degrees(equirect_latitudes(height))
         band_of_row = np.searchsorted(-np.array(BAND_EDGES_DEG[1:-1]), -latitudes, side="left")
         # Integers first, sums of them after: the same figures in any order, on any device.
         by_row = torch.bincount(rows * k * k + pairs, minlength=height * k * k).reshape(
             height, k, k
         )
-        self.counts.index_add_(0, torch.as_tensor(band_of_row, device=truth.device), by_row)
-        angles = torch.as_tensor(equirect_solid_angles((height, width)), device=truth.device)
+        self.pixels += by_row.sum(dim=0)
+        self.bands.index_add_(0, torch.as_tensor(band_of_row, device=known.device), by_row)
+        angles = torch.as_tensor(equirect_solid_angles((height, width)), device=known.device)
         self.steradians += torch.tensordot(angles, by_row.double(), dims=1)
-        self.panoramas += 1
 
     def compute(self) -> ConfusionMatrices:
         """The matrices of all processes, as arrays."""
-        counts = self.counts.cpu().numpy()
         return ConfusionMatrices(
-            erp=counts.sum(axis=0),
+            pixels=self.pixels.cpu().numpy(),
             solid_angle=self.steradians.cpu().numpy(),
-            bands=counts,
-            panoramas=int(self.panoramas),
+            bands=self.bands.cpu().numpy(),
+            images=int(self.images),
         )

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from statistics import fmean, stdev
 from typing import Any
@@ -21,10 +21,18 @@ from tangent_train.errors import DataError
 from tangent_train.tasks.paper import CLASSES, PaperRow, paper_row
 from tangent_train.tasks.runs import RESULTS_FILE, Run
 
-__all__ = ["Figure", "Group", "group_runs"]
+__all__ = ["REAL", "Figure", "Group", "average", "check_classes", "group_runs"]
 
-_REAL = "datamodules.Stanford2D3DS"
-_FOLDED = (_REAL, "datamodules.SynthRooms")  # the latter in the former's areas
+REAL = "datamodules.Stanford2D3DS"
+"""The real data set of the paper's segmentation."""
+
+# Rooms are made in the areas of the real ones.
+_FOLDED = tuple(
+    f"datamodules.{name}{of_photos}"
+    for name in ("Stanford2D3DS", "SynthRooms")
+    for of_photos in ("", "Perspective")
+)
+_NO_BASE_LEVEL = {"CubemapRepresentation": "cubemap", "PerspectiveRepresentation": "photos"}
 
 _SAME_RUN = (
     "checkpoint",
@@ -123,9 +131,12 @@ class Group:
 
     @property
     def base_level(self) -> int | str:
-        """The base level b; ERP for equirectangular images."""
+        """The base level b; ERP for equirectangular images, and what else has none."""
         base_level = self.setting("representation.base_level")
-        return "ERP" if base_level is None else int(base_level)
+        if base_level is not None:
+            return int(base_level)
+        target = str(self.setting("representation._target_")).rpartition(".")[2]
+        return _NO_BASE_LEVEL.get(target, "ERP")
 
     @property
     def paper(self) -> PaperRow | None:
@@ -134,7 +145,7 @@ class Group:
         None for made rooms, whose figures say nothing about real ones, and for turned panoramas.
         """
         same_data = (
-            self.setting("data._target_") == _REAL
+            self.setting("data._target_") == REAL
             and self.setting("data.test_rotation") is None
             and self.class_names == CLASSES
         )
@@ -153,21 +164,32 @@ class Group:
             name: One of `runs.MEANS`, or of `runs.PER_CLASS` with a class.
             class_index: Which class.
         """
-        of_fold: dict[int | None, list[float]] = defaultdict(list)
-        for run in self.runs:
-            value = run.figure(name, class_index)
-            if value is not None:
-                of_fold[run.fold].append(value)
-        means = [fmean(values) for values in of_fold.values()]
-        several = [values for values in of_fold.values() if len(values) > 1]
-        freedom = sum(len(values) - 1 for values in several)
-        squares = sum((len(values) - 1) * stdev(values) ** 2 for values in several)
-        return Figure(
-            mean=fmean(means) if means else None,
-            over_folds=stdev(means) if len(means) > 1 else None,
-            over_seeds=(squares / freedom) ** 0.5 if freedom else None,
-            folds=len(means),
-        )
+        values = [(run.fold, run.figure(name, class_index)) for run in self.runs]
+        return average([(fold, value) for fold, value in values if value is not None])
+
+
+def average(values: Iterable[tuple[int | None, float]]) -> Figure:
+    """Mean over folds of the mean over seeds, with both spreads.
+
+    Args:
+        values: Fold and figure of each run that has the figure.
+
+    >>> average([(1, 0.25), (1, 0.75), (2, 1.0)]).mean
+    0.75
+    """
+    of_fold: dict[int | None, list[float]] = defaultdict(list)
+    for fold, value in values:
+        of_fold[fold].append(value)
+    means = [fmean(found) for found in of_fold.values()]
+    several = [found for found in of_fold.values() if len(found) > 1]
+    freedom = sum(len(found) - 1 for found in several)
+    squares = sum((len(found) - 1) * stdev(found) ** 2 for found in several)
+    return Figure(
+        mean=fmean(means) if means else None,
+        over_folds=stdev(means) if len(means) > 1 else None,
+        over_seeds=(squares / freedom) ** 0.5 if freedom else None,
+        folds=len(means),
+    )
 
 
 def group_runs(runs: Sequence[Run]) -> list[Group]:
@@ -182,14 +204,7 @@ def group_runs(runs: Sequence[Run]) -> list[Group]:
     Raises:
         DataError: Runs have different classes.
     """
-    for run in runs:
-        if run.class_names != runs[0].class_names:
-            raise DataError(
-                run.folder / RESULTS_FILE,
-                found=f"classes {', '.join(run.class_names)}",
-                expected=f"{', '.join(runs[0].class_names)}, as in {runs[0].folder / RESULTS_FILE}",
-                remedy="Report runs with different classes apart.",
-            )
+    check_classes(runs)
     members: dict[str, list[Run]] = defaultdict(list)
     for run in runs:
         members[json.dumps(_identity(run), sort_keys=True, default=str)].append(run)
@@ -198,6 +213,22 @@ def group_runs(runs: Sequence[Run]) -> list[Group]:
         Group(label, tuple(sorted(found, key=_order)))
         for label, found in zip(labels, members.values(), strict=True)
     ]
+
+
+def check_classes(runs: Sequence[Run]) -> None:
+    """Check that runs have the same classes.
+
+    Raises:
+        DataError: They have not.
+    """
+    for run in runs:
+        if run.class_names != runs[0].class_names:
+            raise DataError(
+                run.folder / RESULTS_FILE,
+                found=f"classes {', '.join(run.class_names)}",
+                expected=f"{', '.join(runs[0].class_names)}, as in {runs[0].folder / RESULTS_FILE}",
+                remedy="Report runs with different classes apart.",
+            )
 
 
 def _identity(run: Run) -> dict[str, Any]:

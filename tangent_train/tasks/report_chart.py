@@ -15,10 +15,11 @@ from tangent_train.tasks.report import Figure, Group
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["report_png"]
+__all__ = ["COLORS", "percents", "png_bytes", "report_png", "style_axes"]
 
-# Okabe and Ito's colours: told apart by people who do not see all colours.
-_COLORS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#999999")
+COLORS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#999999")
+"""Okabe and Ito's colours: told apart by people who do not see all colours."""
+
 _LABEL_LENGTH = 60
 
 
@@ -60,9 +61,35 @@ def report_png(groups: Sequence[Group]) -> bytes:
     means.set_title("All classes (± standard deviation over folds, else over seeds)", loc="left")
     handles, labels = means.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper left", frameon=False, ncols=2)
+    return png_bytes(figure, "tangent-report")
+
+
+def png_bytes(figure: Canvas, software: str) -> bytes:
+    """A picture as a PNG file.
+
+    Args:
+        figure: With a canvas.
+        software: Stands in the file.
+    """
     file = io.BytesIO()
-    figure.savefig(file, format="png", metadata={"Software": "tangent-report"})
+    figure.savefig(file, format="png", metadata={"Software": software})
     return file.getvalue()
+
+
+def style_axes(axes: Axes) -> None:
+    """Percent upwards, with light lines across."""
+    axes.set_ylim(0, 105)
+    axes.set_yticks(range(0, 101, 20))
+    axes.set_ylabel("%")
+    axes.margins(x=0.01)
+    axes.grid(axis="y", color="#dddddd")
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def percents(shares: Sequence[float | None]) -> list[float]:
+    """Shares of 1 in percent; NaN, which draws nothing, for None."""
+    return [np.nan if share is None else 100 * share for share in shares]
 
 
 def _bars(
@@ -79,11 +106,11 @@ def _bars(
         at = places + (k - (len(groups) - 1) / 2) * width
         axes.bar(
             at,
-            _percent([figure.mean for figure in row]),
+            percents([figure.mean for figure in row]),
             0.92 * width,
-            yerr=_percent([_spread(figure) for figure in row]),
-            color=_COLORS[k % len(_COLORS)],
-            hatch=("", "//", "..")[k // len(_COLORS) % 3],
+            yerr=percents([_spread(figure) for figure in row]),
+            color=COLORS[k % len(COLORS)],
+            hatch=("", "//", "..")[k // len(COLORS) % 3],
             label=_short(group),
             error_kw={"elinewidth": 1.2, "capsize": min(4.0, 14 * width), "ecolor": "#333333"},
         )
@@ -93,21 +120,11 @@ def _bars(
             axes.plot(at, marks, "D", ms=5.5, color="white", markeredgecolor="black", label=label)
             marked = True
     axes.set_xticks(places, ticks)
-    axes.set_ylim(0, 105)
-    axes.set_yticks(range(0, 101, 20))
-    axes.set_ylabel("%")
-    axes.margins(x=0.01)
-    axes.grid(axis="y", color="#dddddd")
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
+    style_axes(axes)
 
 
 def _spread(figure: Figure) -> float | None:
     return figure.over_seeds if figure.over_folds is None else figure.over_folds
-
-
-def _percent(shares: Sequence[float | None]) -> list[float]:
-    return [np.nan if share is None else 100 * share for share in shares]
 
 
 def _short(group: Group) -> str:

@@ -10,14 +10,22 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from rich.markup import escape
 from rich.table import Table
 
 from tangent_train.tasks.paper import CLASSES, STANFORD_ROWS, PaperRow
 from tangent_train.tasks.report import Figure, Group
+from tangent_train.tasks.report_cells import Cells, cell, line, markdown_table, terminal_table, text
 from tangent_train.tasks.runs import MEANS, PER_CLASS
 
-__all__ = ["MADE_BY", "notes", "report_csv", "report_json", "report_markdown", "report_tables"]
+__all__ = [
+    "MADE_BY",
+    "MADE_ROOMS",
+    "notes",
+    "report_csv",
+    "report_json",
+    "report_markdown",
+    "report_tables",
+]
 
 MADE_BY = "tangent-report"
 """Stands in the JSON file: the mark of a report."""
@@ -26,13 +34,13 @@ _LEGEND = (
     "Percent. Mean over folds of the mean over seeds; ± the sample standard deviation over folds, "
     "in brackets that over seeds within a fold. The paper's own rows are means over the 3 folds."
 )
-_MADE_ROOMS = "Made rooms: nothing here is comparable with figures on real data."
+MADE_ROOMS = "Made rooms: nothing here is comparable with figures on real data."
+"""Stands beside figures of `SynthRooms`."""
+
 _OVERALL = (
     "s", "method", "input", "b", "mAcc", "mIoU", "mAcc by solid angle", "mIoU by solid angle",
     "folds", "runs",
 )  # fmt: skip
-
-Cells = tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -82,13 +90,13 @@ def report_markdown(groups: Sequence[Group], remarks: Sequence[str]) -> str:
     for section in _sections(groups):
         lines += [f"## {section.title}", ""]
         lines += [section.remark, ""] if section.remark else []
-        lines += [*_markdown_table(section.overall, left=3), ""]
+        lines += [*markdown_table(section.overall, left=3), ""]
         for title, cells in section.per_class.items():
-            lines += [f"### {title}", "", *_markdown_table(cells, left=1), ""]
+            lines += [f"### {title}", "", *markdown_table(cells, left=1), ""]
     lines += [f"- {remark}" for remark in remarks]
     lines += ["", "| group | fold | seed | run |", "| --- | ---: | ---: | --- |"]
     lines += [
-        _line((group.label, _text(run.fold), _text(run.settings.get("seed")), str(run.folder)))
+        line((group.label, text(run.fold), text(run.settings.get("seed")), str(run.folder)))
         for group in groups
         for run in group.runs
     ]
@@ -101,16 +109,10 @@ def report_tables(groups: Sequence[Group]) -> list[Table]:
     Args:
         groups: From `report.group_runs`.
     """
-    tables = []
-    for section in _sections(groups):
-        table = Table(title=section.title, caption=section.remark or None)
-        header, *rows = section.overall
-        for k, name in enumerate(header):
-            table.add_column(name, justify="left" if k in {1, 2} else "right")
-        for row in rows:
-            table.add_row(*map(escape, row), style="dim" if row[1].endswith("(paper)") else None)
-        tables.append(table)
-    return tables
+    return [
+        terminal_table(section.title, section.overall, (1, 2), section.remark)
+        for section in _sections(groups)
+    ]
 
 
 def report_csv(groups: Sequence[Group]) -> str:
@@ -119,16 +121,16 @@ def report_csv(groups: Sequence[Group]) -> str:
     Args:
         groups: From `report.group_runs`.
     """
-    text = io.StringIO()
+    file = io.StringIO()
     columns = ["group", "data", "level", "base_level", "inputs", "runs", "class", "figure"]
     columns += ["mean", "over_folds", "over_seeds", "folds", "paper"]
-    writer = csv.DictWriter(text, columns, lineterminator="\n")
+    writer = csv.DictWriter(file, columns, lineterminator="\n")
     writer.writeheader()
     for group in groups:
         for class_name, name, figure, paper in _all_figures(group):
             row = {"group": group.label, "runs": len(group.runs), "class": class_name}
             writer.writerow(row | _facts(group) | {"figure": name, "paper": paper} | asdict(figure))
-    return text.getvalue()
+    return file.getvalue()
 
 
 def report_json(groups: Sequence[Group], remarks: Sequence[str]) -> str:
@@ -154,7 +156,7 @@ def report_json(groups: Sequence[Group], remarks: Sequence[str]) -> str:
                         "folder": str(run.folder),
                         "fold": run.fold,
                         "seed": run.settings.get("seed"),
-                        "panoramas": run.results.get("panoramas"),
+                        "images": run.images,
                     }
                     for run in group.runs
                 ],
@@ -194,7 +196,7 @@ def _sections(groups: Sequence[Group]) -> list[_Section]:
         of_data[group.data].append(group)
     sections = []
     for title, members in of_data.items():
-        made = str(members[0].setting("data._target_")).endswith(".SynthRooms")
+        made = ".SynthRooms" in str(members[0].setting("data._target_"))
         printed = _printed_rows(members)
         rows: list[PaperRow | Group] = [*printed, *members]
         ranked = sorted(rows, key=_level)
@@ -203,7 +205,7 @@ def _sections(groups: Sequence[Group]) -> list[_Section]:
             "IoU %": _per_class(ranked, members[0].class_names, "iou"),
         }
         overall = [_OVERALL, *map(_overall, ranked)]
-        sections.append(_Section(title, _MADE_ROOMS if made else "", overall, per_class))
+        sections.append(_Section(title, MADE_ROOMS if made else "", overall, per_class))
     return sections
 
 
@@ -220,15 +222,15 @@ def _level(row: PaperRow | Group) -> int:
 
 def _overall(row: PaperRow | Group) -> Cells:
     if isinstance(row, PaperRow):
-        figures = tuple(_text(figure) for figure in (row.macc, row.miou))
+        figures = tuple(text(figure) for figure in (row.macc, row.miou))
         start = (str(row.level), _method(row), row.inputs, str(row.base_level))
         return (*start, *figures, "", "", "3" if row.method == "Ours" else "", "")
     names = ("macc", "miou", "macc_solid_angle", "miou_solid_angle")
     folds = ", ".join(map(str, row.folds)) or "–"
     if row.missing_folds:
         folds += " only"
-    start = (_text(row.setting("level")), row.label, row.inputs, str(row.base_level))
-    return (*start, *(_cell(row.figure(n), row) for n in names), folds, str(len(row.runs)))
+    start = (text(row.setting("level")), row.label, row.inputs, str(row.base_level))
+    return (*start, *(cell(row.figure(n), _folds(row)) for n in names), folds, str(len(row.runs)))
 
 
 def _per_class(
@@ -237,7 +239,7 @@ def _per_class(
     cells: list[Cells] = [("method", *class_names)]
     for row in rows:
         if isinstance(row, Group):
-            cells.append((row.label, *(_cell(f, row) for f in _figures(row, name))))
+            cells.append((row.label, *(cell(f, _folds(row)) for f in _figures(row, name))))
         elif getattr(row, name) and tuple(class_names) == CLASSES:
             method = f"{_method(row)}, level {row.level}"
             cells.append((method, *(f"{figure:.1f}" for figure in getattr(row, name))))
@@ -256,31 +258,5 @@ def _method(row: PaperRow) -> str:
     return "tangent images (paper)" if row.method == "Ours" else f"{row.method} (paper)"
 
 
-def _cell(figure: Figure, group: Group) -> str:
-    if figure.mean is None:
-        return "–"
-    text = f"{100 * figure.mean:.1f}"
-    if figure.over_folds is not None:
-        text += f" ± {100 * figure.over_folds:.1f}"
-    if figure.over_seeds is not None:
-        text += f" (± {100 * figure.over_seeds:.1f})"
-    lacking = figure.folds < _folds(group)
-    return text + (f" of {figure.folds}" if lacking else "")
-
-
 def _share(percent: float | None) -> float | None:
     return None if percent is None else percent / 100
-
-
-def _text(value: object) -> str:
-    return "–" if value is None else str(value)
-
-
-def _markdown_table(rows: Sequence[Cells], left: int) -> list[str]:
-    header, *others = rows
-    rule = ["---" if k < left else "---:" for k in range(len(header))]
-    return [_line(cells) for cells in (header, rule, *others)]
-
-
-def _line(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(cell.replace("|", r"\|") for cell in cells) + " |"

@@ -26,7 +26,10 @@ _COLUMNS = ("class", "iou", "accuracy", "iou_solid_angle", "accuracy_solid_angle
 
 
 def evaluation_results(
-    matrices: ConfusionMatrices, class_names: Sequence[str], absent_class: AbsentClass
+    matrices: ConfusionMatrices,
+    class_names: Sequence[str],
+    absent_class: AbsentClass,
+    noun: str = "panoramas",
 ) -> dict[str, Any]:
     """All figures of an evaluation, as plain values.
 
@@ -34,22 +37,24 @@ def evaluation_results(
         matrices: What was counted.
         class_names: K + 1 names, the unknown class first.
         absent_class: What absent classes do to the means.
+        noun: What was scored, in the plural. Photos have neither solid angles nor latitude bands.
 
     Returns:
         Means, per-class and per-band figures, the confusion matrix; shares of 1, not percent, and
         None for what is not defined.
     """
-    erp = segmentation_scores(matrices.erp, absent_class)
-    solid = segmentation_scores(matrices.solid_angle, absent_class)
+    pixels = segmentation_scores(matrices.pixels, absent_class)
+    on_sphere = matrices.solid_angle.any()
+    solid = segmentation_scores(matrices.solid_angle, absent_class if on_sphere else "skip")
     per_class = [
         dict(zip(_COLUMNS, (name, *map(_plain, figures)), strict=True))
         for name, *figures in zip(
             class_names[1:],
-            erp.iou,
-            erp.accuracy,
+            pixels.iou,
+            pixels.accuracy,
             solid.iou,
             solid.accuracy,
-            erp.share,
+            pixels.share,
             strict=True,
         )
     ]
@@ -65,17 +70,19 @@ def evaluation_results(
             (segmentation_scores(band, absent_class) for band in matrices.bands),
             strict=True,
         )
+        if on_sphere
     ]
     return {
-        "panoramas": matrices.panoramas,
-        "miou": _plain(erp.miou),
-        "macc": _plain(erp.macc),
+        "images": matrices.images,
+        "noun": noun,
+        "miou": _plain(pixels.miou),
+        "macc": _plain(pixels.macc),
         "miou_solid_angle": _plain(solid.miou),
         "macc_solid_angle": _plain(solid.macc),
         "absent_class": absent_class,
         "classes": per_class,
         "latitude_bands": bands,
-        "confusion": matrices.erp.tolist(),
+        "confusion": matrices.pixels.tolist(),
     }
 
 
@@ -101,7 +108,7 @@ def results_table(results: dict[str, Any]) -> Table:
     Args:
         results: From `evaluation_results`.
     """
-    table = Table(title=f"{results['panoramas']} panoramas")
+    table = Table(title=_counted(results))
     header, *rows = _rows(results)
     for k, name in enumerate(header):
         table.add_column(name, justify="right" if k else "left")
@@ -123,14 +130,19 @@ def _rows(results: dict[str, Any]) -> list[tuple[str, ...]]:
 
 def _markdown(results: dict[str, Any]) -> str:
     header, *rows = _rows(results)
-    lines = [f"# Results over {results['panoramas']} panoramas", "", _line(header)]
+    lines = [f"# Results over {_counted(results)}", "", _line(header)]
     lines += [_line(["---"] + ["---:"] * (len(header) - 1)), *map(_line, rows), ""]
-    lines += ["| latitude | mIoU % | mAcc % |", "| --- | ---: | ---: |"]
+    if results["latitude_bands"]:
+        lines += ["| latitude | mIoU % | mAcc % |", "| --- | ---: | ---: |"]
     for band in results["latitude_bands"]:
         south, north = band["latitude_deg"]
         figures = (_percent(band["miou"]), _percent(band["macc"]))
         lines.append(_line((f"{south}° … {north}°", *figures)))
     return "\n".join(lines) + "\n"
+
+
+def _counted(results: dict[str, Any]) -> str:
+    return f"{results['images']} {results['noun']}"
 
 
 def _line(cells: Sequence[str]) -> str:

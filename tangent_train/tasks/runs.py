@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,7 @@ from tangent_train.errors import DataError
 
 __all__ = [
     "MEANS",
+    "PER_BAND",
     "PER_CLASS",
     "RESULTS_FILE",
     "Run",
@@ -30,6 +32,9 @@ MEANS = ("miou", "macc", "miou_solid_angle", "macc_solid_angle")
 
 PER_CLASS = ("iou", "accuracy", "iou_solid_angle", "accuracy_solid_angle")
 """Figures of a class, likewise."""
+
+PER_BAND = ("miou", "macc")
+"""Figures of a band of latitude, likewise."""
 
 
 @dataclass(frozen=True)
@@ -57,11 +62,47 @@ class Run:
         """The classes of its results."""
         return tuple(entry["class"] for entry in self.results["classes"])
 
-    def figure(self, name: str, class_index: int | None = None) -> float | None:
-        """A figure of all classes, or of one; a share of 1, None where it is not defined."""
-        source = self.results if class_index is None else self.results["classes"][class_index]
+    @property
+    def images(self) -> int | None:
+        """How many panoramas or photos were scored."""
+        results = self.results
+        images = results.get("images", results.get("panoramas"))  # the latter up to 0.1.0
+        return None if images is None else int(images)
+
+    @property
+    def bands(self) -> tuple[tuple[float, float], ...]:
+        """Its bands of latitude, (south, north) in degrees; none for photos."""
+        return tuple(_edges(entry) for entry in self.results.get("latitude_bands") or ())
+
+    def figure(
+        self,
+        name: str,
+        class_index: int | None = None,
+        band: tuple[float, float] | None = None,
+    ) -> float | None:
+        """A figure of all classes, of one, or of a band of latitude.
+
+        Args:
+            name: One of `MEANS`, of `PER_CLASS` with a class, of `PER_BAND` with a band.
+            class_index: Which class.
+            band: Which band, as in `bands`.
+
+        Returns:
+            A share of 1; None where it is not defined, or there is no such band.
+        """
+        source: Mapping[str, Any] = self.results
+        if class_index is not None:
+            source = self.results["classes"][class_index]
+        elif band is not None:
+            entries = self.results.get("latitude_bands") or ()
+            source = next((entry for entry in entries if _edges(entry) == band), {name: None})
         value = source[name]
-        return None if value is None else float(value)
+        return None if value is None or math.isnan(value) else float(value)
+
+
+def _edges(band: Mapping[str, Any]) -> tuple[float, float]:
+    south, north = band["latitude_deg"]
+    return float(south), float(north)
 
 
 def find_runs(folders: Sequence[Path]) -> list[Path]:
@@ -132,6 +173,9 @@ def _results(path: Path) -> dict[str, Any]:
         for entry in results["classes"]:
             str(entry["class"])
             figures += [entry[name] for name in PER_CLASS]
+        for entry in results.get("latitude_bands") or ():  # photos have none
+            _edges(entry)
+            figures += [entry[name] for name in PER_BAND]
     except (OSError, ValueError) as error:
         raise DataError(path, found=_first_line(error), expected=expected) from error
     except KeyError as error:

@@ -1,4 +1,4 @@
-"""Semantic segmentation of panoramas."""
+"""Semantic segmentation of panoramas and photos."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
 from tangent_train.errors import SettingError
-from tangent_train.rendering import Representation
+from tangent_train.rendering import Assembler
 from tangent_train.tasks.losses import cross_entropy_norm, cross_entropy_sum
 from tangent_train.tasks.metrics import AbsentClass, ConfusionMatrix, segmentation_scores
 
@@ -22,7 +22,7 @@ __all__ = ["SegmentationTask"]
 
 
 class SegmentationTask(lightning.LightningModule):
-    """Trains a network on views of panoramas and scores it on the panoramas.
+    """Trains a network on views of panoramas, or on crops of photos, and scores it on the whole.
 
     The views of all panoramas of a batch, on all processes, make one gradient (paper, supplement,
     "Semantic segmentation"): the loss is the sum over their labelled pixels divided by the sum of
@@ -53,7 +53,7 @@ class SegmentationTask(lightning.LightningModule):
     def __init__(
         self,
         network: nn.Module,
-        representation: Representation,
+        representation: Assembler,
         class_names: Sequence[str],
         optimizer: Callable[..., Optimizer],
         scheduler: Callable[..., LRScheduler] | None = None,
@@ -138,7 +138,7 @@ class SegmentationTask(lightning.LightningModule):
             planned = getattr(config.scheduler, "total_steps", steps)
             if planned != steps:
                 raise SettingError(
-                    "trainer.max_epochs, trainer.devices and data.panoramas_per_step",
+                    "trainer.max_epochs, trainer.devices and data.…_per_step",
                     found=f"{steps} steps of training",
                     expected=f"{planned}, which the schedule of the resumed run was made for",
                     remedy="Resume with the same, or start a new run.",
@@ -183,17 +183,17 @@ class SegmentationTask(lightning.LightningModule):
         return total / norm
 
     @torch.no_grad()
-    def predict_panorama(
-        self, images: Float[Tensor, "images channels height width"], shape: tuple[int, int]
-    ) -> Integer[Tensor, "rows columns"]:
-        """Class index (never unknown) of every pixel of one panorama.
+    def predict_labels(
+        self, images: Float[Tensor, "images channels height width"], shape: tuple[int, ...]
+    ) -> Integer[Tensor, ...]:
+        """Class index (never unknown) of every pixel of one panorama, or of the crops of a photo.
 
         Args:
-            images: The representation's views of the whole sphere.
-            shape: ``(H, W)`` of the panorama.
+            images: The representation's views of the whole.
+            shape: Of the truth: ``(H, W)`` of the panorama, or ``(n, h, w)`` of the crops.
 
         Returns:
-            ``(H, W)`` class indices 1 … K.
+            Class indices 1 … K of that shape.
         """
         size = self.images_per_forward
         parts = [images[start : start + size] for start in range(0, len(images), size)]
@@ -201,9 +201,9 @@ class SegmentationTask(lightning.LightningModule):
         return self.representation.to_labels(scores, shape) + 1
 
     def _evaluate(self, batch: Any) -> Tensor:
-        """Score a batch of panoramas; returns the predictions."""
+        """Score a batch of panoramas or photos; returns the predictions."""
         predictions = [
-            self.predict_panorama(images, (target.shape[0], target.shape[1]))
+            self.predict_labels(images, tuple(target.shape))
             for images, target in zip(batch.images, batch.target, strict=True)
         ]
         for prediction, target in zip(predictions, batch.target, strict=True):
@@ -211,11 +211,11 @@ class SegmentationTask(lightning.LightningModule):
         return torch.stack(predictions)
 
     def validation_step(self, batch: Any, batch_idx: int) -> None:
-        """Score panoramas."""
+        """Score panoramas or photos."""
         self._evaluate(batch)
 
     def test_step(self, batch: Any, batch_idx: int) -> Tensor:
-        """Score panoramas and hand the predictions to the callbacks."""
+        """Score panoramas or photos and hand the predictions to the callbacks."""
         return self._evaluate(batch)
 
     def on_validation_epoch_end(self) -> None:
@@ -229,10 +229,10 @@ class SegmentationTask(lightning.LightningModule):
     def _log_scores(self, stage: str) -> None:
         self.matrices = self.confusion.compute()
         self.confusion.reset()
-        scores = {
-            "": segmentation_scores(self.matrices.erp, self.absent_class),
-            "_solid_angle": segmentation_scores(self.matrices.solid_angle, self.absent_class),
-        }
+        scores = {"": segmentation_scores(self.matrices.pixels, self.absent_class)}
+        if self.matrices.solid_angle.any():
+            score = segmentation_scores(self.matrices.solid_angle, self.absent_class)
+            scores["_solid_angle"] = score
         for suffix, score in scores.items():
             on_bar = stage == "val" and not suffix
             # Every process has the same number: the mean over processes changes nothing.

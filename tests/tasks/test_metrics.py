@@ -31,7 +31,7 @@ def test_scores_equal_plain_numpy_over_the_whole_data_set() -> None:
     prediction = np.concatenate([p.ravel() for p, _ in pairs])
     truth = np.concatenate([t.ravel() for _, t in pairs])
     prediction, truth = prediction[truth > 0], truth[truth > 0]
-    scores = segmentation_scores(_counted(pairs).compute().erp)
+    scores = segmentation_scores(_counted(pairs).compute().pixels)
     for k in range(1, CLASSES):
         hits = np.sum((prediction == k) & (truth == k))
         union = np.sum((prediction == k) | (truth == k))
@@ -46,14 +46,14 @@ def test_iou_equals_torchmetrics() -> None:
     reference = JaccardIndex("multiclass", num_classes=CLASSES, ignore_index=0, average="none")
     for prediction, truth in _panoramas():
         reference.update(torch.from_numpy(prediction), torch.from_numpy(truth))
-    scores = segmentation_scores(_counted(_panoramas()).compute().erp)
+    scores = segmentation_scores(_counted(_panoramas()).compute().pixels)
     np.testing.assert_allclose(scores.iou, reference.compute()[1:].numpy(), rtol=1e-6)
 
 
 def test_the_mean_is_over_the_data_set_not_over_panoramas() -> None:
     pairs = _panoramas()
-    single = [segmentation_scores(_counted([pair]).compute().erp).miou for pair in pairs]
-    whole = segmentation_scores(_counted(pairs).compute().erp).miou
+    single = [segmentation_scores(_counted([pair]).compute().pixels).miou for pair in pairs]
+    whole = segmentation_scores(_counted(pairs).compute().pixels).miou
     assert abs(whole - np.mean(single)) > 1e-3
 
 
@@ -84,7 +84,7 @@ def test_solid_angle_weighs_a_hemisphere_as_half_whatever_its_rows() -> None:
     matrices = metric.compute()
     share = matrices.solid_angle.diagonal()[1:] / (4 * np.pi)
     np.testing.assert_allclose(share, [(1 + np.sqrt(0.5)) / 2, (1 - np.sqrt(0.5)) / 2], rtol=1e-12)
-    np.testing.assert_array_equal(matrices.erp.diagonal()[1:], [3 * 64 * 32, 64 * 32])
+    np.testing.assert_array_equal(matrices.pixels.diagonal()[1:], [3 * 64 * 32, 64 * 32])
 
 
 def test_latitude_bands_go_from_north_to_south() -> None:
@@ -100,12 +100,12 @@ def test_latitude_bands_go_from_north_to_south() -> None:
 def test_matrices_add_up_over_processes_and_reset() -> None:
     pairs = _panoramas()
     parts = [_counted(pairs[:1]), _counted(pairs[1:])]
-    total = sum(part.compute().erp for part in parts)
+    total = sum(part.compute().pixels for part in parts)
     whole = _counted(pairs)
-    np.testing.assert_array_equal(whole.compute().erp, total)
-    assert whole.compute().panoramas == 3
+    np.testing.assert_array_equal(whole.compute().pixels, total)
+    assert whole.compute().images == 3
     whole.reset()
-    assert int(whole.counts.sum()) == int(whole.panoramas) == 0
+    assert int(whole.pixels.sum()) == int(whole.images) == 0
 
 
 def test_bad_input_is_refused() -> None:
@@ -120,5 +120,5 @@ def test_an_all_unknown_panorama_counts_as_seen_and_adds_nothing() -> None:
     metric = ConfusionMatrix(3)
     unknown = torch.zeros(4, 8, dtype=torch.int64)
     metric.update(unknown + 1, unknown)
-    assert metric.compute().erp.sum() == 0
-    assert metric.compute().panoramas == 1
+    assert metric.compute().pixels.sum() == 0
+    assert metric.compute().images == 1

@@ -66,7 +66,7 @@ def _write(
     present = [value for value in iou if value is not None]
     mean = sum(present) / len(present)
     results = {
-        "panoramas": 5,
+        "images": 5,
         **dict.fromkeys(("miou", "macc", "miou_solid_angle", "macc_solid_angle"), mean),
         "absent_class": "skip",
         "classes": [
@@ -343,3 +343,81 @@ def test_a_folder_without_runs_is_an_error(tmp_path: Path) -> None:
         find_runs([tmp_path])
     with pytest.raises(DataError, match="no such folder"):
         find_runs([tmp_path / "nowhere"])
+
+
+def _with_bands(folder: Path, bands: object) -> Path:
+    _write(folder, [0.1, 0.2, 0.3])
+    results = json.loads((folder / "results.json").read_text())
+    results["latitude_bands"] = bands
+    (folder / "results.json").write_text(json.dumps(results))
+    return folder
+
+
+def test_bands_of_latitude_are_read_and_photos_have_none(tmp_path: Path) -> None:
+    bands = [
+        {"latitude_deg": [75, 90], "miou": 0.5, "macc": None},
+        {"latitude_deg": [60, 75], "miou": 0.25, "macc": 0.75},
+    ]
+    run = load_run(_with_bands(tmp_path / "a", bands))
+    assert run.bands == ((75.0, 90.0), (60.0, 75.0))
+    assert run.figure("miou", band=(60.0, 75.0)) == 0.25
+    assert run.figure("macc", band=(75.0, 90.0)) is None
+    assert run.figure("miou", band=(0.0, 15.0)) is None
+    nothing: dict[str, object] = {"empty": [], "null": None}
+    for name, none in nothing.items():
+        photos = load_run(_with_bands(tmp_path / name, none))
+        assert photos.bands == ()
+        assert photos.figure("miou", band=(75.0, 90.0)) is None
+    assert load_run(_write(tmp_path / "b", [0.1, 0.2, 0.3])).bands == ()
+
+
+@pytest.mark.parametrize(
+    ("bands", "message"),
+    [
+        ([{"latitude_deg": [75, 90], "miou": 0.5}], "no 'macc'"),
+        ([{"latitude_deg": [75], "miou": 0.5, "macc": 0.5}], "ValueError"),
+        ([{"latitude_deg": [75, 90], "miou": 50, "macc": 0.5}], "shares of 1"),
+        (5, "other lists"),
+        ({"a": 1}, "other lists"),
+    ],
+)
+def test_broken_bands_are_named(bands: object, message: str, tmp_path: Path) -> None:
+    folder = _with_bands(tmp_path / "a", bands)
+    with pytest.raises(DataError, match=rf"a/results\.json: .*{message}"):
+        load_run(folder)
+
+
+def test_photos_and_cubemaps_are_named_and_have_folds(tmp_path: Path) -> None:
+    ways = {
+        "photos": ("datamodules.SynthRoomsPerspective", "rendering.PerspectiveRepresentation"),
+        "cubemap": ("datamodules.Stanford2D3DS", "rendering.CubemapRepresentation"),
+        "ERP": ("datamodules.Stanford2D3DS", "rendering.EquirectRepresentation"),
+    }
+    for name, (data, representation) in ways.items():
+        settings: dict[str, Any] = {
+            "data___target_": data,
+            "representation___target_": representation,
+        }
+        folder = _write(
+            tmp_path / name, [0.1, 0.2, 0.3], representation__base_level=None, **settings
+        )
+        (group,) = _groups(folder)
+        assert group.base_level == name
+        assert group.missing_folds == (2, 3)
+        assert group.paper is None
+        made = "nothing here is comparable" in report_markdown([group], [])
+        assert made == ("SynthRooms" in data)
+
+
+def test_reports_say_how_many_images_were_scored(tmp_path: Path) -> None:
+    """Also of results that were written before photos were scored, with another name for it."""
+    folder = _write(tmp_path / "a", [0.1, 0.2, 0.3])
+    written = json.loads(report_json(_groups(folder), []))["groups"][0]["runs"][0]
+    assert written["images"] == 5
+    results = json.loads((folder / "results.json").read_text())
+    results["panoramas"] = results.pop("images")
+    (folder / "results.json").write_text(json.dumps(results))
+    assert load_run(folder).images == 5
+    del results["panoramas"]
+    (folder / "results.json").write_text(json.dumps(results))
+    assert load_run(folder).images is None

@@ -29,7 +29,7 @@ def test_results_are_plain_and_complete(tmp_path: Path) -> None:
     write_results(results, tmp_path)
     read = json.loads((tmp_path / "results.json").read_text())
     assert read == results
-    assert read["panoramas"] == 7
+    assert read["images"] == 7
     assert read["macc"] == (0.9 + 0.5) / 2
     assert read["miou"] == (90 / 150 + 50 / 110) / 2
     assert [c["class"] for c in read["classes"]] == ["wall", "floor", "sofa"]

@@ -100,10 +100,10 @@ def test_evaluation_scores_every_panorama_against_its_own_labels(
     task = _task(SignNetwork(), representation, images_per_forward=7)
     trainer = _trainer()
     (figures,) = trainer.test(task, datamodule=Data(representation), verbose=False)
-    assert task.matrices.panoramas == 3
-    assert task.matrices.erp[0].sum() == 0, "unknown truth counts for nothing"
-    assert task.matrices.erp[:, 0].sum() == 0, "unknown is never predicted"
-    assert task.matrices.erp.sum() == 3 * 30 * 64
+    assert task.matrices.images == 3
+    assert task.matrices.pixels[0].sum() == 0, "unknown truth counts for nothing"
+    assert task.matrices.pixels[:, 0].sum() == 0, "unknown is never predicted"
+    assert task.matrices.pixels.sum() == 3 * 30 * 64
     assert figures["test/miou"] > 0.75
 
 
