@@ -27,6 +27,9 @@ __all__ = ["PerspectiveRepresentation", "PhotoCrops", "PhotoSampler"]
 Crops = Literal["grid", "center"]
 """Where the crops of an evaluation are: all over the photo, or one in the middle."""
 
+_NEGLIGIBLE = 1e-6
+"""Of a crop's side: it need not be covered by another one."""
+
 
 @dataclass(frozen=True)
 class PhotoCrops:
@@ -113,7 +116,7 @@ class PhotoSampler:
             return self._crops(np.clip(np.zeros((1, 2)), least, greatest))
         focal = np.diag(self.camera_matrix)[:2]
         extent = 2 * focal * math.tan(math.radians(self.representation.fov_deg) / 2)
-        count = 1 + np.ceil((greatest - least) / extent - 1e-9).astype(int)
+        count = 1 + np.ceil((greatest - least) / extent - _NEGLIGIBLE).astype(int)
         across, down = (
             np.linspace(a, b, n) if n > 1 else np.clip([0.0], a, b)
             for a, b, n in zip(least, greatest, count, strict=True)

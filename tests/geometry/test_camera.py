@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -163,3 +164,44 @@ def test_image_too_small_either_way_is_refused(size: tuple[int, int]) -> None:
 def test_shift_out_of_the_image_is_refused(shift: Any) -> None:
     with pytest.raises(SettingError, match="shift: found"):
         normalize_camera(K, SIZE, shift=shift)
+
+
+@pytest.mark.parametrize("dim", [128, (96, 160), (120, 64)])
+@pytest.mark.parametrize("share", [(0.0, 0.0), (1.0, 1.0), (0.3, 0.8)])
+def test_normalisation_is_opencvs_undistortion_without_distortion(
+    dim: int | tuple[int, int], share: tuple[float, float]
+) -> None:
+    fov_deg = 20.0
+    height, width = (dim, dim) if isinstance(dim, int) else dim
+    least, greatest = shift_range(K, SIZE, fov_deg, dim)
+    shift = least + np.array(share) * (greatest - least)
+    matrix, homography = normalize_camera(K, SIZE, fov_deg, dim, (shift[0], shift[1]))
+    moved = K.copy()
+    moved[:2, 2] += shift
+    x, y = cv2.initUndistortRectifyMap(
+        moved, np.zeros(5), np.eye(3), matrix, (width, height), cv2.CV_32FC1
+    )
+    pixels = np.stack([*np.meshgrid(np.arange(width), np.arange(height)), np.ones((height, width))])
+    old = np.einsum("ij,jhw->ihw", np.linalg.inv(homography), pixels)
+    np.testing.assert_allclose(old[0], x, atol=1e-4)
+    np.testing.assert_allclose(old[1], y, atol=1e-4)
+
+
+def test_crops_that_are_not_square_have_square_pixels_and_touch_the_border() -> None:
+    dim = (60, 140)  # height, width: mistake 5 of the released code swaps them
+    matrix = normalize_camera(K, SIZE, 30.0, dim).camera_matrix
+    focal = 140 / (2 * math.tan(math.radians(15)))
+    np.testing.assert_allclose(matrix, [[focal, 0, 69.5], [0, focal, 29.5], [0, 0, 1.0]])
+    least, greatest = shift_range(K, SIZE, 30.0, dim)
+    for shift, edge, border in (
+        (least, (-0.5, -0.5), (-0.5, -0.5)),
+        (greatest, (139.5, 59.5), (SIZE[1] - 0.5, SIZE[0] - 0.5)),
+    ):
+        old_from_new = np.linalg.inv(normalize_camera(K, SIZE, 30.0, dim, tuple(shift)).homography)
+        np.testing.assert_allclose(old_from_new @ np.array([*edge, 1]), [*border, 1], atol=1e-9)
+
+
+def test_a_crop_too_high_for_the_image_is_refused_though_it_is_narrow_enough() -> None:
+    shift_range(K, SIZE, 40.0, (100, 100))
+    with pytest.raises(SettingError, match=r"found 40° × 72\.1° for an image that spans"):
+        shift_range(K, SIZE, 40.0, (200, 100))
