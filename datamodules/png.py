@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-__all__ = ["PngHeader", "read_color_png", "read_depth_png", "read_png_header"]
+__all__ = ["PngHeader", "read_color_png", "read_depth_png", "read_png", "read_png_header"]
 
 _START = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR"
 _HEADER_BYTES = 26  # the signature, IHDR's length and name, then its first ten bytes
@@ -78,7 +78,7 @@ def read_color_png(path: Path) -> NDArray[np.uint8]:
     Raises:
         DataError: The file is broken.
     """
-    return cv2.cvtColor(_decode(path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+    return cv2.cvtColor(read_png(path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
 
 
 def read_depth_png(path: Path) -> NDArray[np.uint16]:
@@ -87,10 +87,19 @@ def read_depth_png(path: Path) -> NDArray[np.uint16]:
     Raises:
         DataError: The file is broken.
     """
-    return _decode(path, cv2.IMREAD_ANYDEPTH)
+    return read_png(path, cv2.IMREAD_ANYDEPTH)
 
 
-def _decode(path: Path, flags: int) -> NDArray[Any]:
+def read_png(path: Path, flags: int) -> NDArray[Any]:
+    """Decode an image as OpenCV does: blue first.
+
+    Args:
+        path: The file.
+        flags: Of `cv2.imdecode`.
+
+    Raises:
+        DataError: The file is broken.
+    """
     # Decoding from memory keeps "cannot open" and "cannot decode" apart, and any path works.
     try:
         content = np.frombuffer(path.read_bytes(), np.uint8)

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from datamodules.panoramas import STEPS_PER_M
+from datamodules.png import read_png
 from datamodules.samples import RGBD_NORMALIZATION, Normalization
 from tangent_train.errors import DataError
 
@@ -73,15 +74,7 @@ def read_first_channel(path: Path) -> NDArray[Any]:
     Raises:
         DataError: The file is broken.
     """
-    # From memory: any path works, and "cannot open" is told apart from "cannot decode".
-    remedy = "Copy or extract the file again."
-    try:
-        content = np.frombuffer(path.read_bytes(), np.uint8)
-    except OSError as error:
-        raise DataError(path, found=error, expected="a PNG file", remedy=remedy) from error
-    image = cv2.imdecode(content, cv2.IMREAD_UNCHANGED) if content.size else None
-    if image is None:
-        raise DataError(path, found="a broken PNG", expected="one that decodes", remedy=remedy)
+    image = read_png(path, cv2.IMREAD_UNCHANGED)
     # OpenCV's order is blue, green, red, and perhaps alpha.
     return image if image.ndim == 2 else cv2.extractChannel(image, 2)
 

@@ -122,3 +122,15 @@ def test_an_all_unknown_panorama_counts_as_seen_and_adds_nothing() -> None:
     metric.update(unknown + 1, unknown)
     assert metric.compute().pixels.sum() == 0
     assert metric.compute().images == 1
+
+
+def test_photos_are_counted_like_panoramas_without_latitudes_and_solid_angles() -> None:
+    rng = np.random.default_rng(5)
+    prediction, truth = rng.integers(1, CLASSES, (3, 8, 8)), rng.integers(0, CLASSES, (3, 8, 8))
+    photo = _counted([(prediction, truth)]).compute()
+    as_one = _counted([(np.hstack(prediction), np.hstack(truth))]).compute()
+    np.testing.assert_array_equal(photo.pixels, as_one.pixels)
+    assert photo.images == 1, "three crops of one photo"
+    assert not photo.solid_angle.any()
+    assert not photo.bands.any()
+    assert as_one.solid_angle.any()

@@ -58,3 +58,17 @@ def test_the_table_shows_every_class_and_the_mean() -> None:
     text = console.export_text()
     for word in ("7 panoramas", "wall", "60.0", "sofa", "–", "mean", "52.7"):
         assert word in text
+
+
+def test_photos_have_neither_solid_angles_nor_latitudes(tmp_path: Path) -> None:
+    matrices = _matrices()._replace(
+        solid_angle=np.zeros((4, 4)), bands=np.zeros((6, 4, 4), np.int64)
+    )
+    results = evaluation_results(matrices, NAMES, "zero", "photos")
+    assert (results["miou_solid_angle"], results["classes"][0]["iou_solid_angle"]) == (None, None)
+    assert results["latitude_bands"] == []
+    write_results(results, tmp_path)
+    text = (tmp_path / "results.md").read_text()
+    assert text.startswith("# Results over 7 photos\n")
+    assert "latitude" not in text
+    assert "| wall | 60.0 | 90.0 | – | – | 50.0 |" in text
