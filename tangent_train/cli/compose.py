@@ -1,4 +1,4 @@
-"""Finding, checking and restoring configs, before anything heavy is imported."""
+"""Finding configs and checking overrides, before anything heavy is imported."""
 
 from __future__ import annotations
 
@@ -8,28 +8,35 @@ from typing import TYPE_CHECKING, Any
 
 from hydra import compose, initialize_config_dir
 from hydra._internal.utils import get_args_parser
-from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
-from hydra.errors import MissingConfigException, OverrideParseException
+from hydra.errors import (
+    ConfigCompositionException,
+    MissingConfigException,
+    OverrideParseException,
+)
 from omegaconf import DictConfig, OmegaConf
 
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import SettingError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from argparse import Namespace
+    from collections.abc import Iterator, Sequence
 
     from hydra.core.config_loader import ConfigLoader
 
-__all__ = ["check_overrides", "checkpoint_config", "config_folder", "with_stored_config"]
+__all__ = ["STORED", "check_overrides", "compose_option", "config_folder", "search_path"]
 
-
-_STORED = "stored_"
+STORED = "stored_"
 """Begins the names of configs that come from a run or a checkpoint."""
 
 _PLUGINS = {"hydra/launcher/": "hydra-submitit-launcher", "hydra/sweeper/": "hydra-optuna-sweeper"}
 """Packages of the extra ``sweep``, by the config group they add options to."""
+
+_TRANSFER = "transfer"
+_OF_TRANSFER = ("photos", "fine_tuning")
+"""Sections that only its experiments have."""
 
 
 def config_folder() -> Path:
@@ -39,92 +46,32 @@ def config_folder() -> Path:
     return packaged if packaged.is_dir() else package.parent / "configs"
 
 
-def with_stored_config(command: str, arguments: list[str]) -> tuple[str, list[str]]:
-    """Start from a stored config where the command goes on from one.
+def search_path(options: Namespace) -> list[str]:
+    """The override that makes Hydra look into the folder of ``--config-dir`` as well."""
+    if not options.config_dir:
+        return []
+    return [f"hydra.searchpath=['file://{Path(options.config_dir).absolute()}']"]
 
-    ``tangent-train resume=<run folder>`` takes the config inside the run's last checkpoint,
-    ``tangent-evaluate checkpoint=<file>`` the one inside that; overrides then apply to it.
+
+def compose_option(group: str, option: str, search: Sequence[str] = ()) -> dict[str, Any]:
+    """An option of a config group by itself; what it refers to elsewhere is left as it is.
+
+    Hydra must be initialized.
 
     Args:
-        command: train, evaluate or prepare.
-        arguments: The command line after the program's name.
-
-    Returns:
-        The name of the config to compose, and the arguments with the folder to run in.
+        group: The group, without folders.
+        option: The option.
+        search: From `search_path`; Hydra's own, inside a command.
 
     Raises:
-        DataError: There is no usable config where the argument points.
+        SettingError: There is no such option.
     """
-    given = dict(argument.partition("=")[::2] for argument in arguments)
-    if command == "train" and given.get("resume") not in (None, "", "null"):
-        folder = Path(given["resume"]).absolute()
-        # Lightning starts further processes with the run's own folder.
-        its_own = Path(given.get("hydra.run.dir", str(folder)).strip("'\"")).absolute() == folder
-        elsewhere = [a for a in arguments if a in ("-m", "--multirun")]
-        elsewhere += [] if its_own else [f"hydra.run.dir={given['hydra.run.dir']}"]
-        if elsewhere:
-            raise SettingError(
-                f"resume={given['resume']}",
-                found=f"{elsewhere[0]} beside it",
-                expected="neither a sweep nor another folder: a run goes on in its own",
-            )
-        stored = checkpoint_config(_last_checkpoint(folder))
-        stored["resume"] = str(folder)
-        arguments = [a for a in arguments if not a.startswith("resume=")]
-        run_folder = str(folder)
-    elif command == "evaluate" and given.get("checkpoint") not in (None, ""):
-        path = Path(given["checkpoint"]).absolute()
-        stored = checkpoint_config(path)
-        stored["checkpoint"] = str(path)
-        arguments = [a for a in arguments if not a.startswith("checkpoint=")]
-        run_folder = "runs/evaluate/${now:%Y-%m-%d_%H-%M-%S}"
-    else:
-        return command, arguments
-    stored["hydra"] = {"run": {"dir": run_folder}, "sweep": {"dir": run_folder}}
-    ConfigStore.instance().store(_STORED + command, stored)
-    return _STORED + command, arguments
-
-
-def _last_checkpoint(folder: Path) -> Path:
-    path = folder / "checkpoints" / "last.ckpt"
-    if not path.is_file():
-        raise DataError(
-            folder,
-            found="no checkpoints/last.ckpt",
-            expected="the folder of a run that has begun",
-            remedy="Give resume= the folder that tangent-train printed.",
-        )
-    return path
-
-
-def checkpoint_config(path: Path) -> dict[str, Any]:
-    """The config inside a checkpoint, read without unpickling anything but tensors.
-
-    Raises:
-        DataError: The file is missing, no checkpoint, or of another program.
-    """
-    import torch
-
-    expected = "a checkpoint written by tangent-train"
-    if not path.is_file():
-        raise DataError(path, found="no such file", expected=expected)
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-    except Exception as error:
-        first_line = str(error).partition("\n")[0]
-        raise DataError(
-            path, found=f"an unreadable file ({first_line})", expected=expected
-        ) from error
-    if not isinstance(content, dict) or "config" not in content or "state_dict" not in content:
-        raise DataError(path, found="no config inside", expected=expected)
-    return _plain(OmegaConf.create(content["config"]))
-
-
-def _plain(config: Any) -> dict[str, Any]:
-    container = OmegaConf.to_container(config, resolve=False)
-    if not isinstance(container, dict):
-        raise DataError("stored config", found=type(container).__name__, expected="a mapping")
-    return {str(key): value for key, value in container.items()}
+    options = _options(GlobalHydra.instance().config_loader(), group, list(search))
+    if option not in options:
+        _refuse(group, option, options)
+    config = OmegaConf.to_container(compose(f"{group}/{option}", list(search)), resolve=False)
+    section: dict[str, Any] = config[group]  # type: ignore[index, call-overload, assignment]
+    return section
 
 
 def check_overrides(config_name: str, arguments: list[str]) -> None:
@@ -135,12 +82,15 @@ def check_overrides(config_name: str, arguments: list[str]) -> None:
         arguments: The command line; options and additions (``+key=…``) are left to Hydra.
 
     Raises:
-        SettingError: A setting, group or option is unknown, or an override cannot be parsed.
+        SettingError: A setting, group or option is unknown, an override cannot be parsed, or an
+            experiment belongs to another command.
     """
     options = get_args_parser().parse_args(arguments)
-    texts = options.overrides
-    if options.config_dir:
-        texts = [*texts, f"hydra.searchpath=['file://{Path(options.config_dir).absolute()}']"]
+    if options.multirun and config_name == _TRANSFER:
+        raise SettingError(
+            "-m", found="a sweep", expected="folds=[1,2,3] and seeds=[0,1,2], settings of its own"
+        )
+    texts = [*options.overrides, *search_path(options)]
     with initialize_config_dir(str(config_folder()), version_base="1.3"):
         loader = GlobalHydra.instance().config_loader()
         try:
@@ -153,7 +103,7 @@ def check_overrides(config_name: str, arguments: list[str]) -> None:
         search = [str(o.input_line) for o in overrides if o.key_or_group == "hydra.searchpath"]
         options_of = {o.key_or_group: _options(loader, o.key_or_group, search) for o in plain}
         groups = [o for o in plain if options_of[o.key_or_group]]
-        if groups and config_name.startswith(_STORED):
+        if groups and config_name.startswith(STORED):
             raise SettingError(
                 groups[0].key_or_group,
                 found=f"'{groups[0].input_line}'",
@@ -163,16 +113,17 @@ def check_overrides(config_name: str, arguments: list[str]) -> None:
         for override in groups:
             _check_option(override, options_of[override.key_or_group])
         chosen = [str(o.input_line) for o in groups if not o.is_sweep_override()]
-        config = _compose(config_name, [*search, *chosen])
+        config = _compose(config_name, search, chosen)
+        _check_experiment(config_name, config, search, chosen, plain)
     names = list(dict.fromkeys([*_dotted(config), *_group_names(loader)]))
     for override in plain:
         if override not in groups and override.key_or_group not in names:
             _refuse("setting", override.key_or_group, names)
 
 
-def _compose(config_name: str, overrides: list[str]) -> DictConfig:
+def _compose(config_name: str, search: list[str], chosen: list[str]) -> DictConfig:
     try:
-        return compose(config_name, overrides)
+        return compose(config_name, [*search, *chosen])
     except MissingConfigException as error:
         missing = str(error.missing_cfg_file)
         for group, package in _PLUGINS.items():
@@ -184,6 +135,49 @@ def _compose(config_name: str, overrides: list[str]) -> DictConfig:
                     remedy="Run: pip install 'tangent-train[sweep]'",
                 ) from error
         raise
+    except ConfigCompositionException as error:
+        first_line = str(error).partition("\n")[0]
+        if any(f"@{section}." in first_line for section in _OF_TRANSFER):
+            raise _of_another_command(_experiment(chosen), _TRANSFER) from error
+        raise SettingError(
+            f"config '{config_name}'", found=first_line, expected="groups that it has"
+        ) from error
+
+
+def _check_experiment(
+    config_name: str,
+    config: DictConfig,
+    search: list[str],
+    chosen: list[str],
+    overrides: list[Override],
+) -> None:
+    """Refuse experiments of tangent-transfer elsewhere, and there those that know no photos."""
+    experiment = _experiment(chosen)
+    if experiment is None or config_name.startswith(STORED):
+        return
+    if config_name != _TRANSFER:
+        if any(section in config for section in _OF_TRANSFER):
+            raise _of_another_command(experiment, _TRANSFER)
+        return
+    about_photos = any((o.package or o.key_or_group).startswith("photos") for o in overrides)
+    others = _compose(config_name, search, [text for text in chosen if text != experiment])
+    photos = (OmegaConf.to_container(c.photos, resolve=False) for c in (config, others))
+    if not about_photos and next(photos) == next(photos):
+        raise _of_another_command(experiment, "train")
+
+
+def _experiment(chosen: list[str]) -> str | None:
+    return next((text for text in chosen if text.startswith("experiment=")), None)
+
+
+def _of_another_command(experiment: str | None, command: str) -> SettingError:
+    which = experiment or "experiment"
+    return SettingError(
+        which,
+        found=f"an experiment of tangent-{command}",
+        expected="one of this command",
+        remedy=f"Run: tangent-{command} {which}",
+    )
 
 
 def _check_option(override: Override, options: list[str]) -> None:

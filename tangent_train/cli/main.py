@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import sys
+from importlib import import_module
 from typing import TYPE_CHECKING
 
 from tangent_train.errors import DataError, SettingError
@@ -15,7 +16,7 @@ from tangent_train.errors import DataError, SettingError
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
-__all__ = ["evaluate", "prepare", "report", "train"]
+__all__ = ["evaluate", "prepare", "report", "train", "transfer"]
 
 
 def train() -> None:
@@ -31,6 +32,11 @@ def evaluate() -> None:
 def prepare() -> None:
     """``tangent-prepare data=…``: make or check a data set."""
     _main("prepare")
+
+
+def transfer() -> None:
+    """``tangent-transfer experiment=…``: train on photos, evaluate on panoramas."""
+    _main("transfer")
 
 
 def report() -> None:
@@ -60,7 +66,8 @@ def _compose_and_run(command: str, typed: list[str]) -> None:
     from hydra._internal.utils import get_args_parser
     from hydra.errors import InstantiationException
 
-    from tangent_train.cli.compose import check_overrides, config_folder, with_stored_config
+    from tangent_train.cli.compose import check_overrides, config_folder
+    from tangent_train.cli.stored import with_stored_config
 
     as_module = __name__ == "__main__"
     settings = typed[1:] if as_module else typed
@@ -77,9 +84,9 @@ def _compose_and_run(command: str, typed: list[str]) -> None:
             if in_sweep():
                 return run_job(command, settings, visible_gpus, config)
             leave_warnings_to_the_sweep()
-            from tangent_train.cli import run
-
-            result: float | None = getattr(run, command)(config)
+            place = "transfer" if command == "transfer" else "run"
+            commands = import_module(f"tangent_train.cli.{place}")
+            result: float | None = getattr(commands, command)(config)
         except (DataError, SettingError) as error:
             sys.exit(f"tangent-{command}: {error}")
         except InstantiationException as error:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 from tangent_train.errors import SettingError
 from tangent_train.tasks.runs import flat_settings
 
-__all__ = ["check_resumed"]
+__all__ = ["check_resumed", "differing_settings"]
 
 _FREE = (
     "checkpoint_every_n_steps",
@@ -66,15 +66,36 @@ def check_resumed(config: Mapping[str, Any], before: Mapping[str, Any]) -> None:
     Raises:
         SettingError: A setting differs that makes the run what it is.
     """
-    now, then = dict(flat_settings(config)), dict(flat_settings(before))
-    for name in sorted(now.keys() | then.keys()):
-        free = any(name == free or name.startswith(f"{free}.") for free in _FREE)
-        if (free and name not in _NOT_FREE) or now.get(name) == then.get(name):
-            continue
+    for name, now, then in differing_settings(config, before, _FREE, but=_NOT_FREE):
         reason = _REASONS.get(name.partition(".")[0], "it would be another run")
         raise SettingError(
             name,
-            found=f"{now.get(name)!r} for a run that began with {then.get(name)!r}",
+            found=f"{now!r} for a run that began with {then!r}",
             expected=f"no other than before: {reason}",
             remedy="Start a new run for it.",
         )
+
+
+def differing_settings(
+    config: Mapping[str, Any],
+    before: Mapping[str, Any],
+    free: Collection[str],
+    but: Collection[str] = (),
+) -> list[tuple[str, Any, Any]]:
+    """Settings that differ, sorted by name, with what they are and what they were.
+
+    A setting that one of the two does not have is None there.
+
+    Args:
+        config: A resolved config.
+        before: Another one.
+        free: Settings, with all below them, that may differ.
+        but: Except these.
+    """
+    now, then = dict(flat_settings(config)), dict(flat_settings(before))
+    return [
+        (name, now.get(name), then.get(name))
+        for name in sorted(now.keys() | then.keys())
+        if now.get(name) != then.get(name)
+        and (name in but or not any(name == f or name.startswith(f"{f}.") for f in free))
+    ]

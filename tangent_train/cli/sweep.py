@@ -1,8 +1,8 @@
 """Sweeps: every job is an ordinary run, in a process of its own.
 
 Hydra's launcher runs all jobs of a sweep in one process, submitit's in a process that only submitit
-can start. Lightning starts a process per device with the command line it finds: that has to be the
-command line of one run. So a job starts one, waits for it and reads the figure it leaves.
+can start: no place for a run (see `processes`). So a job starts one, waits for it and reads the
+figure it leaves.
 """
 
 from __future__ import annotations
@@ -10,22 +10,20 @@ from __future__ import annotations
 import json
 import os
 import signal
-import subprocess
-import sys
-from collections import deque
-from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING
 
 from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import CompactHydraException
 from hydra.types import RunMode
 
+from tangent_train.cli.processes import command_line, run_environment, run_process
+from tangent_train.cli.stored import stored_config_arguments
 from tangent_train.errors import SettingError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Sequence
 
     from omegaconf import DictConfig
 
@@ -39,8 +37,6 @@ _JOB = "TANGENT_TRAIN_SWEEP_JOB"
 """Set for jobs: an experiment may choose the sweep, and does so for its jobs as well."""
 
 _GRID = "hydra._internal.core_plugins.basic_sweeper.BasicSweeper"
-_PATIENCE_S = 30.0  # for a last checkpoint
-_LINES_OF_AN_ERROR = 12
 
 
 class JobError(CompactHydraException):
@@ -107,7 +103,8 @@ def run_job(
     folder = Path(HydraConfig.get().runtime.output_dir)
     objective = folder / OBJECTIVE_FILE
     objective.unlink(missing_ok=True)
-    code, errors = _run_process(_command_line(command, typed, folder), _environment(visible_gpus))
+    line = command_line(command, _arguments(command, typed), folder)
+    code, errors = run_process(line, _environment(visible_gpus))
     if code:
         job = f"job {HydraConfig.get().job.num} in {folder} ended with status {code}"
         raise JobError("\n".join([f"tangent-{command}: {job}", *errors]))
@@ -122,85 +119,29 @@ def run_job(
     return None
 
 
-def _command_line(command: str, typed: Sequence[str], folder: Path) -> list[str]:
-    """The job as a single run in its folder."""
+def _arguments(command: str, typed: Sequence[str]) -> list[str]:
+    """What makes the job a single run: the options typed, the overrides of this job."""
     options = get_args_parser().parse_args(list(typed))
     named = {
         "--config-dir": options.config_dir,
         "--config-path": options.config_path,
         "--config-name": options.config_name,
     }
-    line = [sys.executable, "-m", "tangent_train.cli.main", command]
-    line += [part for name, value in named.items() if value for part in (name, value)]
-    # Where a stored config comes from is no setting: Hydra does not know it.
-    line += [a for a in typed if a.startswith(("checkpoint=", "resume="))]
+    arguments = [f"{name}={value}" for name, value in named.items() if value]
+    # Where a stored config comes from, and its sections, are no settings: Hydra does not know them.
+    arguments += stored_config_arguments(command, typed)
     hydra = HydraConfig.get().overrides
     swept = ("hydra.sweep.", "hydra.sweeper.", "hydra.launcher.", "hydra.mode=", "hydra.run.")
     groups = ("hydra/", *(f"{group}=" for group in _GROUPS), "checkpoint=", "resume=")
-    line += [o for o in (*hydra.task, *hydra.hydra) if not o.startswith((*swept, *groups))]
-    quoted = str(folder).replace("'", r"\'")
-    return [*line, f"hydra.run.dir='{quoted}'"]
+    arguments += [o for o in (*hydra.task, *hydra.hydra) if not o.startswith((*swept, *groups))]
+    return arguments
 
 
 def _environment(visible_gpus: str | None) -> dict[str, str]:
-    # Not the working folder on Python's path, as with the console scripts: a folder "models" in it
-    # would be imported. A variable, because it has to reach the processes Lightning starts.
-    environment = {**os.environ, "PYTHONSAFEPATH": "1", _JOB: "1"}
+    environment = {**run_environment(), _JOB: "1"}
     if environment.get("SUBMITIT_EXECUTOR") == "local":
         # submitit hides the GPUs of this machine, or shows every job the same ones.
         environment.pop("CUDA_VISIBLE_DEVICES", None)
         if visible_gpus is not None:
             environment["CUDA_VISIBLE_DEVICES"] = visible_gpus
     return environment
-
-
-def _run_process(line: Sequence[str], environment: dict[str, str]) -> tuple[int, list[str]]:
-    """Run to the end; the exit status and the last lines of the standard error."""
-    last: deque[str] = deque(maxlen=_LINES_OF_AN_ERROR)
-    with (
-        _ended_by_sigterm(),
-        subprocess.Popen(
-            line, env=environment, stderr=subprocess.PIPE, text=True, errors="replace"
-        ) as process,
-    ):
-        try:
-            for text in process.stderr or ():
-                sys.stderr.write(text)
-                sys.stderr.flush()
-                last.append(text.rstrip())
-            return process.wait(), list(last)
-        except BaseException as error:
-            _stop(process, told=isinstance(error, KeyboardInterrupt))
-            raise
-
-
-def _stop(process: subprocess.Popen[str], *, told: bool) -> None:
-    """End the process, gently first: a terminal's Ctrl-C has already told it."""
-    try:
-        if not told:
-            process.terminate()
-        for insist in (process.terminate, process.kill):
-            try:
-                # Reads on, or a full pipe would keep the process from ending.
-                sys.stderr.write(process.communicate(timeout=_PATIENCE_S)[1] or "")
-            except subprocess.TimeoutExpired:
-                insist()
-            else:
-                return
-    except BaseException:
-        process.kill()
-        raise
-
-
-@contextmanager
-def _ended_by_sigterm() -> Iterator[None]:
-    """Let SIGTERM unwind this process, so that it ends the job, rather than end it at once."""
-
-    def leave(number: int, frame: object) -> NoReturn:
-        sys.exit(128 + number)
-
-    before = signal.signal(signal.SIGTERM, leave)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)

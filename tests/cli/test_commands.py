@@ -13,8 +13,12 @@ from typing import Any
 import cv2
 import pytest
 import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
 
 from tangent_train.cli import main
+from tangent_train.cli.compose import config_folder
+from tangent_train.cli.stored import stored_config_arguments, with_stored_config
 from tangent_train.tasks.checkpoints import LastCheckpoint
 
 AREAS = ("1", "2", "3", "4", "5a", "5b", "6")
@@ -68,7 +72,7 @@ def _results(folder: Path) -> dict[str, Any]:
 
 def test_a_run_leaves_everything_in_its_folder(run_folder: Path) -> None:
     results = _results(run_folder)
-    assert results["panoramas"] == 2
+    assert results["images"] == 2
     assert len(results["classes"]) == 13
     assert (run_folder / "results.md").read_text().count("\n") > 20
     assert (run_folder / "results.csv").is_file()
@@ -147,7 +151,7 @@ def test_a_run_starts_from_the_network_of_another(
     table = capsys.readouterr().out
     assert "4 → 3 channels" in table
     assert re.search(r"fresh +│ +0 ", table)
-    assert _results(tmp_path / "begun")["panoramas"] == 2
+    assert _results(tmp_path / "begun")["images"] == 2
     foreign = tmp_path / "foreign.pt"
     torch.save({"x": torch.zeros(1)}, foreign)
     with pytest.raises(SystemExit, match=r"foreign\.pt: found no tensor that fits, but x"):
@@ -171,7 +175,9 @@ def test_settings_of_the_checkpoint_reach_what_refers_to_them(
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("representation=erp", "expected overrides of single settings"),
+        ("network=unet", "expected overrides of single settings"),
+        ("representation=erb", "unknown representation: .*Did you mean erp"),
+        ("representation=tangent,erp", "unknown representation: found 'tangent,erp'"),
         ("data.inputs=[rgb]", "network: found other tensors"),
     ],
 )
@@ -182,6 +188,40 @@ def test_what_a_checkpoint_cannot_do_is_refused(
     checkpoint = run_folder / "checkpoints" / "best.ckpt"
     with pytest.raises(SystemExit, match=message):
         _run(monkeypatch, "evaluate", f"checkpoint={checkpoint}", override)
+
+
+def test_a_checkpoint_is_evaluated_on_other_data_through_another_representation(
+    run_folder: Path, rooms: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    checkpoint = f"checkpoint={run_folder / 'checkpoints' / 'best.ckpt'}"
+    same_rooms = [text for text in SETTINGS if text.startswith("data.rooms.")]
+    chosen = ["data=synthrooms", rooms, *same_rooms, "representation=erp"]
+    _run(monkeypatch, "evaluate", checkpoint, *chosen, "hydra.run.dir=other")
+    config: Any = OmegaConf.load(tmp_path / "other" / ".hydra" / "config.yaml")
+    assert config.data.panoramas_per_step == 4, "the option's own, not the run's"
+    assert "base_level" not in config.representation
+    assert OmegaConf.to_container(config, resolve=False)["representation"]["level"] == "${level}"  # type: ignore[index, call-overload]
+    assert config.representation.level == 4
+    assert _results(tmp_path / "other")["confusion"] != _results(run_folder)["confusion"]
+
+
+def test_an_evaluation_on_other_data_stays_on_the_fold(run_folder: Path, tmp_path: Path) -> None:
+    path = tmp_path / "fold_2.ckpt"
+    content = torch.load(run_folder / "checkpoints" / "best.ckpt", weights_only=True)
+    content["config"]["data"]["fold"] = 2
+    torch.save(content, path)
+    with_stored_config("evaluate", [f"checkpoint={path}", "data=synthrooms"])
+    with initialize_config_dir(str(config_folder()), version_base="1.3"):
+        config = compose("stored_evaluate")
+    assert config.data.fold == 2, "the network has seen the rooms of the others"
+
+
+def test_jobs_of_a_sweep_get_the_chosen_sections() -> None:
+    typed = ["checkpoint=x.ckpt", "representation=erp", "data.test_rotation=0,45"]
+    kept = ["checkpoint=x.ckpt", "representation=erp"]
+    assert stored_config_arguments("evaluate", typed) == kept
+    assert stored_config_arguments("train", typed) == kept[:1]
 
 
 def test_a_schedule_cannot_be_resumed_with_another_length(
@@ -225,15 +265,20 @@ def test_evaluate_needs_a_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyP
         _run(monkeypatch, "evaluate")
 
 
-def test_help_answers_before_anything_heavy_is_imported(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("command", "example"), [("train", "rooms/demo"), ("transfer", "rooms/transfer")]
+)
+def test_help_answers_before_anything_heavy_is_imported(
+    command: str, example: str, tmp_path: Path
+) -> None:
     code = (
-        "import sys; from tangent_train.cli.main import train\n"
-        "sys.argv = ['tangent-train', '--help']\n"
-        "train()\n"
+        f"import sys; from tangent_train.cli.main import {command}\n"
+        f"sys.argv = ['tangent-{command}', '--help']\n"
+        f"{command}()\n"
         "assert not {'torch', 'lightning', 'cv2', 'numba'} & set(sys.modules), 'heavy import'"
     )
     done = subprocess.run(
         [sys.executable, "-c", code], check=False, cwd=tmp_path, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
-    assert "experiment=rooms/demo" in done.stdout
+    assert f"tangent-{command} experiment={example}" in done.stdout

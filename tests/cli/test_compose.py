@@ -8,12 +8,8 @@ import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from tangent_train.cli.compose import (
-    check_overrides,
-    checkpoint_config,
-    config_folder,
-    with_stored_config,
-)
+from tangent_train.cli.compose import check_overrides, config_folder
+from tangent_train.cli.stored import checkpoint_config, with_stored_config
 from tangent_train.errors import DataError, SettingError
 
 
@@ -54,6 +50,48 @@ def test_misspelt_overrides_are_refused_with_the_near_matches(override: str, mes
 )
 def test_good_overrides_pass(arguments: list[str]) -> None:
     check_overrides("train", arguments)
+
+
+@pytest.mark.parametrize(
+    ("command", "overrides", "message"),
+    [
+        ("train", ["experiment=rooms/transfer"], "an experiment of tangent-transfer"),
+        ("prepare", ["experiment=paper/transfer_omnisynthia_s7"], "of tangent-transfer"),
+        ("transfer", ["experiment=rooms/demo"], "Run: tangent-train experiment=rooms/demo"),
+        ("transfer", ["-m", "seed=0,1"], "-m: found a sweep; expected folds="),
+        ("transfer", ["launcher=local"], "Could not override 'launcher'"),
+        ("transfer", ["data@photos.data=synthroms"], "Did you mean synthrooms"),
+        ("transfer", ["photos.data.photos_per_stp=4"], "Did you mean photos.data.photos_per_step"),
+    ],
+)
+def test_what_another_command_understands_is_refused(
+    command: str, overrides: list[str], message: str
+) -> None:
+    with pytest.raises(SettingError, match=re.escape(message)):
+        check_overrides(command, overrides)
+
+
+def test_an_experiment_of_a_user_that_only_sets_photos_is_one_of_transfer(tmp_path: Path) -> None:
+    (tmp_path / "experiment").mkdir()
+    (tmp_path / "experiment" / "mine.yaml").write_text(
+        "# @package _global_\nphotos: {data: {photos_per_step: 2}}\n"
+    )
+    mine = ["experiment=mine", "--config-dir", str(tmp_path)]
+    check_overrides("transfer", mine)
+    with pytest.raises(SettingError, match="Run: tangent-transfer experiment=mine"):
+        check_overrides("train", mine)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["experiment=rooms/transfer", "seeds=[0,1]", "photos.representation.fov_deg=60"],
+        ["data@photos.data=stanford2d3ds_perspective", "scheduler@fine_tuning.scheduler=step"],
+        ["experiment=rooms/demo", "photos.data.photos_per_step=4"],
+    ],
+)
+def test_good_overrides_of_a_transfer_pass(arguments: list[str]) -> None:
+    check_overrides("transfer", arguments)
 
 
 def test_options_of_a_users_own_config_folder_are_known(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import lightning
@@ -13,14 +14,18 @@ from omegaconf import DictConfig, OmegaConf
 
 from tangent_train.cli.compose import config_folder
 from tangent_train.cli.run import build
+from tangent_train.cli.stages import folds_and_seeds, plan
+from tests.datamodules.synthia_format import write_panoramas, write_views
 
 if TYPE_CHECKING:
-    from pathlib import Path
+    from tests.conftest import FabricateStanford
 
 FOLDER = config_folder() / "experiment"
-EXPERIMENTS = sorted(
+FOUND = sorted(
     path.relative_to(FOLDER).with_suffix("").as_posix() for path in FOLDER.rglob("*.yaml")
 )
+TRANSFERS = [name for name in FOUND if Path(name).name.startswith("transfer")]
+EXPERIMENTS = [name for name in FOUND if name not in TRANSFERS]
 AREAS = ("1", "2", "3", "4", "5a", "5b", "6")
 ROWS = 32
 
@@ -38,9 +43,24 @@ def rooms_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("rooms")
 
 
-def _composed(experiment: str) -> DictConfig:
+@pytest.fixture(scope="module")
+def photo_roots(
+    tmp_path_factory: pytest.TempPathFactory, fabricate_stanford: FabricateStanford
+) -> dict[str, Path]:
+    """Data sets with photos and panoramas: where each is, or is to be made."""
+    folder = tmp_path_factory.mktemp("photos")
+    frames = {"01": 2, "02": 1, "04": 1, "05": 1, "06": 1}
+    write_panoramas(write_views(folder / "synthia", frames), frames, ROWS)
+    return {
+        "Stanford2D3DS": fabricate_stanford(folder / "stanford", height=ROWS, photos=2),
+        "OmniSynthia": folder / "synthia",
+        "SynthRooms": folder / "rooms",
+    }
+
+
+def _composed(experiment: str, name: str = "train") -> DictConfig:
     with initialize_config_dir(str(config_folder()), version_base="1.3"):
-        return compose("train", [f"experiment={experiment}"])
+        return compose(name, [f"experiment={experiment}"])
 
 
 def _shrunk(config: DictConfig, stanford_root: Path, rooms_root: Path) -> dict[str, Any]:
@@ -79,29 +99,79 @@ def _one_step(config: DictConfig, task: Any, data: Any, folder: Path) -> lightni
     return trainer
 
 
-@pytest.mark.parametrize("experiment", EXPERIMENTS)
-def test_every_experiment_composes_instantiates_and_takes_a_step(
-    experiment: str, stanford_root: Path, rooms_root: Path, tmp_path: Path
-) -> None:
-    config = _composed(experiment)
-    assert config.name in (experiment, experiment.removeprefix("rooms/"))
-    if "weights" in config.network:
-        config.network.weights = None  # nothing from the internet
-    with torch.device("meta"):  # shapes only: build runs the network on an image of full size
-        data, task = build(config)
-    assert len(task.class_names) == len(data.class_names) == 14
-    names = set(task.state_dict())
-
-    for setting, value in _shrunk(config, stanford_root, rooms_root).items():
-        OmegaConf.update(config, setting, value)
+def _takes_a_step(config: DictConfig, folder: Path) -> set[str]:
+    """Build what a run is made of and train one step; the names of all tensors."""
     data, task = build(config)
-    if config.network.get("depth") is None:
-        assert set(task.state_dict()) == names, "the same network, smaller images"
     before = {name: p.detach().clone() for name, p in task.network.named_parameters()}
-    trainer = _one_step(config, task, data, tmp_path)
+    trainer = _one_step(config, task, data, folder)
     assert trainer.global_step == 1
     assert trainer.callback_metrics["train/loss"] > 0
     for name, parameter in task.network.named_parameters():
         assert parameter.isfinite().all(), name
     changed = [n for n, p in task.network.named_parameters() if not torch.equal(p, before[n])]
     assert len(changed) > len(before) / 2
+    return set(task.state_dict())
+
+
+def _builds_at_full_size(config: DictConfig) -> set[str]:
+    """Build it without numbers; the names of all tensors."""
+    if "weights" in config.network:
+        config.network.weights = None  # nothing from the internet
+    with torch.device("meta"):  # shapes only: build runs the network on an image of full size
+        data, task = build(config)
+    assert len(task.class_names) == len(data.class_names) == 14
+    return set(task.state_dict())
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+def test_every_experiment_composes_instantiates_and_takes_a_step(
+    experiment: str, stanford_root: Path, rooms_root: Path, tmp_path: Path
+) -> None:
+    config = _composed(experiment)
+    assert config.name in (experiment, experiment.removeprefix("rooms/"))
+    names = _builds_at_full_size(config)
+    for setting, value in _shrunk(config, stanford_root, rooms_root).items():
+        OmegaConf.update(config, setting, value)
+    stepped = _takes_a_step(config, tmp_path)
+    if config.network.get("depth") is None:
+        assert stepped == names, "the same network, smaller images"
+
+
+def _shrunk_transfer(config: DictConfig, roots: dict[str, Path]) -> dict[str, Any]:
+    """The same for panoramas and photos."""
+    root = roots[config.data._target_.rpartition(".")[2]]
+    settings = _shrunk(config, root, root)
+    photos = {
+        "photos.representation.dim": ROWS,
+        "photos.data.photos_per_step": 2,
+        "photos.data.num_workers": 0,
+    }
+    if "rooms" in config.data:
+        settings |= {"data.rooms.views_per_camera": 1, "data.rooms.view_size": ROWS}
+        settings["data.root"] = str(root / config.data.rooms.views)
+    return settings | photos
+
+
+@pytest.mark.parametrize("experiment", TRANSFERS)
+def test_every_transfer_composes_and_its_stages_take_a_step(
+    experiment: str, photo_roots: dict[str, Path], tmp_path: Path
+) -> None:
+    config = _composed(experiment, "transfer")
+    assert config.name == experiment
+    full = {stage.name: stage for stage in plan(config, tmp_path, *folds_and_seeds(config)[0], {})}
+    last = list(full)[-1]
+    assert last.startswith("S-FT-")
+    names = [_builds_at_full_size(OmegaConf.create(full[s].config)) for s in ("P", last)]
+    assert names[0] == names[1], "one network for both kinds of images"
+
+    if "frames" in config.data:
+        config.data.frames = 2
+    for setting, value in _shrunk_transfer(config, photo_roots).items():
+        OmegaConf.update(config, setting, value)
+    small = {stage.name: stage for stage in plan(config, tmp_path, *folds_and_seeds(config)[0], {})}
+    for name in ("P", last):
+        stage = OmegaConf.create(small[name].config)
+        if "weights" in stage.network:
+            stage.network.weights = None
+        assert stage.data.root == config.data.root
+        _takes_a_step(stage, tmp_path / name)

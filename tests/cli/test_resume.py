@@ -250,4 +250,4 @@ def test_two_processes_make_the_steps_and_figures_of_one(
     assert figures[0]["miou"] == figures[1]["miou"]
     solid_angle = [figure["miou_solid_angle"] for figure in figures]  # added up in another order
     assert solid_angle[0] == pytest.approx(solid_angle[1], rel=1e-12)
-    assert figures[0]["panoramas"] % 2 == 1, "not the same number on both processes"
+    assert figures[0]["images"] % 2 == 1, "not the same number on both processes"

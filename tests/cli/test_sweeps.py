@@ -14,7 +14,7 @@ import pytest
 from hydra.core.config_store import ConfigStore
 from hydra.core.plugins import Plugins
 
-from tangent_train.cli import main, sweep
+from tangent_train.cli import main, processes, sweep
 
 ROOMS = {"area_1": 2, "area_2": 2, "area_3": 1, "area_4": 1, "area_5a": 1, "area_5b": 1}
 SETTINGS = (
@@ -90,7 +90,7 @@ def test_jobs_of_a_grid_are_runs_of_their_own_on_any_number_of_devices(
     assert len({os.getpid(), first, second}) == 3
     for run, devices in zip(runs, (1, 2), strict=True):
         assert f"\n  devices: {devices}\n" in (run / "config.yaml").read_text()
-        assert _json(run / "results.json")["panoramas"] == 2
+        assert _json(run / "results.json")["images"] == 2
 
 
 @pytest.mark.slow
@@ -223,7 +223,7 @@ def _python(code: str) -> list[str]:
 
 def test_output_and_status_of_a_process_are_passed_on(capsys: pytest.CaptureFixture[str]) -> None:
     code = "print('x', file=sys.stderr)\nfor k in range(40): print(k, file=sys.stderr)\nsys.exit(3)"
-    status, last = sweep._run_process(_python(code), dict(os.environ))
+    status, last = processes.run_process(_python(code), dict(os.environ))
     assert status == 3
     assert last == [str(k) for k in range(28, 40)]
     assert capsys.readouterr().err.splitlines() == ["x", *map(str, range(40))]
@@ -239,7 +239,7 @@ def test_sigterm_reaches_the_job_which_may_finish_its_checkpoint(tmp_path: Path)
     )
     before = signal.getsignal(signal.SIGTERM)
     with pytest.raises(SystemExit) as stopped:
-        sweep._run_process(_python(code), dict(os.environ))
+        processes.run_process(_python(code), dict(os.environ))
     assert stopped.value.code == 128 + signal.SIGTERM
     assert mark.exists()
     assert signal.getsignal(signal.SIGTERM) == before
@@ -264,7 +264,7 @@ def test_a_schedulers_warning_ends_the_job_with_a_checkpoint(tmp_path: Path) -> 
     before = signal.signal(signal.SIGUSR2, warned)
     try:
         with pytest.raises(TimeoutError):
-            sweep._run_process(_python(code), sweep._environment(None))
+            processes.run_process(_python(code), sweep._environment(None))
     finally:
         signal.signal(signal.SIGUSR2, before)
     assert mark.exists()
@@ -274,7 +274,7 @@ def test_a_schedulers_warning_ends_the_job_with_a_checkpoint(tmp_path: Path) -> 
 def test_ctrl_c_ends_the_job_even_one_that_does_not_listen(
     deaf: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sweep, "_PATIENCE_S", 0.3)
+    monkeypatch.setattr(processes, "_PATIENCE_S", 0.3)
     number = tmp_path / "pid"
     code = (
         f"open({str(number)!r}, 'w').write(str(os.getpid()))\n"
@@ -282,7 +282,7 @@ def test_ctrl_c_ends_the_job_even_one_that_does_not_listen(
         + "os.kill(os.getppid(), signal.SIGINT)\ntime.sleep(60)"
     )
     with pytest.raises(KeyboardInterrupt):
-        sweep._run_process(_python(code), dict(os.environ))
+        processes.run_process(_python(code), dict(os.environ))
     with pytest.raises(ProcessLookupError):
         os.kill(int(number.read_text()), 0)
 

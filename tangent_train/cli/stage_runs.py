@@ -1,0 +1,218 @@
+"""The stages of a transfer as runs: what is in their folders, starting them and going on.
+
+Beside what a run leaves, a stage's folder holds ``stage.yaml``, its config, and ``stage.json``:
+which stage it is, and a digest of the checkpoint it starts from.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shlex
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from omegaconf import OmegaConf
+
+from tangent_train.cli.processes import command_line, run_environment, run_process
+from tangent_train.cli.resume import differing_settings
+from tangent_train.errors import DataError, SettingError
+from tangent_train.files import write_text
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from tangent_train.cli.stages import Stage
+
+__all__ = ["State", "checkpoint_of", "run_stage", "said_as_a_command", "stage_state"]
+
+State = Literal["new", "begun", "finished"]
+"""What is in a stage's folder. A stage that only evaluates is either new or finished."""
+
+_CONFIG = "stage.yaml"
+_RECORD = "stage.json"
+_RESULTS = "results.json"
+_LAST = Path("checkpoints") / "last.ckpt"
+_REMEDY = "Give another name=, or delete the folder to make it anew."
+_MOST_NAMED = 6
+
+_FREE = (
+    "checkpoint",  # by its digest
+    "checkpoint_every_n_steps",
+    "data.in_memory",
+    "data.label_table",
+    "data.num_workers",
+    "data.root",
+    "data.store",
+    "init_from",
+    "name",
+    "panels",
+    "resume",
+    "task.channels_last",
+    "task.compile",
+    "task.images_per_chunk",
+    "task.images_per_forward",
+    "trainer.accelerator",
+    "trainer.devices",
+    "trainer.enable_model_summary",
+    "trainer.enable_progress_bar",
+    "trainer.log_every_n_steps",
+    "trainer.num_nodes",
+    "trainer.num_sanity_val_steps",
+    "trainer.strategy",
+)
+"""Settings, with all below them, that do not change what a stage finds."""
+
+_ONLY_TRAINING = ("optimizer", "scheduler", "trainer.max_epochs", "trainer.max_steps")
+"""Further ones of a stage that only evaluates."""
+
+
+def stage_state(stage: Stage) -> State:
+    """What there is of a stage.
+
+    Raises:
+        SettingError: Its folder holds something else, or the same stage with other settings.
+        DataError: A file of the stage cannot be read.
+    """
+    record = _read(stage.folder / _RECORD)
+    if record is None:
+        if stage.folder.exists() and any(p.name[0] != "." for p in stage.folder.iterdir()):
+            raise SettingError(
+                stage.folder,
+                found="files that tangent-transfer did not write",
+                expected="a new folder, or that of this stage",
+                remedy=_REMEDY,
+            )
+        return "new"
+    before = _read(stage.folder / _CONFIG)
+    if before is None:
+        return "new"
+    finished = (stage.folder / _RESULTS).is_file()
+    begun = stage.command == "train" and (stage.folder / _LAST).is_file()
+    if finished or begun:
+        _check_settings(stage, before)
+        _check_weights(stage, record)
+        return "finished" if finished else "begun"
+    return "new"
+
+
+def run_stage(stage: Stage, state: State) -> int:
+    """Start a stage, or go on with it, and wait for it.
+
+    Args:
+        stage: Not finished.
+        state: What there is of it.
+
+    Returns:
+        The exit status, as a shell says it.
+
+    Raises:
+        DataError: The checkpoint it starts from is missing.
+    """
+    weights = _checkpoint(stage)
+    config = dict(stage.config)
+    if state == "begun":
+        config["resume"] = str(stage.folder)
+        # Where it has begun: the folder may have been moved since.
+        config["init_from"] = (_read(stage.folder / _CONFIG) or {}).get("init_from")
+    else:
+        source = "init_from" if stage.command == "train" else "checkpoint"
+        config[source] = None if weights is None else str(weights)
+        record = {"stage": stage.name, "weights": weights and _digest(weights)}
+        write_text(stage.folder / _RECORD, json.dumps(record, indent=1) + "\n")
+    write_text(stage.folder / _CONFIG, OmegaConf.to_yaml(OmegaConf.create(config)))
+    status, _ = run_process(_line(stage), run_environment())
+    return status if status >= 0 else 128 - status
+
+
+def said_as_a_command(stage: Stage, state: State) -> str:
+    """What a user would type to run the stage alone."""
+    if state == "begun":
+        return f"tangent-train {shlex.quote(f'resume={stage.folder}')}"
+    _, _, _, command, *arguments = _line(stage)
+    return f"tangent-{command} {shlex.join(arguments)}"
+
+
+def checkpoint_of(weights: Path) -> Path | None:
+    """The checkpoint: a file itself, of a run the one that it has tested; None if missing."""
+    if weights.is_file():
+        return weights
+    folder = weights / "checkpoints"
+    return next((p for p in (folder / "best.ckpt", folder / "last.ckpt") if p.is_file()), None)
+
+
+def _line(stage: Stage) -> list[str]:
+    config = (f"--config-dir={stage.folder}", f"--config-name={Path(_CONFIG).stem}")
+    return command_line(stage.command, config, stage.folder)
+
+
+def _checkpoint(stage: Stage) -> Path | None:
+    if stage.weights is None:
+        return None
+    found = checkpoint_of(stage.weights)
+    if found is None:
+        raise DataError(
+            stage.weights,
+            found="no checkpoints/best.ckpt or last.ckpt",
+            expected=f"the network that {stage.name} starts from",
+            remedy="Delete this folder to train it again.",
+        )
+    return found
+
+
+def _check_settings(stage: Stage, before: Mapping[str, Any]) -> None:
+    now: Any = OmegaConf.to_container(OmegaConf.create(stage.config), resolve=True)
+    free = _FREE if stage.command == "train" else (*_FREE, *_ONLY_TRAINING)
+    differing = differing_settings(now, before, free)
+    if not differing:
+        return
+    named = [f"{name}={then!r} (now {value!r})" for name, value, then in differing[:_MOST_NAMED]]
+    more = len(differing) - len(named)
+    raise SettingError(
+        stage.folder,
+        found=f"stage {stage.name} with " + ", ".join(named) + (f" and {more} more" * (more > 0)),
+        expected="the settings of this command",
+        remedy=_REMEDY,
+    )
+
+
+def _check_weights(stage: Stage, record: Mapping[str, Any]) -> None:
+    """A network that was trained again is another one; one that is gone is not missed."""
+    weights = None if stage.weights is None else checkpoint_of(stage.weights)
+    gone = stage.weights is not None and weights is None
+    if gone or record.get("weights") == (weights and _digest(weights)):
+        return
+    raise SettingError(
+        stage.folder,
+        found=f"stage {stage.name} of another network",
+        expected="none before it" if weights is None else f"the one in {weights}",
+        remedy=_REMEDY,
+    )
+
+
+def _digest(path: Path) -> str:
+    status = path.stat()
+    return _digest_of(path, status.st_mtime_ns, status.st_size)
+
+
+@lru_cache(maxsize=64)
+def _digest_of(path: Path, _changed: int, _size: int) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
+
+
+def _read(path: Path) -> dict[str, Any] | None:
+    """A file of a stage, resolved; None where there is none."""
+    if not path.is_file():
+        return None
+    try:
+        content = OmegaConf.to_container(OmegaConf.load(path), resolve=True)
+    except Exception as error:
+        first_line = str(error).partition("\n")[0]
+        raise DataError(
+            path, found=first_line, expected="as tangent-transfer wrote it", remedy=_REMEDY
+        ) from error
+    if not isinstance(content, dict):
+        raise DataError(path, found=type(content).__name__, expected="settings", remedy=_REMEDY)
+    return {str(name): value for name, value in content.items()}

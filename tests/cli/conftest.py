@@ -1,0 +1,25 @@
+"""What tests of the commands share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tangent_train.cli import compose, stage_runs, transfer
+from tangent_train.tasks import transfer_chart
+from tests.cli.pretended_runs import PretendedRuns
+
+
+@pytest.fixture
+def runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> PretendedRuns:
+    """In place of the stages of a transfer, in an empty folder."""
+    pretended = PretendedRuns()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(stage_runs, "run_process", pretended)
+    # Tested by themselves, and slow.
+    monkeypatch.setattr(transfer, "_try", lambda _: None)
+    monkeypatch.setattr(compose, "check_overrides", lambda *_: None)
+    for name in ("transfer_png", "levels_png"):
+        monkeypatch.setattr(transfer_chart, name, lambda _: b"a picture")
+    return pretended

@@ -1,0 +1,88 @@
+"""Runs of a transfer that are pretended: what real ones would leave, at once."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import OmegaConf
+
+from tangent_train.cli import main
+from tangent_train.tasks.metrics import ConfusionMatrices
+from tangent_train.tasks.results import evaluation_results, write_results
+
+SETTINGS = (
+    "experiment=rooms/transfer",
+    "name=mine",
+    "level=4",
+    "data.rooms.height=32",
+    "data.rooms.views_per_camera=2",
+    "data.rooms.view_size=32",
+    *(f"data.rooms.rooms.area_{area}=1" for area in ("1", "2", "3", "4", "5a", "5b", "6")),
+    "data.panoramas_per_step=2",
+    "data.validation_fraction=0.2",
+    "representation.faces_per_panorama=4",
+    "optimizer.lr=3e-3",
+    "fine_tuning.epochs=[1]",
+    "photos.representation.dim=null",
+    "trainer.max_epochs=20",
+    "trainer.accelerator=cpu",
+    "panels=0",
+)
+HERE = Path("runs/transfer/mine")
+OF_SEED_0 = HERE / "fold_1" / "seed_0"
+
+
+class PretendedRuns:
+    """In place of processes: leaves what a run leaves; S-FT-1's mIoU is twice that of the others.
+
+    Attributes:
+        started: Command and folder name of each, in order.
+        configs: The ``stage.yaml`` of each.
+        failing: A stage that ends with status 7 instead, having begun.
+    """
+
+    def __init__(self) -> None:
+        self.started: list[tuple[str, str]] = []
+        self.configs: list[Any] = []
+        self.failing: str | None = None
+
+    def __call__(self, line: Sequence[str], environment: dict[str, str]) -> tuple[int, list[str]]:
+        assert list(line[:3]) == [sys.executable, "-m", "tangent_train.cli.main"]
+        assert environment["PYTHONSAFEPATH"] == "1"
+        command, config_dir, config_name, run_dir = line[3:]
+        folder = Path(config_dir.removeprefix("--config-dir="))
+        (override,) = OverridesParser.create().parse_overrides([run_dir])
+        assert override.key_or_group == "hydra.run.dir"
+        assert Path(str(override.value())) == folder
+        assert config_name == "--config-name=stage"
+        config: Any = OmegaConf.load(folder / "stage.yaml")
+        self.started.append((command, folder.name))
+        self.configs.append(config)
+        settings = folder / ("config.yaml" if command == "train" else ".hydra/config.yaml")
+        settings.parent.mkdir(exist_ok=True)
+        OmegaConf.save(config, settings, resolve=True)
+        if command == "train":
+            (folder / "checkpoints").mkdir(exist_ok=True)
+            (folder / "checkpoints" / "last.ckpt").write_text(f"{config.name} {config.seed}")
+        if folder.name == self.failing:
+            return 7, []
+        hits = 100 if folder.name == "S-FT-1" else 50
+        pixels = np.diag([0, hits, hits])
+        pixels[1:, 0] = 100 - hits
+        bands = np.zeros((6, 3, 3), np.int64)
+        matrices = ConfusionMatrices(pixels, pixels / 10, bands, 4)
+        results = evaluation_results(matrices, ("unknown", "wall", "floor"), "skip")
+        write_results(results, folder)
+        return 0, []
+
+
+def run_transfer(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None:
+    """``tangent-transfer`` with the settings above, and these."""
+    monkeypatch.setattr(sys, "argv", ["tangent-transfer", *SETTINGS, *arguments])
+    main.transfer()
