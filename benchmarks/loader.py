@@ -134,14 +134,14 @@ def compare_loaders(png: Stanford2D3DS, store: Stanford2D3DS, rounds: int) -> No
 
 def compare_samples(store: Stanford2D3DS, rounds: int) -> None:
     """A sample of a few images beside one of all, in this process."""
-    whole = TangentRepresentation(1, store.representation.grid.level)  # type: ignore[attr-defined]
+    whole = TangentRepresentation(1, store.representation.grid.level)
     source = store.source("train")
 
     def sampler(representation: TangentRepresentation) -> Callable[[int], object]:
         panoramas = TrainingImages(source, representation, 0)
         return lambda epoch: panoramas[epoch, epoch % len(panoramas)]
 
-    few, everything = sampler(store.representation), sampler(whole)  # type: ignore[arg-type]
+    few, everything = sampler(store.representation), sampler(whole)
     seconds: tuple[list[float], list[float]] = ([], [])
     threads = cv2.getNumThreads()
     cv2.setNumThreads(0)  # as in a worker

@@ -56,7 +56,8 @@ def test_the_wheel_holds_the_packages_and_the_configs(wheel: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "command", ["tangent-train", "tangent-evaluate", "tangent-prepare", "tangent-report"]
+    "command",
+    ["tangent-train", "tangent-evaluate", "tangent-prepare", "tangent-report", "tangent-transfer"],
 )
 def test_the_commands_answer_from_another_folder(
     scripts: Path, command: str, tmp_path: Path

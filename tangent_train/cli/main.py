@@ -84,7 +84,7 @@ def _compose_and_run(command: str, typed: list[str]) -> None:
             if in_sweep():
                 return run_job(command, settings, visible_gpus, config)
             leave_warnings_to_the_sweep()
-            place = "transfer" if command == "transfer" else "run"
+            place = "transfer.command" if command == "transfer" else "run"
             commands = import_module(f"tangent_train.cli.{place}")
             result: float | None = getattr(commands, command)(config)
         except (DataError, SettingError) as error:

@@ -34,21 +34,21 @@ def report(arguments: Sequence[str]) -> None:
     from rich.console import Console
 
     from tangent_train.files import write_bytes, write_text
-    from tangent_train.tasks import report_tables
-    from tangent_train.tasks.report import group_runs
-    from tangent_train.tasks.report_chart import report_png
-    from tangent_train.tasks.runs import find_runs, load_run, unfinished_runs
+    from tangent_train.tasks.reports import tables
+    from tangent_train.tasks.reports.chart import report_png
+    from tangent_train.tasks.reports.groups import group_runs
+    from tangent_train.tasks.reports.runs import find_runs, load_run, unfinished_runs
 
     groups = group_runs([load_run(folder) for folder in find_runs(options.folders)])
-    remarks = report_tables.notes(groups)
+    remarks = tables.notes(groups)
     remarks += [f"{run}: not finished, left out." for run in unfinished_runs(options.folders)]
     # The mark of a report first: an interrupted one can be written again.
-    write_text(options.output / "report.json", report_tables.report_json(groups, remarks))
-    write_text(options.output / "report.md", report_tables.report_markdown(groups, remarks))
-    write_text(options.output / "report.csv", report_tables.report_csv(groups))
+    write_text(options.output / "report.json", tables.report_json(groups, remarks))
+    write_text(options.output / "report.md", tables.report_markdown(groups, remarks))
+    write_text(options.output / "report.csv", tables.report_csv(groups))
     write_bytes(options.output / "report.png", report_png(groups))
     console = Console(highlight=False)
-    for table in report_tables.report_tables(groups):
+    for table in tables.report_tables(groups):
         console.print(table)
     for remark in remarks:
         console.print(f"- {remark}", soft_wrap=True, markup=False)
@@ -93,7 +93,7 @@ def _check_output(folder: Path) -> None:
 
 
 def _is_report(path: Path) -> bool:
-    from tangent_train.tasks.report_tables import MADE_BY
+    from tangent_train.tasks.reports.tables import MADE_BY
 
     try:
         content = json.loads(path.read_text())

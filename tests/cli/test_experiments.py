@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from tangent_train.cli.compose import config_folder
 from tangent_train.cli.run import build
-from tangent_train.cli.stages import folds_and_seeds, plan
+from tangent_train.cli.transfer.stages import folds_and_seeds, plan
 from tests.datamodules.synthia_format import write_panoramas, write_views
 
 if TYPE_CHECKING:

@@ -128,7 +128,7 @@ def test_photos_are_counted_like_panoramas_without_latitudes_and_solid_angles() 
     rng = np.random.default_rng(5)
     prediction, truth = rng.integers(1, CLASSES, (3, 8, 8)), rng.integers(0, CLASSES, (3, 8, 8))
     photo = _counted([(prediction, truth)]).compute()
-    as_one = _counted([(np.hstack(prediction), np.hstack(truth))]).compute()
+    as_one = _counted([(np.hstack(list(prediction)), np.hstack(list(truth)))]).compute()
     np.testing.assert_array_equal(photo.pixels, as_one.pixels)
     assert photo.images == 1, "three crops of one photo"
     assert not photo.solid_angle.any()

@@ -15,17 +15,17 @@ from omegaconf import OmegaConf
 from rich.console import Console
 
 from tangent_train.errors import DataError
-from tangent_train.tasks.paper import CLASSES, STANFORD_ROWS
-from tangent_train.tasks.report import Figure, Group, group_runs
-from tangent_train.tasks.report_chart import report_png
-from tangent_train.tasks.report_tables import (
+from tangent_train.tasks.reports.chart import report_png
+from tangent_train.tasks.reports.groups import Figure, Group, group_runs
+from tangent_train.tasks.reports.paper import CLASSES, STANFORD_ROWS
+from tangent_train.tasks.reports.runs import find_runs, load_run, unfinished_runs
+from tangent_train.tasks.reports.tables import (
     notes,
     report_csv,
     report_json,
     report_markdown,
     report_tables,
 )
-from tangent_train.tasks.runs import find_runs, load_run, unfinished_runs
 
 NAMES = ("wall", "floor", "sofa")
 FIGURES = ("iou", "accuracy", "iou_solid_angle", "accuracy_solid_angle")

@@ -18,8 +18,8 @@ from typing import Any
 
 from datamodules.stanford_files import FOLDS
 from tangent_train.errors import DataError
-from tangent_train.tasks.paper import CLASSES, PaperRow, paper_row
-from tangent_train.tasks.runs import RESULTS_FILE, Run
+from tangent_train.tasks.reports.paper import CLASSES, PaperRow, paper_row
+from tangent_train.tasks.reports.runs import RESULTS_FILE, Run
 
 __all__ = ["REAL", "Figure", "Group", "average", "check_classes", "group_runs"]
 

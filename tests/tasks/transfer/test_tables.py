@@ -10,17 +10,17 @@ import pytest
 from rich.console import Console
 
 from tangent_train.errors import DataError
-from tangent_train.tasks.paper import CLASSES
-from tangent_train.tasks.report import Figure
-from tangent_train.tasks.transfer import StageResult, TransferReport, gather
-from tangent_train.tasks.transfer_tables import (
+from tangent_train.tasks.reports.groups import Figure
+from tangent_train.tasks.reports.paper import CLASSES
+from tangent_train.tasks.transfer.report import StageResult, TransferReport, gather
+from tangent_train.tasks.transfer.tables import (
     transfer_csv,
     transfer_json,
     transfer_markdown,
     transfer_notes,
     transfer_tables,
 )
-from tests.tasks.transfer_runs import both, by_name, make_run, markdown_tables, stage
+from tests.tasks.transfer.transfer_runs import both, by_name, make_run, markdown_tables, stage
 
 
 @pytest.fixture

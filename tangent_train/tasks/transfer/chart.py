@@ -9,20 +9,20 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure as Canvas
 
-from tangent_train.tasks.report_cells import change
-from tangent_train.tasks.report_chart import COLORS, percents, png_bytes, style_axes
-from tangent_train.tasks.transfer_cells import scope_text
-from tangent_train.tasks.transfer_paper import printed
-from tangent_train.tasks.transfer_tables import MADE_BY
+from tangent_train.tasks.reports.cells import change
+from tangent_train.tasks.reports.chart import COLORS, percents, png_bytes, style_axes
+from tangent_train.tasks.transfer.beside_paper import printed
+from tangent_train.tasks.transfer.cells import scope_text
+from tangent_train.tasks.transfer.tables import MADE_BY
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from matplotlib.axes import Axes
 
-    from tangent_train.tasks.report import Figure
-    from tangent_train.tasks.transfer import Row, TransferReport
-    from tangent_train.tasks.transfer_levels import LevelReport
+    from tangent_train.tasks.reports.groups import Figure
+    from tangent_train.tasks.transfer.levels import LevelReport
+    from tangent_train.tasks.transfer.report import Row, TransferReport
 
 __all__ = ["levels_png", "transfer_png"]
 

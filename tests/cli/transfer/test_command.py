@@ -12,9 +12,10 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from tangent_train.cli import main, stage_runs
-from tangent_train.cli.transfer_report import trained_level
-from tests.cli.pretended_runs import HERE, OF_SEED_0, SETTINGS, PretendedRuns, run_transfer
+from tangent_train.cli import main
+from tangent_train.cli.transfer import stage_runs
+from tangent_train.cli.transfer.report import trained_level
+from tests.cli.transfer.pretended_runs import HERE, OF_SEED_0, SETTINGS, PretendedRuns, run_transfer
 
 STAGES = ["P", "S", "S-erp", "S-cubemap", "P-FT-1", "S-FT-1"]
 

@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 
 from tangent_train.errors import DataError
-from tangent_train.tasks.transfer_levels import (
+from tangent_train.tasks.transfer.levels import (
     LevelReport,
     LevelResult,
     gather_levels,
@@ -20,7 +20,7 @@ from tangent_train.tasks.transfer_levels import (
     levels_notes,
     levels_tables,
 )
-from tests.tasks.transfer_runs import levels, make_run, markdown_tables
+from tests.tasks.transfer.transfer_runs import levels, make_run, markdown_tables
 
 
 @pytest.fixture

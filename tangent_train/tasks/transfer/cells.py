@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from tangent_train.tasks.report import Figure
-from tangent_train.tasks.report_cells import Cells, cell, change, kept, percent, text
-from tangent_train.tasks.transfer import TransferReport
-from tangent_train.tasks.transfer_paper import paper_table, printed, printed_kept
+from tangent_train.tasks.reports.cells import Cells, cell, change, kept, percent, text
+from tangent_train.tasks.reports.groups import Figure
+from tangent_train.tasks.transfer.beside_paper import paper_table, printed, printed_kept
+from tangent_train.tasks.transfer.report import TransferReport
 
 __all__ = ["band_cells", "class_cells", "overall_cells", "scope_text"]
 

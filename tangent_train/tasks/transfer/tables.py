@@ -11,18 +11,18 @@ from typing import Any
 
 from rich.table import Table
 
-from tangent_train.tasks.report import Figure
-from tangent_train.tasks.report_cells import line, markdown_table, terminal_table, text
-from tangent_train.tasks.report_tables import MADE_ROOMS
-from tangent_train.tasks.runs import MEANS, PER_BAND, PER_CLASS
-from tangent_train.tasks.transfer import Row, TransferReport
-from tangent_train.tasks.transfer_cells import (
+from tangent_train.tasks.reports.cells import line, markdown_table, terminal_table, text
+from tangent_train.tasks.reports.groups import Figure
+from tangent_train.tasks.reports.runs import MEANS, PER_BAND, PER_CLASS
+from tangent_train.tasks.reports.tables import MADE_ROOMS
+from tangent_train.tasks.transfer.beside_paper import paper_notes, paper_tables, printed
+from tangent_train.tasks.transfer.cells import (
     band_cells,
     class_cells,
     overall_cells,
     scope_text,
 )
-from tangent_train.tasks.transfer_paper import paper_notes, paper_tables, printed
+from tangent_train.tasks.transfer.report import Row, TransferReport
 
 __all__ = [
     "MADE_BY",

@@ -12,10 +12,17 @@ from typing import Any
 
 from rich.table import Table
 
-from tangent_train.tasks.paper import CLASSES, STANFORD_ROWS, PaperRow
-from tangent_train.tasks.report import Figure, Group
-from tangent_train.tasks.report_cells import Cells, cell, line, markdown_table, terminal_table, text
-from tangent_train.tasks.runs import MEANS, PER_CLASS
+from tangent_train.tasks.reports.cells import (
+    Cells,
+    cell,
+    line,
+    markdown_table,
+    terminal_table,
+    text,
+)
+from tangent_train.tasks.reports.groups import Figure, Group
+from tangent_train.tasks.reports.paper import CLASSES, STANFORD_ROWS, PaperRow
+from tangent_train.tasks.reports.runs import MEANS, PER_CLASS
 
 __all__ = [
     "MADE_BY",

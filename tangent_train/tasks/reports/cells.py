@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from rich.markup import escape
 from rich.table import Table
 
-from tangent_train.tasks.report import Figure
+from tangent_train.tasks.reports.groups import Figure
 
 __all__ = [
     "Cells",

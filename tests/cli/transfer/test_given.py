@@ -11,9 +11,9 @@ from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
 from tangent_train.cli.compose import config_folder
-from tangent_train.cli.transfer_checkpoint import check_given
+from tangent_train.cli.transfer.given import check_given
 from tangent_train.errors import SettingError
-from tests.cli.pretended_runs import PretendedRuns, run_transfer
+from tests.cli.transfer.pretended_runs import PretendedRuns, run_transfer
 
 
 @pytest.fixture(scope="module")

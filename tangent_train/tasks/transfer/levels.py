@@ -17,8 +17,7 @@ from typing import Any
 from rich.table import Table
 
 from tangent_train.errors import DataError
-from tangent_train.tasks.report import Group, check_classes
-from tangent_train.tasks.report_cells import (
+from tangent_train.tasks.reports.cells import (
     Cells,
     cell,
     change,
@@ -27,10 +26,11 @@ from tangent_train.tasks.report_cells import (
     terminal_table,
     text,
 )
-from tangent_train.tasks.report_tables import MADE_ROOMS
-from tangent_train.tasks.runs import MEANS, Run
-from tangent_train.tasks.transfer_rows import Averages, check_once, sort_key
-from tangent_train.tasks.transfer_tables import MADE_BY
+from tangent_train.tasks.reports.groups import Group, check_classes
+from tangent_train.tasks.reports.runs import MEANS, Run
+from tangent_train.tasks.reports.tables import MADE_ROOMS
+from tangent_train.tasks.transfer.rows import Averages, check_once, sort_key
+from tangent_train.tasks.transfer.tables import MADE_BY
 
 __all__ = [
     "LevelReport",

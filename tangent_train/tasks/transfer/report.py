@@ -14,9 +14,9 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from tangent_train.errors import DataError
-from tangent_train.tasks.report import Group, check_classes
-from tangent_train.tasks.runs import Run
-from tangent_train.tasks.transfer_rows import Averages, check_once, sort_key
+from tangent_train.tasks.reports.groups import Group, check_classes
+from tangent_train.tasks.reports.runs import Run
+from tangent_train.tasks.transfer.rows import Averages, check_once, sort_key
 
 __all__ = ["Row", "StageResult", "TransferReport", "gather"]
 

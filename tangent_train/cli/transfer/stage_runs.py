@@ -23,7 +23,7 @@ from tangent_train.files import write_text
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from tangent_train.cli.stages import Stage
+    from tangent_train.cli.transfer.stages import Stage
 
 __all__ = ["State", "checkpoint_of", "run_stage", "said_as_a_command", "stage_state"]
 

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure as Canvas
 
-from tangent_train.tasks.report import Figure, Group
+from tangent_train.tasks.reports.groups import Figure, Group
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -12,12 +12,13 @@ from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table
 
-from tangent_train.cli.stages import STUDY, Stage, checked_study
+from tangent_train.cli.transfer.stages import STUDY, Stage, checked_study
 from tangent_train.files import write_bytes, write_text
 from tangent_train.geometry import camera_matrix_from_fov
-from tangent_train.tasks import transfer_chart, transfer_levels, transfer_tables
-from tangent_train.tasks.runs import Run, load_run
-from tangent_train.tasks.transfer import StageResult, gather
+from tangent_train.tasks.reports.runs import Run, load_run
+from tangent_train.tasks.transfer import chart, levels
+from tangent_train.tasks.transfer import tables as transfer_tables
+from tangent_train.tasks.transfer.report import StageResult, gather
 
 __all__ = ["trained_level", "write_report"]
 
@@ -71,24 +72,22 @@ def _transfer(stages: Sequence[Stage]) -> _Report:
     }
     notes = transfer_tables.transfer_notes(report)
     tables = transfer_tables.transfer_tables(report)
-    return _Report("transfer", texts, transfer_chart.transfer_png(report), tables, notes)
+    return _Report("transfer", texts, chart.transfer_png(report), tables, notes)
 
 
 def _levels(config: DictConfig, stages: Sequence[Stage]) -> _Report:
     results = [
-        transfer_levels.LevelResult(s.level, s.fold, s.seed, _run(s))
-        for s in stages
-        if s.level is not None
+        levels.LevelResult(s.level, s.fold, s.seed, _run(s)) for s in stages if s.level is not None
     ]
-    report = transfer_levels.gather_levels(results, trained_level(config))
+    report = levels.gather_levels(results, trained_level(config))
     texts = {
-        "json": transfer_levels.levels_json(report),
-        "md": transfer_levels.levels_markdown(report),
-        "csv": transfer_levels.levels_csv(report),
+        "json": levels.levels_json(report),
+        "md": levels.levels_markdown(report),
+        "csv": levels.levels_csv(report),
     }
-    notes = transfer_levels.levels_notes(report)
-    tables = transfer_levels.levels_tables(report)
-    return _Report(STUDY, texts, transfer_chart.levels_png(report), tables, notes)
+    notes = levels.levels_notes(report)
+    tables = levels.levels_tables(report)
+    return _Report(STUDY, texts, chart.levels_png(report), tables, notes)
 
 
 def _run(stage: Stage) -> Run:

@@ -10,16 +10,16 @@ from typing import Any
 
 import pytest
 
-from tangent_train.tasks.paper import CLASSES
-from tangent_train.tasks.paper_transfer import SYNTHIA_ROWS, TRANSFER_STAGES, paper_stage
-from tangent_train.tasks.transfer import TransferReport, gather
-from tangent_train.tasks.transfer_paper import paper_table, printed, printed_kept
-from tangent_train.tasks.transfer_tables import (
+from tangent_train.tasks.reports.paper import CLASSES
+from tangent_train.tasks.transfer.beside_paper import paper_table, printed, printed_kept
+from tangent_train.tasks.transfer.paper import SYNTHIA_ROWS, TRANSFER_STAGES, paper_stage
+from tangent_train.tasks.transfer.report import TransferReport, gather
+from tangent_train.tasks.transfer.tables import (
     transfer_csv,
     transfer_markdown,
     transfer_notes,
 )
-from tests.tasks.transfer_runs import REAL, by_name, make_run, markdown_tables, stage
+from tests.tasks.transfer.transfer_runs import REAL, by_name, make_run, markdown_tables, stage
 
 FOLDS = (1, 2, 3)
 STAGES = ("P", "S", "P-FT-1", "S-FT-1", "P-FT-10", "S-FT-10")

@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
-from tangent_train.tasks.paper import CLASSES
-from tangent_train.tasks.transfer import gather
-from tangent_train.tasks.transfer_chart import levels_png, transfer_png
-from tests.tasks.transfer_runs import REAL, both, levels, make_run, stage
+from tangent_train.tasks.reports.paper import CLASSES
+from tangent_train.tasks.transfer.chart import levels_png, transfer_png
+from tangent_train.tasks.transfer.report import gather
+from tests.tasks.transfer.transfer_runs import REAL, both, levels, make_run, stage
 
 BLUE = (0xB2, 0x72, 0x00)  # OpenCV's order
 GREY = (0x99, 0x99, 0x99)

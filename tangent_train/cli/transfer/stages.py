@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from omegaconf import ListConfig, OmegaConf
 
-from tangent_train.cli.stage_config import Settings, StageConfigs
+from tangent_train.cli.transfer.configs import Settings, StageConfigs
 from tangent_train.errors import SettingError
 
 if TYPE_CHECKING:

@@ -8,8 +8,8 @@ from statistics import fmean
 from typing import Generic, Protocol, Self, TypeVar
 
 from tangent_train.errors import DataError
-from tangent_train.tasks.report import Figure, average
-from tangent_train.tasks.runs import Run
+from tangent_train.tasks.reports.groups import Figure, average
+from tangent_train.tasks.reports.runs import Run
 
 __all__ = ["Averages", "Result", "check_once", "sort_key"]
 

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from tangent_train.cli import stage_runs
-from tangent_train.cli.stage_runs import run_stage, said_as_a_command, stage_state
-from tangent_train.cli.stages import Stage
+from tangent_train.cli.transfer import stage_runs
+from tangent_train.cli.transfer.stage_runs import run_stage, said_as_a_command, stage_state
+from tangent_train.cli.transfer.stages import Stage
 from tangent_train.errors import DataError, SettingError
-from tests.cli.pretended_runs import OF_SEED_0, PretendedRuns, run_transfer
+from tests.cli.transfer.pretended_runs import OF_SEED_0, PretendedRuns, run_transfer
 
 
 def test_a_folder_of_other_settings_is_refused(

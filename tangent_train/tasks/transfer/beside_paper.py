@@ -5,8 +5,10 @@ from __future__ import annotations
 from typing import Literal
 
 from datamodules.stanford_files import FOLDS
-from tangent_train.tasks.paper import CLASSES
-from tangent_train.tasks.paper_transfer import (
+from tangent_train.tasks.reports.cells import Cells, change, text
+from tangent_train.tasks.reports.groups import REAL
+from tangent_train.tasks.reports.paper import CLASSES
+from tangent_train.tasks.transfer.paper import (
     SYNTHIA_ROWS,
     TRANSFER_SETTING,
     TRANSFER_STAGES,
@@ -14,9 +16,7 @@ from tangent_train.tasks.paper_transfer import (
     paper_stage,
     synthia_row,
 )
-from tangent_train.tasks.report import REAL
-from tangent_train.tasks.report_cells import Cells, change, text
-from tangent_train.tasks.transfer import Row, TransferReport
+from tangent_train.tasks.transfer.report import Row, TransferReport
 
 __all__ = ["paper_notes", "paper_table", "paper_tables", "printed", "printed_kept"]
 

@@ -10,8 +10,8 @@ from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
 from tangent_train.cli.compose import compose_option, config_folder
-from tangent_train.cli.stage_config import StageConfigs
-from tangent_train.cli.stages import Stage, folds_and_seeds, plan
+from tangent_train.cli.transfer.configs import StageConfigs
+from tangent_train.cli.transfer.stages import Stage, folds_and_seeds, plan
 from tangent_train.errors import SettingError
 
 FOLDER = Path("/runs/mine")

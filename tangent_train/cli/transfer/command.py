@@ -13,9 +13,9 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from rich.console import Console
 
 from tangent_train.cli.compose import compose_option
-from tangent_train.cli.stage_runs import run_stage, said_as_a_command, stage_state
-from tangent_train.cli.stages import Stage, folds_and_seeds, plan, stage_folder
-from tangent_train.cli.transfer_checkpoint import check_given
+from tangent_train.cli.transfer.given import check_given
+from tangent_train.cli.transfer.stage_runs import run_stage, said_as_a_command, stage_state
+from tangent_train.cli.transfer.stages import Stage, folds_and_seeds, plan, stage_folder
 from tangent_train.errors import DataError, SettingError
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ def transfer(config: DictConfig) -> None:
     except (KeyboardInterrupt, SystemExit):
         _say("Finished stages stay; the same command goes on.", error=True)
         raise
-    from tangent_train.cli.transfer_report import write_report  # heavy, and last
+    from tangent_train.cli.transfer.report import write_report  # heavy, and last
 
     others, remarks = _finished_elsewhere(config, folder, asked, compared)
     for text in (*write_report(config, folder, [*stages, *others]), *remarks):

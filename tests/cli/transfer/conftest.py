@@ -6,9 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from tangent_train.cli import compose, stage_runs, transfer
-from tangent_train.tasks import transfer_chart
-from tests.cli.pretended_runs import PretendedRuns
+from tangent_train.cli import compose
+from tangent_train.cli.transfer import command, stage_runs
+from tangent_train.tasks.transfer import chart
+from tests.cli.transfer.pretended_runs import PretendedRuns
 
 
 @pytest.fixture
@@ -18,8 +19,8 @@ def runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> PretendedRuns:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(stage_runs, "run_process", pretended)
     # Tested by themselves, and slow.
-    monkeypatch.setattr(transfer, "_try", lambda _: None)
+    monkeypatch.setattr(command, "_try", lambda _: None)
     monkeypatch.setattr(compose, "check_overrides", lambda *_: None)
     for name in ("transfer_png", "levels_png"):
-        monkeypatch.setattr(transfer_chart, name, lambda _: b"a picture")
+        monkeypatch.setattr(chart, name, lambda _: b"a picture")
     return pretended

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-from tangent_train.tasks.runs import Run
-from tangent_train.tasks.transfer import Row, StageResult, TransferReport
-from tangent_train.tasks.transfer_levels import LevelReport, LevelResult, gather_levels
+from tangent_train.tasks.reports.runs import Run
+from tangent_train.tasks.transfer.levels import LevelReport, LevelResult, gather_levels
+from tangent_train.tasks.transfer.report import Row, StageResult, TransferReport
 
 NAMES = ("wall", "floor")
 REAL = "datamodules.Stanford2D3DS"

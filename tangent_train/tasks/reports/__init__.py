@@ -1,0 +1,1 @@
+"""Finished runs read from disk, and several of them as one result."""
