@@ -19,7 +19,7 @@ def jitter_colors(rgb: Tensor, strength: float, rng: np.random.Generator) -> Ten
     """Change brightness, contrast, saturation and, a little, hue of all images alike.
 
     Args:
-        rgb: ``(n, h, w, 3)`` uint8, images of one panorama.
+        rgb: ``(n, h, w, 3)`` uint8, views of one panorama or photo.
         strength: 0 to 1. The factors of the first three are uniform in 1 ± strength, hue turns by
             up to strength / 10 of the whole circle either way.
         rng: Where four numbers are drawn from.

@@ -75,5 +75,5 @@ class PhotoDataModule(SegmentationDataModule[Photo]):
                 path,
                 found=error.found,
                 expected=f"all of a crop of {fov_deg:g}°",
-                remedy="Lower representation.fov_deg (and dim with it), or leave the photo out.",
+                remedy="Lower representation.fov_deg, or leave the photo out.",
             ) from error

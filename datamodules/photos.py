@@ -62,5 +62,5 @@ def distance_from_z_depth(
         ((np.arange(count) - camera_matrix[axis, 2]) / camera_matrix[axis, axis]) ** 2
         for axis, count in ((1, z_depth.shape[0]), (0, z_depth.shape[1]))
     )
-    length = np.sqrt(1 + np.add.outer(y_squared, x_squared).astype(np.float32))
+    length = np.sqrt(1 + np.add.outer(y_squared, x_squared))
     return np.minimum(z_depth * length + 0.5, _MOST_STEPS).astype(np.uint16)

@@ -14,7 +14,7 @@ from torch.utils.data import Dataset, default_collate
 
 from datamodules.colors import jitter_colors
 from datamodules.panoramas import STEPS_PER_M
-from datamodules.sampling import sample_rng
+from datamodules.sampling import Seed, sample_rng
 from tangent_train.errors import SettingError
 
 if TYPE_CHECKING:
@@ -174,7 +174,7 @@ class TrainingImages(Dataset[TrainingSample[Inputs]]):
         self,
         source: ImageSource[LabelledImage],
         representation: Any,
-        seed: int,
+        seed: Seed,
         color_jitter: float = 0.0,
     ) -> None:
         self._source = source

@@ -1,4 +1,4 @@
-"""Which panorama comes when, and the randomness of each sample.
+"""Which image comes when, and the randomness of each sample.
 
 Everything random about a sample is drawn from a generator seeded by (seed, epoch, index), so a
 run shows the same faces for any number of workers, and after a resume. The epoch travels with
@@ -17,14 +17,18 @@ from tangent_train.errors import SettingError
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-__all__ = ["EpochSampler", "sample_rng"]
+__all__ = ["EpochSampler", "Seed", "sample_rng"]
 
 
-def sample_rng(seed: int, epoch: int, index: int) -> np.random.Generator:
+Seed = int | tuple[int, int]
+"""A seed, 0 or more, or one with a stream; (seed, 0) is the same as the seed alone."""
+
+
+def sample_rng(seed: Seed, epoch: int, index: int) -> np.random.Generator:
     """The source of randomness of one sample.
 
     Args:
-        seed: Seed of the run, 0 or more.
+        seed: Seed of the run.
         epoch: Epoch, from 0.
         index: Place of the sample in its data set.
     """
@@ -46,7 +50,7 @@ class EpochSampler(Sampler[tuple[int, int]]):
 
     Args:
         length: Number of samples in the data set.
-        seed: Seed of the order, 0 or more.
+        seed: Seed of the order.
         shuffle: A new random order every epoch.
         rank: This process.
         world_size: Number of processes.
@@ -60,7 +64,7 @@ class EpochSampler(Sampler[tuple[int, int]]):
     def __init__(
         self,
         length: int,
-        seed: int,
+        seed: Seed,
         shuffle: bool,
         rank: int = 0,
         world_size: int = 1,

@@ -58,6 +58,8 @@ class SegmentationDataModule(LightningDataModule, ABC, Generic[_Image]):
         inputs: `rgb`, or `rgb` and `depth`.
         num_workers: Worker processes of a loader; the samples are the same for any number.
         seed: Seed of order, views, augmentation and turns, 0 or more.
+        stream: Another number draws another order, other views and colours from the same seed: who
+            trains on, a network that has seen those of stream 0, sees new ones.
         in_memory: Keep decoded images in memory, see `RememberedImages`.
         color_jitter: Strength of the colour augmentation, 0 (none) to 1, see `jitter_colors`.
         normalization: Of the input channels; by default that of Stanford2D3DS.
@@ -88,6 +90,7 @@ class SegmentationDataModule(LightningDataModule, ABC, Generic[_Image]):
         inputs: Sequence[str] = ("rgb", "depth"),
         num_workers: int = 0,
         seed: int = 0,
+        stream: int = 0,
         in_memory: bool = False,
         color_jitter: float = 0.0,
         normalization: Normalization | None = None,
@@ -112,6 +115,7 @@ class SegmentationDataModule(LightningDataModule, ABC, Generic[_Image]):
         self.images_per_step = _at_least(f"data.{self._per_step}", images_per_step, 1)
         self.num_workers = _at_least("data.num_workers", num_workers, 0)
         self.seed = _at_least("data.seed", seed, 0)
+        self._drawn_from = self.seed, _at_least("data.stream", stream, 0)
         self.in_memory = in_memory
         if not isinstance(color_jitter, int | float) or not 0 <= color_jitter <= 1:
             raise SettingError("data.color_jitter", found=color_jitter, expected="0 to 1")
@@ -222,7 +226,7 @@ class SegmentationDataModule(LightningDataModule, ABC, Generic[_Image]):
     def train_dataloader(self) -> DataLoader[TrainingSample[Inputs]]:
         """Batches of `TrainingSample`."""
         source = self.source("train")
-        dataset = TrainingImages(source, self.representation, self.seed, self.color_jitter)
+        dataset = TrainingImages(source, self.representation, self._drawn_from, self.color_jitter)
         size = self.images_per_step
         return self._loader(dataset, len(source), size, self._start, shuffle=True)
 
@@ -254,7 +258,7 @@ class SegmentationDataModule(LightningDataModule, ABC, Generic[_Image]):
         return DataLoader(
             dataset,
             batch_size=batch_size,
-            sampler=EpochSampler(length, self.seed, shuffle, rank, world_size, start),
+            sampler=EpochSampler(length, self._drawn_from, shuffle, rank, world_size, start),
             # Its own: the loader draws seeds for its workers, which would shift those of dropout.
             generator=torch.Generator().manual_seed(self.seed),
             num_workers=self.num_workers,

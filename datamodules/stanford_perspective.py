@@ -122,8 +122,8 @@ class Stanford2D3DSPerspective(PhotoDataModule):
         representation: The camera that all photos are brought to.
         fold: 1, 2 or 3, see `FOLDS`.
         areas: Areas to use, all of which must be there; by default all there are.
-        validation_fraction: Share of the training rooms for validation, see `StanfordSplits`: the
-            same rooms as those of the panoramas.
+        validation_fraction: Share of the training rooms for validation, see `StanfordSplits`; those
+            of the panoramas, where every room has both.
         label_table: The class table, when it is not where the release has it.
         **settings: All others of `PhotoDataModule`; the seed also chooses the validation rooms.
 

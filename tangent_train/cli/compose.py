@@ -50,7 +50,8 @@ def search_path(options: Namespace) -> list[str]:
     """The override that makes Hydra look into the folder of ``--config-dir`` as well."""
     if not options.config_dir:
         return []
-    return [f"hydra.searchpath=['file://{Path(options.config_dir).absolute()}']"]
+    folder = str(Path(options.config_dir).absolute()).replace("'", r"\'")
+    return [f"hydra.searchpath=['file://{folder}']"]
 
 
 def compose_option(group: str, option: str, search: Sequence[str] = ()) -> dict[str, Any]:
@@ -114,7 +115,7 @@ def check_overrides(config_name: str, arguments: list[str]) -> None:
             _check_option(override, options_of[override.key_or_group])
         chosen = [str(o.input_line) for o in groups if not o.is_sweep_override()]
         config = _compose(config_name, search, chosen)
-        _check_experiment(config_name, config, search, chosen, plain)
+        _check_experiment(config_name, config, chosen)
     names = list(dict.fromkeys([*_dotted(config), *_group_names(loader)]))
     for override in plain:
         if override not in groups and override.key_or_group not in names:
@@ -138,45 +139,32 @@ def _compose(config_name: str, search: list[str], chosen: list[str]) -> DictConf
     except ConfigCompositionException as error:
         first_line = str(error).partition("\n")[0]
         if any(f"@{section}." in first_line for section in _OF_TRANSFER):
-            raise _of_another_command(_experiment(chosen), _TRANSFER) from error
+            raise _of_another_command(_experiment(chosen)) from error
         raise SettingError(
             f"config '{config_name}'", found=first_line, expected="groups that it has"
         ) from error
 
 
-def _check_experiment(
-    config_name: str,
-    config: DictConfig,
-    search: list[str],
-    chosen: list[str],
-    overrides: list[Override],
-) -> None:
-    """Refuse experiments of tangent-transfer elsewhere, and there those that know no photos."""
+def _check_experiment(config_name: str, config: DictConfig, chosen: list[str]) -> None:
+    """Refuse experiments of tangent-transfer elsewhere."""
     experiment = _experiment(chosen)
     if experiment is None or config_name.startswith(STORED):
         return
-    if config_name != _TRANSFER:
-        if any(section in config for section in _OF_TRANSFER):
-            raise _of_another_command(experiment, _TRANSFER)
-        return
-    about_photos = any((o.package or o.key_or_group).startswith("photos") for o in overrides)
-    others = _compose(config_name, search, [text for text in chosen if text != experiment])
-    photos = (OmegaConf.to_container(c.photos, resolve=False) for c in (config, others))
-    if not about_photos and next(photos) == next(photos):
-        raise _of_another_command(experiment, "train")
+    if config_name != _TRANSFER and any(section in config for section in _OF_TRANSFER):
+        raise _of_another_command(experiment)
 
 
 def _experiment(chosen: list[str]) -> str | None:
     return next((text for text in chosen if text.startswith("experiment=")), None)
 
 
-def _of_another_command(experiment: str | None, command: str) -> SettingError:
+def _of_another_command(experiment: str | None) -> SettingError:
     which = experiment or "experiment"
     return SettingError(
         which,
-        found=f"an experiment of tangent-{command}",
+        found="an experiment of tangent-transfer",
         expected="one of this command",
-        remedy=f"Run: tangent-{command} {which}",
+        remedy=f"Run: tangent-transfer {which}",
     )
 
 

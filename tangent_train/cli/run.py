@@ -201,10 +201,7 @@ def _trainer(
         "config": OmegaConf.to_container(config),
         "resolved_config": _resolved(config),
         "class_names": list(data.class_names),
-        "normalization": {
-            "mean": list(data.normalization.mean),
-            "std": list(data.normalization.std),
-        },
+        "normalization": _plain_normalization(data),
     }
     panels = PredictionPanels(folder / "panels", config.panels)
     common = [CheckpointContents(contents), panels, ProgressBar()]
@@ -217,7 +214,7 @@ def _trainer(
         callbacks=[*callbacks, *common],
         logger=TensorBoardLogger(folder, name="", version="tensorboard"),
         plugins=[AtomicCheckpointIO()],
-        # The data module's samplers count every panorama once on any number of processes.
+        # The data module's samplers count every image once on any number of processes.
         use_distributed_sampler=False,
     )
     return trainer
@@ -234,8 +231,10 @@ def _checkpoint(path: Path) -> dict[str, Any]:
 
 
 def _test(trainer: lightning.Trainer, task: Any, data: Any, checkpoint: Path, folder: Path) -> None:
+    content = _checkpoint(checkpoint)
+    _check_fits(content, data, checkpoint)
     try:
-        task.load_state_dict(_checkpoint(checkpoint)["state_dict"])
+        task.load_state_dict(content["state_dict"])
     except RuntimeError as error:
         raise SettingError(
             "network",
@@ -248,6 +247,24 @@ def _test(trainer: lightning.Trainer, task: Any, data: Any, checkpoint: Path, fo
     if results["images"] != total:
         raise RuntimeError(f"{results['images']} of {total} test {data.noun} were counted")
     _report(results, checkpoint, folder)
+
+
+def _check_fits(content: dict[str, Any], data: Any, checkpoint: Path) -> None:
+    """Refuse data whose labels or inputs mean something else to the network."""
+    own = {"class_names": list(data.class_names), "normalization": _plain_normalization(data)}
+    for name, value in own.items():
+        if content[name] != value:
+            raise SettingError(
+                f"data, for {checkpoint}",
+                found=f"{name.replace('_', ' ')} {value}",
+                expected=f"{content[name]}, which the network was trained with",
+                remedy="Evaluate it on data of the same classes, with the same data.inputs and "
+                "data.normalization.",
+            )
+
+
+def _plain_normalization(data: Any) -> dict[str, list[float]]:
+    return {"mean": list(data.normalization.mean), "std": list(data.normalization.std)}
 
 
 def _best_on_validation(trainer: lightning.Trainer, folder: Path) -> float | None:

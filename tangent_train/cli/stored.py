@@ -21,6 +21,9 @@ __all__ = ["checkpoint_config", "stored_config_arguments", "with_stored_config"]
 _CHOOSABLE = ("data", "representation")
 """Sections that an evaluation may take from a group: all else belongs to the network."""
 
+_OF_THE_NETWORK = ("fold", "inputs", "normalization")
+"""Settings of the data that a network was trained for."""
+
 
 def with_stored_config(command: str, arguments: list[str]) -> tuple[str, list[str]]:
     """Start from a stored config where the command goes on from one.
@@ -102,20 +105,21 @@ def _last_checkpoint(folder: Path) -> Path:
 def _choose_sections(stored: dict[str, Any], arguments: list[str]) -> None:
     """Put the chosen options in place of the stored sections.
 
-    What they refer to elsewhere in the config, as the level, they take from the stored one. The
-    fold stays: the network has been trained on the others.
+    What they refer to elsewhere in the config, as the level, they take from the stored one. What
+    belongs to the network stays: the fold, as it has been trained on the others, and its inputs.
     """
     chosen = [a.partition("=")[::2] for a in stored_config_arguments("evaluate", arguments)]
     chosen = [(group, option) for group, option in chosen if group in _CHOOSABLE]
     if not chosen:
         return
-    fold = (stored.get("data") or {}).get("fold")
+    before = stored.get("data") or {}
     search = search_path(get_args_parser().parse_args(arguments))
     with initialize_config_dir(str(config_folder()), version_base="1.3"):
         for group, option in chosen:
             stored[group] = compose_option(group, option.strip("'\""), search)
-    if fold is not None and "fold" in stored["data"]:
-        stored["data"]["fold"] = fold
+    for name in _OF_THE_NETWORK:
+        if before.get(name) is not None and (name in stored["data"] or name == "normalization"):
+            stored["data"][name] = before[name]
 
 
 def checkpoint_config(path: Path) -> dict[str, Any]:

@@ -27,6 +27,8 @@ __all__ = ["PerspectiveRepresentation", "PhotoCrops", "PhotoSampler"]
 Crops = Literal["grid", "center"]
 """Where the crops of an evaluation are: all over the photo, or one in the middle."""
 
+_PAPER_FOV_DEG = 45.0
+
 _NEGLIGIBLE = 1e-6
 """Of a crop's side: it need not be covered by another one."""
 
@@ -145,7 +147,8 @@ class PerspectiveRepresentation:
     Args:
         level: Level s of the panoramas whose angular resolution the crops have.
         fov_deg: Field of view Ω' of a crop in degrees, both ways.
-        dim: Side W' of a crop in pixels, default the paper's 2^(s−1): with 45°, 128 at level 8.
+        dim: Side W' of a crop in pixels, default that of the paper's resolution: 2^(s−1) for 45°,
+            128 at level 8; more for a wider view.
         crops_per_photo: Crops drawn at random for a training sample.
         mirror: Mirror half of the training samples left to right.
         evaluation: `grid` covers the photo with crops, each place counted once; `center` takes the
@@ -164,14 +167,15 @@ class PerspectiveRepresentation:
         mirror: bool = False,
         evaluation: Crops = "grid",
     ) -> None:
-        self.dim = 2 ** (level - 1) if dim is None else dim
-        for name, value in (("dim", self.dim), ("crops_per_photo", crops_per_photo)):
-            if value < 1:
-                raise SettingError(f"representation.{name}", found=value, expected="1 or more")
         if not 0 < fov_deg < 180:
             raise SettingError(
                 "representation.fov_deg", found=fov_deg, expected="more than 0 and less than 180"
             )
+        wider = math.tan(math.radians(fov_deg) / 2) / math.tan(math.radians(_PAPER_FOV_DEG) / 2)
+        self.dim = max(1, round(2 ** (level - 1) * wider)) if dim is None else dim
+        for name, value in (("dim", self.dim), ("crops_per_photo", crops_per_photo)):
+            if value < 1:
+                raise SettingError(f"representation.{name}", found=value, expected="1 or more")
         if evaluation not in ("grid", "center"):
             raise SettingError(
                 "representation.evaluation", found=repr(evaluation), expected="grid or center"

@@ -52,7 +52,7 @@ class Sampler(Protocol):
         ...
 
     def whole(self) -> Views:
-        """Views of the whole sphere, in a fixed order."""
+        """Views of the whole panorama or photo, in a fixed order."""
         ...
 
 

@@ -1,4 +1,4 @@
-"""Ways to look at one panorama: which images, turned and mirrored how."""
+"""Ways to look at a panorama: which images, turned and mirrored how."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ Image = NDArray[Any]
 
 
 class Views(Protocol):
-    """One way to look at one panorama."""
+    """One way to look at one panorama or photo."""
 
     def render(self, image: Image, interpolation: Interpolation) -> Image:
-        """Render a panorama ``(H, W[, C])`` to images ``(n, h, w[, C])``, dtype kept."""
+        """Render it ``(H, W[, C])`` to images ``(n, h, w[, C])``, dtype kept."""
         ...
 
 

@@ -1,4 +1,4 @@
-"""Pictures of predictions: input, truth, prediction and error of a panorama, with a legend."""
+"""Pictures of predictions: input, truth, prediction and error, with a legend."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def prediction_panel(
     """Input, truth, prediction and error in a 2×2 grid, over a legend of the classes seen.
 
     Args:
-        rgb: ``(H, W, 3)`` the panorama.
+        rgb: ``(H, W, 3)`` the panorama, or the crops of a photo side by side.
         truth: ``(H, W)`` class indices, 0 unknown.
         prediction: ``(H, W)`` class indices.
         class_names: K + 1 names.

@@ -24,11 +24,11 @@ __all__ = ["SegmentationTask"]
 class SegmentationTask(lightning.LightningModule):
     """Trains a network on views of panoramas, or on crops of photos, and scores it on the whole.
 
-    The views of all panoramas of a batch, on all processes, make one gradient (paper, supplement,
+    The views of all images of a batch, on all processes, make one gradient (paper, supplement,
     "Semantic segmentation"): the loss is the sum over their labelled pixels divided by the sum of
     those pixels' class weights. `images_per_chunk` bounds the memory that takes; the gradient stays
     the same, but batch normalization sees one chunk at a time. Validation and test see the whole
-    sphere; the scores are rendered back and compared with the panorama's own labels.
+    sphere, or all of a photo; the scores are rendered back and compared with its own labels.
 
     Args:
         network: Any module ``(B, C, h, w) -> (B, K+1, h, w)`` or a dict with that under ``"out"``;

@@ -178,7 +178,8 @@ def test_settings_of_the_checkpoint_reach_what_refers_to_them(
         ("network=unet", "expected overrides of single settings"),
         ("representation=erb", "unknown representation: .*Did you mean erp"),
         ("representation=tangent,erp", "unknown representation: found 'tangent,erp'"),
-        ("data.inputs=[rgb]", "network: found other tensors"),
+        ("data.inputs=[rgb]", "found normalization .* which the network was trained with"),
+        ("data=omnisynthia", r"found class names .*'sky'.*; expected .*'beam'"),
     ],
 )
 def test_what_a_checkpoint_cannot_do_is_refused(
@@ -206,15 +207,16 @@ def test_a_checkpoint_is_evaluated_on_other_data_through_another_representation(
     assert _results(tmp_path / "other")["confusion"] != _results(run_folder)["confusion"]
 
 
-def test_an_evaluation_on_other_data_stays_on_the_fold(run_folder: Path, tmp_path: Path) -> None:
+def test_evaluation_on_other_data_keeps_fold_and_inputs(run_folder: Path, tmp_path: Path) -> None:
     path = tmp_path / "fold_2.ckpt"
     content = torch.load(run_folder / "checkpoints" / "best.ckpt", weights_only=True)
-    content["config"]["data"]["fold"] = 2
+    content["config"]["data"] |= {"fold": 2, "inputs": ["rgb"]}
     torch.save(content, path)
     with_stored_config("evaluate", [f"checkpoint={path}", "data=synthrooms"])
     with initialize_config_dir(str(config_folder()), version_base="1.3"):
         config = compose("stored_evaluate")
     assert config.data.fold == 2, "the network has seen the rooms of the others"
+    assert config.data.inputs == ["rgb"], "it takes no others"
 
 
 def test_jobs_of_a_sweep_get_the_chosen_sections() -> None:

@@ -57,7 +57,6 @@ def test_good_overrides_pass(arguments: list[str]) -> None:
     [
         ("train", ["experiment=rooms/transfer"], "an experiment of tangent-transfer"),
         ("prepare", ["experiment=paper/transfer_omnisynthia_s7"], "of tangent-transfer"),
-        ("transfer", ["experiment=rooms/demo"], "Run: tangent-train experiment=rooms/demo"),
         ("transfer", ["-m", "seed=0,1"], "-m: found a sweep; expected folds="),
         ("transfer", ["launcher=local"], "Could not override 'launcher'"),
         ("transfer", ["data@photos.data=synthroms"], "Did you mean synthrooms"),

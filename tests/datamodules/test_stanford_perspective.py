@@ -156,16 +156,16 @@ def test_samples(photo_root: Path) -> None:
 
 
 def test_training_draws_other_crops_each_epoch_and_the_same_again(photo_root: Path) -> None:
-    def labels(epoch: int, workers: int) -> Any:
-        module = Stanford2D3DSPerspective(
-            photo_root, CROPS, photos_per_step=2, validation_fraction=0, num_workers=workers
-        )
+    def labels(epoch: int, workers: int, stream: int = 0) -> Any:
+        settings: Any = {"num_workers": workers, "stream": stream, "photos_per_step": 2}
+        module = Stanford2D3DSPerspective(photo_root, CROPS, validation_fraction=0, **settings)
         loader = module.train_dataloader()
         loader.sampler.set_epoch(epoch)  # type: ignore[attr-defined]
         return next(iter(loader)).labels.numpy()
 
     np.testing.assert_array_equal(labels(1, 0), labels(1, 2))
     assert (labels(0, 0) != labels(1, 0)).any()
+    assert (labels(0, 0) != labels(0, 0, stream=1)).any(), "fine-tuning sees others"
 
 
 def test_rgb_alone_needs_no_depth_files(broken_root: Path) -> None:

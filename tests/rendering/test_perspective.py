@@ -184,6 +184,8 @@ def test_mirrored_crops() -> None:
 def test_the_side_follows_from_the_level() -> None:
     sides = {level: PerspectiveRepresentation(level).image_size for level in (6, 7, 8)}
     assert sides == {6: (32, 32), 7: (64, 64), 8: (128, 128)}, "paper: 128 for level 8"
+    wide = PerspectiveRepresentation(8, fov_deg=90).dim
+    assert wide == round(128 / math.tan(math.pi / 8)), "the same focal length"
 
 
 def test_shifts_of_synthia_cameras() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +20,7 @@ from tangent_train.cli.transfer.stages import Stage, folds_and_seeds, plan, stag
 from tangent_train.errors import DataError, SettingError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
 __all__ = ["transfer"]
 
@@ -64,19 +65,53 @@ def _try(stages: Sequence[Stage]) -> None:
     """Build what stages are made of: what cannot work is said before hours of training."""
     from tangent_train.cli.run import build
 
-    tried = []
+    built: list[tuple[Stage, Any]] = []
+    tried: list[tuple[Any, ...]] = []
+    network: dict[str, Any] = {}
     for stage in stages:
         parts = stage.config["data"], stage.config["representation"], stage.config["level"]
-        if parts in tried:
-            continue
-        tried.append(parts)
-        try:
-            build(OmegaConf.create(stage.config | {"checkpoint": "P's: no weights are fetched"}))
-        except (DataError, SettingError, InstantiationException) as error:
-            cause = error.__cause__ if isinstance(error, InstantiationException) else error
-            if not isinstance(cause, DataError | SettingError):
-                raise
-            raise SettingError(f"stage {stage.name}: {cause}") from error
+        if parts not in tried:
+            tried.append(parts)
+            config = OmegaConf.create(stage.config | {"checkpoint": "P's: no weights are fetched"})
+            with _named(stage):
+                built.append((stage, build(config)[0]))
+                _check_alike(network, built[-1][1])
+    for stage, data in built:  # after all settings: this makes files
+        with _named(stage):
+            data.make_files()
+            data.setup()
+
+
+@contextmanager
+def _named(stage: Stage) -> Iterator[None]:
+    """Say which stage an error is about: settings of the photos are below ``photos``."""
+    try:
+        yield
+    except (DataError, SettingError, InstantiationException) as error:
+        cause = error.__cause__ if isinstance(error, InstantiationException) else error
+        if not isinstance(cause, DataError | SettingError):
+            raise
+        where = ", in photos" if stage.on == "photos" else ""
+        raise SettingError(f"stage {stage.name}{where}: {cause}") from error
+
+
+def _check_alike(network: dict[str, Any], data: Any) -> None:
+    """Refuse data that means something else to the network than that of earlier stages."""
+    own = {
+        "class_names": data.class_names,
+        "inputs": data.inputs,
+        "normalization": data.normalization,
+    }
+    for name, value in own.items():
+        before = network.setdefault(name, value)
+        if before != value:
+            raise SettingError(
+                f"data.{name}",
+                found=value,
+                expected=f"{before}, as in the stages before",
+                remedy="One network sees photos and panoramas: choose data and data@photos.data "
+                "of one kind, with the same inputs.",
+            )
 
 
 def _check_typed(config: DictConfig) -> None:
@@ -91,6 +126,9 @@ def _check_typed(config: DictConfig) -> None:
                 found=f"{several}={list(config[several])} beside it",
                 expected=f"{several}=[{number}], or {several}=null",
             )
+    for text in typed:
+        if text.startswith("photos.data.fold="):
+            raise SettingError(text, found="a fold of the photos", expected="data.fold, of both")
 
 
 def _leave_out_foreign(config: DictConfig) -> None:

@@ -88,12 +88,14 @@ class StageConfigs:
         photos = {name: self._part(("photos", name), kept) for name in ("data", "representation")}
         return self.on_panoramas() | photos
 
-    def fine_tuned(self, config: Settings, epochs: int) -> Settings:
+    def fine_tuned(self, config: Settings, epochs: int, *, seen: bool) -> Settings:
         """Of the same stage, fine-tuned.
 
         Args:
             config: From `on_panoramas` or `on_photos`.
             epochs: For how long.
+            seen: Whether the network was trained on these images: then it gets others of them than
+                those of its first epochs again.
 
         Raises:
             SettingError: There is no learning rate of which to take a tenth.
@@ -106,7 +108,9 @@ class StageConfigs:
             optimizer["lr"] = self._slower_rate()
         scheduler = self._part(("fine_tuning", "scheduler"), kept | {"optimizer"})
         trainer = {**config["trainer"], "max_epochs": epochs}
-        return config | {"optimizer": optimizer, "scheduler": scheduler, "trainer": trainer}
+        data = {**config["data"], "stream": 1} if seen else config["data"]
+        tuned = {"data": data, "optimizer": optimizer, "scheduler": scheduler, "trainer": trainer}
+        return config | tuned
 
     def _slower_rate(self) -> float:
         rate = self._resolved["optimizer"].get("lr")

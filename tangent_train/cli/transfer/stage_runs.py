@@ -51,20 +51,25 @@ _FREE = (
     "resume",
     "task.channels_last",
     "task.compile",
-    "task.images_per_chunk",
     "task.images_per_forward",
     "trainer.accelerator",
-    "trainer.devices",
     "trainer.enable_model_summary",
     "trainer.enable_progress_bar",
     "trainer.log_every_n_steps",
-    "trainer.num_nodes",
     "trainer.num_sanity_val_steps",
     "trainer.strategy",
 )
 """Settings, with all below them, that do not change what a stage finds."""
 
-_ONLY_TRAINING = ("optimizer", "scheduler", "trainer.max_epochs", "trainer.max_steps")
+_ONLY_TRAINING = (
+    "optimizer",
+    "scheduler",
+    "task.images_per_chunk",
+    "trainer.devices",
+    "trainer.max_epochs",
+    "trainer.max_steps",
+    "trainer.num_nodes",
+)
 """Further ones of a stage that only evaluates."""
 
 
@@ -110,13 +115,13 @@ def run_stage(stage: Stage, state: State) -> int:
     Raises:
         DataError: The checkpoint it starts from is missing.
     """
-    weights = _checkpoint(stage)
     config = dict(stage.config)
     if state == "begun":
         config["resume"] = str(stage.folder)
         # Where it has begun: the folder may have been moved since.
         config["init_from"] = (_read(stage.folder / _CONFIG) or {}).get("init_from")
     else:
+        weights = _checkpoint(stage)
         source = "init_from" if stage.command == "train" else "checkpoint"
         config[source] = None if weights is None else str(weights)
         record = {"stage": stage.name, "weights": weights and _digest(weights)}
@@ -156,7 +161,7 @@ def _checkpoint(stage: Stage) -> Path | None:
             stage.weights,
             found="no checkpoints/best.ckpt or last.ckpt",
             expected=f"the network that {stage.name} starts from",
-            remedy="Delete this folder to train it again.",
+            remedy="Delete the stages of this seed to run it all again.",
         )
     return found
 

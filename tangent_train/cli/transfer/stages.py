@@ -142,7 +142,7 @@ class _Planner:
             yield self._stage(f"S-{name}", "panoramas", self._configs.on_panoramas(representation))
         for epochs in _numbers(self._config, "fine_tuning.epochs", 1):
             for kind, on, config in (("P", "photos", photos), ("S", "panoramas", panoramas)):
-                tuned = self._configs.fine_tuned(config, epochs)
+                tuned = self._configs.fine_tuned(config, epochs, seen=on == "photos")
                 yield self._stage(f"{kind}-FT-{epochs}", on, tuned, epochs=epochs)
 
     def study(self) -> Iterator[Stage]:

@@ -30,7 +30,7 @@ def report_png(groups: Sequence[Group]) -> bytes:
     for the same data, resolution, base level and inputs.
 
     Args:
-        groups: From `report.group_runs`.
+        groups: From `groups.group_runs`.
 
     Returns:
         A PNG file.

@@ -90,7 +90,7 @@ def report_markdown(groups: Sequence[Group], remarks: Sequence[str]) -> str:
     """The report as Markdown.
 
     Args:
-        groups: From `report.group_runs`.
+        groups: From `groups.group_runs`.
         remarks: Sentences to stand below the tables.
     """
     lines = ["# Report", "", _LEGEND, ""]
@@ -114,7 +114,7 @@ def report_tables(groups: Sequence[Group]) -> list[Table]:
     """The overall tables for the terminal.
 
     Args:
-        groups: From `report.group_runs`.
+        groups: From `groups.group_runs`.
     """
     return [
         terminal_table(section.title, section.overall, (1, 2), section.remark)
@@ -126,7 +126,7 @@ def report_csv(groups: Sequence[Group]) -> str:
     """One line per group, class ("mean" for all) and figure; shares of 1.
 
     Args:
-        groups: From `report.group_runs`.
+        groups: From `groups.group_runs`.
     """
     file = io.StringIO()
     columns = ["group", "data", "level", "base_level", "inputs", "runs", "class", "figure"]
@@ -144,7 +144,7 @@ def report_json(groups: Sequence[Group], remarks: Sequence[str]) -> str:
     """Everything in the report, figures as shares of 1.
 
     Args:
-        groups: From `report.group_runs`.
+        groups: From `groups.group_runs`.
         remarks: As in the Markdown file.
     """
     content = []

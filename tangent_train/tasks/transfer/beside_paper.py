@@ -117,8 +117,8 @@ def paper_notes(report: TransferReport) -> list[str]:
     """What has to be known about the paper's figures where they stand beside."""
     if report.group is None or not any(printed(report, row, "miou") for row in report.rows):
         return []
-    if paper_table(report) == "omnisynthia":
-        return []
+    synthia = paper_table(report) == "omnisynthia"
+    wanted = {"base_level": 1, "inputs": "RGB"} if synthia else TRANSFER_SETTING
     found = {
         "level": report.group.setting("level"),
         "base_level": report.group.base_level,
@@ -126,11 +126,11 @@ def paper_notes(report: TransferReport) -> list[str]:
     }
     differing = [
         f"{name.replace('_', ' ')} {paper}, here {text(found[name])}"
-        for name, paper in TRANSFER_SETTING.items()
+        for name, paper in wanted.items()
         if found[name] != paper
     ]
     other = f"The paper's transfer was run with {'; '.join(differing)}."
-    return [_FOLD_MEANS, *([other] if differing else [])]
+    return [*([] if synthia else [_FOLD_MEANS]), *([other] if differing else [])]
 
 
 def _same_stage(row: Row) -> PaperStage | None:

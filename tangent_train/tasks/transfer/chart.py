@@ -38,7 +38,7 @@ def transfer_png(report: TransferReport) -> bytes:
     figures on the same data; above the bars stands the change from photos.
 
     Args:
-        report: From `transfer.gather`.
+        report: From `report.gather`.
 
     Returns:
         A PNG file.

@@ -1,6 +1,6 @@
 """Figures of the paper's network transfer, on Stanford2D3DS and on OmniSYNTHIA.
 
-As `paper`: the table of transfer results by fold, the comparison with Zhang et al., and the
+As `reports.paper`: the table of transfer results by fold, the comparison with Zhang et al., and the
 per-class table of the supplement. All in percent. The table's rows for all folds repeat those of
 fold 3 digit for digit; the means of the printed folds are what the per-class table's means are.
 """
@@ -36,7 +36,7 @@ class PaperStage:
         epochs: Of fine-tuning.
         macc: Mean class accuracy of folds 1, 2 and 3.
         miou: Mean IoU, likewise.
-        accuracy: Of each class, see `paper.CLASSES`, over all folds; empty where not printed.
+        accuracy: Of each class, see `reports.paper.CLASSES`, over all folds; empty if not printed.
         iou: Likewise.
     """
 

@@ -2,7 +2,7 @@
 
 The paper's section "Network transfer": a network trained on photos (P) is run on panoramas through
 tangent images (S), as it is and after fine-tuning on either kind (FT-1, FT-10). A figure is
-averaged over seeds and folds as in `report`; what is kept of it is S over P with the same
+averaged over seeds and folds as in `reports.groups`; what is kept of it is S over P with the same
 fine-tuning.
 """
 
@@ -26,7 +26,7 @@ class StageResult:
     """One run of a stage.
 
     Attributes:
-        stage: Its name, as "P", "S-FT-10" or "S erp".
+        stage: Its name, as "P", "S-FT-10" or "S-erp".
         on: What the network was tested on.
         epochs: Of fine-tuning; 0 without.
         representation: How the network saw it: "perspective", "tangent", "erp", "cubemap".

@@ -69,7 +69,7 @@ def transfer_notes(report: TransferReport) -> list[str]:
     """What has to be known beside the figures.
 
     Args:
-        report: From `transfer.gather`.
+        report: From `report.gather`.
     """
     notes = []
     for row in report.rows:
@@ -102,7 +102,7 @@ def transfer_markdown(report: TransferReport) -> str:
     """The report as Markdown.
 
     Args:
-        report: From `transfer.gather`.
+        report: From `report.gather`.
     """
     lines = ["# Transfer from photos to panoramas", "", _LEGEND, ""]
     lines += [_data(report), ""] if report.group else []
@@ -138,7 +138,7 @@ def transfer_tables(report: TransferReport) -> list[Table]:
     """The table over folds for the terminal, and that by latitude.
 
     Args:
-        report: From `transfer.gather`.
+        report: From `report.gather`.
     """
     title, whole = _parts(report)[-1]
     caption = _data(report) if report.group else ""
@@ -153,7 +153,7 @@ def transfer_csv(report: TransferReport) -> str:
     """One line per stage, fold ("mean" over all), class, band of latitude and figure; shares of 1.
 
     Args:
-        report: From `transfer.gather`.
+        report: From `report.gather`.
     """
     file = io.StringIO()
     columns = ["stage", "on", "epochs", "representation", "fold", "class", "south", "north"]
@@ -182,7 +182,7 @@ def transfer_json(report: TransferReport) -> str:
     """Everything in the report, figures as shares of 1.
 
     Args:
-        report: From `transfer.gather`.
+        report: From `report.gather`.
     """
     content = {
         "made_by": MADE_BY,

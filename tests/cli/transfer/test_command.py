@@ -52,7 +52,7 @@ def test_finished_stages_are_not_run_again(
     before = (HERE / "transfer.json").read_text()
     runs.started.clear()
     capsys.readouterr()
-    free = ("panels=9", "+trainer.strategy=ddp", "data.root=other", "task.images_per_chunk=3")
+    free = ("panels=9", "+trainer.strategy=ddp", "data.root=other", "task.images_per_forward=3")
     run_transfer(monkeypatch, "compare=[]", "fine_tuning.epochs=[]", *free)
     assert not runs.started
     assert capsys.readouterr().out.count("finished before") == 2
@@ -152,7 +152,9 @@ def test_what_no_stage_can_do_is_said_before_the_first(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit, match=r"^tangent-transfer: stage P: image size for the UNet: f"):
+    with pytest.raises(
+        SystemExit, match=r"^tangent-transfer: stage P, in photos: image size for the "
+    ):
         run_transfer(monkeypatch)
     dims = ("level=6", "representation.base_level=2", "compare=[]")
     wrong = "representation.faces_per_panorama=9999"
@@ -160,6 +162,11 @@ def test_what_no_stage_can_do_is_said_before_the_first(
         SystemExit, match=r"stage S: representation\.faces_per_panorama: found 9999"
     ):
         run_transfer(monkeypatch, *dims, wrong)
+    alike = (
+        r"stage S: data\.inputs: found \('rgb', 'depth'\); expected \('rgb',\), as in the stages"
+    )
+    with pytest.raises(SystemExit, match=alike):
+        run_transfer(monkeypatch, *dims, "photos.data.inputs=[rgb]")
     assert not (tmp_path / "data").exists()
 
 
@@ -191,6 +198,7 @@ def test_the_level_of_the_photos() -> None:
     assert trained_level(config) == pytest.approx(expected, abs=1e-6)
     assert expected == pytest.approx(8.418, abs=1e-3)
     # A crop with the focal length of tangent images is as fine as they are.
+    config.photos.representation.dim = 128
     config.photos.representation.fov_deg = float(np.degrees(2 * np.arctan(1.1071487 / 2)))
     assert trained_level(config) == pytest.approx(8, abs=1e-6)
     config.representation = {

@@ -243,4 +243,14 @@ def test_references_between_sections() -> None:
     assert photos["representation"] == {"level": "${level}", "rows": 4}
     assert photos["trainer"]["devices"] == 2
     assert configs.on_panoramas()["representation"]["erp_height"] == "${data.size.rows}"
-    assert configs.fine_tuned(photos, 4)["scheduler"] == {"lr": "${optimizer.lr}"}
+    assert configs.fine_tuned(photos, 4, seen=False)["scheduler"] == {"lr": "${optimizer.lr}"}
+
+
+def test_fine_tuning_on_photos_draws_other_crops_than_training_did(
+    rooms: DictConfig, compared: dict[str, Any]
+) -> None:
+    streams = {
+        stage.name: stage.config["data"].get("stream", 0)
+        for stage in plan(rooms, Path("folder"), 1, 0, compared)
+    }
+    assert {name for name, stream in streams.items() if stream} == {"P-FT-1", "P-FT-10"}
