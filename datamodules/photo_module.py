@@ -67,9 +67,9 @@ class PhotoDataModule(SegmentationDataModule[Photo]):
         Raises:
             DataError: It sees less than a crop has to.
         """
-        fov_deg = self.representation.fov_deg
+        fov_deg, crop = self.representation.fov_deg, self.representation.image_size
         try:
-            shift_range(camera_matrix, size, fov_deg)
+            shift_range(camera_matrix, size, fov_deg, crop)
         except SettingError as error:
             raise DataError(
                 path,

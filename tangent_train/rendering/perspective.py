@@ -9,6 +9,7 @@ the side W' = H' and the field of view Ω': ``f' = W' / (2 tan(Ω'/2))``; a crop
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -39,16 +40,16 @@ class PhotoCrops:
 
     Attributes:
         boxes: ``(n, 4)`` left, top, right and bottom in the photo, in pixels from its corner.
-        dim: Side of the crops in pixels.
+        size: Rows and columns of the crops.
         mirrored: Whether they are mirrored left to right.
     """
 
     boxes: NDArray[np.float64]
-    dim: int
+    size: tuple[int, int]
     mirrored: bool = False
 
     def render(self, image: NDArray[Any], interpolation: Interpolation) -> NDArray[Any]:
-        """Render a photo ``(H, W[, C])`` to crops ``(n, d, d[, C])``, dtype kept.
+        """Render a photo ``(H, W[, C])`` to crops ``(n, h, w[, C])``, dtype kept.
 
         Args:
             image: The photo; for `bilinear` uint8.
@@ -56,36 +57,36 @@ class PhotoCrops:
                 the crop): no aliasing. `nearest` takes the pixel at the centre.
         """
         draw = _nearest if interpolation == "nearest" else _smooth
-        crops = np.stack([draw(image, box, self.dim) for box in self.boxes])
+        crops = np.stack([draw(image, box, self.size) for box in self.boxes])
         return np.ascontiguousarray(crops[:, :, ::-1]) if self.mirrored else crops
 
     def owned(self) -> NDArray[np.bool_]:
-        """Which pixels of a crop lie nearer to its centre than to any other's, ``(n, d, d)``.
+        """Which pixels of a crop lie nearer to its centre than to any other's, ``(n, h, w)``.
 
         So every place of the photo is counted once, however much the crops overlap.
         """
-        across, down = (self._owned_along(axis) for axis in (0, 1))
+        across, down = (self._owned_along(axis, self.size[1 - axis]) for axis in (0, 1))
         return down[:, :, None] & across[:, None, :]
 
-    def _owned_along(self, axis: int) -> NDArray[np.bool_]:
+    def _owned_along(self, axis: int, count: int) -> NDArray[np.bool_]:
         near, far = self.boxes[:, axis], self.boxes[:, axis + 2]
         centers, own = np.unique(np.round((near + far) / 2, 6), return_inverse=True)
-        places = np.linspace(near, far, 2 * self.dim + 1, axis=1)[:, 1::2]
+        places = np.linspace(near, far, 2 * count + 1, axis=1)[:, 1::2]
         owner: NDArray[np.int64] = np.abs(places[..., None] - centers).argmin(axis=-1)
         return owner == own[:, None]
 
 
-def _smooth(image: NDArray[Any], box: NDArray[np.float64], dim: int) -> NDArray[Any]:
+def _smooth(image: NDArray[Any], box: NDArray[np.float64], size: tuple[int, int]) -> NDArray[Any]:
     resized = Image.fromarray(image).resize(
-        (dim, dim), Image.Resampling.BILINEAR, box=tuple(box.tolist())
+        size[::-1], Image.Resampling.BILINEAR, box=tuple(box.tolist())
     )
     return np.asarray(resized)
 
 
-def _nearest(image: NDArray[Any], box: NDArray[np.float64], dim: int) -> NDArray[Any]:
+def _nearest(image: NDArray[Any], box: NDArray[np.float64], size: tuple[int, int]) -> NDArray[Any]:
     columns, rows = (
-        np.linspace(near, far, 2 * dim + 1)[1::2].astype(np.intp)
-        for near, far in box.reshape(2, 2).T
+        np.linspace(near, far, 2 * count + 1)[1::2].astype(np.intp)
+        for near, far, count in zip(box[:2], box[2:], size[::-1], strict=True)
     )
     return image[rows][:, columns]
 
@@ -116,8 +117,7 @@ class PhotoSampler:
         least, greatest = self._shifts()
         if self.representation.evaluation == "center":
             return self._crops(np.clip(np.zeros((1, 2)), least, greatest))
-        focal = np.diag(self.camera_matrix)[:2]
-        extent = 2 * focal * math.tan(math.radians(self.representation.fov_deg) / 2)
+        extent = self._extent()
         count = 1 + np.ceil((greatest - least) / extent - _NEGLIGIBLE).astype(int)
         across, down = (
             np.linspace(a, b, n) if n > 1 else np.clip([0.0], a, b)
@@ -126,19 +126,27 @@ class PhotoSampler:
         return self._crops(np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2))
 
     def _shifts(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        return shift_range(self.camera_matrix, self.size, self.representation.fov_deg)
+        wanted = self.representation
+        return shift_range(self.camera_matrix, self.size, wanted.fov_deg, wanted.image_size)
+
+    def _extent(self) -> NDArray[np.float64]:
+        """Width and height of a crop in pixels of the photo."""
+        rows, columns = self.representation.image_size
+        width = 2 * math.tan(math.radians(self.representation.fov_deg) / 2)
+        return np.diag(self.camera_matrix)[:2] * width * (1, rows / columns)
 
     def _crops(self, shifts: NDArray[np.float64], *, mirrored: bool = False) -> PhotoCrops:
         wanted = self.representation
-        corners = np.array([[-0.5, -0.5, 1], [wanted.dim - 0.5, wanted.dim - 0.5, 1]])
+        rows, columns = wanted.image_size
+        corners = np.array([[-0.5, -0.5, 1], [columns - 0.5, rows - 0.5, 1]])
         boxes = []
         for dx, dy in shifts:
             camera = normalize_camera(
-                self.camera_matrix, self.size, wanted.fov_deg, wanted.dim, (dx, dy)
+                self.camera_matrix, self.size, wanted.fov_deg, wanted.image_size, (dx, dy)
             )
             box = (corners @ np.linalg.inv(camera.homography).T)[:, :2] + 0.5
             boxes.append(np.clip(box, 0, self.size[::-1]).ravel())  # rounding may lead outside
-        return PhotoCrops(np.array(boxes), wanted.dim, mirrored)
+        return PhotoCrops(np.array(boxes), wanted.image_size, mirrored)
 
 
 class PerspectiveRepresentation:
@@ -146,13 +154,16 @@ class PerspectiveRepresentation:
 
     Args:
         level: Level s of the panoramas whose angular resolution the crops have.
-        fov_deg: Field of view Ω' of a crop in degrees, both ways.
-        dim: Side W' of a crop in pixels, default that of the paper's resolution: 2^(s−1) for 45°,
-            128 at level 8; more for a wider view.
+        fov_deg: Horizontal field of view Ω' of a crop in degrees.
+        dim: Side W' = H' of a crop in pixels, or ``[H', W']``; default that of the paper's
+            resolution: 2^(s−1) for 45°, 128 at level 8, more for a wider view. Pixels are square.
         crops_per_photo: Crops drawn at random for a training sample.
         mirror: Mirror half of the training samples left to right.
         evaluation: `grid` covers the photo with crops, each place counted once; `center` takes the
             crop in the middle.
+
+    Attributes:
+        image_size: Rows and columns of a crop.
 
     Raises:
         SettingError: A setting that cannot work.
@@ -162,7 +173,7 @@ class PerspectiveRepresentation:
         self,
         level: int,
         fov_deg: float = 45.0,
-        dim: int | None = None,
+        dim: int | Sequence[int] | None = None,
         crops_per_photo: int = 1,
         mirror: bool = False,
         evaluation: Crops = "grid",
@@ -172,10 +183,17 @@ class PerspectiveRepresentation:
                 "representation.fov_deg", found=fov_deg, expected="more than 0 and less than 180"
             )
         wider = math.tan(math.radians(fov_deg) / 2) / math.tan(math.radians(_PAPER_FOV_DEG) / 2)
-        self.dim = max(1, round(2 ** (level - 1) * wider)) if dim is None else dim
-        for name, value in (("dim", self.dim), ("crops_per_photo", crops_per_photo)):
-            if value < 1:
-                raise SettingError(f"representation.{name}", found=value, expected="1 or more")
+        dim = max(1, round(2 ** (level - 1) * wider)) if dim is None else dim
+        sides = (dim, dim) if isinstance(dim, int) else tuple(dim)
+        if len(sides) != 2 or min(sides) < 1:
+            raise SettingError(
+                "representation.dim", found=dim, expected="1 or more, or [height, width]"
+            )
+        self.image_size = sides[0], sides[1]
+        if crops_per_photo < 1:
+            raise SettingError(
+                "representation.crops_per_photo", found=crops_per_photo, expected="1 or more"
+            )
         if evaluation not in ("grid", "center"):
             raise SettingError(
                 "representation.evaluation", found=repr(evaluation), expected="grid or center"
@@ -184,11 +202,6 @@ class PerspectiveRepresentation:
         self.crops_per_photo = crops_per_photo
         self.mirror = mirror
         self.evaluation = evaluation
-
-    @property
-    def image_size(self) -> tuple[int, int]:
-        """Rows and columns of a crop."""
-        return self.dim, self.dim
 
     def of_camera(self, camera_matrix: NDArray[np.float64], size: tuple[int, int]) -> PhotoSampler:
         """What draws the crops of a photo.

@@ -82,7 +82,7 @@ def test_batches(root: Path) -> None:
     module.prepare_data()
     batch = next(iter(module.train_dataloader()))
     images = module.on_after_batch_transfer(batch, 0).images
-    assert images.shape == (3, 1, 3, CROPS.dim, CROPS.dim)
+    assert images.shape == (3, 1, 3, *CROPS.image_size)
     assert batch.labels.max() <= 13
     assert module.normalization.mean == (0.4512, 0.4257, 0.3920)
     assert len(module.class_names) == 14

@@ -28,17 +28,21 @@ def _photo(seed: int = 0, size: tuple[int, int] = SIZE) -> NDArray[np.uint8]:
     return cv2.normalize(smooth, smooth.copy(), 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
 
 
-def _triangle(image: NDArray[np.uint8], homography: NDArray[np.float64], dim: int) -> NDArray[Any]:
+def _triangle(
+    image: NDArray[np.uint8], homography: NDArray[np.float64], rows: int, columns: int | None = None
+) -> NDArray[Any]:
     """Every pixel of a crop in float64: a weighted mean over a triangle around its place.
 
     The triangle is as wide as two pixels of the crop, at least two of the photo: then it is
     bilinear interpolation.
     """
     old_from_new = np.linalg.inv(homography)
-    places = old_from_new @ np.stack([np.arange(dim), np.arange(dim), np.ones(dim)])
     weights = []
-    for axis, count in enumerate(image.shape[1::-1]):
-        away = np.abs(np.arange(count) - places[axis][:, None])
+    for axis, (count, side) in enumerate(
+        zip(image.shape[1::-1], (columns or rows, rows), strict=True)
+    ):
+        places = old_from_new[axis, axis] * np.arange(side) + old_from_new[axis, 2]
+        away = np.abs(np.arange(count) - places[:, None])
         weight = np.maximum(0, 1 - away / max(old_from_new[axis, axis], 1))
         weights.append(weight / weight.sum(axis=1, keepdims=True))
     across, down = weights
@@ -67,6 +71,22 @@ def test_the_crop_in_the_middle_is_the_papers_homography() -> None:
     crop = representation.of_camera(K, SIZE).whole().render(photo, "bilinear")
     homography = normalize_camera(K, SIZE, 30.0, 32).homography
     assert np.abs(crop[0] - _triangle(photo, homography, 32)).max() < 1.01
+
+
+@pytest.mark.parametrize("size", [(12, 40), (40, 12)])
+def test_crops_that_are_not_square(size: tuple[int, int]) -> None:
+    photo = _photo()
+    fov_deg = 25.0 if size[1] > size[0] else 8.0
+    representation = PerspectiveRepresentation(7, fov_deg, size, evaluation="center")
+    crop = representation.of_camera(K, SIZE).whole().render(photo, "bilinear")
+    assert crop.shape == (1, *size, 3)
+    homography = normalize_camera(K, SIZE, fov_deg, size).homography
+    assert np.abs(crop[0] - _triangle(photo, homography, *size)).max() < 1.01
+    grid = PerspectiveRepresentation(7, fov_deg, size).of_camera(K, SIZE).whole()
+    assert grid.owned().shape == (len(grid.boxes), *size)
+    np.testing.assert_allclose(grid.boxes[:, 2:].max(axis=0), SIZE[::-1], atol=0.01)
+    shares = grid.owned().mean(axis=(1, 2)).sum() * np.prod(grid.boxes[0, 2:] - grid.boxes[0, :2])
+    assert abs(shares / np.prod(SIZE) - 1) < 0.1, "each place once"
 
 
 def test_fine_stripes_become_grey_not_moire() -> None:
@@ -134,8 +154,8 @@ def test_crops_never_leave_the_photo_and_the_grid_counts_every_place_once(
     assert len(grid.boxes) == columns * rows
     assert (columns - 1) * extent[0] < width, "no more than needed"
     assert (rows - 1) * extent[1] < height, "no more than needed"
-    area = grid.owned().sum() * np.prod(extent / representation.dim)
-    slack = 2 * (columns + rows) * max(width, height) * max(extent) / representation.dim
+    area = grid.owned().sum() * np.prod(extent / representation.image_size[0])
+    slack = 2 * (columns + rows) * max(width, height) * max(extent) / representation.image_size[0]
     assert abs(area - width * height) <= slack
 
 
@@ -175,7 +195,7 @@ def test_mirrored_crops() -> None:
     drawn = [sampler.sample(np.random.default_rng(seed)) for seed in range(20)]
     assert {crops.mirrored for crops in drawn} == {True, False}
     mirrored = next(crops for crops in drawn if crops.mirrored)
-    plain = type(mirrored)(mirrored.boxes, mirrored.dim)
+    plain = type(mirrored)(mirrored.boxes, mirrored.size)
     np.testing.assert_array_equal(
         mirrored.render(photo, "bilinear"), plain.render(photo, "bilinear")[:, :, ::-1]
     )
@@ -184,7 +204,7 @@ def test_mirrored_crops() -> None:
 def test_the_side_follows_from_the_level() -> None:
     sides = {level: PerspectiveRepresentation(level).image_size for level in (6, 7, 8)}
     assert sides == {6: (32, 32), 7: (64, 64), 8: (128, 128)}, "paper: 128 for level 8"
-    wide = PerspectiveRepresentation(8, fov_deg=90).dim
+    wide = PerspectiveRepresentation(8, fov_deg=90).image_size[0]
     assert wide == round(128 / math.tan(math.pi / 8)), "the same focal length"
 
 
@@ -207,7 +227,15 @@ def test_labels_of_crops() -> None:
 
 @pytest.mark.parametrize(
     ("setting", "value"),
-    [("fov_deg", 0), ("fov_deg", 180), ("dim", 0), ("crops_per_photo", 0), ("evaluation", "all")],
+    [
+        ("fov_deg", 0),
+        ("fov_deg", 180),
+        ("dim", 0),
+        ("dim", [8, 0]),
+        ("dim", [8, 8, 8]),
+        ("crops_per_photo", 0),
+        ("evaluation", "all"),
+    ],
 )
 def test_impossible_settings(setting: str, value: Any) -> None:
     with pytest.raises(SettingError, match=f"representation.{setting}"):
