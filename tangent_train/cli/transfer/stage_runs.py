@@ -6,9 +6,11 @@ which stage it is, and a digest of the checkpoint it starts from.
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
 import shlex
+from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -21,7 +23,7 @@ from tangent_train.errors import DataError, SettingError
 from tangent_train.files import write_text
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping
 
     from tangent_train.cli.transfer.stages import Stage
 
@@ -114,8 +116,10 @@ def run_stage(stage: Stage, state: State) -> int:
 
     Raises:
         DataError: The checkpoint it starts from is missing.
+        SettingError: Another command is at it.
     """
     config = dict(stage.config)
+    record = None
     if state == "begun":
         config["resume"] = str(stage.folder)
         # Where it has begun: the folder may have been moved since.
@@ -125,10 +129,29 @@ def run_stage(stage: Stage, state: State) -> int:
         source = "init_from" if stage.command == "train" else "checkpoint"
         config[source] = None if weights is None else str(weights)
         record = {"stage": stage.name, "weights": weights and _digest(weights)}
-        write_text(stage.folder / _RECORD, json.dumps(record, indent=1) + "\n")
-    write_text(stage.folder / _CONFIG, OmegaConf.to_yaml(OmegaConf.create(config)))
-    status, _ = run_process(_line(stage), run_environment())
+    with _alone(stage):
+        if record is not None:
+            write_text(stage.folder / _RECORD, json.dumps(record, indent=1) + "\n")
+        write_text(stage.folder / _CONFIG, OmegaConf.to_yaml(OmegaConf.create(config)))
+        status, _ = run_process(_line(stage), run_environment())
     return status if status >= 0 else 128 - status
+
+
+@contextmanager
+def _alone(stage: Stage) -> Iterator[None]:
+    """Keep other commands off a stage while this one runs it."""
+    stage.folder.mkdir(parents=True, exist_ok=True)
+    with (stage.folder / ".lock").open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise SettingError(
+                stage.folder,
+                found=f"another tangent-transfer that runs stage {stage.name}",
+                expected="none",
+                remedy="Wait for it; other seeds and folds can run beside it.",
+            ) from error
+        yield
 
 
 def said_as_a_command(stage: Stage, state: State) -> str:

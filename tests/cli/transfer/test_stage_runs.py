@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import shlex
 import shutil
 from dataclasses import replace
@@ -131,3 +132,14 @@ def test_evaluations_do_not_depend_on_how_training_goes(stage: Stage, runs: Pret
         SettingError, match=r"lr=None \(now 1\), trainer\.devices=1 \(now 4\), trainer\.max_epochs"
     ):
         stage_state(replace(stage, config=longer))
+
+
+def test_two_commands_never_run_the_same_stage(stage: Stage, runs: PretendedRuns) -> None:
+    stage.folder.mkdir(parents=True, exist_ok=True)
+    with (stage.folder / ".lock").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        with pytest.raises(SettingError, match="another tangent-transfer that runs stage P"):
+            run_stage(stage, "new")
+        assert not runs.started
+        assert stage_state(stage) == "new"
+    assert run_stage(stage, "new") == 0
