@@ -30,7 +30,7 @@ def overall_cells(report: TransferReport, *, short: bool = False) -> list[Cells]
     table = paper_table(report)
     of_photos: Cells = ("change (kept)",) if short else ("change", "kept")
     header: Cells = ("stage", "run on", "mAcc %", *of_photos, "mIoU %", *of_photos)
-    header += ("mIoU % by solid angle",)
+    header += ("mIoU % by solid angle",) if short else ("mIoU % by solid angle", "kept")
     for name in ("paper mAcc %", "paper mIoU %") if table else ():
         header += (name, "change") if table == "stanford" else (name,)
     rows = [header]
@@ -39,6 +39,7 @@ def overall_cells(report: TransferReport, *, short: bool = False) -> list[Cells]
         for name in ("macc", "miou"):
             cells += (cell(row.figure(name), len(row.folds)), *_kept(row.kept(name), short=short))
         cells += (cell(row.figure("miou_solid_angle"), len(row.folds)),)
+        cells += () if short else (kept(row.kept("miou_solid_angle")),)
         for name in ("macc", "miou") if table else ():
             cells += (percent(printed(report, row, name)),)
             cells += (change(printed_kept(report, row, name)),) if table == "stanford" else ()

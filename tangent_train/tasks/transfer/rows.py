@@ -87,7 +87,8 @@ class Averages(Generic[R_co]):
 
         Both means are over the folds and seeds that both rows have: a seed's panoramas were seen
         by the network of the same seed's photos. The spreads are those of the ratios of single
-        folds and seeds.
+        folds and seeds. Pixels of photos cover nearly the same solid angle: what panoramas score by
+        solid angle is compared with what photos score by pixels.
 
         Args:
             name: As in `figure`.
@@ -99,7 +100,9 @@ class Averages(Generic[R_co]):
         if self.partner is None:
             return average([])
         own = self._values(name, class_index)
-        base = self.partner._values(name, class_index)
+        base = self.partner._values(name, class_index) or self.partner._values(
+            name.removesuffix("_solid_angle"), class_index
+        )
         both = [key for key in own if key in base]
         folds = dict.fromkeys(fold for fold, _ in both)
         in_folds = {fold: [key for key in both if key[0] == fold] for fold in folds}

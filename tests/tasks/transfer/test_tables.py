@@ -56,7 +56,9 @@ def test_what_is_kept_over_folds_is_the_ratio_of_the_means(two_folds: TransferRe
     assert by_name(first)["S"].kept("miou").over_folds is None
     assert first.folds == (1,)
     assert by_name(two_folds)["P"].kept("miou").mean is None
-    assert by_name(two_folds)["S"].kept("miou_solid_angle").mean is None
+    of_sphere = by_name(two_folds)["S"].kept("miou_solid_angle")
+    assert of_sphere.mean == pytest.approx(0.3 / 0.65), "against the photos' pixels"
+    assert by_name(two_folds)["P"].kept("miou_solid_angle").mean is None
 
 
 def test_a_ratio_pairs_the_folds_and_seeds_that_both_have() -> None:
@@ -90,7 +92,7 @@ def test_stages_are_paired_by_their_epochs_and_ordered_as_in_the_paper() -> None
     (text, *_) = [
         found for found in transfer_markdown(report).splitlines() if found.startswith("| S-FT-10 |")
     ]
-    assert text == "| S-FT-10 | tangent images | 60.0 | – | – | 50.0 | – | – | 25.0 |"
+    assert text == "| S-FT-10 | tangent images | 60.0 | – | – | 50.0 | – | – | 25.0 | – |"
 
 
 def test_the_markdown_tables_are_well_formed_and_say_what_is_kept(
@@ -100,7 +102,7 @@ def test_the_markdown_tables_are_well_formed_and_say_what_is_kept(
     mean = tables["Mean of folds 1 and 2"]
     assert mean[0] == [
         "stage", "run on", "mAcc %", "change", "kept", "mIoU %", "change", "kept",
-        "mIoU % by solid angle",
+        "mIoU % by solid angle", "kept",
     ]  # fmt: skip
     # mAcc is 0.1 above: 0.7 / 0.75; folds 0.5 / 0.6, 0.9 / 0.9.
     assert mean[2][3] == "−6.7 %"
@@ -108,7 +110,8 @@ def test_the_markdown_tables_are_well_formed_and_say_what_is_kept(
     assert mean[2][5] == "60.0 ± 28.3 (± 14.1)"
     assert mean[2][6:8] == ["−7.7 %", "92.3 % ± 14.1 (± 13.2)"]
     assert mean[2][8] == "30.0 ± 14.1 (± 7.1)"
-    assert mean[1][6:] == ["–", "–", "–"]
+    assert mean[2][9].startswith("46.2 % ± ")
+    assert mean[1][6:] == ["–", "–", "–", "–"]
     assert tables["Fold 1"][2][5:7] == ["40.0 (± 14.1)", "−20.0 %"]
     assert tables["Fold 2"][2][6] == "+0.0 %"
     assert tables["mIoU % by latitude, mean of folds 1 and 2"] == [
@@ -124,7 +127,7 @@ def test_one_fold_and_one_seed_has_one_table_without_spreads() -> None:
     report = gather(both({(2, 0): 0.4}, {(2, 0): 0.41}))
     tables = markdown_tables(transfer_markdown(report))
     assert [title for title in tables if title.lower().startswith(("fold", "mean"))] == ["Fold 2"]
-    assert tables["Fold 2"][2][2:] == ["51.0", "+2.0 %", "102.0 %", "41.0", "+2.5 %", "102.5 %", "20.5"]  # fmt: skip  # noqa: E501
+    assert tables["Fold 2"][2][2:] == ["51.0", "+2.0 %", "102.0 %", "41.0", "+2.5 %", "102.5 %", "20.5", "51.2 %"]  # fmt: skip  # noqa: E501
 
 
 def test_data_without_folds_is_one_test_set() -> None:
