@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 from datamodules.panorama_module import PanoramaDataModule, Split
 from datamodules.panoramas import Panorama, resize_area, resize_depth, resize_nearest
-from datamodules.png import read_color_png
+from datamodules.png import check_panorama_size, read_color_png
 from datamodules.sources import count_labels
 from datamodules.synthia_files import (
     GET_IT,
@@ -34,7 +34,7 @@ from datamodules.synthia_pixels import (
     read_first_channel,
 )
 from datamodules.synthia_splits import FRAMES, TEST, TRAIN, SequenceSplits
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -216,23 +216,7 @@ class OmniSynthia(PanoramaDataModule):
         found = []
         for frame in frames:
             files = panorama_files(folder, frame, with_depth=self.with_depth)
-            self._check_size(files, check_files(files, PANORAMA_FORMATS))
+            size = check_files(files, PANORAMA_FORMATS)
+            check_panorama_size(files.rgb, size, self.erp_height)
             found.append(_PanoramaName(sequence, frame, files))
         return found
-
-    def _check_size(self, files: PictureFiles, size: tuple[int, int]) -> None:
-        height, width = size
-        if width != 2 * height:
-            raise DataError(
-                files.rgb,
-                found=f"{height}×{width} pixels",
-                expected="twice as wide as high",
-                remedy="Only full 360°×180° panoramas can be used.",
-            )
-        if height < self.erp_height:
-            raise SettingError(
-                "representation.erp_height",
-                found=self.erp_height,
-                expected=f"at most the {height} rows of {files.rgb}",
-                remedy="Choose a lower level, or larger panoramas.",
-            )

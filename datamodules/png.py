@@ -9,14 +9,23 @@ from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 import cv2
 import numpy as np
 
-from tangent_train.errors import DataError
+from tangent_train.errors import DataError, SettingError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
 
-__all__ = ["PngHeader", "read_color_png", "read_depth_png", "read_png", "read_png_header"]
+__all__ = [
+    "PngHeader",
+    "check_panorama_size",
+    "check_png",
+    "read_color_png",
+    "read_depth_png",
+    "read_png",
+    "read_png_header",
+]
 
 _START = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR"
 _HEADER_BYTES = 26  # the signature, IHDR's length and name, then its first ten bytes
@@ -57,6 +66,57 @@ def read_png_header(path: Path) -> PngHeader:
         )
     width, height, bits, color = struct.unpack(">IIBB", start[len(_START) :])
     return PngHeader(height, width, bits, _COLOR_TYPES.get(color, f"color type {color}"))
+
+
+def check_png(path: Path, bits: int, colors: Sequence[str]) -> PngHeader:
+    """Read the header of a PNG file that has to be as a data set was released.
+
+    Args:
+        path: The file.
+        bits: Per channel.
+        colors: What `PngHeader.color` may be.
+
+    Raises:
+        DataError: It cannot be read, is no PNG, parts are missing, or it has other pixels.
+    """
+    header = read_png_header(path)
+    if header.bits != bits or header.color not in colors:
+        raise DataError(
+            path,
+            found=f"{header.bits}-bit {header.color}",
+            expected=f"{bits}-bit {' or '.join(colors)}",
+            remedy="Use the files as released; do not convert them.",
+        )
+    return header
+
+
+def check_panorama_size(path: Path, size: tuple[int, int], erp_height: int) -> None:
+    """Make sure that an image is a whole panorama of enough rows.
+
+    Args:
+        path: The image.
+        size: Its rows and columns.
+        erp_height: Rows that are wanted.
+
+    Raises:
+        DataError: It is not twice as wide as high.
+        SettingError: It has fewer rows.
+    """
+    height, width = size
+    if width != 2 * height:
+        raise DataError(
+            path,
+            found=f"{height}×{width} pixels",
+            expected="twice as wide as high",
+            remedy="Only full 360°×180° panoramas can be used.",
+        )
+    if height < erp_height:
+        raise SettingError(
+            "representation.erp_height",
+            found=erp_height,
+            expected=f"at most the {height} rows of {path}",
+            remedy="Choose a lower level, or larger panoramas.",
+        )
 
 
 def _chunks_end(file: BinaryIO) -> int | None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
-from datamodules.png import PngHeader, read_png_header
-from tangent_train.errors import DataError, SettingError
+from datamodules.png import check_panorama_size, check_png
+from tangent_train.errors import DataError
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -151,22 +151,8 @@ def check_panorama(files: PictureFiles, erp_height: int) -> None:
         DataError: A file is missing, cut off, or of another size or pixel format.
         SettingError: The panorama has fewer rows than wanted.
     """
-    header = _check_png(files.rgb, "rgb")
-    height, width = header.height, header.width
-    if width != 2 * height:
-        raise DataError(
-            files.rgb,
-            found=f"{height}×{width} pixels",
-            expected="twice as wide as high",
-            remedy="Only full 360°×180° panoramas can be used.",
-        )
-    if height < erp_height:
-        raise SettingError(
-            "representation.erp_height",
-            found=erp_height,
-            expected=f"at most the {height} rows of {files.rgb}",
-            remedy="Choose a lower level, or larger panoramas.",
-        )
+    header = check_png(files.rgb, *_FORMATS["rgb"])
+    check_panorama_size(files.rgb, header[:2], erp_height)
     check_picture(files)
 
 
@@ -179,13 +165,13 @@ def check_picture(files: PictureFiles) -> tuple[int, int]:
     Raises:
         DataError: A file is missing, cut off, or of another size or pixel format.
     """
-    header = _check_png(files.rgb, "rgb")
+    header = check_png(files.rgb, *_FORMATS["rgb"])
     height, width = header.height, header.width
     partners = [(files.semantic, "semantic")]
     if files.depth is not None:
         partners.append((files.depth, "depth"))
     for path, domain in partners:
-        other = _check_png(path, domain)
+        other = check_png(path, *_FORMATS[domain])
         if other[:2] != header[:2]:
             raise DataError(
                 path,
@@ -194,16 +180,3 @@ def check_picture(files: PictureFiles) -> tuple[int, int]:
                 remedy="Copy or extract both files again.",
             )
     return height, width
-
-
-def _check_png(path: Path, domain: str) -> PngHeader:
-    header = read_png_header(path)
-    bits, colors = _FORMATS[domain]
-    if header.bits != bits or header.color not in colors:
-        raise DataError(
-            path,
-            found=f"{header.bits}-bit {header.color}",
-            expected=f"{bits}-bit {' or '.join(colors)}",
-            remedy="Use the files as released; do not convert them.",
-        )
-    return header

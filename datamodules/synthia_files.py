@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from datamodules.png import read_png_header
+from datamodules.png import check_png
 from tangent_train.errors import DataError
 
 if TYPE_CHECKING:
@@ -167,15 +167,7 @@ def check_files(files: PictureFiles, formats: Formats) -> tuple[int, int]:
     """
     size = None
     for part, path in files.parts.items():
-        header = read_png_header(path)
-        bits, colors = formats[part]
-        if header.bits != bits or header.color not in colors:
-            raise DataError(
-                path,
-                found=f"{header.bits}-bit {header.color}",
-                expected=f"{bits}-bit {' or '.join(colors)}",
-                remedy="Use the files as released; do not convert them.",
-            )
+        header = check_png(path, *formats[part])
         size = size or (header.height, header.width)
         if (header.height, header.width) != size:
             raise DataError(
