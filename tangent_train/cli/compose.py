@@ -10,7 +10,7 @@ from hydra import compose, initialize_config_dir
 from hydra._internal.utils import get_args_parser
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override
+from hydra.core.override_parser.types import Override, Quote, QuotedString
 from hydra.errors import (
     ConfigCompositionException,
     MissingConfigException,
@@ -26,13 +26,23 @@ if TYPE_CHECKING:
 
     from hydra.core.config_loader import ConfigLoader
 
-__all__ = ["STORED", "check_overrides", "compose_option", "config_folder", "search_path"]
+__all__ = [
+    "STORED",
+    "check_overrides",
+    "compose_option",
+    "config_folder",
+    "quote_path",
+    "search_path",
+]
 
 STORED = "stored_"
 """Begins the names of configs that come from a run or a checkpoint."""
 
 _PLUGINS = {"hydra/launcher/": "hydra-submitit-launcher", "hydra/sweeper/": "hydra-optuna-sweeper"}
 """Packages of the extra ``sweep``, by the config group they add options to."""
+
+_PATHS = ("back", "cameras", "checkpoint", "depth", "figure", "input", "output")
+"""Settings of predict, render and export that name files or folders."""
 
 _TRANSFER = "transfer"
 _OF_TRANSFER = ("photos", "fine_tuning")
@@ -44,6 +54,18 @@ def config_folder() -> Path:
     package = Path(__file__).resolve().parents[1]
     packaged = package / "configs"
     return packaged if packaged.is_dir() else package.parent / "configs"
+
+
+def quote_path(argument: str) -> str:
+    """An override of a setting of `_PATHS` so that Hydra takes its value as it is.
+
+    >>> quote_path("input=holiday (1)/a=b,c.jpg"), quote_path("level=7"), quote_path("depth=null")
+    ("input='holiday (1)/a=b,c.jpg'", 'level=7', 'depth=null')
+    """
+    name, _, value = argument.partition("=")
+    if name not in _PATHS or value in ("", "null") or value[0] in "'\"":
+        return argument
+    return f"{name}={QuotedString(value, Quote.single).with_quotes()}"
 
 
 def search_path(options: Namespace) -> list[str]:

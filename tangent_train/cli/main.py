@@ -16,7 +16,18 @@ from tangent_train.errors import DataError, SettingError
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
-__all__ = ["evaluate", "prepare", "report", "train", "transfer"]
+__all__ = ["evaluate", "export", "predict", "prepare", "render", "report", "train", "transfer"]
+
+_MODULES = {
+    "export": "export",
+    "predict": "predict",
+    "render": "render",
+    "transfer": "transfer.command",
+}
+"""Where a command is, if not in `run`."""
+
+_OF_FILES = ("export", "predict", "render")
+"""Commands whose paths are taken as they are, whatever characters are in them."""
 
 
 def train() -> None:
@@ -37,6 +48,21 @@ def prepare() -> None:
 def transfer() -> None:
     """``tangent-transfer experiment=…``: train on photos, evaluate on panoramas."""
     _main("transfer")
+
+
+def predict() -> None:
+    """``tangent-predict checkpoint=… input=… output=…``: label images of one's own."""
+    _main("predict")
+
+
+def render() -> None:
+    """``tangent-render input=… output=…``: tangent images as files, and back."""
+    _main("render")
+
+
+def export() -> None:
+    """``tangent-export checkpoint=… format=…``: the network for other programs."""
+    _main("export")
 
 
 def report() -> None:
@@ -66,11 +92,13 @@ def _compose_and_run(command: str, typed: list[str]) -> None:
     from hydra._internal.utils import get_args_parser
     from hydra.errors import InstantiationException
 
-    from tangent_train.cli.compose import check_overrides, config_folder
+    from tangent_train.cli.compose import check_overrides, config_folder, quote_path
     from tangent_train.cli.stored import with_stored_config
 
     as_module = __name__ == "__main__"
     settings = typed[1:] if as_module else typed
+    if command in _OF_FILES:
+        settings = [quote_path(argument) for argument in settings]
     config_name, arguments = with_stored_config(command, settings)
     check_overrides(config_name, arguments)
     visible_gpus = os.environ.get("CUDA_VISIBLE_DEVICES")
@@ -84,8 +112,7 @@ def _compose_and_run(command: str, typed: list[str]) -> None:
             if in_sweep():
                 return run_job(command, settings, visible_gpus, config)
             leave_warnings_to_the_sweep()
-            place = "transfer.command" if command == "transfer" else "run"
-            commands = import_module(f"tangent_train.cli.{place}")
+            commands = import_module(f"tangent_train.cli.{_MODULES.get(command, 'run')}")
             result: float | None = getattr(commands, command)(config)
         except (DataError, SettingError) as error:
             sys.exit(f"tangent-{command}: {error}")
