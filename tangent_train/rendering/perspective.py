@@ -65,15 +65,32 @@ class PhotoCrops:
 
         So every place of the photo is counted once, however much the crops overlap.
         """
-        across, down = (self._owned_along(axis, self.size[1 - axis]) for axis in (0, 1))
+        cells = self.cells()
+        across, down = (
+            (cells[:, None, axis] <= places) & (places < cells[:, None, axis + 2])
+            for axis in (0, 1)
+            for places in [self._places(axis)]
+        )
         return down[:, :, None] & across[:, None, :]
 
-    def _owned_along(self, axis: int, count: int) -> NDArray[np.bool_]:
-        near, far = self.boxes[:, axis], self.boxes[:, axis + 2]
-        centers, own = np.unique(np.round((near + far) / 2, 6), return_inverse=True)
-        places = np.linspace(near, far, 2 * count + 1, axis=1)[:, 1::2]
-        owner: NDArray[np.int64] = np.abs(places[..., None] - centers).argmin(axis=-1)
-        return owner == own[:, None]
+    def cells(self) -> NDArray[np.float64]:
+        """The part of the photo that lies nearer to a crop's centre than to any other's.
+
+        Returns:
+            ``(n, 4)`` left, top, right and bottom, as `boxes`; infinite beyond the outermost.
+        """
+        cells = np.empty_like(self.boxes)
+        for axis in (0, 1):
+            middle = (self.boxes[:, axis] + self.boxes[:, axis + 2]) / 2
+            centers, own = np.unique(np.round(middle, 6), return_inverse=True)
+            edges = np.array([-np.inf, *(centers[1:] + centers[:-1]) / 2, np.inf])
+            cells[:, axis], cells[:, axis + 2] = edges[own], edges[own + 1]
+        return cells
+
+    def _places(self, axis: int) -> NDArray[np.float64]:
+        """``(n, pixels)`` where the centres of a crop's columns (0) or rows (1) are."""
+        near, far, count = self.boxes[:, axis], self.boxes[:, axis + 2], self.size[1 - axis]
+        return np.linspace(near, far, 2 * count + 1, axis=1)[:, 1::2]
 
 
 def _smooth(image: NDArray[Any], box: NDArray[np.float64], size: tuple[int, int]) -> NDArray[Any]:
@@ -114,10 +131,18 @@ class PhotoSampler:
 
     def whole(self) -> PhotoCrops:
         """As few crops as cover the photo, evenly spread; or the one in the middle."""
-        least, greatest = self._shifts()
         if self.representation.evaluation == "center":
-            return self._crops(np.clip(np.zeros((1, 2)), least, greatest))
-        extent = self._extent()
+            return self._crops(np.clip(np.zeros((1, 2)), *self._shifts()))
+        return self.cover()
+
+    def cover(self, overlap: float = 0.0) -> PhotoCrops:
+        """As few crops as cover the photo, evenly spread.
+
+        Args:
+            overlap: The least share of its side by which a crop overlaps the next, 0 to below 1.
+        """
+        least, greatest = self._shifts()
+        extent = self._extent() * (1 - overlap)
         count = 1 + np.ceil((greatest - least) / extent - _NEGLIGIBLE).astype(int)
         across, down = (
             np.linspace(a, b, n) if n > 1 else np.clip([0.0], a, b)
