@@ -1,4 +1,4 @@
-"""A progress bar for making files."""
+"""Progress bars of work on files."""
 
 from __future__ import annotations
 
@@ -9,7 +9,23 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-__all__ = ["show_progress"]
+__all__ = ["progress_bar", "show_progress"]
+
+
+def progress_bar(*, show: bool = True) -> Progress:
+    """A bar for tasks with a field `rate`.
+
+    Args:
+        show: Whether to show anything.
+    """
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[rate]}"),
+        TimeRemainingColumn(),
+    )
+    return Progress(*columns, disable=not show)
 
 
 def show_progress(
@@ -31,14 +47,7 @@ def show_progress(
         before: Pieces that were done before.
         show: Whether to show anything.
     """
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[rate]}"),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, disable=not show) as bar:
+    with progress_bar(show=show) as bar:
         task = bar.add_task(description, total=total, rate="")
         bar.advance(task, before)
         for _ in done:

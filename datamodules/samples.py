@@ -34,6 +34,7 @@ __all__ = [
     "TrainingSample",
     "collate",
     "normalize",
+    "render_inputs",
 ]
 
 MAX_DEPTH_M = 4.0
@@ -190,7 +191,7 @@ class TrainingImages(Dataset[TrainingSample[Inputs]]):
         image = self._source.read(index)
         rng = sample_rng(self._seed, epoch, index)
         views = image.sampler(self._representation).sample(rng)
-        rgb, *depth = _render(image, views)
+        rgb, *depth = render_inputs(image.rgb, image.depth, views)
         if self._color_jitter:
             rgb = jitter_colors(rgb, self._color_jitter, rng)
         return TrainingSample(
@@ -218,7 +219,8 @@ class EvaluationImages(Dataset[EvaluationSample[Inputs]]):
     def __getitem__(self, key: tuple[int, int]) -> EvaluationSample[Inputs]:
         _, index = key
         image = self._source.read(index)
-        images = _render(image, image.sampler(self._representation).whole())
+        views = image.sampler(self._representation).whole()
+        images = render_inputs(image.rgb, image.depth, views)
         target = image.target(self._representation)
         return EvaluationSample(images, torch.tensor(target), index)
 
@@ -235,12 +237,24 @@ def collate(samples: list[_Sample]) -> _Sample:
     return kind([image[None] for image in images], labels[None], torch.tensor([index]))
 
 
-def _render(image: LabelledImage, views: Views) -> tuple[Tensor, ...]:
-    rgb = _tensor(views.render(image.rgb, "bilinear"))
-    if image.depth is None:
-        return (rgb,)
-    steps = np.minimum(views.render(image.depth, "nearest"), int(MAX_DEPTH_M * STEPS_PER_M))
-    return rgb, torch.from_numpy(steps.view(np.int16))  # torch hardly knows uint16
+def render_inputs(
+    rgb: NDArray[np.uint8], depth: NDArray[np.uint16] | None, views: Views
+) -> tuple[Tensor, ...]:
+    """What a network is shown of an image, before `normalize`.
+
+    Args:
+        rgb: ``(H, W, 3)``.
+        depth: ``(H, W)`` in steps of 1/512 m, 0 where missing; or None.
+        views: Where it looks.
+
+    Returns:
+        RGB ``(n, h, w, 3)`` uint8 and, with depth, ``(n, h, w)`` int16 steps up to `MAX_DEPTH_M`.
+    """
+    colors = _tensor(views.render(rgb, "bilinear"))
+    if depth is None:
+        return (colors,)
+    steps = np.minimum(views.render(depth, "nearest"), int(MAX_DEPTH_M * STEPS_PER_M))
+    return colors, torch.from_numpy(steps.view(np.int16))  # torch hardly knows uint16
 
 
 def _tensor(array: NDArray[np.uint8]) -> Tensor:

@@ -54,7 +54,7 @@ class ScoreMosaic:
         self.shape = shape
         self.blend = blend
         self._power = FEATHER_POWER if blend == "feather" else 0
-        self._labels = np.zeros(shape, np.uint8 if num_classes <= 256 else np.uint16)
+        self._labels = np.zeros(shape, np.uint8 if num_classes < 256 else np.uint16)
         averaged = averaged or blend == "feather"
         self._total = _zeros((*shape, num_classes) if averaged else (0, 0, num_classes))
         self._rays: tuple[NDArray[np.float64], ...] | None = None
@@ -122,13 +122,13 @@ class ScoreMosaic:
             over_rows(mosaic_kernels.best_classes, self.shape, self._total, self._labels)
         return self._labels
 
-    def probabilities(self, rows: slice) -> NDArray[np.float32]:
+    def probabilities(self, rows: slice | NDArray[np.intp]) -> NDArray[np.float32]:
         """``(h, W, K)`` probabilities of some rows, which add up to 1; only where averaged."""
         total = self._total[rows]
         return total / np.maximum(total.sum(axis=-1, keepdims=True), np.finfo(np.float32).tiny)
 
     def _prepared(self, scores: Tensor) -> NDArray[np.float32]:
-        """``(n, h, w, K)`` on the CPU; as probabilities where they are feathered (as in training)."""
+        """``(n, h, w, K)`` on the CPU; feathered are probabilities, as in evaluation."""
         scores = scores.detach().float()
         if self._power:
             scores = scores.softmax(dim=1)

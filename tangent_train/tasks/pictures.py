@@ -11,11 +11,13 @@ from numpy.typing import NDArray
 
 from tangent_train.tasks.losses import UNKNOWN
 
-__all__ = ["class_colors", "colorize", "prediction_panel"]
+__all__ = ["class_colors", "colorize", "overlay_picture", "prediction_panel"]
 
 _Image = NDArray[np.uint8]
 _MARGIN = 8
 _LEAST_ROWS = 256
+_LEGEND_WIDTH = 1200
+"""Pixels of width per step of a legend's size."""
 
 
 def class_colors(num_classes: int) -> _Image:
@@ -88,19 +90,45 @@ def _titled(image: _Image, title: str) -> _Image:
     return np.concatenate([_text(strip, title, (2, 16)), image])
 
 
-def _legend(width: int, classes: NDArray[np.integer], class_names: Sequence[str]) -> _Image:
-    cell, line = 104, 22
+def overlay_picture(
+    rgb: _Image, labels: NDArray[np.integer], class_names: Sequence[str], opacity: float = 0.5
+) -> _Image:
+    """A picture with its labels laid over it, over a legend of the classes in it.
+
+    Args:
+        rgb: ``(H, W, 3)``.
+        labels: ``(H, W)`` class indices; what is unknown (0) shows the picture.
+        class_names: K + 1 names.
+        opacity: Of the labels.
+
+    Returns:
+        RGB image of the same width, a little higher; the legend grows with the width.
+    """
+    colors = colorize(labels, len(class_names))
+    mixed = cv2.addWeighted(rgb, 1 - opacity, colors, opacity, 0)
+    mixed[labels == UNKNOWN] = rgb[labels == UNKNOWN]
+    scale = max(1, round(rgb.shape[1] / _LEGEND_WIDTH))
+    seen = np.setdiff1d(np.unique(labels), [UNKNOWN])
+    return np.concatenate([mixed, _legend(rgb.shape[1], seen, class_names, scale)])
+
+
+def _legend(
+    width: int, classes: NDArray[np.integer], class_names: Sequence[str], scale: int = 1
+) -> _Image:
+    longest = max((len(class_names[index]) for index in classes), default=0)
+    cell, line = max(104, 30 + 9 * longest) * scale, 22 * scale
     per_row = max(1, width // cell)
     rows = -(-len(classes) // per_row)
-    legend = np.full((rows * line + _MARGIN, width, 3), 255, np.uint8)
+    legend = np.full((rows * line + _MARGIN * scale, width, 3), 255, np.uint8)
     colors = class_colors(len(class_names))
     for k, index in enumerate(classes):
-        x, y = k % per_row * cell + 2, k // per_row * line + _MARGIN
-        legend[y : y + 14, x : x + 14] = colors[index]
-        _text(legend, class_names[index], (x + 19, y + 12))
+        x, y = k % per_row * cell + 2 * scale, k // per_row * line + _MARGIN * scale
+        legend[y : y + 14 * scale, x : x + 14 * scale] = colors[index]
+        _text(legend, class_names[index], (x + 19 * scale, y + 12 * scale), scale)
     return legend
 
 
-def _text(image: _Image, text: str, origin: tuple[int, int]) -> _Image:
-    cv2.putText(image, text, origin, cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
+def _text(image: _Image, text: str, origin: tuple[int, int], scale: int = 1) -> _Image:
+    font, black = cv2.FONT_HERSHEY_SIMPLEX, (0, 0, 0)
+    cv2.putText(image, text, origin, font, 0.45 * scale, black, scale, cv2.LINE_AA)
     return image

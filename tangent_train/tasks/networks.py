@@ -1,0 +1,240 @@
+"""Networks as configs describe them, and as they are once trained."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
+
+import torch
+from hydra.errors import InstantiationException
+from hydra.utils import instantiate
+from torch import Tensor, nn
+
+from tangent_train.errors import DataError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from datamodules.samples import Normalization
+
+__all__ = [
+    "PRETRAINED",
+    "Scores",
+    "TrainedNetwork",
+    "completed_settings",
+    "make",
+    "make_stored",
+    "network_from",
+    "size_multiple_of",
+]
+
+PRETRAINED = ("weights", "weights_backbone", "encoder_weights")
+"""Settings that name trained weights, in models, torchvision and segmentation-models-pytorch."""
+
+_EXTRAS = {"segmentation_models_pytorch": "networks"}
+"""Packages of networks that an extra of this one installs."""
+
+_PROBED = (1, 2, 4, 8, 16, 32, 64, 128)
+_PROBED_SIDES = (127, 131)
+"""The least height and width to try: primes, which are multiples of nothing smaller."""
+
+
+@dataclass(frozen=True)
+class TrainedNetwork:
+    """A trained network with all that is needed to use it.
+
+    Attributes:
+        network: In evaluation mode; ``(B, C, h, w)`` float32, normalized, to scores ``(B, K+1, h,
+            w)``, the unknown class first.
+        class_names: K + 1 names, the unknown class first.
+        inputs: ``("rgb",)`` or ``("rgb", "depth")``.
+        normalization: Of the images.
+        level: Level s it was trained at.
+        representation: The section of the config it was trained with, resolved.
+        image_size: Rows and columns of the images that representation evaluates on.
+        size_multiple: Height and width of its images must be multiples of this.
+        fixed_size: The only rows and columns it takes; None where it takes others.
+        settings: The section of the config that makes it, complete; None where only the computation
+            is known (ONNX, TorchScript).
+    """
+
+    network: nn.Module
+    class_names: tuple[str, ...]
+    inputs: tuple[str, ...]
+    normalization: Normalization
+    level: int
+    representation: Mapping[str, Any]
+    image_size: tuple[int, int]
+    size_multiple: int = 1
+    fixed_size: tuple[int, int] | None = None
+    settings: Mapping[str, Any] | None = None
+
+
+class Scores(nn.Module):
+    """A network whose result is always a tensor.
+
+    Args:
+        network: Maps images ``(B, C, h, w)`` to scores ``(B, K, h, w)``, or to a dict with those
+            under ``"out"`` (torchvision's).
+    """
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Scores of every pixel."""
+        scores = self.network(images)
+        result: Tensor = scores["out"] if isinstance(scores, dict) else scores
+        return result
+
+
+def make(settings: Mapping[str, Any]) -> Any:
+    """What a section of a config describes.
+
+    All that stored configs name is made here: their `_target_` can be any function of any package
+    that is installed, so they must come from a file that somebody trusts as much as a program.
+
+    Args:
+        settings: ``_target_`` and its arguments.
+
+    Raises:
+        InstantiationException: It cannot be made.
+    """
+    return instantiate(dict(settings))
+
+
+def completed_settings(
+    settings: Any, in_channels: int, num_classes: int, *, restored: bool = False
+) -> Any:
+    """Settings of a network, and of networks inside them, with what the data says where null.
+
+    Args:
+        settings: Resolved; ``in_channels``, and ``num_classes`` or ``classes`` may be null.
+        in_channels: Channels of the images.
+        num_classes: Classes, the unknown one included.
+        restored: Whether a checkpoint will bring the tensors: no others are fetched first.
+    """
+    known = dict.fromkeys(("num_classes", "classes"), num_classes) | {"in_channels": in_channels}
+    unwanted = PRETRAINED if restored else ()
+
+    def complete(value: Any) -> Any:
+        if not isinstance(value, Mapping):
+            return value
+        return {
+            name: known.get(name) if inner is None or name in unwanted else complete(inner)
+            for name, inner in value.items()
+        }
+
+    return complete(settings)
+
+
+def make_stored(path: Path, section: str, settings: Mapping[str, Any]) -> Any:
+    """What a section of the config in a file describes.
+
+    Args:
+        path: The file, for the messages.
+        section: Name of the section, for the messages.
+        settings: ``_target_`` and its arguments.
+
+    Raises:
+        DataError: It cannot be made; where a package is missing, which.
+    """
+    try:
+        return make(settings)
+    except InstantiationException as error:
+        package = _missing_package(error)
+        if package is None:
+            cause = error.__cause__ or error
+            first_line = str(cause).partition("\n")[0]
+            raise DataError(
+                path,
+                found=f"a {section} that cannot be made ({first_line})",
+                expected=f"settings of {settings.get('_target_')}",
+            ) from error
+        extra = _EXTRAS.get(package)
+        raise DataError(
+            path,
+            found=f"a {section} of the package {package}, which is not installed",
+            expected=f"{settings.get('_target_')}, as in training",
+            remedy=f"Run: pip install 'tangent-train[{extra}]'"
+            if extra
+            else "Install it, or add the folder it is in to PYTHONPATH.",
+        ) from error
+
+
+def network_from(
+    path: Path, settings: Mapping[str, Any], tensors: Mapping[str, Tensor]
+) -> nn.Module:
+    """The network that settings describe with the tensors of a file, in evaluation mode.
+
+    Args:
+        path: The file, for the messages.
+        settings: Complete: ``_target_`` and its arguments.
+        tensors: All of its state.
+
+    Returns:
+        Its result is always a tensor.
+
+    Raises:
+        DataError: It cannot be made, or the tensors are those of another network.
+    """
+    network: nn.Module = make_stored(path, "network", settings)
+    try:
+        network.load_state_dict(dict(tensors))
+    except RuntimeError as error:
+        raise DataError(
+            path,
+            found=f"other tensors than those of its network ({error})",
+            expected=f"the tensors of {settings['_target_']}",
+            remedy="Is the package of the network of another version than in training?",
+        ) from error
+    return Scores(network).eval()
+
+
+def size_multiple_of(network: nn.Module, in_channels: int) -> int | None:
+    """What height and width of a network's images must be multiples of, found by trying.
+
+    Args:
+        network: In evaluation mode, on the CPU; its result a tensor.
+        in_channels: Channels of its images.
+
+    Returns:
+        A power of two from 1 to 128; None when it takes no such size.
+    """
+    probe: nn.Module = copy.deepcopy(network).to("meta")  # shapes only: nothing is computed
+    device = "meta"
+    for multiple in _PROBED:
+        size = tuple(-(-side // multiple) | 1 for side in _PROBED_SIDES)  # odd: of no greater one
+        images = (1, in_channels, *(multiple * count for count in size))
+        try:
+            fits = _keeps_size(probe, torch.zeros(images, device=device))
+        except NotImplementedError:  # by an operation that only computes
+            probe, device = network, "cpu"
+            fits = _keeps_size(probe, torch.zeros(images))
+        if fits:
+            return multiple
+    return None
+
+
+@torch.no_grad()
+def _keeps_size(network: nn.Module, images: Tensor) -> bool:
+    try:
+        scores = network(images)
+    except NotImplementedError:
+        raise
+    except Exception:  # each network refuses sizes in its own words
+        return False
+    return tuple(scores.shape[-2:]) == tuple(images.shape[-2:])
+
+
+def _missing_package(error: BaseException | None) -> str | None:
+    while error is not None:
+        if isinstance(error, ModuleNotFoundError) and error.name:
+            package = error.name.partition(".")[0]
+            return None if find_spec(package) else package
+        error = error.__cause__ or error.__context__
+    return None

@@ -1,0 +1,1 @@
+"""Labels of one's own panoramas and photos, from a trained network."""

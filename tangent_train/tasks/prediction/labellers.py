@@ -1,0 +1,202 @@
+"""From the file of an image to its labels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from datamodules.gpano import area_of, area_of_crop, whole_area
+from datamodules.image_files import photo_fov_deg, read_depth_m, read_rgb
+from datamodules.panoramas import STEPS_PER_M, resize_nearest
+from tangent_train.errors import DataError
+from tangent_train.geometry import camera_matrix_from_fov
+from tangent_train.tasks.prediction.predictor import Done, InputImage
+from tangent_train.tasks.prediction.seams import seam_score
+from tangent_train.tasks.prediction.summary import class_shares
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from datamodules.gpano import PanoramaArea
+    from tangent_train.rendering.mosaic import ScoreMosaic
+    from tangent_train.tasks.prediction.panoramas import PanoramaPredictor
+    from tangent_train.tasks.prediction.photos import PhotoPredictor
+
+__all__ = ["DepthFolder", "Labelled", "Labeller", "PanoramaLabeller", "PhotoLabeller"]
+
+_DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".npy", ".exr")
+_MOST_STEPS = np.iinfo(np.uint16).max
+_ASPECT_TOLERANCE = 0.01
+
+
+@dataclass(frozen=True)
+class Labelled:
+    """One image and its labels.
+
+    Attributes:
+        rgb: ``(h, w, 3)`` the image.
+        labels: ``(h, w)`` labels, 0 unknown.
+        figures: Plain values about it, for the summary.
+        mosaic: The scores.
+        rows: ``(h,)`` rows of the mosaic that are the image's.
+        columns: ``(w,)`` likewise.
+        area: Where the image of a panorama lies on the sphere; None for photos.
+    """
+
+    rgb: NDArray[np.uint8]
+    labels: NDArray[np.unsignedinteger]
+    figures: dict[str, Any]
+    mosaic: ScoreMosaic
+    rows: NDArray[np.intp]
+    columns: NDArray[np.intp]
+    area: PanoramaArea | None = None
+
+
+class Labeller(Protocol):
+    """Labels image files of one kind."""
+
+    def label(self, path: Path, done: Done, *, averaged: bool) -> Labelled:
+        """Labels of one image.
+
+        Args:
+            path: Its file.
+            done: Told of the progress.
+            averaged: Whether probabilities will be asked for.
+
+        Raises:
+            DataError: The file cannot be used.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class DepthFolder:
+    """Depth images named as the images they belong to, or with ``_depth`` at the end.
+
+    Attributes:
+        path: The folder.
+        units_per_m: Of files with whole numbers.
+    """
+
+    path: Path
+    units_per_m: float
+
+    def read(self, image: Path, shape: tuple[int, int]) -> NDArray[np.uint16]:
+        """Depth of an image in steps of 1/512 m, 0 where missing, ``shape``.
+
+        Raises:
+            DataError: There is none, it is broken, or it shows something of another form.
+        """
+        names = [f"{image.stem}{end}{s}" for end in ("", "_depth") for s in _DEPTH_SUFFIXES]
+        found = [self.path / name for name in names if (self.path / name).is_file()]
+        if not found:
+            raise DataError(
+                image,
+                found=f"no {names[0]} or the like in {self.path}",
+                expected="depth of every image, for a network that takes RGB and depth",
+                remedy=f"Name it {image.stem} or {image.stem}_depth, "
+                f"with {', '.join(_DEPTH_SUFFIXES)}.",
+            )
+        depth_m = read_depth_m(found[0], self.units_per_m)
+        height, width = depth_m.shape
+        if abs(width * shape[0] / (height * shape[1]) - 1) > _ASPECT_TOLERANCE:
+            raise DataError(
+                found[0],
+                found=f"{height}×{width} pixels",
+                expected=f"the form of {image.name}, which has {shape[0]}×{shape[1]}",
+            )
+        steps = np.minimum(np.rint(resize_nearest(depth_m, shape) * STEPS_PER_M), _MOST_STEPS)
+        return steps.astype(np.uint16)
+
+
+@dataclass(frozen=True)
+class PanoramaLabeller:
+    """Labels panoramas, whole or a part of the sphere.
+
+    Attributes:
+        predictor: Labels whole ones.
+        class_names: K + 1 names.
+        crop: What all of them show, see `area_of_crop`; None for what they say themselves.
+        depth: Their depth, for networks that take it.
+    """
+
+    predictor: PanoramaPredictor
+    class_names: Sequence[str]
+    crop: Sequence[float] | None = None
+    depth: DepthFolder | None = None
+
+    def label(self, path: Path, done: Done, *, averaged: bool) -> Labelled:
+        """Labels of one panorama; see `Labeller`."""
+        rgb = read_rgb(path)
+        size = (rgb.shape[0], rgb.shape[1])
+        if self.crop is not None:
+            area = area_of_crop(size, self.crop)
+        else:
+            area = area_of(path, size) or whole_area(path, size)
+        depth = None if self.depth is None else area.place(self.depth.read(path, size))
+        prediction = self.predictor.predict(
+            InputImage(area.place(rgb), depth), done, averaged=averaged
+        )
+        labels = prediction.mosaic.labels() + np.uint8(1)  # 0 is the unknown class
+        if not area.is_whole:
+            labels[~area.known] = 0
+        figures: dict[str, Any] = {"level": prediction.level, "views": prediction.views}
+        if prediction.grid is not None:
+            seam = seam_score(labels, prediction.grid)
+            figures |= {"seam_border": seam.border, "seam_inside": seam.inside}
+            figures["seam_ratio"] = seam.ratio
+        figures["classes"] = class_shares(labels, self.class_names)
+        height, width = area.full_shape
+        rows = area.cut(np.broadcast_to(np.arange(height)[:, None], (height, width)))[:, 0]
+        columns = area.cut(np.broadcast_to(np.arange(width), (height, width)))[0]
+        mosaic = prediction.mosaic
+        return Labelled(rgb, area.cut(labels), figures, mosaic, rows, columns, area)
+
+
+@dataclass(frozen=True)
+class PhotoLabeller:
+    """Labels photos.
+
+    Attributes:
+        predictor: Labels them.
+        class_names: K + 1 names.
+        fov_deg: Horizontal field of view of all of them; None for what they say themselves.
+        depth: Depth along their optical axes, for networks that take depth.
+    """
+
+    predictor: PhotoPredictor
+    class_names: Sequence[str]
+    fov_deg: float | None = None
+    depth: DepthFolder | None = None
+
+    def label(self, path: Path, done: Done, *, averaged: bool) -> Labelled:
+        """Labels of one photo; see `Labeller`."""
+        rgb = read_rgb(path)
+        height, width = rgb.shape[:2]
+        fov_deg = photo_fov_deg(path) if self.fov_deg is None else self.fov_deg
+        if fov_deg is None:
+            raise DataError(
+                path,
+                found="no focal length in its EXIF data",
+                expected="the field of view, on which the size of things in the photo depends",
+                remedy="Give fov=, the horizontal one in degrees: 65 to 80 for most telephones.",
+            )
+        camera_matrix = camera_matrix_from_fov(fov_deg, (height, width))
+        depth = None if self.depth is None else self.depth.read(path, (height, width))
+        prediction = self.predictor.predict(
+            InputImage(rgb, depth), camera_matrix, done, averaged=averaged
+        )
+        labels = prediction.mosaic.labels() + np.uint8(1)  # 0 is the unknown class
+        figures = {
+            "level": prediction.level,
+            "views": prediction.views,
+            "fov_deg": fov_deg,
+            "classes": class_shares(labels, self.class_names, camera_matrix),
+        }
+        rows, columns = np.arange(height), np.arange(width)
+        return Labelled(rgb, labels, figures, prediction.mosaic, rows, columns)

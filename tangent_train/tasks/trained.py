@@ -1,0 +1,112 @@
+"""Trained networks from files."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from tangent_train.errors import DataError
+from tangent_train.tasks.networks import (
+    TrainedNetwork,
+    completed_settings,
+    make_stored,
+    network_from,
+    size_multiple_of,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+__all__ = ["TrainedNetwork", "load_trained", "read_checkpoint"]
+
+_PREFIX = "network."
+"""Begins the names of the network's tensors in a checkpoint."""
+
+_NEEDED = ("resolved_config", "class_names", "normalization", "state_dict")
+_SECTIONS = ("network", "representation", "level")
+_EXPECTED = "a checkpoint written by tangent-train"
+
+
+def load_trained(path: Path) -> TrainedNetwork:
+    """A trained network, on the CPU and in evaluation mode, from a file of this package.
+
+    Args:
+        path: A checkpoint; or what `tangent-export` wrote, known by its suffix ``.onnx`` or
+            ``.safetensors``, TorchScript whatever its suffix. A checkpoint and a safetensors file
+            name the class of their network, which is called: trust those as much as a program.
+
+    Raises:
+        DataError: There is no such file, it holds something else, its network cannot be made, or
+            a package to read it is missing.
+    """
+    from tangent_train.tasks import exported
+
+    suffix = path.suffix.lower()
+    if suffix == ".onnx":
+        return exported.load_onnx(path)
+    if suffix == ".safetensors":
+        return exported.load_safetensors(path)
+    if path.is_file() and exported.is_torchscript(path):
+        return exported.load_torchscript(path)
+    return _from_checkpoint(path)
+
+
+def read_checkpoint(path: Path, needed: Sequence[str] = ("config", "state_dict")) -> dict[str, Any]:
+    """The content of a checkpoint; nothing but tensors and plain values is unpickled.
+
+    Args:
+        path: The file. Tensors stay in it until they are used.
+        needed: What must be in it.
+
+    Raises:
+        DataError: The file is missing, no checkpoint, or of another program.
+    """
+    import torch
+
+    if not path.is_file():
+        raise DataError(path, found="no such file", expected=_EXPECTED)
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+    except Exception as error:
+        first_line = str(error).partition("\n")[0]
+        raise DataError(
+            path, found=f"an unreadable file ({first_line})", expected=_EXPECTED
+        ) from error
+    missing = [n for n in needed if n not in content] if isinstance(content, dict) else needed
+    if missing:
+        raise DataError(path, found=f"no {missing[0]} inside", expected=_EXPECTED)
+    return dict(content)
+
+
+def _from_checkpoint(path: Path) -> TrainedNetwork:
+    from datamodules.samples import Normalization
+
+    content = read_checkpoint(path, _NEEDED)
+    config = content["resolved_config"]
+    missing = [name for name in _SECTIONS if config.get(name) is None]
+    if missing:
+        raise DataError(path, found=f"no {missing[0]} in its config", expected=_EXPECTED)
+    class_names = tuple(content["class_names"])
+    normalization = Normalization(**content["normalization"])
+    channels = normalization.channels
+    settings = completed_settings(config["network"], channels, len(class_names), restored=True)
+    tensors = {
+        name.removeprefix(_PREFIX): tensor
+        for name, tensor in content["state_dict"].items()
+        if name.startswith(_PREFIX)
+    }
+    network = network_from(path, settings, tensors)
+    rows, columns = make_stored(path, "representation", config["representation"]).image_size
+    multiple = size_multiple_of(network, channels)
+    return TrainedNetwork(
+        network=network,
+        class_names=class_names,
+        inputs=("rgb", "depth")[: channels - 2],
+        normalization=normalization,
+        level=config["level"],
+        representation=config["representation"],
+        image_size=(rows, columns),
+        size_multiple=multiple or 1,
+        fixed_size=None if multiple else (rows, columns),
+        settings=settings,
+    )
