@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -38,8 +39,40 @@ if TYPE_CHECKING:
 
 __all__ = ["predict"]
 
-_PROJECTIONS = ("equirectangular", "perspective")
-_BLENDS = ("feather", "nearest")
+_MOST_FOV_DEG = 180
+
+
+def _whole_from_0(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
+
+
+_ALLOWED: dict[str, tuple[Callable[[Any], bool], str]] = {
+    "projection": (
+        lambda value: value in ("equirectangular", "perspective"),
+        "equirectangular or perspective",
+    ),
+    "blend": (lambda value: value in ("feather", "nearest"), "feather or nearest"),
+    "level": (
+        lambda value: value in (None, "image") or _whole_from_0(value),
+        "a whole number from 0, image, or null for the network's",
+    ),
+    "base_level": (
+        lambda value: value is None or _whole_from_0(value),
+        "a whole number from 0, or null for the network's",
+    ),
+    "fov": (
+        lambda value: (
+            value is None or (isinstance(value, int | float) and 0 < value < _MOST_FOV_DEG)
+        ),
+        "degrees between 0 and 180, or null",
+    ),
+    "report": (_whole_from_0, "a number of images, 0 for no report"),
+    "depth_scale": (
+        lambda value: isinstance(value, int | float) and value > 0,
+        "units per metre, more than 0",
+    ),
+}
+"""What settings may be, and how to say so."""
 
 
 def predict(config: DictConfig) -> None:
@@ -98,9 +131,9 @@ def _check(config: DictConfig) -> None:
                 expected="a file" if name == "checkpoint" else "a file or folder",
                 remedy=f"For example: tangent-predict {name}={example} …",
             )
-    for name, allowed in (("projection", _PROJECTIONS), ("blend", _BLENDS)):
-        if config[name] not in allowed:
-            raise SettingError(name, found=repr(config[name]), expected=" or ".join(allowed))
+    for name, (allowed, expected) in _ALLOWED.items():
+        if not allowed(config[name]):
+            raise SettingError(name, found=repr(config[name]), expected=expected)
     panoramas = config.projection == "equirectangular"
     unused = ("fov",) if panoramas else ("crop", "rotations")
     for name in unused:
@@ -150,9 +183,9 @@ def _device(name: str) -> str:
 def _what_happens(config: DictConfig, trained: TrainedNetwork, count: int) -> str:
     level = trained.level if config.level is None else config.level
     level = "of each image" if level == "image" else level
-    nouns = "panoramas" if config.projection == "equirectangular" else "photos"
+    noun = "panorama" if config.projection == "equirectangular" else "photo"
     return (
-        f"{count} {nouns}, {len(trained.class_names) - 1} classes, "
+        f"{count} {noun}{'s' if count != 1 else ''}, {len(trained.class_names) - 1} classes, "
         f"level {level} (the network's is {trained.level}), blend {config.blend}, "
         f"{'RGB and depth' if 'depth' in trained.inputs else 'RGB'}"
     )
@@ -215,7 +248,7 @@ def _mean_shares(done: Sequence[dict[str, Any]], class_names: Sequence[str]) -> 
 
 def _terminal_table(done: Sequence[dict[str, Any]], class_names: Sequence[str]) -> RichTable:
     shares = sorted(_mean_shares(done, class_names).items(), key=lambda item: -item[1])
-    table = RichTable(title=f"{len(done)} images")
+    table = RichTable(title="Mean over the images")
     table.add_column("class")
     table.add_column("solid angle %", justify="right")
     for name, share in shares:

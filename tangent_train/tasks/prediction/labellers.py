@@ -42,7 +42,7 @@ class Labelled:
         rgb: ``(h, w, 3)`` the image.
         labels: ``(h, w)`` labels, 0 unknown.
         figures: Plain values about it, for the summary.
-        mosaic: The scores.
+        mosaic: The scores, where probabilities were asked for.
         rows: ``(h,)`` rows of the mosaic that are the image's.
         columns: ``(w,)`` likewise.
         area: Where the image of a panorama lies on the sphere; None for photos.
@@ -51,7 +51,7 @@ class Labelled:
     rgb: NDArray[np.uint8]
     labels: NDArray[np.unsignedinteger]
     figures: dict[str, Any]
-    mosaic: ScoreMosaic
+    mosaic: ScoreMosaic | None
     rows: NDArray[np.intp]
     columns: NDArray[np.intp]
     area: PanoramaArea | None = None
@@ -154,7 +154,7 @@ class PanoramaLabeller:
         height, width = area.full_shape
         rows = area.cut(np.broadcast_to(np.arange(height)[:, None], (height, width)))[:, 0]
         columns = area.cut(np.broadcast_to(np.arange(width), (height, width)))[0]
-        mosaic = prediction.mosaic
+        mosaic = prediction.mosaic if averaged else None  # 4·K bytes a pixel
         return Labelled(rgb, area.cut(labels), figures, mosaic, rows, columns, area)
 
 
@@ -199,4 +199,5 @@ class PhotoLabeller:
             "classes": class_shares(labels, self.class_names, camera_matrix),
         }
         rows, columns = np.arange(height), np.arange(width)
-        return Labelled(rgb, labels, figures, prediction.mosaic, rows, columns)
+        mosaic = prediction.mosaic if averaged else None
+        return Labelled(rgb, labels, figures, mosaic, rows, columns)

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from tangent_train.rendering.mosaic import ScoreMosaic
     from tangent_train.tasks.prediction.labellers import Labelled
 
 __all__ = ["OutputFolder", "output_names"]
@@ -110,17 +111,17 @@ class OutputFolder:
         _write_png(files["labels"], found.labels)
         _write_png(files["color"], colorize(found.labels, len(self.class_names)))
         _write_png(files["overlay"], overlay_picture(found.rgb, found.labels, self.class_names))
-        if self.probabilities:
-            self._write_probabilities(files["probabilities"], found)
+        if found.mosaic is not None:
+            self._write_probabilities(files["probabilities"], found, found.mosaic)
 
-    def _write_probabilities(self, path: Path, found: Labelled) -> None:
+    def _write_probabilities(self, path: Path, found: Labelled, mosaic: ScoreMosaic) -> None:
         """Write ``(h, w, K)`` float16 probabilities, class k being label k + 1."""
         with atomic_path(path) as temporary:
             shape = (*found.labels.shape, len(self.class_names) - 1)
             array = np.lib.format.open_memmap(temporary, "w+", np.float16, shape)
             for start in range(0, len(found.rows), _ROWS_AT_ONCE):
                 part = slice(start, start + _ROWS_AT_ONCE)
-                array[part] = found.mosaic.probabilities(found.rows[part])[:, found.columns]
+                array[part] = mosaic.probabilities(found.rows[part])[:, found.columns]
             array.flush()
 
 

@@ -81,7 +81,7 @@ def photo_representation(
     else:
         seen = panorama_representation(trained, level, base_level)
         if not isinstance(seen, PinholeRepresentation):
-            seen = panorama_representation(trained, level, _BASE_LEVEL_FOR_PHOTOS)
+            return photo_representation(trained, level, _BASE_LEVEL_FOR_PHOTOS)
         size = seen.image_size
         fov_deg = 2 * math.degrees(math.atan(seen.grid.dim / 2 * seen.grid.pitch))
     _check_size(trained, size)
@@ -90,12 +90,12 @@ def photo_representation(
 
 def _check_size(trained: TrainedNetwork, size: tuple[int, int]) -> None:
     rows, columns = size
-    if trained.fixed_size not in (None, size):
+    fixed = trained.fixed_size
+    if fixed is not None and fixed != size:
         raise SettingError(
             "level and base_level",
             found=f"images of {rows}×{columns}",
-            expected=f"those of {'×'.join(map(str, trained.fixed_size or ()))} that the file of "
-            "the network takes",
+            expected=f"those of {fixed[0]}×{fixed[1]} that the file of the network takes",
             remedy="Leave level and base_level as trained, or use the network's checkpoint.",
         )
     multiple = trained.size_multiple

@@ -1,0 +1,124 @@
+"""Opening image files of any origin through Pillow, with errors that say what is wrong."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from PIL import ExifTags, Image
+
+from tangent_train.errors import DataError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+    from typing import Any
+
+    from numpy.typing import NDArray
+
+__all__ = ["open_image", "oriented_array", "oriented_size"]
+
+_FORMATS = ("JPEG", "PNG", "TIFF", "WEBP")
+_MOST_PIXELS = 32768 * 16384
+_MOST = "at most 32768×16384 pixels"
+
+# EXIF orientation: are rows and columns exchanged, and which of them run backwards afterwards?
+_ORIENTATIONS = {
+    2: (False, 1, -1),
+    3: (False, -1, -1),
+    4: (False, -1, 1),
+    5: (True, 1, 1),
+    6: (True, 1, -1),
+    7: (True, -1, -1),
+    8: (True, -1, 1),
+}
+
+
+@contextmanager
+def open_image(path: Path) -> Iterator[Image.Image]:
+    """Open a JPEG, PNG, TIFF or WebP file, whatever its name ends in; nothing is decoded yet.
+
+    Args:
+        path: The file.
+
+    Yields:
+        The image; of several in one file, the first.
+
+    Raises:
+        DataError: It cannot be read, is none of these, is too large, or turns out to be broken
+            while the block reads it.
+    """
+    _allow_panoramas()
+    try:
+        with Image.open(path, formats=_FORMATS) as image:
+            _check_size(path, image)
+            yield image
+    except (DataError, MemoryError):
+        raise
+    except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
+        raise _too_large(path, error) from error
+    # Decoders that meet a broken file raise anything from OSError to SyntaxError and IndexError.
+    except Exception as error:
+        raise DataError(
+            path,
+            found=_reason(error),
+            expected="a whole JPEG, PNG, TIFF or WebP image",
+            remedy="Copy or export the file again.",
+        ) from error
+
+
+def oriented_size(image: Image.Image) -> tuple[int, int]:
+    """Rows and columns of an image as it is to be looked at, from its header."""
+    exchanged, _, _ = _orientation(image)
+    return (image.width, image.height) if exchanged else (image.height, image.width)
+
+
+def oriented_array(array: NDArray[Any], image: Image.Image) -> NDArray[Any]:
+    """Turn the pixels of `image` as its EXIF orientation says.
+
+    Args:
+        array: ``(H, W[, C])`` as stored.
+        image: Where they are from.
+
+    Returns:
+        A view of them.
+    """
+    exchanged, rows, columns = _orientation(image)
+    return (array.swapaxes(0, 1) if exchanged else array)[::rows, ::columns]
+
+
+def _orientation(image: Image.Image) -> tuple[bool, int, int]:
+    upright = (False, 1, 1)
+    # Pillow turns TIFF itself. Of PNG, only what is said before the pixels is heeded: to know the
+    # rest, all of the file would have to be decoded, for a size as well.
+    if image.format == "TIFF" or (image.format == "PNG" and "exif" not in image.info):
+        return upright
+    try:
+        orientation = image.getexif().get(ExifTags.Base.Orientation)
+    except Exception:  # as above: broken EXIF data do not make the pixels unreadable
+        return upright
+    return _ORIENTATIONS.get(orientation, upright) if isinstance(orientation, int) else upright
+
+
+def _allow_panoramas() -> None:
+    """Raise Pillow's limit, which 16384×8192 exceeds; each file is compared with ours."""
+    limit = Image.MAX_IMAGE_PIXELS
+    if limit is not None and limit < _MOST_PIXELS:
+        Image.MAX_IMAGE_PIXELS = _MOST_PIXELS
+
+
+def _check_size(path: Path, image: Image.Image) -> None:
+    if image.width * image.height > _MOST_PIXELS:
+        raise _too_large(path, f"{image.height}×{image.width} pixels")
+
+
+def _too_large(path: Path, found: object) -> DataError:
+    return DataError(path, found=found, expected=_MOST, remedy="Shrink the image.")
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, OSError) and error.errno is not None:
+        return str(error)
+    # Of a file that no decoder knows Pillow says only its name, which the message has already.
+    detail = "" if type(error).__name__ == "UnidentifiedImageError" else f" ({error})"
+    return f"no image that can be decoded{detail}"

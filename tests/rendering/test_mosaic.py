@@ -1,0 +1,194 @@
+"""Scores put together image by image, against those rendered all at once."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+import torch
+
+from tangent_train.errors import SettingError
+from tangent_train.geometry import (
+    CubeGrid,
+    TangentGrid,
+    camera_matrix_from_fov,
+    equirect_directions,
+    random_rotation,
+    rotation_about,
+)
+from tangent_train.rendering import (
+    PerspectiveRepresentation,
+    mosaic,
+    tangent_to_equirect,
+    tangent_to_labels,
+)
+from tangent_train.rendering.mosaic import ScoreMosaic
+from tangent_train.rendering.perspective import PhotoCrops
+
+if TYPE_CHECKING:
+    from tangent_train.geometry import PinholeGrid
+    from tangent_train.rendering import Blend
+
+GRIDS = [
+    (TangentGrid(0, 5), (64, 128)),
+    (TangentGrid(1, 6, rotation=random_rotation(np.random.default_rng(1))), (101, 203)),
+    (TangentGrid(2, 6, dim=TangentGrid.least_dim(2, 6)), (48, 96)),
+    (TangentGrid(1, 5, dim=40), (30, 61)),
+    (TangentGrid(0, 4, rotation=rotation_about((1, 0, 0), math.pi / 2)), (32, 64)),
+]
+
+
+def _scores(grid: PinholeGrid, classes: int = 7) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(grid.num_images)
+    return 3 * torch.randn(grid.num_images, classes, grid.dim, grid.dim, generator=generator)
+
+
+def _added(result: ScoreMosaic, scores: torch.Tensor, grid: PinholeGrid) -> ScoreMosaic:
+    for faces in np.array_split(np.random.default_rng(0).permutation(grid.num_images), 6):
+        result.add(scores[faces], grid, faces)
+    return result
+
+
+@pytest.mark.parametrize("averaged", [False, True])
+@pytest.mark.parametrize(("grid", "shape"), GRIDS)
+def test_owners_labels_are_those_of_all_images_at_once(
+    grid: TangentGrid, shape: tuple[int, int], averaged: bool
+) -> None:
+    scores = _scores(grid)
+    result = _added(ScoreMosaic(shape, 7, "nearest", averaged=averaged), scores, grid)
+    expected = tangent_to_labels(scores.double(), grid, shape).numpy()
+    # Where two images are equally near, as on the meridians of their edges, both may be right.
+    nearest, second = -np.sort(-equirect_directions(shape) @ grid.centers_xyz.T)[..., :2].T
+    decided = (nearest - second > 1e-9).T
+    assert decided.mean() > 0.99
+    # Another order of the same sums: only ties of rounding may differ.
+    assert (result.labels() == expected)[decided].mean() > 0.9995
+
+
+@pytest.mark.parametrize(("grid", "shape"), GRIDS)
+def test_feathered_probabilities_are_those_of_all_images_at_once(
+    grid: TangentGrid, shape: tuple[int, int]
+) -> None:
+    scores = _scores(grid)
+    result = _added(ScoreMosaic(shape, 7, "feather"), scores, grid)
+    softmax = scores.double().softmax(dim=1)
+    expected = tangent_to_equirect(softmax, grid, shape, "feather").movedim(0, -1).numpy()
+    np.testing.assert_allclose(result.probabilities(slice(None)), expected, atol=2e-6)
+    labels = tangent_to_labels(softmax, grid, shape, "feather").numpy()
+    assert (result.labels() == labels).mean() > 0.9995
+
+
+def test_probabilities_of_owners_are_the_softmax_of_the_interpolated_scores() -> None:
+    grid, shape = GRIDS[1]
+    scores = _scores(grid)
+    result = _added(ScoreMosaic(shape, 7, "nearest", averaged=True), scores, grid)
+    expected = tangent_to_equirect(scores.double(), grid, shape).softmax(dim=0).movedim(0, -1)
+    np.testing.assert_allclose(result.probabilities(slice(None)), expected.numpy(), atol=1e-5)
+
+
+def test_several_grids_are_averaged() -> None:
+    shape = (32, 64)
+    grids = [TangentGrid(0, 4), TangentGrid(0, 4, rotation=rotation_about((0, 0, 1), 0.4))]
+    result = ScoreMosaic(shape, 7, "nearest", averaged=True)
+    singles = []
+    for grid in grids:
+        _added(result, _scores(grid), grid)
+        single = ScoreMosaic(shape, 7, "nearest", averaged=True)
+        singles.append(_added(single, _scores(grid), grid).probabilities(slice(None)))
+    np.testing.assert_allclose(
+        result.probabilities(slice(None)), np.mean(singles, axis=0), atol=1e-6
+    )
+
+
+def test_every_pixel_has_one_owner_even_where_images_are_equally_near() -> None:
+    # Pixel centres on the cube's edges and corners: width 8 puts columns on its 45° meridians.
+    grid, shape = CubeGrid(8), (6, 12)
+    ones = torch.ones(6, 3, 8, 8)
+    result = ScoreMosaic(shape, 3, "nearest", averaged=True)
+    for face in range(6):
+        result.add(ones[[face]], grid, np.array([face]))
+    total = result._total.sum(axis=-1)
+    np.testing.assert_allclose(total, 1.0, atol=1e-6)
+
+
+def test_images_that_do_not_overlap_are_not_feathered() -> None:
+    grid = CubeGrid(8)
+    with pytest.raises(SettingError, match="blend"):
+        ScoreMosaic((16, 32), 3, "feather").add(torch.ones(6, 3, 8, 8), grid, np.arange(6))
+
+
+def test_large_sums_live_in_a_file_and_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    grid, shape = GRIDS[0]
+    scores = _scores(grid)
+    expected = _added(ScoreMosaic(shape, 7, "feather"), scores, grid).probabilities(slice(None))
+    monkeypatch.setattr(mosaic, "_IN_MEMORY_BYTES", 0)
+    result = _added(ScoreMosaic(shape, 7, "feather"), scores, grid)
+    assert isinstance(result._total, np.memmap)
+    np.testing.assert_array_equal(result.probabilities(slice(None)), expected)
+
+
+def test_nan_never_wins_and_the_first_of_equals_does() -> None:
+    grid = TangentGrid(0, 4)
+    scores = torch.zeros(20, 3, 16, 16)
+    scores[:, 0] = torch.nan
+    result = ScoreMosaic((16, 32), 3, "nearest")
+    result.add(scores, grid, np.arange(20))
+    assert (result.labels() == 1).all()
+
+
+def _photo_crops(blend: Blend) -> tuple[PhotoCrops, tuple[int, int]]:
+    size = (45, 70)
+    camera = PerspectiveRepresentation(level=5, fov_deg=30.0, dim=(20, 24))
+    sampler = camera.of_camera(camera_matrix_from_fov(70.0, size), size)
+    return sampler.cover(0.3 if blend == "feather" else 0.0), size
+
+
+@pytest.mark.parametrize("blend", ["nearest", "feather"])
+def test_crops_of_a_smooth_field_give_the_field(blend: Blend) -> None:
+    """Two classes whose log-odds are linear over the photo: interpolation is exact inside."""
+    crops, (height, width) = _photo_crops(blend)
+    rows, columns = crops.size
+    x = np.linspace(crops.boxes[:, 0], crops.boxes[:, 2], 2 * columns + 1, axis=1)[:, 1::2]
+    y = np.linspace(crops.boxes[:, 1], crops.boxes[:, 3], 2 * rows + 1, axis=1)[:, 1::2]
+    field = 0.05 * (x[:, None, :] - 30) + 0.08 * (y[:, :, None] - 20)
+    scores = torch.from_numpy(np.stack([np.zeros_like(field), field], axis=1)).float()
+    result = ScoreMosaic((height, width), 2, blend, averaged=True)
+    for part in np.array_split(np.arange(len(field)), 3):
+        result.add_crops(scores[part], crops, part)
+    tolerance = 1e-5 if blend == "nearest" else 2e-3  # probabilities, not scores, are feathered
+    truth = 0.05 * (np.arange(width) + 0.5 - 30) + 0.08 * (np.arange(height)[:, None] + 0.5 - 20)
+    inside = slice(4, -4)
+    probability = result.probabilities(slice(None))[..., 1]
+    expected = 1 / (1 + np.exp(-truth))
+    np.testing.assert_allclose(
+        probability[inside, inside], expected[inside, inside], atol=tolerance
+    )
+    decided = np.abs(truth) > 0.05
+    assert ((result.labels() == 1) == (truth > 0))[inside, inside][decided[inside, inside]].all()
+
+
+def test_cells_of_crops_tile_the_photo() -> None:
+    crops, (height, width) = _photo_crops("feather")
+    counts = np.zeros((height, width), int)
+    for left, top, right, bottom in crops.cells():
+        y, x = np.mgrid[:height, :width] + 0.5
+        counts += (left <= x) & (x < right) & (top <= y) & (y < bottom)
+    assert (counts == 1).all()
+    inner = crops.cells()[np.isfinite(crops.cells()).all(axis=1)]
+    assert len(inner) > 0
+
+
+def test_covering_crops_overlap_as_asked() -> None:
+    size = (60, 90)
+    camera = PerspectiveRepresentation(level=5, fov_deg=20.0, dim=16)
+    sampler = camera.of_camera(camera_matrix_from_fov(60.0, size), size)
+    for overlap in (0.0, 0.25, 0.5):
+        boxes = sampler.cover(overlap).boxes
+        for axis in (0, 1):
+            starts = np.unique(boxes[:, axis].round(6))
+            side = boxes[0, axis + 2] - boxes[0, axis]
+            assert np.diff(starts).max() <= side * (1 - overlap) + 1e-6
+            assert starts[0] == pytest.approx(0, abs=1e-6)
+            assert starts[-1] + side == pytest.approx(size[1 - axis], abs=1e-6)
