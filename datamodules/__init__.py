@@ -11,6 +11,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from datamodules.folder_panoramas import FolderPanoramas
     from datamodules.omnisynthia import OmniSynthia
     from datamodules.panoramas import Panorama
     from datamodules.photos import Photo
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 __all__ = [
     "EpochSampler",
     "EvaluationSample",
+    "FolderPanoramas",
     "Normalization",
     "OmniSynthia",
     "Panorama",
@@ -39,6 +41,7 @@ __all__ = [
 ]
 
 _MODULES = (
+    "folder_panoramas",
     "omnisynthia",
     "panoramas",
     "photos",

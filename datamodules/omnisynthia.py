@@ -9,7 +9,7 @@ http://synthia-dataset.net.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from datamodules.panorama_module import PanoramaDataModule, Split
 from datamodules.panoramas import Panorama, resize_area, resize_depth, resize_nearest
@@ -141,7 +141,7 @@ class OmniSynthia(PanoramaDataModule):
         SettingError: A setting that cannot work.
     """
 
-    class_names: ClassVar[tuple[str, ...]] = ("unknown", *CLASSES)
+    class_names = ("unknown", *CLASSES)
 
     def __init__(
         self,
@@ -166,7 +166,6 @@ class OmniSynthia(PanoramaDataModule):
         self.validation_fraction = validation_fraction
         self.frames = frames
         self.panorama_height = panorama_height
-        self._splits: dict[Split, SynthiaPanoramas] = {}
 
     def make_files(self) -> None:
         """Make the panoramas of sequences that have none yet, or are not finished.
@@ -179,28 +178,18 @@ class OmniSynthia(PanoramaDataModule):
             self.root, self._division.sequences, frames=self.frames, height=self.panorama_height
         )
 
-    def setup(self, stage: str | None = None) -> None:
-        """Find the files and check all that can be checked without decoding them.
-
-        Args:
-            stage: Ignored: what a test will need is checked before training already.
+    def find_splits(self) -> dict[Split, SynthiaPanoramas]:
+        """The panoramas of all splits, checked.
 
         Raises:
             DataError: Something is missing or cannot be used.
             SettingError: The panoramas are too small for the representation.
         """
-        if self._splits:
-            return
         check_root(self.root)
-        self._splits = {
+        return {
             split: SynthiaPanoramas(panoramas, self.erp_height)
             for split, panoramas in self._division.divide(self._panoramas).items()
         }
-
-    def open_split(self, split: Split) -> SynthiaPanoramas:
-        """The panoramas of one split."""
-        self.setup()
-        return self._splits[split]
 
     def _panoramas(self, sequence: str) -> list[_PanoramaName]:
         """The panoramas of a sequence, all of them checked."""

@@ -14,7 +14,7 @@ from datamodules.store import PreparedPanoramas, prepare_store
 from tangent_train.errors import SettingError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from datamodules.sources import ImageSource
     from tangent_train.rendering.representation import Representation
@@ -27,8 +27,7 @@ _HALF_TURN_DEG = 180
 class PanoramaDataModule(SegmentationDataModule[Panorama]):
     """Panoramas of one data set.
 
-    A data set says which panoramas it has (`open_split`), its `class_names`, and checks its files
-    in `setup`.
+    A data set says which panoramas it has (`find_splits`) and its `class_names`.
 
     Args:
         representation: What the network sees of a panorama.
@@ -69,8 +68,13 @@ class PanoramaDataModule(SegmentationDataModule[Panorama]):
         self.test_rotation = _checked_rotation(test_rotation)
 
     @abstractmethod
+    def find_splits(self) -> Mapping[Split, FileSource]:
+        """The panoramas of all splits as they are on disk, see `SegmentationDataModule`."""
+
     def open_split(self, split: Split) -> FileSource:
         """The panoramas of one split as they are on disk."""
+        source: Any = super().open_split(split)  # one that `find_splits` gave
+        return source
 
     def prepare_data(self) -> None:
         """Make the files, and what the store lacks if there is to be one.

@@ -24,8 +24,7 @@ __all__ = ["PhotoDataModule", "Split"]
 class PhotoDataModule(SegmentationDataModule[Photo]):
     """Photos of one data set.
 
-    A data set says which photos it has (`open_split`), its `class_names`, and checks its files in
-    `setup`.
+    A data set says which photos it has (`find_splits`) and its `class_names`.
 
     Args:
         representation: The camera that all photos are brought to.

@@ -29,7 +29,7 @@ from datamodules.sources import ImageSource, LabelledImage, RememberedImages, in
 from tangent_train.errors import SettingError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from torch import Tensor
@@ -49,6 +49,8 @@ _Sample = TypeVar("_Sample")
 
 class SegmentationDataModule(LightningDataModule, ABC, Generic[_Image]):
     """Labelled images of one data set, split for training, validation and test.
+
+    A data set says which images it has (`find_splits`) and its `class_names`.
 
     The trainer must be made with ``use_distributed_sampler=False``, see `EpochSampler`.
 
@@ -77,7 +79,7 @@ class SegmentationDataModule(LightningDataModule, ABC, Generic[_Image]):
         SettingError: A setting that cannot work.
     """
 
-    class_names: ClassVar[tuple[str, ...]]
+    class_names: tuple[str, ...]
     noun: ClassVar[str]
     root: Path
     validation_fraction: float
@@ -120,6 +122,7 @@ class SegmentationDataModule(LightningDataModule, ABC, Generic[_Image]):
         if not isinstance(color_jitter, int | float) or not 0 <= color_jitter <= 1:
             raise SettingError("data.color_jitter", found=color_jitter, expected="0 to 1")
         self.color_jitter = color_jitter
+        self._splits: Mapping[Split, ImageSource[_Image]] = {}
         self._sources: dict[Split, ImageSource[_Image]] = {}
         self._start = (0, 0)
 
@@ -129,8 +132,27 @@ class SegmentationDataModule(LightningDataModule, ABC, Generic[_Image]):
         return "depth" in self.inputs
 
     @abstractmethod
+    def find_splits(self) -> Mapping[Split, ImageSource[_Image]]:
+        """The images of all splits as they are on disk, checked without decoding them.
+
+        Raises:
+            DataError: Something is missing or cannot be used.
+            SettingError: The images are too small for the representation.
+        """
+
+    def setup(self, stage: str | None = None) -> None:
+        """Find the images, once, see `find_splits`.
+
+        Args:
+            stage: Ignored: what a test will need is checked before training already.
+        """
+        if not self._splits:
+            self._splits = self.find_splits()
+
     def open_split(self, split: Split) -> ImageSource[_Image]:
         """The images of one split as they are on disk."""
+        self.setup()
+        return self._splits[split]
 
     def make_files(self) -> None:
         """Make the files of the data set, where it is one that is made."""

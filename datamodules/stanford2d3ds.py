@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -162,7 +162,7 @@ class Stanford2D3DS(PanoramaDataModule):
         SettingError: A setting that cannot work.
     """
 
-    class_names: ClassVar[tuple[str, ...]] = ("unknown", *CLASSES)
+    class_names = ("unknown", *CLASSES)
 
     def __init__(
         self,
@@ -192,32 +192,21 @@ class Stanford2D3DS(PanoramaDataModule):
             seed=self.seed,
             label_table=label_table,
         )
-        self._splits: dict[Split, StanfordPanoramas] = {}
 
-    def setup(self, stage: str | None = None) -> None:
-        """Find the files and check all that can be checked without decoding them.
-
-        Args:
-            stage: Ignored: what a test will need is checked before training already.
+    def find_splits(self) -> dict[Split, StanfordPanoramas]:
+        """The panoramas of all splits, checked.
 
         Raises:
             DataError: Something is missing or cannot be used.
             SettingError: The panoramas are too small for the representation.
         """
-        if self._splits:
-            return
         table = self._division.read_label_table()
         files = self._division.divide(
             lambda area: list_pictures(self.root, area, "pano", self.with_depth)
         )
         for panorama in (picture for pictures in files.values() for picture in pictures):
             check_panorama(panorama, self.erp_height)
-        self._splits = {
+        return {
             split: StanfordPanoramas(chosen, table, self.erp_height, self.mask)
             for split, chosen in files.items()
         }
-
-    def open_split(self, split: Split) -> StanfordPanoramas:
-        """The panoramas of one split."""
-        self.setup()
-        return self._splits[split]

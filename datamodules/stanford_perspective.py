@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -131,7 +131,7 @@ class Stanford2D3DSPerspective(PhotoDataModule):
         SettingError: A setting that cannot work.
     """
 
-    class_names: ClassVar[tuple[str, ...]] = ("unknown", *CLASSES)
+    class_names = ("unknown", *CLASSES)
 
     def __init__(
         self,
@@ -155,19 +155,13 @@ class Stanford2D3DSPerspective(PhotoDataModule):
             seed=self.seed,
             label_table=label_table,
         )
-        self._splits: dict[Split, StanfordPhotos] = {}
 
-    def setup(self, stage: str | None = None) -> None:
-        """Find the files and check all that can be checked without decoding the images.
-
-        Args:
-            stage: Ignored: what a test will need is checked before training already.
+    def find_splits(self) -> dict[Split, StanfordPhotos]:
+        """The photos of all splits, checked.
 
         Raises:
             DataError: Something is missing or cannot be used; a photo sees less than a crop.
         """
-        if self._splits:
-            return
         table = self._division.read_label_table()
         files = self._division.divide(
             lambda area: list_pictures(self.root, area, "data", self.with_depth)
@@ -175,12 +169,7 @@ class Stanford2D3DSPerspective(PhotoDataModule):
         photos = [photo for chosen in files.values() for photo in chosen]
         for _ in in_threads(lambda index: self._check(photos[index]), len(photos)):
             pass
-        self._splits = {split: StanfordPhotos(chosen, table) for split, chosen in files.items()}
-
-    def open_split(self, split: Split) -> StanfordPhotos:
-        """The photos of one split."""
-        self.setup()
-        return self._splits[split]
+        return {split: StanfordPhotos(chosen, table) for split, chosen in files.items()}
 
     def _check(self, files: PictureFiles) -> None:
         self.check_camera(files.rgb, read_camera_matrix(files.pose), check_picture(files))

@@ -6,7 +6,7 @@ On disk as released, see `synthia_files`; free for research: http://synthia-data
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from datamodules.photo_module import PhotoDataModule, Split
 from datamodules.photos import Photo, distance_from_z_depth
@@ -119,7 +119,7 @@ class SynthiaPerspective(PhotoDataModule):
         SettingError: A setting that cannot work.
     """
 
-    class_names: ClassVar[tuple[str, ...]] = ("unknown", *CLASSES)
+    class_names = ("unknown", *CLASSES)
 
     def __init__(
         self,
@@ -142,29 +142,18 @@ class SynthiaPerspective(PhotoDataModule):
         self.root = Path(root)
         self.validation_fraction = validation_fraction
         self.frames = frames
-        self._splits: dict[Split, SynthiaPhotos] = {}
 
-    def setup(self, stage: str | None = None) -> None:
-        """Find the files and check all that can be checked without decoding the images.
-
-        Args:
-            stage: Ignored: what a test will need is checked before training already.
+    def find_splits(self) -> dict[Split, SynthiaPhotos]:
+        """The photos of all splits, checked.
 
         Raises:
             DataError: Something is missing or cannot be used; a photo sees less than a crop.
         """
-        if self._splits:
-            return
         check_root(self.root)
-        self._splits = {
+        return {
             split: SynthiaPhotos([view for frame in frames for view in frame])
             for split, frames in self._division.divide(self._frames).items()
         }
-
-    def open_split(self, split: Split) -> SynthiaPhotos:
-        """The photos of one split."""
-        self.setup()
-        return self._splits[split]
 
     def _frames(self, sequence: str) -> list[list[_View]]:
         """The views of the chosen frames of a sequence, all of them checked."""

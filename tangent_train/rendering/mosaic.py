@@ -129,10 +129,10 @@ class ScoreMosaic:
 
     def _prepared(self, scores: Tensor) -> NDArray[np.float32]:
         """``(n, h, w, K)`` on the CPU; feathered are probabilities, as in evaluation."""
-        values = scores.detach().movedim(1, -1).float().contiguous()
+        scores = scores.detach().float()
         if self._power:
-            values = values.softmax(dim=-1)
-        return values.cpu().numpy()
+            scores = scores.softmax(dim=1)
+        return scores.movedim(1, -1).contiguous().cpu().numpy()
 
     def _over(self, rows: tuple[int, int], kernel: Any, *arguments: Any) -> None:
         first, last = rows

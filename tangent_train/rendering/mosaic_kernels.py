@@ -26,11 +26,10 @@ def _interpolate(
     left, top = int(x), int(y)
     right, bottom = min(left + 1, width - 1), min(top + 1, height - 1)
     across, down = np.float32(x - left), np.float32(y - top)
-    a, b = scores[top, left], scores[top, right]
-    c, d = scores[bottom, left], scores[bottom, right]
     for k in range(values.shape[0]):
-        upper = a[k] + across * (b[k] - a[k])
-        lower = c[k] + across * (d[k] - c[k])
+        a, b = scores[top, left, k], scores[top, right, k]
+        c, d = scores[bottom, left, k], scores[bottom, right, k]
+        upper, lower = a + across * (b - a), c + across * (d - c)
         values[k] = upper + down * (lower - upper)
 
 

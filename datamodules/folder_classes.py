@@ -1,0 +1,194 @@
+"""The classes of one's own data set, `classes.json`: what the pixels of its label images mean."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tangent_train.errors import DataError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+__all__ = ["UNKNOWN_NAME", "FolderClasses", "read_classes"]
+
+UNKNOWN_NAME = "unknown"
+"""Name of label 0, pixels without a class."""
+
+_MOST_CLASSES = 255  # labels are uint8, and 0 is taken
+_MOST_VALUE = 65535
+_MOST_SHOWN = 8
+_COLOR = re.compile(r"#[0-9a-fA-F]{6}")
+_EXPECTED = (
+    'a list of class names, ["wall", "floor"], or an object with the values or colours of each '
+    'class, {"wall": 1, "floor": [2, 3]} or {"wall": "#ff0000"}'
+)
+
+
+@dataclass(frozen=True, eq=False)
+class FolderClasses:
+    """Which values or colours of label images are which class.
+
+    Attributes:
+        names: K names; the label of a class is its place here plus one.
+        codes: ``(n,)`` int32, in rising order: values, or colours as R · 65536 + G · 256 + B.
+        labels: ``(n,)`` uint8, the class of each.
+        in_colors: Whether the codes are colours.
+    """
+
+    names: tuple[str, ...]
+    codes: NDArray[np.int32]
+    labels: NDArray[np.uint8]
+    in_colors: bool
+
+    @property
+    def fingerprint(self) -> str:
+        """Changes when pixels would get other labels."""
+        parts = [self.codes.tobytes(), self.labels.tobytes(), bytes([self.in_colors])]
+        return hashlib.sha256(b"".join(parts)).hexdigest()[:16]
+
+    def decode(self, stored: NDArray[np.integer]) -> NDArray[np.uint8]:
+        """Labels of the pixels of a label image; 0 where they have no class.
+
+        Args:
+            stored: ``(H, W)`` values, or ``(H, W, 3)`` uint8 colours.
+
+        Returns:
+            ``(H, W)``.
+
+        >>> codes, labels = np.array([7], np.int32), np.array([1], np.uint8)
+        >>> classes = FolderClasses(("wall",), codes, labels, in_colors=False)
+        >>> classes.decode(np.array([[6, 7, 8]])).tolist()
+        [[0, 1, 0]]
+        """
+        codes = self.pack(stored)
+        place = np.minimum(np.searchsorted(self.codes, codes), len(self.codes) - 1)
+        return np.where(self.codes[place] == codes, self.labels[place], np.uint8(0))
+
+    def pack(self, stored: NDArray[np.integer]) -> NDArray[np.int32]:
+        """One number for each pixel of a label image, as in `codes`."""
+        numbers = stored.astype(np.int32)
+        if not self.in_colors:
+            return numbers
+        return numbers[..., 0] << 16 | numbers[..., 1] << 8 | numbers[..., 2]
+
+    def describe(self, codes: NDArray[np.int32]) -> str:
+        """Some codes as they are written in `classes.json`."""
+        written = "#{:06x}" if self.in_colors else "{}"
+        shown = [written.format(code) for code in codes[:_MOST_SHOWN].tolist()]
+        shown += ["…"] if len(codes) > _MOST_SHOWN else []
+        return ("colours " if self.in_colors else "values ") + ", ".join(shown)
+
+
+def read_classes(path: Path) -> FolderClasses:
+    """Read `classes.json`, in one of these forms.
+
+    * A list of names: the value of a class is its place in the list, from 0. ``null`` in the place
+      of a name leaves a value without a class::
+
+          [null, "wall", "floor"]
+
+    * An object of names and values, 0 to 65535, or several values for one class::
+
+          {"wall": 1, "floor": [2, 3], "window": 255}
+
+    * An object of names and colours, one or several::
+
+          {"wall": "#ff0000", "floor": ["#00ff00", "#00ee00"]}
+
+    Values and colours that are not named, 255 among them, are unknown: such pixels count neither
+    in training nor in evaluation. "unknown" is therefore no class.
+
+    Args:
+        path: The file.
+
+    Raises:
+        DataError: It cannot be read, is in another form, names something twice or nothing.
+    """
+    try:
+        content = json.loads(path.read_bytes(), object_pairs_hook=_Pairs)
+    except (OSError, ValueError, RecursionError) as error:
+        remedy = "docs/own_data.md shows how to bring your own data."
+        raise DataError(path, found=error, expected=_EXPECTED, remedy=remedy) from error
+    if isinstance(content, _Pairs):
+        codes = content
+    elif isinstance(content, list):
+        codes = _Pairs((name, place) for place, name in enumerate(content) if name is not None)
+    else:
+        raise DataError(path, found=json.dumps(content), expected=_EXPECTED)
+    _check_names(path, [name for name, _ in codes])
+    return _classes(path, codes)
+
+
+class _Pairs(list[tuple[Any, Any]]):
+    """An object in JSON: names and what belongs to them; names may come twice, as in no dict."""
+
+
+def _check_names(path: Path, names: list[Any]) -> None:
+    strange = [name for name in names if not isinstance(name, str) or not name.strip()]
+    if strange:
+        raise DataError(path, found=f"class name {strange[0]!r}", expected=_EXPECTED)
+    if UNKNOWN_NAME in names:
+        raise DataError(
+            path,
+            found=f"a class {UNKNOWN_NAME!r}",
+            expected="none: all that is not named is unknown",
+            remedy="Leave it out; in a list, write null in its place.",
+        )
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise DataError(path, found=f"class {twice[0]!r} twice", expected="every name once")
+    if not 1 <= len(names) <= _MOST_CLASSES:
+        raise DataError(
+            path, found=f"{len(names)} classes", expected=f"1 to {_MOST_CLASSES} classes"
+        )
+
+
+def _classes(path: Path, codes: _Pairs) -> FolderClasses:
+    owners: dict[int, int] = {}
+    kinds = set()
+    for place, (name, listed) in enumerate(codes):
+        for value in _listed(path, name, listed):
+            code, kind = _code(path, name, value)
+            kinds.add(kind)
+            if code in owners and len(kinds) == 1:
+                both = " and ".join(repr(codes[owner][0]) for owner in (owners[code], place))
+                raise DataError(
+                    path, found=f"{value} for {both}", expected="every value or colour once"
+                )
+            owners[code] = place
+    if len(kinds) > 1:
+        raise DataError(path, found="values and colours", expected="either values or colours")
+    ordered = sorted(owners)
+    return FolderClasses(
+        names=tuple(name for name, _ in codes),
+        codes=np.array(ordered, np.int32),
+        labels=np.array([owners[code] + 1 for code in ordered], np.uint8),
+        in_colors=kinds == {"color"},
+    )
+
+
+def _listed(path: Path, name: str, listed: Any) -> list[Any]:
+    """One or several values or colours."""
+    if listed == []:
+        raise DataError(path, found=f"nothing for {name!r}", expected="a value or a colour")
+    return listed if isinstance(listed, list) else [listed]
+
+
+def _code(path: Path, name: str, value: Any) -> tuple[int, str]:
+    if isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= _MOST_VALUE:
+        return value, "value"
+    if isinstance(value, str) and _COLOR.fullmatch(value):
+        return int(value[1:], 16), "color"
+    raise DataError(
+        path,
+        found=f"{json.dumps(value)} for {name!r}",
+        expected=f'a value of 0 to {_MOST_VALUE}, a colour such as "#ff8000", or a list of either',
+    )

@@ -1,0 +1,225 @@
+"""One's own panoramas: a folder of images, one of label images, and a list of classes.
+
+On disk::
+
+    root/
+      classes.json                  see `read_classes`
+      images/[scene/]…/name.jpg     or .png, .tif, .webp: 360°×180°, twice as wide as high
+      labels/[scene/]…/name.png     values or colours of the classes, at the size of the image
+      depth/[scene/]…/name.png      or .tif, .npy, .exr, if depth is an input, see `read_depth_m`
+      train.txt val.txt test.txt    if wanted, names one per line, see `FolderSplits`
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from datamodules.folder_classes import UNKNOWN_NAME, read_classes
+from datamodules.folder_files import (
+    check_class_codes,
+    check_panorama,
+    list_panoramas,
+    read_codes,
+)
+from datamodules.folder_splits import FolderSplits
+from datamodules.image_files import read_depth_m, read_rgb
+from datamodules.panorama_module import PanoramaDataModule, Split
+from datamodules.panoramas import (
+    STEPS_PER_M,
+    Panorama,
+    resize_area,
+    resize_depth,
+    resize_nearest,
+)
+from datamodules.samples import Normalization
+from datamodules.sources import count_labels, in_threads
+from tangent_train.errors import SettingError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from datamodules.folder_classes import FolderClasses
+    from datamodules.folder_files import PanoramaFiles
+    from tangent_train.rendering.representation import Representation
+
+__all__ = ["FolderPanoramas", "FolderSource"]
+
+_MOST_STEPS = np.iinfo(np.uint16).max
+
+
+class FolderSource:
+    """Reads panoramas at one size.
+
+    Args:
+        panoramas: Which.
+        classes: What their labels mean.
+        erp_height: Rows to read.
+        depth_units_per_m: Units in a metre of depth files of whole numbers.
+    """
+
+    def __init__(
+        self,
+        panoramas: Sequence[PanoramaFiles],
+        classes: FolderClasses,
+        erp_height: int,
+        depth_units_per_m: float,
+    ) -> None:
+        self._panoramas = tuple(panoramas)
+        self._classes = classes
+        self._shape = (erp_height, 2 * erp_height)
+        self._depth_units_per_m = depth_units_per_m
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the panoramas."""
+        return self._shape
+
+    @property
+    def variant(self) -> str:
+        """The size."""
+        return f"{self._shape[0]}x{self._shape[1]}"
+
+    @property
+    def settings(self) -> dict[str, str]:
+        """The size, the classes in short and, where depth is read, its units."""
+        settings = {"size": self.variant, "classes": self._classes.fingerprint}
+        if any(files.depth is not None for files in self._panoramas):
+            settings["depth units per metre"] = f"{self._depth_units_per_m:g}"
+        return settings
+
+    def files(self, index: int) -> dict[str, Path]:
+        """The file of every part of one panorama."""
+        return self._panoramas[index].parts
+
+    def __len__(self) -> int:
+        return len(self._panoramas)
+
+    def name(self, index: int) -> str:
+        """The path of a panorama in ``images/`` without ending, as ``kitchen/seen_from_door``."""
+        return self._panoramas[index].name
+
+    def read(self, index: int) -> Panorama:
+        """One panorama.
+
+        Raises:
+            DataError: A file is broken.
+        """
+        files = self._panoramas[index]
+        depth = None
+        if files.depth is not None:
+            steps = _depth_steps(read_depth_m(files.depth, self._depth_units_per_m))
+            depth = resize_depth(steps, self._shape)
+        rgb = resize_area(read_rgb(files.rgb), self._shape)
+        return Panorama(rgb, depth, self._labels(files.labels))
+
+    def label_counts(self, index: int) -> NDArray[np.int64]:
+        """The pixels of every label of one panorama, ``(256,)``.
+
+        Raises:
+            DataError: A file is broken.
+        """
+        return count_labels(self._labels(self._panoramas[index].labels))
+
+    def _labels(self, path: Path) -> NDArray[np.uint8]:
+        codes = read_codes(path, in_colors=self._classes.in_colors)
+        return self._classes.decode(resize_nearest(codes, self._shape))
+
+
+def _depth_steps(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
+    """Depth in steps of 1/512 m, rounded, at most 65535 (128 m), of depth in metres.
+
+    What is there but nearer than half a step is one step away: 0 would mean that it is missing.
+
+    >>> _depth_steps(np.array([0, 1e-4, 1, 1000], np.float32)).tolist()
+    [0, 1, 512, 65535]
+    """
+    steps = np.minimum(depth_m * np.float32(STEPS_PER_M) + np.float32(0.5), _MOST_STEPS)
+    return np.maximum(steps.astype(np.uint16), depth_m > 0)
+
+
+class FolderPanoramas(PanoramaDataModule):
+    """One's own panoramas, with the classes of ``classes.json``.
+
+    Args:
+        root: Folder with ``classes.json``, ``images/`` and ``labels/``.
+        representation: What the network sees of a panorama.
+        test_fraction: Share of the scenes for test, unless there are lists, see `FolderSplits`.
+        validation_fraction: Share of the training scenes for validation, likewise.
+        split_seed: Of the drawing of both. Not the seed of the run: networks of other seeds are
+            compared on the same panoramas, and none is ever tested on what another was trained on.
+        depth_units_per_m: Units in a metre of depth files of whole numbers, 1000 for millimetres.
+        inputs: `rgb`, or `rgb` and `depth`. Depth is clipped to 4 m.
+        normalization: Of the input channels, or a mapping with its `mean` and `std`; by default
+            that of Stanford2D3DS.
+        **settings: All others of `PanoramaDataModule`.
+
+    Attributes:
+        class_names: "unknown", then those of ``classes.json``.
+
+    Raises:
+        DataError: ``classes.json`` is missing or cannot be used.
+        SettingError: A setting that cannot work.
+    """
+
+    def __init__(
+        self,
+        root: str | Path,
+        representation: Representation,
+        *,
+        test_fraction: float = 0.2,
+        validation_fraction: float = 0.1,
+        split_seed: int = 0,
+        depth_units_per_m: float = 1000,
+        inputs: Sequence[str] = ("rgb",),
+        normalization: Normalization | Mapping[str, Sequence[float]] | None = None,
+        **settings: Any,
+    ) -> None:
+        normalization = _normalization(normalization)
+        super().__init__(representation, inputs=inputs, normalization=normalization, **settings)
+        if not depth_units_per_m > 0:
+            raise SettingError(
+                "data.depth_units_per_m", found=depth_units_per_m, expected="more than 0"
+            )
+        self.root = Path(root)
+        self.validation_fraction = validation_fraction
+        self.depth_units_per_m = depth_units_per_m
+        self._division = FolderSplits(self.root, test_fraction, validation_fraction, split_seed)
+        # Now, not with the files: the network is made for as many classes.
+        self._classes = read_classes(self.root / "classes.json")
+        self.class_names = (UNKNOWN_NAME, *self._classes.names)
+
+    def find_splits(self) -> dict[Split, FolderSource]:
+        """The panoramas of all splits, checked.
+
+        Raises:
+            DataError: Something is missing or cannot be used.
+            SettingError: The panoramas are too small for the representation.
+        """
+        panoramas = list_panoramas(self.root, with_depth=self.with_depth)
+        splits = self._division.divide(panoramas)
+
+        def check(index: int) -> None:
+            check_panorama(panoramas[index], self.erp_height, in_colors=self._classes.in_colors)
+
+        for _ in in_threads(check, len(panoramas)):
+            pass
+        check_class_codes(panoramas, self._classes)
+        return {
+            split: FolderSource(chosen, self._classes, self.erp_height, self.depth_units_per_m)
+            for split, chosen in splits.items()
+        }
+
+
+def _normalization(
+    given: Normalization | Mapping[str, Sequence[float]] | None,
+) -> Normalization | None:
+    if given is None or isinstance(given, Normalization):
+        return given
+    if set(given) != {"mean", "std"}:
+        raise SettingError("data.normalization", found=dict(given), expected="mean and std")
+    return Normalization(given["mean"], given["std"])
