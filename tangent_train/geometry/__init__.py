@@ -31,7 +31,9 @@ from tangent_train.geometry.equirect import (
 )
 from tangent_train.geometry.grid import TangentGrid
 from tangent_train.geometry.icosphere import Icosphere, icosphere, vertex_resolution
+from tangent_train.geometry.levels import nearest_level
 from tangent_train.geometry.pinhole_grid import PinholeGrid
+from tangent_train.geometry.resized_grid import ResizedGrid
 from tangent_train.geometry.sphere import (
     FLIP_Y,
     checked_rotation,
@@ -46,6 +48,7 @@ __all__ = [
     "CubeGrid",
     "Icosphere",
     "PinholeGrid",
+    "ResizedGrid",
     "TangentGrid",
     "camera_matrix_from_fov",
     "checked_rotation",
@@ -57,6 +60,7 @@ __all__ = [
     "icosphere",
     "lonlat_to_equirect",
     "lonlat_to_xyz",
+    "nearest_level",
     "normalize_camera",
     "perspective_directions",
     "random_rotation",

@@ -5,6 +5,12 @@ by compiled kernels. The geometry of all of them is `tangent_train.geometry`'s.
 """
 
 from tangent_train.rendering.backward import Blend, tangent_to_equirect, tangent_to_labels
+from tangent_train.rendering.camera_files import (
+    CameraFile,
+    read_cameras,
+    write_cameras,
+    write_colmap,
+)
 from tangent_train.rendering.cubemap import CubemapRepresentation
 from tangent_train.rendering.forward import Interpolation, equirect_to_tangent
 from tangent_train.rendering.perspective import PerspectiveRepresentation
@@ -22,6 +28,7 @@ from tangent_train.rendering.tables import set_table_cache_limit
 __all__ = [
     "Assembler",
     "Blend",
+    "CameraFile",
     "CubemapRepresentation",
     "EquirectRepresentation",
     "Interpolation",
@@ -32,8 +39,11 @@ __all__ = [
     "Views",
     "equirect_to_perspective",
     "equirect_to_tangent",
+    "read_cameras",
     "rotate_equirect",
     "set_table_cache_limit",
     "tangent_to_equirect",
     "tangent_to_labels",
+    "write_cameras",
+    "write_colmap",
 ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, Literal, overload
+from typing import Any, Literal, TypeVar, overload
 
 import numpy as np
 import torch
@@ -14,10 +14,14 @@ from tangent_train.geometry import PinholeGrid
 from tangent_train.rendering import feather_kernels, label_kernels
 from tangent_train.rendering.checks import (
     check_blend,
+    check_images_array,
+    check_nearest,
     check_scores,
     check_shape,
     check_tangent_images,
 )
+from tangent_train.rendering.feathering import feather_arrays
+from tangent_train.rendering.forward import Interpolation
 from tangent_train.rendering.sampling import map_dtype
 from tangent_train.rendering.tables import (
     feather_arguments,
@@ -26,12 +30,14 @@ from tangent_train.rendering.tables import (
     owner_table,
     tensors_on,
 )
-from tangent_train.rendering.taps import Taps, image_taps, sample
+from tangent_train.rendering.taps import Taps, image_taps, nearest_image_index, sample
 from tangent_train.rendering.threads import over_rows
 
 __all__ = ["Blend", "tangent_to_equirect", "tangent_to_labels"]
 
 Blend = Literal["nearest", "feather"]
+
+Scalar = TypeVar("Scalar", bound=np.generic)
 
 _BAND = 2**20
 """Pixels whose taps torch holds at once."""
@@ -39,19 +45,28 @@ _BAND = 2**20
 
 @overload
 def tangent_to_equirect(
-    images: Tensor, grid: PinholeGrid, shape: tuple[int, int], blend: Blend = "nearest"
-) -> Tensor: ...
-@overload
-def tangent_to_equirect(
-    images: NDArray[Any], grid: PinholeGrid, shape: tuple[int, int], blend: Blend = "nearest"
-) -> NDArray[Any]: ...
-def tangent_to_equirect(
-    images: Tensor | NDArray[Any],
+    images: Tensor,
     grid: PinholeGrid,
     shape: tuple[int, int],
     blend: Blend = "nearest",
-) -> Tensor | NDArray[Any]:
-    """Render tangent images back to a panorama, bilinearly.
+    interpolation: Interpolation = "bilinear",
+) -> Tensor: ...
+@overload
+def tangent_to_equirect(
+    images: NDArray[Scalar],
+    grid: PinholeGrid,
+    shape: tuple[int, int],
+    blend: Blend = "nearest",
+    interpolation: Interpolation = "bilinear",
+) -> NDArray[Scalar]: ...
+def tangent_to_equirect(
+    images: Tensor | NDArray[Scalar],
+    grid: PinholeGrid,
+    shape: tuple[int, int],
+    blend: Blend = "nearest",
+    interpolation: Interpolation = "bilinear",
+) -> Tensor | NDArray[Scalar]:
+    """Render tangent images back to a panorama.
 
     Args:
         images: All images of the grid: a floating-point tensor ``(..., N, C, d, d)`` on any
@@ -61,15 +76,20 @@ def tangent_to_equirect(
         blend: ``nearest``: every direction is taken from its owner. ``feather``: the average of
             all images that see it, weights falling to 0 at the images' borders: no seams. Only
             for images that overlap, not for a cube's.
+        interpolation: ``bilinear``, or ``nearest`` for labels, masks and depth of any dtype: the
+            owner's pixel whose centre is nearest, kept exactly. Only with the blend ``nearest``.
 
     Returns:
         A tensor ``(..., C, H, W)`` or an array ``(H, W[, C])``, of the dtype of the images.
 
     Raises:
-        SettingError: The images, the shape or the blend cannot be used.
+        SettingError: The images, the shape, the blend or the interpolation cannot be used.
     """
     check_blend(blend, grid)
     height, width = check_shape(shape)
+    if interpolation != "bilinear":
+        check_nearest(images, grid, blend, interpolation)
+        return _nearest(images, grid, (height, width))
     if isinstance(images, np.ndarray):
         return _from_arrays(images, grid, (height, width), blend)
     check_tangent_images(images, grid)
@@ -77,6 +97,26 @@ def tangent_to_equirect(
     flat = images.movedim(-4, -3).reshape(-1, grid.num_images * size)
     bands = [sample(flat, taps) for taps in _bands(images, grid, (height, width), blend, size)]
     return torch.cat(bands, dim=1).reshape(*images.shape[:-4], channels, height, width)
+
+
+def _nearest(
+    images: Tensor | NDArray[Scalar], grid: PinholeGrid, shape: tuple[int, int]
+) -> Tensor | NDArray[Scalar]:
+    """The owner's pixel whose centre is nearest, for every pixel of the panorama."""
+    # Positions are float32 for all dtypes, so that all take the same pixel.
+    table = owner_table(grid, shape, map_dtype(False, "nearest"))
+    face, u, v = (torch.from_numpy(part.reshape(-1)) for part in table.arrays)
+    bands = [slice(start, start + _BAND) for start in range(0, len(face), _BAND)]
+    indices = (nearest_image_index(face[band], u[band], v[band], grid.dim) for band in bands)
+    size = grid.num_images * grid.dim**2
+    if isinstance(images, np.ndarray):
+        pixels = images.reshape(size, *images.shape[3:])
+        taken = np.concatenate([pixels[index.numpy()] for index in indices])
+        return taken.reshape(*shape, *images.shape[3:])
+    flat = images.movedim(-4, -3).reshape(-1, size)
+    on_device = (index.to(images.device).expand(len(flat), -1) for index in indices)
+    parts = [flat.gather(1, index) for index in on_device]
+    return torch.cat(parts, dim=1).reshape(*images.shape[:-4], images.shape[-3], *shape)
 
 
 @overload
@@ -145,10 +185,14 @@ def _tensor(array: NDArray[Any]) -> Tensor:
 
 
 def _from_arrays(
-    images: NDArray[Any], grid: PinholeGrid, shape: tuple[int, int], blend: Blend
-) -> NDArray[Any]:
+    images: NDArray[Scalar], grid: PinholeGrid, shape: tuple[int, int], blend: Blend
+) -> NDArray[Scalar]:
     """`tangent_to_equirect` of arrays ``(N, d, d[, C])``; integers are rounded."""
     exact = (images.dtype.kind in "ui" and images.dtype.itemsize > 2) or images.dtype == np.float64
+    if blend == "feather" and not exact:
+        check_images_array(images, grid)
+        stacked = images if images.ndim == 4 else images[..., None]
+        return feather_arrays(stacked, grid, shape).reshape(*shape, *images.shape[3:])
     stack = _tensor(images.astype(np.float64 if exact else np.float32, copy=False))
     stack = stack[:, None] if images.ndim == 3 else stack.movedim(-1, 1)
     result = tangent_to_equirect(stack, grid, shape, blend).movedim(0, -1).numpy()

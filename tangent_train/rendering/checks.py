@@ -14,7 +14,9 @@ from tangent_train.geometry import PinholeGrid
 
 __all__ = [
     "check_blend",
+    "check_images_array",
     "check_interpolation",
+    "check_nearest",
     "check_numpy_image",
     "check_scores",
     "check_shape",
@@ -37,6 +39,36 @@ def check_blend(blend: str, grid: PinholeGrid) -> None:
             found="'feather'",
             expected="'nearest' for images that do not overlap",
             remedy="All weights are 0 on the edges where they meet.",
+        )
+
+
+def check_nearest(
+    images: Tensor | NDArray[np.generic], grid: PinholeGrid, blend: str, interpolation: str
+) -> None:
+    """Raise SettingError unless images of any dtype can be taken to a panorama pixel by pixel."""
+    check_interpolation(interpolation)
+    if blend != "nearest":
+        raise SettingError(
+            "interpolation",
+            found=f"'nearest' with blend {blend!r}",
+            expected="blend='nearest'",
+            remedy="What is taken pixel by pixel is not averaged.",
+        )
+    if isinstance(images, Tensor):
+        _check_stack("tangent images", images, grid)
+    else:
+        check_images_array(images, grid)
+
+
+def check_images_array(images: NDArray[np.generic], grid: PinholeGrid) -> None:
+    """Raise SettingError unless an array is ``(N, d, d[, C])`` and fits the grid."""
+    expected = (grid.num_images, grid.dim, grid.dim)
+    if images.ndim not in (3, 4) or images.shape[:3] != expected:
+        raise SettingError(
+            "tangent images",
+            found=f"shape {images.shape}",
+            expected="({}, {}, {}[, channels]) for this grid".format(*expected),
+            remedy="All images of the grid are needed, in its order.",
         )
 
 
@@ -89,11 +121,13 @@ def _check_floating(name: str, tensor: Tensor) -> None:
 def check_tangent_images(images: Tensor, grid: PinholeGrid) -> None:
     """Raise SettingError unless images are ``(..., N, C, d, d)`` floats that fit the grid."""
     _check_stack("tangent images", images, grid)
+    _check_floating("tangent images", images)
 
 
 def check_scores(scores: Tensor, grid: PinholeGrid) -> None:
     """Raise SettingError unless scores are ``(..., N, K, d, d)`` floats that fit the grid."""
     _check_stack("scores", scores, grid)
+    _check_floating("scores", scores)
     if scores.shape[-3] == 0:
         raise SettingError("scores", found="no class", expected="one class or more")
 
@@ -108,4 +142,3 @@ def _check_stack(name: str, images: Tensor, grid: PinholeGrid) -> None:
             expected="(..., {}, channels, {}, {}) for this grid".format(*expected),
             remedy="All images of the grid are needed, in its order.",
         )
-    _check_floating(name, images)

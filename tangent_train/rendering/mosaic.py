@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from tangent_train.rendering.backward import Blend
     from tangent_train.rendering.perspective import PhotoCrops
 
-__all__ = ["ScoreMosaic"]
+__all__ = ["ScoreMosaic", "window"]
 
 _IN_MEMORY_BYTES = 2**31
 """Sums of more bytes are kept in a temporary file."""
@@ -76,7 +76,7 @@ class ScoreMosaic:
         reach = math.atan(math.sqrt(2) * grid.dim / 2 * grid.pitch)
         for face, image in zip(faces, self._prepared(scores), strict=True):
             others = np.setdiff1d(grid.neighbors[face], face)
-            rows, columns = _window(grid.centers_xyz[face], reach, self.shape)
+            rows, columns = window(grid.centers_xyz[face], reach, self.shape)
             self._over(
                 rows,
                 mosaic_kernels.add_pinhole_image,
@@ -151,10 +151,19 @@ def _zeros(shape: tuple[int, ...]) -> NDArray[np.float32]:
         return np.memmap(file, np.float32, "w+", shape=shape)
 
 
-def _window(
+def window(
     center_xyz: NDArray[np.float64], reach: float, shape: tuple[int, int]
 ) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Rows, and first column and number of columns, of all directions within an angle."""
+    """Where all directions within an angle of one are in an ERP of this shape.
+
+    Args:
+        center_xyz: The direction.
+        reach: Radians.
+        shape: ``(H, W)``.
+
+    Returns:
+        First row and the one after the last; first column and number of columns, across ±180°.
+    """
     height, width = shape
     latitude = math.asin(max(-1.0, min(1.0, center_xyz[2])))
     top = math.floor((0.5 - (latitude + reach) / math.pi) * height)

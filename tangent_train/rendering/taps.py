@@ -11,7 +11,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-__all__ = ["Taps", "bilinear_equirect_taps", "image_taps", "nearest_equirect_index", "sample"]
+__all__ = [
+    "Taps",
+    "bilinear_equirect_taps",
+    "image_taps",
+    "nearest_equirect_index",
+    "nearest_image_index",
+    "sample",
+]
 
 
 class Taps(NamedTuple):
@@ -97,6 +104,22 @@ def image_taps(
     if weight is not None:
         weights = [part * weight for part in weights]
     return Taps(index, torch.cat(weights))
+
+
+def nearest_image_index(face: Tensor, u: Tensor, v: Tensor, dim: int) -> Tensor:
+    """The pixel centre nearest to positions in tangent images; half-way between two, the even one.
+
+    Args:
+        face: ``(P,)`` images, any integer dtype.
+        u: ``(P,)`` columns in the images.
+        v: ``(P,)`` rows in the images.
+        dim: Side d of the images.
+
+    Returns:
+        ``(P,)`` int64 flat indices into ``(N, d, d)``.
+    """
+    row, column = (line.round().long().clamp(0, dim - 1) for line in (v, u))
+    return (face.long() * dim + row) * dim + column
 
 
 def sample(source: Tensor, taps: Taps) -> Tensor:

@@ -9,8 +9,15 @@ import pytest
 import torch
 
 from tangent_train.errors import SettingError
-from tangent_train.geometry import TangentGrid, equirect_directions, random_rotation
-from tangent_train.rendering import equirect_to_tangent, tangent_to_equirect, tangent_to_labels
+from tangent_train.geometry import CubeGrid, TangentGrid, equirect_directions, random_rotation
+from tangent_train.geometry.resized_grid import ResizedGrid
+from tangent_train.rendering import (
+    equirect_to_tangent,
+    feathering,
+    tangent_to_equirect,
+    tangent_to_labels,
+)
+from tests.rendering.reference import ReferenceGrid
 
 BLENDS = ["nearest", "feather"]
 SHAPES = [(64, 128), (63, 125), (50, 70)]
@@ -139,6 +146,131 @@ def test_arrays_agree_with_tensors(dtype: Any, channels: tuple[int, ...], blend:
     assert (found.dtype, found.shape) == (dtype, (15, 32, *channels))
     tolerance = 0.501 if np.dtype(dtype).kind in "ui" else 1e-4
     np.testing.assert_allclose(found.reshape(expected.shape), expected, atol=tolerance)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("grid", GRIDS)
+def test_nearest_is_the_nearest_pixel_of_the_reference(
+    grid: TangentGrid, shape: tuple[int, int]
+) -> None:
+    turn = np.eye(3) if grid.rotation is None else grid.rotation
+    reference = ReferenceGrid(grid.base_level, grid.level, grid.dim, turn)
+    order = reference.order(grid.centers_xyz)
+    ours = np.empty(len(order), np.int64)
+    ours[order] = np.arange(len(order))
+    owner = reference.nearness(shape).argmax(axis=-1)
+    row, column = reference.positions(shape, owner)
+    # Half-way between two pixels or two images, rounding decides.
+    fractions = np.stack([row, column]) % 1
+    certain = reference.clear(shape) & (np.abs(fractions - 0.5) > 1e-4).all(axis=0)
+    assert certain.mean() > 0.9
+    nearest = (np.clip(np.floor(line + 0.5), 0, grid.dim - 1).astype(int) for line in (row, column))
+    # Every pixel has a value of its own.
+    images = np.arange(grid.num_images * grid.dim**2).reshape(-1, grid.dim, grid.dim)
+    expected = images[ours[owner], *nearest]
+    found = tangent_to_equirect(images, grid, shape, interpolation="nearest")
+    assert found.dtype == images.dtype
+    np.testing.assert_array_equal(found[certain], expected[certain])
+
+
+@pytest.mark.parametrize("dtype", [np.bool_, np.uint8, np.uint16, np.int64, np.float16, np.float64])
+@pytest.mark.parametrize("channels", [(), (1,), (5,)])
+def test_nearest_keeps_any_type(dtype: Any, channels: tuple[int, ...]) -> None:
+    grid = TangentGrid(0, 4)
+    numbers = np.random.default_rng(0).random((20, 16, 16, *channels)) * 250
+    images = numbers.astype(dtype)
+    found = tangent_to_equirect(images, grid, (15, 31), interpolation="nearest")
+    assert (found.dtype, found.shape) == (dtype, (15, 31, *channels))
+    assert set(found.ravel().tolist()) <= set(images.ravel().tolist())
+    as_floats = tangent_to_equirect(
+        images.astype(np.float64), grid, (15, 31), interpolation="nearest"
+    )
+    np.testing.assert_array_equal(found, as_floats)
+    if dtype == np.uint16:
+        return
+    stack = torch.from_numpy(images.reshape(20, 16, 16, -1)).movedim(-1, 1)
+    tensor = tangent_to_equirect(stack, grid, (15, 31), interpolation="nearest")
+    np.testing.assert_array_equal(tensor.movedim(0, -1).numpy().reshape(found.shape), found)
+
+
+def test_nearest_in_bands_batches_and_backwards(monkeypatch: pytest.MonkeyPatch) -> None:
+    grid = TangentGrid(0, 3)
+    images = torch.rand(3, 2, 20, 4, 8, 8, requires_grad=True)
+    whole = tangent_to_equirect(images, grid, (9, 20), interpolation="nearest")
+    assert whole.shape == (3, 2, 4, 9, 20)
+    monkeypatch.setattr("tangent_train.rendering.backward._BAND", 7)
+    banded = tangent_to_equirect(images, grid, (9, 20), interpolation="nearest")
+    torch.testing.assert_close(banded, whole, rtol=0, atol=0)
+    (gradient,) = torch.autograd.grad(banded.sum(), images)
+    assert gradient.sum() == banded.numel()
+
+
+@pytest.mark.parametrize(
+    ("images", "grid", "arguments", "message"),
+    [
+        (np.zeros((20, 16, 16)), TangentGrid(0, 4), {"blend": "feather"}, "blend='nearest'"),
+        (np.zeros((20, 16, 16)), TangentGrid(0, 4), {"interpolation": "cubic"}, "interpolation"),
+        (np.zeros((19, 16, 16)), TangentGrid(0, 4), {}, r"\(20, 16, 16\[, channels\]\)"),
+        (np.zeros((20, 16, 16, 3, 1)), TangentGrid(0, 4), {}, "tangent images"),
+        (torch.zeros(20, 16, 16), TangentGrid(0, 4), {}, "tangent images"),
+        (torch.zeros(6, 1, 8, 9), CubeGrid(8), {}, "tangent images"),
+    ],
+)
+def test_nearest_errors(images: Any, grid: Any, arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(SettingError, match=message):
+        tangent_to_equirect(images, grid, (8, 16), **{"interpolation": "nearest"} | arguments)
+
+
+@pytest.mark.parametrize("grid", GRIDS)
+@pytest.mark.parametrize("shape", SHAPES)
+def test_feathered_arrays_are_the_reference_s(
+    grid: TangentGrid, shape: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(feathering, "_BAND_PIXELS", 10 * shape[1] + 3)
+    turn = np.eye(3) if grid.rotation is None else grid.rotation
+    reference = ReferenceGrid(grid.base_level, grid.level, grid.dim, turn)
+    images = np.random.default_rng(0).random((grid.num_images, grid.dim, grid.dim, 2))
+    theirs = np.empty_like(images)
+    theirs[reference.order(grid.centers_xyz)] = images
+    found = tangent_to_equirect(images.astype(np.float32), grid, shape, "feather")
+    np.testing.assert_allclose(found, reference.feathered(theirs, shape), atol=1e-5)
+
+
+@pytest.mark.parametrize("blend", BLENDS)
+@pytest.mark.parametrize("dim", [2, 15, 32, 64])
+@pytest.mark.parametrize("cropped", [False, True])
+def test_images_of_another_size_show_the_same(dim: int, cropped: bool, blend: Any) -> None:
+    """The panorama's directions, drawn at the pixels of the other size by hand, come back."""
+    grid = TangentGrid(0, 5, 24 if cropped else None)
+    resized = ResizedGrid(grid, dim)
+    side = grid.dim * grid.pitch  # from edge to edge on the plane
+    line = ((np.arange(dim) + 0.5) / dim - 0.5) * side
+    x, y = np.meshgrid(line, line)
+    planes = np.stack([x, y, np.ones_like(x)], axis=-1)
+    directions = np.einsum("nwc,ijc->nijw", grid.world_from_camera, planes)
+    np.testing.assert_allclose(
+        directions / np.linalg.norm(directions, axis=-1, keepdims=True),
+        resized.directions(),
+        atol=1e-12,
+    )
+    # Points on the planes are linear in the pixels: bilinear sampling is exact but at the edges.
+    panorama = tangent_to_equirect(directions, resized, (40, 80), blend)
+    panorama /= np.linalg.norm(panorama, axis=-1, keepdims=True)
+    away = np.degrees(np.arccos((panorama * equirect_directions((40, 80))).sum(-1).clip(-1, 1)))
+    half_pixel = np.degrees(side / dim / 2)
+    if cropped:  # the cells reach to the outermost pixels
+        assert away.max() < half_pixel * np.sqrt(2)
+    elif blend == "nearest" and dim > 2:
+        assert away.max() < 1e-5
+    assert np.median(away) < (half_pixel if dim == 2 else 1e-5 if blend == "nearest" else 1)
+    assert resized.with_rotation(TURNED.rotation).rotation is not None
+    assert resized != ResizedGrid(grid, dim + 1)
+    assert resized == ResizedGrid(grid, dim)
+
+
+def test_images_of_another_size_need_two_pixels() -> None:
+    with pytest.raises(SettingError, match="2 or more"):
+        ResizedGrid(TangentGrid(0, 4), 1)
 
 
 def test_batches_and_dtypes_are_kept() -> None:

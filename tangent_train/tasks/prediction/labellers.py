@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from datamodules.gpano import area_of, area_of_crop, whole_area
-from datamodules.image_files import photo_fov_deg, read_depth_m, read_rgb
+from datamodules.image_files import DEPTH_SUFFIXES, photo_fov_deg, read_depth_m, read_rgb
 from datamodules.panoramas import STEPS_PER_M, resize_nearest
 from tangent_train.errors import DataError
 from tangent_train.geometry import camera_matrix_from_fov
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 
 __all__ = ["DepthFolder", "Labelled", "Labeller", "PanoramaLabeller", "PhotoLabeller"]
 
-_DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".npy", ".exr")
 _MOST_STEPS = np.iinfo(np.uint16).max
 _ASPECT_TOLERANCE = 0.01
 
@@ -92,7 +91,7 @@ class DepthFolder:
         Raises:
             DataError: There is none, it is broken, or it shows something of another form.
         """
-        names = [f"{image.stem}{end}{s}" for end in ("", "_depth") for s in _DEPTH_SUFFIXES]
+        names = [f"{image.stem}{end}{s}" for end in ("", "_depth") for s in DEPTH_SUFFIXES]
         found = [self.path / name for name in names if (self.path / name).is_file()]
         if not found:
             raise DataError(
@@ -100,7 +99,7 @@ class DepthFolder:
                 found=f"no {names[0]} or the like in {self.path}",
                 expected="depth of every image, for a network that takes RGB and depth",
                 remedy=f"Name it {image.stem} or {image.stem}_depth, "
-                f"with {', '.join(_DEPTH_SUFFIXES)}.",
+                f"with {', '.join(DEPTH_SUFFIXES)}.",
             )
         depth_m = read_depth_m(found[0], self.units_per_m)
         height, width = depth_m.shape

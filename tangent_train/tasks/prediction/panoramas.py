@@ -12,13 +12,13 @@ import torch
 
 from datamodules.panoramas import resize_area, resize_depth
 from tangent_train.errors import SettingError
-from tangent_train.geometry import rotation_about
+from tangent_train.geometry import nearest_level, rotation_about
 from tangent_train.rendering.mosaic import ScoreMosaic
 from tangent_train.rendering.perspective import PhotoCrops
 from tangent_train.rendering.representation import PinholeRepresentation
 from tangent_train.rendering.views import PinholeViews
 from tangent_train.tasks.prediction.predictor import Done, InputImage, Level, Prediction, Runner
-from tangent_train.tasks.prediction.seen import image_level, panorama_representation
+from tangent_train.tasks.prediction.seen import panorama_representation
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -99,7 +99,7 @@ class PanoramaPredictor:
             SettingError: The network cannot be shown a panorama of this level.
         """
         height, width = image.rgb.shape[:2]
-        level = image_level(height) if self._level == "image" else self._level
+        level = nearest_level(height) if self._level == "image" else self._level
         seen = self._seen(level)
         small = _shrunk(image, (seen.erp_height, 2 * seen.erp_height))
         averaged = averaged or len(self._turns) > 1

@@ -9,10 +9,11 @@ import cv2
 import numpy as np
 
 from datamodules.photos import distance_from_z_depth
+from tangent_train.geometry import nearest_level
 from tangent_train.rendering.mosaic import ScoreMosaic
 from tangent_train.rendering.perspective import PhotoCrops
 from tangent_train.tasks.prediction.predictor import Done, InputImage, Level, Prediction, Runner
-from tangent_train.tasks.prediction.seen import image_level, photo_representation
+from tangent_train.tasks.prediction.seen import photo_representation
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -73,7 +74,7 @@ class PhotoPredictor:
         height, width = image.rgb.shape[:2]
         level = self._level
         if level == "image":  # of panoramas with the photo's angular resolution
-            level = image_level(round(math.pi * camera_matrix[1, 1]))
+            level = nearest_level(round(math.pi * camera_matrix[1, 1]))
         representation = photo_representation(self._trained, level, self._base_level)
         whole, margin, matrix = _widened(image, camera_matrix, representation)
         sampler = representation.of_camera(matrix, whole.rgb.shape[:2])

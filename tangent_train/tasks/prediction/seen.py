@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from tangent_train.rendering import EquirectRepresentation
     from tangent_train.tasks.networks import TrainedNetwork
 
-__all__ = ["image_level", "panorama_representation", "photo_representation"]
+__all__ = ["panorama_representation", "photo_representation"]
 
 _PREFIX = "tangent_train.rendering."
 _TANGENT = _PREFIX + "TangentRepresentation"
@@ -22,11 +22,6 @@ _PERSPECTIVE = _PREFIX + "PerspectiveRepresentation"
 
 _BASE_LEVEL_FOR_PHOTOS = 1
 """Base level for networks trained on photos (paper, section 5: transfer uses b = 1)."""
-
-
-def image_level(height: int) -> int:
-    """Level s whose panoramas, of 2^(s+1) rows, are nearest in size to one of this many rows."""
-    return max(0, round(math.log2(max(height, 1))) - 1)
 
 
 def panorama_representation(

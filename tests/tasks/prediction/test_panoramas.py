@@ -16,7 +16,7 @@ from tangent_train.geometry import equirect_directions
 from tangent_train.tasks.networks import make
 from tangent_train.tasks.prediction.panoramas import PanoramaPredictor, turns
 from tangent_train.tasks.prediction.predictor import InputImage, Prediction, Runner
-from tangent_train.tasks.prediction.seen import image_level, panorama_representation
+from tangent_train.tasks.prediction.seen import panorama_representation
 from tangent_train.tasks.segmentation import SegmentationTask
 from tests.tasks.prediction.trained import CUBE, ERP, PERSPECTIVE, TANGENT, trained_network
 
@@ -136,7 +136,6 @@ def test_rotations_are_turned_about_the_vertical_and_averaged() -> None:
 
 
 def test_levels() -> None:
-    assert [image_level(height) for height in (64, 512, 1000, 4096, 1)] == [5, 8, 9, 11, 0]
     trained, image = trained_network(TANGENT), InputImage(_sphere(128))
     assert _predict(trained, image).level == 4
     assert _predict(trained, image, level=5).grid == panorama_representation(trained, 5).grid  # type: ignore[union-attr]

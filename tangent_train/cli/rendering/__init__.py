@@ -1,0 +1,1 @@
+"""``tangent-render``: to tangent images, and back."""

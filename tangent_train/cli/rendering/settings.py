@@ -1,0 +1,180 @@
+"""The settings of ``tangent-render``, checked."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from datamodules.pixel_files import PIXEL_SUFFIXES
+from datamodules.tangent_results import KINDS
+from tangent_train.errors import SettingError
+from tangent_train.geometry import random_rotation, rotation_about
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from datamodules.tangent_results import Kind
+    from tangent_train.rendering import Blend, Interpolation
+
+__all__ = ["BackSettings", "ForwardSettings"]
+
+_FORMATS = tuple(suffix[1:] for suffix in PIXEL_SUFFIXES)
+
+
+@dataclass(frozen=True)
+class ForwardSettings:
+    """How panoramas become tangent images; see ``configs/render.yaml``."""
+
+    input: str
+    output: Path | None
+    figure: Path | None
+    base_level: int
+    level: int | None
+    dim: int | None
+    faces: tuple[int, ...] | None
+    rotation: NDArray[np.float64] | None
+    suffix: str
+    interpolation: Interpolation
+    colmap: bool
+    overwrite: bool
+
+    @classmethod
+    def of(cls, config: Mapping[str, Any]) -> ForwardSettings:
+        """Check the settings.
+
+        Raises:
+            SettingError: One cannot work.
+        """
+        output, figure = _path(config, "output"), _path(config, "figure")
+        if output is None and figure is None:
+            raise SettingError("output", found="none", expected="a folder for the tangent images")
+        if figure is not None and figure.suffix.lower() != ".png":
+            raise SettingError("figure", found=str(figure), expected="the name of a .png file")
+        base_level = _whole(config, "base_level", 0)
+        level = _optional(config, "level", base_level)
+        return cls(
+            input=str(config["input"]),
+            output=output,
+            figure=figure,
+            base_level=base_level,
+            level=level,
+            dim=_optional(config, "dim", 2),
+            faces=_faces(config["faces"], 20 * 4**base_level),
+            rotation=_rotation(config["rotation"], config["seed"]),
+            suffix="." + _choice(config, "format", _FORMATS),
+            interpolation=_choice(config, "interpolation", ("bilinear", "nearest")),
+            colmap=_flag(config, "colmap"),
+            overwrite=_flag(config, "overwrite"),
+        )
+
+
+@dataclass(frozen=True)
+class BackSettings:
+    """How results become panoramas; see ``configs/render.yaml``."""
+
+    back: Path
+    output: Path
+    cameras: Path | None
+    blend: Blend
+    height: int | None
+    kind: Kind | Any
+    z_depth: bool
+    overwrite: bool
+
+    @classmethod
+    def of(cls, config: Mapping[str, Any]) -> BackSettings:
+        """Check the settings.
+
+        Raises:
+            SettingError: One cannot work.
+        """
+        given = [name for name in ("input", "figure") if config[name] is not None]
+        if given:
+            raise SettingError(
+                "back",
+                found=f"{given[0]}= as well",
+                expected="one of them: input= renders tangent images, back= what was made of them",
+            )
+        output = _path(config, "output")
+        if output is None:
+            raise SettingError("output", found="none", expected="a file for the panorama")
+        return cls(
+            back=Path(str(config["back"])).expanduser(),
+            output=output,
+            cameras=_path(config, "cameras"),
+            blend=_choice(config, "blend", ("feather", "nearest")),
+            height=_optional(config, "height", 1),
+            kind=_choice(config, "kind", ("auto", *KINDS)),
+            z_depth=_flag(config, "z_depth"),
+            overwrite=_flag(config, "overwrite"),
+        )
+
+
+def _path(config: Mapping[str, Any], name: str) -> Path | None:
+    value = config[name]
+    return None if value is None else Path(str(value)).expanduser()
+
+
+def _whole(config: Mapping[str, Any], name: str, least: int) -> int:
+    value = config[name]
+    if type(value) is not int or value < least:
+        raise SettingError(name, found=value, expected=f"a whole number, {least} or more")
+    return value
+
+
+def _optional(config: Mapping[str, Any], name: str, least: int) -> int | None:
+    return None if config[name] is None else _whole(config, name, least)
+
+
+def _flag(config: Mapping[str, Any], name: str) -> bool:
+    value = config[name]
+    if not isinstance(value, bool):
+        raise SettingError(name, found=value, expected="true or false")
+    return value
+
+
+def _choice(config: Mapping[str, Any], name: str, allowed: tuple[str, ...]) -> Any:
+    value = config[name]
+    if value not in allowed:
+        raise SettingError(name, found=value, expected=" or ".join(allowed))
+    return value
+
+
+def _faces(value: Any, count: int) -> tuple[int, ...] | None:
+    if value is None:
+        return None
+    faces = tuple(value) if isinstance(value, list) else (value,)
+    known = all(type(face) is int and 0 <= face < count for face in faces)
+    if not faces or not known or len(set(faces)) < len(faces):
+        expected = f"different indices from 0 to {count - 1}, as in faces=[0,5]"
+        raise SettingError("faces", found=value, expected=expected)
+    return faces
+
+
+def _rotation(value: Any, seed: Any) -> NDArray[np.float64] | None:
+    """The rotation in the frame of directions: x forward, y to the right, z up."""
+    if value is None:
+        return None
+    if value == "so3":
+        if type(seed) is not int or seed < 0:
+            raise SettingError("seed", found=seed, expected="a whole number, 0 or more")
+        return random_rotation(np.random.default_rng(seed))
+    numbers = isinstance(value, list) and [type(angle) in (int, float) for angle in value]
+    if numbers != [True] * 3 or not np.isfinite(value).all():
+        raise SettingError(
+            "rotation",
+            found=value,
+            expected="[yaw,pitch,roll] in degrees (to the right, up, clockwise), or so3",
+        )
+    yaw, pitch, roll = np.radians(value)
+    # y is to the right here: turning about it the usual way looks down.
+    return (
+        rotation_about((0, 0, 1), yaw)
+        @ rotation_about((0, 1, 0), -pitch)
+        @ rotation_about((1, 0, 0), -roll)
+    )

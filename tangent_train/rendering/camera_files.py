@@ -1,0 +1,256 @@
+"""The cameras of tangent images as files: ``cameras.json``, and COLMAP's text format.
+
+Files are for people who know nothing of this library, so their world is an ordinary right-handed
+one: x forward (to the middle column of the panorama), y left, z up. `FLIP_Y` changes between it
+and the frame of `tangent_train.geometry`.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tangent_train.errors import DataError, SettingError
+from tangent_train.files import write_text
+from tangent_train.geometry import FLIP_Y, TangentGrid, xyz_to_lonlat
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+__all__ = ["CAMERAS_FILE", "CameraFile", "read_cameras", "write_cameras", "write_colmap"]
+
+CAMERAS_FILE = "cameras.json"
+"""The name of the file in a folder of tangent images."""
+
+_FORMAT = "tangent images"
+_VERSION = 1
+_CONVENTIONS = {
+    "pixels": "Pixel centres are whole numbers: (0, 0) is the centre of the upper left pixel, "
+    "columns count to the right, rows down. matrix (K) takes camera coordinates to (column, row). "
+    "For programs that count from pixel corners, add 0.5 to the principal point.",
+    "camera_axes": "x right, y down, z forward.",
+    "world_axes": "Right-handed, at the centre of the panorama: x forward, to the middle column of "
+    "the panorama; y left, a quarter of the width to the left of it; z up, to the top row.",
+    "world_from_camera": "Rotation matrix by rows, determinant +1: a direction d of the camera is "
+    "world_from_camera · d in the world. All cameras stand at the origin.",
+    "icosahedron_rotation": "Rotation of the icosahedron as a whole, in the world axes; null for "
+    "none.",
+    "center": "Direction of the centre of an image: degrees to the right of the middle of the "
+    "panorama, and upwards.",
+    "fov": "fov_deg is the angle across the middle of an image, from edge to edge; "
+    "fov_between_corners_deg the angle between the centres of two adjacent corner pixels.",
+}
+_NUMBERS = re.compile(r"\[[-+.,\d\se]+\]")
+"""Rows of matrices, which are easier to read on one line."""
+
+_REMEDY = "Use the file as tangent-render wrote it."
+
+
+@dataclass(frozen=True)
+class CameraFile:
+    """What a ``cameras.json`` says.
+
+    Attributes:
+        source: Name of the panorama.
+        shape: ``(H, W)`` of the panorama.
+        grid: The geometry of all images.
+        faces: Which of them there are.
+        files: The files' names, one for each face.
+    """
+
+    source: str
+    shape: tuple[int, int]
+    grid: TangentGrid
+    faces: tuple[int, ...]
+    files: tuple[str, ...]
+
+
+def write_cameras(path: Path, cameras: CameraFile) -> None:
+    """Write a ``cameras.json``.
+
+    Args:
+        path: The file.
+        cameras: What it says; see its own ``conventions`` for how.
+    """
+    grid = cameras.grid
+    rotation = None if grid.rotation is None else _in_room(grid.rotation).tolist()
+    content = {
+        "format": _FORMAT,
+        "version": _VERSION,
+        "conventions": _CONVENTIONS,
+        "source": {
+            "file": cameras.source,
+            "height": cameras.shape[0],
+            "width": cameras.shape[1],
+        },
+        "base_level": grid.base_level,
+        "level": grid.level,
+        "dim": grid.dim,
+        "icosahedron_rotation": rotation,
+        "camera": {
+            "width": grid.dim,
+            "height": grid.dim,
+            "matrix": grid.camera_matrix.tolist(),
+            "pixel_pitch": grid.pitch,
+            "fov_deg": math.degrees(2 * math.atan(grid.dim * grid.pitch / 2)),
+            "fov_between_corners_deg": grid.fov_deg,
+        },
+        "images": [
+            _image(grid, face, file)
+            for face, file in zip(cameras.faces, cameras.files, strict=True)
+        ],
+    }
+    text = json.dumps(content, indent=1, ensure_ascii=False)
+    write_text(path, _NUMBERS.sub(lambda match: " ".join(match[0].split()), text) + "\n")
+
+
+def _image(grid: TangentGrid, face: int, file: str) -> dict[str, Any]:
+    lon_deg, lat_deg = np.degrees(xyz_to_lonlat(grid.centers_xyz[face]))
+    return {
+        "file": file,
+        "face": face,
+        "center": {"right_deg": float(lon_deg), "up_deg": float(lat_deg)},
+        "world_from_camera": _world_from_camera(grid, face).tolist(),
+    }
+
+
+def _world_from_camera(grid: TangentGrid, face: int) -> NDArray[np.float64]:
+    """``(3, 3)`` proper rotation from camera axes to the right-handed world of the files."""
+    return np.asarray(FLIP_Y @ grid.world_from_camera[face])
+
+
+def _in_room(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A rotation of the frame of directions in the right-handed world, or back."""
+    return np.asarray(FLIP_Y @ rotation @ FLIP_Y)
+
+
+def read_cameras(path: Path) -> CameraFile:
+    """Read a ``cameras.json``.
+
+    Args:
+        path: The file.
+
+    Raises:
+        DataError: It is missing, or cannot be what `write_cameras` wrote: its parts are missing or
+            contradict each other.
+    """
+    try:
+        content = json.loads(path.read_bytes())
+    except (OSError, ValueError) as error:
+        found = "no such file" if isinstance(error, FileNotFoundError) else error
+        raise DataError(
+            path,
+            found=found,
+            expected="the cameras of tangent images",
+            remedy="tangent-render input=… output=… writes them beside the images.",
+        ) from error
+    if not isinstance(content, dict) or content.get("format") != _FORMAT:
+        raise DataError(
+            path, found="another kind of file", expected=f'"format": "{_FORMAT}"', remedy=_REMEDY
+        )
+    if content.get("version") != _VERSION:
+        raise DataError(
+            path,
+            found=f"version {content.get('version')}",
+            expected=f"version {_VERSION}",
+            remedy="It was written by another version of tangent-render.",
+        )
+    try:
+        cameras = _parse(content)
+    except (KeyError, TypeError, ValueError) as error:
+        missing = f"no {error}" if isinstance(error, KeyError) else error
+        raise DataError(path, found=missing, expected="a whole file", remedy=_REMEDY) from error
+    _check(path, cameras, content)
+    return cameras
+
+
+def _parse(content: dict[str, Any]) -> CameraFile:
+    source, images, rotation = (
+        content[key] for key in ("source", "images", "icosahedron_rotation")
+    )
+    numbers = [content[key] for key in ("base_level", "level", "dim")]
+    numbers += [source["height"], source["width"], *(image["face"] for image in images)]
+    if not all(type(number) is int for number in numbers):
+        raise SettingError("levels, dim, sizes and faces", found=numbers, expected="whole numbers")
+    base_level, level, dim, height, width, *faces = numbers
+    if min(height, width) < 1:
+        raise SettingError("source", found=f"{height}×{width} pixels", expected="1 or more")
+    turn = None if rotation is None else _in_room(np.array(rotation, np.float64).reshape(3, 3))
+    grid = TangentGrid(base_level, level, dim, turn)
+    grid.face_indices(faces)
+    files = tuple(str(image["file"]) for image in images)
+    return CameraFile(str(source["file"]), (height, width), grid, tuple(faces), files)
+
+
+def _check(path: Path, cameras: CameraFile, content: dict[str, Any]) -> None:
+    """Compare the matrices with those of the levels: an edited file would put things elsewhere."""
+    stems = [Path(file).stem for file in cameras.files]
+    if len(set(cameras.faces)) < len(stems) or len(set(stems)) < len(stems):
+        raise DataError(path, found="an image twice", expected="every one once", remedy=_REMEDY)
+    try:
+        found = [content["camera"]["matrix"]]
+        found += [image["world_from_camera"] for image in content["images"]]
+        matrices = np.array(found, np.float64)
+    except (KeyError, TypeError, ValueError) as error:
+        raise DataError(path, found=error, expected="3×3 matrices", remedy=_REMEDY) from error
+    grid = cameras.grid
+    expected = [grid.camera_matrix, *(_world_from_camera(grid, face) for face in cameras.faces)]
+    same = matrices.shape == (len(expected), 3, 3)
+    if not same or not np.allclose(matrices, expected, rtol=1e-6, atol=1e-6):
+        raise DataError(
+            path,
+            found="matrices that do not belong to base_level, level, dim and faces",
+            expected="those of its tangent images",
+            remedy=_REMEDY,
+        )
+
+
+def write_colmap(folder: Path, cameras: CameraFile) -> None:
+    """Write ``cameras.txt``, ``images.txt`` and ``points3D.txt`` in COLMAP's text format.
+
+    One PINHOLE camera, its centre counted from pixel corners; for every image the rotation from
+    world to camera as a unit quaternion (w, x, y, z), no translation; no points.
+
+    Args:
+        folder: Where they go; a sparse model for COLMAP.
+        cameras: The images; the world is that of `write_cameras`.
+    """
+    grid = cameras.grid
+    focal, center = 1 / grid.pitch, grid.dim / 2
+    write_text(
+        folder / "cameras.txt",
+        "# CAMERA_ID MODEL WIDTH HEIGHT FX FY CX CY\n"
+        f"1 PINHOLE {grid.dim} {grid.dim} {focal!r} {focal!r} {center!r} {center!r}\n",
+    )
+    lines = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", "# POINTS2D[] (none)"]
+    for number, (face, file) in enumerate(zip(cameras.faces, cameras.files, strict=True), 1):
+        w, x, y, z = _quaternion(_world_from_camera(grid, face).T)
+        lines += [f"{number} {w!r} {x!r} {y!r} {z!r} 0 0 0 1 {file}", ""]
+    write_text(folder / "images.txt", "\n".join(lines) + "\n")
+    write_text(folder / "points3D.txt", "# POINT3D_ID X Y Z R G B ERROR TRACK[]\n")
+
+
+def _quaternion(rotation: NDArray[np.float64]) -> tuple[float, float, float, float]:
+    """Unit quaternion (w, x, y, z), w ≥ 0, of a rotation matrix.
+
+    Its products with each other are sums of the matrix's entries (Shepperd 1978): the row of the
+    largest of them is the quaternion times its largest part.
+    """
+    ((a, b, c), (d, e, f), (g, h, i)) = rotation.tolist()
+    products = np.array(
+        [
+            [1 + a + e + i, h - f, c - g, d - b],
+            [h - f, 1 + a - e - i, b + d, c + g],
+            [c - g, b + d, 1 - a + e - i, f + h],
+            [d - b, c + g, f + h, 1 - a - e + i],
+        ]
+    )
+    row = products[np.diag(products).argmax()]
+    w, x, y, z = (row / np.linalg.norm(row) * (-1 if row[0] < 0 else 1)).tolist()
+    return w, x, y, z
