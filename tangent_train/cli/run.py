@@ -9,6 +9,7 @@ import shutil
 import signal
 import sys
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,12 +37,13 @@ from tangent_train.tasks.checkpoints import (
     LastCheckpoint,
     best_checkpoint,
 )
+from tangent_train.tasks.html.evaluation import write_evaluation_report
+from tangent_train.tasks.networks import completed_settings, make
 from tangent_train.tasks.results import evaluation_results, results_table, write_results
+from tangent_train.tasks.tensorboard_pictures import TrainingSpeed, ValidationPictures
+from tangent_train.tasks.trained import read_checkpoint
 
 __all__ = ["build", "evaluate", "prepare", "train"]
-
-_PRETRAINED = ("weights", "weights_backbone", "encoder_weights")
-"""Settings that name trained weights, in models, torchvision and segmentation-models-pytorch."""
 
 # lightning 2.6 asks torch's tree library in a way torch ≥ 2.13 deprecates: nothing to do about it.
 warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)`", FutureWarning)
@@ -61,7 +63,7 @@ def train(config: DictConfig) -> float | None:
     lightning.seed_everything(config.seed, workers=True, verbose=False)
     resumed = None if config.resume is None else checkpoints / "last.ckpt"
     if resumed is not None:
-        check_resumed(_resolved(config), _checkpoint(resumed)["resolved_config"])
+        check_resumed(_resolved(config), read_checkpoint(resumed)["resolved_config"])
     data, task = build(config)
     if config.init_from is not None and resumed is None:
         origins = initialize(task.network, config.init_from)
@@ -138,13 +140,12 @@ def build(config: DictConfig) -> tuple[Any, Any]:
     _check_compiler(config.task.get("compile"))
     representation = instantiate(config.representation)
     data = instantiate(config.data, representation=representation)
-    known = dict.fromkeys(("num_classes", "classes"), len(data.class_names))
-    known["in_channels"] = data.in_channels
     restored = config.get("resume") is not None or config.get("checkpoint") is not None
     network = OmegaConf.to_container(config.network, resolve=True)
+    classes = len(data.class_names)
     task = instantiate(
         config.task,
-        network=instantiate(_completed(network, known, restored=restored)),
+        network=make(completed_settings(network, data.in_channels, classes, restored=restored)),
         representation=representation,
         class_names=data.class_names,
         optimizer=instantiate(config.optimizer),
@@ -166,19 +167,6 @@ def _check_compiler(compiling: Any) -> None:
             expected="one, for torch.compile",
             remedy="Install one (g++), name it in CXX, or set task.compile=null.",
         )
-
-
-def _completed(settings: Any, known: dict[str, int], *, restored: bool) -> Any:
-    """Settings of a network and of those inside it, with what is `known` where they are null."""
-    if not isinstance(settings, dict):
-        return settings
-    unwanted = _PRETRAINED if restored else ()
-    return {
-        name: known.get(name)
-        if value is None or name in unwanted
-        else _completed(value, known, restored=restored)
-        for name, value in settings.items()
-    }
 
 
 def _try_network(task: Any, representation: Assembler, channels: int) -> None:
@@ -204,7 +192,9 @@ def _trainer(
         "normalization": _plain_normalization(data),
     }
     panels = PredictionPanels(folder / "panels", config.panels)
-    common = [CheckpointContents(contents), panels, ProgressBar()]
+    # Configs of older runs do not have the setting.
+    pictures = ValidationPictures(config.get("tensorboard_images", 0))
+    common = [CheckpointContents(contents), panels, pictures, TrainingSpeed(), ProgressBar()]
     every, epochs = config.trainer.check_val_every_n_epoch, config.trainer.max_epochs
     trainer: lightning.Trainer = instantiate(
         config.trainer,
@@ -225,13 +215,8 @@ def _resolved(config: DictConfig) -> dict[str, Any]:
     return plain
 
 
-def _checkpoint(path: Path) -> dict[str, Any]:
-    content: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-    return content
-
-
 def _test(trainer: lightning.Trainer, task: Any, data: Any, checkpoint: Path, folder: Path) -> None:
-    content = _checkpoint(checkpoint)
+    content = read_checkpoint(checkpoint)
     _check_fits(content, data, checkpoint)
     try:
         task.load_state_dict(content["state_dict"])
@@ -247,6 +232,7 @@ def _test(trainer: lightning.Trainer, task: Any, data: Any, checkpoint: Path, fo
     if results["images"] != total:
         raise RuntimeError(f"{results['images']} of {total} test {data.noun} were counted")
     _report(results, checkpoint, folder)
+    _report_page(results, task.class_names, trainer, checkpoint, folder)
 
 
 def _check_fits(content: dict[str, Any], data: Any, checkpoint: Path) -> None:
@@ -284,6 +270,21 @@ def _report(results: dict[str, Any], checkpoint: Path, folder: Path) -> None:
     console = _console()
     console.print(results_table(results))
     console.print(f"Results, pictures and logs are in {folder} (checkpoint {checkpoint.name}).")
+
+
+@rank_zero_only
+def _report_page(
+    results: dict[str, Any],
+    class_names: Sequence[str],
+    trainer: lightning.Trainer,
+    checkpoint: Path,
+    folder: Path,
+) -> None:
+    callbacks: list[Any] = trainer.callbacks  # type: ignore[attr-defined]
+    images = [i for c in callbacks if isinstance(c, PredictionPanels) for i in c.images]
+    page = folder / "report.html"
+    write_evaluation_report(page, results, class_names, images, checkpoint)
+    _console().print(f"To look at in a browser: {page}")
 
 
 def _run_folder() -> Path:

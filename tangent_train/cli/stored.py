@@ -128,20 +128,9 @@ def checkpoint_config(path: Path) -> dict[str, Any]:
     Raises:
         DataError: The file is missing, no checkpoint, or of another program.
     """
-    import torch
+    from tangent_train.tasks.trained import read_checkpoint
 
-    expected = "a checkpoint written by tangent-train"
-    if not path.is_file():
-        raise DataError(path, found="no such file", expected=expected)
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-    except Exception as error:
-        first_line = str(error).partition("\n")[0]
-        raise DataError(
-            path, found=f"an unreadable file ({first_line})", expected=expected
-        ) from error
-    if not isinstance(content, dict) or "config" not in content or "state_dict" not in content:
-        raise DataError(path, found="no config inside", expected=expected)
+    content = read_checkpoint(path)
     container = OmegaConf.to_container(OmegaConf.create(content["config"]), resolve=False)
     if not isinstance(container, dict):
         raise DataError("stored config", found=type(container).__name__, expected="a mapping")

@@ -8,9 +8,12 @@ from typing import Any
 import cv2
 import lightning
 import numpy as np
+import torch
 from lightning.pytorch.callbacks import Callback, RichProgressBar
 
 from tangent_train.files import write_bytes
+from tangent_train.tasks.html.evaluation import image_note
+from tangent_train.tasks.html.images import EncodedImage, ViewerImage, encode_image
 from tangent_train.tasks.pictures import prediction_panel
 
 __all__ = ["PredictionPanels", "ProgressBar"]
@@ -24,11 +27,23 @@ class PredictionPanels(Callback):
     Args:
         folder: Where to.
         count: How many of them, spread over the test split.
+
+    Attributes:
+        images: The same, compressed, for the viewer of the report; after the test those of all
+            processes, in the order of the split.
     """
 
     def __init__(self, folder: Path | str, count: int = 6) -> None:
         self.folder = Path(folder)
         self.count = count
+        self.images: list[EncodedImage] = []
+        self._encoded: dict[int, EncodedImage] = {}
+
+    def on_test_start(
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
+    ) -> None:
+        """Start anew."""
+        self._encoded = {}
 
     def on_test_batch_end(  # noqa: D102 - a hook of Lightning
         self,
@@ -56,6 +71,25 @@ class PredictionPanels(Callback):
                 encoded = cv2.imencode(".png", cv2.cvtColor(panel, cv2.COLOR_RGB2BGR))[1]
                 name = source.name(index).replace("/", "_")
                 write_bytes(self.folder / f"{name}.png", encoded.tobytes())
+                rgb, truth, labels = shown
+                viewed = ViewerImage(
+                    source.name(index),
+                    rgb,
+                    labels,
+                    truth,
+                    sphere=target.ndim == _PANORAMA_DIMENSIONS,
+                    note=image_note(truth, labels, len(class_names)),
+                )
+                self._encoded[index] = encode_image(viewed, len(class_names))
+
+    def on_test_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Bring together what the processes have."""
+        parts = [self._encoded]
+        if torch.distributed.is_available() and torch.distributed.is_initialized():
+            parts *= trainer.world_size
+            torch.distributed.all_gather_object(parts, self._encoded)
+        together = {index: image for part in parts for index, image in part.items()}
+        self.images = [together[index] for index in sorted(together)]
 
 
 class ProgressBar(RichProgressBar):

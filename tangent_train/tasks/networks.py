@@ -37,9 +37,19 @@ PRETRAINED = ("weights", "weights_backbone", "encoder_weights")
 _EXTRAS = {"segmentation_models_pytorch": "networks"}
 """Packages of networks that an extra of this one installs."""
 
-_PROBED = (1, 2, 4, 8, 16, 32, 64, 128)
-_PROBED_SIDES = (127, 131)
-"""The least height and width to try: primes, which are multiples of nothing smaller."""
+_PROBED = {
+    1: (127, 131),
+    2: (67, 71),
+    4: (37, 41),
+    8: (17, 19),
+    14: (11, 13),
+    16: (11, 13),
+    32: (5, 7),
+    64: (5, 7),
+    128: (5, 7),
+}
+"""What sides may have to be multiples of, and how often they are that when it is tried: primes, so
+that they are multiples of nothing else. 14 is for transformers with such patches."""
 
 
 @dataclass(frozen=True)
@@ -203,19 +213,18 @@ def size_multiple_of(network: nn.Module, in_channels: int) -> int | None:
         in_channels: Channels of its images.
 
     Returns:
-        A power of two from 1 to 128; None when it takes no such size.
+        1, 2, 4, 8, 14, 16, 32, 64 or 128; None when it takes no such size.
     """
-    probe: nn.Module = copy.deepcopy(network).to("meta")  # shapes only: nothing is computed
-    device = "meta"
-    for multiple in _PROBED:
-        size = tuple(-(-side // multiple) | 1 for side in _PROBED_SIDES)  # odd: of no greater one
-        images = (1, in_channels, *(multiple * count for count in size))
-        try:
-            fits = _keeps_size(probe, torch.zeros(images, device=device))
-        except NotImplementedError:  # by an operation that only computes
-            probe, device = network, "cpu"
-            fits = _keeps_size(probe, torch.zeros(images))
-        if fits:
+    shapes_only: nn.Module = copy.deepcopy(network).to("meta")
+    found = _least_multiple(shapes_only, in_channels, "meta")
+    # Some networks look at values, which there are none of there.
+    return found or _least_multiple(network, in_channels, "cpu")
+
+
+def _least_multiple(network: nn.Module, in_channels: int, device: str) -> int | None:
+    for multiple, counts in _PROBED.items():
+        rows, columns = (multiple * count for count in counts)
+        if _keeps_size(network, torch.zeros(1, in_channels, rows, columns, device=device)):
             return multiple
     return None
 
@@ -224,8 +233,6 @@ def size_multiple_of(network: nn.Module, in_channels: int) -> int | None:
 def _keeps_size(network: nn.Module, images: Tensor) -> bool:
     try:
         scores = network(images)
-    except NotImplementedError:
-        raise
     except Exception:  # each network refuses sizes in its own words
         return False
     return tuple(scores.shape[-2:]) == tuple(images.shape[-2:])

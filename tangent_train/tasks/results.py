@@ -10,9 +10,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+from rich.markup import escape
 from rich.table import Table
 
 from tangent_train.files import write_text
+from tangent_train.tasks.losses import UNKNOWN
 from tangent_train.tasks.metrics import (
     BAND_EDGES_DEG,
     AbsentClass,
@@ -20,7 +24,7 @@ from tangent_train.tasks.metrics import (
     segmentation_scores,
 )
 
-__all__ = ["evaluation_results", "results_table", "write_results"]
+__all__ = ["evaluation_results", "largest_loss", "results_table", "write_results"]
 
 _COLUMNS = ("class", "iou", "accuracy", "iou_solid_angle", "accuracy_solid_angle", "share")
 
@@ -103,18 +107,56 @@ def write_results(results: dict[str, Any], folder: Path) -> None:
 
 
 def results_table(results: dict[str, Any]) -> Table:
-    """The per-class table for the terminal.
+    """The per-class table for the terminal, with the largest loss below.
 
     Args:
         results: From `evaluation_results`.
     """
-    table = Table(title=_counted(results))
+    caption = largest_loss(results)
+    table = Table(title=_counted(results), caption=None if caption is None else escape(caption))
     header, *rows = _rows(results)
     for k, name in enumerate(header):
         table.add_column(name, justify="right" if k else "left")
     for row in rows:
         table.add_row(*row, style="bold" if row is rows[-1] else None)
     return table
+
+
+def largest_loss(results: dict[str, Any]) -> str | None:
+    """The class that takes most from the mean IoU, 100 % less its own, and where it went.
+
+    Args:
+        results: From `evaluation_results`.
+
+    Returns:
+        A sentence; None where no class is labelled. Classes without labelled pixels are not named,
+        of equals the one with most.
+    """
+    confusion = np.asarray(results["confusion"], np.float64)
+    labelled = [k for k, row in enumerate(confusion[1:], start=1) if row.any()]
+    if not labelled:
+        return None
+    names = ["unknown", *(entry["class"] for entry in results["classes"])]
+    ious = {k: results["classes"][k - 1]["iou"] for k in labelled}
+    worst = min(labelled, key=lambda k: (float(ious[k]), -confusion[k].sum()))
+    if ious[worst] == 1:
+        return "No loss: every labelled class has 100 % IoU."
+    return f"Largest loss: {names[worst]}, {_percent(ious[worst])} % IoU; " + _where_it_went(
+        confusion, worst, names
+    )
+
+
+def _where_it_went(confusion: NDArray[np.float64], worst: int, names: Sequence[str]) -> str:
+    """What a class is mostly taken for; where all of it was found, what is taken for it."""
+    missed, wrong = confusion[worst].copy(), confusion[:, worst].copy()
+    missed[worst] = wrong[worst] = wrong[UNKNOWN] = 0
+    if missed.any():
+        other = int(missed.argmax())
+        share = _percent(missed[other] / confusion[worst].sum())
+        return f"most often taken for {names[other]} ({share} % of its pixels)."
+    other = int(wrong.argmax())
+    share = _percent(wrong[other] / confusion[UNKNOWN + 1 :, worst].sum())
+    return f"all of it was found, but {share} % of what was taken for it is {names[other]}."
 
 
 def _rows(results: dict[str, Any]) -> list[tuple[str, ...]]:
@@ -132,6 +174,8 @@ def _markdown(results: dict[str, Any]) -> str:
     header, *rows = _rows(results)
     lines = [f"# Results over {_counted(results)}", "", _line(header)]
     lines += [_line(["---"] + ["---:"] * (len(header) - 1)), *map(_line, rows), ""]
+    loss = largest_loss(results)
+    lines += [loss, ""] if loss is not None else []
     if results["latitude_bands"]:
         lines += ["| latitude | mIoU % | mAcc % |", "| --- | ---: | ---: |"]
     for band in results["latitude_bands"]:

@@ -82,6 +82,9 @@ def test_a_run_leaves_everything_in_its_folder(run_folder: Path) -> None:
     picture = cv2.imread(str(panel))
     assert picture is not None
     assert picture.shape[1] == 2 * 512 + 8
+    page = (run_folder / "report.html").read_text()
+    assert all(f"<h2>{title}</h2>" in page for title in ("Validation", "Confusion"))
+    assert page.count('<li><button type="button"><img') == 1
 
 
 def test_checkpoints_hold_tensors_and_plain_values_only(run_folder: Path) -> None:

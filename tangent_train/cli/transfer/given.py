@@ -17,9 +17,6 @@ if TYPE_CHECKING:
 
 __all__ = ["check_given"]
 
-_PRETRAINED = ("network.weights", "network.weights_backbone", "network.encoder_weights")
-"""Where a network began does not matter once it is trained."""
-
 
 def check_given(config: DictConfig, folds: Sequence[int | None]) -> None:
     """Refuse a checkpoint of another network, of other classes or of another fold.
@@ -54,11 +51,15 @@ def check_given(config: DictConfig, folds: Sequence[int | None]) -> None:
 
 
 def _check_network(path: Path, given: dict[str, Any], wanted: dict[str, Any]) -> None:
+    from tangent_train.tasks.networks import PRETRAINED
+
     now, then = (
         {"network": config["network"], "data": {"inputs": config["data"].get("inputs")}}
         for config in (wanted, given)
     )
-    differing = differing_settings(now, then, free=_PRETRAINED)
+    # Where a network began does not matter once it is trained.
+    free = [f"network.{name}" for name in PRETRAINED]
+    differing = differing_settings(now, then, free)
     if differing:
         name, value, before = differing[0]
         raise SettingError(

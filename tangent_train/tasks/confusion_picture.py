@@ -1,0 +1,82 @@
+"""A confusion matrix as a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike, NDArray
+
+__all__ = ["confusion_picture", "row_shares"]
+
+_DPI = 100
+_CELL_IN = 0.34
+"""Side of a class's square in inches, for two digits of `_FONT_PT`."""
+
+_FONT_PT = 8.0
+_LETTER_IN = 0.075
+_LEAST_IN = 2.5
+_DARK = 0.5
+
+
+def row_shares(confusion: ArrayLike) -> NDArray[np.float64]:
+    """Where the labelled pixels of every class went.
+
+    Args:
+        confusion: ``(K+1, K+1)`` counts or weights: rows truth, columns prediction, 0 unknown.
+
+    Returns:
+        ``(K, K)`` shares of 1 of the rows, without the unknown class; NaN in rows of classes that
+        no labelled pixel has.
+    """
+    rows = np.asarray(confusion, np.float64)[1:]
+    total = rows.sum(axis=1, keepdims=True)
+    shares: NDArray[np.float64] = np.full((len(rows), len(rows)), np.nan)
+    np.divide(rows[:, 1:], total, out=shares, where=total > 0)
+    return shares
+
+
+def confusion_picture(confusion: ArrayLike, class_names: Sequence[str]) -> NDArray[np.uint8]:
+    """Where the pixels of every class went: a row per true class, percent of its pixels.
+
+    Numbers are whole percents; what rounds to 0 is left out, rows of classes without labelled
+    pixels are grey.
+
+    Args:
+        confusion: ``(K+1, K+1)`` counts or weights: rows truth, columns prediction, 0 unknown.
+        class_names: K + 1 names, the unknown class first.
+
+    Returns:
+        RGB image, as large as its classes need.
+    """
+    shares, names = row_shares(confusion), class_names[1:]
+    side = _CELL_IN * len(names)
+    margin = 0.5 + _LETTER_IN * max(map(len, names))
+    right, bottom = 0.15, 0.4
+    width, height = max(margin + side + right, _LEAST_IN), margin + side + bottom
+    figure = Figure(figsize=(width, height), dpi=_DPI)
+    canvas: Any = FigureCanvasAgg(figure)
+    axes = figure.add_axes((margin / width, bottom / height, side / width, side / height))
+    axes.set_facecolor("#cccccc")  # seen through NaN
+    axes.imshow(shares, cmap="Blues", vmin=0, vmax=1, aspect="auto", interpolation="nearest")
+    places = range(len(names))
+    axes.set_xticks(places, names, rotation=90, fontsize=_FONT_PT)
+    axes.set_yticks(places, names, fontsize=_FONT_PT)
+    axes.xaxis.tick_top()
+    axes.tick_params(length=0)
+    axes.set_xticks(np.arange(len(names) + 1) - 0.5, minor=True)
+    axes.set_yticks(np.arange(len(names) + 1) - 0.5, minor=True)
+    axes.tick_params(which="minor", length=0)
+    axes.grid(which="minor", color="white", linewidth=0.6)
+    axes.set_ylabel("truth", fontsize=_FONT_PT + 1)
+    axes.set_xlabel("prediction, % of the true class", fontsize=_FONT_PT + 1, loc="left")
+    percents = np.rint(100 * np.nan_to_num(shares)).astype(int)
+    for row, column in np.argwhere(percents):
+        color = "white" if shares[row, column] > _DARK else "black"
+        text = str(percents[row, column])
+        axes.text(column, row, text, ha="center", va="center", color=color, fontsize=_FONT_PT - 1)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()

@@ -1,0 +1,205 @@
+"""The report of an evaluation: its results as tables, its images, the curves of the training."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tangent_train.tasks.html.page import write_report
+from tangent_train.tasks.html.parts import Curve, Table
+from tangent_train.tasks.metrics import segmentation_scores
+from tangent_train.tasks.results import largest_loss
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from tangent_train.tasks.html.images import EncodedImage
+
+__all__ = ["evaluation_tables", "image_note", "training_curves", "write_evaluation_report"]
+
+_CURVES = (
+    ("Training loss", "loss", ("train/loss",)),
+    ("Validation", "%", ("val/miou", "val/macc", "val/miou_solid_angle", "val/macc_solid_angle")),
+    ("Learning rate", "learning rate", ("lr-",)),
+)
+_NAMES = {"miou": "mIoU", "macc": "mAcc"}
+
+
+def write_evaluation_report(
+    path: Path,
+    results: dict[str, Any],
+    class_names: Sequence[str],
+    images: Iterable[EncodedImage],
+    checkpoint: Path,
+) -> None:
+    """Write the report of an evaluation.
+
+    Args:
+        path: The HTML file.
+        results: From `evaluation_results`.
+        class_names: K + 1 names, the unknown class first.
+        images: Some of the images that were scored.
+        checkpoint: What was evaluated; curves are drawn where it lies in the folder of its run.
+    """
+    figures = [
+        f"{name} {_percent(results[key])}\u00a0%"
+        for key, name in (("miou", "mIoU"), ("macc", "mAcc"))
+    ]
+    notes = [f"{', '.join(figures)} over {results['images']} {results['noun']}"]
+    if results["miou_solid_angle"] is not None:
+        solid = (_percent(results[f"{key}_solid_angle"]) for key in _NAMES)
+        notes.append("By solid angle: mIoU {}\u00a0%, mAcc {}\u00a0%.".format(*solid))
+    notes += filter(None, [largest_loss(results)])
+    notes.append(f"Checkpoint: {checkpoint}")
+    write_report(
+        path,
+        f"Evaluation of {checkpoint.name}",
+        tables=evaluation_tables(results),
+        curves=training_curves(checkpoint.resolve().parent.parent),
+        images=images,
+        class_names=class_names,
+        notes=notes,
+    )
+
+
+def evaluation_tables(results: dict[str, Any]) -> list[Table]:
+    """All figures of an evaluation: overall, per class, by latitude, and who is taken for whom.
+
+    Args:
+        results: From `evaluation_results`.
+    """
+    on_sphere = bool(results["latitude_bands"])
+    tables = [_overall(results, on_sphere=on_sphere)]
+    if on_sphere:
+        rows = [
+            (
+                "{}° … {}°".format(*band["latitude_deg"]),
+                _percent(band["miou"]),
+                _percent(band["macc"]),
+            )
+            for band in results["latitude_bands"]
+        ]
+        tables.append(Table("By latitude", ("latitude", "mIoU %", "mAcc %"), rows))
+    return [*tables, _per_class(results, on_sphere=on_sphere), _confusion(results)]
+
+
+def _overall(results: dict[str, Any], *, on_sphere: bool) -> Table:
+    weights = {"by pixels": ""} | ({"by solid angle": "_solid_angle"} if on_sphere else {})
+    rows = [
+        (name, *(_percent(results[f"{key}{suffix}"]) for key in _NAMES))
+        for name, suffix in weights.items()
+    ]
+    absent = "do not count" if results["absent_class"] == "skip" else "count as 0"
+    note = f"{results['images']} {results['noun']}; classes without truth {absent} in the means."
+    return Table("Overall", ("mean", "mIoU %", "mAcc %"), rows, note)
+
+
+def _per_class(results: dict[str, Any], *, on_sphere: bool) -> Table:
+    columns = {"iou": "IoU %", "accuracy": "acc. %", "share": "pixels %"}
+    if on_sphere:
+        columns |= {
+            "iou_solid_angle": "IoU % by solid angle",
+            "accuracy_solid_angle": "acc. % by solid angle",
+        }
+    rows = [
+        (entry["class"], *(_percent(entry[column]) for column in columns))
+        for entry in results["classes"]
+    ]
+    return Table("Per class", ("class", *columns.values()), rows)
+
+
+def _confusion(results: dict[str, Any]) -> Table:
+    names = [entry["class"] for entry in results["classes"]]
+    counts = np.asarray(results["confusion"], np.float64)[1:, 1:]
+    totals = counts.sum(axis=1, keepdims=True)
+    shares = np.divide(counts, totals, out=np.zeros_like(counts), where=totals > 0)
+    rows = [
+        (name, *(f"{100 * share:.0f}" if share >= 0.005 else "" for share in row))
+        for name, row in zip(names, shares, strict=True)
+    ]
+    note = "Rows: truth; columns: prediction; % of the pixels of the row."
+    return Table("Confusion", ("", *names), rows, note, shades=shares.tolist())
+
+
+def image_note(
+    truth: NDArray[np.integer], prediction: NDArray[np.integer], class_count: int
+) -> str:
+    """The scores of one image, for its place in the viewer.
+
+    Args:
+        truth: Class indices, 0 unknown; of any shape.
+        prediction: Likewise, of the same shape.
+        class_count: K + 1.
+
+    Returns:
+        Its mIoU over the classes it holds and the share of right pixels; nothing without truth.
+    """
+    pairs = truth.astype(np.int64).ravel() * class_count + prediction.ravel()
+    counts = np.bincount(pairs, minlength=class_count**2).reshape(class_count, class_count)
+    known = counts[1:].sum()
+    if not known:
+        return ""
+    right = counts.diagonal()[1:].sum() / known
+    miou = segmentation_scores(counts).miou
+    return f"mIoU {_percent(miou)}\u00a0%, {_percent(right)}\u00a0% of pixels right"
+
+
+def training_curves(run_folder: Path) -> list[Curve]:
+    """Loss, validation scores and learning rate that a training logged.
+
+    Args:
+        run_folder: Of the training; its event files are read, if it has any.
+
+    Returns:
+        A curve for each of them that was logged.
+    """
+    logs = run_folder / "tensorboard"
+    if not any(logs.glob("events.out.tfevents.*")):
+        return []
+    # Takes half a second to import.
+    from tensorboard.backend.event_processing.event_accumulator import (  # type: ignore[import-untyped]
+        EventAccumulator,
+    )
+
+    # 0: all scalars, not a sample of them; one picture is the least it keeps.
+    events = EventAccumulator(str(logs), size_guidance={"scalars": 0, "images": 1})
+    events.Reload()
+    logged = {tag: events.Scalars(tag) for tag in events.Tags()["scalars"]}
+    return [
+        curve
+        for title, label, wanted in _CURVES
+        if (curve := _curve(title, label, {t: v for t, v in logged.items() if _is_in(t, wanted)}))
+    ]
+
+
+def _is_in(tag: str, wanted: Sequence[str]) -> bool:
+    return any(tag.startswith(name) if name.endswith("-") else tag == name for name in wanted)
+
+
+def _curve(title: str, label: str, logged: dict[str, Sequence[Any]]) -> Curve | None:
+    """Series over the steps at which any of them was logged."""
+    steps = sorted({event.step for events in logged.values() for event in events})
+    factor = 100 if label == "%" else 1
+    series = {}
+    for tag, events in logged.items():
+        values = {event.step: factor * event.value for event in events}
+        series[_series_name(tag)] = [values.get(step, float("nan")) for step in steps]
+    return Curve(title, label, steps, series, x_label="step") if series else None
+
+
+def _series_name(tag: str) -> str:
+    group, _, name = tag.partition("/")
+    if group == "train":
+        return "training"
+    if group != "val":
+        return tag
+    score, _, weight = name.partition("_")
+    return f"{_NAMES[score]} by solid angle" if weight else _NAMES[score]
+
+
+def _percent(value: float | None) -> str:
+    return "–" if value is None else f"{100 * value:.1f}"

@@ -1,0 +1,217 @@
+"""Panoramas and photos as the compressed files a report holds, within a budget of bytes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+
+from tangent_train.errors import DataError
+from tangent_train.geometry import equirect_solid_angles
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+__all__ = ["BUDGET_BYTES", "MOST_PIXELS", "EncodedImage", "ViewerImage", "encode_image"]
+
+BUDGET_BYTES = 8_000_000
+"""Of the HTML file, for one image with its label maps."""
+
+MOST_PIXELS = 4096
+"""The longer side of an image in the report."""
+
+_QUALITIES = (90, 85, 80, 70, 60, 45, 30)
+_THUMBNAIL_BYTES = 40_000
+_THUMBNAIL_SHAPE = (108, 216)
+_LABEL_VALUES = 256
+
+
+@dataclass(frozen=True)
+class ViewerImage:
+    """An image to look at, with its label maps.
+
+    Attributes:
+        name: Shown beside it.
+        rgb: ``(H, W, 3)`` uint8.
+        prediction: ``(h, w)`` class indices, 0 where there is none; of any size.
+        truth: ``(h, w)`` class indices, 0 unknown; of any size.
+        sphere: Whether it is a whole equirectangular panorama; others are shown flat.
+        note: A line about it, such as a score.
+    """
+
+    name: str
+    rgb: NDArray[np.uint8]
+    prediction: NDArray[np.integer] | None = None
+    truth: NDArray[np.integer] | None = None
+    sphere: bool = True
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class EncodedImage:
+    """A `ViewerImage` compressed: what a report holds of it, and what to keep meanwhile.
+
+    Attributes:
+        name: As given.
+        note: As given.
+        sphere: As given.
+        width: Columns of the image as given.
+        height: Rows of the image as given.
+        jpeg: The image.
+        thumbnail: A small JPEG of it.
+        prediction: 8-bit grey PNG of class indices, perhaps of fewer pixels.
+        truth: Likewise.
+        shares: ``(class index, share of the truth, share of the prediction)``, without the maps
+            that are missing, of the classes that appear; by solid angle on panoramas.
+    """
+
+    name: str
+    note: str
+    sphere: bool
+    width: int
+    height: int
+    jpeg: bytes
+    thumbnail: bytes
+    prediction: bytes | None
+    truth: bytes | None
+    shares: tuple[tuple[float, ...], ...]
+
+
+def encode_image(
+    image: ViewerImage, class_count: int, budget_bytes: int = BUDGET_BYTES
+) -> EncodedImage:
+    """Compress an image so that it takes no more than its share of the report.
+
+    Sides longer than `MOST_PIXELS` are shrunk: colours by area, labels to the nearest. Label maps,
+    exact, may take half of the budget, halved in size until they do; the picture gets the rest, its
+    quality lowered step by step and then its size.
+
+    Args:
+        image: What to show.
+        class_count: K + 1, the unknown class 0 included.
+        budget_bytes: Of the HTML file, where files are written in base64.
+
+    Returns:
+        The compressed image.
+
+    Raises:
+        DataError: Arrays of other shapes or types, or class indices out of range.
+    """
+    _check(image, class_count)
+    height, width = image.rgb.shape[:2]
+    rgb = _shrunk(image.rgb, cv2.INTER_AREA)
+    room = budget_bytes * 3 // 4 - _THUMBNAIL_BYTES
+    maps = {"truth": image.truth, "prediction": image.prediction}
+    labels = {
+        kind: _shrunk(labels.astype(np.uint8, copy=False), cv2.INTER_NEAREST_EXACT)
+        for kind, labels in maps.items()
+        if labels is not None
+    }
+    pngs = _label_pngs(labels, room // 2)
+    scale = max(s / t for s, t in zip(_THUMBNAIL_SHAPE, rgb.shape[:2], strict=True))
+    small = rgb if scale >= 1 else _resized(rgb, scale, cv2.INTER_AREA)
+    return EncodedImage(
+        name=image.name,
+        note=image.note,
+        sphere=image.sphere,
+        width=width,
+        height=height,
+        jpeg=_jpeg_within(rgb, room - sum(map(len, pngs.values()))),
+        thumbnail=_jpeg_within(small, _THUMBNAIL_BYTES // 2),
+        prediction=pngs.get("prediction"),
+        truth=pngs.get("truth"),
+        shares=_shares(list(labels.values()), class_count, sphere=image.sphere),
+    )
+
+
+def _check(image: ViewerImage, class_count: int) -> None:
+    rgb = image.rgb
+    if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8 or not rgb.size:
+        raise DataError(
+            f"image {image.name}",
+            found=f"{rgb.dtype} of shape {rgb.shape}",
+            expected="uint8 of shape (H, W, 3)",
+        )
+    for kind, labels in (("truth", image.truth), ("prediction", image.prediction)):
+        if labels is not None:
+            _check_labels(f"{kind} of {image.name}", labels, min(class_count, _LABEL_VALUES))
+
+
+def _check_labels(name: str, labels: NDArray[np.integer], count: int) -> None:
+    if labels.ndim != 2 or labels.dtype.kind not in "iu" or not labels.size:
+        raise DataError(
+            name,
+            found=f"{labels.dtype} of shape {labels.shape}",
+            expected="whole numbers of shape (H, W)",
+        )
+    least, most = int(labels.min()), int(labels.max())
+    if least < 0 or most >= count:
+        raise DataError(
+            name, found=f"class indices {least} to {most}", expected=f"0 to {count - 1}"
+        )
+
+
+def _shrunk(pixels: NDArray[np.uint8], interpolation: int) -> NDArray[np.uint8]:
+    scale = MOST_PIXELS / max(pixels.shape[:2])
+    return pixels if scale >= 1 else _resized(pixels, scale, interpolation)
+
+
+def _resized(pixels: NDArray[np.uint8], scale: float, interpolation: int) -> NDArray[np.uint8]:
+    height, width = (max(1, round(side * scale)) for side in pixels.shape[:2])
+    resized: Any = cv2.resize(pixels, (width, height), interpolation=interpolation)
+    return resized
+
+
+def _label_pngs(labels: dict[str, NDArray[np.uint8]], room: int) -> dict[str, bytes]:
+    while True:
+        pngs = {kind: _png(indices) for kind, indices in labels.items()}
+        whole = sum(map(len, pngs.values()))
+        if whole <= room or max((v.size for v in labels.values()), default=1) == 1:
+            return pngs
+        labels = {
+            kind: _resized(indices, 0.5, cv2.INTER_NEAREST_EXACT)
+            for kind, indices in labels.items()
+        }
+
+
+def _png(indices: NDArray[np.uint8]) -> bytes:
+    return _encoded(".png", indices, [cv2.IMWRITE_PNG_COMPRESSION, 6])
+
+
+def _jpeg_within(rgb: NDArray[np.uint8], room: int) -> bytes:
+    while True:
+        bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
+        for quality in _QUALITIES:
+            jpeg = _encoded(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
+            if len(jpeg) <= room or rgb[..., 0].size == 1:
+                return jpeg
+        rgb = _resized(rgb, 0.5, cv2.INTER_AREA)
+
+
+def _encoded(suffix: str, pixels: Any, settings: Sequence[int]) -> bytes:
+    return bytes(cv2.imencode(suffix, pixels, settings)[1])
+
+
+def _shares(
+    maps: Sequence[NDArray[np.uint8]], class_count: int, *, sphere: bool
+) -> tuple[tuple[float, ...], ...]:
+    shares = [_class_shares(indices, class_count, sphere=sphere) for indices in maps]
+    return tuple(
+        (index, *(float(share[index]) for share in shares))
+        for index in range(class_count)
+        if any(share[index] > 0 for share in shares)
+    )
+
+
+def _class_shares(
+    indices: NDArray[np.uint8], class_count: int, *, sphere: bool
+) -> NDArray[np.float64]:
+    height, width = indices.shape
+    weights = equirect_solid_angles((height, width)) if sphere else np.ones(height)
+    # Row by row: no array of weights as large as the image.
+    counts = np.stack([np.bincount(row, minlength=class_count) for row in indices])
+    weighed: NDArray[np.float64] = weights.reshape(-1) @ counts
+    return weighed / weighed.sum()

@@ -1,0 +1,235 @@
+// What draws: WebGL 2, or where there is none the flat image on an ordinary canvas.
+
+const LAYERS = ["input", "truth", "prediction", "error", "overlay"];
+const LABELS = ["truth", "prediction"];
+
+async function decode(base64, type, mostPixels) {
+  const text = atob(base64);
+  const bytes = new Uint8Array(text.length);
+  for (let k = 0; k < text.length; k++) bytes[k] = text.charCodeAt(k);
+  const blob = new Blob([bytes], { type });
+  // Class indices must arrive as they are in the file.
+  const exact = { premultiplyAlpha: "none", colorSpaceConversion: "none" };
+  const whole = await createImageBitmap(blob, exact);
+  const shrink = mostPixels / Math.max(whole.width, whole.height);
+  if (shrink >= 1) return whole;
+  const resizeWidth = Math.max(1, Math.floor(whole.width * shrink));
+  const resizeHeight = Math.max(1, Math.floor(whole.height * shrink));
+  whole.close();
+  const resizeQuality = type === "image/png" ? "pixelated" : "high";
+  return createImageBitmap(blob, { ...exact, resizeWidth, resizeHeight, resizeQuality });
+}
+
+async function decodeImage(data, mostPixels) {
+  const image = { input: await decode(data.input, "image/jpeg", mostPixels) };
+  for (const kind of LABELS) {
+    image[kind] = data[kind] ? await decode(data[kind], "image/png", mostPixels) : null;
+  }
+  return image;
+}
+
+function pixelAt(u, v, width, height) {
+  return [Math.floor(u * width) % width, Math.min(Math.floor(v * height), height - 1)];
+}
+
+class GlSurface {
+  static open(canvas) {
+    const gl = canvas.getContext("webgl2", { antialias: false, alpha: false });
+    return gl ? new GlSurface(gl) : null;
+  }
+
+  constructor(gl) {
+    this.gl = gl;
+    this.projections = ["inside", "planet", "flat"];
+    this.build();
+  }
+
+  // Everything the context holds: again after it was lost.
+  build() {
+    const { gl } = this;
+    this.mostPixels = gl.getParameter(gl.MAX_TEXTURE_SIZE);
+    this.textures = {};
+    this.program = this.link();
+    gl.useProgram(this.program);
+    this.framebuffer = gl.createFramebuffer();
+    ["input", ...LABELS, "classes"].forEach((name, unit) => {
+      this.textures[name] = this.texture(unit);
+      this.set("uniform1i", `u${name[0].toUpperCase()}${name.slice(1)}`, unit);
+    });
+  }
+
+  link() {
+    const { gl } = this;
+    // One triangle that covers the canvas.
+    const corners = `#version 300 es
+      void main() {
+        gl_Position = vec4(gl_VertexID == 1 ? 3 : -1, gl_VertexID == 2 ? 3 : -1, 0, 1);
+      }`;
+    const fragments = document.getElementById("shader").textContent.trim();
+    const program = gl.createProgram();
+    for (const [kind, source] of [[gl.VERTEX_SHADER, corners], [gl.FRAGMENT_SHADER, fragments]]) {
+      const shader = gl.createShader(kind);
+      gl.shaderSource(shader, source);
+      gl.compileShader(shader);
+      gl.attachShader(program, shader);
+    }
+    gl.linkProgram(program);
+    if (!gl.getProgramParameter(program, gl.LINK_STATUS) && !gl.isContextLost()) {
+      const logs = gl.getAttachedShaders(program).map((shader) => gl.getShaderInfoLog(shader));
+      throw new Error(`The viewer's shader: ${logs.join(" ")} ${gl.getProgramInfoLog(program)}`);
+    }
+    return program;
+  }
+
+  texture(unit) {
+    const { gl } = this;
+    const texture = gl.createTexture();
+    gl.activeTexture(gl.TEXTURE0 + unit);
+    gl.bindTexture(gl.TEXTURE_2D, texture);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE);
+    return texture;
+  }
+
+  set(method, name, ...values) {
+    this.gl[method](this.gl.getUniformLocation(this.program, name), ...values);
+  }
+
+  load(image, sphere) {
+    const { gl } = this;
+    gl.pixelStorei(gl.UNPACK_COLORSPACE_CONVERSION_WEBGL, gl.NONE);
+    gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+    gl.activeTexture(gl.TEXTURE0);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, image.input);
+    gl.generateMipmap(gl.TEXTURE_2D);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR_MIPMAP_LINEAR);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.LINEAR);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_S, sphere ? gl.REPEAT : gl.CLAMP_TO_EDGE);
+    this.set("uniform1i", "uSphere", sphere);
+    this.set("uniform1i", "uHasTruth", image.truth !== null);
+    this.set("uniform1i", "uHasPrediction", image.prediction !== null);
+    this.sizes = {};
+    LABELS.forEach((kind, k) => {
+      gl.activeTexture(gl.TEXTURE1 + k);
+      const map = image[kind] ?? new ImageData(1, 1);
+      gl.texImage2D(gl.TEXTURE_2D, 0, gl.R8, gl.RED, gl.UNSIGNED_BYTE, map);
+      this.sizes[kind] = image[kind] && [map.width, map.height];
+    });
+    for (const bitmap of Object.values(image)) bitmap?.close();
+  }
+
+  paint(classes, hidden) {
+    const { gl } = this;
+    const colors = new Uint8Array(4 * 256);
+    classes.forEach(({ rgb }, k) => colors.set([...rgb, hidden.has(k) ? 0 : 255], 4 * k));
+    gl.activeTexture(gl.TEXTURE3);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, 256, 1, 0, gl.RGBA, gl.UNSIGNED_BYTE, colors);
+  }
+
+  draw(view, layer, opacity) {
+    const { gl } = this;
+    gl.viewport(0, 0, gl.canvas.width, gl.canvas.height);
+    this.set("uniform2f", "uCanvas", gl.canvas.width, gl.canvas.height);
+    this.set("uniform2f", "uCenter", view.u, view.v);
+    this.set("uniform1f", "uReach", view.reach);
+    this.set("uniform1f", "uAspect", view.image.aspect);
+    this.set("uniform1f", "uOpacity", opacity);
+    this.set("uniform1i", "uProjection", PROJECTIONS[view.projection].index);
+    this.set("uniform1i", "uLayer", LAYERS.indexOf(layer));
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  // Class index of a label map at {u, v}, read back from the texture; null without such a map.
+  classAt(kind, { u, v }) {
+    const { gl } = this;
+    if (!this.sizes?.[kind]) return null;
+    const [width, height] = this.sizes[kind];
+    const pixel = new Uint8Array(4);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.framebuffer);
+    const target = [gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D];
+    gl.framebufferTexture2D(...target, this.textures[kind], 0);
+    const [column, row] = pixelAt(u, v, width, height);
+    gl.readPixels(column, row, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    return pixel[0];
+  }
+}
+
+class FlatSurface {
+  constructor(canvas) {
+    this.context = canvas.getContext("2d");
+    this.projections = ["flat"];
+    this.mostPixels = 1024;
+  }
+
+  load(image) {
+    const [width, height] = [image.input.width, image.input.height];
+    this.sheet = new OffscreenCanvas(width, height);
+    this.pixels = {};
+    for (const [kind, bitmap] of Object.entries(image)) {
+      if (!bitmap) continue;
+      const settings = { willReadFrequently: true };
+      const scratch = new OffscreenCanvas(width, height).getContext("2d", settings);
+      scratch.imageSmoothingEnabled = false;
+      scratch.drawImage(bitmap, 0, 0, width, height);
+      this.pixels[kind] = scratch.getImageData(0, 0, width, height).data;
+      bitmap.close();
+    }
+    this.painted = null;
+  }
+
+  paint(classes, hidden) {
+    [this.classes, this.hidden, this.painted] = [classes, hidden, null];
+  }
+
+  draw(view, layer, opacity) {
+    const { context, sheet } = this;
+    const { canvas } = context;
+    if (this.painted !== layer + opacity) this.compose(layer, opacity);
+    this.painted = layer + opacity;
+    const width = Math.max(canvas.width, canvas.height) / view.extent;
+    const height = width / view.image.aspect;
+    const left = canvas.width / 2 - view.u * width;
+    context.fillStyle = "#16181c";
+    context.fillRect(0, 0, canvas.width, canvas.height);
+    const top = canvas.height / 2 - view.v * height;
+    for (const turn of view.image.sphere ? [-1, 0, 1] : [0]) {
+      context.drawImage(sheet, left + turn * width, top, width, height);
+    }
+  }
+
+  compose(layer, opacity) {
+    const { truth, prediction, input } = this.pixels;
+    const result = new ImageData(this.sheet.width, this.sheet.height);
+    for (let k = 0; k < input.length; k += 4) {
+      const under = [input[k], input[k + 1], input[k + 2]];
+      const color = this.shown(layer, opacity, under, truth?.[k] ?? 0, prediction?.[k]);
+      result.data.set([...color, 255], k);
+    }
+    this.sheet.getContext("2d").putImageData(result, 0, 0);
+  }
+
+  // One pixel, as in the shader.
+  shown(layer, opacity, under, truth, prediction) {
+    if (layer === "input") return under;
+    const index = layer === "truth" || layer === "error" ? truth : (prediction ?? truth);
+    const visible = !this.hidden.has(index);
+    const { rgb } = this.classes[index];
+    const grey = 0.299 * under[0] + 0.587 * under[1] + 0.114 * under[2];
+    if (layer === "overlay") {
+      return visible && index ? under.map((c, k) => c + opacity * (rgb[k] - c)) : under;
+    }
+    if (!visible) return Array(3).fill(0.4 * grey);
+    if (layer !== "error") return rgb;
+    if (!truth) return [110, 110, 110];
+    return truth === prediction ? Array(3).fill(191.25 + 0.25 * grey) : [214, 39, 40];
+  }
+
+  classAt(kind, { u, v }) {
+    if (!this.pixels?.[kind]) return null;
+    const { width, height } = this.sheet;
+    const [column, row] = pixelAt(u, v, width, height);
+    return this.pixels[kind][4 * (row * width + column)];
+  }
+}

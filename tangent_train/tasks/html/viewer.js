@@ -1,0 +1,281 @@
+// The viewer of a report: one panorama or photo at a time, decoded when it is chosen.
+
+class Viewer {
+  constructor(section) {
+    this.section = section;
+    this.canvas = this.find("canvas");
+    this.classes = JSON.parse(document.getElementById("classes").textContent);
+    this.hidden = new Set();
+    this.layer = "overlay";
+    this.opacity = 0.55;
+    this.view = new View();
+    this.surface = this.open();
+    this.connect();
+    this.choose(this.items[0]);
+  }
+
+  find(selector) {
+    return this.section.querySelector(selector);
+  }
+
+  get items() {
+    return [...this.section.querySelectorAll(".gallery button")];
+  }
+
+  open() {
+    try {
+      const surface = GlSurface.open(this.canvas);
+      if (surface) return surface;
+      this.say("This browser offers no WebGL 2: images are shown flat.");
+    } catch (error) {
+      this.say(`WebGL does not work here, images are shown flat. ${error.message}`);
+      const fresh = this.canvas.cloneNode(); // one that had a context cannot have another
+      this.canvas.replaceWith(fresh);
+      this.canvas = fresh;
+    }
+    this.view.projection = "flat";
+    return new FlatSurface(this.canvas);
+  }
+
+  say(text) {
+    this.find(".message").textContent = text;
+  }
+
+  // Images ------------------------------------------------------------------------------------
+
+  async choose(item) {
+    for (const other of this.items) other.setAttribute("aria-current", String(other === item));
+    this.bringIntoStrip(item);
+    this.current = item;
+    this.section.classList.add("busy");
+    try {
+      const data = JSON.parse(item.nextElementSibling.textContent);
+      const image = await decodeImage(data, this.surface.mostPixels);
+      if (this.current === item) this.show(data, image);
+    } catch (error) {
+      this.say(`${item.textContent.trim()} cannot be shown: ${error.message}`);
+    } finally {
+      if (this.current === item) this.section.classList.remove("busy");
+    }
+  }
+
+  // Not scrollIntoView, which would move the page as well.
+  bringIntoStrip(item) {
+    const strip = this.find(".gallery");
+    const [outer, inner] = [strip.getBoundingClientRect(), item.getBoundingClientRect()];
+    const [left, right] = [outer.left + 8 - inner.left, inner.right + 8 - outer.right];
+    strip.scrollLeft += Math.max(0, right) - Math.max(0, left);
+  }
+
+  show(data, image) {
+    this.data = data;
+    const aspect = image.input.width / image.input.height;
+    this.surface.load(image, data.sphere);
+    this.surface.paint(this.classes, this.hidden);
+    this.view.show({ sphere: data.sphere, aspect });
+    if (this.surface.projections.length === 1) this.view.projection = "flat";
+    this.view.resize(this.canvas.clientWidth, this.canvas.clientHeight);
+    this.find(".caption").textContent = [data.name, data.note].filter(Boolean).join(" · ");
+    this.offerLayers();
+    this.offerProjections();
+    this.fillLegend();
+    this.redraw();
+  }
+
+  offers(layer) {
+    const { truth, prediction } = this.data;
+    if (layer === "input") return true;
+    if (layer === "error") return Boolean(truth && prediction);
+    if (layer === "overlay") return Boolean(truth || prediction);
+    return Boolean(this.data[layer]);
+  }
+
+  offerLayers() {
+    for (const radio of this.section.querySelectorAll("input[name=layer]")) {
+      radio.closest("label").hidden = !this.offers(radio.value);
+    }
+    this.setLayer(this.offers(this.layer) ? this.layer : "input");
+  }
+
+  setLayer(layer) {
+    if (!this.data || !this.offers(layer)) return;
+    this.layer = layer;
+    this.find(`input[name=layer][value=${layer}]`).checked = true;
+    this.find(".opacity").hidden = layer !== "overlay";
+    this.find(".errors").hidden = layer !== "error";
+    this.redraw();
+  }
+
+  offerProjections() {
+    const select = this.find(".projection");
+    select.hidden = !this.data.sphere || this.surface.projections.length === 1;
+    select.value = this.view.projection;
+  }
+
+  // Legend ------------------------------------------------------------------------------------
+
+  fillLegend() {
+    const columns = LABELS.filter((kind) => this.data[kind]);
+    this.find(".legend").hidden = columns.length === 0;
+    this.find(".shares").textContent = columns.length ? `share of ${columns.join(" / ")}, %` : "";
+    const entries = this.data.shares.map(([index, ...shares]) => this.legendEntry(index, shares));
+    this.find(".legend ul").replaceChildren(...entries);
+  }
+
+  legendEntry(index, shares) {
+    const entry = document.getElementById("legend-entry").content.cloneNode(true);
+    const box = entry.querySelector("input");
+    [box.checked, box.value] = [!this.hidden.has(index), index];
+    entry.querySelector(".swatch").style.background = `rgb(${this.classes[index].rgb.join(" ")})`;
+    entry.querySelector(".name").textContent = this.classes[index].name;
+    const percent = (share) => (share === 0 ? "–" : (100 * share).toFixed(1));
+    entry.querySelector(".share").textContent = shares.map(percent).join(" / ");
+    return entry;
+  }
+
+  toggle(boxes, checked) {
+    for (const box of boxes) {
+      box.checked = checked;
+      this.hidden[checked ? "delete" : "add"](Number(box.value));
+    }
+    this.surface.paint(this.classes, this.hidden);
+    this.redraw();
+  }
+
+  // Drawing -----------------------------------------------------------------------------------
+
+  redraw() {
+    this.frame ??= requestAnimationFrame(() => {
+      this.frame = null;
+      if (this.data) this.draw();
+    });
+  }
+
+  draw() {
+    const { canvas, view } = this;
+    const density = Math.min(window.devicePixelRatio || 1, 2);
+    const width = Math.max(1, Math.round(canvas.clientWidth * density));
+    const height = Math.max(1, Math.round(canvas.clientHeight * density));
+    if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
+    view.resize(canvas.clientWidth, canvas.clientHeight);
+    this.surface.draw(view, this.layer, this.opacity);
+    const closer = (view.limits.most / view.extent).toFixed(1);
+    const zoom = view.projection === "flat" ? `× ${closer}` : `${view.extent.toFixed(0)}° wide`;
+    this.find(".looking").textContent = `Looking at ${this.place(view)} · ${zoom}`;
+    this.readOut();
+  }
+
+  place({ u, v }) {
+    const { sphere, width, height } = this.data;
+    if (!sphere) return `column ${Math.floor(u * width)}, row ${Math.floor(v * height)}`;
+    const degrees = (value) => `${value.toFixed(1).replace(/^-0\.0$/, "0.0").replace("-", "−")}°`;
+    return `longitude ${degrees((u - 0.5) * 360)}, latitude ${degrees((0.5 - v) * 180)}`;
+  }
+
+  readOut() {
+    const { pointer } = this.gestures;
+    const at = pointer ? this.view.locate(...pointer) : this.view;
+    const found = [];
+    for (const kind of at ? LABELS : []) {
+      const index = this.surface.classAt(kind, at);
+      if (index !== null) found.push(`${kind}: ${this.classes[index]?.name ?? index}`);
+    }
+    const where = pointer && at ? this.place(at) : "in the middle";
+    const shown = at && (pointer || found.length);
+    this.find(".readout").textContent = shown ? [where, ...found].join(" · ") : "";
+  }
+
+  // Events ------------------------------------------------------------------------------------
+
+  connect() {
+    const { canvas, section } = this;
+    this.gestures = new Gestures(this);
+    section.addEventListener("keydown", (event) => this.key(event));
+    section.addEventListener("change", (event) => this.changed(event.target));
+    section.addEventListener("click", (event) => this.clicked(event.target.closest("button")));
+    this.find(".opacity input").addEventListener("input", (event) => {
+      this.opacity = event.target.value / 100;
+      this.redraw();
+    });
+    canvas.addEventListener("webglcontextlost", (event) => {
+      event.preventDefault();
+      [this.data, this.surface.sizes] = [null, null];
+      this.say("The graphics card was taken away; the picture comes back with it.");
+    });
+    canvas.addEventListener("webglcontextrestored", () => {
+      this.surface.build();
+      this.say("");
+      this.choose(this.current);
+    });
+    this.find(".full").hidden = !document.fullscreenEnabled;
+    new ResizeObserver(() => this.redraw()).observe(canvas);
+  }
+
+  changed(control) {
+    if (control.name === "layer") this.setLayer(control.value);
+    else if (control.name === "class") this.toggle([control], control.checked);
+    else if (control.classList.contains("projection")) {
+      this.view.project(control.value);
+      this.redraw();
+    }
+  }
+
+  clicked(button) {
+    if (!button) return;
+    const boxes = this.section.querySelectorAll("input[name=class]");
+    const actions = {
+      all: () => this.toggle(boxes, true),
+      none: () => this.toggle(boxes, false),
+      in: () => this.view.zoom(1.3),
+      out: () => this.view.zoom(1 / 1.3),
+      reset: () => this.view.reset(),
+      full: () => this.fullScreen(),
+    };
+    if (button.closest(".gallery")) this.choose(button);
+    actions[button.dataset.action]?.();
+    this.redraw();
+  }
+
+  fullScreen() {
+    if (!document.fullscreenEnabled) return;
+    if (document.fullscreenElement) document.exitFullscreen();
+    else this.find(".panel").requestFullscreen();
+  }
+
+  key(event) {
+    if (event.ctrlKey || event.metaKey || event.altKey) return;
+    const elsewhere = event.target !== this.canvas;
+    if (event.target.matches("select, input[type=range]")) return;
+    if (elsewhere && event.key.startsWith("Arrow")) return; // moves between radio buttons
+    const { view } = this;
+    const step = view.half / 8;
+    const actions = {
+      ArrowLeft: () => view.pan(step, 0),
+      ArrowRight: () => view.pan(-step, 0),
+      ArrowUp: () => view.pan(0, step),
+      ArrowDown: () => view.pan(0, -step),
+      "+": () => view.zoom(1.25),
+      "=": () => view.zoom(1.25),
+      "-": () => view.zoom(0.8),
+      0: () => view.reset(),
+      Home: () => view.reset(),
+      PageUp: () => this.neighbour(-1),
+      PageDown: () => this.neighbour(1),
+      f: () => this.fullScreen(),
+    };
+    LAYERS.forEach((layer, k) => (actions[k + 1] = () => this.setLayer(layer)));
+    if (!actions[event.key]) return;
+    event.preventDefault();
+    this.gestures.pointer = null; // the readout follows the middle
+    actions[event.key]();
+    this.redraw();
+  }
+
+  neighbour(step) {
+    const { items } = this;
+    this.choose(items[(items.indexOf(this.current) + step + items.length) % items.length]);
+  }
+}
+
+const section = document.getElementById("viewer");
+if (section) new Viewer(section);

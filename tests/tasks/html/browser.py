@@ -1,0 +1,154 @@
+"""A real browser at a report."""
+
+from __future__ import annotations
+
+import shutil
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+import pytest
+from playwright.sync_api import Page, sync_playwright
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+    from playwright.sync_api import Browser, ConsoleMessage, FloatRect
+
+PROGRAMS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+# WebGL on the processor; no sandbox, as containers often run as root.
+ARGUMENTS = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox")
+NO_WEBGL = """const original = HTMLCanvasElement.prototype.getContext;
+HTMLCanvasElement.prototype.getContext = function (kind, ...rest) {
+  return kind.startsWith("webgl") ? null : original.call(this, kind, ...rest);
+};"""
+# Two frames: what an event asked for has been drawn.
+DRAWN = "() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
+
+
+@contextmanager
+def chromium() -> Iterator[Browser]:
+    """The Chromium of the system, or a skip that says there is none."""
+    program = next(filter(None, map(shutil.which, PROGRAMS)), None)
+    if program is None:
+        pytest.skip(f"no browser: none of {', '.join(PROGRAMS)} is on the path")
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=program, args=list(ARGUMENTS))
+        yield browser
+        browser.close()
+
+
+@dataclass
+class OpenReport:
+    """A report in the browser.
+
+    Attributes:
+        page: Of the browser.
+        problems: Errors, warnings and requests since it was opened.
+    """
+
+    page: Page
+    problems: list[str] = field(default_factory=list)
+
+    def text(self, selector: str) -> str:
+        """What stands there."""
+        return self.page.locator(selector).inner_text().strip()
+
+    def drawn(self) -> None:
+        """Wait until all images are decoded and drawn."""
+        self.page.wait_for_selector("#viewer:not(.busy) .caption:not(:empty)", timeout=20_000)
+        self.page.evaluate(DRAWN)
+
+    def choose(self, number: int) -> None:
+        """Click an image of the strip."""
+        self.page.locator(".gallery button").nth(number).click()
+        self.page.wait_for_selector(f".gallery li:nth-child({number + 1}) [aria-current=true]")
+        self.drawn()
+
+    def layer(self, name: str) -> None:
+        """Choose a layer."""
+        self.page.locator(f"input[name=layer][value={name}]").check()
+        self.drawn()
+
+    def project(self, name: str) -> None:
+        """Choose a projection."""
+        self.page.locator(".projection").select_option(name)
+        self.drawn()
+
+    def press(self, *keys: str) -> None:
+        """Press keys with the picture in focus."""
+        self.page.locator("canvas").focus()
+        for key in keys:
+            self.page.keyboard.press(key)
+        self.drawn()
+
+    def box(self) -> tuple[float, float, float, float]:
+        """Left, top, width and height of the picture."""
+        box = self.page.locator("canvas").bounding_box()
+        assert box is not None
+        return box["x"], box["y"], box["width"], box["height"]
+
+    def middle(self) -> tuple[float, float]:
+        """The middle of the picture on the page."""
+        x, y, width, height = self.box()
+        return x + width / 2, y + height / 2
+
+    def drag(self, dx: float, dy: float) -> None:
+        """Drag the picture with the mouse, from its middle."""
+        x, y = self.middle()
+        self.page.mouse.move(x, y)
+        self.page.mouse.down()
+        self.page.mouse.move(x + dx, y + dy)
+        self.page.mouse.up()
+        self.drawn()
+
+    def pixels(self) -> NDArray[np.int64]:
+        """What the canvas shows, ``(height, width, 3)``, without what lies on it."""
+        self.page.locator("canvas").scroll_into_view_if_needed()
+        for shown in ("hidden", ""):
+            if shown == "":
+                png = self.page.screenshot(clip=self._clip())
+            above = self.page.locator(".buttons, .errors")
+            above.evaluate_all("(all, v) => all.forEach((e) => (e.style.visibility = v))", shown)
+        pixels: Any = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+        return pixels[..., ::-1].astype(np.int64)
+
+    def _clip(self) -> FloatRect:
+        """The canvas in whole pixels of the window."""
+        x, y, width, height = self.box()
+        return {"x": round(x), "y": round(y), "width": int(width), "height": int(height)}
+
+    def center(self) -> NDArray[np.int64]:
+        """The colour in the middle of the canvas."""
+        pixels = self.pixels()
+        return pixels[pixels.shape[0] // 2, pixels.shape[1] // 2]
+
+
+@contextmanager
+def opened(
+    browser: Browser, path: Path, *, script: str | None = None, **context: Any
+) -> Iterator[OpenReport]:
+    """A report in a window of its own; afterwards nothing must have gone wrong or been fetched."""
+    context.setdefault("viewport", {"width": 600, "height": 800})
+    window = browser.new_context(**context)
+    window.set_default_timeout(20_000)
+    report = OpenReport(window.new_page())
+    if script is not None:
+        report.page.add_init_script(script)
+
+    def heard(message: ConsoleMessage) -> None:
+        report.problems.append(f"{message.type}: {message.text}")
+
+    report.page.on("console", heard)
+    report.page.on("pageerror", lambda error: report.problems.append(str(error)))
+    report.page.on("request", lambda request: report.problems.append(request.url[:200]))
+    report.page.goto(path.as_uri())
+    report.drawn()
+    yield report
+    window.close()
+    fetched = [url for url in report.problems if not url.startswith("data:image/")]
+    assert fetched == [path.as_uri()]
