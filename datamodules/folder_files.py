@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from datamodules.image_files import find_images, read_depth_size, read_image_size
+from datamodules.image_files import DEPTH_SUFFIXES, find_images, read_depth_size, read_image_size
 from datamodules.image_opening import open_image
 from datamodules.png import check_panorama_size, read_png_header
 from tangent_train.errors import DataError
@@ -19,16 +19,12 @@ if TYPE_CHECKING:
     from datamodules.folder_classes import FolderClasses
 
 __all__ = [
-    "DEPTH_SUFFIXES",
     "PanoramaFiles",
     "check_class_codes",
     "check_panorama",
     "list_panoramas",
     "read_codes",
 ]
-
-DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".npy", ".exr")
-"""What names of depth files end in."""
 
 _LAYOUT = "images/, labels/ and classes.json, see docs/own_data.md"
 _TRIED = 4

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import numpy as np
-
+from datamodules.group_drawing import draw_groups
 from datamodules.segmentation_module import SPLITS, Split
 from tangent_train.errors import DataError, SettingError
 
@@ -120,17 +119,15 @@ class FolderSplits:
 
     def _draw(self, split: Split, panoramas: Sequence[PanoramaFiles], fraction: float) -> set[str]:
         """The names in some scenes, the same for the same seed."""
-        scenes = sorted({files.scene for files in panoramas})
-        if len(scenes) < 2:
+        scenes = {files.scene for files in panoramas}
+        drawn = draw_groups(scenes, fraction, [self.seed, SPLITS.index(split)])
+        if not drawn:
             raise DataError(
                 self.root / "images",
                 found=f"{len(scenes)} scenes to draw those of {split} from",
                 expected="two or more: first folders, or images that are in none",
                 remedy=f"Have more of them, or {_named_in(split)}.",
             )
-        count = min(max(1, round(fraction * len(scenes))), len(scenes) - 1)
-        order = np.random.default_rng([self.seed, SPLITS.index(split)]).permutation(len(scenes))
-        drawn = {scenes[place] for place in order[:count]}
         return {files.name for files in panoramas if files.scene in drawn}
 
     def _some(self, split: Split, names: set[str]) -> set[str]:

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from PIL import Image
 
 __all__ = [
+    "DEPTH_SUFFIXES",
     "IMAGE_SUFFIXES",
     "find_images",
     "photo_fov_deg",
@@ -33,6 +34,9 @@ __all__ = [
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
 """What names of images end in, in lower case."""
+
+DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".npy", ".exr")
+"""What names of depth files end in."""
 
 _BAND_ROWS = 256
 _MOST_M = 1e4  # what lies farther marks missing depth: some files have 1e10 there

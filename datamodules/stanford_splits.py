@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
+from datamodules.group_drawing import draw_groups
 from datamodules.label_table import LabelTable
 from datamodules.segmentation_module import Split
 from datamodules.stanford_files import AREAS, FOLDS, GET_IT, PictureFiles
@@ -130,14 +129,12 @@ class StanfordSplits:
         """Draw the rooms for validation, the same for the same seed."""
         if self._fraction == 0:
             return set()
-        rooms = sorted({picture.room for picture in files})
-        if len(rooms) == 1:
+        rooms = draw_groups((picture.room for picture in files), self._fraction, self._seed)
+        if files and not rooms:
             raise DataError(
                 self.root,
                 found="one training room",
                 expected="two or more, to keep some for validation",
                 remedy="Set data.validation_fraction=0, or use more rooms.",
             )
-        count = min(max(1, round(self._fraction * len(rooms))), len(rooms) - 1)
-        order = np.random.default_rng(self._seed).permutation(len(rooms))
-        return {rooms[i] for i in order[:count]}
+        return rooms
