@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
@@ -28,6 +28,9 @@ Level = int | Literal["image"] | None
 
 Done = Callable[[float], None]
 """Is told what share of an image has been done since the last time."""
+
+_FORMAT: Any = torch.channels_last
+"""Of images and network: half the time of a UNet on a CPU."""
 
 _PIXELS_AT_ONCE = 2**20
 """Pixels the network sees at once, if nothing else is asked for."""
@@ -82,7 +85,7 @@ class Runner:
             raise SettingError("images_per_forward", found=views_at_once, expected="1 or more")
         try:
             self._device = torch.device(device)
-            self._network = trained.network.to(self._device)
+            self._network = trained.network.to(self._device, memory_format=_FORMAT)
         except (RuntimeError, AssertionError) as error:  # torch says so when it lacks CUDA
             raise SettingError(
                 "device", found=f"{device} ({error})", expected="cpu, or a device of this machine"
@@ -100,5 +103,6 @@ class Runner:
     def scores(self, image: InputImage, views: Views) -> Tensor:
         """``(n, K, h, w)`` scores of the views; the unknown class, never predicted, is left out."""
         inputs = [part.to(self._device) for part in render_inputs(image.rgb, image.depth, views)]
-        scores: Tensor = self._network(normalize(inputs, self._normalization))
+        images = normalize(inputs, self._normalization).contiguous(memory_format=_FORMAT)
+        scores: Tensor = self._network(images)
         return scores[:, 1:]

@@ -21,6 +21,7 @@ from tangent_train.tasks.reports.cells import (
     text,
 )
 from tangent_train.tasks.reports.groups import Figure, Group
+from tangent_train.tasks.reports.losses import largest_losses
 from tangent_train.tasks.reports.paper import CLASSES, STANFORD_ROWS, PaperRow
 from tangent_train.tasks.reports.runs import MEANS, PER_CLASS
 
@@ -58,6 +59,7 @@ class _Section:
     remark: str
     overall: list[Cells]
     per_class: dict[str, list[Cells]]
+    losses: list[str]
 
 
 def notes(groups: Sequence[Group]) -> list[str]:
@@ -100,6 +102,7 @@ def report_markdown(groups: Sequence[Group], remarks: Sequence[str]) -> str:
         lines += [*markdown_table(section.overall, left=3), ""]
         for title, cells in section.per_class.items():
             lines += [f"### {title}", "", *markdown_table(cells, left=1), ""]
+        lines += [*(f"- {sentence}" for sentence in section.losses), ""] if section.losses else []
     lines += [f"- {remark}" for remark in remarks]
     lines += ["", "| group | fold | seed | run |", "| --- | ---: | ---: | --- |"]
     lines += [
@@ -117,7 +120,12 @@ def report_tables(groups: Sequence[Group]) -> list[Table]:
         groups: From `groups.group_runs`.
     """
     return [
-        terminal_table(section.title, section.overall, (1, 2), section.remark)
+        terminal_table(
+            section.title,
+            section.overall,
+            (1, 2),
+            "\n".join(filter(None, (section.remark, *section.losses))),
+        )
         for section in _sections(groups)
     ]
 
@@ -212,7 +220,8 @@ def _sections(groups: Sequence[Group]) -> list[_Section]:
             "IoU %": _per_class(ranked, members[0].class_names, "iou"),
         }
         overall = [_OVERALL, *map(_overall, ranked)]
-        sections.append(_Section(title, MADE_ROOMS if made else "", overall, per_class))
+        remark, losses = MADE_ROOMS if made else "", largest_losses(members)
+        sections.append(_Section(title, remark, overall, per_class, losses))
     return sections
 
 

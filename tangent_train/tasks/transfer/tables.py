@@ -22,6 +22,7 @@ from tangent_train.tasks.transfer.cells import (
     overall_cells,
     scope_text,
 )
+from tangent_train.tasks.transfer.losses import largest_losses
 from tangent_train.tasks.transfer.report import Row, TransferReport
 
 __all__ = [
@@ -117,6 +118,8 @@ def transfer_markdown(report: TransferReport) -> str:
             *markdown_table(rows, left=1),
             "",
         ]
+    losses = [f"- {sentence}" for sentence in largest_losses(report)]
+    lines += [*losses, ""] if losses else []
     bands = band_cells(report)
     if bands:
         title = f"## mIoU % by latitude, {scope_text(report)}"
@@ -135,13 +138,14 @@ def transfer_markdown(report: TransferReport) -> str:
 
 
 def transfer_tables(report: TransferReport) -> list[Table]:
-    """The table over folds for the terminal, and that by latitude.
+    """The table over folds for the terminal with the first stage's loss, and that by latitude.
 
     Args:
         report: From `report.gather`.
     """
     title, whole = _parts(report)[-1]
-    caption = _data(report) if report.group else ""
+    facts = [_data(report)] if report.group else []
+    caption = "\n".join([*facts, *largest_losses(report)[:1]])
     tables = [
         terminal_table(f"Transfer: {title}", overall_cells(whole, short=True), (0, 1), caption)
     ]

@@ -17,6 +17,7 @@ from rich.console import Console
 from tangent_train.errors import DataError
 from tangent_train.tasks.reports.chart import report_png
 from tangent_train.tasks.reports.groups import Figure, Group, group_runs
+from tangent_train.tasks.reports.losses import largest_losses
 from tangent_train.tasks.reports.paper import CLASSES, STANFORD_ROWS
 from tangent_train.tasks.reports.runs import find_runs, load_run, unfinished_runs
 from tangent_train.tasks.reports.tables import (
@@ -421,3 +422,27 @@ def test_reports_say_how_many_images_were_scored(tmp_path: Path) -> None:
     del results["panoramas"]
     (folder / "results.json").write_text(json.dumps(results))
     assert load_run(folder).images is None
+
+
+def test_the_class_that_takes_most_from_the_mean_is_named(
+    three_folds: Path, tmp_path: Path
+) -> None:
+    # Means over folds: walls 0.6, floors (0.5 + 0.8 + 0.2) / 3, sofas (0.5 + 0.7) / 2.
+    (group,) = _groups(three_folds)
+    sentence = "mine: largest loss: floor, 50.0 % IoU."
+    assert largest_losses([group]) == [sentence]
+    assert f"\n- {sentence}\n" in report_markdown([group], [])
+    console = Console(width=160, record=True, file=io.StringIO())
+    for table in report_tables([group]):
+        console.print(table)
+    assert sentence in console.export_text()
+
+    folder = _write(tmp_path / "zero", [0.5, 0.4, 0.0])
+    content = json.loads((folder / "results.json").read_text())
+    content["classes"][2]["share"] = 0.0  # absent, counted as 0
+    (folder / "results.json").write_text(json.dumps(content))
+    assert largest_losses(_groups(folder)) == ["mine: largest loss: floor, 40.0 % IoU."]
+    for entry in content["classes"]:
+        entry["share"] = 0.0
+    (folder / "results.json").write_text(json.dumps(content))
+    assert largest_losses(_groups(folder)) == []

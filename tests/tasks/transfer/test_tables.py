@@ -12,6 +12,7 @@ from rich.console import Console
 from tangent_train.errors import DataError
 from tangent_train.tasks.reports.groups import Figure
 from tangent_train.tasks.reports.paper import CLASSES
+from tangent_train.tasks.transfer.losses import largest_losses
 from tangent_train.tasks.transfer.report import StageResult, TransferReport, gather
 from tangent_train.tasks.transfer.tables import (
     transfer_csv,
@@ -268,3 +269,35 @@ def test_made_rooms_stand_apart_from_the_papers_figures(two_folds: TransferRepor
     assert table[2] == ["S", "57.4", "−7.1 %", "42.3", "−7.4 %"]
     assert {row["paper"] for row in csv.DictReader(io.StringIO(transfer_csv(two_folds)))} == {""}
     assert len(CLASSES) == 13
+
+
+def test_the_class_that_the_transfer_costs_most_is_named() -> None:
+    report = gather(
+        [
+            stage("P", make_run(0.5, classes=(0.4, 0.9)), 1),
+            stage("P", make_run(0.5, classes=(0.8, None)), 2),
+            stage("S", make_run(0.5, classes=(0.1, 0.8)), 1),
+            stage("S", make_run(0.5, classes=(0.8, 0.1)), 2),
+            stage("S erp", make_run(0.5, classes=(0.5, None)), 1, representation="erp"),
+            stage("S-FT-1", make_run(0.5), 1),
+        ]
+    )
+    # Walls lose 0.3 and 0 in the folds; floors 0.1 in the only one in which both have them.
+    first, second = largest_losses(report)
+    assert first == "S: wall loses most IoU from P: 60.0 % to 45.0 %."
+    assert second == "S erp: no class loses IoU from P, wall gains least: 40.0 % to 50.0 %."
+    assert f"\n- {first}\n- {second}\n\n" in transfer_markdown(report)
+    console = Console(width=160, record=True, file=io.StringIO())
+    for table in transfer_tables(report):
+        console.print(table)
+    assert first in console.export_text()
+    assert second not in console.export_text()
+
+
+def test_an_absent_class_that_counts_as_zero_is_not_what_the_transfer_costs() -> None:
+    sphere = make_run(0.5, classes=(0.0, 0.3))
+    sphere.results["classes"][0]["share"] = 0.0
+    report = gather([stage("P", make_run(0.5)), stage("S", sphere)])
+    assert largest_losses(report) == ["S: floor loses most IoU from P: 50.0 % to 30.0 %."]
+    sphere.results["classes"][1]["share"] = 0.0
+    assert largest_losses(report) == []

@@ -1,0 +1,104 @@
+"""An ONNX file as a network like any other."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from tangent_train.errors import DataError, SettingError
+
+__all__ = ["OnnxNetwork"]
+
+_ERRORS_ONLY = 3
+"""Of onnxruntime's levels of logging: its warnings are about speed, for makers of networks."""
+
+
+class OnnxNetwork(nn.Module):
+    """Runs an ONNX file with onnxruntime, on as many threads as torch uses.
+
+    For images on a GPU its CUDA provider is used where onnxruntime has one (package
+    onnxruntime-gpu); the scores come back to the device of the images in any case. It has no
+    parameters and no gradients.
+
+    Args:
+        path: The file; one input ``(B, C, h, w)`` float32, one output.
+
+    Attributes:
+        metadata: What the file says about itself, text by key.
+
+    Raises:
+        DataError: There is no such file, it is no network of this kind, or onnxruntime is missing.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self._path = path
+        if not path.is_file():
+            raise DataError(path, found="no such file", expected="an ONNX file")
+        self._sessions = {"CPU": self._open("CPU")}
+        session = self._sessions["CPU"]
+        inputs, outputs = session.get_inputs(), session.get_outputs()
+        if [len(i.shape) for i in inputs] != [4] or len(outputs) != 1:
+            raise DataError(
+                path,
+                found=f"inputs {[i.name for i in inputs]}, outputs {[o.name for o in outputs]}",
+                expected="images (B, C, h, w) as the only input, scores as the only output",
+            )
+        self._input = inputs[0]
+        self.metadata: dict[str, str] = dict(session.get_modelmeta().custom_metadata_map)
+
+    def forward(
+        self, images: Float[Tensor, "batch channels height width"]
+    ) -> Float[Tensor, "batch classes height width"]:
+        """Scores of every pixel.
+
+        Raises:
+            SettingError: The file was made for images of another shape.
+        """
+        kind = self._provider(images)
+        if kind not in self._sessions:
+            self._sessions[kind] = self._open(kind)
+        array = images.detach().to("cpu", torch.float32).contiguous().numpy()
+        try:
+            (scores,) = self._sessions[kind].run(None, {self._input.name: array})
+        except Exception as error:
+            raise SettingError(
+                f"images for {self._path.name}",
+                found="×".join(map(str, images.shape)),
+                expected="×".join(map(str, self._input.shape)),
+                remedy=f"onnxruntime says: {str(error).partition(chr(10))[0]}",
+            ) from error
+        return torch.from_numpy(scores).to(images.device)
+
+    def _provider(self, images: Tensor) -> str:
+        import onnxruntime
+
+        with_cuda = "CUDAExecutionProvider" in onnxruntime.get_available_providers()
+        return "CUDA" if images.is_cuda and with_cuda else "CPU"
+
+    def _open(self, kind: str) -> Any:
+        """A session whose first choice is the CPU, or CUDA."""
+        try:
+            import onnxruntime
+        except ImportError as error:
+            raise DataError(
+                self._path,
+                found="an ONNX file",
+                expected="the package onnxruntime, to run it",
+                remedy="Run: pip install 'tangent-train[export]'",
+            ) from error
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = torch.get_num_threads()
+        options.log_severity_level = _ERRORS_ONLY
+        providers = list(dict.fromkeys((f"{kind}ExecutionProvider", "CPUExecutionProvider")))
+        try:
+            return onnxruntime.InferenceSession(self._path, options, providers=providers)
+        except Exception as error:
+            first_line = str(error).partition("\n")[0]
+            raise DataError(
+                self._path, found=f"an unreadable file ({first_line})", expected="an ONNX file"
+            ) from error

@@ -1,0 +1,101 @@
+"""`tangent-export`: a trained network for other programs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+from rich.console import Console
+
+from tangent_train.errors import SettingError
+from tangent_train.tasks.export import SUFFIXES, Export, Format, export_network
+from tangent_train.tasks.trained import load_trained
+
+__all__ = ["export"]
+
+_EXAMPLE = "For example: tangent-export checkpoint=runs/…/checkpoints/best.ckpt output=model.onnx"
+
+
+def export(config: DictConfig) -> None:
+    """Write a trained network to a file and say how well it agrees with PyTorch.
+
+    Args:
+        config: The composed ``export.yaml``.
+
+    Raises:
+        DataError: The checkpoint cannot be used.
+        SettingError: A setting is missing or impossible, the file is there already, or the network
+            cannot be exported.
+    """
+    settings: Any = OmegaConf.to_container(config, resolve=True)
+    checkpoint = _given(settings, "checkpoint", "a checkpoint written by tangent-train")
+    output = _given(settings, "output", f"a file ending in {', '.join(SUFFIXES.values())}")
+    form = _format(settings["format"], output)
+    size, opset = _image_size(settings["image_size"]), _opset(settings["opset"])
+    if output.exists() and (output.is_dir() or not settings["overwrite"]):
+        raise SettingError(
+            "output",
+            found=f"{output}, which exists",
+            expected="a new file",
+            remedy="" if output.is_dir() else "Give another name, or set overwrite=true.",
+        )
+    console = Console(soft_wrap=True, highlight=False)
+    with console.status(f"Writing {output.name} …"):
+        written = export_network(
+            load_trained(checkpoint), output, form, image_size=size, opset=opset
+        )
+    console.print(_summary(written, output))
+
+
+def _given(settings: dict[str, Any], name: str, expected: str) -> Path:
+    if not settings[name]:
+        raise SettingError(name, found="none", expected=expected, remedy=_EXAMPLE)
+    return Path(str(settings[name])).expanduser()
+
+
+def _format(given: str | None, output: Path) -> Format:
+    if given in SUFFIXES:
+        return given
+    forms = {suffix: form for form, suffix in SUFFIXES.items()}
+    suffix = output.suffix.lower()
+    if given is not None:
+        raise SettingError("format", found=given, expected=" or ".join(SUFFIXES))
+    if suffix not in forms:
+        raise SettingError(
+            "output", found=output.name, expected=f"a name ending in {', '.join(forms)}"
+        )
+    return forms[suffix]
+
+
+def _image_size(given: Any) -> tuple[int, int] | None:
+    if given is None:
+        return None
+    sides = given if isinstance(given, Sequence) and not isinstance(given, str) else []
+    if len(sides) != 2 or not all(isinstance(side, int) for side in sides):
+        raise SettingError("image_size", found=given, expected="[height, width] or null")
+    return sides[0], sides[1]
+
+
+def _opset(given: Any) -> int | None:
+    if given is not None and not isinstance(given, int):
+        raise SettingError("opset", found=given, expected="a whole number or null")
+    return given
+
+
+def _summary(written: Export, output: Path) -> str:
+    trained = written.trained
+    channels, classes = trained.normalization.channels, len(trained.class_names)
+    if trained.fixed_size is not None:
+        sides = "×".join(map(str, trained.fixed_size))
+    elif trained.size_multiple > 1:
+        sides = f"h×w, both multiples of {trained.size_multiple}"
+    else:
+        sides = "h×w"
+    return (
+        f"{output}: {output.stat().st_size / 1e6:.1f} MB\n"
+        f"images: any number of {channels} channels, {sides}; scores of {classes} classes\n"
+        f"largest difference to PyTorch: {written.difference:.1e}, "
+        f"{written.share:.1e} of the range of the scores"
+    )

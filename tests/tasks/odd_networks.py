@@ -1,0 +1,91 @@
+"""Networks that an exporter has a hard time with, and what it means to compute the same."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from tangent_train.tasks.networks import TrainedNetwork
+
+
+class Tied(nn.Module):
+    """Two names for one tensor."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.first = nn.Conv2d(4, 4, 1)
+        self.second = self.first
+        self.head = nn.Conv2d(4, 5, 1)
+
+    def forward(self, images: Tensor) -> dict[str, Tensor]:
+        return {"out": self.head(self.second(self.first(images)).relu())}
+
+
+class OneSize(nn.Conv2d):
+    """Something learned for every pixel."""
+
+    def __init__(self) -> None:
+        super().__init__(4, 5, 1)
+        self.places = nn.Parameter(torch.randn(5, 24, 40))
+
+    def forward(self, images: Tensor) -> Tensor:
+        return super().forward(images) + self.places
+
+
+class TwoSizes(nn.Conv2d):
+    """Another computation for wide images: a trace knows only one of them."""
+
+    def __init__(self) -> None:
+        super().__init__(4, 5, 1)
+
+    def forward(self, images: Tensor) -> Tensor:
+        return super().forward(images) * (2 if images.shape[-1] > 35 else 1)
+
+
+class Counting(nn.Conv2d):
+    """Another computation for two images: a trace knows only one of them."""
+
+    def __init__(self) -> None:
+        super().__init__(4, 5, 1)
+
+    def forward(self, images: Tensor) -> Tensor:
+        return super().forward(images) * (2 if images.shape[0] == 2 else 1)
+
+
+class Looking(nn.Conv2d):
+    """Another computation for other values: no exporter knows both."""
+
+    def __init__(self) -> None:
+        super().__init__(4, 5, 1)
+
+    def forward(self, images: Tensor) -> Tensor:
+        return super().forward(images) * (2 if bool(images.sum() > 0) else 1)
+
+
+def own(name: str) -> dict[str, Any]:
+    """Settings of a network of this module."""
+    return {"_target_": f"{__name__}.{name}"}
+
+
+def some_images(trained: TrainedNetwork, count: int, size: tuple[int, int]) -> Tensor:
+    """Normalized images of its channels."""
+    return torch.randn(count, trained.normalization.channels, *size)
+
+
+def scores_of(trained: TrainedNetwork, images: Tensor) -> Tensor:
+    """What PyTorch makes of them."""
+    with torch.no_grad():
+        scores: Tensor = trained.network(images)
+    return scores
+
+
+def assert_same(found: Any, expected: Tensor) -> None:
+    """To 1e-4, of the scores and of their range."""
+    span = float(expected.max() - expected.min())
+    assert span > 0.01
+    difference = float(np.abs(np.asarray(found) - expected.numpy()).max())
+    assert difference <= 1e-4
+    assert difference <= 1e-4 * span

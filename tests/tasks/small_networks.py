@@ -1,0 +1,94 @@
+"""Small networks with the numbers of trained ones, and checkpoints as runs write them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+from torch import nn
+
+from datamodules.samples import Normalization
+from tangent_train.cli.compose import config_folder
+from tangent_train.cli.run import build
+from tangent_train.tasks.networks import Scores, TrainedNetwork, make, size_multiple_of
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from tangent_train.tasks import SegmentationTask
+
+NAMES = ("unknown", "beam", "board", "sofa", "wall")
+UNET = {"_target_": "models.UNet", "in_channels": 4, "num_classes": 5, "widths": [4, 8, 8]}
+
+
+def with_statistics(network: nn.Module, seed: int = 0) -> nn.Module:
+    """Batch statistics as after training: none of them what they are at first."""
+    generator = torch.Generator().manual_seed(seed)
+    for module in network.modules():
+        if isinstance(getattr(module, "running_var", None), torch.Tensor):
+            module.running_mean.normal_(0, 0.2, generator=generator)  # type: ignore[operator]
+            module.running_var.uniform_(0.5, 2, generator=generator)  # type: ignore[operator]
+    return network
+
+
+def small_trained(
+    settings: Mapping[str, Any] = UNET,
+    network: nn.Module | None = None,
+    image_size: tuple[int, int] = (32, 32),
+    channels: int = 4,
+) -> TrainedNetwork:
+    """As it comes out of a checkpoint, with random numbers; `network` instead of the settings'."""
+    torch.manual_seed(1)
+    scores = Scores(with_statistics(network or make(settings))).eval()
+    multiple = size_multiple_of(scores, channels)
+    return TrainedNetwork(
+        network=scores,
+        class_names=NAMES,
+        inputs=("rgb", "depth")[: channels - 2],
+        normalization=Normalization(
+            [0.5, 0.4, 0.3, 1.1][:channels], [0.2, 0.25, 0.3, 0.8][:channels]
+        ),
+        level=5,
+        representation={
+            "_target_": "tangent_train.rendering.TangentRepresentation",
+            "base_level": 0,
+            "level": 5,
+        },
+        image_size=image_size,
+        size_multiple=multiple or 1,
+        fixed_size=None if multiple else image_size,
+        settings=settings,
+    )
+
+
+def save_checkpoint(path: Path, *overrides: str, **changes: Any) -> SegmentationTask:
+    """Write what a run of such a config writes (of Lightning's own entries none is needed).
+
+    Args:
+        path: The file.
+        overrides: Of the composed ``train.yaml``.
+        changes: Entries of the file to replace; None leaves one out.
+
+    Returns:
+        The task in evaluation mode, whose tensors are in the file.
+    """
+    with initialize_config_dir(str(config_folder()), version_base="1.3"):
+        config = compose("train", ["level=4", *overrides])
+    torch.manual_seed(2)
+    data, task = build(config)
+    with_statistics(task.network)
+    normalization = data.normalization
+    content = {
+        "config": OmegaConf.to_container(config),
+        "resolved_config": OmegaConf.to_container(config, resolve=True),
+        "class_names": list(data.class_names),
+        "normalization": {"mean": list(normalization.mean), "std": list(normalization.std)},
+        "state_dict": task.state_dict(),
+        **changes,
+    }
+    torch.save({name: value for name, value in content.items() if value is not None}, path)
+    trained: SegmentationTask = task.eval()
+    return trained

@@ -1,0 +1,281 @@
+"""Trained networks come out of checkpoints as they went in."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from tangent_train.errors import DataError
+from tangent_train.tasks.networks import PRETRAINED, Scores, completed_settings, size_multiple_of
+from tangent_train.tasks.trained import load_trained, read_checkpoint
+from tests.tasks.small_networks import save_checkpoint, with_statistics
+
+SMALL_UNET = ["network=unet", "network.widths=[4,8,8]"]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "inputs", "size", "multiple"),
+    [
+        (SMALL_UNET, ("rgb", "depth"), (16, 16), 4),
+        ([*SMALL_UNET, "data.inputs=[rgb]"], ("rgb",), (16, 16), 4),
+        ([*SMALL_UNET, "representation=cubemap"], ("rgb", "depth"), (16, 16), 4),
+        ([*SMALL_UNET, "representation=erp_crops"], ("rgb", "depth"), (32, 64), 4),
+        (
+            [
+                *SMALL_UNET,
+                "data=synthrooms_perspective",
+                "representation=perspective",
+                "representation.dim=[12,20]",
+            ],
+            ("rgb", "depth"),
+            (12, 20),
+            4,
+        ),
+        (
+            ["network=deeplabv3_mobilenet", "data.inputs=[rgb]", "level=5"],  # its result is a dict
+            ("rgb",),
+            (32, 32),
+            1,
+        ),
+    ],
+    ids=["tangent", "rgb", "cubemap", "erp", "photos", "dict"],
+)
+def test_a_network_computes_what_its_task_does(
+    overrides: list[str],
+    inputs: tuple[str, ...],
+    size: tuple[int, int],
+    multiple: int,
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "best.ckpt"
+    task = save_checkpoint(path, *overrides)
+    trained = load_trained(path)
+    images = torch.randn(2, 2 + len(inputs), *size)
+    with torch.no_grad():
+        torch.testing.assert_close(trained.network(images), task(images), rtol=0, atol=0)
+    assert not any(module.training for module in trained.network.modules())
+    assert trained.inputs == inputs
+    assert trained.image_size == size
+    assert (trained.size_multiple, trained.fixed_size) == (multiple, None)
+    assert trained.class_names == task.class_names
+    assert trained.level == (5 if "level=5" in overrides else 4)
+    assert trained.normalization.channels == images.shape[1]
+    assert trained.representation["_target_"].startswith("tangent_train.rendering.")
+
+
+def test_tensors_of_the_file_are_used_and_no_others_fetched(tmp_path: Path) -> None:
+    path = tmp_path / "best.ckpt"
+    save_checkpoint(path, *SMALL_UNET, level="x")
+    content = torch.load(path, weights_only=True)
+    settings = content["resolved_config"]["network"]
+    settings["_target_"] = f"{__name__}.Remembering"
+    settings |= dict.fromkeys(PRETRAINED, "published")
+    del settings["widths"]
+    content["state_dict"] = {
+        "network.weight": torch.ones(14, 4, 1, 1),
+        "class_weights": torch.ones(2),
+    }
+    torch.save(content, path)
+    trained = load_trained(path)
+    assert isinstance(trained.network, Scores)
+    network = trained.network.network
+    assert isinstance(network, Remembering)
+    assert network.settings == dict.fromkeys(PRETRAINED)
+    assert torch.equal(network.weight.detach(), torch.ones(14, 4, 1, 1))
+    assert trained.settings == {
+        "_target_": f"{__name__}.Remembering",
+        "in_channels": 4,
+        "num_classes": 14,
+        **dict.fromkeys(PRETRAINED),
+    }
+
+
+class Remembering(nn.Conv2d):
+    """A network that remembers its settings."""
+
+    def __init__(self, in_channels: int, num_classes: int, **settings: Any) -> None:
+        super().__init__(in_channels, num_classes, 1, bias=False)
+        self.settings = settings
+
+
+class OneSize(nn.Conv2d):
+    """A network with something learned for every pixel."""
+
+    def __init__(self) -> None:
+        super().__init__(3, 5, 1)
+        self.places = nn.Parameter(torch.randn(5, 24, 40))
+
+    def forward(self, images: Tensor) -> Tensor:
+        return super().forward(images) + self.places
+
+
+class Looking(nn.Conv2d):
+    """A network that looks at values, of which there are none where only shapes are computed."""
+
+    def forward(self, images: Tensor) -> Tensor:
+        return super().forward(images) * (2 if bool(images.sum() > 1) else 1)
+
+
+class Coarse(nn.Conv2d):
+    """A network whose scores are smaller than its images unless those are multiples of 6."""
+
+    def forward(self, images: Tensor) -> Tensor:
+        rows, columns = (side // 6 * 6 for side in images.shape[-2:])
+        return super().forward(images[..., :rows, :columns])
+
+
+@pytest.mark.parametrize(
+    ("network", "multiple"),
+    [
+        (nn.Conv2d(3, 5, 3, padding=1), 1),
+        (Looking(3, 5, 1), 1),
+        (nn.Sequential(nn.AvgPool2d(8), nn.Upsample(scale_factor=8)), 8),
+        (nn.Sequential(nn.AvgPool2d(14), nn.Upsample(scale_factor=14)), 14),
+        (OneSize(), None),
+        (Coarse(3, 5, 1), None),
+        (nn.Conv2d(4, 5, 1), None),
+    ],
+    ids=["any", "looking", "eighths", "patches of 14", "one", "sixths", "other channels"],
+)
+def test_sizes_that_a_network_takes_are_found(network: nn.Module, multiple: int | None) -> None:
+    assert size_multiple_of(network.eval(), 3) == multiple
+
+
+def test_a_network_of_one_size_is_said_to_be_one(tmp_path: Path) -> None:
+    path = tmp_path / "best.ckpt"
+    save_checkpoint(
+        path,
+        "data=synthrooms_perspective",
+        "representation=perspective",
+        "representation.dim=[24,40]",
+        "data.inputs=[rgb]",
+        "network=hexunet",
+        "representation.dim=[32,48]",
+    )
+    content = torch.load(path, weights_only=True)
+    content["resolved_config"]["network"] = {"_target_": f"{__name__}.OneSize"}
+    content["resolved_config"]["representation"]["dim"] = [24, 40]
+    content["state_dict"] = {f"network.{n}": t for n, t in OneSize().state_dict().items()}
+    torch.save(content, path)
+    trained = load_trained(path)
+    assert (trained.image_size, trained.fixed_size) == ((24, 40), (24, 40))
+
+
+def test_nulls_of_networks_inside_networks_are_completed() -> None:
+    settings = {"in_channels": None, "x": None, "inner": {"classes": None, "weights": "coco"}}
+    completed = completed_settings(settings, 3, 7)
+    assert completed == {"in_channels": 3, "x": None, "inner": {"classes": 7, "weights": "coco"}}
+    assert completed_settings(settings, 3, 7, restored=True)["inner"]["weights"] is None
+
+
+def _edited(path: Path, edit: Any) -> Path:
+    save_checkpoint(path, *SMALL_UNET)
+    content = torch.load(path, weights_only=True)
+    edit(content)
+    torch.save(content, path)
+    return path
+
+
+def _other_network(content: Any) -> None:
+    content["resolved_config"]["network"]["widths"] = [4, 8]
+
+
+def _no_tensors(content: Any) -> None:
+    content["state_dict"] = {"weight": torch.zeros(1)}
+
+
+def _no_package(content: Any) -> None:
+    content["resolved_config"]["network"]["_target_"] = "no_such_package.nets.Net"
+
+
+def _no_class(content: Any) -> None:
+    content["resolved_config"]["network"]["_target_"] = "models.NoSuchNet"
+
+
+def _no_module(content: Any) -> None:
+    content["resolved_config"]["network"]["_target_"] = "models.missing.Net"
+
+
+def _wrong_setting(content: Any) -> None:
+    content["resolved_config"]["network"]["wide"] = 3
+
+
+def _wrong_level(content: Any) -> None:
+    content["resolved_config"]["representation"]["dim"] = 2
+
+
+def _no_representation(content: Any) -> None:
+    del content["resolved_config"]["representation"]
+
+
+def _no_classes(content: Any) -> None:
+    del content["class_names"]
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (_other_network, r"other tensors than .*; expected the tensors of models\.UNet"),
+        (_no_tensors, r"other tensors than"),
+        (
+            _no_package,
+            r"a network of the package no_such_package, which is not installed; .*PYTHONPATH",
+        ),
+        (_no_class, r"a network that cannot be made .*NoSuchNet.*settings of models\.NoSuchNet"),
+        (_no_module, r"a network that cannot be made .*models\.missing"),
+        (_wrong_setting, r"a network that cannot be made .*'wide'"),
+        (_wrong_level, r"a representation that cannot be made .*dim"),
+        (_no_representation, r"no representation in its config"),
+        (_no_classes, r"no class_names inside; expected a checkpoint written by tangent-train"),
+    ],
+)
+def test_what_cannot_be_loaded_says_why(edit: Any, message: str, tmp_path: Path) -> None:
+    path = _edited(tmp_path / "best.ckpt", edit)
+    with pytest.raises(DataError, match=rf"(?s)^{re.escape(str(path))}: found {message}"):
+        load_trained(path)
+
+
+def test_the_extra_of_a_missing_package_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def smp(content: Any) -> None:
+        content["resolved_config"]["network"] = {"_target_": "segmentation_models_pytorch.Unet"}
+
+    path = _edited(tmp_path / "best.ckpt", smp)
+    monkeypatch.setitem(sys.modules, "segmentation_models_pytorch", None)
+    with pytest.raises(DataError, match=r"pip install 'tangent-train\[networks\]'"):
+        load_trained(path)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "no such file"),
+        (b"", "an unreadable file"),
+        (b"not a checkpoint", "an unreadable file"),
+        ({"state_dict": {}}, "no config inside"),
+        ([1, 2], "no config inside"),
+        ({"config": {}, "state_dict": {}, "extra": Path("x")}, "an unreadable file"),
+    ],
+)
+def test_what_is_no_checkpoint_is_refused(content: Any, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "x.ckpt"
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    elif content is not None:
+        torch.save(content, path)
+    with pytest.raises(DataError, match=f"{message}.*expected a checkpoint written by tangent"):
+        read_checkpoint(path)
+    with pytest.raises(DataError):
+        load_trained(path)
+
+
+def test_statistics_of_the_test_networks_are_not_the_initial_ones() -> None:
+    network = with_statistics(nn.Sequential(nn.BatchNorm2d(3)))
+    assert not torch.equal(network[0].running_var, torch.ones(3))  # type: ignore[index]
