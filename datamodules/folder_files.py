@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from datamodules.image_files import DEPTH_SUFFIXES, find_images, read_depth_size, read_image_size
+from datamodules.image_files import find_depth, find_images, read_depth_size, read_image_size
 from datamodules.image_opening import open_image
 from datamodules.png import check_panorama_size, read_png_header
 from tangent_train.errors import DataError
@@ -31,6 +31,7 @@ _TRIED = 4
 # What label images may be. In grey of 1 to 4 bits the numbers may be meant, or the steps from black
 # to white that they stand for: better asked than guessed. 16 bits beside alpha are not decoded.
 _VALUES = ("8-bit grey", "16-bit grey", "8-bit grey with alpha", "palette")
+_WITHOUT = "Or train without depth: data.inputs=[rgb]."
 _COLORS = ("8-bit RGB", "8-bit RGBA", "8-bit grey", "8-bit grey with alpha", "palette")
 
 
@@ -85,22 +86,9 @@ def list_panoramas(root: Path, *, with_depth: bool) -> list[PanoramaFiles]:
                 expected="one image of each name: its labels have the same one",
                 remedy="Rename or remove one of them.",
             )
-        depth = _find_depth(root, name) if with_depth else None
+        depth = find_depth(root / "depth", name, _WITHOUT) if with_depth else None
         found[name] = PanoramaFiles(name, rgb, root / "labels" / f"{name}.png", depth)
     return [found[name] for name in sorted(found)]
-
-
-def _find_depth(root: Path, name: str) -> Path:
-    candidates = [root / "depth" / f"{name}{suffix}" for suffix in DEPTH_SUFFIXES]
-    found = [path for path in candidates if path.is_file()]
-    if len(found) != 1:
-        raise DataError(
-            root / "depth" / name,
-            found=", ".join(path.name for path in found) or "no such file",
-            expected=f"one file with this name and one of {', '.join(DEPTH_SUFFIXES)}",
-            remedy="" if found else "Or train without depth: data.inputs=[rgb].",
-        )
-    return found[0]
 
 
 def check_panorama(files: PanoramaFiles, erp_height: int, *, in_colors: bool) -> None:

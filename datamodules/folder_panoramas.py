@@ -28,8 +28,8 @@ from datamodules.folder_splits import FolderSplits
 from datamodules.image_files import read_depth_m, read_rgb
 from datamodules.panorama_module import PanoramaDataModule, Split
 from datamodules.panoramas import (
-    STEPS_PER_M,
     Panorama,
+    meters_to_steps,
     resize_area,
     resize_depth,
     resize_nearest,
@@ -48,8 +48,6 @@ if TYPE_CHECKING:
     from tangent_train.rendering.representation import Representation
 
 __all__ = ["FolderPanoramas", "FolderSource"]
-
-_MOST_STEPS = np.iinfo(np.uint16).max
 
 
 class FolderSource:
@@ -112,7 +110,7 @@ class FolderSource:
         files = self._panoramas[index]
         depth = None
         if files.depth is not None:
-            steps = _depth_steps(read_depth_m(files.depth, self._depth_units_per_m))
+            steps = meters_to_steps(read_depth_m(files.depth, self._depth_units_per_m))
             depth = resize_depth(steps, self._shape)
         rgb = resize_area(read_rgb(files.rgb), self._shape)
         return Panorama(rgb, depth, self._labels(files.labels))
@@ -128,18 +126,6 @@ class FolderSource:
     def _labels(self, path: Path) -> NDArray[np.uint8]:
         codes = read_codes(path, in_colors=self._classes.in_colors)
         return self._classes.decode(resize_nearest(codes, self._shape))
-
-
-def _depth_steps(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
-    """Depth in steps of 1/512 m, rounded, at most 65535 (128 m), of depth in metres.
-
-    What is there but nearer than half a step is one step away: 0 would mean that it is missing.
-
-    >>> _depth_steps(np.array([0, 1e-4, 1, 1000], np.float32)).tolist()
-    [0, 1, 512, 65535]
-    """
-    steps = np.minimum(depth_m * np.float32(STEPS_PER_M) + np.float32(0.5), _MOST_STEPS)
-    return np.maximum(steps.astype(np.uint16), depth_m > 0)
 
 
 class FolderPanoramas(PanoramaDataModule):

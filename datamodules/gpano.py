@@ -36,6 +36,7 @@ _SIZES = (
     "CroppedAreaTopPixels",
 )
 _TOLERANCE = 0.02  # of pixels that should be square: angles and sizes are given in round numbers
+_MOST_COLUMNS = 32768  # of the whole panorama, as of images that are one
 _SAY_IT = "Say with crop=[west,east,south,north] in degrees what the image shows."
 _NOT_WHOLE = (
     "If it is a part of a panorama, say which with crop=[west,east,south,north] in degrees or with "
@@ -184,6 +185,13 @@ def area_of_crop(size: tuple[int, int], crop: Sequence[float]) -> PanoramaArea:
             f"of {size[0]}×{size[1]}",
             expected="angles that make them square",
         )
+    if size[1] * 360 / width > _MOST_COLUMNS:
+        raise SettingError(
+            "crop",
+            found=f"{list(crop)} for an image of {size[0]}×{size[1]}",
+            expected=f"a part of a panorama of at most {_MOST_COLUMNS} columns",
+            remedy="Shrink the image, or take it as a photo (projection=perspective).",
+        )
     return _area(
         size, ((west + 180) / 360, width / 360), ((90 - north) / 180, (north - south) / 180)
     )
@@ -233,6 +241,13 @@ def _area_of_tags(path: Path, size: tuple[int, int], tags: Sequence[int]) -> Pan
         )
     if (width, height) == (full_width, full_height) and abs(size[1] - 2 * size[0]) <= 1:
         return whole_area(path, size)
+    if size[1] / width * full_width > _MOST_COLUMNS:
+        raise DataError(
+            path,
+            found=stated,
+            expected=f"a part of a panorama of at most {_MOST_COLUMNS} columns",
+            remedy="Shrink the image, or take it as a photo (projection=perspective).",
+        )
     west = left % full_width / full_width
     return _area(size, (west, width / full_width), (top / full_height, height / full_height))
 

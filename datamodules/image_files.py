@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 __all__ = [
     "DEPTH_SUFFIXES",
     "IMAGE_SUFFIXES",
+    "find_depth",
     "find_images",
     "photo_fov_deg",
     "read_depth_m",
@@ -253,3 +254,28 @@ def _read_array(path: Path, *, mapped: bool = False) -> NDArray[Any]:
 
 
 _DEPTH_READERS = {".npy": _read_array, ".exr": read_exr}
+
+
+def find_depth(folder: Path, name: str, remedy: str) -> Path:
+    """The depth image that belongs to an image.
+
+    Args:
+        folder: Of the depth images.
+        name: Path of the image below the folder of the images, without suffix. The depth image has
+            the same, perhaps with ``_depth`` at the end, and one of `DEPTH_SUFFIXES`.
+        remedy: What to do where there is none.
+
+    Raises:
+        DataError: There is none, or there are several.
+    """
+    candidates = [folder / f"{name}{end}{s}" for end in ("", "_depth") for s in DEPTH_SUFFIXES]
+    found = [path for path in candidates if path.is_file()]
+    if len(found) != 1:
+        raise DataError(
+            folder / name,
+            found=", ".join(path.name for path in found) or "no such file",
+            expected="one file of this name, or with _depth at its end, and one of "
+            f"{', '.join(DEPTH_SUFFIXES)}",
+            remedy="" if found else remedy,
+        )
+    return found[0]

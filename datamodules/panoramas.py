@@ -35,6 +35,7 @@ __all__ = [
     "Turn",
     "TurnedPanoramas",
     "mask_black",
+    "meters_to_steps",
     "resize_area",
     "resize_depth",
     "resize_nearest",
@@ -228,3 +229,16 @@ class TurnedPanoramas:
 def steps_to_meters(steps: NDArray[np.uint16]) -> NDArray[np.float32]:
     """Depth in metres, float32, of depth in steps of 1/512 m."""
     return steps.astype(np.float32) / np.float32(STEPS_PER_M)
+
+
+def meters_to_steps(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
+    """Depth in steps of 1/512 m, rounded, at most 65535 (128 m), of depth in metres.
+
+    What is there but nearer than half a step is one step away: 0 would mean that it is missing.
+
+    >>> meters_to_steps(np.array([0, 1e-4, 1, 1000], np.float32)).tolist()
+    [0, 1, 512, 65535]
+    """
+    most = np.iinfo(np.uint16).max
+    steps = np.minimum(depth_m * np.float32(STEPS_PER_M) + np.float32(0.5), most)
+    return np.maximum(steps.astype(np.uint16), depth_m > 0)

@@ -97,7 +97,9 @@ def _parse(path: Path, xmp: bytes, namespace: str) -> dict[str, str]:
     parser.StartDoctypeDeclHandler = refuse
     try:
         parser.Parse(_trimmed(xmp), True)
-    except expat.ExpatError:
+    except DataError:
+        raise
+    except (expat.ExpatError, LookupError, ValueError):  # broken, or of an unknown encoding
         return {}
     return tags
 

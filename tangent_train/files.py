@@ -45,4 +45,5 @@ def write_bytes(path: Path, content: bytes) -> None:
 
 def write_text(path: Path, content: str) -> None:
     """Write `content` to `path` atomically, UTF-8."""
-    write_bytes(path, content.encode())
+    # Names of files may hold bytes that are no text.
+    write_bytes(path, content.encode(errors="backslashreplace"))

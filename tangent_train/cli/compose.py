@@ -65,7 +65,8 @@ def quote_path(argument: str) -> str:
     name, _, value = argument.partition("=")
     if name not in _PATHS or value in ("", "null") or value[0] in "'\"":
         return argument
-    return f"{name}={QuotedString(value, Quote.single).with_quotes()}"
+    plain = value.replace("${", r"\${")  # no interpolation
+    return f"{name}={QuotedString(plain, Quote.single).with_quotes()}"
 
 
 def search_path(options: Namespace) -> list[str]:

@@ -9,6 +9,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
+from tangent_train.cli import values
 from tangent_train.errors import SettingError
 from tangent_train.tasks.export import SUFFIXES, Export, Format, export_network
 from tangent_train.tasks.trained import load_trained
@@ -34,7 +35,7 @@ def export(config: DictConfig) -> None:
     output = _given(settings, "output", f"a file ending in {', '.join(SUFFIXES.values())}")
     form = _format(settings["format"], output)
     size, opset = _image_size(settings["image_size"]), _opset(settings["opset"])
-    if output.exists() and (output.is_dir() or not settings["overwrite"]):
+    if output.exists() and (output.is_dir() or not values.flag(settings, "overwrite")):
         raise SettingError(
             "output",
             found=f"{output}, which exists",

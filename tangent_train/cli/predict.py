@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from omegaconf import OmegaConf
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table as RichTable
 
 from datamodules.image_files import find_images
 from datamodules.progress import progress_bar
+from tangent_train.cli import values
 from tangent_train.errors import DataError, SettingError
 from tangent_train.tasks.html import Table, ViewerImage, encode_image, write_report
 from tangent_train.tasks.prediction.labellers import (
@@ -25,7 +30,7 @@ from tangent_train.tasks.prediction.labellers import (
 from tangent_train.tasks.prediction.outputs import OutputFolder, output_names
 from tangent_train.tasks.prediction.panoramas import PanoramaPredictor
 from tangent_train.tasks.prediction.photos import PhotoPredictor
-from tangent_train.tasks.prediction.predictor import Runner
+from tangent_train.tasks.prediction.predictor import Level, Runner
 from tangent_train.tasks.prediction.summary import write_summary
 from tangent_train.tasks.trained import load_trained
 
@@ -34,45 +39,82 @@ if TYPE_CHECKING:
 
     from omegaconf import DictConfig
 
+    from tangent_train.rendering import Blend
     from tangent_train.tasks.html import EncodedImage
     from tangent_train.tasks.networks import TrainedNetwork
 
 __all__ = ["predict"]
 
-_MOST_FOV_DEG = 180
+_CROP = "[west,east,south,north] in degrees, or null"
 
 
-def _whole_from_0(value: object) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
+@dataclass(frozen=True)
+class _Settings:
+    """What the command line asks for, checked; see ``predict.yaml``."""
 
+    checkpoint: Path
+    input: str
+    output: Path
+    depth: Path | None
+    depth_scale: float
+    projection: str
+    crop: list[float] | None
+    fov: float | None
+    level: Level
+    base_level: int | None
+    blend: Blend
+    rotations: int
+    probabilities: bool
+    report: int
+    overwrite: bool
+    images_per_forward: int | None
+    device: str
 
-_ALLOWED: dict[str, tuple[Callable[[Any], bool], str]] = {
-    "projection": (
-        lambda value: value in ("equirectangular", "perspective"),
-        "equirectangular or perspective",
-    ),
-    "blend": (lambda value: value in ("feather", "nearest"), "feather or nearest"),
-    "level": (
-        lambda value: value in (None, "image") or _whole_from_0(value),
-        "a whole number from 0, image, or null for the network's",
-    ),
-    "base_level": (
-        lambda value: value is None or _whole_from_0(value),
-        "a whole number from 0, or null for the network's",
-    ),
-    "fov": (
-        lambda value: (
-            value is None or (isinstance(value, int | float) and 0 < value < _MOST_FOV_DEG)
-        ),
-        "degrees between 0 and 180, or null",
-    ),
-    "report": (_whole_from_0, "a number of images, 0 for no report"),
-    "depth_scale": (
-        lambda value: isinstance(value, int | float) and value > 0,
-        "units per metre, more than 0",
-    ),
-}
-"""What settings may be, and how to say so."""
+    @classmethod
+    def of(cls, config: Mapping[str, Any]) -> _Settings:
+        """Check them.
+
+        Raises:
+            SettingError: One is missing or cannot work.
+        """
+        examples = {"checkpoint": "runs/…/best.ckpt", "input": "panoramas", "output": "labels"}
+        for name, example in examples.items():
+            if config[name] is None:
+                raise SettingError(
+                    name,
+                    found="none",
+                    expected="a file" if name == "checkpoint" else "a file or folder",
+                    remedy=f"For example: tangent-predict {name}={example} …",
+                )
+        projection = values.choice(config, "projection", ("equirectangular", "perspective"))
+        for name in ("crop", "rotations") if projection == "perspective" else ("fov",):
+            if config[name] not in (None, 1):
+                raise SettingError(
+                    name, found=config[name], expected=f"null with projection={projection}"
+                )
+        depth = values.path(config, "depth")
+        if depth is not None and not depth.is_dir():
+            raise SettingError("depth", found=str(depth), expected="a folder of depth images")
+        image_level = config["level"] == "image"
+        return cls(
+            checkpoint=Path(str(config["checkpoint"])).expanduser(),
+            input=str(config["input"]),
+            output=Path(str(config["output"])).expanduser(),
+            depth=depth,
+            depth_scale=values.number(config, "depth_scale", 0, math.inf),
+            projection=projection,
+            crop=values.numbers(config, "crop", _CROP),
+            fov=None if config["fov"] is None else values.number(config, "fov", 0, 180),
+            level="image" if image_level else values.optional_whole(config, "level", 0),
+            base_level=values.optional_whole(config, "base_level", 0),
+            blend=values.choice(config, "blend", ("feather", "nearest")),
+            rotations=values.whole(config, "rotations", 1),
+            probabilities=values.flag(config, "probabilities"),
+            report=values.whole(config, "report", 0),
+            overwrite=values.flag(config, "overwrite"),
+            images_per_forward=values.optional_whole(config, "images_per_forward", 1),
+            device=str(config["device"]),
+        )
 
 
 def predict(config: DictConfig) -> None:
@@ -85,31 +127,29 @@ def predict(config: DictConfig) -> None:
         SettingError: A setting is missing or cannot work.
         DataError: The checkpoint cannot be read, or there are no images.
     """
-    _check(config)
-    paths = find_images(config.input)
+    settings = _Settings.of(OmegaConf.to_container(config, resolve=True))  # type: ignore[arg-type]
+    paths = _without_results(find_images(settings.input), settings)
     names = output_names(paths)
-    trained = load_trained(Path(config.checkpoint).expanduser())
-    output = OutputFolder(
-        Path(config.output).expanduser(), trained.class_names, config.probabilities
-    )
-    output.check(names, overwrite=config.overwrite)
-    labeller = _labeller(config, trained)
+    trained = load_trained(settings.checkpoint)
+    output = OutputFolder(settings.output, trained.class_names, settings.probabilities)
+    labeller = _labeller(settings, trained)
+    output.check(names, overwrite=settings.overwrite)
     console = Console(soft_wrap=True, highlight=False)
-    console.print(_what_happens(config, trained, len(paths)))
+    console.print(_what_happens(settings, trained, len(paths)))
     entries: list[dict[str, Any]] = []
     shown: list[EncodedImage] = []
     try:
         for entry, found in _label_all(paths, names, labeller, output):
             entries.append(entry)
-            if found is not None and len(shown) < config.report:
+            if found is not None and len(shown) < settings.report:
                 shown.append(_shown(entry, found, len(trained.class_names)))
     finally:
         if entries:  # those done are kept when it is interrupted
             output.write_classes()
-            write_summary(output.path, _summary(config, trained, entries), trained.class_names)
+            write_summary(output.path, _summary(settings, trained, entries), trained.class_names)
     done = [entry for entry in entries if "error" not in entry]
     if shown:
-        _write_report(output, done, shown, _what_happens(config, trained, len(done)))
+        _write_report(output, done, shown, _what_happens(settings, trained, len(done)))
     if done:
         console.print(_terminal_table(done, trained.class_names))
         console.print(f"Results are in {output.path}.", markup=False)
@@ -118,50 +158,33 @@ def predict(config: DictConfig) -> None:
         sys.exit(f"tangent-predict: {failed} could not be used, see above")
 
 
-def _check(config: DictConfig) -> None:
-    for name, example in (
-        ("checkpoint", "runs/…/checkpoints/best.ckpt"),
-        ("input", "panoramas"),
-        ("output", "labels"),
-    ):
-        if config[name] is None:
-            raise SettingError(
-                name,
-                found="none",
-                expected="a file" if name == "checkpoint" else "a file or folder",
-                remedy=f"For example: tangent-predict {name}={example} …",
-            )
-    for name, (allowed, expected) in _ALLOWED.items():
-        if not allowed(config[name]):
-            raise SettingError(name, found=repr(config[name]), expected=expected)
-    panoramas = config.projection == "equirectangular"
-    unused = ("fov",) if panoramas else ("crop", "rotations")
-    for name in unused:
-        if config[name] not in (None, 1):
-            raise SettingError(
-                name, found=config[name], expected=f"null with projection={config.projection}"
-            )
-    if config.depth is not None and not Path(config.depth).expanduser().is_dir():
-        raise SettingError("depth", found=str(config.depth), expected="a folder of depth images")
+def _without_results(paths: Sequence[Path], settings: _Settings) -> list[Path]:
+    """The images that are not results of this command in its output folder."""
+    results = [(settings.output / kind).resolve() for kind in ("labels", "color", "overlay")]
+    kept = [p for p in paths if not any(p.resolve().is_relative_to(r) for r in results)]
+    if not kept:
+        raise SettingError("input", found=f"only results in {settings.output}", expected="images")
+    return kept
 
 
-def _labeller(config: DictConfig, trained: TrainedNetwork) -> Labeller:
-    runner = Runner(trained, _device(config.device), config.images_per_forward)
-    depth = _depth(config, trained)
-    seen = (trained, runner, config.level, config.base_level, config.blend)
+def _labeller(settings: _Settings, trained: TrainedNetwork) -> Labeller:
+    runner = Runner(trained, _device(settings.device), settings.images_per_forward)
+    depth = _depth(settings, trained)
+    seen = (trained, runner, settings.level, settings.base_level, settings.blend)
     names = trained.class_names
-    if config.projection == "perspective":
-        return PhotoLabeller(PhotoPredictor(*seen), names, config.fov, depth)
-    crop = None if config.crop is None else list(config.crop)
-    return PanoramaLabeller(PanoramaPredictor(*seen, config.rotations), names, crop, depth)
+    if settings.projection == "perspective":
+        return PhotoLabeller(PhotoPredictor(*seen), names, settings.fov, depth)
+    return PanoramaLabeller(
+        PanoramaPredictor(*seen, settings.rotations), names, settings.crop, depth
+    )
 
 
-def _depth(config: DictConfig, trained: TrainedNetwork) -> DepthFolder | None:
-    wanted, given = "depth" in trained.inputs, config.depth is not None
+def _depth(settings: _Settings, trained: TrainedNetwork) -> DepthFolder | None:
+    wanted, given = "depth" in trained.inputs, settings.depth is not None
     if wanted != given:
         raise SettingError(
             "depth",
-            found=str(config.depth) if given else "none",
+            found=str(settings.depth) if given else "none",
             expected="a folder of depth images, for a network that takes RGB and depth"
             if wanted
             else "null, for a network that takes RGB only",
@@ -169,7 +192,7 @@ def _depth(config: DictConfig, trained: TrainedNetwork) -> DepthFolder | None:
             if wanted
             else "",
         )
-    return DepthFolder(Path(config.depth).expanduser(), config.depth_scale) if given else None
+    return DepthFolder(settings.depth, settings.depth_scale) if settings.depth else None
 
 
 def _device(name: str) -> str:
@@ -180,13 +203,13 @@ def _device(name: str) -> str:
     return "cuda" if torch.cuda.is_available() else "cpu"
 
 
-def _what_happens(config: DictConfig, trained: TrainedNetwork, count: int) -> str:
-    level = trained.level if config.level is None else config.level
+def _what_happens(settings: _Settings, trained: TrainedNetwork, count: int) -> str:
+    level = trained.level if settings.level is None else settings.level
     level = "of each image" if level == "image" else level
-    noun = "panorama" if config.projection == "equirectangular" else "photo"
+    noun = "panorama" if settings.projection == "equirectangular" else "photo"
     return (
         f"{count} {noun}{'s' if count != 1 else ''}, {len(trained.class_names) - 1} classes, "
-        f"level {level} (the network's is {trained.level}), blend {config.blend}, "
+        f"level {level} (the network's is {trained.level}), blend {settings.blend}, "
         f"{'RGB and depth' if 'depth' in trained.inputs else 'RGB'}"
     )
 
@@ -201,18 +224,26 @@ def _label_all(
         for number, (path, name) in enumerate(zip(paths, names, strict=True), start=1):
             entry: dict[str, Any] = {"file": str(path), "name": name}
             start = time.monotonic()
+            without_suffix = name.removesuffix(path.suffix)
             try:
                 found = labeller.label(
-                    path, lambda share: bar.advance(task, share), averaged=output.probabilities
+                    path,
+                    without_suffix,
+                    lambda share: bar.advance(task, share),
+                    averaged=output.probabilities,
                 )
-            except DataError as error:
-                bar.console.print(str(error), style="red", markup=False, soft_wrap=True)
-                yield entry | {"error": str(error)}, None
+            except (DataError, SettingError, MemoryError) as error:
+                message = f"{path}: {error}" if isinstance(error, MemoryError) else str(error)
+                bar.console.print(message, style="red", markup=False, soft_wrap=True)
+                yield entry | {"error": message}, None
             else:
                 output.write(name, found)
                 rows, columns = found.labels.shape
                 entry |= {"rows": rows, "columns": columns} | found.figures
+                # Without the scores: one image's are in memory, not two.
+                found = replace(found, mosaic=None)
                 yield entry | {"seconds": round(time.monotonic() - start, 3)}, found
+                del found
             rate = f"{number / (time.monotonic() - begun):.2f} images/s"
             bar.update(task, completed=number, rate=rate)
 
@@ -228,14 +259,16 @@ def _shown(entry: dict[str, Any], found: Labelled, class_count: int) -> EncodedI
 
 
 def _summary(
-    config: DictConfig, trained: TrainedNetwork, entries: list[dict[str, Any]]
+    settings: _Settings, trained: TrainedNetwork, entries: list[dict[str, Any]]
 ) -> dict[str, Any]:
-    settings = {name: config[name] for name in ("projection", "blend", "rotations", "base_level")}
+    how = {
+        name: getattr(settings, name) for name in ("projection", "blend", "rotations", "base_level")
+    }
     done = [entry for entry in entries if "error" not in entry]
     return {
-        "checkpoint": str(config.checkpoint),
-        "level": trained.level if config.level is None else config.level,
-        **settings,
+        "checkpoint": str(settings.checkpoint),
+        "level": trained.level if settings.level is None else settings.level,
+        **how,
         "classes": _mean_shares(done, trained.class_names),
         "images": entries,
     }
@@ -252,7 +285,7 @@ def _terminal_table(done: Sequence[dict[str, Any]], class_names: Sequence[str]) 
     table.add_column("class")
     table.add_column("solid angle %", justify="right")
     for name, share in shares:
-        table.add_row(name, f"{100 * share:.1f}")
+        table.add_row(escape(name), f"{100 * share:.1f}")
     return table
 
 

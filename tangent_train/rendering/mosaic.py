@@ -8,11 +8,13 @@ only the labels are kept.
 from __future__ import annotations
 
 import math
+import os
 import tempfile
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from tangent_train.errors import SettingError
 from tangent_train.rendering import kernels, mosaic_kernels
 from tangent_train.rendering.checks import check_blend
 from tangent_train.rendering.tables import FEATHER_POWER
@@ -42,7 +44,7 @@ class ScoreMosaic:
             `tangent_to_labels`. ``feather``: the weighted average of all images that see it.
         averaged: Whether to keep sums of probabilities: always with ``feather``; with ``nearest``
             for more than one grid, or when the probabilities are wanted. They take 4·K bytes a
-            pixel, beyond 2 GiB in a temporary file.
+            pixel, beyond 2 GiB in a temporary file (of the folder TMPDIR).
 
     Raises:
         SettingError: An unknown blend, or one the images cannot have.
@@ -101,8 +103,9 @@ class ScoreMosaic:
             crops: Where all crops are.
             which: ``(n,)`` which of them these are.
         """
+        cells = crops.cells()
         for number, image in zip(which, self._prepared(scores), strict=True):
-            box, cell = crops.boxes[number], crops.cells()[number]
+            box, cell = crops.boxes[number], cells[number]
             rows = max(0, math.floor(box[1])), min(self.shape[0], math.ceil(box[3]))
             self._over(
                 rows,
@@ -144,11 +147,21 @@ class ScoreMosaic:
 
 
 def _zeros(shape: tuple[int, ...]) -> NDArray[np.float32]:
-    if math.prod(shape) * 4 <= _IN_MEMORY_BYTES:
+    nbytes = math.prod(shape) * 4
+    if nbytes <= _IN_MEMORY_BYTES:
         return np.zeros(shape, np.float32)
     # The file has no name: it is gone with the array, whatever happens.
     with tempfile.TemporaryFile() as file:
-        return np.memmap(file, np.float32, "w+", shape=shape)
+        try:  # now: of a full disk the system says nothing later, it ends the process
+            os.posix_fallocate(file.fileno(), 0, nbytes)
+        except OSError as error:
+            raise SettingError(
+                f"temporary folder {tempfile.gettempdir()}",
+                found=error,
+                expected=f"room for {nbytes / 1e9:.1f} GB of scores",
+                remedy="Set TMPDIR to a folder on a larger disk, or choose blend=nearest.",
+            ) from error
+        return np.memmap(file, np.float32, "r+", shape=shape)
 
 
 def window(

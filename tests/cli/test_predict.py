@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from tangent_train.cli import main
 from tangent_train.geometry import equirect_directions, equirect_solid_angles
@@ -207,8 +208,8 @@ def test_networks_with_depth_want_depth(monkeypatch: pytest.MonkeyPatch, tmp_pat
         ({"output": "null"}, "output: found none"),
         ({"input": "nowhere"}, "nowhere"),
         ({"checkpoint": "nowhere.ckpt"}, r"nowhere\.ckpt: found no such file"),
-        ({"blend": "mean"}, "blend: found 'mean'; expected feather or nearest"),
-        ({"projection": "fisheye"}, "projection: found 'fisheye'"),
+        ({"blend": "mean"}, "blend: found mean; expected feather or nearest"),
+        ({"projection": "fisheye"}, "projection: found fisheye"),
         ({"fov": 60}, "fov: found 60"),
         ({"crop": "[0,10,0,10]", "projection": "perspective"}, "crop: found"),
         ({"rotations": 0}, "rotations: found 0"),
@@ -219,6 +220,11 @@ def test_networks_with_depth_want_depth(monkeypatch: pytest.MonkeyPatch, tmp_pat
         ({"images_per_forward": 0}, "images_per_forward"),
         ({"depth": "nowhere"}, "depth"),
         ({"colour": 1}, "unknown setting"),
+        ({"overwrite": "no"}, "overwrite: found no; expected true or false"),
+        ({"probabilities": "off"}, "probabilities: found off"),
+        ({"images_per_forward": 1.5}, "images_per_forward"),
+        ({"crop": 5}, r"crop: found 5; expected \[west"),
+        ({"crop": "[a,b,c,d]"}, "crop"),
     ],
 )
 def test_impossible_settings_are_refused_before_any_work(
@@ -269,3 +275,61 @@ def test_an_interruption_keeps_what_is_done(
     images = json.loads((output / "summary.json").read_text())["images"]
     assert [entry["name"] for entry in images] == ["a"]
     assert [path.name for path in (output / "labels").iterdir()] == ["a.png"]
+
+
+def test_results_are_not_labelled_again(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, checkpoint: Path
+) -> None:
+    _write(tmp_path / "a.png", _sphere(16))
+    settings = {"checkpoint": checkpoint, "input": tmp_path, "output": tmp_path}
+    for overwrite in ("false", "true"):
+        _predict(monkeypatch, **settings, overwrite=overwrite, report=0)
+        images = json.loads((tmp_path / "summary.json").read_text())["images"]
+        assert [entry["name"] for entry in images] == ["a"]
+    with pytest.raises(SystemExit, match="found only results"):
+        _predict(monkeypatch, **(settings | {"input": tmp_path / "color"}), overwrite="true")
+
+
+def test_one_picture_that_cannot_be_used_does_not_stop_the_others(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, checkpoint: Path
+) -> None:
+    """Neither a setting that does not fit it, nor a lie about its size, nor its name."""
+    folder, output = tmp_path / "in", tmp_path / "out"
+    _write(folder / "b.png", _sphere(16))
+    _write(folder / "square.png", _sphere(16)[:, :16])
+    strange = folder / "caf\udce9 ${x}.png"
+    _write(folder / "c.png", _sphere(16)).rename(strange)
+    lie = (
+        '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF '
+        'xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#"><rdf:Description '
+        'xmlns:GPano="http://ns.google.com/photos/1.0/panorama/" '
+        'GPano:ProjectionType="equirectangular" GPano:FullPanoWidthPixels="2000000" '
+        'GPano:FullPanoHeightPixels="1000000" GPano:CroppedAreaImageWidthPixels="32" '
+        'GPano:CroppedAreaImageHeightPixels="16" GPano:CroppedAreaLeftPixels="0" '
+        'GPano:CroppedAreaTopPixels="0"/></rdf:RDF></x:xmpmeta>'
+    )
+    Image.fromarray(_sphere(16)).save(folder / "huge.webp", xmp=lie.encode())
+    with pytest.raises(SystemExit, match="2 of 4 images"):
+        _predict(monkeypatch, checkpoint=checkpoint, input=folder, output=output)
+    assert len(list((output / "labels").iterdir())) == 2
+    with (output / "summary.csv").open(newline="") as file:
+        errors = {row["file"].rpartition("/")[2]: row["error"] for row in csv.DictReader(file)}
+    assert "32768 columns" in errors["huge.webp"]
+    assert "twice as wide" in errors["square.png"]
+
+
+def test_depth_is_that_of_the_image_in_its_folder(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    checkpoint = write_checkpoint(tmp_path / "model.ckpt", channels=4)
+    for scene, metres in (("x", 0.5), ("y", 3.5)):
+        _write(tmp_path / "images" / scene / "a.png", _sphere(32))
+        (tmp_path / "depth" / scene).mkdir(parents=True)
+        np.save(tmp_path / "depth" / scene / "a.npy", np.full((32, 64), metres, np.float32))
+    settings = {"checkpoint": checkpoint, "input": tmp_path / "images", "output": tmp_path / "out"}
+    _predict(monkeypatch, **settings, depth=tmp_path / "depth")
+    near, far = (_labels(tmp_path / "out" / "labels" / scene / "a.png") for scene in "xy")
+    assert (near != far).any()
+    np.save(tmp_path / "depth" / "y" / "a_depth.npy", np.full((32, 64), 1, np.float32))
+    with pytest.raises(SystemExit, match="1 of 2 images"):
+        _predict(monkeypatch, **settings, depth=tmp_path / "depth", overwrite="true")

@@ -10,6 +10,7 @@ import numpy as np
 
 from datamodules.pixel_files import PIXEL_SUFFIXES
 from datamodules.tangent_results import KINDS
+from tangent_train.cli import values
 from tangent_train.errors import SettingError
 from tangent_train.geometry import random_rotation, rotation_about
 
@@ -50,26 +51,26 @@ class ForwardSettings:
         Raises:
             SettingError: One cannot work.
         """
-        output, figure = _path(config, "output"), _path(config, "figure")
+        output, figure = values.path(config, "output"), values.path(config, "figure")
         if output is None and figure is None:
             raise SettingError("output", found="none", expected="a folder for the tangent images")
         if figure is not None and figure.suffix.lower() != ".png":
             raise SettingError("figure", found=str(figure), expected="the name of a .png file")
-        base_level = _whole(config, "base_level", 0)
-        level = _optional(config, "level", base_level)
+        base_level = values.whole(config, "base_level", 0)
+        level = values.optional_whole(config, "level", base_level)
         return cls(
             input=str(config["input"]),
             output=output,
             figure=figure,
             base_level=base_level,
             level=level,
-            dim=_optional(config, "dim", 2),
+            dim=values.optional_whole(config, "dim", 2),
             faces=_faces(config["faces"], 20 * 4**base_level),
             rotation=_rotation(config["rotation"], config["seed"]),
-            suffix="." + _choice(config, "format", _FORMATS),
-            interpolation=_choice(config, "interpolation", ("bilinear", "nearest")),
-            colmap=_flag(config, "colmap"),
-            overwrite=_flag(config, "overwrite"),
+            suffix="." + values.choice(config, "format", _FORMATS),
+            interpolation=values.choice(config, "interpolation", ("bilinear", "nearest")),
+            colmap=values.flag(config, "colmap"),
+            overwrite=values.flag(config, "overwrite"),
         )
 
 
@@ -100,49 +101,19 @@ class BackSettings:
                 found=f"{given[0]}= as well",
                 expected="one of them: input= renders tangent images, back= what was made of them",
             )
-        output = _path(config, "output")
+        output = values.path(config, "output")
         if output is None:
             raise SettingError("output", found="none", expected="a file for the panorama")
         return cls(
             back=Path(str(config["back"])).expanduser(),
             output=output,
-            cameras=_path(config, "cameras"),
-            blend=_choice(config, "blend", ("feather", "nearest")),
-            height=_optional(config, "height", 1),
-            kind=_choice(config, "kind", ("auto", *KINDS)),
-            z_depth=_flag(config, "z_depth"),
-            overwrite=_flag(config, "overwrite"),
+            cameras=values.path(config, "cameras"),
+            blend=values.choice(config, "blend", ("feather", "nearest")),
+            height=values.optional_whole(config, "height", 1),
+            kind=values.choice(config, "kind", ("auto", *KINDS)),
+            z_depth=values.flag(config, "z_depth"),
+            overwrite=values.flag(config, "overwrite"),
         )
-
-
-def _path(config: Mapping[str, Any], name: str) -> Path | None:
-    value = config[name]
-    return None if value is None else Path(str(value)).expanduser()
-
-
-def _whole(config: Mapping[str, Any], name: str, least: int) -> int:
-    value = config[name]
-    if type(value) is not int or value < least:
-        raise SettingError(name, found=value, expected=f"a whole number, {least} or more")
-    return value
-
-
-def _optional(config: Mapping[str, Any], name: str, least: int) -> int | None:
-    return None if config[name] is None else _whole(config, name, least)
-
-
-def _flag(config: Mapping[str, Any], name: str) -> bool:
-    value = config[name]
-    if not isinstance(value, bool):
-        raise SettingError(name, found=value, expected="true or false")
-    return value
-
-
-def _choice(config: Mapping[str, Any], name: str, allowed: tuple[str, ...]) -> Any:
-    value = config[name]
-    if value not in allowed:
-        raise SettingError(name, found=value, expected=" or ".join(allowed))
-    return value
 
 
 def _faces(value: Any, count: int) -> tuple[int, ...] | None:

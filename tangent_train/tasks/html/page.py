@@ -67,7 +67,10 @@ def write_report(
     }
     page = _filled(_resource("page.html"), parts)
     before, _, after = page.partition(_IMAGES)
-    with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+    with (
+        atomic_path(path) as temporary,
+        temporary.open("w", encoding="utf-8", errors="backslashreplace") as file,
+    ):
         file.write(before)
         for image in itertools.chain(filter(None, [first]), encoded):
             _write_image(file, image)

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from datamodules.gpano import area_of, area_of_crop, whole_area
-from datamodules.image_files import DEPTH_SUFFIXES, photo_fov_deg, read_depth_m, read_rgb
-from datamodules.panoramas import STEPS_PER_M, resize_nearest
+from datamodules.image_files import find_depth, photo_fov_deg, read_depth_m, read_rgb
+from datamodules.panoramas import meters_to_steps, resize_nearest
 from tangent_train.errors import DataError
 from tangent_train.geometry import camera_matrix_from_fov
 from tangent_train.tasks.prediction.predictor import Done, InputImage
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 
 __all__ = ["DepthFolder", "Labelled", "Labeller", "PanoramaLabeller", "PhotoLabeller"]
 
-_MOST_STEPS = np.iinfo(np.uint16).max
 _ASPECT_TOLERANCE = 0.01
+_NAMED = "Put depth into a folder of its own, with the names of the images."
 
 
 @dataclass(frozen=True)
@@ -59,11 +59,12 @@ class Labelled:
 class Labeller(Protocol):
     """Labels image files of one kind."""
 
-    def label(self, path: Path, done: Done, *, averaged: bool) -> Labelled:
+    def label(self, path: Path, name: str, done: Done, *, averaged: bool) -> Labelled:
         """Labels of one image.
 
         Args:
             path: Its file.
+            name: Its path below the folder of all images, without suffix.
             done: Told of the progress.
             averaged: Whether probabilities will be asked for.
 
@@ -85,32 +86,26 @@ class DepthFolder:
     path: Path
     units_per_m: float
 
-    def read(self, image: Path, shape: tuple[int, int]) -> NDArray[np.uint16]:
+    def read(self, name: str, shape: tuple[int, int]) -> NDArray[np.uint16]:
         """Depth of an image in steps of 1/512 m, 0 where missing, ``shape``.
+
+        Args:
+            name: Of the image, see `find_depth`.
+            shape: Its rows and columns.
 
         Raises:
             DataError: There is none, it is broken, or it shows something of another form.
         """
-        names = [f"{image.stem}{end}{s}" for end in ("", "_depth") for s in DEPTH_SUFFIXES]
-        found = [self.path / name for name in names if (self.path / name).is_file()]
-        if not found:
-            raise DataError(
-                image,
-                found=f"no {names[0]} or the like in {self.path}",
-                expected="depth of every image, for a network that takes RGB and depth",
-                remedy=f"Name it {image.stem} or {image.stem}_depth, "
-                f"with {', '.join(DEPTH_SUFFIXES)}.",
-            )
-        depth_m = read_depth_m(found[0], self.units_per_m)
+        path = find_depth(self.path, name, _NAMED)
+        depth_m = read_depth_m(path, self.units_per_m)
         height, width = depth_m.shape
         if abs(width * shape[0] / (height * shape[1]) - 1) > _ASPECT_TOLERANCE:
             raise DataError(
-                found[0],
+                path,
                 found=f"{height}×{width} pixels",
-                expected=f"the form of {image.name}, which has {shape[0]}×{shape[1]}",
+                expected=f"the form of the image, which has {shape[0]}×{shape[1]}",
             )
-        steps = np.minimum(np.rint(resize_nearest(depth_m, shape) * STEPS_PER_M), _MOST_STEPS)
-        return steps.astype(np.uint16)
+        return meters_to_steps(resize_nearest(depth_m, shape))
 
 
 @dataclass(frozen=True)
@@ -129,7 +124,7 @@ class PanoramaLabeller:
     crop: Sequence[float] | None = None
     depth: DepthFolder | None = None
 
-    def label(self, path: Path, done: Done, *, averaged: bool) -> Labelled:
+    def label(self, path: Path, name: str, done: Done, *, averaged: bool) -> Labelled:
         """Labels of one panorama; see `Labeller`."""
         rgb = read_rgb(path)
         size = (rgb.shape[0], rgb.shape[1])
@@ -137,7 +132,7 @@ class PanoramaLabeller:
             area = area_of_crop(size, self.crop)
         else:
             area = area_of(path, size) or whole_area(path, size)
-        depth = None if self.depth is None else area.place(self.depth.read(path, size))
+        depth = None if self.depth is None else area.place(self.depth.read(name, size))
         prediction = self.predictor.predict(
             InputImage(area.place(rgb), depth), done, averaged=averaged
         )
@@ -173,7 +168,7 @@ class PhotoLabeller:
     fov_deg: float | None = None
     depth: DepthFolder | None = None
 
-    def label(self, path: Path, done: Done, *, averaged: bool) -> Labelled:
+    def label(self, path: Path, name: str, done: Done, *, averaged: bool) -> Labelled:
         """Labels of one photo; see `Labeller`."""
         rgb = read_rgb(path)
         height, width = rgb.shape[:2]
@@ -186,7 +181,7 @@ class PhotoLabeller:
                 remedy="Give fov=, the horizontal one in degrees: 65 to 80 for most telephones.",
             )
         camera_matrix = camera_matrix_from_fov(fov_deg, (height, width))
-        depth = None if self.depth is None else self.depth.read(path, (height, width))
+        depth = None if self.depth is None else self.depth.read(name, (height, width))
         prediction = self.predictor.predict(
             InputImage(rgb, depth), camera_matrix, done, averaged=averaged
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,18 +38,19 @@ def output_names(paths: Sequence[Path]) -> list[str]:
     >>> output_names([Path("a/x/1.jpg"), Path("a/1.jpg"), Path("a/1.png")])
     ['x/1', '1.jpg', '1.png']
     """
-    parents = [path.absolute().parent for path in paths]
+    # Without "..", which would lead out of the output folder.
+    absolute = [Path(os.path.abspath(path)) for path in paths]  # noqa: PTH100
     shared = 0
-    for parts in zip(*(parent.parts for parent in parents), strict=False):
+    for parts in zip(*(path.parent.parts for path in absolute), strict=False):
         if len(set(parts)) > 1:
             break
         shared += 1
-    whole = [Path(*path.absolute().parts[shared:]) for path in paths]
+    whole = [Path(*path.parts[shared:]) for path in absolute]
     short = [path.with_suffix("") for path in whole]
-    # Upper and lower case are the same file on some disks.
-    seen = Counter(str(path).casefold() for path in short)
+    # Upper and lower case are the same file on some disks; "1.jpg.png" without suffix is "1.jpg".
+    taken = Counter(str(path).casefold() for path in (*short, *whole))
     chosen = zip(whole, short, strict=True)
-    return [(a if seen[str(b).casefold()] > 1 else b).as_posix() for a, b in chosen]
+    return [(a if taken[str(b).casefold()] > 1 else b).as_posix() for a, b in chosen]
 
 
 @dataclass(frozen=True)
@@ -82,8 +84,12 @@ class OutputFolder:
             SettingError: A file is there already, or no folder can be.
         """
         place = next(p for p in (self.path, *self.path.absolute().parents) if p.exists())
-        if not place.is_dir():
-            raise SettingError("output", found=f"the file {place}", expected="a folder")
+        if not place.is_dir() or not os.access(place, os.W_OK):
+            found = f"the file {place}" if place.is_file() else str(place)
+            raise SettingError("output", found=found, expected="a folder that can be written")
+        if len({name.casefold() for name in names}) < len(names):
+            twice = next(name for name in names if names.count(name) > 1)
+            raise SettingError("input", found=f"{twice} twice", expected="every image once")
         wanted = [file for name in names for file in self.files(name).values()]
         wanted += [self.path / name for name in _OF_ALL]
         there = [file for file in wanted if file.exists()]

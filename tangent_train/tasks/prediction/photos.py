@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
+from datamodules.panoramas import resize_area, resize_depth
 from datamodules.photos import distance_from_z_depth
 from tangent_train.geometry import nearest_level
 from tangent_train.rendering.mosaic import ScoreMosaic
@@ -16,8 +19,6 @@ from tangent_train.tasks.prediction.predictor import Done, InputImage, Level, Pr
 from tangent_train.tasks.prediction.seen import photo_representation
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from tangent_train.rendering import Blend, PerspectiveRepresentation
     from tangent_train.tasks.networks import TrainedNetwork
 
@@ -25,6 +26,11 @@ __all__ = ["PhotoPredictor"]
 
 _OVERLAP = 0.25
 """Least overlap of neighbouring crops that are feathered, as a share of their side."""
+
+_FINER = 2
+"""Pixels of a photo per pixel of a crop that are kept of photos smaller than a crop."""
+
+_Boxes = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
 class PhotoPredictor:
@@ -76,12 +82,11 @@ class PhotoPredictor:
         if level == "image":  # of panoramas with the photo's angular resolution
             level = nearest_level(round(math.pi * camera_matrix[1, 1]))
         representation = photo_representation(self._trained, level, self._base_level)
-        whole, margin, matrix = _widened(image, camera_matrix, representation)
+        whole, matrix, to_photo = _fitted(image, camera_matrix, representation)
         sampler = representation.of_camera(matrix, whole.rgb.shape[:2])
         overlap = _OVERLAP if self._blend == "feather" else 0.0
         crops = sampler.cover(overlap)
-        left, top = margin
-        in_photo = PhotoCrops(crops.boxes - [left, top, left, top], crops.size)
+        in_photo = PhotoCrops(to_photo(crops.boxes), crops.size)
         mosaic = ScoreMosaic(
             (height, width), self._runner.num_classes, self._blend, averaged=averaged
         )
@@ -93,29 +98,38 @@ class PhotoPredictor:
         return Prediction(mosaic, level, count)
 
 
-def _widened(
+def _fitted(
     image: InputImage, camera_matrix: NDArray[np.float64], wanted: PerspectiveRepresentation
-) -> tuple[InputImage, tuple[int, int], NDArray[np.float64]]:
-    """The photo, mirrored at its borders where it is smaller than one crop.
+) -> tuple[InputImage, NDArray[np.float64], _Boxes]:
+    """The photo; where it is smaller than a crop, mirrored at its borders.
+
+    Of those only as many pixels are kept as the crops need: mirrored, a photo of a telescope would
+    fill the memory.
 
     Returns:
-        The image with distance as depth, columns and rows added to the left and on top, and its K.
+        The image with distance as depth, its K, and what brings boxes in it back to the photo.
     """
-    size = image.rgb.shape[:2]
-    rows, columns = wanted.image_size
-    pixel = 2 * math.tan(math.radians(wanted.fov_deg) / 2) / columns
-    least = (rows * pixel * camera_matrix[1, 1], columns * pixel * camera_matrix[0, 0])
     depth = image.depth
     if depth is not None:
         depth = distance_from_z_depth(depth, camera_matrix)
-    missing = [max(0, math.ceil(a - b + 1e-6)) for a, b in zip(least, size, strict=True)]
-    if not any(missing):
-        return InputImage(image.rgb, depth), (0, 0), camera_matrix
-    # Twice the half, so that the principal point stays as near to the middle as it was.
-    top, left = ((n + 1) // 2 for n in missing)
+    size, rgb = image.rgb.shape[:2], image.rgb
+    pixel = 2 * math.tan(math.radians(wanted.fov_deg) / 2) / wanted.image_size[1]
+    per_pixel = pixel * np.diag(camera_matrix)[[1, 0]]  # pixels of the photo, down and across
+    least = wanted.image_size * per_pixel
+    if np.all(least <= size):
+        return InputImage(rgb, depth), camera_matrix, lambda boxes: boxes
+    kept = np.minimum(1, _FINER / per_pixel)
+    rows, columns = (max(1, round(n * share)) for n, share in zip(size, kept, strict=True))
+    scale = np.array([columns / size[1], rows / size[0]])
+    least = np.ceil(least * scale[::-1] + 1e-6)
+    top, left = (math.ceil(max(0, a - b) / 2) for a, b in zip(least, (rows, columns), strict=True))
     borders = (top, top, left, left, cv2.BORDER_REFLECT_101)
+    rgb = cv2.copyMakeBorder(resize_area(rgb, (rows, columns)), *borders)
+    if depth is not None:
+        depth = cv2.copyMakeBorder(resize_depth(depth, (rows, columns)), *borders)
     matrix = camera_matrix.copy()
-    matrix[:2, 2] += left, top
-    rgb = cv2.copyMakeBorder(image.rgb, *borders)
-    depth = None if depth is None else cv2.copyMakeBorder(depth, *borders)
-    return InputImage(rgb, depth), (left, top), matrix
+    matrix[:2, 2] += 0.5
+    matrix[:2] *= scale[:, None]
+    matrix[:2, 2] += (left - 0.5, top - 0.5)
+    offset, factor = np.tile((left, top), 2), np.tile(scale, 2)
+    return InputImage(rgb, depth), matrix, lambda boxes: (boxes - offset) / factor

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from tangent_train.geometry import equirect_latitudes
+from tangent_train.rendering.kernels import directions_of_rows
 from tangent_train.rendering.tables import owner_table
 
 if TYPE_CHECKING:
@@ -51,10 +52,10 @@ def seam_score(labels: NDArray[np.integer], grid: PinholeGrid) -> SeamScore:
         Shares from 0 to 1; NaN where there are no such pairs.
     """
     step = -(-labels.shape[0] // _MOST_ROWS)
+    owners = _owners(grid, (labels.shape[0], labels.shape[1]), step)
+    weight = np.cos(equirect_latitudes(labels.shape[0]))[::step, None]
     labels = labels[::step, ::step]
-    shape = (labels.shape[0], labels.shape[1])
-    owners = owner_table(grid, shape, np.dtype(np.float32)).face[0]
-    weight = np.cos(equirect_latitudes(shape[0]))[:, None]
+    shape = labels.shape
     counts = np.zeros((2, 2))  # inside or border, equal or different
     for axis, last in ((1, shape[0]), (0, shape[0] - 1)):  # the rows end, the columns go around
         other, owner = np.roll(labels, -1, axis)[:last], np.roll(owners, -1, axis)[:last]
@@ -65,3 +66,16 @@ def seam_score(labels: NDArray[np.integer], grid: PinholeGrid) -> SeamScore:
     with np.errstate(invalid="ignore"):
         inside, border = counts[:, 1] / counts.sum(axis=1)
     return SeamScore(float(border), float(inside))
+
+
+def _owners(grid: PinholeGrid, shape: tuple[int, int], step: int) -> NDArray[np.integer]:
+    """Owners of every `step`-th row and column of a panorama."""
+    if step == 1:
+        return owner_table(grid, shape, np.dtype(np.float32)).face[0]
+    columns, rows = directions_of_rows(*shape)
+    columns, rows = columns[::step], rows[::step]
+    owners = np.empty((len(rows), len(columns)), np.int32)
+    for owner, (cosine, sine) in zip(owners, rows, strict=True):
+        directions = np.column_stack([cosine * columns, np.full(len(columns), sine)])
+        owner[:] = grid.owners(directions)
+    return owners

@@ -20,6 +20,8 @@ NAMES = ("unknown", "a", "b")
         (["p/x/a.jpg", "p/y/a.jpg"], ["x/a", "y/a"]),
         (["p/a.jpg", "p/a.png", "p/A.tif", "p/b.c.jpg"], ["a.jpg", "a.png", "A.tif", "b.c"]),
         (["p/q/a.jpg", "b.jpg"], ["p/q/a", "b"]),
+        (["1.jpg", "1.png", "1.jpg.png"], ["1.jpg", "1.png", "1.jpg.png"]),
+        (["p/../p/q/../a.jpg", "p/b.jpg"], ["a", "b"]),
         (["a/x.jpg", "ab/x.jpg"], ["a/x", "ab/x"]),
         (["raum ü (1)/ä.jpg"], ["ä"]),
     ],

@@ -124,3 +124,14 @@ def test_crops_the_network_cannot_take_are_refused() -> None:
     trained = trained_network(TANGENT, size_multiple=16)
     with pytest.raises(SettingError, match="multiples of 16"):
         PhotoPredictor(trained, Runner(trained), level=3)
+
+
+def test_a_photo_of_a_telescope_needs_little_memory() -> None:
+    """Far smaller than a crop: mirrored at full resolution it would have 14,000² pixels."""
+    trained = trained_network(PERSPECTIVE, network=color_network(kernel=1))
+    rgb = np.zeros((600, 800, 3), np.uint8)
+    rgb[:, 400:] = 255
+    labels = _predict(trained, InputImage(rgb), 2.5).mosaic.labels()
+    assert (labels[:, :330] == labels[0, 0]).all()
+    assert (labels[:, 470:] == labels[0, -1]).all()
+    assert labels[0, 0] != labels[0, -1]
