@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import DTypeLike, NDArray
 
-__all__ = ["PIXEL_SUFFIXES", "check_writable", "read_pixels", "write_pixels"]
+__all__ = ["LOSSY_SUFFIXES", "PIXEL_SUFFIXES", "check_writable", "read_pixels", "write_pixels"]
 
 _EIGHT = (np.dtype(np.uint8),)
 _SIXTEEN = (*_EIGHT, np.dtype(np.uint16))
@@ -102,6 +102,10 @@ def _read_deep(path: Path, *, grey: bool) -> NDArray[Any] | None:
     if image.ndim == 2 or grey:
         return np.ascontiguousarray(image if image.ndim == 2 else image[..., 0])
     return np.ascontiguousarray(image[..., 2::-1] if image.shape[2] in (3, 4) else image)
+
+
+LOSSY_SUFFIXES = (".jpg", ".jpeg", ".webp")
+"""Files whose pixels come back a little other: not for labels and depth."""
 
 
 def check_writable(suffix: str, dtype: DTypeLike, channels: int) -> None:

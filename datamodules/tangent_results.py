@@ -12,7 +12,13 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.lib.format import open_memmap
 
-from datamodules.pixel_files import PIXEL_SUFFIXES, check_writable, read_pixels, write_pixels
+from datamodules.pixel_files import (
+    LOSSY_SUFFIXES,
+    PIXEL_SUFFIXES,
+    check_writable,
+    read_pixels,
+    write_pixels,
+)
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import atomic_path
 from tangent_train.geometry.resized_grid import ResizedGrid
@@ -177,6 +183,12 @@ class TangentResults:
         if z_depth and self.kind != "depth":
             raise SettingError("z_depth", found=f"true for {self.kind}", expected="depth")
         suffix = path.suffix.lower()
+        if suffix in LOSSY_SUFFIXES and self.kind != "color":
+            raise SettingError(
+                "output",
+                found=path.name,
+                expected=f"png, tif or npy: {suffix} would change the {self.kind}",
+            )
         channels = self.arrays[0].shape[2:]
         check_writable(suffix, self._dtype(suffix), channels[0] if channels else 1)
         size = self.arrays[0].shape[0]

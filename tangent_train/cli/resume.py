@@ -26,6 +26,7 @@ _FREE = (
     "task.compile",
     "task.images_per_chunk",
     "task.images_per_forward",
+    "tensorboard_images",
     "trainer",
 )
 """Settings, with all below them, that say where and how a run is computed, not what."""

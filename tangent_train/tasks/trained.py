@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from typing import TYPE_CHECKING, Any
 
 from tangent_train.errors import DataError
@@ -64,7 +65,11 @@ def read_checkpoint(path: Path, needed: Sequence[str] = ("config", "state_dict")
     import torch
 
     if not path.is_file():
-        raise DataError(path, found="no such file", expected=_EXPECTED)
+        found = "a folder" if path.is_dir() else "no such file"
+        remedy = "Give its checkpoints/best.ckpt." if path.is_dir() else ""
+        raise DataError(path, found=found, expected=_EXPECTED, remedy=remedy)
+    if not zipfile.is_zipfile(path):
+        raise DataError(path, found="an unreadable file", expected=_EXPECTED)
     try:
         content = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
     except Exception as error:

@@ -155,17 +155,19 @@ def test_a_part_of_a_panorama_is_labelled_as_that_part(
 
 @pytest.mark.parametrize("representation", [TANGENT, PERSPECTIVE])
 def test_photos(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, representation: dict[str, Any]
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    representation: dict[str, Any],
 ) -> None:
     checkpoint = write_checkpoint(tmp_path / "model.ckpt", representation)
     rgb = _sphere(64)[10:40, 20:70]
     _write(tmp_path / "photos" / "a.png", np.ascontiguousarray(rgb))
     settings = {"checkpoint": checkpoint, "input": tmp_path / "photos", "projection": "perspective"}
-    with pytest.raises(SystemExit):
-        _predict(monkeypatch, **settings, output=tmp_path / "none")
-    assert not (tmp_path / "none" / "labels").exists()
-    error = json.loads((tmp_path / "none" / "summary.json").read_text())["images"][0]["error"]
-    assert "Give fov=" in error
+    with pytest.raises(SystemExit, match="1 of 1 images"):
+        _predict(monkeypatch, **settings, output=tmp_path / "out")
+    assert not (tmp_path / "out").exists()  # nothing in the way of the next try
+    assert "Give fov=" in " ".join(capsys.readouterr().out.split())
     _predict(monkeypatch, **settings, output=tmp_path / "out", fov=70)
     assert _labels(tmp_path / "out" / "labels" / "a.png").shape == (30, 50)
     entry = json.loads((tmp_path / "out" / "summary.json").read_text())["images"][0]
@@ -242,19 +244,25 @@ def test_impossible_settings_are_refused_before_any_work(
 
 
 def test_a_picture_that_is_no_panorama_says_what_to_do(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, checkpoint: Path
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    checkpoint: Path,
 ) -> None:
     image = _write(tmp_path / "a.png", np.zeros((30, 40, 3), np.uint8))
     with pytest.raises(SystemExit):
         _predict(monkeypatch, checkpoint=checkpoint, input=image, output=tmp_path / "out")
-    error = json.loads((tmp_path / "out" / "summary.json").read_text())["images"][0]["error"]
+    error = capsys.readouterr().out
     assert "30×40" in error
     for remedy in ("crop=", "GPano", "projection=perspective"):
         assert remedy in error
 
 
 def test_an_interruption_keeps_what_is_done(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, checkpoint: Path
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    checkpoint: Path,
 ) -> None:
     for name in ("a", "b", "c"):
         _write(tmp_path / "panoramas" / f"{name}.png", _sphere(16))
@@ -275,6 +283,17 @@ def test_an_interruption_keeps_what_is_done(
     images = json.loads((output / "summary.json").read_text())["images"]
     assert [entry["name"] for entry in images] == ["a"]
     assert [path.name for path in (output / "labels").iterdir()] == ["a.png"]
+    assert "1 of 3 images are done. resume=true" in capsys.readouterr().out
+    monkeypatch.setattr(PanoramaLabeller, "label", whole)
+    first = (output / "labels" / "a.png").stat().st_mtime_ns
+    settings = {"checkpoint": checkpoint, "input": tmp_path / "panoramas", "output": output}
+    with pytest.raises(SystemExit, match="blend: found nearest; expected feather"):
+        _predict(monkeypatch, **settings, resume="true", blend="nearest")
+    _predict(monkeypatch, **settings, resume="true")
+    images = json.loads((output / "summary.json").read_text())["images"]
+    assert [entry["name"] for entry in images] == ["a", "b", "c"]
+    assert (output / "labels" / "a.png").stat().st_mtime_ns == first
+    assert len(list((output / "labels").iterdir())) == 3
 
 
 def test_results_are_not_labelled_again(

@@ -184,6 +184,9 @@ def test_labels_are_never_mixed(tmp_path: Path) -> None:
     labels = labels.repeat(8, axis=0).repeat(8, axis=1)
     path = _write(tmp_path / "labels.png", labels)
     _render(input=path, output=tmp_path / "tan", interpolation="nearest", base_level=1)
+    for name in ("back.jpg", "back.webp"):
+        with pytest.raises(DataError, match="would change the labels"):
+            _render(back=tmp_path / "tan" / "labels", output=tmp_path / name)
     _render(back=tmp_path / "tan" / "labels", output=tmp_path / "back.png")
     again = _read(tmp_path / "back.png")
     assert again.dtype == np.uint8
@@ -499,6 +502,10 @@ def test_parts_of_panoramas_by_their_tags(tmp_path: Path) -> None:
         ({"input": "in", "output": "tan", "rotation": "so3", "seed": -1}, "seed"),
         ({"input": "in", "output": "tan", "format": "gif"}, "format: found gif; expected png"),
         ({"input": "in", "output": "tan", "interpolation": "cubic"}, "interpolation"),
+        (
+            {"input": "in", "output": "tan", "interpolation": "nearest", "format": "jpg"},
+            "format: found jpg; .* others change pixels",
+        ),
         ({"input": "in", "output": "tan", "colmap": "yes"}, "colmap: found yes; expected true"),
         ({"input": "in", "figure": "a.jpg"}, "figure"),
         ({"input": "in", "back": "tan", "output": "a.png"}, "input= as well"),

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from datamodules.pixel_files import PIXEL_SUFFIXES
+from datamodules.pixel_files import LOSSY_SUFFIXES, PIXEL_SUFFIXES
 from datamodules.tangent_results import KINDS
 from tangent_train.cli import values
 from tangent_train.errors import SettingError
@@ -56,6 +56,14 @@ class ForwardSettings:
             raise SettingError("output", found="none", expected="a folder for the tangent images")
         if figure is not None and figure.suffix.lower() != ".png":
             raise SettingError("figure", found=str(figure), expected="the name of a .png file")
+        suffix = "." + values.choice(config, "format", _FORMATS)
+        interpolation = values.choice(config, "interpolation", ("bilinear", "nearest"))
+        if interpolation == "nearest" and suffix in LOSSY_SUFFIXES:
+            raise SettingError(
+                "format",
+                found=config["format"],
+                expected="png, tif or npy with interpolation=nearest: others change pixels",
+            )
         base_level = values.whole(config, "base_level", 0)
         level = values.optional_whole(config, "level", base_level)
         return cls(
@@ -67,8 +75,8 @@ class ForwardSettings:
             dim=values.optional_whole(config, "dim", 2),
             faces=_faces(config["faces"], 20 * 4**base_level),
             rotation=_rotation(config["rotation"], config["seed"]),
-            suffix="." + values.choice(config, "format", _FORMATS),
-            interpolation=values.choice(config, "interpolation", ("bilinear", "nearest")),
+            suffix=suffix,
+            interpolation=interpolation,
             colmap=values.flag(config, "colmap"),
             overwrite=values.flag(config, "overwrite"),
         )

@@ -17,7 +17,7 @@ from tangent_train.files import atomic_path, write_bytes, write_text
 from tangent_train.tasks.pictures import colorize, overlay_picture
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
     from numpy.typing import NDArray
 
@@ -73,7 +73,7 @@ class OutputFolder:
         kinds |= {"probabilities": ".npy"} if self.probabilities else {}
         return {kind: self.path / kind / f"{name}{suffix}" for kind, suffix in kinds.items()}
 
-    def check(self, names: Sequence[str], *, overwrite: bool) -> None:
+    def check(self, names: Iterable[str], *, overwrite: bool) -> None:
         """Make sure that nothing of the user's would be lost, before any work.
 
         Args:
@@ -87,9 +87,6 @@ class OutputFolder:
         if not place.is_dir() or not os.access(place, os.W_OK):
             found = f"the file {place}" if place.is_file() else str(place)
             raise SettingError("output", found=found, expected="a folder that can be written")
-        if len({name.casefold() for name in names}) < len(names):
-            twice = next(name for name in names if names.count(name) > 1)
-            raise SettingError("input", found=f"{twice} twice", expected="every image once")
         wanted = [file for name in names for file in self.files(name).values()]
         wanted += [self.path / name for name in _OF_ALL]
         there = [file for file in wanted if file.exists()]
@@ -98,7 +95,7 @@ class OutputFolder:
                 "output",
                 found=f"{there[0]}" + (f" and {len(there) - 1} more" if there[1:] else ""),
                 expected="a folder without earlier results",
-                remedy="Give another folder, or overwrite=true.",
+                remedy="Give another folder, resume=true to keep them, or overwrite=true.",
             )
 
     def write_classes(self) -> None:
@@ -112,7 +109,18 @@ class OutputFolder:
         Args:
             name: From `output_names`.
             found: The image and its labels.
+
+        Raises:
+            SettingError: They cannot be written.
         """
+        try:
+            self._write(name, found)
+        except OSError as error:
+            raise SettingError(
+                "output", found=error, expected="a folder that can be written, with room"
+            ) from error
+
+    def _write(self, name: str, found: Labelled) -> None:
         files = self.files(name)
         _write_png(files["labels"], found.labels)
         _write_png(files["color"], colorize(found.labels, len(self.class_names)))

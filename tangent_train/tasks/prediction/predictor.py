@@ -85,7 +85,7 @@ class Runner:
             raise SettingError("images_per_forward", found=views_at_once, expected="1 or more")
         try:
             self._device = torch.device(device)
-            self._network = trained.network.to(self._device, memory_format=_FORMAT)
+            self._network = trained.network.to(self._device).to(memory_format=_FORMAT)
         except (RuntimeError, AssertionError) as error:  # torch says so when it lacks CUDA
             raise SettingError(
                 "device", found=f"{device} ({error})", expected="cpu, or a device of this machine"

@@ -1,0 +1,1 @@
+"""What tangent-predict is told, and what it tells."""
