@@ -18,7 +18,14 @@ if TYPE_CHECKING:
 
     from numpy.typing import DTypeLike, NDArray
 
-__all__ = ["LOSSY_SUFFIXES", "PIXEL_SUFFIXES", "check_writable", "read_pixels", "write_pixels"]
+__all__ = [
+    "LOSSY_SUFFIXES",
+    "PIXEL_SUFFIXES",
+    "READABLE_SUFFIXES",
+    "check_writable",
+    "read_pixels",
+    "write_pixels",
+]
 
 _EIGHT = (np.dtype(np.uint8),)
 _SIXTEEN = (*_EIGHT, np.dtype(np.uint16))
@@ -103,6 +110,9 @@ def _read_deep(path: Path, *, grey: bool) -> NDArray[Any] | None:
         return np.ascontiguousarray(image if image.ndim == 2 else image[..., 0])
     return np.ascontiguousarray(image[..., 2::-1] if image.shape[2] in (3, 4) else image)
 
+
+READABLE_SUFFIXES = (*PIXEL_SUFFIXES, ".exr")
+"""What names of files end in that `read_pixels` takes."""
 
 LOSSY_SUFFIXES = (".jpg", ".jpeg", ".webp")
 """Files whose pixels come back a little other: not for labels and depth."""

@@ -14,7 +14,7 @@ from numpy.lib.format import open_memmap
 
 from datamodules.pixel_files import (
     LOSSY_SUFFIXES,
-    PIXEL_SUFFIXES,
+    READABLE_SUFFIXES,
     check_writable,
     read_pixels,
     write_pixels,
@@ -68,7 +68,7 @@ def result_files(folder: Path, cameras: CameraFile) -> list[Path]:
         )
     files: dict[str, list[Path]] = {}
     for file in sorted(folder.iterdir() if folder.is_dir() else ()):
-        if file.suffix.lower() in PIXEL_SUFFIXES and not file.name.startswith("."):
+        if file.suffix.lower() in READABLE_SUFFIXES and not file.name.startswith("."):
             files.setdefault(file.stem, []).append(file)
     stems = {Path(name).stem: face for name, face in zip(cameras.files, cameras.faces, strict=True)}
     _check_names(folder, files, stems.keys())

@@ -81,12 +81,14 @@ def train(config: DictConfig) -> float | None:
         warnings.filterwarnings("ignore", ".* your dataloader is not resumable")
         try:
             trainer.fit(task, datamodule=data, ckpt_path=resumed, weights_only=True)
+            # First: an error in the test must not cost a sweep its figure.
+            score = _best_on_validation(trainer, folder)
             best = checkpoints / "best.ckpt"
             best = best if best.exists() else checkpoints / "last.ckpt"
             _test(trainer, task, data, best, folder)
         except SIGTERMException:
             sys.exit(128 + signal.SIGTERM)
-    return _best_on_validation(trainer, folder)
+    return score
 
 
 def evaluate(config: DictConfig) -> None:
@@ -269,7 +271,9 @@ def _report(results: dict[str, Any], checkpoint: Path, folder: Path) -> None:
     write_results(results, folder)
     console = _console()
     console.print(results_table(results))
-    console.print(f"Results, pictures and logs are in {folder} (checkpoint {checkpoint.name}).")
+    console.print(
+        f"Results, pictures and logs are in {folder} (checkpoint {checkpoint.name}).", markup=False
+    )
 
 
 @rank_zero_only
@@ -284,7 +288,7 @@ def _report_page(
     images = [i for c in callbacks if isinstance(c, PredictionPanels) for i in c.images]
     page = folder / "report.html"
     write_evaluation_report(page, results, class_names, images, checkpoint)
-    _console().print(f"To look at in a browser: {page}")
+    _console().print(f"To look at in a browser: {page}", markup=False)
 
 
 def _run_folder() -> Path:

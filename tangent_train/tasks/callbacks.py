@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from lightning.pytorch.callbacks import Callback, RichProgressBar
 
+from tangent_train.errors import SettingError
 from tangent_train.files import write_bytes
 from tangent_train.tasks.html.evaluation import image_note
 from tangent_train.tasks.html.images import EncodedImage, ViewerImage, encode_image
@@ -34,6 +35,8 @@ class PredictionPanels(Callback):
     """
 
     def __init__(self, folder: Path | str, count: int = 6) -> None:
+        if count < 0:
+            raise SettingError("panels", found=count, expected="0 or more")
         self.folder = Path(folder)
         self.count = count
         self.images: list[EncodedImage] = []

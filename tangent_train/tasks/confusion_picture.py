@@ -16,6 +16,10 @@ _DPI = 100
 _CELL_IN = 0.34
 """Side of a class's square in inches, for two digits of `_FONT_PT`."""
 
+_SMALL_CELL_IN = 0.12
+_MOST_NUMBERED = 40
+"""Of more classes the squares are smaller and without numbers."""
+
 _FONT_PT = 8.0
 _LETTER_IN = 0.075
 _LEAST_IN = 2.5
@@ -42,8 +46,8 @@ def row_shares(confusion: ArrayLike) -> NDArray[np.float64]:
 def confusion_picture(confusion: ArrayLike, class_names: Sequence[str]) -> NDArray[np.uint8]:
     """Where the pixels of every class went: a row per true class, percent of its pixels.
 
-    Numbers are whole percents; what rounds to 0 is left out, rows of classes without labelled
-    pixels are grey.
+    Numbers are whole percents, of up to 40 classes; what rounds to 0 is left out, rows of classes
+    without labelled pixels are grey.
 
     Args:
         confusion: ``(K+1, K+1)`` counts or weights: rows truth, columns prediction, 0 unknown.
@@ -53,7 +57,9 @@ def confusion_picture(confusion: ArrayLike, class_names: Sequence[str]) -> NDArr
         RGB image, as large as its classes need.
     """
     shares, names = row_shares(confusion), class_names[1:]
-    side = _CELL_IN * len(names)
+    numbered = len(names) <= _MOST_NUMBERED
+    side = (_CELL_IN if numbered else _SMALL_CELL_IN) * len(names)
+    font = _FONT_PT if numbered else _FONT_PT - 2
     margin = 0.5 + _LETTER_IN * max(map(len, names))
     right, bottom = 0.15, 0.4
     width, height = max(margin + side + right, _LEAST_IN), margin + side + bottom
@@ -63,8 +69,8 @@ def confusion_picture(confusion: ArrayLike, class_names: Sequence[str]) -> NDArr
     axes.set_facecolor("#cccccc")  # seen through NaN
     axes.imshow(shares, cmap="Blues", vmin=0, vmax=1, aspect="auto", interpolation="nearest")
     places = range(len(names))
-    axes.set_xticks(places, names, rotation=90, fontsize=_FONT_PT)
-    axes.set_yticks(places, names, fontsize=_FONT_PT)
+    axes.set_xticks(places, names, rotation=90, fontsize=font)
+    axes.set_yticks(places, names, fontsize=font)
     axes.xaxis.tick_top()
     axes.tick_params(length=0)
     axes.set_xticks(np.arange(len(names) + 1) - 0.5, minor=True)
@@ -74,7 +80,7 @@ def confusion_picture(confusion: ArrayLike, class_names: Sequence[str]) -> NDArr
     axes.set_ylabel("truth", fontsize=_FONT_PT + 1)
     axes.set_xlabel("prediction, % of the true class", fontsize=_FONT_PT + 1, loc="left")
     percents = np.rint(100 * np.nan_to_num(shares)).astype(int)
-    for row, column in np.argwhere(percents):
+    for row, column in np.argwhere(percents) if numbered else ():
         color = "white" if shares[row, column] > _DARK else "black"
         text = str(percents[row, column])
         axes.text(column, row, text, ha="center", va="center", color=color, fontsize=_FONT_PT - 1)

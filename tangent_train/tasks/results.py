@@ -118,7 +118,7 @@ def results_table(results: dict[str, Any]) -> Table:
     for k, name in enumerate(header):
         table.add_column(name, justify="right" if k else "left")
     for row in rows:
-        table.add_row(*row, style="bold" if row is rows[-1] else None)
+        table.add_row(*map(escape, row), style="bold" if row is rows[-1] else None)
     return table
 
 

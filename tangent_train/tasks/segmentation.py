@@ -210,9 +210,9 @@ class SegmentationTask(lightning.LightningModule):
             self.confusion.update(prediction, target)
         return torch.stack(predictions)
 
-    def validation_step(self, batch: Any, batch_idx: int) -> None:
-        """Score panoramas or photos."""
-        self._evaluate(batch)
+    def validation_step(self, batch: Any, batch_idx: int) -> Tensor:
+        """Score panoramas or photos and hand the predictions to the callbacks."""
+        return self._evaluate(batch)
 
     def test_step(self, batch: Any, batch_idx: int) -> Tensor:
         """Score panoramas or photos and hand the predictions to the callbacks."""

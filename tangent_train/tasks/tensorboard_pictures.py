@@ -20,7 +20,7 @@ from tangent_train.tasks.pictures import prediction_panel
 
 __all__ = ["TrainingSpeed", "ValidationPictures", "shown_image"]
 
-_MOST_ROWS = 512
+_MOST_ROWS = 256
 """Larger images are shown smaller: an event file holds the pictures of all validations."""
 
 _PANORAMA_DIMENSIONS = 2
@@ -67,10 +67,8 @@ class ValidationPictures(Callback):
         if writer is None or batch_idx not in chosen:
             return
         target, index = batch.target[0], int(batch.index[0])
-        # Once more, for these few: a validation step keeps no predictions.
-        with trainer.precision_plugin.forward_context(), torch.no_grad():
-            task: Any = pl_module
-            prediction = task.predict_labels(batch.images[0], tuple(target.shape))
+        task: Any = pl_module
+        prediction = outputs[0]
         data: Any = trainer.datamodule  # type: ignore[attr-defined]
         source = data.source("val")
         if index not in self._shown:

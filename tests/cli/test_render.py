@@ -165,6 +165,31 @@ def test_averaging_keeps_the_type(dtype: Any, channels: tuple[int, ...]) -> None
     assert tangent_folders.shrink_to_level(blocks, 3) is blocks
 
 
+def test_folders_whose_names_end_like_files_come_back_apart(tmp_path: Path) -> None:
+    for name in ("room.png", "room.png.png"):
+        _write(tmp_path / "in" / name, _smooth(16))
+    _render(input=tmp_path / "in", output=tmp_path / "tan", base_level=0)
+    _render(back=tmp_path / "tan", output=tmp_path / "back")
+    names = sorted(path.name for path in (tmp_path / "back").iterdir())
+    assert names == ["room.png", "room.png.png"]
+
+
+def test_depth_in_openexr_comes_back(room: Path, tmp_path: Path) -> None:
+    OpenEXR = pytest.importorskip("OpenEXR")
+    _render(input=room, output=tmp_path / "tan", base_level=0)
+    cameras = read_cameras(tmp_path / "tan" / "room" / "cameras.json")
+    (tmp_path / "depth").mkdir()
+    for face, file in enumerate(cameras.files):
+        depth = np.full((cameras.grid.dim, cameras.grid.dim), face + 1, np.float32)
+        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+        path = tmp_path / "depth" / f"{Path(file).stem}.exr"
+        OpenEXR.File(header, {"Z": depth}).write(str(path))
+    output = tmp_path / "depth.npy"
+    _render(back=tmp_path / "depth", cameras=tmp_path / "tan" / "room", output=output, kind="depth")
+    owners = cameras.grid.owners(equirect_directions(cameras.shape))
+    assert (np.load(output, allow_pickle=False) == owners + 1).mean() > 0.999
+
+
 @pytest.mark.parametrize("suffix", [".png", ".tif"])
 def test_16_bits_stay(suffix: str, tmp_path: Path) -> None:
     image = _smooth().astype(np.uint16) * 257

@@ -67,3 +67,11 @@ def test_nothing_labelled_is_a_picture_too() -> None:
     picture = confusion_picture(np.zeros((3, 3), np.int64), _names(2))
     assert len(_places(picture, GREY)) == 4
     assert picture.dtype == np.uint8
+
+
+def test_many_classes_are_drawn_small_and_without_numbers() -> None:
+    count = 150
+    picture = confusion_picture(
+        np.ones((count + 1, count + 1)), ["unknown", *(f"class {k}" for k in range(count))]
+    )
+    assert max(picture.shape) < 2500

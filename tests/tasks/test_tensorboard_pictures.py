@@ -219,11 +219,11 @@ def test_crops_of_a_photo_stand_side_by_side(
 def test_large_panoramas_are_shown_smaller(rows: int) -> None:
     from tangent_train.tasks.tensorboard_pictures import _smaller
 
-    step = -(-rows // 512)
+    step = -(-rows // 256)
     rng = np.random.default_rng(0)
     labels = rng.integers(0, 14, (rows, 2 * rows)).astype(np.uint8)
     small = _smaller(labels)
-    assert small.shape[0] <= 512
+    assert small.shape[0] <= 256
     np.testing.assert_array_equal(small[3, 5], labels[3 * step + step // 2, 5 * step + step // 2])
     colors = _smaller(np.full((rows, 2 * rows, 3), 77, np.uint8))
     assert colors.shape == (*small.shape, 3)

@@ -27,12 +27,14 @@ class _Task:
     Attributes:
         folder: Where they are.
         cameras: Their ``cameras.json``.
-        output: The panorama's file; without a suffix if that depends on the results.
+        output: The panorama's file.
+        named: Whether its suffix is given; else it is added as the results need.
     """
 
     folder: Path
     cameras: Path
     output: Path
+    named: bool
 
 
 def render_back(settings: BackSettings) -> None:
@@ -94,7 +96,7 @@ def _find(settings: BackSettings) -> list[_Task]:
             expected=f"a folder for the {len(folders)} panoramas whose results are in {back}",
         )
     return [
-        _Task(back / folder, root / folder / CAMERAS_FILE, settings.output / folder)
+        _Task(back / folder, root / folder / CAMERAS_FILE, settings.output / folder, named=False)
         for folder in folders
     ]
 
@@ -106,11 +108,11 @@ def _single(settings: BackSettings, cameras: Path) -> _Task:
             found=str(settings.output),
             expected=f"the name of a file that ends in {' or '.join(PIXEL_SUFFIXES)}",
         )
-    return _Task(settings.back, cameras, settings.output)
+    return _Task(settings.back, cameras, settings.output, named=True)
 
 
 def _possible_files(task: _Task) -> list[Path]:
-    if task.output.suffix.lower() in PIXEL_SUFFIXES:
+    if task.named:
         return [task.output]
     return [task.output.with_name(task.output.name + suffix) for suffix in PIXEL_SUFFIXES]
 
@@ -120,7 +122,7 @@ def _render(task: _Task, settings: BackSettings) -> Path:
     files = result_files(task.folder, cameras)
     results = TangentResults.read(files, cameras.grid, settings.kind)
     output = task.output
-    if output.suffix.lower() not in PIXEL_SUFFIXES:
+    if not task.named:
         output = output.with_name(output.name + results.suffix)
     height = settings.height
     shape = cameras.shape if height is None else (height, 2 * height)

@@ -54,6 +54,7 @@ _FREE = (
     "task.channels_last",
     "task.compile",
     "task.images_per_forward",
+    "tensorboard_images",
     "trainer.accelerator",
     "trainer.enable_model_summary",
     "trainer.enable_progress_bar",

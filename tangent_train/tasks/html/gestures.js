@@ -19,6 +19,7 @@ class Gestures {
   }
 
   pointerdown(event) {
+    if (event.button !== 0) return;
     this.pressed.set(event.pointerId, this.position(event));
     this.canvas.setPointerCapture(event.pointerId);
     this.canvas.classList.add("grabbed");
@@ -27,6 +28,8 @@ class Gestures {
   pointermove(event) {
     const { view } = this.viewer;
     this.pointer = this.position(event);
+    // Released outside, or over a menu.
+    if (event.pointerType === "mouse" && event.buttons === 0) this.pointerup(event);
     if (this.pressed.has(event.pointerId)) {
       const [middle, spread] = this.grip();
       this.pressed.set(event.pointerId, this.pointer);

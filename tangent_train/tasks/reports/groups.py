@@ -51,6 +51,7 @@ _SAME_RUN = (
     "seed",
     "sweep",
     "task.images_per_forward",
+    "tensorboard_images",
     "trainer.accelerator",
     "trainer.enable_model_summary",
     "trainer.enable_progress_bar",
