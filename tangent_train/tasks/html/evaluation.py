@@ -175,7 +175,7 @@ def _scalars(logs: Path) -> dict[str, dict[int, float]]:
     Its own reader checks every byte in Python, 6 MB/s, and most bytes are pictures: here longer
     records are skipped. A record is its length, 8 bytes, and a checksum, 4; an `Event`; a checksum.
     """
-    from google.protobuf.message import DecodeError
+    from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
     from tensorboard.compat.proto.event_pb2 import Event  # type: ignore[import-untyped]
 
     logged: dict[str, dict[int, float]] = {}
