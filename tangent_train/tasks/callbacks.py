@@ -15,7 +15,7 @@ from tangent_train.errors import SettingError
 from tangent_train.files import write_bytes
 from tangent_train.tasks.html.evaluation import image_note
 from tangent_train.tasks.html.images import EncodedImage, ViewerImage, encode_image
-from tangent_train.tasks.pictures import prediction_panel
+from tangent_train.tasks.pictures import prediction_panel, shown_image, side_by_side
 
 __all__ = ["PredictionPanels", "ProgressBar"]
 
@@ -64,11 +64,11 @@ class PredictionPanels(Callback):
         ):
             if index in chosen:
                 image: Any = source.read(index)
-                shown = image.rgb, target.cpu().numpy(), prediction.cpu().numpy()
-                if target.ndim > _PANORAMA_DIMENSIONS:  # crops of a photo, side by side
-                    crops = image.sampler(pl_module.representation).whole()
-                    rgb = crops.render(image.rgb, "bilinear")
-                    shown = np.hstack(rgb), np.hstack(shown[1]), np.hstack(shown[2])
+                shown = (
+                    shown_image(image, target, pl_module.representation),
+                    side_by_side(target.cpu().numpy()),
+                    side_by_side(prediction.cpu().numpy()),
+                )
                 class_names: Any = pl_module.class_names
                 panel = prediction_panel(*shown, class_names)
                 encoded = cv2.imencode(".png", cv2.cvtColor(panel, cv2.COLOR_RGB2BGR))[1]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import colorsys
 from collections.abc import Sequence
+from typing import Any
 
 import cv2
 import numpy as np
@@ -11,11 +12,19 @@ from numpy.typing import NDArray
 
 from tangent_train.tasks.losses import UNKNOWN
 
-__all__ = ["class_colors", "colorize", "overlay_picture", "prediction_panel"]
+__all__ = [
+    "class_colors",
+    "colorize",
+    "overlay_picture",
+    "prediction_panel",
+    "shown_image",
+    "side_by_side",
+]
 
 _Image = NDArray[np.uint8]
 _MARGIN = 8
 _LEAST_ROWS = 256
+_PANORAMA_DIMENSIONS = 2
 _LEGEND_WIDTH = 1200
 """Pixels of width per step of a legend's size."""
 
@@ -83,6 +92,28 @@ def prediction_panel(
     grid = np.concatenate([np.concatenate([titled[k], gap, titled[k + 1]], axis=1) for k in (0, 2)])
     seen = np.union1d(np.unique(truth), np.unique(prediction))
     return np.concatenate([grid, _legend(grid.shape[1], seen, class_names)])
+
+
+def shown_image(image: Any, target: Any, representation: Any) -> NDArray[np.uint8]:
+    """What is shown beside labels: the panorama itself, or the crops of a photo side by side.
+
+    Args:
+        image: Of an `ImageSource`.
+        target: Its labels as they are evaluated: ``(H, W)``, or ``(n, h, w)`` of crops.
+        representation: What makes the crops.
+
+    Returns:
+        RGB ``(H, W, 3)``, or ``(h, n·w, 3)``.
+    """
+    if target.ndim == _PANORAMA_DIMENSIONS:
+        return np.asarray(image.rgb)
+    crops = image.sampler(representation).whole().render(image.rgb, "bilinear")
+    return np.hstack(crops)
+
+
+def side_by_side(labels: NDArray[np.integer]) -> NDArray[np.integer]:
+    """``(H, W)`` labels as they are, ``(n, h, w)`` of crops in one row."""
+    return labels if labels.ndim == _PANORAMA_DIMENSIONS else np.hstack([*labels])
 
 
 def _titled(image: _Image, title: str) -> _Image:

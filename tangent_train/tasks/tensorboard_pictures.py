@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from tangent_train.errors import SettingError
 from tangent_train.tasks.confusion_picture import confusion_picture
 from tangent_train.tasks.metrics import segmentation_scores
-from tangent_train.tasks.pictures import prediction_panel
+from tangent_train.tasks.pictures import prediction_panel, shown_image, side_by_side
 
-__all__ = ["TrainingSpeed", "ValidationPictures", "shown_image"]
+__all__ = ["TrainingSpeed", "ValidationPictures"]
 
 _MOST_ROWS = 256
 """Larger images are shown smaller: an event file holds the pictures of all validations."""
@@ -73,8 +73,8 @@ class ValidationPictures(Callback):
         source = data.source("val")
         if index not in self._shown:
             rgb = shown_image(source.read(index), target, task.representation)
-            self._shown[index] = _smaller(rgb), _smaller(_side_by_side(target.cpu().numpy()))
-        shown = _smaller(_side_by_side(prediction.cpu().numpy()))
+            self._shown[index] = _smaller(rgb), _smaller(side_by_side(target.cpu().numpy()))
+        shown = _smaller(side_by_side(prediction.cpu().numpy()))
         panel = prediction_panel(*self._shown[index], shown, task.class_names)
         tag = f"val_images/{source.name(index).replace('/', '_')}"
         writer.add_image(tag, panel, _step(trainer), dataformats="HWC")
@@ -154,27 +154,6 @@ class TrainingSpeed(Callback):
         figures |= {"validation_s": self._validation} if self._validation else {}
         for name, value in figures.items():
             pl_module.log(f"speed/{name}", value, rank_zero_only=True)
-
-
-def shown_image(image: Any, target: Any, representation: Any) -> NDArray[np.uint8]:
-    """What is shown beside labels: the panorama itself, or the crops of a photo side by side.
-
-    Args:
-        image: Of an `ImageSource`.
-        target: Its labels as they are evaluated: ``(H, W)``, or ``(n, h, w)`` of crops.
-        representation: What makes the crops.
-
-    Returns:
-        RGB ``(H, W, 3)``, or ``(h, n·w, 3)``.
-    """
-    if target.ndim == _PANORAMA_DIMENSIONS:
-        return np.asarray(image.rgb)
-    crops = image.sampler(representation).whole().render(image.rgb, "bilinear")
-    return np.hstack(crops)
-
-
-def _side_by_side(labels: _Labels) -> _Labels:
-    return labels if labels.ndim == _PANORAMA_DIMENSIONS else np.hstack([*labels])
 
 
 def _smaller(image: NDArray[Any]) -> NDArray[Any]:
