@@ -114,6 +114,13 @@ def read_classes(path: Path) -> FolderClasses:
     """
     try:
         content = json.loads(path.read_bytes(), object_pairs_hook=_Pairs)
+    except FileNotFoundError as error:
+        raise DataError(
+            path,
+            found="no such file" if path.parent.is_dir() else f"no folder {path.parent}",
+            expected="the classes of one's own panoramas",
+            remedy="Give data.root=<folder>; docs/own_data.md says what is in it.",
+        ) from error
     except (OSError, ValueError, RecursionError) as error:
         remedy = "docs/own_data.md shows how to bring your own data."
         raise DataError(path, found=error, expected=_EXPECTED, remedy=remedy) from error

@@ -17,6 +17,7 @@ import lightning
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
+from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
@@ -88,6 +89,10 @@ def train(config: DictConfig) -> float | None:
             _test(trainer, task, data, best, folder)
         except SIGTERMException:
             sys.exit(128 + signal.SIGTERM)
+        except MisconfigurationException as error:  # as fewer epochs than a resumed run has done
+            raise SettingError(
+                "trainer", found=f"what cannot work: {error}", expected="settings that can"
+            ) from error
     return score
 
 

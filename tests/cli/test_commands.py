@@ -11,9 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import lightning
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
+from lightning.fabric.utilities.exceptions import MisconfigurationException
 from omegaconf import OmegaConf
 
 from tangent_train.cli import main
@@ -287,3 +289,18 @@ def test_help_answers_before_anything_heavy_is_imported(
     )
     assert done.returncode == 0, done.stderr
     assert f"tangent-{command} experiment={example}" in done.stdout
+
+
+def test_what_lightning_refuses_is_said_in_one_line(
+    run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As it does when a run of six epochs is resumed for three."""
+    again = tmp_path / "again"
+    shutil.copytree(run_folder, again)
+
+    def refuse(*_: Any, **__: Any) -> None:
+        raise MisconfigurationException("You restored a checkpoint with current_epoch=6")
+
+    monkeypatch.setattr(lightning.Trainer, "fit", refuse)
+    with pytest.raises(SystemExit, match=r"tangent-train: trainer: found .*current_epoch=6"):
+        _run(monkeypatch, "train", f"resume={again}")
