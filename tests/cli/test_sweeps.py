@@ -281,8 +281,13 @@ def test_ctrl_c_ends_the_job_even_one_that_does_not_listen(
         + ("signal.signal(signal.SIGTERM, signal.SIG_IGN)\n" if deaf else "")
         + "os.kill(os.getppid(), signal.SIGINT)\ntime.sleep(60)"
     )
-    with pytest.raises(KeyboardInterrupt):
-        processes.run_process(_python(code), dict(os.environ))
+    # A shell starts what runs in the background deaf to it.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            processes.run_process(_python(code), dict(os.environ))
+    finally:
+        signal.signal(signal.SIGINT, before)
     with pytest.raises(ProcessLookupError):
         os.kill(int(number.read_text()), 0)
 
