@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from datamodules.image_opening import MOST_PIXELS
 from tangent_train.errors import DataError
 
 if TYPE_CHECKING:
@@ -21,7 +22,6 @@ __all__ = ["read_exr", "read_exr_size"]
 
 _MAGIC = b"\x76\x2f\x31\x01"
 _PREFERRED = ("Z", "Y", "V", "R")
-_MOST_PIXELS = 16384 * 32768
 _EXPECTED = "an OpenEXR image"
 _CONVERT = "convert it to a float TIFF or .npy file"
 
@@ -102,7 +102,7 @@ def _read_header(path: Path) -> _Header:
             remedy="Flatten the image.",
         )
     height, width = bottom - top + 1, right - left + 1
-    if not 0 < height * width <= _MOST_PIXELS:
+    if not 0 < height * width <= MOST_PIXELS:
         raise DataError(
             path, found=f"{height}×{width} pixels", expected="as many as 16384×32768, at most"
         )

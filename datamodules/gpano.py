@@ -120,6 +120,13 @@ class PanoramaArea:
             part = np.concatenate([part[:, left:], part[:, : right - width]], axis=1)
         return resize_nearest(part, self.image_shape)
 
+    def places(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Rows ``(h,)`` and columns ``(w,)`` of the whole panorama that `cut` takes."""
+        rows = np.arange(*self.rows)[:, None]
+        columns = np.arange(*self.columns)[None] % self.full_shape[1]
+        height, width = self.image_shape
+        return resize_nearest(rows, (height, 1))[:, 0], resize_nearest(columns, (1, width))[0]
+
     @staticmethod
     def _check(image: NDArray[Any], shape: tuple[int, int]) -> None:
         if image.shape[:2] != shape:

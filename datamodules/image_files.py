@@ -27,6 +27,7 @@ __all__ = [
     "find_depth",
     "find_images",
     "photo_fov_deg",
+    "read_array",
     "read_depth_m",
     "read_depth_size",
     "read_image_size",
@@ -222,7 +223,7 @@ def read_depth_size(path: Path) -> tuple[int, int]:
     if suffix == ".exr":
         return read_exr_size(path)
     if suffix == ".npy":
-        shape = _read_array(path, mapped=True).shape
+        shape = read_array(path, mapped=True).shape
         return (shape[0], shape[1]) if len(shape) > 1 else (0, 0)
     return read_image_size(path)
 
@@ -240,7 +241,19 @@ def _read_depth_image(path: Path) -> NDArray[Any]:
         return stored.astype(stored.dtype.newbyteorder("="))
 
 
-def _read_array(path: Path, *, mapped: bool = False) -> NDArray[Any]:
+def read_array(path: Path, *, mapped: bool = False) -> NDArray[Any]:
+    """Read a ``.npy`` file.
+
+    Args:
+        path: The file.
+        mapped: Whether the pixels stay in it until they are used; not to be written to then.
+
+    Returns:
+        What it holds; of ``(H, W, 1)`` without the last dimension.
+
+    Raises:
+        DataError: It cannot be read, or is no array of NumPy's.
+    """
     try:
         array = np.load(path, mmap_mode="r" if mapped else None, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
@@ -253,7 +266,7 @@ def _read_array(path: Path, *, mapped: bool = False) -> NDArray[Any]:
     return array[..., 0] if array.ndim == 3 and array.shape[-1] == 1 else array
 
 
-_DEPTH_READERS = {".npy": _read_array, ".exr": read_exr}
+_DEPTH_READERS = {".npy": read_array, ".exr": read_exr}
 
 
 def find_depth(folder: Path, name: str, remedy: str) -> Path:

@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-__all__ = ["open_image", "oriented_array", "oriented_size"]
+__all__ = ["MOST_PIXELS", "open_image", "oriented_array", "oriented_size"]
 
 _FORMATS = ("JPEG", "PNG", "TIFF", "WEBP")
-_MOST_PIXELS = 32768 * 16384
+MOST_PIXELS = 32768 * 16384
 _MOST = "at most 32768×16384 pixels"
 
 # EXIF orientation: are rows and columns exchanged, and which of them run backwards afterwards?
@@ -103,12 +103,12 @@ def _orientation(image: Image.Image) -> tuple[bool, int, int]:
 def _allow_panoramas() -> None:
     """Raise Pillow's limit, which 16384×8192 exceeds; each file is compared with ours."""
     limit = Image.MAX_IMAGE_PIXELS
-    if limit is not None and limit < _MOST_PIXELS:
-        Image.MAX_IMAGE_PIXELS = _MOST_PIXELS
+    if limit is not None and limit < MOST_PIXELS:
+        Image.MAX_IMAGE_PIXELS = MOST_PIXELS
 
 
 def _check_size(path: Path, image: Image.Image) -> None:
-    if image.width * image.height > _MOST_PIXELS:
+    if image.width * image.height > MOST_PIXELS:
         raise _too_large(path, f"{image.height}×{image.width} pixels")
 
 

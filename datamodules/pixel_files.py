@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from datamodules.exr import read_exr
-from datamodules.image_files import read_rgb
+from datamodules.image_files import read_array, read_rgb
 from datamodules.image_opening import open_image, oriented_array
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import atomic_path, write_bytes
@@ -41,6 +41,12 @@ _WRITABLE = {
 
 PIXEL_SUFFIXES = (*_WRITABLE, ".npy")
 """What names of files of pixels end in, in lower case."""
+
+READABLE_SUFFIXES = (*PIXEL_SUFFIXES, ".exr")
+"""What names of files end in that `read_pixels` takes."""
+
+LOSSY_SUFFIXES = (".jpg", ".jpeg", ".webp")
+"""Files whose pixels come back a little other: not for labels and depth."""
 
 _PNG, _PNG_BITS, _PNG_COLOR = b"\x89PNG\r\n\x1a\n", 24, 25
 _GREY_WITH_ALPHA = 4
@@ -84,21 +90,14 @@ def read_pixels(path: Path, *, indices: bool) -> NDArray[Any]:
 
 
 def _read_array(path: Path) -> NDArray[Any]:
-    try:
-        array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise DataError(
-            path, found=error, expected="an array of numbers", remedy="Save it with numpy.save."
-        ) from error
-    if not isinstance(array, np.ndarray):
-        raise DataError(path, found="a .npz archive", expected="one array, saved with numpy.save")
+    array = read_array(path, mapped=True)
     if array.ndim not in (2, 3) or 0 in array.shape or array.dtype.kind not in "buif":
         raise DataError(
             path,
             found=f"{array.dtype} of shape {array.shape}",
             expected="numbers of shape (H, W) or (H, W, C)",
         )
-    return array[..., 0] if array.ndim == 3 and array.shape[2] == 1 else array
+    return array
 
 
 def _read_deep(path: Path, *, grey: bool) -> NDArray[Any] | None:
@@ -109,13 +108,6 @@ def _read_deep(path: Path, *, grey: bool) -> NDArray[Any] | None:
     if image.ndim == 2 or grey:
         return np.ascontiguousarray(image if image.ndim == 2 else image[..., 0])
     return np.ascontiguousarray(image[..., 2::-1] if image.shape[2] in (3, 4) else image)
-
-
-READABLE_SUFFIXES = (*PIXEL_SUFFIXES, ".exr")
-"""What names of files end in that `read_pixels` takes."""
-
-LOSSY_SUFFIXES = (".jpg", ".jpeg", ".webp")
-"""Files whose pixels come back a little other: not for labels and depth."""
 
 
 def check_writable(suffix: str, dtype: DTypeLike, channels: int) -> None:

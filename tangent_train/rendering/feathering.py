@@ -7,7 +7,6 @@ times as fast on a CPU, in less memory.
 
 from __future__ import annotations
 
-import math
 from typing import TypeVar
 
 import numpy as np
@@ -43,12 +42,13 @@ def feather_arrays(
     height, width = shape
     channels = images.shape[3]
     panorama = np.empty((*shape, channels), images.dtype)
+    rays = kernels.directions_of_rows(height, width)
     step = max(1, _BAND_PIXELS // width)
     for start in range(0, height, step):
         band = slice(start, min(height, start + step))
         sums = np.zeros((band.stop - start, width, channels + 1), np.float32)
         for face in range(grid.num_images):
-            _add(images[face], grid, face, shape, start, sums)
+            _add(images[face], grid, face, shape, rays, start, sums)
         values = sums[..., :channels]
         values /= sums[..., channels:]
         panorama[band] = np.rint(values, out=values) if images.dtype.kind in "ui" else values
@@ -60,16 +60,16 @@ def _add(
     grid: PinholeGrid,
     face: int,
     shape: tuple[int, int],
+    rays: tuple[NDArray[np.float64], ...],
     start: int,
     sums: NDArray[np.float32],
 ) -> None:
     """Add an image to the sums ``(h, W, C + 1)`` of the panorama's rows from `start` on."""
-    reach = math.atan(math.sqrt(2) * grid.dim / 2 * grid.pitch)
-    (top, bottom), span = window(grid.centers_xyz[face], reach, shape)
+    (top, bottom), span = window(grid, face, shape)
     first, last = max(top - start, 0), min(bottom - start, len(sums))
     if first >= last:
         return
-    columns, rows = kernels.directions_of_rows(*shape)
+    columns, rows = rays
     padded = np.ones((*image.shape[:2], sums.shape[2]), np.float32)
     padded[..., :-1] = image
     axes, no_rivals = np.ascontiguousarray(grid.world_from_camera[face]), np.empty((0, 3))

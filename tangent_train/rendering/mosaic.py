@@ -75,10 +75,9 @@ class ScoreMosaic:
         check_blend(self.blend, grid)
         if self._rays is None:
             self._rays = kernels.directions_of_rows(*self.shape)
-        reach = math.atan(math.sqrt(2) * grid.dim / 2 * grid.pitch)
         for face, image in zip(faces, self._prepared(scores), strict=True):
             others = np.setdiff1d(grid.neighbors[face], face)
-            rows, columns = window(grid.centers_xyz[face], reach, self.shape)
+            rows, columns = window(grid, face, self.shape)
             self._over(
                 rows,
                 mosaic_kernels.add_pinhole_image,
@@ -165,26 +164,28 @@ def _zeros(shape: tuple[int, ...]) -> NDArray[np.float32]:
 
 
 def window(
-    center_xyz: NDArray[np.float64], reach: float, shape: tuple[int, int]
+    grid: PinholeGrid, face: int, shape: tuple[int, int]
 ) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Where all directions within an angle of one are in an ERP of this shape.
+    """Where an image may see something of an ERP of this shape: all within its corners' angle.
 
     Args:
-        center_xyz: The direction.
-        reach: Radians.
+        grid: The images.
+        face: Which of them.
         shape: ``(H, W)``.
 
     Returns:
         First row and the one after the last; first column and number of columns, across ±180°.
     """
     height, width = shape
-    latitude = math.asin(max(-1.0, min(1.0, center_xyz[2])))
+    x, y, z = grid.centers_xyz[face]
+    reach = math.atan(math.sqrt(2) * grid.dim / 2 * grid.pitch)
+    latitude = math.asin(max(-1.0, min(1.0, z)))
     top = math.floor((0.5 - (latitude + reach) / math.pi) * height)
     bottom = math.ceil((0.5 - (latitude - reach) / math.pi) * height)
     rows = max(0, top), min(height, bottom)
     if abs(latitude) + reach >= math.pi / 2:
         return rows, (0, width)
     spread = math.asin(math.sin(reach) / math.cos(latitude)) / (2 * math.pi) * width
-    middle = (math.atan2(center_xyz[1], center_xyz[0]) / (2 * math.pi) + 0.5) * width
+    middle = (math.atan2(y, x) / (2 * math.pi) + 0.5) * width
     first = math.floor(middle - spread) - 1
     return rows, (first % width, min(width, math.ceil(2 * spread) + 3))

@@ -13,7 +13,7 @@ from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from torch import Tensor, nn
 
-from tangent_train.errors import DataError
+from tangent_train.errors import DataError, SettingError
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -112,9 +112,16 @@ def make(settings: Mapping[str, Any]) -> Any:
         settings: ``_target_`` and its arguments.
 
     Raises:
-        InstantiationException: It cannot be made.
+        DataError: It says itself that a file cannot be used.
+        SettingError: It says itself that a setting cannot work.
+        InstantiationException: It cannot be made for another reason.
     """
-    return instantiate(dict(settings))
+    try:
+        return instantiate(dict(settings))
+    except InstantiationException as error:
+        if isinstance(error.__cause__, DataError | SettingError):
+            raise error.__cause__ from error
+        raise
 
 
 def completed_settings(
@@ -155,10 +162,11 @@ def make_stored(path: Path, section: str, settings: Mapping[str, Any]) -> Any:
     """
     try:
         return make(settings)
-    except InstantiationException as error:
+    except (DataError, SettingError, InstantiationException) as error:
         package = _missing_package(error)
         if package is None:
-            cause = error.__cause__ or error
+            named = isinstance(error, DataError | SettingError)
+            cause = error if named else error.__cause__ or error
             first_line = str(cause).partition("\n")[0]
             raise DataError(
                 path,

@@ -24,7 +24,7 @@ from tangent_train.tasks.metrics import (
     segmentation_scores,
 )
 
-__all__ = ["evaluation_results", "largest_loss", "results_table", "write_results"]
+__all__ = ["evaluation_results", "largest_loss", "percent", "results_table", "write_results"]
 
 _COLUMNS = ("class", "iou", "accuracy", "iou_solid_angle", "accuracy_solid_angle", "share")
 
@@ -141,7 +141,7 @@ def largest_loss(results: dict[str, Any]) -> str | None:
     worst = min(labelled, key=lambda k: (float(ious[k]), -confusion[k].sum()))
     if ious[worst] == 1:
         return "No loss: every labelled class has 100 % IoU."
-    return f"Largest loss: {names[worst]}, {_percent(ious[worst])} % IoU; " + _where_it_went(
+    return f"Largest loss: {names[worst]}, {percent(ious[worst])} % IoU; " + _where_it_went(
         confusion, worst, names
     )
 
@@ -152,10 +152,10 @@ def _where_it_went(confusion: NDArray[np.float64], worst: int, names: Sequence[s
     missed[worst] = wrong[worst] = wrong[UNKNOWN] = 0
     if missed.any():
         other = int(missed.argmax())
-        share = _percent(missed[other] / confusion[worst].sum())
+        share = percent(missed[other] / confusion[worst].sum())
         return f"most often taken for {names[other]} ({share} % of its pixels)."
     other = int(wrong.argmax())
-    share = _percent(wrong[other] / confusion[UNKNOWN + 1 :, worst].sum())
+    share = percent(wrong[other] / confusion[UNKNOWN + 1 :, worst].sum())
     return f"all of it was found, but {share} % of what was taken for it is {names[other]}."
 
 
@@ -163,11 +163,11 @@ def _rows(results: dict[str, Any]) -> list[tuple[str, ...]]:
     header = ("class", "IoU %", "acc. %", "IoU % by solid angle", "acc. %", "pixels %")
     rows = [header]
     rows += [
-        (entry["class"], *(_percent(entry[column]) for column in _COLUMNS[1:]))
+        (entry["class"], *(percent(entry[column]) for column in _COLUMNS[1:]))
         for entry in results["classes"]
     ]
     means = (results[k] for k in ("miou", "macc", "miou_solid_angle", "macc_solid_angle"))
-    return [*rows, ("mean", *map(_percent, means), "")]
+    return [*rows, ("mean", *map(percent, means), "")]
 
 
 def _markdown(results: dict[str, Any]) -> str:
@@ -180,7 +180,7 @@ def _markdown(results: dict[str, Any]) -> str:
         lines += ["| latitude | mIoU % | mAcc % |", "| --- | ---: | ---: |"]
     for band in results["latitude_bands"]:
         south, north = band["latitude_deg"]
-        figures = (_percent(band["miou"]), _percent(band["macc"]))
+        figures = (percent(band["miou"]), percent(band["macc"]))
         lines.append(_line((f"{south}° … {north}°", *figures)))
     return "\n".join(lines) + "\n"
 
@@ -197,5 +197,6 @@ def _plain(value: float) -> float | None:
     return None if math.isnan(value) else float(value)
 
 
-def _percent(value: float | None) -> str:
+def percent(value: float | None) -> str:
+    """A share of 1 in percent, for tables; a dash where there is none."""
     return "–" if value is None else f"{100 * value:.1f}"

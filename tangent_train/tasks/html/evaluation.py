@@ -11,7 +11,7 @@ import numpy as np
 from tangent_train.tasks.html.page import write_report
 from tangent_train.tasks.html.parts import Curve, Table
 from tangent_train.tasks.metrics import segmentation_scores
-from tangent_train.tasks.results import largest_loss
+from tangent_train.tasks.results import largest_loss, percent
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -50,12 +50,12 @@ def write_evaluation_report(
         checkpoint: What was evaluated; curves are drawn where it lies in the folder of its run.
     """
     figures = [
-        f"{name} {_percent(results[key])}\u00a0%"
+        f"{name} {percent(results[key])}\u00a0%"
         for key, name in (("miou", "mIoU"), ("macc", "mAcc"))
     ]
     notes = [f"{', '.join(figures)} over {results['images']} {results['noun']}"]
     if results["miou_solid_angle"] is not None:
-        solid = (_percent(results[f"{key}_solid_angle"]) for key in _NAMES)
+        solid = (percent(results[f"{key}_solid_angle"]) for key in _NAMES)
         notes.append("By solid angle: mIoU {}\u00a0%, mAcc {}\u00a0%.".format(*solid))
     notes += filter(None, [largest_loss(results)])
     notes.append(f"Checkpoint: {checkpoint}")
@@ -82,8 +82,8 @@ def evaluation_tables(results: dict[str, Any]) -> list[Table]:
         rows = [
             (
                 "{}° … {}°".format(*band["latitude_deg"]),
-                _percent(band["miou"]),
-                _percent(band["macc"]),
+                percent(band["miou"]),
+                percent(band["macc"]),
             )
             for band in results["latitude_bands"]
         ]
@@ -94,7 +94,7 @@ def evaluation_tables(results: dict[str, Any]) -> list[Table]:
 def _overall(results: dict[str, Any], *, on_sphere: bool) -> Table:
     weights = {"by pixels": ""} | ({"by solid angle": "_solid_angle"} if on_sphere else {})
     rows = [
-        (name, *(_percent(results[f"{key}{suffix}"]) for key in _NAMES))
+        (name, *(percent(results[f"{key}{suffix}"]) for key in _NAMES))
         for name, suffix in weights.items()
     ]
     absent = "do not count" if results["absent_class"] == "skip" else "count as 0"
@@ -110,7 +110,7 @@ def _per_class(results: dict[str, Any], *, on_sphere: bool) -> Table:
             "accuracy_solid_angle": "acc. % by solid angle",
         }
     rows = [
-        (entry["class"], *(_percent(entry[column]) for column in columns))
+        (entry["class"], *(percent(entry[column]) for column in columns))
         for entry in results["classes"]
     ]
     return Table("Per class", ("class", *columns.values()), rows)
@@ -149,7 +149,7 @@ def image_note(
         return ""
     right = counts.diagonal()[1:].sum() / known
     miou = segmentation_scores(counts).miou
-    return f"mIoU {_percent(miou)}\u00a0%, {_percent(right)}\u00a0% of pixels right"
+    return f"mIoU {percent(miou)}\u00a0%, {percent(right)}\u00a0% of pixels right"
 
 
 def training_curves(run_folder: Path) -> list[Curve]:
@@ -222,7 +222,3 @@ def _series_name(tag: str) -> str:
         return tag
     score, _, weight = name.partition("_")
     return f"{_NAMES[score]} by solid angle" if weight else _NAMES[score]
-
-
-def _percent(value: float | None) -> str:
-    return "–" if value is None else f"{100 * value:.1f}"

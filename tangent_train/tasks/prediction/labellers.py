@@ -42,8 +42,6 @@ class Labelled:
         labels: ``(h, w)`` labels, 0 unknown.
         figures: Plain values about it, for the summary.
         mosaic: The scores, where probabilities were asked for.
-        rows: ``(h,)`` rows of the mosaic that are the image's.
-        columns: ``(w,)`` likewise.
         area: Where the image of a panorama lies on the sphere; None for photos.
     """
 
@@ -51,8 +49,6 @@ class Labelled:
     labels: NDArray[np.unsignedinteger]
     figures: dict[str, Any]
     mosaic: ScoreMosaic | None
-    rows: NDArray[np.intp]
-    columns: NDArray[np.intp]
     area: PanoramaArea | None = None
 
 
@@ -145,11 +141,8 @@ class PanoramaLabeller:
             figures |= {"seam_border": seam.border, "seam_inside": seam.inside}
             figures["seam_ratio"] = seam.ratio
         figures["classes"] = class_shares(labels, self.class_names)
-        height, width = area.full_shape
-        rows = area.cut(np.broadcast_to(np.arange(height)[:, None], (height, width)))[:, 0]
-        columns = area.cut(np.broadcast_to(np.arange(width), (height, width)))[0]
         mosaic = prediction.mosaic if averaged else None  # 4·K bytes a pixel
-        return Labelled(rgb, area.cut(labels), figures, mosaic, rows, columns, area)
+        return Labelled(rgb, area.cut(labels), figures, mosaic, area)
 
 
 @dataclass(frozen=True)
@@ -192,6 +185,5 @@ class PhotoLabeller:
             "fov_deg": fov_deg,
             "classes": class_shares(labels, self.class_names, camera_matrix),
         }
-        rows, columns = np.arange(height), np.arange(width)
         mosaic = prediction.mosaic if averaged else None
-        return Labelled(rgb, labels, figures, mosaic, rows, columns)
+        return Labelled(rgb, labels, figures, mosaic)

@@ -132,10 +132,12 @@ class OutputFolder:
         """Write ``(h, w, K)`` float16 probabilities, class k being label k + 1."""
         with atomic_path(path) as temporary:
             shape = (*found.labels.shape, len(self.class_names) - 1)
+            whole = tuple(map(np.arange, found.labels.shape))
+            rows, columns = whole if found.area is None else found.area.places()
             array = np.lib.format.open_memmap(temporary, "w+", np.float16, shape)
-            for start in range(0, len(found.rows), _ROWS_AT_ONCE):
+            for start in range(0, len(rows), _ROWS_AT_ONCE):
                 part = slice(start, start + _ROWS_AT_ONCE)
-                array[part] = mosaic.probabilities(found.rows[part])[:, found.columns]
+                array[part] = mosaic.probabilities(rows[part])[:, columns]
             array.flush()
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING
 
 import cv2
@@ -78,14 +78,11 @@ class PanoramaPredictor:
         self._turns = turns(rotations)
         self._blend = blend
         self._level = trained.level if level is None else level
-
-        @lru_cache(maxsize=4)
-        def seen(level: int) -> PinholeRepresentation | EquirectRepresentation:
-            return panorama_representation(trained, level, base_level)
-
-        self._seen = seen
-        if self._level != "image" and len(self._turns) > 1:
-            self._check_turns(seen(self._level))
+        self._seen = lru_cache(maxsize=4)(
+            partial(panorama_representation, trained, base_level=base_level)
+        )
+        if self._level != "image":
+            self._check_turns(self._seen(self._level))
 
     def predict(self, image: InputImage, done: Done, *, averaged: bool = False) -> Prediction:
         """The scores of one panorama ``(H, W)`` of any size, twice as wide as high.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING
 
 import cv2
@@ -55,11 +56,13 @@ class PhotoPredictor:
         base_level: int | None = None,
         blend: Blend = "feather",
     ) -> None:
-        self._trained, self._runner = trained, runner
-        self._base_level, self._blend = base_level, blend
+        self._runner, self._blend = runner, blend
         self._level = trained.level if level is None else level
+        self._seen = lru_cache(maxsize=4)(
+            partial(photo_representation, trained, base_level=base_level)
+        )
         if self._level != "image":
-            photo_representation(trained, self._level, base_level)
+            self._seen(self._level)
 
     def predict(
         self,
@@ -81,7 +84,7 @@ class PhotoPredictor:
         level = self._level
         if level == "image":  # of panoramas with the photo's angular resolution
             level = nearest_level(round(math.pi * camera_matrix[1, 1]))
-        representation = photo_representation(self._trained, level, self._base_level)
+        representation = self._seen(level)
         whole, matrix, to_photo = _fitted(image, camera_matrix, representation)
         sampler = representation.of_camera(matrix, whole.rgb.shape[:2])
         overlap = _OVERLAP if self._blend == "feather" else 0.0
