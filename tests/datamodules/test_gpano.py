@@ -325,3 +325,14 @@ def test_edges_are_where_the_crop_says(seed: int) -> None:
 def test_impossible_crops(crop: tuple[float, ...], message: str) -> None:
     with pytest.raises(SettingError, match=f"crop: found .*{message}|{message}"):
         area_of_crop((100, 100), crop)
+
+
+@pytest.mark.parametrize("crop", [(-180, 180, -45, 45), (135, -135, -45, 45), (-180, 180, -90, 90)])
+def test_places_are_the_rows_and_columns_that_are_cut(crop: tuple[float, ...]) -> None:
+    west, east, south, north = crop
+    width = (east - west) % 360 or 360
+    area = area_of_crop((round((north - south) / 3), round(width / 3)), crop)
+    height, columns_in_all = area.full_shape
+    whole = np.arange(height * columns_in_all).reshape(area.full_shape)
+    rows, columns = area.places()
+    np.testing.assert_array_equal(whole[rows][:, columns], area.cut(whole))
