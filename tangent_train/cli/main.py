@@ -14,12 +14,26 @@ from typing import TYPE_CHECKING
 from tangent_train.errors import DataError, SettingError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from omegaconf import DictConfig
 
-__all__ = ["evaluate", "export", "predict", "prepare", "render", "report", "train", "transfer"]
+__all__ = [
+    "evaluate",
+    "export",
+    "keypoints",
+    "predict",
+    "prepare",
+    "render",
+    "report",
+    "study",
+    "train",
+    "transfer",
+]
 
 _MODULES = {
     "export": "export",
+    "keypoints": "keypoints",
     "predict": "predict",
     "render": "render",
     "transfer": "transfer.command",
@@ -65,14 +79,32 @@ def export() -> None:
     _main("export")
 
 
+def keypoints() -> None:
+    """``tangent-keypoints data=…``: keypoints of pairs of panoramas, matched and scored."""
+    _main("keypoints")
+
+
 def report() -> None:
     """``tangent-report <run folders>``: tables and a chart over runs."""
     from tangent_train.cli.report import report as write_report
 
+    _with_arguments("report", write_report)
+
+
+def study() -> None:
+    """``tangent-study <name>``: the paper's figures about distortion."""
+    from tangent_train.cli.study import study as make_study
+
+    _with_arguments("study", make_study)
+
+
+def _with_arguments(command: str, run: Callable[[list[str]], None]) -> None:
     try:
-        write_report(sys.argv[1:])
+        run(sys.argv[1:])
     except (DataError, SettingError) as error:
-        sys.exit(f"tangent-report: {error}")
+        sys.exit(f"tangent-{command}: {error}")
+    except KeyboardInterrupt:
+        sys.exit(130)
 
 
 def _main(command: str) -> None:

@@ -32,6 +32,7 @@ from tangent_train.geometry.equirect import (
 from tangent_train.geometry.grid import TangentGrid
 from tangent_train.geometry.icosphere import Icosphere, icosphere, vertex_resolution
 from tangent_train.geometry.levels import nearest_level
+from tangent_train.geometry.panorama_pose import PanoramaPose
 from tangent_train.geometry.pinhole_grid import PinholeGrid
 from tangent_train.geometry.resized_grid import ResizedGrid
 from tangent_train.geometry.sphere import (
@@ -47,6 +48,7 @@ __all__ = [
     "FLIP_Y",
     "CubeGrid",
     "Icosphere",
+    "PanoramaPose",
     "PinholeGrid",
     "ResizedGrid",
     "TangentGrid",

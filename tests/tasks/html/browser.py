@@ -26,8 +26,11 @@ NO_WEBGL = """const original = HTMLCanvasElement.prototype.getContext;
 HTMLCanvasElement.prototype.getContext = function (kind, ...rest) {
   return kind.startsWith("webgl") ? null : original.call(this, kind, ...rest);
 };"""
-# Two frames: what an event asked for has been drawn.
-DRAWN = "() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
+# Two frames: what an event asked for has been drawn. Playwright waits for promises without end.
+DRAWN = """() => new Promise((done, failed) => {
+  setTimeout(() => failed(new Error("no frame was drawn in 20 s")), 20_000);
+  requestAnimationFrame(() => requestAnimationFrame(done));
+})"""
 
 
 @contextmanager

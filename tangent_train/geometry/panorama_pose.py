@@ -1,0 +1,64 @@
+"""Where a panorama was taken, and how it was turned."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tangent_train.errors import SettingError
+from tangent_train.geometry.sphere import checked_rotation
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+__all__ = ["PanoramaPose"]
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class PanoramaPose:
+    """Pose of a panorama in a world of metres.
+
+    The point seen at distance d in direction s of the panorama (`tangent_train.geometry`: x to the
+    middle of the image, y to the right of it, z up) is ``location_m + d · world_from_panorama @ s``.
+
+    In a right-handed world the matrix reflects, as `FLIP_Y` does: its determinant is −1.
+
+    Args:
+        world_from_panorama: ``(3, 3)`` orthogonal, of determinant 1 or −1.
+        location_m: ``(3,)`` centre.
+
+    Raises:
+        SettingError: The matrix is not orthogonal.
+    """
+
+    world_from_panorama: NDArray[np.float64]
+    location_m: NDArray[np.float64]
+
+    def __init__(self, world_from_panorama: ArrayLike, location_m: ArrayLike) -> None:
+        matrix = np.array(world_from_panorama, np.float64)
+        location = np.array(location_m, np.float64)
+        if matrix.shape != (3, 3) or location.shape != (3,):
+            raise SettingError(
+                "pose",
+                found=f"arrays {matrix.shape} and {location.shape}",
+                expected="(3, 3) and (3,)",
+            )
+        checked_rotation(matrix if np.linalg.det(matrix) > 0 else -matrix)
+        object.__setattr__(self, "world_from_panorama", matrix)
+        object.__setattr__(self, "location_m", location)
+
+    def points_m(self, directions_xyz: ArrayLike, distance_m: ArrayLike) -> NDArray[np.float64]:
+        """World points ``(…, 3)`` seen in directions ``(…, 3)`` at distances ``(…)``."""
+        ahead = np.asarray(directions_xyz, np.float64) @ self.world_from_panorama.T
+        return self.location_m + ahead * np.asarray(distance_m, np.float64)[..., None]
+
+    def seen(self, points_m: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Where points ``(…, 3)`` appear: unit directions ``(…, 3)`` and distances ``(…)`` in metres.
+
+        A point at the centre itself has the direction 0.
+        """
+        way = (np.asarray(points_m, np.float64) - self.location_m) @ self.world_from_panorama
+        distance = np.linalg.norm(way, axis=-1)
+        return way / np.where(distance > 0, distance, 1.0)[..., None], distance
