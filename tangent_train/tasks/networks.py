@@ -119,9 +119,10 @@ def make(settings: Mapping[str, Any]) -> Any:
     try:
         return instantiate(dict(settings))
     except InstantiationException as error:
-        if isinstance(error.__cause__, DataError | SettingError):
-            raise error.__cause__ from error
-        raise
+        said = error.__cause__
+        if not isinstance(said, DataError | SettingError):
+            raise
+    raise said  # out here, or the two would be each other's cause
 
 
 def completed_settings(
