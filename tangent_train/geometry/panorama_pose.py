@@ -21,7 +21,8 @@ class PanoramaPose:
     """Pose of a panorama in a world of metres.
 
     The point seen at distance d in direction s of the panorama (`tangent_train.geometry`: x to the
-    middle of the image, y to the right of it, z up) is ``location_m + d · world_from_panorama @ s``.
+    middle of the image, y to the right of it, z up) is
+    ``location_m + d · world_from_panorama @ s``.
 
     In a right-handed world the matrix reflects, as `FLIP_Y` does: its determinant is −1.
 
@@ -30,7 +31,7 @@ class PanoramaPose:
         location_m: ``(3,)`` centre.
 
     Raises:
-        SettingError: The matrix is not orthogonal.
+        SettingError: The matrix is not orthogonal, or the centre is no place.
     """
 
     world_from_panorama: NDArray[np.float64]
@@ -45,7 +46,11 @@ class PanoramaPose:
                 found=f"arrays {matrix.shape} and {location.shape}",
                 expected="(3, 3) and (3,)",
             )
+        if not (np.isfinite(matrix).all() and np.isfinite(location).all()):
+            raise SettingError("pose", found="numbers that are not finite", expected="finite ones")
         checked_rotation(matrix if np.linalg.det(matrix) > 0 else -matrix)
+        for array in (matrix, location):
+            array.setflags(write=False)
         object.__setattr__(self, "world_from_panorama", matrix)
         object.__setattr__(self, "location_m", location)
 
@@ -55,10 +60,45 @@ class PanoramaPose:
         return self.location_m + ahead * np.asarray(distance_m, np.float64)[..., None]
 
     def seen(self, points_m: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Where points ``(…, 3)`` appear: unit directions ``(…, 3)`` and distances ``(…)`` in metres.
+        """Where points ``(…, 3)`` appear: directions ``(…, 3)`` and distances ``(…)`` in metres.
 
         A point at the centre itself has the direction 0.
         """
         way = (np.asarray(points_m, np.float64) - self.location_m) @ self.world_from_panorama
         distance = np.linalg.norm(way, axis=-1)
         return way / np.where(distance > 0, distance, 1.0)[..., None], distance
+
+    def relative_to(self, other: PanoramaPose) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """From another panorama's coordinates to this one's: ``x_this = R x_other + t``.
+
+        Args:
+            other: Pose in the same world.
+
+        Returns:
+            R ``(3, 3)``, a rotation, and t ``(3,)`` in metres: where the other's centre is.
+
+        Raises:
+            SettingError: One of the two mirrors the world and the other does not.
+        """
+        rotation = self.world_from_panorama.T @ other.world_from_panorama
+        if np.linalg.det(rotation) < 0:
+            raise SettingError(
+                "poses",
+                found="one in a right-handed world and one in a left-handed world",
+                expected="both in the same world",
+            )
+        shift_m = (other.location_m - self.location_m) @ self.world_from_panorama
+        return rotation, shift_m
+
+    def moved(self, rotation: ArrayLike, translation_m: ArrayLike) -> PanoramaPose:
+        """The pose whose `relative_to` this one is ``(rotation, translation_m)``.
+
+        Args:
+            rotation: ``(3, 3)`` rotation R from this panorama's coordinates to the new one's.
+            translation_m: ``(3,)`` t of ``x_new = R x_this + t``.
+
+        Raises:
+            SettingError: The matrix is no rotation.
+        """
+        turned = self.world_from_panorama @ checked_rotation(rotation).T
+        return PanoramaPose(turned, self.location_m - turned @ np.asarray(translation_m, float))

@@ -1,0 +1,1 @@
+"""The paper's figures about distortion, one file per study, and what goes beyond them."""

@@ -1,0 +1,121 @@
+"""Poses of panoramas, against plain trigonometry and homogeneous matrices."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tangent_train.errors import SettingError
+from tangent_train.geometry import (
+    FLIP_Y,
+    PanoramaPose,
+    lonlat_to_xyz,
+    random_rotation,
+    rotation_about,
+    xyz_to_lonlat,
+)
+
+
+def posed(seed: int, mirrored: bool) -> PanoramaPose:
+    rng = np.random.default_rng(seed)
+    turn = random_rotation(rng)
+    return PanoramaPose(turn @ FLIP_Y if mirrored else turn, rng.normal(size=3) * 4)
+
+
+def test_a_panorama_in_a_right_handed_room() -> None:
+    # It looks along the room's y axis from 1.5 m above the floor: its right is the room's x.
+    pose = PanoramaPose(rotation_about((0, 0, 1), np.pi / 2) @ FLIP_Y, (3, 4, 1.5))
+    ahead, right, up = np.eye(3)
+    np.testing.assert_allclose(pose.points_m(ahead, 2), (3, 6, 1.5), atol=1e-15)
+    np.testing.assert_allclose(pose.points_m(right, 2), (5, 4, 1.5), atol=1e-15)
+    np.testing.assert_allclose(pose.points_m(up, 2), (3, 4, 3.5), atol=1e-15)
+    direction, distance = pose.seen((3 + np.sqrt(3), 4 - 1, 1.5))
+    np.testing.assert_allclose(np.degrees(xyz_to_lonlat(direction)), (120, 0), atol=1e-12)
+    assert distance == pytest.approx(2)
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_points_appear_where_they_came_from(mirrored: bool) -> None:
+    pose = posed(1, mirrored)
+    rng = np.random.default_rng(2)
+    # With both poles and both sides of the seam among them.
+    special = np.radians(np.array([[0, 90], [0, -90], [180, 0], [-180, 10], [179.9, 3]]))
+    some = rng.uniform((-np.pi, -np.pi / 2), (np.pi, np.pi / 2), (40, 2))
+    directions = lonlat_to_xyz(np.concatenate([special, some])).reshape(9, 5, 3)
+    distance_m = rng.uniform(0.1, 9, (9, 5))
+    back, back_m = pose.seen(pose.points_m(directions, distance_m))
+    np.testing.assert_allclose(back, directions, atol=1e-12)
+    np.testing.assert_allclose(back_m, distance_m, atol=1e-12)
+
+
+def test_a_point_at_the_centre_has_no_direction() -> None:
+    pose = posed(3, mirrored=True)
+    direction, distance = pose.seen(pose.location_m)
+    np.testing.assert_array_equal(direction, 0)
+    assert distance == 0
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_relative_poses_are_those_of_homogeneous_matrices(mirrored: bool) -> None:
+    left, right = posed(4, mirrored), posed(5, mirrored)
+
+    def homogeneous(pose: PanoramaPose) -> NDArray[np.float64]:
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = pose.world_from_panorama, pose.location_m
+        return matrix
+
+    expected = np.linalg.inv(homogeneous(right)) @ homogeneous(left)
+    rotation, shift_m = right.relative_to(left)
+    np.testing.assert_allclose(rotation, expected[:3, :3], atol=1e-12)
+    np.testing.assert_allclose(shift_m, expected[:3, 3], atol=1e-12)
+    assert np.linalg.det(rotation) == pytest.approx(1)
+    again = left.moved(rotation, shift_m)
+    np.testing.assert_allclose(again.world_from_panorama, right.world_from_panorama, atol=1e-12)
+    np.testing.assert_allclose(again.location_m, right.location_m, atol=1e-12)
+
+
+def test_what_a_relative_pose_means() -> None:
+    left = PanoramaPose(np.eye(3), (0, 0, 0))
+    # The right one stands 1 m ahead of the left one and is turned by 30° to the right.
+    right = PanoramaPose(rotation_about((0, 0, 1), np.radians(30)), (1, 0, 0))
+    rotation, shift_m = right.relative_to(left)
+    # What is far away ahead of the left one is 30° to the left of the right one's middle,
+    seen = np.degrees(xyz_to_lonlat(rotation @ np.array([1.0, 0, 0])))
+    np.testing.assert_allclose(seen, (-30, 0), atol=1e-12)
+    # and the left one itself is behind, 1 m away.
+    np.testing.assert_allclose(np.degrees(xyz_to_lonlat(shift_m)), (150, 0), atol=1e-12)
+    assert np.linalg.norm(shift_m) == pytest.approx(1)
+
+
+def test_a_pose_does_not_change() -> None:
+    matrix, place = np.eye(3), np.zeros(3)
+    pose = PanoramaPose(matrix, place)
+    matrix[0, 0], place[0] = 5, 5
+    np.testing.assert_array_equal(pose.world_from_panorama, np.eye(3))
+    np.testing.assert_array_equal(pose.location_m, 0)
+    with pytest.raises(ValueError, match="read-only"):
+        pose.location_m[0] = 1
+
+
+@pytest.mark.parametrize(
+    ("matrix", "place", "message"),
+    [
+        (np.eye(3) * 2, np.zeros(3), "3×3 rotation matrix"),
+        (np.zeros((3, 3)), np.zeros(3), "3×3 rotation matrix"),
+        (np.eye(4), np.zeros(3), r"arrays \(4, 4\) and \(3,\)"),
+        (np.eye(3), np.zeros(2), r"arrays \(3, 3\) and \(2,\)"),
+        (np.eye(3) * np.nan, np.zeros(3), "not finite"),
+        (np.eye(3), np.array([0, np.inf, 0]), "not finite"),
+    ],
+)
+def test_what_is_no_pose(
+    matrix: NDArray[np.float64], place: NDArray[np.float64], message: str
+) -> None:
+    with pytest.raises(SettingError, match=message):
+        PanoramaPose(matrix, place)
+
+
+def test_worlds_must_be_the_same() -> None:
+    with pytest.raises(SettingError, match="same world"):
+        posed(1, mirrored=True).relative_to(posed(1, mirrored=False))
