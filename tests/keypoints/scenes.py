@@ -1,0 +1,73 @@
+"""Matches of known motion, all around the sphere."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tangent_train.geometry import FLIP_Y, PanoramaPose, random_rotation
+
+__all__ = ["Scene", "angle_deg", "rotation_angle_deg", "two_views", "unit"]
+
+
+class Scene(NamedTuple):
+    """Matches and the truth about them; the first `wrong` ones are wrong."""
+
+    left_xyz: NDArray[np.float64]
+    right_xyz: NDArray[np.float64]
+    rotation: NDArray[np.float64]
+    translation_m: NDArray[np.float64]
+    left: PanoramaPose
+    right: PanoramaPose
+    wrong: int
+
+
+def two_views(
+    count: int,
+    *,
+    baseline_m: float = 0.5,
+    wrong: int = 0,
+    noise_deg: float = 0.0,
+    flat: bool = False,
+    seed: int = 0,
+) -> Scene:
+    """Points 1.5 to 5 m around the left camera, or on the floor, and in all directions."""
+    rng = np.random.default_rng(seed)
+    points_m = unit(rng.normal(size=(count, 3))) * rng.uniform(1.5, 5, (count, 1))
+    special = np.array([(0, 0, 2), (0, 0, -2), (-3, 0, 0), (-2, 1e-3, 0.1)])
+    points_m[:4] = special[:count]
+    if flat:
+        points_m[:, 2] = -1.2
+    left = PanoramaPose(random_rotation(rng) @ FLIP_Y, np.zeros(3))
+    right = PanoramaPose(random_rotation(rng) @ FLIP_Y, baseline_m * unit(rng.normal(size=3)))
+    left_xyz, right_xyz = (pose.seen(points_m)[0] for pose in (left, right))
+    order = rng.permutation(count)  # the special points are not the wrong ones
+    left_xyz, right_xyz = left_xyz[order], right_xyz[order]
+    right_xyz[:wrong] = unit(rng.normal(size=(wrong, 3)))
+    left_xyz += rng.normal(size=(count, 3)) * np.radians(noise_deg)
+    right_xyz += rng.normal(size=(count, 3)) * np.radians(noise_deg)
+    rotation, translation_m = right.relative_to(left)
+    return Scene(unit(left_xyz), unit(right_xyz), rotation, translation_m, left, right, wrong)
+
+
+def unit(vectors: ArrayLike) -> NDArray[np.float64]:
+    """Vectors of length 1."""
+    array = np.asarray(vectors, np.float64)
+    scaled: NDArray[np.float64] = array / np.linalg.norm(array, axis=-1, keepdims=True)
+    return scaled
+
+
+def angle_deg(first: ArrayLike, second: ArrayLike) -> NDArray[np.float64]:
+    """Angles between vectors, by another formula than the library's."""
+    a, b = unit(first), unit(second)
+    sines = np.linalg.norm(np.cross(a, b), axis=-1)
+    degrees: NDArray[np.float64] = np.degrees(np.arctan2(sines, (a * b).sum(axis=-1)))
+    return degrees
+
+
+def rotation_angle_deg(first: ArrayLike, second: ArrayLike) -> float:
+    """Angle of the rotation from one to the other, by its trace."""
+    trace = np.trace(np.asarray(first, np.float64) @ np.asarray(second, np.float64).T)
+    return float(np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1))))

@@ -1,0 +1,290 @@
+"""What panoramas see of each other, against rooms whose rays are traced in closed form."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tangent_train.errors import SettingError
+from tangent_train.geometry import (
+    FLIP_Y,
+    PanoramaPose,
+    equirect_directions,
+    equirect_solid_angles,
+    lonlat_to_xyz,
+    random_rotation,
+    rotation_about,
+)
+from tangent_train.keypoints.covisibility import (
+    DepthView,
+    Tolerance,
+    correct_matches,
+    fov_overlap,
+    visible_count,
+    visible_from,
+)
+from tests.keypoints.scenes import angle_deg, unit
+
+Array = NDArray[np.float64]
+SHAPE = (128, 256)
+SMALL = Tolerance(relative=0.02, absolute_m=0.02)
+
+
+class Room(NamedTuple):
+    """A box seen from inside, with boxes in it; corners as (low, high) in metres."""
+
+    walls: tuple[Array, Array]
+    boxes: tuple[tuple[Array, Array], ...] = ()
+
+    def distance_m(self, centre: Array, rays: Array) -> Array:
+        """Distance to the first surface along unit rays ``(…, 3)``, by the slab method."""
+        distance = _slabs(centre, rays, *self.walls)[1]
+        for low, high in self.boxes:
+            near, far = _slabs(centre, rays, low, high)
+            distance = np.where((near <= far) & (near > 0), np.minimum(near, distance), distance)
+        return distance
+
+    def view(self, pose: PanoramaPose, shape: tuple[int, int] = SHAPE) -> DepthView:
+        rays = equirect_directions(shape) @ pose.world_from_panorama.T
+        return DepthView(self.distance_m(pose.location_m, rays).astype(np.float32), pose)
+
+    def hidden(self, pose: PanoramaPose, points_m: Array) -> Array:
+        """How far behind what is seen from a place points are, in metres: 0 if visible."""
+        way = points_m - pose.location_m
+        away = np.linalg.norm(way, axis=-1)
+        return away - self.distance_m(pose.location_m, way / away[..., None])
+
+
+def _slabs(centre: Array, rays: Array, low: Array, high: Array) -> tuple[Array, Array]:
+    with np.errstate(divide="ignore"):
+        first, second = ((corner - centre) / rays for corner in (low, high))
+    return np.minimum(first, second).max(axis=-1), np.maximum(first, second).min(axis=-1)
+
+
+WALLS = (np.array([-3.0, -2, 0]), np.array([3.0, 2.5, 2.7]))
+CUPBOARD = (np.array([-0.4, -0.5, 0]), np.array([0.3, 0.8, 1.9]))
+SHELF = (np.array([-1.5, 1.5, 1.0]), np.array([1.0, 2.5, 1.2]))
+ROOM = Room(WALLS, (CUPBOARD, SHELF))
+
+
+def upright(place: tuple[float, float, float], heading_deg: float = 0) -> PanoramaPose:
+    return PanoramaPose(rotation_about((0, 0, 1), np.radians(heading_deg)) @ FLIP_Y, place)
+
+
+def tilted(place: tuple[float, float, float], seed: int) -> PanoramaPose:
+    return PanoramaPose(random_rotation(np.random.default_rng(seed)) @ FLIP_Y, place)
+
+
+LEFT, RIGHT = upright((-1.8, 0.2, 1.5), 20), upright((1.6, -0.4, 1.4), 170)
+
+
+@pytest.mark.parametrize(
+    ("left", "right"),
+    [
+        (LEFT, RIGHT),
+        # Poles and seam look anywhere: at edges of boxes and corners of the room.
+        (tilted((-1.8, 0.2, 1.5), 1), tilted((1.6, -0.4, 1.4), 2)),
+        (tilted((-1.8, 0.2, 0.6), 3), upright((1.6, 2.2, 2.4))),
+        # The cupboard straight below and above: behind the poles.
+        (upright((-0.1, 0.1, 2.5)), upright((0.5, 0.1, 0.7), 45)),
+    ],
+)
+def test_what_a_box_hides(left: PanoramaPose, right: PanoramaPose) -> None:
+    views = ROOM.view(left), ROOM.view(right)
+    directions = equirect_directions(SHAPE).reshape(-1, 3)
+    for source, target in (views, views[::-1]):
+        found = visible_from(directions, source, target, SMALL)
+        points_m = source.pose.points_m(directions, source.distance_m.reshape(-1))
+        hidden_m = ROOM.hidden(target.pose, points_m)
+        clearly_hidden, clearly_seen = hidden_m > 0.25, hidden_m < 1e-5
+        assert clearly_hidden.mean() > 0.05
+        # The map of the other panorama is as fine as its pixels: at its edges of depth, and on
+        # surfaces seen edge-on, a pixel more or less is seen.
+        assert found.visible[clearly_seen].mean() > 0.96
+        assert found.visible[clearly_hidden].mean() < 0.03
+        assert found.known.all()
+        near_edge = beside_an_edge(target, points_m)
+        assert not found.visible[clearly_hidden & ~near_edge].any()
+        assert found.visible[clearly_seen & ~near_edge].mean() > 0.999
+
+
+def beside_an_edge(view: DepthView, points_m: Array) -> NDArray[np.bool_]:
+    """Whether distances within 2.5 pixels of where points are seen differ by a quarter."""
+    directions, _ = view.pose.seen(points_m)
+    radius = np.tan(2.5 * np.pi / view.distance_m.shape[0])
+    sideways = unit(np.cross(directions, (0.3, 0.5, 0.81)))
+    around = []
+    for angle in np.linspace(0, 2 * np.pi, 16, endpoint=False):
+        step = np.cos(angle) * sideways + np.sin(angle) * np.cross(directions, sideways)
+        for part in (0.5, 1.0):
+            rays = unit(directions + part * radius * step) @ view.pose.world_from_panorama.T
+            around.append(ROOM.distance_m(view.pose.location_m, rays))
+    beside: NDArray[np.bool_] = np.max(around, axis=0) > 1.25 * np.min(around, axis=0)
+    return beside
+
+
+@pytest.mark.parametrize("by_solid_angle", [False, True])
+def test_overlap_is_the_share_of_points_the_other_sees(by_solid_angle: bool) -> None:
+    views = ROOM.view(LEFT), ROOM.view(RIGHT)
+    weights = np.ones(SHAPE)
+    if by_solid_angle:
+        weights *= equirect_solid_angles(SHAPE)[:, None]
+    shares = []
+    for source, target in (views, views[::-1]):
+        rays = equirect_directions(SHAPE)
+        hidden_m = ROOM.hidden(target.pose, source.pose.points_m(rays, source.distance_m))
+        shares.append(np.average(hidden_m < 0.05, weights=weights))
+    found = fov_overlap(*views, SMALL, by_solid_angle=by_solid_angle)
+    assert found == pytest.approx(np.mean(shares), abs=0.015)
+    assert 0.4 < found < 0.95
+    assert fov_overlap(*views[::-1], SMALL, by_solid_angle=by_solid_angle) == pytest.approx(found)
+
+
+def test_an_empty_room_overlaps_wholly() -> None:
+    empty = Room(WALLS)
+    assert fov_overlap(empty.view(LEFT), empty.view(RIGHT)) > 0.9999
+    same = ROOM.view(LEFT)
+    assert fov_overlap(same, same) == 1
+
+
+def test_rooms_without_a_door_do_not_overlap() -> None:
+    wall = (np.array([-0.1, -2, 0]), np.array([0.1, 2.5, 2.7]))
+    two = Room(WALLS, (wall,))
+    assert fov_overlap(two.view(LEFT), two.view(RIGHT)) < 0.002
+
+
+def test_of_large_maps_some_pixels_are_enough() -> None:
+    views = ROOM.view(LEFT, (150, 300)), ROOM.view(RIGHT, (201, 399))
+    every = fov_overlap(*views)
+    assert fov_overlap(*views, rows=50) == pytest.approx(every, abs=0.01)
+
+
+def test_maps_may_have_different_sizes() -> None:
+    directions = unit(np.random.default_rng(1).normal(size=(4000, 3)))
+    fine, coarse = ROOM.view(RIGHT, (256, 512)), ROOM.view(RIGHT, (99, 201))
+    source = ROOM.view(LEFT)
+    found = [visible_from(directions, source, target).visible for target in (fine, coarse)]
+    assert (found[0] == found[1]).mean() > 0.98
+
+
+def test_missing_depth() -> None:
+    left, right = ROOM.view(LEFT), ROOM.view(RIGHT)
+    directions = equirect_directions(SHAPE).reshape(-1, 3)
+    full = visible_from(directions, left, right)
+    holes = np.random.default_rng(2).random(SHAPE) < 0.3
+    blind = DepthView(np.full(SHAPE, np.nan), RIGHT)
+    # Not placed, not counted, whichever sign for missing the file had.
+    for missing in (0.0, np.nan, np.inf, -1.0):
+        part = DepthView(np.where(holes, missing, left.distance_m), LEFT)
+        found = visible_from(directions, part, right)
+        assert found.visible.sum() < full.visible.sum()
+        np.testing.assert_array_equal(found.visible, full.visible & ~holes.reshape(-1))
+        np.testing.assert_array_equal(found.known, ~holes.reshape(-1))
+    # Nothing known to hide: counted, and said to be unknown.
+    found = visible_from(directions, left, blind)
+    assert found.visible.all()
+    assert not found.known.any()
+    assert visible_count(directions, blind, left) == 0
+    assert np.isnan(fov_overlap(left, blind))
+    assert visible_count(directions, left, right) == full.visible.sum()
+
+
+def test_single_missing_pixels_do_not_open_walls() -> None:
+    left, right = ROOM.view(LEFT), ROOM.view(RIGHT)
+    directions = equirect_directions(SHAPE).reshape(-1, 3)
+    full = visible_from(directions, left, right)
+    lone = np.zeros(SHAPE, np.bool_)
+    lone[1::3, ::3] = True  # no two of them are neighbours
+    found = visible_from(directions, left, DepthView(np.where(lone, 0, right.distance_m), RIGHT))
+    assert found.known.all()
+    assert (found.visible == full.visible).mean() > 0.99
+
+
+def test_distances_between_pixels_of_a_wall_are_exact() -> None:
+    view = Room(WALLS).view(LEFT)
+    # All around the seam and both poles, between pixel centres.
+    lonlat = np.stack([np.linspace(-np.pi, np.pi, 500), np.linspace(-1.57, 1.57, 500)], axis=-1)
+    rays = lonlat_to_xyz(lonlat)
+    expected = Room(WALLS).distance_m(LEFT.location_m, rays @ LEFT.world_from_panorama.T)
+    distance_m, reach_m = view.distances(rays)
+    error = np.abs(distance_m / expected - 1)
+    assert np.median(error) < 2e-4
+    assert error.max() < 0.03  # in corners of the room
+    np.testing.assert_allclose(reach_m, distance_m, rtol=1e-6)
+
+
+def test_at_an_edge_of_depth_there_are_two_distances() -> None:
+    near_far = np.full((4, 8), 1.0)
+    near_far[:, 4:] = 5.0
+    view = DepthView(near_far, LEFT)
+    rays = lonlat_to_xyz([(-0.1, 0.0), (0.1, 0.0), (np.pi - 0.1, 0.0), (-np.pi + 0.1, 0.0)])
+    distance_m, reach_m = view.distances(rays)
+    np.testing.assert_allclose(distance_m, (1, 5, 5, 1))
+    np.testing.assert_allclose(reach_m, (1.1, 5.5, 5.5, 1.1))
+
+
+def test_matches_of_the_same_point_are_correct() -> None:
+    left, right = ROOM.view(LEFT, (256, 512)), ROOM.view(tilted((1.6, -0.4, 1.4), 5), (256, 512))
+    rng = np.random.default_rng(3)
+    rays = unit(rng.normal(size=(3000, 3)))
+    points_m = left.pose.points_m(
+        rays, ROOM.distance_m(LEFT.location_m, rays @ LEFT.world_from_panorama.T)
+    )
+    seen, _ = right.pose.seen(points_m)
+    visible = ROOM.hidden(right.pose, points_m) < 1e-6
+    truth = correct_matches(rays[visible], seen[visible], left, right)
+    assert truth.known.all()
+    assert truth.correct.mean() > 0.998
+    # Moved by 3°, or with another one's partner, they are not.
+    moved = unit(seen + np.tan(np.radians(3)) * unit(np.cross(seen, rng.normal(size=seen.shape))))
+    far = angle_deg(moved, seen) > 2.9
+    assert correct_matches(rays, moved, left, right).correct[far & visible].mean() < 0.03
+    assert correct_matches(rays, np.roll(seen, 1, axis=0), left, right).correct.mean() < 0.01
+
+
+def test_a_match_along_the_ray_is_wrong_although_it_fits_the_geometry() -> None:
+    # What an essential matrix cannot tell: another point of the same epipolar arc.
+    empty = Room(WALLS)
+    left, right = empty.view(LEFT, (256, 512)), empty.view(RIGHT, (256, 512))
+    rays = unit(np.random.default_rng(4).normal(size=(500, 3)))
+    halfway_m = left.pose.points_m(rays, 0.5 * left.distances(rays)[0])
+    seen, _ = right.pose.seen(halfway_m)
+    true, _ = right.pose.seen(left.pose.points_m(rays, left.distances(rays)[0]))
+    apart = angle_deg(seen, true) > 5
+    assert apart.mean() > 0.8
+    assert correct_matches(rays, seen, left, right).correct[apart].mean() < 0.03
+
+
+def test_where_no_depth_is_known_no_match_is_judged() -> None:
+    blind = DepthView(np.zeros(SHAPE, np.uint16), RIGHT)
+    ray = np.array([[1.0, 0, 0]])
+    truth = correct_matches(ray, ray, blind, blind)
+    assert not truth.known.any()
+    assert not truth.correct.any()
+    one = correct_matches(ray, ray, ROOM.view(RIGHT), blind)
+    assert one.known.all()
+    assert one.correct.all()
+
+
+def test_no_directions() -> None:
+    left, right, none = ROOM.view(LEFT), ROOM.view(RIGHT), np.empty((0, 3))
+    assert visible_from(none, left, right).visible.shape == (0,)
+    assert visible_count(none, left, right) == 0
+    assert correct_matches(none, none, left, right).correct.shape == (0,)
+
+
+def test_what_cannot_be_used() -> None:
+    view, ray = ROOM.view(LEFT), np.array([[1.0, 0, 0]])
+    with pytest.raises(SettingError, match=r"shape \(4,\)"):
+        DepthView(np.ones(4), LEFT)
+    with pytest.raises(SettingError, match="complex"):
+        DepthView(np.ones((4, 8), np.complex64), LEFT)
+    with pytest.raises(SettingError, match=r"shape \(3,\)"):
+        visible_from(ray[0], view, view)
+    with pytest.raises(SettingError, match="0 or no numbers"):
+        visible_from(ray * 0, view, view)
+    with pytest.raises(SettingError, match="1 and 2"):
+        correct_matches(ray, np.repeat(ray, 2, axis=0), view, view)

@@ -1,0 +1,93 @@
+"""Panoramas of closed forms: turned ones are computed, not resampled."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.ndimage import map_coordinates
+from scipy.spatial import cKDTree
+
+from tangent_train.geometry import equirect_directions
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+    from tangent_train.keypoints.spherical import SphericalKeypoints
+
+
+def texture(
+    shape: tuple[int, int], rotation: ArrayLike | None = None, seed: int = 0
+) -> NDArray[np.uint8]:
+    """A sphere cut out of random grey volumes: alike in all directions.
+
+    Turned by a rotation, direction d shows what was at Rᵀd.
+    """
+    directions = equirect_directions(shape)
+    if rotation is not None:
+        directions = directions @ np.asarray(rotation)
+    rng = np.random.default_rng(seed)
+    grey = np.zeros(shape)
+    for cells in (10, 20, 40, 80):
+        volume = rng.standard_normal((cells + 4,) * 3)
+        places = np.moveaxis((directions + 1) / 2 * cells + 1.5, -1, 0)
+        grey += map_coordinates(volume, places, order=3) * cells**-0.25
+    return _as_bytes(127 + 75 * grey)
+
+
+def blobs(
+    shape: tuple[int, int], centers_xyz: NDArray[np.float64], sigma_rad: float
+) -> NDArray[np.uint8]:
+    """Bright Gaussian blobs on grey: 60 + Σ 150 exp(−angle² / 2σ²)."""
+    directions = equirect_directions(shape)
+    grey = np.full(shape, 60.0)
+    for center in centers_xyz:
+        chord = ((directions - center) ** 2).sum(axis=-1)
+        grey += 150 * np.exp(-((2 * np.arcsin(np.sqrt(chord) / 2)) ** 2) / (2 * sigma_rad**2))
+    return _as_bytes(grey)
+
+
+def disc(shape: tuple[int, int], center_xyz: NDArray[np.float64], radius_rad: float) -> Any:
+    """A bright disc on grey, its border one pixel wide."""
+    angle = np.arccos(np.clip(equirect_directions(shape) @ center_xyz, -1, 1))
+    return _as_bytes(60 + 150 * np.clip((radius_rad - angle) / (np.pi / shape[0]) + 0.5, 0, 1))
+
+
+def _as_bytes(grey: NDArray[np.float64]) -> NDArray[np.uint8]:
+    return np.rint(grey.clip(0, 255)).astype(np.uint8)
+
+
+def angles_deg(left_xyz: NDArray[np.float64], right_xyz: NDArray[np.float64]) -> Any:
+    """Angles between unit vectors, exact for small ones too."""
+    return np.degrees(2 * np.arcsin(np.linalg.norm(left_xyz - right_xyz, axis=-1).clip(0, 2) / 2))
+
+
+class Agreement:
+    """Keypoints of a panorama beside those of the turned one, each with the most similar one near.
+
+    Attributes:
+        share: Of all keypoints, those with another of similar size within 1°.
+        error_deg: Median angle between those.
+        size_ratio: Median ratio of their sizes.
+        size_spread: Median of |log| of it.
+        turn_deg: Median angle between their orientations.
+    """
+
+    def __init__(self, left: SphericalKeypoints, right: SphericalKeypoints) -> None:
+        tree = cKDTree(right.directions_xyz)
+        reach = 2 * np.sin(np.deg2rad(1) / 2)
+        _, near = tree.query(left.directions_xyz, k=12, distance_upper_bound=reach)
+        there = near < len(right)
+        near[~there] = 0
+        there &= np.abs(np.log(left.sizes_rad[:, None] / right.sizes_rad[near])) < np.log(1.4)
+        difference = left.descriptors[:, None].astype(np.float64) - right.descriptors[near]
+        distance = np.where(there, (difference**2).sum(axis=-1), np.inf)
+        found = there.any(axis=1)
+        nearest = near[np.arange(len(left)), distance.argmin(axis=1)][found]
+        left, right = left.select(found), right.select(nearest)
+        ratios = right.sizes_rad / left.sizes_rad
+        self.share = found.mean()
+        self.error_deg = np.median(angles_deg(left.directions_xyz, right.directions_xyz))
+        self.size_ratio = np.median(ratios)
+        self.size_spread = np.median(np.abs(np.log(ratios)))
+        self.turn_deg = np.median(angles_deg(left.orientations_xyz, right.orientations_xyz))
