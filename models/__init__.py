@@ -3,7 +3,17 @@
 from models.fcn_resnet import FCNResNet
 from models.hexunet import HexUNet
 from models.initialize import initialize
+from models.multi_view import MultiView
+from models.shape_classifier import ShapeClassifier
 from models.stem import widen_stem
 from models.unet import UNet
 
-__all__ = ["FCNResNet", "HexUNet", "UNet", "initialize", "widen_stem"]
+__all__ = [
+    "FCNResNet",
+    "HexUNet",
+    "MultiView",
+    "ShapeClassifier",
+    "UNet",
+    "initialize",
+    "widen_stem",
+]

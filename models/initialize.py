@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -41,9 +41,10 @@ def initialize(network: nn.Module, path: Path | str) -> Origins:
     """Load what fits from a checkpoint, a state dict or a safetensors file, in place.
 
     Names are compared behind the prefix under which most of them are the network's (``module.``,
-    ``network.``, …). Of the first convolution, filters of further input channels start at zero, so
-    RGB-D begins as RGB; ones the network has no channel for are left out. Other tensors of another
-    shape stay as they are: the last layer, for another number of classes.
+    ``network.``, …), in the file or, where that has none, in the network. Of the first convolution,
+    filters of further input channels start at zero, so RGB-D begins as RGB; ones the network has no
+    channel for are left out. Other tensors of another shape stay as they are: the last layer, for
+    another number of classes.
 
     Args:
         network: Into which.
@@ -54,7 +55,7 @@ def initialize(network: nn.Module, path: Path | str) -> Origins:
     """
     path = Path(path)
     own = network.state_dict()
-    found = _without_prefix(read_tensors(path), own)
+    found = _renamed(read_tensors(path), own)
     stem = _stem_name(network)
     loaded: dict[str, Tensor] = {}
     adapted: dict[str, str] = {}
@@ -103,16 +104,30 @@ def origins_table(origins: Origins, path: Path | str) -> Table:
     return table
 
 
-def _without_prefix(tensors: Mapping[str, Tensor], own: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The tensors behind the prefix under which most are the network's; the shortest such."""
-    counts = Counter(
-        name[: len(name) - len(wanted)]
-        for name in tensors
-        for wanted in own
-        if name == wanted or name.endswith(f".{wanted}")
+def _renamed(tensors: Mapping[str, Tensor], own: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The tensors by the network's names: behind, or with, the prefix under which most are its."""
+    prefix = _commonest(_prefixes(tensors, own))
+    if prefix is not None:
+        return {n.removeprefix(prefix): t for n, t in tensors.items() if n.startswith(prefix)}
+    # A network inside this one.
+    prefix = _commonest(_prefixes(own, tensors)) or ""
+    return {prefix + name: tensor for name, tensor in tensors.items()}
+
+
+def _prefixes(names: Iterable[str], ends: Iterable[str]) -> Counter[str]:
+    """How many names are made of a prefix and one of the ends, for every such prefix."""
+    ends = list(ends)
+    return Counter(
+        name[: len(name) - len(end)]
+        for name in names
+        for end in ends
+        if name == end or name.endswith(f".{end}")
     )
-    prefix = min(counts, key=lambda prefix: (-counts[prefix], len(prefix)), default="")
-    return {n.removeprefix(prefix): t for n, t in tensors.items() if n.startswith(prefix)}
+
+
+def _commonest(counts: Counter[str]) -> str | None:
+    """The one that is there most often, of equals the shortest."""
+    return min(counts, key=lambda prefix: (-counts[prefix], len(prefix)), default=None)
 
 
 def _stem_name(network: nn.Module) -> str | None:

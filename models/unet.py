@@ -9,46 +9,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from models.residual import Down, Residual
 from models.stride import check_sides
 from tangent_train.errors import SettingError
 
 __all__ = ["UNet"]
-
-
-class _Residual(nn.Module):
-    """Bottleneck 1×1 – 3×3 – 1×1 with a 1×1 shortcut, every convolution normalised."""
-
-    def __init__(self, in_channels: int, out_channels: int) -> None:
-        super().__init__()
-        neck = min(in_channels, out_channels)
-        self.body = nn.Sequential(
-            nn.Conv2d(in_channels, neck, 1),
-            nn.BatchNorm2d(neck),
-            nn.ReLU(inplace=True),
-            nn.Conv2d(neck, neck, 3, padding=1),
-            nn.BatchNorm2d(neck),
-            nn.ReLU(inplace=True),
-            nn.Conv2d(neck, out_channels, 1),
-            nn.BatchNorm2d(out_channels),
-        )
-        self.shortcut = nn.Sequential(
-            nn.Conv2d(in_channels, out_channels, 1), nn.BatchNorm2d(out_channels)
-        )
-
-    def forward(self, x: Tensor) -> Tensor:
-        return torch.relu(self.body(x) + self.shortcut(x))
-
-
-class _Down(nn.Sequential):
-    """Half the resolution.
-
-    The original halves bilinearly after the first 1×1 convolution and again in the shortcut. At
-    ratio ½ that is the mean of 2×2 pixels, and a mean commutes with a 1×1 convolution: averaging
-    once, first, gives the same numbers with a quarter of the work.
-    """
-
-    def __init__(self, in_channels: int, out_channels: int) -> None:
-        super().__init__(nn.AvgPool2d(2), _Residual(in_channels, out_channels))
 
 
 class _Up(nn.Module):
@@ -57,7 +22,7 @@ class _Up(nn.Module):
     def __init__(self, in_channels: int, skip_channels: int, out_channels: int) -> None:
         super().__init__()
         self.up = nn.ConvTranspose2d(in_channels, in_channels, 4, stride=2, padding=1)
-        self.merge = _Residual(in_channels + skip_channels, out_channels)
+        self.merge = Residual(in_channels + skip_channels, out_channels)
 
     def forward(self, x: Tensor, skip: Tensor) -> Tensor:
         merged: Tensor = self.merge(torch.cat([self.up(x), skip], dim=1))
@@ -93,7 +58,7 @@ class UNet(nn.Module):
             )
         self.stride = 2 ** (len(widths) - 1)
         self.stem = nn.Conv2d(in_channels, widths[0], 3, padding=1)
-        self.downs = nn.ModuleList(_Down(a, b) for a, b in pairwise(widths))
+        self.downs = nn.ModuleList(Down(a, b) for a, b in pairwise(widths))
         ups = []
         below = widths[-1]
         for i in reversed(range(len(widths) - 1)):

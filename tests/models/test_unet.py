@@ -7,7 +7,7 @@ import torch
 from torch import nn
 
 from models import UNet
-from models.unet import _Down
+from models.residual import Down
 from tangent_train.errors import SettingError
 
 
@@ -29,7 +29,7 @@ def test_scores_have_the_size_of_the_images(size: tuple[int, int]) -> None:
 
 
 def test_averaging_first_equals_halving_after_the_first_convolution() -> None:
-    down = _Down(6, 10).eval()
+    down = Down(6, 10).eval()
     x = torch.randn(2, 6, 8, 12)
     residual: Any = down[1]
     first, *rest = residual.body
