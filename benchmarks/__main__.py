@@ -1,7 +1,7 @@
 """All benchmarks: ``python -m benchmarks``."""
 
-from benchmarks import loader, memory, rendering, training
+from benchmarks import keypoints, loader, memory, rendering, training
 
-for benchmark in (rendering, loader, memory, training):
+for benchmark in (rendering, loader, memory, training, keypoints):
     benchmark.main()
     print()

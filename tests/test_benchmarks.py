@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from benchmarks import loader, memory, rendering, training
+from benchmarks import keypoints, loader, memory, rendering, training
 
 
 @pytest.mark.slow
@@ -44,3 +44,13 @@ def test_the_training_benchmark_steps_in_both_precisions(
 ) -> None:
     training.main(["--quick"])
     assert len(re.findall(r"ms +[\d.]+× as fast", capsys.readouterr().out)) == 2
+
+
+@pytest.mark.slow
+def test_the_keypoint_benchmark_finds_keypoints_in_all_ways(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    keypoints.main(["--quick"])
+    counts = re.findall(r"(\d+) keypoints +[\d.]+ ms", capsys.readouterr().out)
+    assert len(counts) == 8
+    assert min(map(int, counts)) > 100

@@ -25,6 +25,7 @@ _DRAWS = 2**15
 """Pairs of matches tried for a rotation: a right one is among them at 2 % of inliers, surely."""
 _HYPOTHESES = 512
 _REFINEMENTS = 6
+_STARTS = 4
 
 
 def colmap() -> Any:
@@ -55,8 +56,9 @@ def find_motion(
 ) -> Motion | None:
     """A motion with a translation that many matches fit.
 
-    COLMAP's five-point LO-RANSAC on rays (`pycolmap.estimate_relative_pose`), refined on the
-    matches that fit.
+    COLMAP's five-point LO-RANSAC on rays (`pycolmap.estimate_relative_pose`), several times, each
+    refined on the matches that fit; of these the one with the least ``Σ min(e, max_error)²``.
+    A single run may stop at a motion that is degrees away and fits nearly as many.
     `estimate_calibrated_two_view_geometry` finds the same motions, in several times the time: it
     searches for homographies as well, and it measures errors in ERP pixels, which are small near
     the poles.
@@ -66,7 +68,7 @@ def find_motion(
         right_xyz: ``(m, 3)`` unit vectors.
         max_error_rad: How far off matches may be.
         seed: Of the random samples.
-        max_trials: Most samples.
+        max_trials: Most samples, of all runs together.
 
     Returns:
         None where COLMAP finds none.
@@ -76,7 +78,28 @@ def find_motion(
     """
     pycolmap = colmap()
     left, right = (rays @ CAMERA_FROM_PANORAMA.T for rays in (left_xyz, right_xyz))
-    options = pycolmap.RANSACOptions()
+
+    def refit(chosen: NDArray[np.bool_], motion: Motion) -> Motion | None:
+        pose = pycolmap.Rigid3d(rigid_matrix(motion.rotation, motion.translation))
+        refined = pycolmap.refine_relative_pose(pose, left, right, chosen)
+        return None if refined is None else _motion(refined["cam2_from_cam1"])
+
+    best, least = None, math.inf
+    for number in np.random.SeedSequence(seed).generate_state(_STARTS) % 2**31:
+        options = _ransac_options(max_error_rad, int(number), math.ceil(max_trials / _STARTS))
+        found = pycolmap.estimate_relative_pose(left, right, options)
+        # COLMAP's choice among the four motions of an essential matrix counts rays that meet in
+        # front of both; where they are nearly parallel that is noise.
+        for start in [] if found is None else _twins(_motion(found["cam2_from_cam1"])):
+            motion = _refined(start, left_xyz, right_xyz, max_error_rad, refit)
+            cost = _cost(motion_errors(left_xyz, right_xyz, motion), max_error_rad)
+            if cost < least:
+                best, least = motion, cost
+    return best
+
+
+def _ransac_options(max_error_rad: float, seed: int, max_trials: int) -> Any:
+    options = colmap().RANSACOptions()
     # The Sampson error is a one-sided one over √2 where both sides weigh the same.
     options.max_error = max_error_rad / math.sqrt(2)
     options.random_seed = seed
@@ -84,21 +107,7 @@ def find_motion(
     options.min_num_trials = min(options.min_num_trials, max_trials)
     options.min_inlier_ratio = 0.01
     options.confidence = 0.9999
-    found = pycolmap.estimate_relative_pose(left, right, options)
-    if found is None:
-        return None
-    start = _motion(found["cam2_from_cam1"])
-
-    def refit(chosen: NDArray[np.bool_], motion: Motion) -> Motion | None:
-        pose = pycolmap.Rigid3d(rigid_matrix(motion.rotation, motion.translation))
-        refined = pycolmap.refine_relative_pose(pose, left, right, chosen)
-        return None if refined is None else _motion(refined["cam2_from_cam1"])
-
-    # COLMAP's choice among the four motions of an essential matrix counts rays that meet in front
-    # of both; where they are nearly parallel that is noise.
-    starts = [_refined(way, left_xyz, right_xyz, max_error_rad, refit) for way in _twins(start)]
-    costs = [_cost(motion_errors(left_xyz, right_xyz, way), max_error_rad) for way in starts]
-    return starts[int(np.argmin(costs))]
+    return options
 
 
 def find_rotation(
