@@ -263,6 +263,16 @@ def test_pairs_without_translation(tmp_path: Path, kind: Any, config: str) -> No
 
 
 @needs_pycolmap
+def test_matches_without_a_geometry(tmp_path: Path) -> None:
+    images = [ColmapImage(name, (50, 100), keypoints(some(9))) for name in "ab"]
+    matches = np.array([(0, 8), (7, 1)])
+    write_colmap_database(tmp_path / "pair.db", images, [ColmapPair("a", "b", matches)])
+    with opened(tmp_path / "pair.db") as database:
+        np.testing.assert_array_equal(database.read_matches(1, 2), matches)
+        assert database.num_inlier_matches() == 0
+
+
+@needs_pycolmap
 def test_no_keypoints(tmp_path: Path) -> None:
     images = [ColmapImage(name, (50, 100), keypoints(some(0))) for name in "ab"]
     pairs = [ColmapPair("a", "b", NO_MATCHES, estimate_two_view(some(0), some(0)))]
