@@ -82,7 +82,9 @@ def compare(title: str, rows: list[Row], rounds: int) -> None:
 
 def forward_rows(panorama: NDArray[np.uint8], grid: TangentGrid) -> list[Row]:
     """The library beside a bare loop over ready-made maps."""
-    maps = [forward_map(grid, panorama.shape[:2], face, FLOAT32) for face in range(grid.num_images)]
+    maps = [
+        forward_map(grid, panorama.shape[:2], [face], FLOAT32) for face in range(grid.num_images)
+    ]
 
     def bare() -> list[Any]:
         return [
@@ -132,7 +134,7 @@ def table_rows(grid: TangentGrid, shape: tuple[int, int]) -> list[Row]:
         Row("owners (images to panorama)", cold(lambda: owner_table(grid, shape, FLOAT32))),
         Row(
             "maps of all images (panorama to images)",
-            cold(lambda: [forward_map(grid, shape, f, FLOAT32) for f in range(grid.num_images)]),
+            cold(lambda: [forward_map(grid, shape, [f], FLOAT32) for f in range(grid.num_images)]),
         ),
     ]
 

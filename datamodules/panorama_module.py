@@ -109,7 +109,7 @@ class PanoramaDataModule(SegmentationDataModule[Panorama]):
             sources = {s: PreparedPanoramas(self.open_split(s), self.store) for s in splits}
             prepare_store(list(sources.values()), whole=[sources[split] for split in whole])
 
-    def _opened(self, split: Split) -> ImageSource[Panorama]:
+    def opened(self, split: Split) -> ImageSource[Panorama]:
         """The panoramas of one split: from the store, turned, if asked for."""
         files = self.open_split(split)
         source: ImageSource[Panorama] = files

@@ -51,10 +51,11 @@ _Sample = TypeVar("_Sample", "TrainingSample[Inputs]", "EvaluationSample[Inputs]
 class Normalization:
     """Mean and standard deviation of the channels R, G, B (of 0 to 1) and perhaps depth (metres).
 
-    Depth counts clipped to `MAX_DEPTH_M` and 0 where missing.
+    Depth counts clipped to `MAX_DEPTH_M` and 0 where missing. Spheres of shapes have six channels,
+    see `mesh_spheres`.
 
     Attributes:
-        mean: 3 or 4 numbers.
+        mean: 3, 4 or 6 numbers.
         std: As many, greater than 0.
 
     Raises:
@@ -68,17 +69,17 @@ class Normalization:
         # Plain tuples, whatever list a config brought: comparable and safe in checkpoints.
         object.__setattr__(self, "mean", tuple(float(value) for value in self.mean))
         object.__setattr__(self, "std", tuple(float(value) for value in self.std))
-        right = len(self.mean) == len(self.std) and len(self.mean) in (3, 4)
+        right = len(self.mean) == len(self.std) and len(self.mean) in (3, 4, 6)
         if not (right and all(map(math.isfinite, [*self.mean, *self.std])) and min(self.std) > 0):
             raise SettingError(
                 "normalization",
                 found=f"mean {self.mean}, std {self.std}",
-                expected="3 numbers each, 4 with depth, std greater than 0",
+                expected="3 numbers each, 4 with depth, 6 of shapes, std greater than 0",
             )
 
     @property
     def channels(self) -> int:
-        """3, or 4 with depth."""
+        """3, 4 with depth, or 6 of shapes."""
         return len(self.mean)
 
 

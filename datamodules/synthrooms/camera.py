@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from datamodules.synthrooms.settings import ViewKind
 
 __all__ = [
+    "CAMERA_FROM_SPHERE",
     "PanoramaView",
     "PerspectiveView",
     "Pose",
@@ -47,7 +48,8 @@ __all__ = [
 
 _X, _Y, _Z = np.eye(3)
 _BLENDER = np.diag([1.0, -1.0, -1.0])  # Blender's camera axes <-> x right, y down, z forward
-_CAMERA_FROM_SPHERE = np.array([[0, 1.0, 0], [0, 0, -1.0], [1.0, 0, 0]])
+CAMERA_FROM_SPHERE = np.array([[0, 1.0, 0], [0, 0, -1.0], [1.0, 0, 0]])
+"""A panorama's axes (x to the middle, y right, z up) to a camera's (x right, y down, z forward)."""
 
 
 def euler_rotation(angles_rad: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -140,7 +142,7 @@ class PanoramaView:
         lon = equirect_to_lonlat(columns, shape)[:, 0]
         lat = equirect_to_lonlat(rows, shape)[:, 1]
         # A direction is cos φ times its horizontal part plus the vertical: no trigonometry a pixel.
-        turn = (self.pose.world_from_camera @ _CAMERA_FROM_SPHERE).T
+        turn = (self.pose.world_from_camera @ CAMERA_FROM_SPHERE).T
         level = (lonlat_to_xyz(np.stack([lon, 0 * lon], axis=-1)) @ turn).astype(np.float32)
         vertical = np.sin(lat)[:, None] * turn[2]
         spread = np.cos(lat).astype(np.float32)[:, None, None] * level

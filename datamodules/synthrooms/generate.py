@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import json
-import multiprocessing
 import os
-import signal
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-import cv2
 import numpy as np
 
+from datamodules.made_folders import claim_folder
+from datamodules.processes import in_processes, number_of_processes
 from datamodules.progress import show_progress
 from datamodules.stanford_files import AREAS
 from datamodules.synthrooms.camera import PanoramaView, PerspectiveView, Pose, draw_view
@@ -29,11 +26,10 @@ from datamodules.synthrooms.writer import (
     label_strings,
     pose_record,
 )
-from tangent_train.errors import DataError, SettingError
 from tangent_train.files import write_bytes, write_text
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
     from datamodules.synthrooms.render import Camera
@@ -48,7 +44,6 @@ VERSION = 1
 
 _LABELS = "semantic_labels.json"
 _CAMERA_SHARES = (0.75, 0.15, 0.1)  # of rooms with one, two and three cameras
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _TAILS = {".png": b"IEND\xaeB`\x82", ".json": b"}\n"}
 
 
@@ -78,16 +73,20 @@ def plan_rooms(settings: RoomSettings) -> list[RoomPlan]:
     for area, count in settings.rooms.items():
         for _ in range(count):
             numbers[area[0]] += 1
-            plans.append(_begin(settings.seed, area, numbers[area[0]], len(plans))[0])
+            plans.append(_begin(settings, area, numbers[area[0]], len(plans))[0])
     return plans
 
 
-def _begin(seed: int, area: str, number: int, order: int) -> tuple[RoomPlan, np.random.Generator]:
+def _begin(
+    settings: RoomSettings, area: str, number: int, order: int
+) -> tuple[RoomPlan, np.random.Generator]:
     """A room's plan, and its generator of random numbers after the plan was drawn."""
+    seed = settings.seed
     rng = np.random.default_rng((seed, AREAS.index(area), number))
     room = RoomName(area, draw_room_type(rng), number, order)
-    cameras = 1 + rng.choice(len(_CAMERA_SHARES), p=_CAMERA_SHARES)
-    return RoomPlan(room, tuple(PictureName.of_camera(seed, room, k) for k in range(cameras))), rng
+    drawn = 1 + int(rng.choice(len(_CAMERA_SHARES), p=_CAMERA_SHARES))
+    cameras = range(max(settings.least_cameras, drawn))
+    return RoomPlan(room, tuple(PictureName.of_camera(seed, room, k) for k in cameras)), rng
 
 
 def generate_rooms(
@@ -108,9 +107,8 @@ def generate_rooms(
         DataError: The folder holds other files, or rooms of other settings. Nothing is written.
         SettingError: The number of workers is negative.
     """
-    if workers is not None and workers < 0:
-        raise SettingError("workers", found=workers, expected="0 or more, or None")
-    _claim(root, settings)
+    number_of_processes(workers, 0)
+    claim_folder(root, MANIFEST, "SynthRooms", VERSION, settings.as_dict())
     plans = plan_rooms(settings)
     labels = root / _LABELS
     if not labels.exists():
@@ -118,71 +116,10 @@ def generate_rooms(
     unfinished = _unfinished(root, plans, settings.views_per_camera)
     if not unfinished:
         return
-    processes = min(os.cpu_count() or 1 if workers is None else workers, len(unfinished))
-    done = _in_processes if processes > 1 else _in_this_process
-    show_progress(
-        done(root, settings, unfinished, processes),
-        "Making rooms",
-        "rooms",
-        len(plans),
-        before=len(plans) - len(unfinished),
-        show=progress,
-    )
-
-
-def _claim(root: Path, settings: RoomSettings) -> None:
-    """Make sure that the folder is ours to write to, and mark it."""
-    wanted = {"generator": "SynthRooms", "version": VERSION, "settings": settings.as_dict()}
-    manifest = root / MANIFEST
-    remedy = "Name another folder, or remove this one to make it anew."
-    if manifest.exists():
-        found = _read_manifest(manifest)
-        if found != wanted:
-            raise DataError(
-                manifest,
-                found=_differences(found, wanted),
-                expected=_differences(wanted, found),
-                remedy=remedy,
-            )
-        return
-    if root.exists():
-        if not root.is_dir():
-            raise DataError(root, found="a file", expected="a folder", remedy=remedy)
-        foreign = sorted(path.name for path in root.iterdir() if not path.name.startswith("."))
-        if foreign:
-            raise DataError(
-                root,
-                found=f"files that are not SynthRooms' ({', '.join(foreign[:3])}, …)",
-                expected="a new or empty folder",
-                remedy="Name another folder.",
-            )
-    write_text(manifest, json.dumps(wanted, indent=1) + "\n")
-
-
-def _read_manifest(manifest: Path) -> dict[str, Any]:
-    try:
-        found = json.loads(manifest.read_text(encoding="utf-8"))
-    except ValueError:
-        found = None
-    if not isinstance(found, dict):
-        raise DataError(
-            manifest,
-            found="something else",
-            expected="the settings of SynthRooms as JSON",
-            remedy="Remove the folder to make it anew.",
-        )
-    return found
-
-
-def _differences(one: dict[str, Any], other: dict[str, Any]) -> str:
-    """What `one` says that `other` does not."""
-    flat, others = _flatten(one), _flatten(other)
-    return ", ".join(f"{k}={v}" for k, v in flat.items() if others.get(k) != v) or "nothing more"
-
-
-def _flatten(manifest: dict[str, Any]) -> dict[str, Any]:
-    settings = manifest.get("settings")
-    return {**manifest, **(settings if isinstance(settings, dict) else {}), "settings": ""}
+    pieces = [(root, settings, plan.name) for plan in unfinished]
+    making = in_processes(make_room, pieces, number_of_processes(workers, len(pieces)))
+    before = len(plans) - len(unfinished)
+    show_progress(making, "Making rooms", "rooms", len(plans), before=before, show=progress)
 
 
 def _unfinished(root: Path, plans: Sequence[RoomPlan], views_per_camera: int) -> list[RoomPlan]:
@@ -204,52 +141,6 @@ def _is_whole(path: Path) -> bool:
         return False
 
 
-def _in_this_process(
-    root: Path, settings: RoomSettings, plans: Iterable[RoomPlan], processes: int
-) -> Iterator[None]:
-    del processes
-    for plan in plans:
-        make_room(root, settings, plan.name)
-        yield
-
-
-def _in_processes(
-    root: Path, settings: RoomSettings, plans: Iterable[RoomPlan], processes: int
-) -> Iterator[None]:
-    """Make rooms in fresh processes; after an interrupt the rooms begun are finished."""
-    methods = multiprocessing.get_all_start_methods()
-    context = multiprocessing.get_context("forkserver" if "forkserver" in methods else "spawn")
-    context.set_forkserver_preload([__name__])  # imported once, not once per process
-    with _one_thread_each(), ProcessPoolExecutor(processes, context, _prepare_worker) as pool:
-        try:
-            futures = [pool.submit(make_room, root, settings, plan.name) for plan in plans]
-            for future in as_completed(futures):
-                future.result()
-                yield
-        finally:
-            pool.shutdown(cancel_futures=True)
-
-
-@contextmanager
-def _one_thread_each() -> Iterator[None]:
-    """Let processes that are started inside have one thread of linear algebra each."""
-    before = {name: os.environ.get(name) for name in _THREADS}
-    os.environ.update(dict.fromkeys(_THREADS, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name)
-            else:
-                os.environ[name] = value
-
-
-def _prepare_worker() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what is still done
-    cv2.setNumThreads(1)
-
-
 def make_room(root: Path, settings: RoomSettings, name: RoomName) -> None:
     """Make a room, take its pictures and write their files.
 
@@ -258,7 +149,7 @@ def make_room(root: Path, settings: RoomSettings, name: RoomName) -> None:
         settings: Settings of the data set.
         name: Which room.
     """
-    plan, rng = _begin(settings.seed, name.area, name.number, name.order)
+    plan, rng = _begin(settings, name.area, name.number, name.order)
     room = furnish(rng, name.kind)
     scene = RayScene(room)
     holes = draw_holes(rng, scene)

@@ -33,6 +33,7 @@ class RoomSettings:
         views_per_camera: Perspective views per panorama.
         view_size: Side of the square perspective views in pixels.
         supersample: Rays per pixel side for the colours (labels and depth: one ray at the centre).
+        least_cameras: Panoramas that every room has at least; most have no more than one otherwise.
 
     Raises:
         SettingError: A setting that cannot work.
@@ -45,6 +46,7 @@ class RoomSettings:
     views_per_camera: int = 0
     view_size: int = 540
     supersample: int = 2
+    least_cameras: int = 1
 
     def __post_init__(self) -> None:
         rooms = {str(area).removeprefix("area_"): n for area, n in self.rooms.items()}
@@ -59,12 +61,16 @@ class RoomSettings:
         if self.views not in get_args(ViewKind):
             raise SettingError("views", found=self.views, expected=get_args(ViewKind))
         limits = {"seed": 0, "height": 8, "views_per_camera": 0, "view_size": 8, "supersample": 1}
+        limits["least_cameras"] = 1
         for name, least in limits.items():
             _check_integer(name, getattr(self, name), least=least)
 
     def as_dict(self) -> dict[str, Any]:
         """The settings as plain values, for JSON."""
-        return asdict(self)
+        settings = asdict(self)
+        if self.least_cameras == 1:
+            del settings["least_cameras"]  # data sets made before it was a setting are the same
+        return settings
 
 
 def _check_integer(name: str, value: object, *, least: int) -> None:

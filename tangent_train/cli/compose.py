@@ -41,8 +41,12 @@ STORED = "stored_"
 _PLUGINS = {"hydra/launcher/": "hydra-submitit-launcher", "hydra/sweeper/": "hydra-optuna-sweeper"}
 """Packages of the extra ``sweep``, by the config group they add options to."""
 
-_PATHS = ("back", "cameras", "checkpoint", "depth", "figure", "input", "output")
-"""Settings of predict, render and export that name files or folders."""
+_PATHS = ("back", "cameras", "checkpoint", "depth", "figure", "input", "left", "output", "right")
+"""Settings of export, keypoints, predict and render that name files or folders."""
+
+_KEYPOINTS = "keypoints"
+_PAIRS = ("image_pairs", "stanford2d3ds_pairs", "synthrooms_pairs")
+"""Data that only it takes."""
 
 _TRANSFER = "transfer"
 _OF_TRANSFER = ("photos", "fine_tuning")
@@ -136,6 +140,7 @@ def check_overrides(config_name: str, arguments: list[str]) -> None:
             )
         for override in groups:
             _check_option(override, options_of[override.key_or_group])
+            _check_pairs(override, config_name)
         chosen = [str(o.input_line) for o in groups if not o.is_sweep_override()]
         config = _compose(config_name, search, chosen)
         _check_experiment(config_name, config, chosen)
@@ -198,6 +203,18 @@ def _check_option(override: Override, options: list[str]) -> None:
     for option in wanted:
         if str(option) not in options:
             _refuse(override.key_or_group, str(option), options)
+
+
+def _check_pairs(override: Override, config_name: str) -> None:
+    """Refuse pairs of panoramas where panoramas are wanted."""
+    data = str(override.value())
+    if override.key_or_group == "data" and data in _PAIRS and config_name != _KEYPOINTS:
+        raise SettingError(
+            "data",
+            found=f"{data}, pairs of panoramas",
+            expected="data of this command",
+            remedy=f"Run: tangent-keypoints data={data} output=…",
+        )
 
 
 def _refuse(kind: str, found: str, known: list[str]) -> None:

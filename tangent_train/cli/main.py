@@ -40,7 +40,7 @@ _MODULES = {
 }
 """Where a command is, if not in `run`."""
 
-_OF_FILES = ("export", "predict", "render")
+_OF_FILES = ("export", "keypoints", "predict", "render")
 """Commands whose paths are taken as they are, whatever characters are in them."""
 
 
@@ -125,12 +125,15 @@ def _compose_and_run(command: str, typed: list[str]) -> None:
     from hydra.errors import InstantiationException
 
     from tangent_train.cli.compose import check_overrides, config_folder, quote_path
+    from tangent_train.cli.keypoint_pairs.arguments import keypoint_arguments
     from tangent_train.cli.stored import with_stored_config
 
     as_module = __name__ == "__main__"
     settings = typed[1:] if as_module else typed
     if command in _OF_FILES:
         settings = [quote_path(argument) for argument in settings]
+    if command == "keypoints":
+        settings = keypoint_arguments(settings)
     config_name, arguments = with_stored_config(command, settings)
     check_overrides(config_name, arguments)
     visible_gpus = os.environ.get("CUDA_VISIBLE_DEVICES")

@@ -29,6 +29,9 @@ Scalar = TypeVar("Scalar", bound=np.generic)
 _CHUNK = 2**20
 """Positions whose taps torch holds at once."""
 
+_TOGETHER = 2**16
+"""Pixels of small images that are rendered at once: tables of this size stay in a core's cache."""
+
 
 @overload
 def equirect_to_tangent(
@@ -76,12 +79,16 @@ def equirect_to_tangent(
         return _render_tensor(image, grid, indices, interpolation)
     check_numpy_image(image, interpolation)
     image = np.ascontiguousarray(image)
-    out = np.empty((len(indices), grid.dim, grid.dim, *image.shape[2:]), image.dtype)
+    out = np.empty((len(indices) * grid.dim, grid.dim, *image.shape[2:]), image.dtype)
     dtype = map_dtype(image.dtype == np.float64, interpolation)
-    for face, target in zip(indices, out, strict=True):
-        table = forward_map(grid, image.shape[:2], int(face), dtype)
-        table.sample(image, interpolation, target)
-    return out
+    # Small images go together: to call for each takes longer than to render it. Random subsets do
+    # not, unless their tables are not kept anyway.
+    together = faces is None or grid.rotation is not None
+    step = max(1, _TOGETHER // max(grid.dim**2, 4 * grid.dim)) if together else 1
+    for start in range(0, len(indices), step):
+        table = forward_map(grid, image.shape[:2], indices[start : start + step], dtype)
+        table.sample(image, interpolation, out[start * grid.dim :][: len(table.u)])
+    return out.reshape(len(indices), grid.dim, *out.shape[1:])
 
 
 def _render_tensor(
@@ -115,7 +122,7 @@ def _positions(
 
     def tensors(face: int) -> tuple[Tensor, ...]:
         def arrays() -> tuple[NDArray[np.floating], ...]:
-            table = forward_map(grid, shape, face, dtype)
+            table = forward_map(grid, shape, [face], dtype)
             return table.u, table.v
 
         return tensors_on(device, grid, ("forward", shape, face, dtype), arrays)

@@ -36,24 +36,27 @@ def pinhole_map(
     u: NDArray[np.floating],
     v: NDArray[np.floating],
 ) -> None:
-    """ERP positions of the pixels of a pinhole image, rows ``start:stop``.
+    """ERP positions of the pixels of pinhole images, one below the other, rows ``start:stop``.
 
     Args:
         start: First row.
         stop: One past the last row.
-        world_from_pixel: ``(3, 3)`` matrix from homogeneous pixels (column, row, 1) to directions.
+        world_from_pixel: ``(n, 3, 3)`` matrices from homogeneous pixels (column, row, 1) to
+            directions.
         height: Rows H of the ERP.
         width: Columns W of the ERP.
-        u: ``(h, w)`` columns, written.
-        v: ``(h, w)`` rows, written.
+        u: ``(n h, w)`` columns, written.
+        v: ``(n h, w)`` rows, written.
     """
-    m = world_from_pixel
-    for i in range(start, stop):
+    image_height = u.shape[0] // len(world_from_pixel)
+    for row in range(start, stop):
+        m = world_from_pixel[row // image_height]
+        i = row % image_height
         for j in range(u.shape[1]):
             x = m[0, 0] * j + m[0, 1] * i + m[0, 2]
             y = m[1, 0] * j + m[1, 1] * i + m[1, 2]
             z = m[2, 0] * j + m[2, 1] * i + m[2, 2]
-            u[i, j], v[i, j] = _equirect_pixel(x, y, z, height, width)
+            u[row, j], v[row, j] = _equirect_pixel(x, y, z, height, width)
 
 
 @njit_exact

@@ -94,12 +94,14 @@ class EquirectMap:
             cv2.remap(image, u, v, flag, dst=out, borderMode=cv2.BORDER_WRAP)
             return
         # Other numbers of channels cv2 refuses, or samples at rounded positions.
-        for first in range(0, channels, 4):
-            group = image[..., first : first + 4]
+        several = 3 if channels % 3 == 0 else 4
+        for first in range(0, channels, several):
+            group = image[..., first : first + several]
             size = group.shape[2]
-            padded = np.pad(group, ((0, 0), (0, 0), (0, max(0, 3 - size))))
-            sampled = cv2.remap(padded, u, v, flag, borderMode=cv2.BORDER_WRAP)
-            out[..., first : first + 4] = sampled[..., :size]
+            if size < 3:
+                group = np.pad(group, ((0, 0), (0, 0), (0, 3 - size)))
+            sampled = cv2.remap(np.ascontiguousarray(group), u, v, flag, borderMode=cv2.BORDER_WRAP)
+            out[..., first : first + several] = sampled[..., :size]
 
     def _gather(
         self,
@@ -129,14 +131,17 @@ def pinhole_equirect_map(
     shape: tuple[int, int],
     dtype: np.dtype[np.floating],
 ) -> EquirectMap:
-    """Where the pixels of a pinhole image are in an ERP.
+    """Where the pixels of pinhole images are in an ERP, one image below the other.
 
     Args:
-        world_from_pixel: ``(3, 3)`` from homogeneous pixels (column, row, 1) to directions.
-        size: ``(height, width)`` of the pinhole image.
+        world_from_pixel: ``(3, 3)`` or, of n images, ``(n, 3, 3)`` from homogeneous pixels (column,
+            row, 1) to directions.
+        size: ``(height, width)`` of each image.
         shape: ``(H, W)`` of the ERP.
         dtype: float32 or float64; computed in float64 either way.
     """
-    u, v = np.empty(size, dtype), np.empty(size, dtype)
-    over_rows(pinhole_map, size, np.ascontiguousarray(world_from_pixel), *shape, u, v)
+    height, width = size
+    matrices = np.ascontiguousarray(world_from_pixel).reshape(-1, 3, 3)
+    u, v = np.empty((2, len(matrices) * height, width), dtype)
+    over_rows(pinhole_map, u.shape, matrices, *shape, u, v)
     return EquirectMap(u, v, shape)

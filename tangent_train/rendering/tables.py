@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -154,22 +154,26 @@ def _cached(
 
 
 def forward_map(
-    grid: PinholeGrid, shape: tuple[int, int], face: int, dtype: np.dtype[np.floating]
+    grid: PinholeGrid,
+    shape: tuple[int, int],
+    faces: Sequence[int] | NDArray[np.int64],
+    dtype: np.dtype[np.floating],
 ) -> EquirectMap:
-    """Where the pixels of a tangent image are in the ERP.
+    """Where the pixels of tangent images are in the ERP, one below the other.
 
     Args:
         grid: The images.
         shape: ``(H, W)`` of the ERP.
-        face: The image.
+        faces: The images.
         dtype: float32 or float64; computed in float64 either way.
     """
+    chosen = tuple(int(face) for face in faces)
 
     def build() -> EquirectMap:
-        world_from_pixel = grid.world_from_camera[face] @ np.linalg.inv(grid.camera_matrix)
+        world_from_pixel = grid.world_from_camera[list(chosen)] @ np.linalg.inv(grid.camera_matrix)
         return pinhole_equirect_map(world_from_pixel, (grid.dim, grid.dim), shape, dtype)
 
-    return _cached(grid, ("forward", shape, face, dtype), build, lambda table: table.nbytes)
+    return _cached(grid, ("forward", shape, chosen, dtype), build, lambda table: table.nbytes)
 
 
 def owner_table(

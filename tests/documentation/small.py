@@ -19,12 +19,14 @@ from tangent_train.cli.compose import config_folder
 from tests.documentation.markdown import Command
 from tests.documentation.world import (
     DEMO,
+    PAPER_PAIRS,
     PLACES,
     RGB_CHECKPOINT,
     ROOM_FOLDERS,
     ROOMS,
     ROWS,
     RUNS,
+    SHAPES,
     TIME,
 )
 
@@ -33,6 +35,7 @@ STAND_INS = {
     "checkpoint": f"runs/{RUNS[0]}/{TIME}/checkpoints/best.ckpt",
     "resume": f"runs/{RUNS[0]}/{TIME}",
     "input": "panoramas",
+    "mnist": "mnist",
     "output": "made",
     "data.root": ROOM_FOLDERS[0],
 }
@@ -46,6 +49,7 @@ _SMALL: dict[str, dict[str, Any]] = {
     "data": {
         "panoramas_per_step": 2,
         "photos_per_step": 2,
+        "shapes_per_step": 4,
         "num_workers": 0,
         "validation_fraction": DEMO["data.validation_fraction"],
         "frames": 2,
@@ -62,6 +66,7 @@ _SMALL: dict[str, dict[str, Any]] = {
 """Values for settings that are not null, if a config has them."""
 
 _ALSO_NULL = {"erp_height"}
+_OF_PAIRS = {"data.rooms.height", "data.rooms.supersample"}
 
 
 class NoStandInError(LookupError):
@@ -163,6 +168,20 @@ def _transfer(arguments: Sequence[str], folder: Path) -> list[str]:
     return _overrides(settings)
 
 
+def _study(arguments: Sequence[str], _folder: Path) -> list[str]:
+    """Few pixels, one network for one epoch: each where the study is asked for."""
+    small = {
+        "distorted_digits": ["seeds=[0]", "epochs=1"],
+        "representation_distortion": ["side=16"],
+    }
+    return [
+        setting
+        for name, settings in small.items()
+        if {name, "all"} & set(arguments)
+        for setting in settings
+    ]
+
+
 def _evaluation(arguments: Sequence[str], _folder: Path) -> list[str]:
     rooms = any(text.startswith("data=synthrooms") for text in arguments)
     rows = any(text.startswith("representation.erp_height=") for text in arguments)
@@ -170,14 +189,26 @@ def _evaluation(arguments: Sequence[str], _folder: Path) -> list[str]:
     return _overrides({**(ROOMS if rooms else {}), **height})
 
 
+def _keypoints(arguments: Sequence[str], _folder: Path) -> list[str]:
+    """Two small rooms, or two small panoramas with the names of the paper's."""
+    if "data=stanford2d3ds_pairs" in arguments:
+        return [f"data.root={PAPER_PAIRS}", "max_pairs=2", "base_level=0"]
+    if any(text.startswith(("left=", "input=")) for text in arguments):
+        return []
+    rooms = {name: value for name, value in ROOMS.items() if name in _OF_PAIRS}
+    return _overrides({**rooms, "data.rooms.rooms.area_1": 1, "base_level": 0})
+
+
 _RULES: Mapping[str, Callable[[Sequence[str], Path], list[str]]] = {
     "python": _benchmark,
     "tangent-evaluate": _evaluation,
     "tangent-export": _nothing,
+    "tangent-keypoints": _keypoints,
     "tangent-predict": _nothing,
     "tangent-prepare": _preparation,
     "tangent-render": _nothing,
     "tangent-report": _nothing,
+    "tangent-study": _study,
     "tangent-train": _run,
     "tangent-transfer": _transfer,
 }
@@ -215,6 +246,8 @@ def _of_run(name: str, arguments: Sequence[str], folder: Path) -> dict[str, Any]
         "panels": 1,
     }
     settings |= ROOMS if "rooms" in config.data else {}
+    if "shapes" in config.data:
+        settings |= {name: value for name, value in SHAPES.items() if name.startswith("data.")}
     settings |= {
         f"{section}.{key}": value
         for section, known in _SMALL.items()
@@ -230,6 +263,8 @@ def _of_run(name: str, arguments: Sequence[str], folder: Path) -> dict[str, Any]
 
 def _of_network(config: DictConfig, composed: Callable[..., DictConfig]) -> dict[str, Any]:
     """The UNet's widths; a UNet in place of a ResNet, without what experiments say of that."""
+    if "ShapeClassifier" in config.network._target_:
+        return {"network.width": SHAPES["network.width"]}
     if "FCNResNet" not in config.network._target_:
         return {"network.widths": "[4,8]"} if "widths" in config.network else {}
     left = composed("network=unet").network

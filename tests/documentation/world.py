@@ -10,10 +10,14 @@ import cv2
 import numpy as np
 from PIL import ExifTags, Image
 
+from datamodules.synthshapes.generate import generate_shapes
+from datamodules.synthshapes.settings import ShapeSettings
 from tests.datamodules.folder_format import write_data_set
+from tests.datamodules.stanford_pairs_format import write_paper_pairs
 from tests.datamodules.synthia_format import write_panoramas, write_views
 from tests.documentation.cluster import write_cluster
 from tests.documentation.running import run
+from tests.tasks.studies.mnist_format import write_mnist
 
 if TYPE_CHECKING:
     from tests.conftest import FabricateStanford
@@ -26,6 +30,7 @@ RUNS = ("demo", "make_demo", "run", "standard", "paper/semseg_s7_b0_rgbd")
 PLACES = {
     "/data/2d3ds": "2d3ds",
     "/data/synthia": "synthia",
+    "/data/ModelNet40": "modelnet40",
     "/ssd": "ssd",
     "/shared": "shared",
 }
@@ -37,6 +42,9 @@ INSTALLED = "installed"
 
 CLUSTER = "cluster"
 """A folder of SLURM's commands."""
+
+PAPER_PAIRS = "paper_pairs"
+"""Where panoramas with the names of the paper's pairs are: only those, without labels."""
 
 RGB_CHECKPOINT = "best.ckpt"
 """Of a network without depth; the demo's is one with it."""
@@ -59,6 +67,9 @@ ROOMS = {
     "data.rooms.supersample": 1,
 }
 """Settings of a few small rooms."""
+
+SHAPES = {"data.shapes.train": 3, "data.shapes.test": 1, "network.width": 2}
+"""Settings of a few shapes and a narrow network."""
 
 DEMO: dict[str, Any] = {
     "level": 4,
@@ -87,8 +98,11 @@ def build_world(folder: Path, fabricate_stanford: FabricateStanford) -> Path:
     write_panoramas(write_views(folder / PLACES["/data/synthia"], SEQUENCES), SEQUENCES, ROWS)
     (folder / INSTALLED).mkdir()
     (folder / INSTALLED / "my_package.py").write_text(_NETWORK)
+    write_paper_pairs(folder / PAPER_PAIRS, ROWS)
     _write_pictures(folder)
     _write_tangent_images(folder)
+    _write_shapes(folder)
+    write_mnist(folder / "mnist")
     write_data_set(folder / "my_rooms", height=ROWS, depth=True)
     settings = [f"{name}={value}" for name, value in DEMO.items()]
     first, *others = (folder / "runs" / name / TIME for name in RUNS)
@@ -105,6 +119,16 @@ def build_world(folder: Path, fabricate_stanford: FabricateStanford) -> Path:
     write_cluster(folder / CLUSTER)
     shutil.copyfile(first / "checkpoints" / "best.ckpt", folder / "other.ckpt")
     return folder
+
+
+def _write_shapes(folder: Path) -> None:
+    """A run on made shapes, and these in the place of ModelNet40."""
+    small = [f"{name}={value}" for name, value in SHAPES.items()]
+    small += ["level=4", "data.validation_fraction=0.34", "trainer.max_epochs=1"]
+    place = f"hydra.run.dir=runs/shapes/default/{TIME}"
+    done = run(["tangent-train", "experiment=shapes/default", *small, place], {}, folder)
+    assert done.status == 0, done.output
+    generate_shapes(folder / PLACES["/data/ModelNet40"], ShapeSettings(train=3, test=1))
 
 
 def _write_tangent_images(folder: Path) -> None:

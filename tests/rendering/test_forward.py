@@ -196,3 +196,22 @@ def test_gradients(shape: tuple[int, int]) -> None:
 def test_errors(image: Any, arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(SettingError, match=message):
         equirect_to_tangent(image, TangentGrid(0, 4), **arguments)
+
+
+@pytest.mark.parametrize("channels", [1, 2, 3, 5, 6, 7])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+def test_small_images_together_are_those_rendered_one_by_one(channels: int, dtype: Any) -> None:
+    rng = np.random.default_rng(0)
+    image = (rng.random((32, 64, channels)) * 250).astype(dtype)
+    turn = random_rotation(rng)
+    for grid in (TangentGrid(0, 4), TangentGrid(2, 4), TangentGrid(1, 5, rotation=turn)):
+        together = equirect_to_tangent(image, grid)
+        for face in range(grid.num_images):
+            alone = equirect_to_tangent(image, grid.with_rotation(grid.rotation), [face])[0]
+            np.testing.assert_array_equal(together[face], alone)
+        for channel in range(channels):
+            plain = equirect_to_tangent(image[..., channel], grid)
+            tolerance = 1 if dtype != np.float32 else 1e-3
+            np.testing.assert_allclose(
+                together[..., channel].astype(float), plain.astype(float), atol=tolerance
+            )

@@ -24,7 +24,7 @@ def test_pinhole_map_writes_only_its_rows() -> None:
     grid = TangentGrid(0, 4)
     world_from_pixel = grid.world_from_camera[4] @ np.linalg.inv(grid.camera_matrix)
     u, v = np.full((2, 16, 16), -9.0)
-    kernels.pinhole_map(3, 5, world_from_pixel, 20, 40, u, v)
+    kernels.pinhole_map(3, 5, world_from_pixel[None], 20, 40, u, v)
     expected = lonlat_to_equirect(xyz_to_lonlat(grid.directions([4])[0]), (20, 40))
     np.testing.assert_allclose(np.stack([u, v], axis=-1)[3:5], expected[3:5], atol=1e-12)
     assert (u[:3] == -9).all()

@@ -85,9 +85,9 @@ def test_tables_are_reused(cache: tables.TableCache) -> None:
     equirect_to_tangent(image, TangentGrid(0, 4), [1, 2])
     assert len(cache) == 2
     dtype = np.dtype(np.float32)
-    first = tables.forward_map(TangentGrid(0, 4), (32, 64), 1, dtype)
-    assert tables.forward_map(TangentGrid(0, 4), (32, 64), 1, dtype) is first
-    assert tables.forward_map(TangentGrid(0, 4), (16, 32), 1, dtype) is not first
+    first = tables.forward_map(TangentGrid(0, 4), (32, 64), [1], dtype)
+    assert tables.forward_map(TangentGrid(0, 4), (32, 64), [1], dtype) is first
+    assert tables.forward_map(TangentGrid(0, 4), (16, 32), [1], dtype) is not first
 
 
 def test_rotated_grids_are_not_kept(cache: tables.TableCache) -> None:
@@ -112,9 +112,9 @@ def test_the_cache_is_bounded_by_bytes() -> None:
 
 
 def test_the_limit_can_be_set(cache: tables.TableCache) -> None:
-    set_table_cache_limit(5000)
+    set_table_cache_limit(50_000)
     equirect_to_tangent(np.zeros((32, 64), np.float32), TangentGrid(0, 4))
-    assert 0 < cache.nbytes <= 5000
+    assert 0 < cache.nbytes <= 50_000
     with pytest.raises(SettingError, match="cache limit"):
         set_table_cache_limit(-1)
 

@@ -89,6 +89,15 @@ def test_one_to_three_cameras_in_a_room() -> None:
     assert 0.2 < (counts[2] + counts[3]) / 800 < 0.3
 
 
+def test_rooms_have_as_many_cameras_as_wanted_and_are_the_same_rooms() -> None:
+    usual = plan_rooms(RoomSettings(rooms={"1": 50}))
+    more = plan_rooms(RoomSettings(rooms={"1": 50}, least_cameras=2))
+    for one, other in zip(usual, more, strict=True):
+        assert one.name == other.name
+        assert len(other.cameras) == max(2, len(one.cameras))
+        assert other.cameras[: len(one.cameras)] == one.cameras
+
+
 @pytest.mark.slow  # the processes import torch with the package
 def test_the_same_bytes_for_any_number_of_processes(tiny: Path, tmp_path: Path) -> None:
     generate_rooms(tmp_path / "same", TINY, workers=2, progress=True)

@@ -13,6 +13,11 @@ def test_rooms_come_in_the_order_of_the_areas_and_leave_room_for_nothing() -> No
     assert list(settings.as_dict()["rooms"].items()) == [("1", 2), ("5b", 0)]
 
 
+def test_one_camera_at_least_is_what_it_was_before_it_could_be_said() -> None:
+    assert "least_cameras" not in RoomSettings().as_dict()
+    assert RoomSettings(least_cameras=2).as_dict()["least_cameras"] == 2
+
+
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
@@ -28,6 +33,7 @@ def test_rooms_come_in_the_order_of_the_areas_and_leave_room_for_nothing() -> No
         ({"views_per_camera": -1}, "views_per_camera"),
         ({"view_size": 0}, "view_size"),
         ({"supersample": 0}, "supersample"),
+        ({"least_cameras": 0}, "least_cameras"),
     ],
 )
 def test_what_cannot_work_is_named(wrong: dict[str, Any], message: str) -> None:

@@ -1,0 +1,86 @@
+"""Work in several processes: results as they come, an interrupt leaves what was begun finished."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import cv2
+
+from tangent_train.errors import SettingError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Generator, Iterator, Sequence
+
+__all__ = ["in_processes", "number_of_processes"]
+
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+_Result = TypeVar("_Result")
+
+
+def number_of_processes(workers: int | None, pieces: int, least: int = 1) -> int:
+    """How many processes a piece of work is worth.
+
+    Args:
+        workers: What is asked for; by default one per CPU core.
+        pieces: How many pieces there are.
+        least: Pieces for which one more process is worth starting.
+
+    Raises:
+        SettingError: The number asked for is negative.
+    """
+    if workers is not None and workers < 0:
+        raise SettingError("workers", found=workers, expected="0 or more, or None")
+    return min(os.cpu_count() or 1 if workers is None else workers, -(-pieces // least))
+
+
+def in_processes(
+    work: Callable[..., _Result], pieces: Sequence[tuple[Any, ...]], processes: int
+) -> Generator[_Result]:
+    """``work(*piece)`` of all pieces, in the order in which they are done.
+
+    After an interrupt the pieces begun are finished, no others.
+
+    Args:
+        work: A function of a module.
+        pieces: Its arguments.
+        processes: How many; 0 and 1 work in this one.
+    """
+    if processes <= 1:
+        for piece in pieces:
+            yield work(*piece)
+        return
+    methods = multiprocessing.get_all_start_methods()
+    context = multiprocessing.get_context("forkserver" if "forkserver" in methods else "spawn")
+    context.set_forkserver_preload([work.__module__])  # imported once, not once per process
+    with _one_thread_each(), ProcessPoolExecutor(processes, context, _prepare_worker) as pool:
+        try:
+            futures = [pool.submit(work, *piece) for piece in pieces]
+            for future in as_completed(futures):
+                yield future.result()
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def _one_thread_each() -> Iterator[None]:
+    """Let processes that are started inside have one thread of linear algebra each."""
+    before = {name: os.environ.get(name) for name in _THREADS}
+    os.environ.update(dict.fromkeys(_THREADS, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name)
+            else:
+                os.environ[name] = value
+
+
+def _prepare_worker() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what is still done
+    cv2.setNumThreads(1)

@@ -1,0 +1,1 @@
+"""SynthShapes: parametric families of shapes, written as OFF files in ModelNet40's own tree."""

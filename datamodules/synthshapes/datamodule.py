@@ -1,0 +1,52 @@
+"""SynthShapes as a data module: ModelNet40's own, after making the files."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from datamodules.modelnet40 import ModelNet40
+from datamodules.synthshapes.families import CLASSES
+from datamodules.synthshapes.settings import ShapeSettings
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from tangent_train.rendering.representation import Representation
+
+__all__ = ["SynthShapes"]
+
+
+class SynthShapes(ModelNet40):
+    """Shapes made on the first use, read as ModelNet40: the data set that needs no download.
+
+    Args:
+        root: Folder for the files.
+        representation: What the network sees of a sphere.
+        shapes: Which shapes to make.
+        **settings: All others of `ModelNet40`.
+
+    Raises:
+        SettingError: A setting that cannot work.
+    """
+
+    def __init__(
+        self,
+        root: str | Path,
+        representation: Representation,
+        shapes: ShapeSettings | Mapping[str, Any] | None = None,
+        **settings: Any,
+    ) -> None:
+        given = shapes or {}
+        self.shapes = given if isinstance(given, ShapeSettings) else ShapeSettings(**given)
+        super().__init__(root, representation, **settings)
+
+    def find_classes(self) -> tuple[str, ...]:
+        """The names of the ten classes."""
+        return CLASSES
+
+    def make_files(self) -> None:
+        """Make the files, unless they are there."""
+        from datamodules.synthshapes.generate import generate_shapes
+
+        generate_shapes(self.root, self.shapes)

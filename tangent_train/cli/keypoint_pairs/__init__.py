@@ -1,0 +1,1 @@
+"""What tangent-keypoints is told, and where it leaves its results."""
