@@ -35,4 +35,4 @@ def each_view(network: nn.Module, images: Tensor) -> Tensor:
             remedy="It is a network for task=classification.",
         )
     found: Tensor = network(images.flatten(0, 1))
-    return found.unflatten(0, images.shape[:2])
+    return found.reshape(*images.shape[:2], *found.shape[1:])

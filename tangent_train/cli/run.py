@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import copy
 import json
-import os
-import shutil
 import signal
 import sys
 import warnings
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import lightning
-import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from lightning.fabric.utilities.exceptions import MisconfigurationException
@@ -26,22 +21,19 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from models.initialize import initialize, origins_table
+from tangent_train.cli.build import build
 from tangent_train.cli.resume import check_resumed
 from tangent_train.cli.sweep import OBJECTIVE_FILE
 from tangent_train.errors import SettingError
 from tangent_train.files import write_text
-from tangent_train.rendering import Assembler
-from tangent_train.tasks.callbacks import PredictionPanels, ProgressBar
+from tangent_train.tasks.callbacks import ProgressBar
 from tangent_train.tasks.checkpoints import (
     AtomicCheckpointIO,
     CheckpointContents,
     LastCheckpoint,
     best_checkpoint,
 )
-from tangent_train.tasks.html.evaluation import write_evaluation_report
-from tangent_train.tasks.networks import completed_settings, make
-from tangent_train.tasks.results import evaluation_results, results_table, write_results
-from tangent_train.tasks.tensorboard_pictures import TrainingSpeed, ValidationPictures
+from tangent_train.tasks.tensorboard_pictures import TrainingSpeed
 from tangent_train.tasks.trained import read_checkpoint
 
 __all__ = ["build", "evaluate", "prepare", "train"]
@@ -73,8 +65,8 @@ def train(config: DictConfig) -> float | None:
     last = LastCheckpoint(checkpoints, config.checkpoint_every_n_steps)
     callbacks = [last, LearningRateMonitor()]
     if data.validation_fraction:
-        callbacks.append(best_checkpoint(checkpoints))
-    trainer = _trainer(config, folder, data, callbacks)
+        callbacks.append(best_checkpoint(checkpoints, task.monitor))
+    trainer = _trainer(config, folder, data, task, callbacks)
     with warnings.catch_warnings():
         # The checkpoints of a resumed run are meant to be there.
         warnings.filterwarnings("ignore", "Checkpoint directory .* exists and is not empty")
@@ -115,7 +107,8 @@ def evaluate(config: DictConfig) -> None:
     folder = _run_folder()
     lightning.seed_everything(config.seed, workers=True, verbose=False)
     data, task = build(config)
-    _test(_trainer(config, folder, data, []), task, data, Path(config.checkpoint), folder)
+    trainer = _trainer(config, folder, data, task, [])
+    _test(trainer, task, data, Path(config.checkpoint), folder)
 
 
 def prepare(config: DictConfig) -> None:
@@ -131,77 +124,19 @@ def prepare(config: DictConfig) -> None:
     _console().print(f"{data.root} is ready. {data.noun.capitalize()}: {counts}.")
 
 
-def build(config: DictConfig) -> tuple[Any, Any]:
-    """The data module and the task of a config.
-
-    Network settings that are null are taken from the data: ``in_channels``, and ``num_classes`` or
-    ``classes``, also of a network inside the network's settings. Where a checkpoint will bring the
-    tensors, no others are fetched first.
-
-    Args:
-        config: A composed config.
-
-    Returns:
-        Data module and task.
-    """
-    _check_compiler(config.task.get("compile"))
-    representation = instantiate(config.representation)
-    data = instantiate(config.data, representation=representation)
-    restored = config.get("resume") is not None or config.get("checkpoint") is not None
-    network = OmegaConf.to_container(config.network, resolve=True)
-    classes = len(data.class_names)
-    task = instantiate(
-        config.task,
-        network=make(completed_settings(network, data.in_channels, classes, restored=restored)),
-        representation=representation,
-        class_names=data.class_names,
-        optimizer=instantiate(config.optimizer),
-        scheduler=instantiate(config.scheduler),
-    )
-    _try_network(task, representation, data.in_channels)
-    return data, task
-
-
-def _check_compiler(compiling: Any) -> None:
-    """`torch.compile` writes C++; without a compiler it says so in 170 lines, after the data."""
-    if compiling is None or compiling.get("backend", "inductor") != "inductor":
-        return
-    compilers = (os.environ.get("CXX", "g++"), "clang++")
-    if not any(map(shutil.which, compilers)):
-        raise SettingError(
-            "task.compile",
-            found=f"no C++ compiler ({' or '.join(compilers)})",
-            expected="one, for torch.compile",
-            remedy="Install one (g++), name it in CXX, or set task.compile=null.",
-        )
-
-
-def _try_network(task: Any, representation: Assembler, channels: int) -> None:
-    """Run the network on one empty image: what does not fit shows before any data is made."""
-    size = representation.image_size
-    probe = copy.deepcopy(task).to("meta").eval()  # shapes only: nothing is computed
-    with torch.no_grad():
-        try:
-            probe(torch.zeros(1, channels, *size, device="meta"))
-        except NotImplementedError:  # by an operation that only computes
-            probe = copy.deepcopy(task).eval()
-            probe(torch.zeros(1, channels, *size))
-
-
 def _trainer(
-    config: DictConfig, folder: Path, data: Any, callbacks: list[Any]
+    config: DictConfig, folder: Path, data: Any, task: Any, callbacks: list[Any]
 ) -> lightning.Trainer:
     contents = {
+        "kind": task.kind,
         # Not resolved: an override of level or seed still reaches everything that refers to it.
         "config": OmegaConf.to_container(config),
         "resolved_config": _resolved(config),
         "class_names": list(data.class_names),
         "normalization": _plain_normalization(data),
     }
-    panels = PredictionPanels(folder / "panels", config.panels)
-    # Configs of older runs do not have the setting.
-    pictures = ValidationPictures(config.get("tensorboard_images", 0))
-    common = [CheckpointContents(contents), panels, pictures, TrainingSpeed(), ProgressBar()]
+    common = [CheckpointContents(contents), *task.pictures(folder, config)]
+    common += [TrainingSpeed(), ProgressBar()]
     every, epochs = config.trainer.check_val_every_n_epoch, config.trainer.max_epochs
     trainer: lightning.Trainer = instantiate(
         config.trainer,
@@ -234,12 +169,11 @@ def _test(trainer: lightning.Trainer, task: Any, data: Any, checkpoint: Path, fo
             expected="the network and inputs of the checkpoint",
         ) from error
     trainer.test(task, datamodule=data, verbose=False)
-    results = evaluation_results(task.matrices, task.class_names, task.absent_class, data.noun)
+    results = task.results(data.noun)
     total = len(data.source("test"))
     if results["images"] != total:
         raise RuntimeError(f"{results['images']} of {total} test {data.noun} were counted")
-    _report(results, checkpoint, folder)
-    _report_page(results, task.class_names, trainer, checkpoint, folder)
+    _report(task, results, checkpoint, folder)
 
 
 def _check_fits(content: dict[str, Any], data: Any, checkpoint: Path) -> None:
@@ -272,28 +206,15 @@ def _best_on_validation(trainer: lightning.Trainer, folder: Path) -> float | Non
 
 
 @rank_zero_only
-def _report(results: dict[str, Any], checkpoint: Path, folder: Path) -> None:
-    write_results(results, folder)
+def _report(task: Any, results: dict[str, Any], checkpoint: Path, folder: Path) -> None:
     console = _console()
-    console.print(results_table(results))
+    console.print(task.write_results(results, folder))
     console.print(
         f"Results, pictures and logs are in {folder} (checkpoint {checkpoint.name}).", markup=False
     )
-
-
-@rank_zero_only
-def _report_page(
-    results: dict[str, Any],
-    class_names: Sequence[str],
-    trainer: lightning.Trainer,
-    checkpoint: Path,
-    folder: Path,
-) -> None:
-    callbacks: list[Any] = trainer.callbacks  # type: ignore[attr-defined]
-    images = [i for c in callbacks if isinstance(c, PredictionPanels) for i in c.images]
     page = folder / "report.html"
-    write_evaluation_report(page, results, class_names, images, checkpoint)
-    _console().print(f"To look at in a browser: {page}", markup=False)
+    task.write_page(page, results, checkpoint)
+    console.print(f"To look at in a browser: {page}", markup=False)
 
 
 def _run_folder() -> Path:

@@ -26,37 +26,43 @@ _LEAST_IN = 2.5
 _DARK = 0.5
 
 
-def row_shares(confusion: ArrayLike) -> NDArray[np.float64]:
-    """Where the labelled pixels of every class went.
+def row_shares(confusion: ArrayLike, *, unknown: bool = True) -> NDArray[np.float64]:
+    """Where what is labelled went, of every class.
 
     Args:
-        confusion: ``(K+1, K+1)`` counts or weights: rows truth, columns prediction, 0 unknown.
+        confusion: Counts or weights, rows truth, columns prediction: ``(K+1, K+1)`` with the
+            unknown class first, or ``(K, K)`` without.
+        unknown: Whether there is an unknown class.
 
     Returns:
         ``(K, K)`` shares of 1 of the rows, without the unknown class; NaN in rows of classes that
-        no labelled pixel has.
+        nothing is labelled with.
     """
-    rows = np.asarray(confusion, np.float64)[1:]
+    first = int(unknown)
+    rows = np.asarray(confusion, np.float64)[first:]
     total = rows.sum(axis=1, keepdims=True)
     shares: NDArray[np.float64] = np.full((len(rows), len(rows)), np.nan)
-    np.divide(rows[:, 1:], total, out=shares, where=total > 0)
+    np.divide(rows[:, first:], total, out=shares, where=total > 0)
     return shares
 
 
-def confusion_picture(confusion: ArrayLike, class_names: Sequence[str]) -> NDArray[np.uint8]:
-    """Where the pixels of every class went: a row per true class, percent of its pixels.
+def confusion_picture(
+    confusion: ArrayLike, class_names: Sequence[str], *, unknown: bool = True
+) -> NDArray[np.uint8]:
+    """Where every class went: a row per true class, percent of what it has.
 
     Numbers are whole percents, of up to 40 classes; what rounds to 0 is left out, rows of classes
-    without labelled pixels are grey.
+    that nothing is labelled with are grey.
 
     Args:
-        confusion: ``(K+1, K+1)`` counts or weights: rows truth, columns prediction, 0 unknown.
-        class_names: K + 1 names, the unknown class first.
+        confusion: As in `row_shares`.
+        class_names: As many names as it has rows.
+        unknown: Whether the first one is the unknown class.
 
     Returns:
         RGB image, as large as its classes need.
     """
-    shares, names = row_shares(confusion), class_names[1:]
+    shares, names = row_shares(confusion, unknown=unknown), class_names[int(unknown) :]
     numbered = len(names) <= _MOST_NUMBERED
     side = (_CELL_IN if numbered else _SMALL_CELL_IN) * len(names)
     font = _FONT_PT if numbered else _FONT_PT - 2

@@ -133,7 +133,7 @@ def completed_settings(
     Args:
         settings: Resolved; ``in_channels``, and ``num_classes`` or ``classes`` may be null.
         in_channels: Channels of the images.
-        num_classes: Classes, the unknown one included.
+        num_classes: Classes, the unknown one included where there is one.
         restored: Whether a checkpoint will bring the tensors: no others are fetched first.
     """
     known = dict.fromkeys(("num_classes", "classes"), num_classes) | {"in_channels": in_channels}

@@ -24,7 +24,18 @@ from tangent_train.tasks.metrics import (
     segmentation_scores,
 )
 
-__all__ = ["evaluation_results", "largest_loss", "percent", "results_table", "write_results"]
+__all__ = [
+    "counted",
+    "evaluation_results",
+    "largest_loss",
+    "markdown_line",
+    "per_class_table",
+    "percent",
+    "plain",
+    "results_table",
+    "write_files",
+    "write_results",
+]
 
 _COLUMNS = ("class", "iou", "accuracy", "iou_solid_angle", "accuracy_solid_angle", "share")
 
@@ -51,7 +62,7 @@ def evaluation_results(
     on_sphere = matrices.solid_angle.any()
     solid = segmentation_scores(matrices.solid_angle, absent_class if on_sphere else "skip")
     per_class = [
-        dict(zip(_COLUMNS, (name, *map(_plain, figures)), strict=True))
+        dict(zip(_COLUMNS, (name, *map(plain, figures)), strict=True))
         for name, *figures in zip(
             class_names[1:],
             pixels.iou,
@@ -65,8 +76,8 @@ def evaluation_results(
     bands = [
         {
             "latitude_deg": [south, north],
-            "miou": _plain(scores.miou),
-            "macc": _plain(scores.macc),
+            "miou": plain(scores.miou),
+            "macc": plain(scores.macc),
         }
         for north, south, scores in zip(
             BAND_EDGES_DEG[:-1],
@@ -79,10 +90,10 @@ def evaluation_results(
     return {
         "images": matrices.images,
         "noun": noun,
-        "miou": _plain(pixels.miou),
-        "macc": _plain(pixels.macc),
-        "miou_solid_angle": _plain(solid.miou),
-        "macc_solid_angle": _plain(solid.macc),
+        "miou": plain(pixels.miou),
+        "macc": plain(pixels.macc),
+        "miou_solid_angle": plain(solid.miou),
+        "macc_solid_angle": plain(solid.macc),
         "absent_class": absent_class,
         "classes": per_class,
         "latitude_bands": bands,
@@ -97,13 +108,47 @@ def write_results(results: dict[str, Any], folder: Path) -> None:
         results: From `evaluation_results`, perhaps with more plain values.
         folder: Where to.
     """
+    write_files(results, _COLUMNS, _markdown(results), folder)
+
+
+def write_files(
+    results: dict[str, Any], columns: Sequence[str], markdown: str, folder: Path
+) -> None:
+    """Write results as JSON, those of the classes as CSV, and a text, each atomically.
+
+    Args:
+        results: With a list of ``classes``.
+        columns: Of the CSV file, figures of a class.
+        markdown: The text.
+        folder: Where to.
+    """
     write_text(folder / "results.json", json.dumps(results, indent=1) + "\n")
     text = io.StringIO()
-    writer = csv.DictWriter(text, _COLUMNS, lineterminator="\n")
+    writer = csv.DictWriter(text, columns, lineterminator="\n")
     writer.writeheader()
     writer.writerows(results["classes"])
     write_text(folder / "results.csv", text.getvalue())
-    write_text(folder / "results.md", _markdown(results))
+    write_text(folder / "results.md", markdown)
+
+
+def per_class_table(
+    title: str, rows: Sequence[Sequence[str]], caption: str | None, left: Sequence[int] = (0,)
+) -> Table:
+    """A table for the terminal, its last row bold.
+
+    Args:
+        title: Stands above.
+        rows: The first is the header.
+        caption: Stands below.
+        left: Columns of text; the others are of numbers.
+    """
+    table = Table(title=title, caption=None if caption is None else escape(caption))
+    header, *others = rows
+    for k, name in enumerate(header):
+        table.add_column(name, justify="left" if k in left else "right")
+    for row in others:
+        table.add_row(*map(escape, row), style="bold" if row is others[-1] else None)
+    return table
 
 
 def results_table(results: dict[str, Any]) -> Table:
@@ -112,14 +157,7 @@ def results_table(results: dict[str, Any]) -> Table:
     Args:
         results: From `evaluation_results`.
     """
-    caption = largest_loss(results)
-    table = Table(title=_counted(results), caption=None if caption is None else escape(caption))
-    header, *rows = _rows(results)
-    for k, name in enumerate(header):
-        table.add_column(name, justify="right" if k else "left")
-    for row in rows:
-        table.add_row(*map(escape, row), style="bold" if row is rows[-1] else None)
-    return table
+    return per_class_table(counted(results), _rows(results), largest_loss(results))
 
 
 def largest_loss(results: dict[str, Any]) -> str | None:
@@ -172,8 +210,8 @@ def _rows(results: dict[str, Any]) -> list[tuple[str, ...]]:
 
 def _markdown(results: dict[str, Any]) -> str:
     header, *rows = _rows(results)
-    lines = [f"# Results over {_counted(results)}", "", _line(header)]
-    lines += [_line(["---"] + ["---:"] * (len(header) - 1)), *map(_line, rows), ""]
+    lines = [f"# Results over {counted(results)}", "", markdown_line(header)]
+    lines += [markdown_line(["---"] + ["---:"] * (len(header) - 1)), *map(markdown_line, rows), ""]
     loss = largest_loss(results)
     lines += [loss, ""] if loss is not None else []
     if results["latitude_bands"]:
@@ -181,19 +219,22 @@ def _markdown(results: dict[str, Any]) -> str:
     for band in results["latitude_bands"]:
         south, north = band["latitude_deg"]
         figures = (percent(band["miou"]), percent(band["macc"]))
-        lines.append(_line((f"{south}° … {north}°", *figures)))
+        lines.append(markdown_line((f"{south}° … {north}°", *figures)))
     return "\n".join(lines) + "\n"
 
 
-def _counted(results: dict[str, Any]) -> str:
+def counted(results: dict[str, Any]) -> str:
+    """What was scored and how many, as in "44 panoramas"."""
     return f"{results['images']} {results['noun']}"
 
 
-def _line(cells: Sequence[str]) -> str:
+def markdown_line(cells: Sequence[str]) -> str:
+    """A line of a Markdown table."""
     return "| " + " | ".join(cells) + " |"
 
 
-def _plain(value: float) -> float | None:
+def plain(value: float) -> float | None:
+    """A figure for JSON; None for what is not defined."""
     return None if math.isnan(value) else float(value)
 
 

@@ -2,26 +2,33 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal
+from pathlib import Path
+from typing import Any, ClassVar, Literal
 
-import lightning
 import torch
 from jaxtyping import Float, Integer
+from lightning.pytorch.callbacks import Callback
+from rich.table import Table
 from torch import Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
+from datamodules.split_module import Kind
 from tangent_train.errors import SettingError
 from tangent_train.rendering import Assembler
+from tangent_train.tasks.base import Task, check_at_once
+from tangent_train.tasks.callbacks import PredictionPanels
+from tangent_train.tasks.html.evaluation import write_evaluation_report
 from tangent_train.tasks.losses import cross_entropy_norm, cross_entropy_sum
 from tangent_train.tasks.metrics import AbsentClass, ConfusionMatrix, segmentation_scores
+from tangent_train.tasks.results import evaluation_results, results_table, write_results
+from tangent_train.tasks.tensorboard_pictures import ValidationPictures
 
 __all__ = ["SegmentationTask"]
 
 
-class SegmentationTask(lightning.LightningModule):
+class SegmentationTask(Task):
     """Trains a network on views of panoramas, or on crops of photos, and scores it on the whole.
 
     The views of all images of a batch, on all processes, make one gradient (paper, supplement,
@@ -48,7 +55,11 @@ class SegmentationTask(lightning.LightningModule):
         compile: Arguments of `torch.compile` for the network, empty for its defaults; None not to.
     """
 
+    kind: ClassVar[Kind] = "segmentation"
+    monitor: ClassVar[str] = "val/miou"
+    takes: ClassVar[str] = "images (n, C, h, w) to scores of every pixel (n, K + 1, h, w)"
     class_weights: Tensor
+    representation: Assembler
 
     def __init__(
         self,
@@ -65,26 +76,21 @@ class SegmentationTask(lightning.LightningModule):
         channels_last: bool = False,
         compile: Mapping[str, Any] | None = None,  # noqa: A002 - torch's own word
     ) -> None:
-        super().__init__()
-        if not 0 <= label_smoothing < 1:
-            raise SettingError("task.label_smoothing", found=label_smoothing, expected="0 to 1")
-        at_once = {"images_per_chunk": images_per_chunk, "images_per_forward": images_per_forward}
-        for name, count in at_once.items():
-            if count is not None and (not isinstance(count, int) or count < 1):
-                raise SettingError(f"task.{name}", found=count, expected="a whole number from 1")
+        super().__init__(
+            network,
+            representation,
+            class_names,
+            optimizer,
+            scheduler,
+            label_smoothing=label_smoothing,
+            images_per_chunk=images_per_chunk,
+            channels_last=channels_last,
+            compile=compile,
+        )
+        check_at_once("images_per_forward", images_per_forward)
         if absent_class not in ("skip", "zero"):
             raise SettingError("task.absent_class", found=absent_class, expected="skip or zero")
-        self.memory_format = torch.channels_last if channels_last else torch.contiguous_format
-        self.network: nn.Module = network.to(memory_format=self.memory_format)
-        if compile is not None:
-            self.network.compile(**compile)  # in place: names of tensors stay as they are
-        self.representation = representation
-        self.class_names = tuple(class_names)
-        self.make_optimizer = optimizer
-        self.make_scheduler = scheduler
         self.weighting = class_weights
-        self.label_smoothing = label_smoothing
-        self.images_per_chunk = images_per_chunk
         self.images_per_forward = images_per_forward
         self.absent_class: AbsentClass = absent_class
         self.register_buffer("class_weights", torch.ones(len(self.class_names)))
@@ -127,60 +133,21 @@ class SegmentationTask(lightning.LightningModule):
             )
         return scores
 
-    def on_train_start(self) -> None:
-        """Refuse to resume a schedule that was made for another length of training.
+    def example(self, channels: int) -> Tensor:
+        """One empty image ``(1, C, h, w)``."""
+        return torch.zeros(1, channels, *self.representation.image_size)
 
-        Raises:
-            SettingError: The length has changed.
-        """
-        steps = int(self.trainer.estimated_stepping_batches)
-        for config in self.trainer.lr_scheduler_configs:
-            planned = getattr(config.scheduler, "total_steps", steps)
-            if planned != steps:
-                raise SettingError(
-                    "trainer.max_epochs, trainer.devices and data.…_per_step",
-                    found=f"{steps} steps of training",
-                    expected=f"{planned}, which the schedule of the resumed run was made for",
-                    remedy="Resume with the same, or start a new run.",
-                )
+    def training_pairs(self, batch: Any) -> tuple[Tensor, Tensor]:
+        """Images of all panoramas or photos ``(n, C, h, w)``, and their labels ``(n, h, w)``."""
+        return batch.images.flatten(0, 1), batch.labels.flatten(0, 1)
 
-    def training_step(self, batch: Any, batch_idx: int) -> Tensor:
-        """One gradient of the whole batch of spheres, over all chunks and processes.
+    def loss_sum(self, scores: Tensor, labels: Tensor) -> Tensor:
+        """Weighted cross-entropy of the labelled pixels, summed."""
+        return cross_entropy_sum(scores, labels, self.class_weights, self.label_smoothing)
 
-        All chunks but the last are back-propagated here, Lightning does the last one. On several
-        processes this is still inside `DistributedDataParallel.forward`, which exchanges gradients
-        only in a backward pass that follows it: once, after the last chunk.
-        """
-        images, labels = batch.images.flatten(0, 1), batch.labels.flatten(0, 1)
-        norm = self._whole_norm(labels)
-        batches = self.trainer.accumulate_grad_batches
-        if batch_idx % batches == 0:
-            self.trainer.optimizers[0].zero_grad()
-        size = self.images_per_chunk or len(images)
-        *chunks, last = zip(images.split(size), labels.split(size), strict=True)
-        value = torch.zeros_like(norm)
-        for chunk in chunks:
-            loss = self._loss(*chunk, norm)
-            self.trainer.strategy.backward(loss / batches, None)
-            value += loss.detach()
-        loss = self._loss(*last, norm)
-        # The mean over processes, each divided by the mean norm, is the loss of the whole batch.
-        self.log("train/loss", value + loss.detach(), prog_bar=True, sync_dist=True)
-        return loss
-
-    def optimizer_zero_grad(self, *_: Any) -> None:
-        """Nothing: `training_step` clears the gradients before its first chunk."""
-
-    def _whole_norm(self, labels: Tensor) -> Tensor:
-        """Norm of the loss over all processes; as their gradients are averaged, its mean."""
-        norm = cross_entropy_norm(labels, self.class_weights)
-        mean: Tensor = self.trainer.strategy.reduce(norm, reduce_op="mean")
-        return mean.clamp(min=torch.finfo(norm.dtype).tiny)
-
-    def _loss(self, images: Tensor, labels: Tensor, norm: Tensor) -> Tensor:
-        scores = self(images)
-        total = cross_entropy_sum(scores, labels, self.class_weights, self.label_smoothing)
-        return total / norm
+    def loss_norm(self, labels: Tensor) -> Tensor:
+        """The class weights of the labelled pixels, added up."""
+        return cross_entropy_norm(labels, self.class_weights)
 
     @torch.no_grad()
     def predict_labels(
@@ -239,16 +206,22 @@ class SegmentationTask(lightning.LightningModule):
             self.log(f"{stage}/miou{suffix}", score.miou, prog_bar=on_bar, sync_dist=True)
             self.log(f"{stage}/macc{suffix}", score.macc, sync_dist=True)
 
-    def configure_optimizers(self) -> Any:
-        """Optimizer, and scheduler if there is one."""
-        optimizer = self.make_optimizer(self.parameters())
-        if self.make_scheduler is None:
-            return optimizer
-        by_step = "total_steps" in inspect.signature(self.make_scheduler).parameters
-        length = {"total_steps": int(self.trainer.estimated_stepping_batches)} if by_step else {}
-        scheduler = self.make_scheduler(optimizer, **length)
-        interval = "step" if by_step else "epoch"
-        return {
-            "optimizer": optimizer,
-            "lr_scheduler": {"scheduler": scheduler, "interval": interval},
-        }
+    def pictures(self, folder: Path, settings: Mapping[str, Any]) -> list[Callback]:
+        """Panels of test images, and pictures of validation images for TensorBoard."""
+        shown = settings.get("tensorboard_images", 0)  # configs of older runs do not have it
+        return [PredictionPanels(folder / "panels", settings["panels"]), ValidationPictures(shown)]
+
+    def results(self, noun: str) -> dict[str, Any]:
+        """See `results.evaluation_results`."""
+        return evaluation_results(self.matrices, self.class_names, self.absent_class, noun)
+
+    def write_results(self, results: dict[str, Any], folder: Path) -> Table:
+        """Write ``results.json``, ``.csv`` and ``.md``; returns the table per class."""
+        write_results(results, folder)
+        return results_table(results)
+
+    def write_page(self, path: Path, results: dict[str, Any], checkpoint: Path) -> None:
+        """Write them with a viewer of the panels' images."""
+        callbacks: list[Any] = self.trainer.callbacks  # type: ignore[attr-defined]
+        images = [i for c in callbacks if isinstance(c, PredictionPanels) for i in c.images]
+        write_evaluation_report(path, results, self.class_names, images, checkpoint)

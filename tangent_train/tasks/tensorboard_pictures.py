@@ -14,11 +14,12 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from numpy.typing import NDArray
 
 from tangent_train.errors import SettingError
+from tangent_train.tasks.classification_metrics import classification_scores
 from tangent_train.tasks.confusion_picture import confusion_picture
 from tangent_train.tasks.metrics import segmentation_scores
 from tangent_train.tasks.pictures import prediction_panel, shown_image, side_by_side
 
-__all__ = ["TrainingSpeed", "ValidationPictures"]
+__all__ = ["TrainingSpeed", "ValidationConfusion", "ValidationPictures"]
 
 _MOST_ROWS = 256
 """Larger images are shown smaller: an event file holds the pictures of all validations."""
@@ -92,6 +93,32 @@ class ValidationPictures(Callback):
             if not np.isnan(iou):
                 writer.add_scalar(f"val_iou/{name}", iou, step)
         picture = confusion_picture(matrix, task.class_names)
+        writer.add_image("val/confusion", picture, step, dataformats="HWC")
+
+
+class ValidationConfusion(Callback):
+    """Shows in TensorBoard, after every validation of a classification, what became of each class.
+
+    * ``val_accuracy/<class>``: share of the classes that occur that was classified rightly.
+    * ``val/confusion``: the confusion matrix, in percent of the true class.
+
+    They stand at the same steps as ``val/accuracy``. Only the first process draws; nothing is drawn
+    without a logger for TensorBoard.
+    """
+
+    def on_validation_end(  # noqa: D102 - a hook of Lightning; the scores are there now
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
+    ) -> None:
+        writer = _writer(trainer)
+        if writer is None:
+            return
+        task: Any = pl_module
+        step = _step(trainer)
+        scores = classification_scores(task.matrix)
+        for name, accuracy in zip(task.class_names, scores.of_class, strict=True):
+            if not np.isnan(accuracy):
+                writer.add_scalar(f"val_accuracy/{name}", accuracy, step)
+        picture = confusion_picture(task.matrix, task.class_names, unknown=False)
         writer.add_image("val/confusion", picture, step, dataformats="HWC")
 
 

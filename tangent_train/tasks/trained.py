@@ -83,10 +83,23 @@ def read_checkpoint(path: Path, needed: Sequence[str] = ("config", "state_dict")
     return dict(content)
 
 
+def _check_kind(path: Path, content: dict[str, Any]) -> None:
+    """Refuse networks that do not label pixels."""
+    kind = content.get("kind", "segmentation")  # which older checkpoints do not say
+    if kind != "segmentation":
+        raise DataError(
+            path,
+            found=f"a network for {kind}",
+            expected="one for segmentation, with scores of every pixel",
+            remedy=f"tangent-evaluate checkpoint={path} is for both.",
+        )
+
+
 def _from_checkpoint(path: Path) -> TrainedNetwork:
     from datamodules.samples import Normalization
 
     content = read_checkpoint(path, _NEEDED)
+    _check_kind(path, content)
     config = content["resolved_config"]
     missing = [name for name in _SECTIONS if config.get(name) is None]
     if missing:

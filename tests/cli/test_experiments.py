@@ -12,6 +12,8 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
+from datamodules.synthshapes.generate import generate_shapes
+from datamodules.synthshapes.settings import ShapeSettings
 from tangent_train.cli.compose import config_folder
 from tangent_train.cli.run import build
 from tangent_train.cli.transfer.stages import folds_and_seeds, plan
@@ -25,7 +27,8 @@ FOUND = sorted(
     path.relative_to(FOLDER).with_suffix("").as_posix() for path in FOLDER.rglob("*.yaml")
 )
 TRANSFERS = [name for name in FOUND if Path(name).name.startswith("transfer")]
-EXPERIMENTS = [name for name in FOUND if name not in TRANSFERS]
+SHAPES = [name for name in FOUND if name.startswith("shapes/") or "modelnet" in name]
+EXPERIMENTS = [name for name in FOUND if name not in (*TRANSFERS, *SHAPES)]
 AREAS = ("1", "2", "3", "4", "5a", "5b", "6")
 ROWS = 32
 
@@ -135,6 +138,34 @@ def test_every_experiment_composes_instantiates_and_takes_a_step(
     stepped = _takes_a_step(config, tmp_path)
     if config.network.get("depth") is None:
         assert stepped == names, "the same network, smaller images"
+
+
+@pytest.fixture(scope="module")
+def shapes_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three shapes of every class for training, two for the test."""
+    root = tmp_path_factory.mktemp("shapes")
+    generate_shapes(root, ShapeSettings(train=3, test=2))
+    return root
+
+
+@pytest.mark.parametrize("experiment", SHAPES)
+def test_every_experiment_on_shapes_composes_instantiates_and_takes_a_step(
+    experiment: str, shapes_root: Path, tmp_path: Path
+) -> None:
+    config = _composed(experiment)
+    assert config.name == experiment
+    with torch.device("meta"):
+        data, task = build(config)
+    assert (
+        len(task.class_names) == len(data.class_names) == (40 if "modelnet" in experiment else 10)
+    )
+    small = {"level": 4, "data.root": str(shapes_root), "data.num_workers": 0}
+    if "shapes" in config.data:
+        small |= {"data.shapes.train": 3, "data.shapes.test": 2}
+    for setting, value in small.items():
+        OmegaConf.update(config, setting, value)
+    stepped = _takes_a_step(config, tmp_path)
+    assert stepped == set(task.state_dict()), "the same network, smaller images"
 
 
 def _shrunk_transfer(config: DictConfig, roots: dict[str, Path]) -> dict[str, Any]:

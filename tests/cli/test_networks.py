@@ -1,4 +1,4 @@
-"""Every network of the config tree takes RGB and RGB-D, and what `build` fills in for it."""
+"""Every network of the config tree takes the data it is for, and what `build` fills in for it."""
 
 from __future__ import annotations
 
@@ -11,8 +11,14 @@ from omegaconf import DictConfig
 
 from tangent_train.cli.compose import config_folder
 from tangent_train.cli.run import build
+from tangent_train.errors import SettingError
 
-NETWORKS = sorted(path.stem for path in (config_folder() / "network").glob("*.yaml"))
+NETWORKS = {path.stem for path in (config_folder() / "network").glob("*.yaml")}
+OF_SHAPES = {
+    "multi_view_resnet18": "models.multi_view.MultiView",
+    "shape_classifier": "models.shape_classifier.ShapeClassifier",
+    "shape_classifier_16": "models.shape_classifier.ShapeClassifier",
+}
 MAKER = {
     "deeplabv3_mobilenet": "torchvision.models.segmentation.deeplabv3.DeepLabV3",
     "fcn_resnet": "models.fcn_resnet.FCNResNet",
@@ -28,7 +34,11 @@ def _composed(*overrides: str) -> DictConfig:
         return compose("train", ["level=5", "representation.erp_height=32", *overrides])
 
 
-@pytest.mark.parametrize("network", NETWORKS)
+def test_every_network_is_tested() -> None:
+    assert set(MAKER) | set(OF_SHAPES) == NETWORKS
+
+
+@pytest.mark.parametrize("network", sorted(MAKER))
 def test_every_network_takes_the_data_s_channels_and_classes(network: str) -> None:
     shallow = ["network.depth=50"] if network == "fcn_resnet" else []
     for inputs, channels in (("[rgb]", 3), ("[rgb,depth]", 4)):
@@ -41,6 +51,76 @@ def test_every_network_takes_the_data_s_channels_and_classes(network: str) -> No
     scores.square().mean().backward()
     unused = [name for name, p in task.named_parameters() if p.grad is None]
     assert not unused, "parameters without gradient"
+
+
+SHAPES = ("data=modelnet40", "data.root=nowhere", "task=classification")
+
+
+@pytest.mark.parametrize("network", sorted(OF_SHAPES))
+def test_every_network_of_shapes_takes_their_channels_and_classes(network: str) -> None:
+    data, task = build(_composed(*SHAPES, f"network={network}"))
+    made = type(task.network)
+    assert f"{made.__module__}.{made.__name__}" == OF_SHAPES[network]
+    assert len(data.class_names) == 40
+    scores = task(torch.randn(2, 3, 6, 32, 32))
+    assert scores.shape == (2, 40)
+    scores.square().mean().backward()
+    unused = [name for name, p in task.named_parameters() if p.grad is None]
+    assert not unused, "parameters without gradient"
+
+
+def test_the_papers_shape_classifiers_have_their_numbers_of_parameters() -> None:
+    for network, count in (("shape_classifier", 5_135_880), ("shape_classifier_16", 1_309_976)):
+        _, task = build(_composed(*SHAPES, f"network={network}"))
+        assert sum(p.numel() for p in task.parameters()) == count
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (
+            ["data=modelnet40", "data.root=nowhere"],
+            r"task: found segmentation, with the shapes of ModelNet40; expected classification\. "
+            r"Choose task=classification .*experiment=shapes/default",
+        ),
+        (
+            ["task=classification", "network=shape_classifier"],
+            r"task: found classification, with the panoramas of SynthRooms; .*task=segmentation",
+        ),
+    ],
+)
+def test_what_does_not_belong_together_is_refused(overrides: list[str], message: str) -> None:
+    with pytest.raises(SettingError, match=message):
+        build(_composed(*overrides))
+
+
+def test_networks_for_single_images_are_refused_for_shapes() -> None:
+    config = _composed(*SHAPES)
+    config.network = {"_target_": "torchvision.models.resnet18", "num_classes": None}
+    message = (
+        r"network: found ResNet, which does not take \(1, 20, 6, 32, 32\) \(resnet\.py, line .*: .*"
+        r"expected one that maps views of shapes"
+    )
+    with pytest.raises(SettingError, match=message):
+        build(config)
+
+
+def test_the_place_of_an_error_in_ones_own_network_is_said() -> None:
+    config = _composed()
+    config.network = {"_target_": f"{__name__}.Broken"}
+    message = r"network: found Broken, .* \(test_networks\.py, line \d+: .*4096"
+    with pytest.raises(SettingError, match=message):
+        build(config)
+
+
+class Broken(torch.nn.Linear):
+    """A network for something else."""
+
+    def __init__(self) -> None:
+        super().__init__(3, 3)
+
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        return super().forward(images.flatten(1))
 
 
 def test_timm_encoders_come_with_segmentation_models_pytorch() -> None:

@@ -29,7 +29,16 @@ def check_given(config: DictConfig, folds: Sequence[int | None]) -> None:
         DataError: It is no checkpoint of tangent-train.
         SettingError: The transfer cannot start from it.
     """
+    from tangent_train.tasks.trained import read_checkpoint
+
     path = Path(config.checkpoint)
+    kind = read_checkpoint(path).get("kind", "segmentation")
+    if kind != "segmentation":
+        raise SettingError(
+            f"checkpoint={path}",
+            found=f"a network for {kind}",
+            expected="one for segmentation: a transfer compares labels of pixels",
+        )
     given: Any = OmegaConf.to_container(OmegaConf.create(checkpoint_config(path)), resolve=True)
     wanted: Any = OmegaConf.to_container(config, resolve=True)
     _check_network(path, given, wanted)

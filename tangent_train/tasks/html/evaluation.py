@@ -20,17 +20,31 @@ if TYPE_CHECKING:
 
     from tangent_train.tasks.html.images import EncodedImage
 
-__all__ = ["evaluation_tables", "image_note", "training_curves", "write_evaluation_report"]
+__all__ = [
+    "evaluation_tables",
+    "heat_table",
+    "image_note",
+    "training_curves",
+    "write_evaluation_report",
+]
 
 _MOST_SCALAR_BYTES = 2**16
 """Of an event; longer ones hold pictures."""
 
+_NAMES = {"miou": "mIoU", "macc": "mAcc"}
+_VALIDATION = {
+    "val/miou": "mIoU",
+    "val/macc": "mAcc",
+    "val/miou_solid_angle": "mIoU by solid angle",
+    "val/macc_solid_angle": "mAcc by solid angle",
+    "val/accuracy": "accuracy",
+    "val/class_accuracy": "mean of the classes",
+}
 _CURVES = (
     ("Training loss", "loss", ("train/loss",)),
-    ("Validation", "%", ("val/miou", "val/macc", "val/miou_solid_angle", "val/macc_solid_angle")),
+    ("Validation", "%", tuple(_VALIDATION)),
     ("Learning rate", "learning rate", ("lr-",)),
 )
-_NAMES = {"miou": "mIoU", "macc": "mAcc"}
 
 
 def write_evaluation_report(
@@ -121,11 +135,22 @@ def _confusion(results: dict[str, Any]) -> Table:
     counts = np.asarray(results["confusion"], np.float64)[1:, 1:]
     totals = counts.sum(axis=1, keepdims=True)
     shares = np.divide(counts, totals, out=np.zeros_like(counts), where=totals > 0)
+    return heat_table(names, shares, "pixels")
+
+
+def heat_table(names: Sequence[str], shares: NDArray[np.float64], noun: str) -> Table:
+    """A confusion matrix as a table.
+
+    Args:
+        names: Of the classes.
+        shares: ``(K, K)`` of 1, rows truth, columns prediction.
+        noun: What was counted, in the plural.
+    """
     rows = [
         (name, *(f"{100 * share:.0f}" if share >= 0.005 else "" for share in row))
         for name, row in zip(names, shares, strict=True)
     ]
-    note = "Rows: truth; columns: prediction; % of the pixels of the row."
+    note = f"Rows: truth; columns: prediction; % of the {noun} of the row."
     return Table("Confusion", ("", *names), rows, note, shades=shares.tolist())
 
 
@@ -215,10 +240,4 @@ def _curve(title: str, label: str, logged: dict[str, dict[int, float]]) -> Curve
 
 
 def _series_name(tag: str) -> str:
-    group, _, name = tag.partition("/")
-    if group == "train":
-        return "training"
-    if group != "val":
-        return tag
-    score, _, weight = name.partition("_")
-    return f"{_NAMES[score]} by solid angle" if weight else _NAMES[score]
+    return "training" if tag.startswith("train/") else _VALIDATION.get(tag, tag)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure as Canvas
 
+from tangent_train.tasks.reports.classification import rotations
 from tangent_train.tasks.reports.groups import Figure, Group
 
 if TYPE_CHECKING:
@@ -23,8 +24,36 @@ COLORS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#99
 _LABEL_LENGTH = 60
 
 
+class _Panels(NamedTuple):
+    """Names of the figures that are drawn and what they are called, and the legend's columns."""
+
+    means: Mapping[str, str]
+    per_class: Mapping[str, str]
+    legend_columns: int
+
+
+_PANELS = {
+    "segmentation": _Panels(
+        {
+            "miou": "mIoU",
+            "macc": "mAcc",
+            "miou_solid_angle": "mIoU by solid angle",
+            "macc_solid_angle": "mAcc by solid angle",
+        },
+        {"iou": "IoU", "accuracy": "Accuracy"},
+        2,
+    ),
+    "classification": _Panels(
+        {"accuracy": "accuracy", "class_accuracy": "mean of the classes"},
+        {"accuracy": "Accuracy"},
+        1,
+    ),
+}
+"""By the kind of the groups."""
+
+
 def report_png(groups: Sequence[Group]) -> bytes:
-    """Bars of mIoU and mAcc, and of every class, one colour per group.
+    """Bars of the means, and of every class, one colour per group.
 
     Error bars are the standard deviation over folds, else over seeds; diamonds the paper's figures
     for the same data, resolution, base level and inputs.
@@ -35,21 +64,20 @@ def report_png(groups: Sequence[Group]) -> bytes:
     Returns:
         A PNG file.
     """
-    names = groups[0].class_names
+    names, panels = groups[0].class_names, _PANELS[groups[0].kind]
     width = max(9.0, 0.75 * len(names) * max(1.0, len(groups) / 3))
-    figure = Canvas(figsize=(width, 10.5 + 0.1 * len(groups)), dpi=120, layout="constrained")
+    size = (width, 3.5 * (1 + len(panels.per_class)) + 0.1 * len(groups))
+    figure = Canvas(figsize=size, dpi=120, layout="constrained")
     FigureCanvasAgg(figure)
-    means, iou, accuracy = figure.subplots(3, 1)
-    overall = ("miou", "macc", "miou_solid_angle", "macc_solid_angle")
-    ticks = ("mIoU", "mAcc", "mIoU by solid angle", "mAcc by solid angle")
+    means, *others = figure.subplots(1 + len(panels.per_class), 1)
     _bars(
         means,
         groups,
-        ticks,
-        [[group.figure(name) for name in overall] for group in groups],
-        [[getattr(group.paper, name, None) for name in overall] for group in groups],
+        tuple(panels.means.values()),
+        [[group.figure(name) for name in panels.means] for group in groups],
+        [[getattr(group.paper, name, None) for name in panels.means] for group in groups],
     )
-    for axes, name, title in ((iou, "iou", "IoU"), (accuracy, "accuracy", "Accuracy")):
+    for axes, (name, title) in zip(others, panels.per_class.items(), strict=True):
         _bars(
             axes,
             groups,
@@ -60,7 +88,9 @@ def report_png(groups: Sequence[Group]) -> bytes:
         axes.set_title(f"{title} of each class", loc="left")
     means.set_title("All classes (± standard deviation over folds, else over seeds)", loc="left")
     handles, labels = means.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper left", frameon=False, ncols=2)
+    figure.legend(
+        handles, labels, loc="outside upper left", frameon=False, ncols=panels.legend_columns
+    )
     return png_bytes(figure, "tangent-report")
 
 
@@ -134,4 +164,5 @@ def _short(group: Group) -> str:
         label = f"{label[: _LABEL_LENGTH // 2 - 1]} … {label[1 - _LABEL_LENGTH // 2 :]}"
     folds = f"fold {', '.join(map(str, group.folds))}; " if group.folds else ""
     runs = len(group.runs)
-    return f"{group.data}: {label} ({folds}{runs} run{'s' if runs > 1 else ''})"
+    turned = f", {rotations(group)}" if group.kind == "classification" else ""
+    return f"{group.data}{turned}: {label} ({folds}{runs} run{'s' if runs > 1 else ''})"

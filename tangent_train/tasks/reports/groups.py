@@ -91,6 +91,11 @@ class Group:
     runs: tuple[Run, ...]
 
     @property
+    def kind(self) -> str:
+        """What was learned, a key of `runs.FIGURES`."""
+        return self.runs[0].kind
+
+    @property
     def class_names(self) -> tuple[str, ...]:
         """The classes of its results."""
         return self.runs[0].class_names
@@ -120,10 +125,12 @@ class Group:
 
     @property
     def data(self) -> str:
-        """Its data set, and whether the test panoramas were turned."""
+        """Its data set, and whether the test panoramas were turned (of shapes tables say that)."""
         name = str(self.setting("data._target_")).rpartition(".")[2]
         turned = self.setting("data.test_rotation")
-        return name if turned is None else f"{name}, test panoramas turned: {turned}"
+        if turned is None or self.kind == "classification":
+            return name
+        return f"{name}, test panoramas turned: {turned}"
 
     @property
     def inputs(self) -> str:
@@ -162,7 +169,8 @@ class Group:
         """Mean and spread of a figure.
 
         Args:
-            name: One of `runs.MEANS`, or of `runs.PER_CLASS` with a class.
+            name: One of the means of its kind, see `runs.FIGURES`, or with a class of the figures
+                per class.
             class_index: Which class.
         """
         values = [(run.fold, run.figure(name, class_index)) for run in self.runs]
@@ -217,12 +225,19 @@ def group_runs(runs: Sequence[Run]) -> list[Group]:
 
 
 def check_classes(runs: Sequence[Run]) -> None:
-    """Check that runs have the same classes.
+    """Check that runs are of one kind and have the same classes.
 
     Raises:
         DataError: They have not.
     """
     for run in runs:
+        if run.kind != runs[0].kind:
+            raise DataError(
+                run.folder / RESULTS_FILE,
+                found=f"results of {run.kind}",
+                expected=f"{runs[0].kind}, as in {runs[0].folder / RESULTS_FILE}",
+                remedy="Report them apart.",
+            )
         if run.class_names != runs[0].class_names:
             raise DataError(
                 run.folder / RESULTS_FILE,

@@ -1,4 +1,4 @@
-"""Which class takes most from the mean IoU."""
+"""Which class takes most from the mean over the classes."""
 
 from __future__ import annotations
 
@@ -6,9 +6,12 @@ from collections.abc import Sequence
 
 from tangent_train.tasks.reports.cells import percent
 from tangent_train.tasks.reports.groups import Group
-from tangent_train.tasks.reports.runs import Run
+from tangent_train.tasks.reports.runs import FIGURES, Run
 
 __all__ = ["is_labelled", "largest_losses"]
+
+
+_UNITS = {"iou": "IoU", "accuracy": "accuracy"}
 
 
 def is_labelled(run: Run, class_index: int) -> bool:
@@ -17,7 +20,7 @@ def is_labelled(run: Run, class_index: int) -> bool:
 
 
 def largest_losses(groups: Sequence[Group]) -> list[str]:
-    """For every group the class that takes most from its mean IoU.
+    """For every group the class that takes most from its mean IoU, or accuracy of shapes.
 
     Args:
         groups: From `groups.group_runs`.
@@ -27,13 +30,16 @@ def largest_losses(groups: Sequence[Group]) -> list[str]:
     """
     sentences = []
     for group in groups:
-        ious = [
+        figure = FIGURES[group.kind].worst
+        found = [
             (mean, name)
             for k, name in enumerate(group.class_names)
             if any(is_labelled(run, k) for run in group.runs)
-            and (mean := group.figure("iou", k).mean) is not None
+            and (mean := group.figure(figure, k).mean) is not None
         ]
-        if ious:
-            iou, name = min(ious, key=lambda found: found[0])
-            sentences.append(f"{group.label}: largest loss: {name}, {percent(iou)} % IoU.")
+        if found:
+            worst, name = min(found, key=lambda pair: pair[0])
+            sentences.append(
+                f"{group.label}: largest loss: {name}, {percent(worst)} % {_UNITS[figure]}."
+            )
     return sentences

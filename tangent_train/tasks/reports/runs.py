@@ -7,17 +7,19 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from omegaconf import OmegaConf
 
 from tangent_train.errors import DataError
 
 __all__ = [
+    "FIGURES",
     "MEANS",
     "PER_BAND",
     "PER_CLASS",
     "RESULTS_FILE",
+    "Figures",
     "Run",
     "find_runs",
     "flat_settings",
@@ -35,6 +37,29 @@ PER_CLASS = ("iou", "accuracy", "iou_solid_angle", "accuracy_solid_angle")
 
 PER_BAND = ("miou", "macc")
 """Figures of a band of latitude, likewise."""
+
+
+class Figures(NamedTuple):
+    """What results of one kind hold.
+
+    Attributes:
+        means: Figures over all classes, as named in the results.
+        per_class: Figures of a class, likewise.
+        worst: The one of them by which a class is the worst.
+        per_band: Figures of a band of latitude, likewise.
+    """
+
+    means: tuple[str, ...]
+    per_class: tuple[str, ...]
+    worst: str
+    per_band: tuple[str, ...] = ()
+
+
+FIGURES: Mapping[str, Figures] = {
+    "segmentation": Figures(MEANS, PER_CLASS, "iou", PER_BAND),
+    "classification": Figures(("accuracy", "class_accuracy"), ("accuracy",), "accuracy"),
+}
+"""By the kind of the task."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +81,11 @@ class Run:
         """The fold it was tested on; None for data without folds."""
         fold = self.settings.get("data.fold")
         return None if fold is None else int(fold)
+
+    @property
+    def kind(self) -> str:
+        """What was learned, a key of `FIGURES`."""
+        return _kind(self.results)
 
     @property
     def class_names(self) -> tuple[str, ...]:
@@ -83,7 +113,8 @@ class Run:
         """A figure of all classes, of one, or of a band of latitude.
 
         Args:
-            name: One of `MEANS`, of `PER_CLASS` with a class, of `PER_BAND` with a band.
+            name: One of the means of its kind, see `FIGURES`; of its figures per class with a
+                class, of those per band with a band.
             class_index: Which class.
             band: Which band, as in `bands`.
 
@@ -98,6 +129,10 @@ class Run:
             source = next((entry for entry in entries if _edges(entry) == band), {name: None})
         value = source[name]
         return None if value is None or math.isnan(value) else float(value)
+
+
+def _kind(results: Mapping[str, Any]) -> str:
+    return str(results.get("kind", "segmentation"))  # which older results do not say
 
 
 def _edges(band: Mapping[str, Any]) -> tuple[float, float]:
@@ -169,24 +204,33 @@ def _results(path: Path) -> dict[str, Any]:
         raise DataError(path, found="no such file", expected=expected)
     try:
         results = json.loads(path.read_text())
-        figures = [results[name] for name in MEANS]
-        for entry in results["classes"]:
-            str(entry["class"])
-            figures += [entry[name] for name in PER_CLASS]
-        for entry in results.get("latitude_bands") or ():  # photos have none
-            _edges(entry)
-            figures += [entry[name] for name in PER_BAND]
+        figures = _figures(results)
     except (OSError, ValueError) as error:
         raise DataError(path, found=_first_line(error), expected=expected) from error
     except KeyError as error:
         raise DataError(path, found=f"no {error}", expected=expected) from error
-    except TypeError as error:
+    except (AttributeError, TypeError) as error:
         raise DataError(path, found="other lists and mappings", expected=expected) from error
     for value in figures:
         number = isinstance(value, int | float) and not isinstance(value, bool)
         if value is not None and not (number and 0 <= value <= 1):
             raise DataError(path, found=f"{value!r}", expected="shares of 1, or null")
     return dict(results)
+
+
+def _figures(results: Mapping[str, Any]) -> list[Any]:
+    """All figures that results of their kind must have."""
+    if _kind(results) not in FIGURES:
+        raise ValueError(f"results of {_kind(results)}")
+    names = FIGURES[_kind(results)]
+    figures = [results[name] for name in names.means]
+    for entry in results["classes"]:
+        str(entry["class"])
+        figures += [entry[name] for name in names.per_class]
+    for entry in results.get("latitude_bands") or ():  # photos have none
+        _edges(entry)
+        figures += [entry[name] for name in names.per_band]
+    return figures
 
 
 def _first_line(error: Exception) -> str:

@@ -1,0 +1,222 @@
+"""What all tasks share: one gradient of a batch, the optimizer, and what a run asks of them."""
+
+from __future__ import annotations
+
+import inspect
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+import lightning
+import torch
+from lightning.pytorch.callbacks import Callback
+from rich.table import Table
+from torch import Tensor, nn
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LRScheduler
+
+from datamodules.split_module import Kind
+from tangent_train.errors import SettingError
+
+__all__ = ["Task", "check_at_once"]
+
+
+class Task(lightning.LightningModule, ABC):
+    """Trains a network on batches of spheres and says what runs need to know about it.
+
+    All images of a batch, on all processes, make one gradient: the loss is a sum over the batch
+    divided by a norm of the batch, whatever the chunks it is computed in.
+
+    Args:
+        network: What is trained.
+        representation: What made its images.
+        class_names: Names of the classes.
+        optimizer: Makes the optimizer from parameters.
+        scheduler: Makes a learning rate scheduler from the optimizer, or None. When it takes
+            `total_steps`, it is told the length of the training and stepped every step.
+        label_smoothing: Share of the target spread over all classes.
+        images_per_chunk: Images trained at once, a bound on memory; None for the whole batch.
+        channels_last: Memory format of the network, often faster.
+        compile: Arguments of `torch.compile` for the network, empty for its defaults; None not to.
+
+    Attributes:
+        kind: What is learned; data modules say what they are labelled for.
+        monitor: The figure of the validation split that makes an epoch the best one.
+        takes: What a network for this task maps to what, for messages.
+
+    Raises:
+        SettingError: A setting that cannot work.
+    """
+
+    kind: ClassVar[Kind]
+    monitor: ClassVar[str]
+    takes: ClassVar[str]
+
+    def __init__(
+        self,
+        network: nn.Module,
+        representation: Any,
+        class_names: Sequence[str],
+        optimizer: Callable[..., Optimizer],
+        scheduler: Callable[..., LRScheduler] | None = None,
+        *,
+        label_smoothing: float = 0.0,
+        images_per_chunk: int | None = None,
+        channels_last: bool = False,
+        compile: Mapping[str, Any] | None = None,  # noqa: A002 - torch's own word
+    ) -> None:
+        super().__init__()
+        if not 0 <= label_smoothing < 1:
+            raise SettingError("task.label_smoothing", found=label_smoothing, expected="0 to 1")
+        check_at_once("images_per_chunk", images_per_chunk)
+        self.memory_format = torch.channels_last if channels_last else torch.contiguous_format
+        self.network: nn.Module = network.to(memory_format=self.memory_format)
+        if compile is not None:
+            self.network.compile(**compile)  # in place: names of tensors stay as they are
+        self.representation = representation
+        self.class_names = tuple(class_names)
+        self.make_optimizer = optimizer
+        self.make_scheduler = scheduler
+        self.label_smoothing = label_smoothing
+        self.images_per_chunk = images_per_chunk
+
+    @abstractmethod
+    def example(self, channels: int) -> Tensor:
+        """An empty input of the network, of the size of the run."""
+
+    @abstractmethod
+    def training_pairs(self, batch: Any) -> tuple[Tensor, Tensor]:
+        """Inputs of the network and their labels, of the same length."""
+
+    @abstractmethod
+    def loss_sum(self, scores: Tensor, labels: Tensor) -> Tensor:
+        """The loss of some of them, a sum."""
+
+    @abstractmethod
+    def loss_norm(self, labels: Tensor) -> Tensor:
+        """What the loss of all of them is divided by: known before any network has run."""
+
+    @abstractmethod
+    def pictures(self, folder: Path, settings: Mapping[str, Any]) -> list[Callback]:
+        """Callbacks that show what becomes of the validation and test splits.
+
+        Args:
+            folder: Of the run.
+            settings: Of the run.
+        """
+
+    @abstractmethod
+    def results(self, noun: str) -> dict[str, Any]:
+        """All figures of the last evaluation, as plain values, with ``images`` counted.
+
+        Args:
+            noun: What was scored, in the plural.
+        """
+
+    @abstractmethod
+    def write_results(self, results: dict[str, Any], folder: Path) -> Table:
+        """Write them as files.
+
+        Args:
+            results: From `results`.
+            folder: Where to.
+
+        Returns:
+            A table for the terminal.
+        """
+
+    @abstractmethod
+    def write_page(self, path: Path, results: dict[str, Any], checkpoint: Path) -> None:
+        """Write them as a page, with the curves of the training.
+
+        Args:
+            path: The HTML file.
+            results: From `results`.
+            checkpoint: What was evaluated.
+        """
+
+    def inputs_per_chunk(self, inputs: Tensor) -> int:
+        """How many inputs of the network are trained at once."""
+        return self.images_per_chunk or len(inputs)
+
+    def on_train_start(self) -> None:
+        """Refuse to resume a schedule that was made for another length of training.
+
+        Raises:
+            SettingError: The length has changed.
+        """
+        steps = int(self.trainer.estimated_stepping_batches)
+        for config in self.trainer.lr_scheduler_configs:
+            planned = getattr(config.scheduler, "total_steps", steps)
+            if planned != steps:
+                raise SettingError(
+                    "trainer.max_epochs, trainer.devices and data.…_per_step",
+                    found=f"{steps} steps of training",
+                    expected=f"{planned}, which the schedule of the resumed run was made for",
+                    remedy="Resume with the same, or start a new run.",
+                )
+
+    def training_step(self, batch: Any, batch_idx: int) -> Tensor:
+        """One gradient of the whole batch, over all chunks and processes.
+
+        All chunks but the last are back-propagated here, Lightning does the last one. On several
+        processes this is still inside `DistributedDataParallel.forward`, which exchanges gradients
+        only in a backward pass that follows it: once, after the last chunk.
+        """
+        inputs, labels = self.training_pairs(batch)
+        norm = self._whole_norm(labels)
+        batches = self.trainer.accumulate_grad_batches
+        if batch_idx % batches == 0:
+            self.trainer.optimizers[0].zero_grad()
+        size = self.inputs_per_chunk(inputs)
+        *chunks, last = zip(torch.split(inputs, size), torch.split(labels, size), strict=True)
+        value = torch.zeros_like(norm)
+        for chunk in chunks:
+            loss = self._loss(*chunk, norm)
+            self.trainer.strategy.backward(loss / batches, None)
+            value += loss.detach()
+        loss = self._loss(*last, norm)
+        # The mean over processes, each divided by the mean norm, is the loss of the whole batch.
+        self.log("train/loss", value + loss.detach(), prog_bar=True, sync_dist=True)
+        return loss
+
+    def optimizer_zero_grad(self, *_: Any) -> None:
+        """Nothing: `training_step` clears the gradients before its first chunk."""
+
+    def _whole_norm(self, labels: Tensor) -> Tensor:
+        """Norm of the loss over all processes; as their gradients are averaged, its mean."""
+        norm = self.loss_norm(labels)
+        mean: Tensor = self.trainer.strategy.reduce(norm, reduce_op="mean")
+        return mean.clamp(min=torch.finfo(norm.dtype).tiny)
+
+    def _loss(self, inputs: Tensor, labels: Tensor, norm: Tensor) -> Tensor:
+        return self.loss_sum(self(inputs), labels) / norm
+
+    def configure_optimizers(self) -> Any:
+        """Optimizer, and scheduler if there is one."""
+        optimizer = self.make_optimizer(self.parameters())
+        if self.make_scheduler is None:
+            return optimizer
+        by_step = "total_steps" in inspect.signature(self.make_scheduler).parameters
+        length = {"total_steps": int(self.trainer.estimated_stepping_batches)} if by_step else {}
+        scheduler = self.make_scheduler(optimizer, **length)
+        interval = "step" if by_step else "epoch"
+        return {
+            "optimizer": optimizer,
+            "lr_scheduler": {"scheduler": scheduler, "interval": interval},
+        }
+
+
+def check_at_once(name: str, count: object) -> None:
+    """Refuse a bound on memory that lets nothing through.
+
+    Args:
+        name: Of the setting, below ``task``.
+        count: Images at once; None for no bound.
+
+    Raises:
+        SettingError: It is neither a whole number from 1 nor None.
+    """
+    if count is not None and (not isinstance(count, int) or count < 1):
+        raise SettingError(f"task.{name}", found=count, expected="a whole number from 1")

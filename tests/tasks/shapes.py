@@ -1,0 +1,102 @@
+"""Shapes that a small network can learn, as batches of their views."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import lightning
+import torch
+from torch import Tensor, nn
+from torch.utils.data import DataLoader
+
+from models.views import each_view
+from tangent_train.rendering import TangentRepresentation
+from tangent_train.tasks import ClassificationTask
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+NAMES = ("bottle", "chair", "mug")
+TANGENT = TangentRepresentation(base_level=0, level=4)
+
+
+class Shape(NamedTuple):
+    """As the data module of shapes gives them."""
+
+    images: Tensor
+    label: Tensor
+    index: int  # type: ignore[assignment]  # nobody needs tuple.index
+
+
+class Shapes(lightning.LightningDataModule):
+    """Shapes whose class is the brightest channel of one of their views, under noise.
+
+    Args:
+        count: How many there are, of class k % 3.
+        batch_size: Of training; evaluation takes two at a time.
+        rank: Process whose part it is.
+        processes: Of all of them.
+    """
+
+    kind = "classification"
+
+    def __init__(
+        self, count: int = 9, batch_size: int = 3, rank: int = 0, processes: int = 1
+    ) -> None:
+        super().__init__()
+        generator = torch.Generator().manual_seed(0)
+        self.shapes: list[Shape] = []
+        for index in range(count):
+            images = 0.3 * torch.randn(5, 3, 16, 16, generator=generator)
+            images[index % 5, index % 3] += 2
+            self.shapes.append(Shape(images, torch.tensor(index % 3), index))
+        self.mine = self.shapes[rank::processes]
+        self.batch_size = batch_size
+
+    def train_dataloader(self) -> DataLoader[Any]:
+        return DataLoader(self.mine, batch_size=self.batch_size)  # type: ignore[arg-type]
+
+    def val_dataloader(self) -> DataLoader[Any]:
+        return DataLoader(self.mine, batch_size=2)  # type: ignore[arg-type]
+
+    test_dataloader = val_dataloader
+
+
+class SmallNetwork(nn.Module):
+    """Without batch statistics: a gradient does not depend on what is computed together."""
+
+    def __init__(self, classes: int = 3) -> None:
+        super().__init__()
+        self.features = nn.Sequential(
+            nn.Conv2d(3, 8, 3, stride=2, padding=1), nn.GroupNorm(2, 8), nn.ReLU()
+        )
+        self.head = nn.Linear(8, classes)
+
+    def forward(self, images: Tensor) -> Tensor:
+        features = each_view(self.features, images)
+        scores: Tensor = self.head(features.mean(dim=(1, 3, 4)))
+        return scores
+
+
+def shape_task(
+    network: nn.Module | None = None, names: Sequence[str] = NAMES, **settings: Any
+) -> ClassificationTask:
+    """A task on shapes; the same small network at every call."""
+    torch.manual_seed(0)
+    optimizer = settings.pop("optimizer", partial(torch.optim.SGD, lr=0.1))
+    return ClassificationTask(network or SmallNetwork(), TANGENT, names, optimizer, **settings)
+
+
+def quiet_trainer(**settings: Any) -> lightning.Trainer:
+    """A trainer that writes and prints nothing."""
+    quiet: dict[str, Any] = {
+        "logger": False,
+        "enable_checkpointing": False,
+        "enable_progress_bar": False,
+        "enable_model_summary": False,
+        "accelerator": "cpu",
+        "num_sanity_val_steps": 0,
+        "use_distributed_sampler": False,
+    }
+    return lightning.Trainer(**(quiet | settings))
