@@ -14,6 +14,7 @@ from tangent_train.geometry import (
     lonlat_to_xyz,
 )
 from tangent_train.keypoints.depth_view import DepthView
+from tangent_train.keypoints.spherical import angles_between, unit_directions
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -82,7 +83,7 @@ def visible_from(
     Raises:
         SettingError: The directions are none.
     """
-    directions = _directions(directions_xyz)
+    directions = unit_directions(directions_xyz)
     visible, known = np.zeros((2, len(directions)), np.bool_)
     for start in range(0, len(directions), _BLOCK):
         part = slice(start, start + _BLOCK)
@@ -202,7 +203,7 @@ def correct_matches(
     Raises:
         SettingError: The directions are none or do not belong together.
     """
-    rays = _directions(left_xyz), _directions(right_xyz)
+    rays = unit_directions(left_xyz), unit_directions(right_xyz)
     if len(rays[0]) != len(rays[1]):
         raise SettingError(
             "matched directions",
@@ -224,17 +225,4 @@ def _transfer_errors_deg(
     """Angles between where the target sees the source's points and where it should."""
     distance_m, _ = source.distances(source_xyz)
     seen_xyz, _ = target.pose.seen(source.pose.points_m(source_xyz, distance_m))
-    apart = (np.linalg.norm(seen_xyz + sign * target_xyz, axis=1) for sign in (-1, 1))
-    return np.degrees(2 * np.arctan2(*apart))
-
-
-def _directions(directions_xyz: ArrayLike) -> NDArray[np.float64]:
-    array = np.asarray(directions_xyz, np.float64)
-    if array.ndim != 2 or array.shape[1] != 3:
-        raise SettingError("directions", found=f"shape {array.shape}", expected="(n, 3)")
-    lengths = np.linalg.norm(array, axis=1, keepdims=True)
-    if not (np.isfinite(lengths) & (lengths > 0)).all():
-        raise SettingError(
-            "directions", found="some that are 0 or no numbers", expected="unit vectors"
-        )
-    return array / lengths
+    return np.degrees(angles_between(seen_xyz, target_xyz))

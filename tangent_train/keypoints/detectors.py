@@ -140,7 +140,7 @@ class Detector:
             gray: ``(h, w)`` uint8.
 
         Returns:
-            All keypoints, in OpenCV's order. SIFT finds none within 5 pixels of the borders, ORB
+            All keypoints, in OpenCV's order. SIFT finds none within 1¾ pixels of the borders, ORB
             none within 31.
 
         Raises:

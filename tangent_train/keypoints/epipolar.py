@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from tangent_train.keypoints.spherical import angles_between
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -55,7 +57,7 @@ def motion_errors(
     rotation, translation = motion
     ahead = left_xyz @ rotation.T
     if translation is None:
-        return _angles(ahead, right_xyz)
+        return angles_between(ahead, right_xyz)
     return np.maximum(
         _arc_angles(right_xyz, ahead, translation),
         _arc_angles(ahead, right_xyz, -translation),
@@ -72,19 +74,10 @@ def _arc_angles(
     # Beside the arc are points between its ends, seen along it; others are nearest to an end.
     after_start = _dots(points_xyz, np.cross(normals, starts_xyz)) >= 0
     before_end = _dots(points_xyz, np.cross(end_xyz, normals)) >= 0
-    ends = np.minimum(_angles(points_xyz, starts_xyz), _angles(points_xyz, end_xyz))
+    ends = np.minimum(angles_between(points_xyz, starts_xyz), angles_between(points_xyz, end_xyz))
     return np.where(
         after_start & before_end & (sines > 0), np.arcsin(np.minimum(across, 1.0)), ends
     )
-
-
-def _angles(first_xyz: NDArray[np.float64], second_xyz: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Angles between unit vectors, precise near 0 and π alike."""
-    halves = (
-        np.linalg.norm(first_xyz - second_xyz, axis=-1),
-        np.linalg.norm(first_xyz + second_xyz, axis=-1),
-    )
-    return 2 * np.arctan2(*halves)
 
 
 def _dots(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:

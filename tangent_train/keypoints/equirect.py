@@ -34,7 +34,7 @@ def detect_on_equirect(image: NDArray[Any], detector: Detector) -> SphericalKeyp
     """Find keypoints in a panorama as if it were an ordinary image, but across ±180°.
 
     The image is continued by W/8 columns of its other side, left and right: what lies at ±180° is
-    found once. Nothing is continued beyond the poles, as in the paper's baseline: within 5 rows
+    found once. Nothing is continued beyond the poles, as in the paper's baseline: within 2 rows
     (SIFT) or 31 (ORB) of a pole nothing is found.
 
     Args:

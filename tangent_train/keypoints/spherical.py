@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["SphericalKeypoints"]
+__all__ = ["SphericalKeypoints", "angles_between", "unit_directions"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,6 +123,41 @@ class SphericalKeypoints:
         jacobian = equirect_jacobian(self.directions_xyz, shape)
         gradient = np.einsum("nc,nci->ni", self.orientations_xyz, jacobian)
         return np.arctan2(gradient[:, 1], gradient[:, 0])
+
+
+def unit_directions(directions_xyz: ArrayLike) -> NDArray[np.float64]:
+    """Directions of any length, made unit vectors.
+
+    Args:
+        directions_xyz: ``(n, 3)``, of any length but 0.
+
+    Raises:
+        SettingError: They have another shape, are 0 or no numbers.
+    """
+    array = np.asarray(directions_xyz, np.float64)
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise SettingError("directions", found=f"shape {array.shape}", expected="(n, 3)")
+    lengths = np.linalg.norm(array, axis=1, keepdims=True)
+    if not (np.isfinite(lengths) & (lengths > 0)).all():
+        raise SettingError(
+            "directions", found="some that are 0 or no numbers", expected="finite vectors"
+        )
+    return array / lengths
+
+
+def angles_between(first_xyz: ArrayLike, second_xyz: ArrayLike) -> NDArray[np.float64]:
+    """Angles between unit vectors in radians, precise near 0 and π alike.
+
+    Args:
+        first_xyz: ``(..., 3)``.
+        second_xyz: ``(..., 3)``.
+
+    Returns:
+        ``(...)`` from 0 to π.
+    """
+    first, second = np.asarray(first_xyz, np.float64), np.asarray(second_xyz, np.float64)
+    halves = (np.linalg.norm(first + sign * second, axis=-1) for sign in (-1, 1))
+    return np.asarray(2 * np.arctan2(*halves))
 
 
 def equirect_jacobian(

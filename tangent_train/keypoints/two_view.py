@@ -17,6 +17,7 @@ from tangent_train.keypoints.epipolar import (
     prefers_rotation,
 )
 from tangent_train.keypoints.motion_search import find_motion, find_rotation
+from tangent_train.keypoints.spherical import angles_between, unit_directions
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -101,8 +102,7 @@ class TwoView:
         length = float(np.linalg.norm(translation_m))
         if self.translation is not None and length > 0:
             true = translation_m / length
-            apart = (np.linalg.norm(self.translation + sign * true) for sign in (-1, 1))
-            shift = math.degrees(2 * math.atan2(*apart))
+            shift = math.degrees(angles_between(self.translation, true))
         return turn, shift
 
 
@@ -135,7 +135,10 @@ def estimate_two_view(
     Raises:
         SettingError: The directions or a setting cannot be used, or pycolmap is missing.
     """
-    left, right = _unit(left_xyz, right_xyz)
+    left, right = unit_directions(left_xyz), unit_directions(right_xyz)
+    if len(left) != len(right):
+        found = f"{len(left)} and {len(right)}"
+        raise SettingError("matched directions", found=found, expected="as many on either side")
     _check(max_error_deg, seed, min_inliers, max_trials)
     max_error_rad = math.radians(max_error_deg)
     if len(left) < min_inliers:
@@ -172,25 +175,6 @@ def _preferred(
 
 def _nothing(count: int) -> TwoView:
     return TwoView("none", np.zeros(count, np.bool_), np.full(count, np.nan), None, None)
-
-
-def _unit(left_xyz: ArrayLike, right_xyz: ArrayLike) -> list[NDArray[np.float64]]:
-    rays = [np.asarray(array, np.float64) for array in (left_xyz, right_xyz)]
-    shapes = [array.shape for array in rays]
-    if shapes[0] != shapes[1] or len(shapes[0]) != 2 or shapes[0][1] != 3:
-        raise SettingError(
-            "matched directions",
-            found=f"arrays {shapes[0]} and {shapes[1]}",
-            expected="(m, 3) both",
-        )
-    lengths = [np.linalg.norm(array, axis=1, keepdims=True) for array in rays]
-    if not all((np.isfinite(length) & (length > 0)).all() for length in lengths):
-        raise SettingError(
-            "matched directions",
-            found="some that are 0 or no numbers",
-            expected="directions",
-        )
-    return [array / length for array, length in zip(rays, lengths, strict=True)]
 
 
 def _check(max_error_deg: float, seed: int, min_inliers: int, max_trials: int) -> None:

@@ -64,6 +64,15 @@ def test_blobs_are_found_where_they_are(name: str, sigma: float) -> None:
     assert np.median(np.linalg.norm(error, axis=1)) < 0.05
 
 
+@pytest.mark.parametrize(("name", "border"), [("sift", 1.75), ("orb", 31)])
+def test_nothing_is_found_near_borders(name: str, border: float) -> None:
+    image = np.random.default_rng(0).integers(0, 256, (300, 321), np.uint8)
+    image = cv2.normalize(cv2.GaussianBlur(image, (0, 0), 1), None, 0, 255, cv2.NORM_MINMAX)
+    places = Detector(name).detect(image).points_xy
+    nearest = min(places.min(), (np.array(image.shape[::-1]) - 1 - places).min())
+    assert border <= nearest < border + 1
+
+
 def test_opencvs_default_sift_is_off_by_a_quarter_of_a_pixel() -> None:
     size = (401, 500)
     centers = scattered(0, size)

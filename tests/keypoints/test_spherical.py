@@ -12,12 +12,15 @@ from tangent_train.geometry import (
     lonlat_to_equirect,
     lonlat_to_xyz,
     random_rotation,
+    rotation_about,
     xyz_to_lonlat,
 )
 from tangent_train.keypoints.spherical import (
     SphericalKeypoints,
+    angles_between,
     equirect_jacobian,
     local_to_sphere,
+    unit_directions,
 )
 
 SHAPE = (90, 210)
@@ -123,6 +126,30 @@ def test_sizes_and_angles_at_the_poles_are_finite() -> None:
     np.testing.assert_allclose(poles.equirect_pixels(SHAPE)[:, 1], [-0.5, SHAPE[0] - 0.5])
     np.testing.assert_array_equal(poles.equirect_sizes(SHAPE), SHAPE[0])
     assert np.isfinite(poles.equirect_angles(SHAPE)).all()
+
+
+def test_angles_are_precise_from_0_to_180_degrees() -> None:
+    axis, start = np.array([0.6, 0, 0.8]), np.array([0.8, 0, -0.6])
+    angles = np.array([0, 1e-12, 1e-5, 1.0, np.pi / 2, np.pi - 1e-5, np.pi])
+    ends = np.array([rotation_about(axis, angle) @ start for angle in angles])
+    np.testing.assert_allclose(angles_between(start, ends), angles, rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(angles_between(ends, start), angles, rtol=1e-9, atol=1e-15)
+    assert angles_between(start, axis).shape == ()
+    assert angles_between(ends[:0], start).shape == (0,)
+
+
+def test_directions_of_any_length_become_unit_vectors() -> None:
+    unit = unit_directions(np.array([[0, 3, -4], [1e-9, 0, 0]]))
+    np.testing.assert_allclose(unit, np.array([[0, 0.6, -0.8], [1, 0, 0]]))
+    assert unit_directions(np.empty((0, 3))).shape == (0, 3)
+    for wrong, message in (
+        ([1.0, 0, 0], r"shape \(3,\); expected \(n, 3\)"),
+        ([[1.0, 0]], r"shape \(1, 2\)"),
+        ([[0.0, 0, 0]], "0 or no numbers"),
+        ([[np.inf, 0, 0]], "0 or no numbers"),
+    ):
+        with pytest.raises(SettingError, match=message):
+            unit_directions(wrong)
 
 
 def arrays(points: SphericalKeypoints) -> dict[str, NDArray[Any]]:

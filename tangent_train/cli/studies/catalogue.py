@@ -115,13 +115,13 @@ def _between(settings: Settings, name: str, least: int, most: int) -> int:
 STUDIES: Mapping[str, Study] = {
     "surface_area": Study(
         "area of the subdivided icosahedron over that of the sphere",
-        {"levels": (10, "the last level of subdivision, 0 to 12")},
+        {"levels": (10, "the last level of subdivision, 0 to 12 (12 takes 3 GB)")},
         _check_levels,
         _surface_area,
     ),
     "angular_resolution": Study(
         "levels, sizes of panoramas and degrees per pixel, beside perspective cameras",
-        {"levels": (10, "the last level of subdivision, 0 to 12")},
+        {"levels": (10, "the last level of subdivision, 0 to 12 (12 takes 3 GB)")},
         _check_levels,
         _angular_resolution,
     ),

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from tangent_train.geometry import TangentGrid, equirect_shape
 from tangent_train.geometry.loop_lattice import LoopLattice
 from tangent_train.tasks.reports.chart import COLORS
-from tangent_train.tasks.studies.fov import BASE_LEVELS
+from tangent_train.tasks.studies.fov import BASE_LEVELS, has_images
 from tangent_train.tasks.studies.outcome import Column, Outcome, canvas, plain, png, style
 
 __all__ = ["CAMERAS", "PAPER_DEG", "Camera", "angular_resolution"]
@@ -96,8 +96,7 @@ def _of_level(lattice: LoopLattice) -> list[Any]:
 
 def _tangent_deg(base_level: int, level: int) -> float | None:
     """Degrees per pixel in the middle of a tangent image, if there are such images."""
-    side = 2 ** (level - base_level) if level >= base_level else 0
-    if side < 1 or TangentGrid.least_dim(base_level, level) > side:
+    if not has_images(base_level, level):
         return None
     return math.degrees(TangentGrid(base_level, level).pitch)
 

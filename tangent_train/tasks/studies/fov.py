@@ -11,7 +11,7 @@ from tangent_train.geometry.owned_cells import owned_polygons
 from tangent_train.tasks.reports.chart import COLORS
 from tangent_train.tasks.studies.outcome import Column, Outcome, canvas, png, style
 
-__all__ = ["BASE_LEVELS", "PAPER_DEG", "fov"]
+__all__ = ["BASE_LEVELS", "PAPER_DEG", "fov", "has_images"]
 
 BASE_LEVELS = range(5)
 PAPER_DEG = (73.1, 51.6, 31.5, 16.7, 8.4)
@@ -43,13 +43,13 @@ def fov(level: int) -> Outcome:
     Args:
         level: Level s of the panorama.
     """
-    rows = [_row(b, level) for b in BASE_LEVELS if _reaches(b, level)]
+    rows = [_row(b, level) for b in BASE_LEVELS if has_images(b, level)]
     title = f"Field of view of tangent images in degrees, level s = {level}"
     return Outcome(title, _COLUMNS, rows, _NOTES, _picture(level))
 
 
-def _reaches(base_level: int, level: int) -> bool:
-    """Whether images of that side cover what they own."""
+def has_images(base_level: int, level: int) -> bool:
+    """Whether there are tangent images: of the usual side they cover what they own."""
     return level >= base_level and TangentGrid.least_dim(base_level, level) <= 2 ** (
         level - base_level
     )
@@ -73,7 +73,7 @@ def _picture(level: int) -> bytes:
     axes = figure.subplots()
     levels = range(4, max(_PAPER_LEVEL, level) + 1)
     for b in BASE_LEVELS:
-        grids = [TangentGrid(b, s) for s in levels if _reaches(b, s)]
+        grids = [TangentGrid(b, s) for s in levels if has_images(b, s)]
         at = [grid.level for grid in grids]
         _lines(axes, at, grids, COLORS[b], b)
     paper = [_PAPER_LEVEL] * len(PAPER_DEG)
