@@ -48,6 +48,7 @@ def test_the_wheel_holds_the_packages_and_the_configs(wheel: Path) -> None:
         "tangent_train/configs/experiment/rooms/demo.yaml",
         "tangent_train/py.typed",
         "datamodules/stanford2d3ds.py",
+        "datamodules/stanford_pairs.csv",
         "datamodules/synthrooms/generate.py",
         "models/unet.py",
     )
@@ -57,7 +58,15 @@ def test_the_wheel_holds_the_packages_and_the_configs(wheel: Path) -> None:
 
 @pytest.mark.parametrize(
     "command",
-    ["tangent-train", "tangent-evaluate", "tangent-prepare", "tangent-report", "tangent-transfer"],
+    [
+        "tangent-train",
+        "tangent-evaluate",
+        "tangent-keypoints",
+        "tangent-prepare",
+        "tangent-report",
+        "tangent-study",
+        "tangent-transfer",
+    ],
 )
 def test_the_commands_answer_from_another_folder(
     scripts: Path, command: str, tmp_path: Path
