@@ -47,7 +47,8 @@ class ModelNet40(SplitDataModule[Shapes]):
         root: Folder of the meshes, see `shape_files`.
         representation: What the network sees of a sphere; it turns the shapes while training.
         shapes_per_step: Shapes per training step and process, and in every step of evaluation.
-        store: Folder for the prepared spheres, ``spheres_<height>x<width>`` in `root` by default.
+        store: Folder in which the prepared spheres get one for their size,
+            ``spheres_<height>x<width>``; by default `root`.
         validation_fraction: Share of the training shapes of every class for validation, drawn from
             the seed.
         test_rotation: Turn the test shapes: `yaw` about the vertical, `so3` any way; the same shape
@@ -102,8 +103,8 @@ class ModelNet40(SplitDataModule[Shapes]):
         self.test_rotation = test_rotation
         self.erp_height = representation.erp_height
         height, width = self.erp_height, 2 * self.erp_height
-        store = self.root / f"spheres_{height}x{width}" if store is None else Path(store)
-        self.spheres = SphereFolder(store, (height, width))
+        folder = Path(self.root if store is None else store) / f"spheres_{height}x{width}"
+        self.spheres = SphereFolder(folder, (height, width))
         self._meshes: list[ShapeFile] = []
         self.class_names = self.find_classes()
 

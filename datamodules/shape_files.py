@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 __all__ = ["MODELNET40", "ShapeFile", "find_shapes"]
 
-GET_IT = (
+_GET_IT = (
     "Get ModelNet40.zip from https://modelnet.cs.princeton.edu and name the unpacked folder in "
     "data.root. Or choose data=synthshapes, which needs no download."
 )
@@ -72,7 +72,7 @@ def find_shapes(root: Path) -> list[ShapeFile]:
             shape to train on.
     """
     if not root.is_dir():
-        raise DataError(root, found="no such folder", expected="the data set", remedy=GET_IT)
+        raise DataError(root, found="no such folder", expected="the data set", remedy=_GET_IT)
     by_class, by_split = list(_by_class(root)), list(_by_split(root))
     if by_class and by_split:
         raise DataError(
@@ -83,7 +83,7 @@ def find_shapes(root: Path) -> list[ShapeFile]:
         )
     shapes = sorted(by_class or by_split, key=lambda shape: (shape.part, shape.name))
     if not shapes:
-        raise DataError(root, found="no meshes", expected=_TREE, remedy=_where(root) or GET_IT)
+        raise DataError(root, found="no meshes", expected=_TREE, remedy=_where(root) or _GET_IT)
     training = {shape.label for shape in shapes if shape.part == "train"}
     if untrained := sorted({shape.label for shape in shapes} - training):
         raise DataError(

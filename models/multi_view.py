@@ -49,7 +49,7 @@ class MultiView(nn.Module):
             SettingError: The network gives no scores of the classes, or the images are not those of
                 shapes.
         """
-        scores = each_view(self.network, images)
+        scores = each_view(self._scores, images)
         if scores.ndim != _DIMENSIONS:
             raise SettingError(
                 f"scores of {type(self.network).__name__}",
@@ -58,6 +58,12 @@ class MultiView(nn.Module):
                 remedy="Its network must be one that classifies images.",
             )
         return scores.mean(dim=1)
+
+    def _scores(self, images: Tensor) -> Tensor:
+        found = self.network(images)
+        # GoogLeNet and Inception, while training: auxiliary scores follow, which nothing learns by.
+        scores: Tensor = found[0] if isinstance(found, tuple) else found
+        return scores
 
 
 def _fit_head(network: nn.Module, num_classes: int) -> None:

@@ -7,14 +7,16 @@ from typing import TYPE_CHECKING
 from tangent_train.errors import SettingError
 
 if TYPE_CHECKING:
-    from torch import Tensor, nn
+    from collections.abc import Callable
+
+    from torch import Tensor
 
 __all__ = ["each_view"]
 
 _DIMENSIONS = 5
 
 
-def each_view(network: nn.Module, images: Tensor) -> Tensor:
+def each_view(network: Callable[[Tensor], Tensor], images: Tensor) -> Tensor:
     """What a network makes of every view by itself.
 
     Args:

@@ -24,15 +24,11 @@ from tangent_train.tasks.results import (
 )
 
 __all__ = [
-    "CLASSIFICATION",
     "classification_results",
     "classification_rows",
     "classification_table",
     "write_classification_results",
 ]
-
-CLASSIFICATION = "classification"
-"""Stands under ``kind`` in the results."""
 
 _COLUMNS = ("class", "images", "accuracy", "taken_for", "taken_for_share")
 
@@ -65,7 +61,7 @@ def classification_results(
             }
         )
     return {
-        "kind": CLASSIFICATION,
+        "kind": "classification",
         "images": int(confusion.sum()),
         "noun": noun,
         "accuracy": plain(scores.accuracy),

@@ -79,10 +79,9 @@ def confusion_picture(
     axes.set_yticks(places, names, fontsize=font)
     axes.xaxis.tick_top()
     axes.tick_params(length=0)
-    axes.set_xticks(np.arange(len(names) + 1) - 0.5, minor=True)
-    axes.set_yticks(np.arange(len(names) + 1) - 0.5, minor=True)
-    axes.tick_params(which="minor", length=0)
-    axes.grid(which="minor", color="white", linewidth=0.6)
+    edges, end = np.arange(1, len(names)) - 0.5, len(names) - 0.5
+    axes.hlines(edges, -0.5, end, colors="white", linewidth=0.6)
+    axes.vlines(edges, -0.5, end, colors="white", linewidth=0.6)
     axes.set_ylabel("truth", fontsize=_FONT_PT + 1)
     axes.set_xlabel("prediction, % of the true class", fontsize=_FONT_PT + 1, loc="left")
     percents = np.rint(100 * np.nan_to_num(shares)).astype(int)

@@ -148,11 +148,13 @@ def test_a_split_without_a_usable_shape(tmp_path: Path, part: str) -> None:
 
 
 def test_spheres_elsewhere(root: Path, tmp_path: Path) -> None:
-    module = ModelNet40(root, TangentRepresentation(0, 2), store=tmp_path / "store")
-    module.prepare_data()
-    assert len(list((tmp_path / "store/cup/train").glob("*.npy"))) == COUNTS["cup"][0]
-    assert not (root / "spheres_8x16").exists()
-    assert module.source("train").read(0).shape == (8, 16, 6)
+    for level, size in ((2, "8x16"), (4, "32x64")):  # two sizes in one store
+        module = ModelNet40(root, TangentRepresentation(0, level), store=tmp_path / "store")
+        module.prepare_data()
+        made = (tmp_path / "store" / f"spheres_{size}/cup/train").glob("*.npy")
+        assert len(list(made)) == COUNTS["cup"][0]
+        assert not (root / f"spheres_{size}").exists()
+        assert module.source("train").read(0).shape == (2 ** (level + 1), 2 ** (level + 2), 6)
 
 
 def test_spheres_of_every_size_have_a_folder(root: Path) -> None:

@@ -84,6 +84,17 @@ def test_it_starts_from_weights_of_the_same_network(tmp_path: Any) -> None:
     assert set(origins.fresh) == {"network.fc.weight", "network.fc.bias"}
 
 
+def test_auxiliary_scores_are_left_out() -> None:
+    torch.manual_seed(0)
+    inner = _torchvision("googlenet", num_classes=5, init_weights=False)
+    network, images = MultiView(inner, 3, 5), torch.randn(2, 2, 3, 32, 32)
+    inner.dropout = nn.Identity()
+    scores = network(images)
+    logits, *auxiliary = inner(images.flatten(0, 1))
+    assert len(auxiliary) == 2
+    torch.testing.assert_close(scores, logits.reshape(2, 2, 5).mean(dim=1))
+
+
 @pytest.mark.parametrize(
     ("network", "message"),
     [

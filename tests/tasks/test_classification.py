@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import multiprocessing
 import os
 import socket
 from functools import partial
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
-from torch.multiprocessing.spawn import spawn
+from torch.multiprocessing.spawn import start_processes
 from torch.nn import functional
 
 from models import ShapeClassifier
@@ -185,7 +186,8 @@ def test_two_processes_take_the_step_of_one_and_count_every_shape_once(tmp_path:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    spawn(_one_of_two, (port, tmp_path), nprocs=2)  # type: ignore[no-untyped-call]
+    multiprocessing.set_forkserver_preload([__name__])  # imported once, not once per process
+    start_processes(_one_of_two, (port, tmp_path), nprocs=2, start_method="forkserver")  # type: ignore[no-untyped-call]
     expected, loss = _expected(4)
     for rank in range(2):
         found = torch.load(tmp_path / f"{rank}.pt", weights_only=True)
