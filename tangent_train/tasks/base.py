@@ -98,6 +98,18 @@ class Task(lightning.LightningModule, ABC):
         """What the loss of all of them is divided by: known before any network has run."""
 
     @abstractmethod
+    def evaluate(self, batch: Any) -> Tensor:
+        """Count what the network makes of a batch; returns the predictions for the callbacks."""
+
+    @abstractmethod
+    def log_scores(self, stage: str) -> None:
+        """Log the scores of all that was counted, keep them for the results, and start anew.
+
+        Args:
+            stage: ``val`` or ``test``.
+        """
+
+    @abstractmethod
     def pictures(self, folder: Path, settings: Mapping[str, Any]) -> list[Callback]:
         """Callbacks that show what becomes of the validation and test splits.
 
@@ -192,6 +204,22 @@ class Task(lightning.LightningModule, ABC):
 
     def _loss(self, inputs: Tensor, labels: Tensor, norm: Tensor) -> Tensor:
         return self.loss_sum(self(inputs), labels) / norm
+
+    def validation_step(self, batch: Any, batch_idx: int) -> Tensor:
+        """Count a batch of the validation split."""
+        return self.evaluate(batch)
+
+    def test_step(self, batch: Any, batch_idx: int) -> Tensor:
+        """Count a batch of the test split."""
+        return self.evaluate(batch)
+
+    def on_validation_epoch_end(self) -> None:
+        """Log the scores of the validation split."""
+        self.log_scores("val")
+
+    def on_test_epoch_end(self) -> None:
+        """Log the scores of the test split."""
+        self.log_scores("test")
 
     def configure_optimizers(self) -> Any:
         """Optimizer, and scheduler if there is one."""

@@ -131,29 +131,14 @@ class ClassificationTask(Task):
         """The number of shapes."""
         return torch.tensor(float(len(labels)), device=labels.device)
 
-    def _evaluate(self, batch: Any) -> Tensor:
-        """Score a batch of shapes; returns the predictions ``(B,)``."""
+    def evaluate(self, batch: Any) -> Tensor:
+        """Count a batch of shapes; returns the predictions ``(B,)``."""
         prediction = self(batch.images).argmax(dim=1)
         self.counts.update(prediction, batch.label)
         return prediction
 
-    def validation_step(self, batch: Any, batch_idx: int) -> Tensor:
-        """Score shapes and hand the predictions to the callbacks."""
-        return self._evaluate(batch)
-
-    def test_step(self, batch: Any, batch_idx: int) -> Tensor:
-        """Score shapes and hand the predictions to the callbacks."""
-        return self._evaluate(batch)
-
-    def on_validation_epoch_end(self) -> None:
-        """Log the scores of the validation split."""
-        self._log_scores("val")
-
-    def on_test_epoch_end(self) -> None:
-        """Log the scores of the test split and keep the matrix for the results."""
-        self._log_scores("test")
-
-    def _log_scores(self, stage: str) -> None:
+    def log_scores(self, stage: str) -> None:
+        """Log the accuracies of a split and keep its matrix for the results."""
         self.matrix = self.counts.compute()
         self.counts.reset()
         scores = classification_scores(self.matrix)

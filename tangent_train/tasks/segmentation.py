@@ -167,8 +167,8 @@ class SegmentationTask(Task):
         scores = torch.cat([self(part)[:, 1:].float() for part in parts])
         return self.representation.to_labels(scores, shape) + 1
 
-    def _evaluate(self, batch: Any) -> Tensor:
-        """Score a batch of panoramas or photos; returns the predictions."""
+    def evaluate(self, batch: Any) -> Tensor:
+        """Count a batch of panoramas or photos; returns the predictions."""
         predictions = [
             self.predict_labels(images, tuple(target.shape))
             for images, target in zip(batch.images, batch.target, strict=True)
@@ -177,23 +177,8 @@ class SegmentationTask(Task):
             self.confusion.update(prediction, target)
         return torch.stack(predictions)
 
-    def validation_step(self, batch: Any, batch_idx: int) -> Tensor:
-        """Score panoramas or photos and hand the predictions to the callbacks."""
-        return self._evaluate(batch)
-
-    def test_step(self, batch: Any, batch_idx: int) -> Tensor:
-        """Score panoramas or photos and hand the predictions to the callbacks."""
-        return self._evaluate(batch)
-
-    def on_validation_epoch_end(self) -> None:
-        """Log the scores of the validation split."""
-        self._log_scores("val")
-
-    def on_test_epoch_end(self) -> None:
-        """Log the scores of the test split and keep the matrices for the results."""
-        self._log_scores("test")
-
-    def _log_scores(self, stage: str) -> None:
+    def log_scores(self, stage: str) -> None:
+        """Log the scores of a split and keep its matrices for the results."""
         self.matrices = self.confusion.compute()
         self.confusion.reset()
         scores = {"": segmentation_scores(self.matrices.pixels, self.absent_class)}
