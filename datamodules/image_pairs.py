@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import glob
 from itertools import combinations, pairwise
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from datamodules.gpano import area_of, whole_area
@@ -11,8 +13,7 @@ from datamodules.panorama_pairs import PairedPanorama, PanoramaPair, PanoramaPai
 from tangent_train.errors import DataError, SettingError
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
+    from datamodules.gpano import PanoramaArea
 
 __all__ = ["ImagePairs"]
 
@@ -50,7 +51,7 @@ class ImagePairs(PanoramaPairs):
         if pairing not in ("consecutive", "all"):
             raise SettingError("pairing", found=pairing, expected="consecutive or all")
         if input is None:
-            self._paths = [_one(str(left)), _one(str(right))]
+            self._paths = [_one("left", str(left)), _one("right", str(right))]
         else:
             self._paths = find_images(input)
         if len(self._paths) < 2:
@@ -70,6 +71,11 @@ class ImagePairs(PanoramaPairs):
         left, right = self._pairs[index]
         return f"{self._names[left]} – {self._names[right]}"
 
+    def files(self, index: int) -> tuple[Path, Path]:
+        """Both files."""
+        left, right = self._pairs[index]
+        return self._paths[left], self._paths[right]
+
     def read(self, index: int) -> PanoramaPair:
         """Read a pair; of panoramas that are a part of the sphere the rest is black.
 
@@ -80,13 +86,15 @@ class ImagePairs(PanoramaPairs):
         return PanoramaPair(self.name(index), None, left, right)
 
 
-def _one(pattern: str) -> Path:
+def _one(side: str, pattern: str) -> Path:
+    if not glob.has_magic(pattern) and not Path(pattern).expanduser().exists():
+        raise SettingError(f"{side}: no such file: {pattern}")
     found = find_images(pattern)
     if len(found) > 1:
         raise SettingError(
-            "left and right",
+            side,
             found=f"{len(found)} images ({pattern})",
-            expected="one panorama each",
+            expected="one panorama",
             remedy="Name folders with input=.",
         )
     return found[0]
@@ -105,5 +113,18 @@ def _names(paths: list[Path]) -> list[str]:
 def _panorama(name: str, path: Path) -> PairedPanorama:
     rgb = read_rgb(path)
     size = (rgb.shape[0], rgb.shape[1])
-    whole = (area_of(path, size) or whole_area(path, size)).place(rgb)
-    return PairedPanorama(name, whole, file=path)
+    area = area_of(path, size) or _whole(path, size)
+    return PairedPanorama(name, area.place(rgb), file=path)
+
+
+def _whole(path: Path, size: tuple[int, int]) -> PanoramaArea:
+    """All of the sphere; the message names only what pairs can be told."""
+    try:
+        return whole_area(path, size)
+    except DataError as error:
+        raise DataError(
+            path,
+            found=error.found,
+            expected="a whole panorama, twice as wide as high, or a part with GPano tags that say "
+            "where it lies",
+        ) from None

@@ -21,8 +21,8 @@ __all__ = ["build"]
 _REMEDIES = {
     "classification": "Choose task=classification with a network for it (experiment=shapes/default "
     "has both), or data of panoramas or photos.",
-    "segmentation": "Choose data of shapes, as data=synthshapes, or task=segmentation with a network "
-    "for it.",
+    "segmentation": "Choose data of shapes, as data=synthshapes, or task=segmentation with a "
+    "network for it.",
 }
 """By what the data has labels for."""
 

@@ -18,13 +18,14 @@ from tangent_train.cli.keypoint_pairs.export import ColmapExport
 from tangent_train.cli.keypoint_pairs.folder import EXPORT, ResultsFolder
 from tangent_train.cli.keypoint_pairs.outputs import PairOutputs
 from tangent_train.cli.keypoint_pairs.settings import KeypointSettings
+from tangent_train.cli.processes import ended_by_sigterm
 from tangent_train.errors import DataError, SettingError
 from tangent_train.keypoints.detectors import Detector
 from tangent_train.keypoints.motion_search import colmap
 from tangent_train.tasks.keypoints.compare import Comparer, Matching
 from tangent_train.tasks.keypoints.entries import PairEntry
 from tangent_train.tasks.keypoints.representations import Representations
-from tangent_train.tasks.keypoints.tables import KeypointReport, overall_tables
+from tangent_train.tasks.keypoints.tables import KeypointReport, overall_tables, shown_name
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -49,20 +50,27 @@ def keypoints(config: DictConfig) -> None:
     plain: Any = OmegaConf.to_container(config, resolve=True)
     settings = KeypointSettings.of(plain)
     colmap()  # pycolmap is needed: it is missed now rather than after minutes
-    pairs = _pairs(config)
+    with ended_by_sigterm():  # after it: pycolmap has a handler that prints its stack
+        _compare_and_tell(_pairs(config), settings)
+
+
+def _compare_and_tell(pairs: PanoramaPairs, settings: KeypointSettings) -> None:
     comparer = _comparer(settings)
     folder = ResultsFolder(settings.output, settings.deciding)
+    outputs = _outputs(settings, comparer, folder)
+    if outputs.export is not None and isinstance(pairs, ImagePairs):
+        count = min(len(pairs), settings.max_pairs or len(pairs))
+        outputs.export.check_files([file for k in range(count) for file in pairs.files(k)])
     earlier = folder.open(overwrite=settings.overwrite)
     pairs.make_files()
     names = [pairs.name(k) for k in range(len(pairs))][: settings.max_pairs]
-    outputs = _outputs(settings, comparer, folder)
     missing = outputs.missing(names, earlier)
     console = Console(soft_wrap=True, highlight=False)
     console.print(_what_happens(settings, comparer, len(names), len(missing)), markup=False)
     entries = dict(earlier)
     try:
         _compare_all(pairs, missing, comparer, outputs, entries)
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, SystemExit):
         done = sum(name in entries for name in names)
         console.print(
             f"Interrupted: {done} of {len(names)} pairs are done. The same command goes on.",
@@ -74,7 +82,8 @@ def keypoints(config: DictConfig) -> None:
         _write(folder, ordered, pairs, comparer, settings)
     for table in overall_tables(_report(ordered, pairs, comparer, settings)):
         console.print(table)
-    console.print(f"Results are in {folder.path}.", markup=False)
+    if any(entry.error is None for entry in ordered):
+        console.print(f"Results are in {folder.path}.", markup=False)
     good = [name for name in names if entries[name].error is None]
     if outputs.export is not None and good and not outputs.export.is_complete(good):
         root = outputs.export.finish(good)
@@ -129,7 +138,7 @@ def _outputs(settings: KeypointSettings, comparer: Comparer, folder: ResultsFold
 def _what_happens(settings: KeypointSettings, comparer: Comparer, count: int, missing: int) -> str:
     """One line before the work begins."""
     kept = f"; {count - missing} of them are there already" if missing < count else ""
-    names = ", ".join(comparer.representations.names)
+    names = ", ".join(map(shown_name, comparer.representations.names))
     level = "of each pair" if settings.level is None else settings.level
     turned = ", also with the right panorama turned" if settings.controls else ""
     noun = "pair" if count == 1 else "pairs"
@@ -145,7 +154,7 @@ def _compare_all(
 ) -> None:
     """Fill `entries` pair by pair, and write them every few seconds."""
     begun = written = time.monotonic()
-    with progress_bar() as bar:
+    with progress_bar(show=bool(missing)) as bar:
         task = bar.add_task("Comparing pairs", total=len(missing), rate="")
         for number, (name, entry) in enumerate(
             _compared(pairs, missing, comparer, outputs), start=1
@@ -154,6 +163,9 @@ def _compare_all(
             if entry.error is not None:
                 message = f"Pair {name}: {entry.error}"
                 bar.console.print(message, style="red", markup=False, soft_wrap=True)
+            for side in entry.without_keypoints:
+                message = f"Pair {name}: no keypoint on {side}"
+                bar.console.print(message, style="yellow", markup=False, soft_wrap=True)
             if time.monotonic() - written > _SECONDS_BETWEEN_WRITES:
                 outputs.folder.write(entries.values())
                 written = time.monotonic()
@@ -170,7 +182,7 @@ def _compared(
             pair = pairs.read(index)
             comparison = comparer.compare(pair)
             outputs.write(index, pair, comparison)
-        except (DataError, SettingError, MemoryError) as error:
+        except (DataError, MemoryError) as error:  # of this pair; a SettingError is of all
             yield name, PairEntry(name, error=str(error) or type(error).__name__)
         else:
             yield name, comparison.entry

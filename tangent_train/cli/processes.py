@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
-__all__ = ["command_line", "run_environment", "run_process"]
+__all__ = ["command_line", "ended_by_sigterm", "run_environment", "run_process"]
 
 _PATIENCE_S = 30.0  # for a last checkpoint
 _LINES_OF_AN_ERROR = 12
@@ -64,7 +64,7 @@ def run_process(line: Sequence[str], environment: dict[str, str]) -> tuple[int, 
     """
     last: deque[str] = deque(maxlen=_LINES_OF_AN_ERROR)
     with (
-        _ended_by_sigterm(),
+        ended_by_sigterm(),
         subprocess.Popen(
             line, env=environment, stderr=subprocess.PIPE, text=True, errors="replace"
         ) as process,
@@ -99,8 +99,8 @@ def _stop(process: subprocess.Popen[str], *, told: bool) -> None:
 
 
 @contextmanager
-def _ended_by_sigterm() -> Iterator[None]:
-    """Let SIGTERM unwind this process, so that it ends the run, rather than end it at once."""
+def ended_by_sigterm() -> Iterator[None]:
+    """Let SIGTERM unwind this process as Ctrl-C does, rather than end it at once."""
 
     def leave(number: int, frame: object) -> NoReturn:
         sys.exit(128 + number)

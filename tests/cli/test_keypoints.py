@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import re
+import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -20,7 +22,7 @@ from datamodules.stanford_pairs import StanfordPairs, published_pairs
 from tangent_train.cli import main
 from tangent_train.cli.compose import check_overrides, config_folder
 from tangent_train.cli.keypoint_pairs.arguments import keypoint_arguments
-from tangent_train.cli.keypoint_pairs.settings import KeypointSettings
+from tangent_train.cli.keypoint_pairs.settings import EXPORTS, KeypointSettings
 from tangent_train.cli.keypoints import keypoints
 from tangent_train.errors import SettingError
 from tangent_train.keypoints import motion_search
@@ -100,8 +102,7 @@ def test_two_panoramas(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert picture is not None
     assert picture.shape[1] == 2 * 724
     shown = capsys.readouterr().out
-    assert "1 pair, sift, ERP, ERP_shrunk, L0, L1" in shown
-    assert "ERP ×0.71" in shown
+    assert "1 pair, sift, ERP, ERP ×0.71, L0, L1" in shown
     assert "Results are in out (1)." in shown
     assert "n_L and n_R are all keypoints" in (output / "keypoints.md").read_text()
 
@@ -181,7 +182,9 @@ def test_export_for_colmap(
         database.close()
     capsys.readouterr()
     run(*arguments)
-    assert "2 of them are there already" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "2 of them are there already" in shown
+    assert "Comparing pairs" not in shown  # no bar of nothing
     # Asked for afterwards, all pairs are compared once more; their figures are the same.
     (export / "export.json").unlink()
     run(*arguments)
@@ -190,7 +193,51 @@ def test_export_for_colmap(
     assert (export / "export.json").is_file()
 
 
+def test_names_that_colmaps_text_cannot_hold_are_refused_before_any_work(
+    run: Run, tmp_path: Path, panoramas: Path
+) -> None:
+    folder = tmp_path / "my photos"  # COLMAP's names are relative to it
+    folder.mkdir()
+    for old, new in (("a", "a"), ("b", "b"), ("c", "living room")):
+        (folder / f"{new}.png").write_bytes((panoramas / f"{old}.png").read_bytes())
+    arguments = ("input=my photos", *SMALL, "export=colmap_text", "output=out")
+    message = r"export: found colmap_text of 'living room\.png'; .* export=colmap_database"
+    with pytest.raises(SystemExit, match=message):
+        run(*arguments)
+    assert not (tmp_path / "out").exists()
+    run(*arguments, "max_pairs=1")
+    assert (tmp_path / "out/export/L0/matches.txt").is_file()
+
+
 # Interrupted, gone on with, thrown away.
+
+
+@pytest.mark.parametrize(("signal_", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_a_signal_ends_a_run_that_can_be_gone_on_with(
+    run: Run,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+    signal_: signal.Signals,
+    status: int,
+) -> None:
+    true_compare = Comparer.compare
+
+    def signalled(self: Comparer, pair: Any) -> Comparison:
+        if pair.name == "b – c":
+            os.kill(os.getpid(), signal_)
+        return true_compare(self, pair)
+
+    monkeypatch.setattr(Comparer, "compare", signalled)
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(SystemExit) as stopped:
+        run("input=$PANORAMAS", *SMALL, "output=out")
+    assert stopped.value.code == status
+    shown = capfd.readouterr()
+    assert "Interrupted: 1 of 2 pairs are done. The same command goes on." in shown.out
+    assert "SIGTERM" not in shown.err
+    assert _names(tmp_path / "out") == ["a – b"]
+    assert signal.getsignal(signal.SIGTERM) == before
 
 
 def test_an_interrupted_run_goes_on(
@@ -291,6 +338,32 @@ def test_nothing_but_broken_pairs(run: Run, tmp_path: Path) -> None:
     assert not (tmp_path / "out" / "pairs.csv").exists()
 
 
+def test_settings_that_suit_no_panorama_leave_no_results(
+    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    two = ("left=$PANORAMAS/a.png", "right=$PANORAMAS/b.png", *SMALL[1:], "output=out")
+    for wrong, message in (
+        ("base_level=5", "base_level: found 5; expected at most the level, 6, less 2"),
+        ("level=7", "level: found 7; expected at most 6, that of a, 96 rows"),
+    ):
+        with pytest.raises(SystemExit, match=f"^tangent-keypoints: {message}"):
+            run(*two, wrong)
+        assert "Results are in" not in capsys.readouterr().out
+    run(*two, "base_level=0")  # other settings; there are no results to be kept from it
+    assert "Results are in" in capsys.readouterr().out
+    assert _results(tmp_path / "out")["settings"]["base_level"] == [0]
+
+
+def test_a_panorama_without_keypoints_is_named(
+    run: Run, tmp_path: Path, panoramas: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cv2.imwrite(str(tmp_path / "black.png"), np.zeros((96, 192, 3), np.uint8))
+    run("left=$PANORAMAS/a.png", "right=black.png", *SMALL, "output=out")
+    assert "Pair a – black: no keypoint on black" in capsys.readouterr().out
+    text = (tmp_path / "out" / "keypoints.md").read_text()
+    assert "## Panoramas without any keypoint\n\n* black\n" in text
+
+
 # Settings.
 
 
@@ -305,9 +378,12 @@ def test_nothing_but_broken_pairs(run: Run, tmp_path: Path) -> None:
         (["base_level=0,0", "output=o"], "base_level: found [0, 0]"),
         (["base_level=-1", "output=o"], "base_level: found -1"),
         (["base_level=2", "level=1", "output=o"], "level: found 1"),
+        (["base_level=0", "level=1", "output=o"], "level: found 1; expected a whole number, 2"),
         (["detector=surf", "output=o"], "detector: found surf"),
         (["margin=-1", "output=o"], "margin: found -1"),
         (["ratio=0", "output=o"], "ratio: found 0"),
+        (["ratio=1.5", "output=o"], "ratio: found 1.5; expected at most 1"),
+        (["left=$PANORAMAS/a.png", "right=nofile.png", "output=o"], "right: no such file"),
         (["mutual=maybe", "output=o"], "mutual: found maybe"),
         (["max_error_deg=21", "output=o"], "max_error_deg: found 21"),
         (["max_pairs=0", "output=o"], "max_pairs: found 0"),
@@ -357,6 +433,16 @@ def test_pairs_are_refused_elsewhere(name: str) -> None:
 )
 def test_plain_words_become_hydras(typed: list[str], understood: list[str]) -> None:
     assert keypoint_arguments(typed) == understood
+
+
+def test_help_lists_the_choices(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        run("--help")
+    choices = capsys.readouterr().out.partition("== Choices ==")[2].partition("==")[0]
+    pairs = [path.stem for path in (config_folder() / "data").glob("*_pairs.yaml")]
+    for choice in (*pairs, "sift", "orb", "akaze", *EXPORTS, "consecutive", "all"):
+        assert re.search(rf"\b{choice}\b", choices), choice
+    assert "synthrooms," not in choices
 
 
 def test_the_defaults_are_the_documented_ones() -> None:

@@ -65,7 +65,8 @@ def test_namesakes_are_told_apart(tmp_path: Path) -> None:
         ({"left": "a.png", "right": "b.png", "input": "x"}, "input: found left=a.png"),
         ({"left": "a.png", "input": "x"}, "input: found left=a.png, input=x"),
         ({"input": ".", "pairing": "every"}, "pairing: found every"),
-        ({"left": ".", "right": "a.png"}, "left and right: found 4 images"),
+        ({"left": ".", "right": "a.png"}, "left: found 4 images"),
+        ({"left": "a.png", "right": "nofile.png"}, "right: no such file: nofile.png"),
     ],
 )
 def test_settings_that_do_not_fit_are_named(
@@ -86,7 +87,9 @@ def test_photos_are_refused_when_read_and_a_column_too_many_is_not(tmp_path: Pat
     _write(tmp_path / "a.png", 0, (8, 17))
     _write(tmp_path / "b.png", 0, (8, 12))
     pairs = ImagePairs(input=str(tmp_path))
-    with pytest.raises(DataError, match=r"b\.png: found 8×12"):
+    with pytest.raises(
+        DataError, match=r"b\.png: found 8×12 pixels; .* GPano tags that say where it lies\.$"
+    ):
         pairs.read(0)
     assert ImagePairs(str(tmp_path / "a.png"), str(tmp_path / "a.png")).read(0).left.rgb.shape == (
         8,

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from datamodules.image_files import read_image_size
-from tangent_train.errors import DataError
+from tangent_train.errors import DataError, SettingError
 from tangent_train.files import atomic_path, write_text
 from tangent_train.keypoints.colmap import (
     ColmapImage,
@@ -30,7 +30,7 @@ from tangent_train.keypoints.two_view import TwoView
 from tangent_train.tasks.keypoints.entries import AS_GIVEN
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
     from datamodules.panorama_pairs import PairedPanorama, PanoramaPair
     from tangent_train.tasks.keypoints.compare import Comparison
@@ -55,6 +55,29 @@ class ColmapExport:
     folder: Path
     kind: str
     representations: tuple[str, ...]
+
+    def check_files(self, files: Iterable[Path]) -> None:
+        """Make sure, before any work, that COLMAP's files can hold the names.
+
+        Args:
+            files: Of all panoramas.
+
+        Raises:
+            SettingError: A name has a space, and COLMAP's lists of matches are wanted.
+        """
+        absolute = [file.absolute() for file in files]
+        if self.kind != "colmap_text":
+            return
+        for file in absolute:
+            name = file.relative_to(_root(absolute)).as_posix()
+            if any(character.isspace() for character in name):
+                raise SettingError(
+                    "export",
+                    found=f"colmap_text of {name!r}",
+                    expected="names without spaces, which COLMAP's lists of matches cannot hold",
+                    remedy="Choose export=colmap_database, which takes any name, or rename the "
+                    "file.",
+                )
 
     def is_complete(self, names: Sequence[str]) -> bool:
         """Whether all pairs are exported already, by name."""
@@ -124,7 +147,7 @@ class ColmapExport:
         sides = dict.fromkeys(str(side) for part in pairs.values() for side in part["sides"])
         parts = {side: _load(self._part(representation, "panorama", side)) for side in sides}
         files = {side: Path(str(part["image_file"])) for side, part in parts.items()}
-        root = Path(os.path.commonpath([file.parent for file in files.values()]))
+        root = _root(files.values())
         images = {side: _image(parts[side], files[side].relative_to(root)) for side in sides}
         matched = [_pair(part, images) for part in pairs.values()]
         folder = self.folder / representation
@@ -139,6 +162,11 @@ class ColmapExport:
     def _part(self, representation: str, kind: str, name: str) -> Path:
         digest = hashlib.sha256(name.encode(errors="surrogateescape")).hexdigest()[:24]
         return self.folder / _PARTS / representation / f"{kind}_{digest}.npz"
+
+
+def _root(files: Iterable[Path]) -> Path:
+    """The folder that holds all of them, directly or in its folders."""
+    return Path(os.path.commonpath([file.parent for file in files]))
 
 
 def _of_keypoints(keypoints: SphericalKeypoints) -> dict[str, Any]:

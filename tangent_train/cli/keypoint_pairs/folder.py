@@ -56,11 +56,12 @@ class ResultsFolder:
         """
         self._check_place()
         found = self._read()
-        if found is None or overwrite:
+        entries = [entry for entry in found[1] if entry.error is None] if found else []
+        if found is None or not entries or overwrite:  # without a finished pair nothing is lost
             self._clear()
             self.write(())
             return {}
-        before, entries = found
+        before = found[0]
         differing = [k for k, value in self._plain().items() if before.get(k) != value]
         if differing:
             name = differing[0]
@@ -70,7 +71,7 @@ class ResultsFolder:
                 expected=f"{before.get(name)}, as for the results in {self.path}",
                 remedy="Give another output, or overwrite=true to throw them away.",
             )
-        return {entry.name: entry for entry in entries if entry.error is None}
+        return {entry.name: entry for entry in entries}
 
     def write(self, entries: Iterable[PairEntry]) -> None:
         """Write ``results.json``."""

@@ -10,6 +10,7 @@ from typing import Any
 
 from tangent_train.cli import values
 from tangent_train.errors import SettingError
+from tangent_train.tasks.keypoints.representations import LEAST_STEPS
 
 __all__ = ["EXPORTS", "KeypointSettings"]
 
@@ -81,10 +82,10 @@ class KeypointSettings:
             output=output,
             overwrite=values.flag(config, "overwrite"),
             base_levels=base_levels,
-            level=values.optional_whole(config, "level", max(base_levels)),
+            level=values.optional_whole(config, "level", max(base_levels) + LEAST_STEPS),
             detector=detector,
             margin=values.whole(config, "margin", 0),
-            ratio=values.number(config, "ratio", 0, math.inf),
+            ratio=_ratio(config),
             mutual=values.flag(config, "mutual"),
             max_error_deg=values.number(config, "max_error_deg", 0, _MOST_DEG),
             seed=values.whole(config, "seed", 0),
@@ -104,6 +105,15 @@ class KeypointSettings:
             f"Detector {self.detector}, level {level}, margin {self.margin}, ratio {self.ratio:g}"
             f"{mutual}, inliers within {self.max_error_deg:g}°, seed {self.seed}."
         )
+
+
+def _ratio(config: Mapping[str, Any]) -> float:
+    ratio = values.number(config, "ratio", 0, math.inf)
+    if ratio > 1:
+        raise SettingError(
+            "ratio", found=config["ratio"], expected="at most 1, which keeps every nearest match"
+        )
+    return ratio
 
 
 def _base_levels(value: Any) -> tuple[int, ...]:

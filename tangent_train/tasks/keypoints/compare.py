@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from tangent_train.errors import SettingError
 from tangent_train.geometry import nearest_level, random_rotation
 from tangent_train.keypoints.matching import match
 from tangent_train.keypoints.two_view import estimate_two_view
@@ -92,12 +93,10 @@ class Comparer:
             pair: The pair.
 
         Raises:
-            SettingError: The panoramas are too small for a base level.
+            SettingError: The panoramas are too small for the level or for a base level.
         """
         begun = time.monotonic()
-        rows = max(side.rgb.shape[0] for side in (pair.left, pair.right))
-        level = nearest_level(rows) if self.level is None else self.level
-        self.representations.check_level(level)
+        rows, level = self._rows_and_level(pair)
         turns = {AS_GIVEN: np.eye(3)}
         if self.turned:
             turns[TURNED] = self.matching.turn(pair.name)
@@ -128,6 +127,24 @@ class Comparer:
             seconds=round(time.monotonic() - begun, 2),
         )
         return Comparison(entry, found, images)
+
+    def _rows_and_level(self, pair: PanoramaPair) -> tuple[int, int]:
+        """Rows of the larger panorama, and the level to detect keypoints at.
+
+        Raises:
+            SettingError: The level is finer than the panorama, which would only be magnified, or
+                too coarse for a base level.
+        """
+        larger = max(pair.left, pair.right, key=lambda side: side.rgb.shape[0])
+        rows = larger.rgb.shape[0]
+        own = nearest_level(rows)
+        of_panorama = f"that of {larger.name}, {rows} rows"
+        if self.level is not None and self.level > own:
+            raise SettingError("level", found=self.level, expected=f"at most {own}, {of_panorama}")
+        level = own if self.level is None else self.level
+        reason = f"The level is {of_panorama}." if self.level is None else ""
+        self.representations.check_level(level, reason)
+        return rows, level
 
     def _found(
         self,

@@ -115,6 +115,16 @@ class PairEntry:
         """What was found in a condition, by representation."""
         return {s.representation: s for s in self.scored if s.condition == condition}
 
+    @property
+    def without_keypoints(self) -> list[str]:
+        """Names of the panoramas on which no representation has a keypoint, as they are."""
+        scored = list(self.of_condition(AS_GIVEN).values())
+        counts = {
+            self.left: sum(s.keypoints_left for s in scored),
+            self.right: sum(s.keypoints_right for s in scored),
+        }
+        return [name for name, count in counts.items() if scored and not count]
+
 
 def with_splits(entries: Sequence[PairEntry]) -> list[PairEntry]:
     """Divide pairs in two halves by their overlaps, as the paper's are, where no split is given.

@@ -20,13 +20,16 @@ if TYPE_CHECKING:
     from tangent_train.keypoints.detectors import Detector
     from tangent_train.keypoints.spherical import SphericalKeypoints
 
-__all__ = ["ERP", "SHRUNK", "Representations", "shrunk_rows"]
+__all__ = ["ERP", "LEAST_STEPS", "SHRUNK", "Representations", "shrunk_rows"]
 
 ERP = "ERP"
 """The panorama itself, the paper's baseline."""
 
 SHRUNK = "ERP_shrunk"
 """The panorama with pixels as large as those of tangent images; see `shrunk_rows`."""
+
+LEAST_STEPS = 2
+"""Least s − b: smaller tangent images leave parts of the sphere uncovered, see `TangentGrid`."""
 
 
 def shrunk_rows(level: int) -> int:
@@ -64,16 +67,23 @@ class Representations:
         """`ERP`, `SHRUNK` if wanted, and ``L0``, ``L1`` … for the base levels."""
         return [ERP, *[SHRUNK] * self.shrunk, *(f"L{b}" for b in self.base_levels)]
 
-    def check_level(self, level: int) -> None:
+    def check_level(self, level: int, reason: str = "") -> None:
         """Make sure that all tangent images exist.
 
+        Args:
+            level: Level s.
+            reason: Why it is this one, a sentence for the message.
+
         Raises:
-            SettingError: A base level is greater than the level.
+            SettingError: A base level is too great for the level.
         """
         for base_level in self.base_levels:
-            if base_level > level:
+            if base_level > level - LEAST_STEPS:
                 raise SettingError(
-                    "base_level", found=base_level, expected=f"at most the level, {level}"
+                    "base_level",
+                    found=base_level,
+                    expected=f"at most the level, {level}, less {LEAST_STEPS}",
+                    remedy=reason,
                 )
 
     def detect(self, rgb: NDArray[np.uint8], level: int, name: str) -> SphericalKeypoints:

@@ -92,7 +92,15 @@ class KeypointReport:
 
     def markdown(self) -> str:
         """All tables."""
-        return "\n".join([*self._head(), *self._overall(), *self._per_pair(), *self._failed()])
+        return "\n".join(
+            [
+                *self._head(),
+                *self._overall(),
+                *self._per_pair(),
+                *self._without_keypoints(),
+                *self._failed(),
+            ]
+        )
 
     def _head(self) -> Iterator[str]:
         yield from ("# Keypoints", "", f"{self.settings}", "", _visibility(self.entries), "")
@@ -145,6 +153,12 @@ class KeypointReport:
                 )
                 rows.append(("paper", "", f"{100 * published.fov_overlap:.0f}", *printed))
         return rows
+
+    def _without_keypoints(self) -> Iterator[str]:
+        names = dict.fromkeys(name for entry in self.entries for name in entry.without_keypoints)
+        if names:
+            yield from ("## Panoramas without any keypoint", "")
+            yield from (*(f"* {name}" for name in names), "")
 
     def _failed(self) -> Iterator[str]:
         failed = [entry for entry in self.entries if entry.error is not None]

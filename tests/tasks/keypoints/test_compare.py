@@ -9,7 +9,7 @@ import pytest
 
 from datamodules.panorama_pairs import PanoramaPair
 from tangent_train.errors import SettingError
-from tangent_train.geometry import random_rotation
+from tangent_train.geometry import TangentGrid, random_rotation
 from tangent_train.keypoints.detectors import Detector
 from tangent_train.rendering import rotate_equirect
 from tangent_train.tasks.keypoints.compare import Comparer, Comparison, Matching
@@ -135,15 +135,33 @@ def test_blank_panoramas_have_undefined_scores(pair: PanoramaPair) -> None:
     blank = pair.left._replace(rgb=np.full((64, 128, 3), 90, np.uint8), distance_m=None)
     ways = Representations((0,), Detector("sift"), 16, shrunk=True)
     entry = Comparer(ways, Matching()).compare(PanoramaPair("x", None, blank, blank)).entry
+    assert entry.without_keypoints == ["ball_l"]
     for scored in entry.scored:
         assert (scored.putative, scored.inliers, scored.kind) == (0, 0, "none")
         assert scored.pmr is scored.ms is scored.p is None
 
 
-def test_a_base_level_beyond_the_level_is_refused(pair: PanoramaPair) -> None:
-    ways = Representations((3,), Detector("sift"), 16, shrunk=False)
-    with pytest.raises(SettingError, match="base_level: found 3; expected at most the level, 2"):
-        Comparer(ways, Matching(), level=2).compare(pair)
+@pytest.mark.parametrize("base_level", [0, 3])
+def test_a_base_level_too_near_to_the_level_is_refused(base_level: int) -> None:
+    ways = Representations((base_level,), Detector("sift"), 16, shrunk=False)
+    ways.check_level(base_level + 2)
+    for level in (base_level, base_level + 1):
+        message = f"base_level: found {base_level}; expected at most the level, {level}, less 2"
+        with pytest.raises(SettingError, match=message):
+            ways.check_level(level)
+        with pytest.raises(SettingError, match="dim"):  # the grid would refuse it, too
+            _ = TangentGrid(base_level, level)
+    _ = TangentGrid(base_level, base_level + 2)
+
+
+def test_levels_that_do_not_suit_the_panorama_are_refused(pair: PanoramaPair) -> None:
+    far = replace(WAYS, base_levels=(6,))
+    with pytest.raises(SettingError, match=r"level, 7, less 2\. The level is that of ball_l, 192"):
+        Comparer(far, Matching()).compare(pair)
+    with pytest.raises(
+        SettingError, match="level: found 8; expected at most 7, that of ball_l, 192"
+    ):
+        Comparer(WAYS, Matching(), level=8).compare(pair)
 
 
 def test_panoramas_are_averaged_down_to_the_level() -> None:
