@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 __all__ = ["ClassWeights", "class_weights"]
 
-ClassWeights = Literal["log", "sqrt", "none"]
+ClassWeights = Literal["log", "sqrt", "effective", "none"]
 """How the loss weighs classes; see `class_weights`."""
 
 _LOG_OFFSET = 1.02
@@ -25,7 +25,16 @@ def class_weights(counts: NDArray[np.int64], kind: ClassWeights) -> Tensor:
     """Weights of the classes.
 
     With r the share of a class among the pixels that have one: `log` is ``1 / ln(1.02 + r)``
-    (released code of the paper), `sqrt` is ``1 / √r`` scaled to a mean of 1, `none` is 1.
+    (released code of the paper), `sqrt` is ``1 / √r``, `effective` is ``1 / (1 − e^(−r K))`` with K
+    classes seen, the last two scaled to a mean of 1; `none` is 1.
+
+    `effective` is ``(1 − β) / (1 − βⁿ)`` for n pixels (Cui et al., "Class-Balanced Loss Based on
+    Effective Number of Samples", CVPR 2019, equation 4) with 1/(1 − β), the number of pixels that
+    there is something to be learned from, set to the mean count of the seen classes. Pixels are no
+    samples: neighbours are alike, and their number grows with the resolution. With Cui's own β, up
+    to 0.9999, some ten thousand pixels are all there is to learn from, and the weights of all
+    classes equal; with this β only the shares count, as with the others. Classes rarer than the
+    mean weigh about as ``1 / r``, more frequent ones nearly the same.
 
     Args:
         counts: ``(classes,)`` pixels of every label, the unknown one first.
@@ -37,18 +46,27 @@ def class_weights(counts: NDArray[np.int64], kind: ClassWeights) -> Tensor:
     Raises:
         SettingError: Another kind.
     """
-    if kind not in ("log", "sqrt", "none"):
-        raise SettingError("class weights", found=repr(kind), expected="log, sqrt or none")
+    kinds = get_args(ClassWeights)
+    if kind not in kinds:
+        expected = f"{', '.join(kinds[:-1])} or {kinds[-1]}"
+        raise SettingError("class weights", found=repr(kind), expected=expected)
     weights = np.ones(len(counts))
     if kind != "none":
         seen = counts > 0
         seen[0] = False
-        ratio = counts[seen] / counts[1:].sum()
         weights[~seen] = 0
-        if kind == "log":
-            weights[seen] = 1 / np.log(_LOG_OFFSET + ratio)
-        else:
-            weights[seen] = 1 / np.sqrt(ratio)
-            weights[seen] /= weights[seen].mean()
+        if seen.any():
+            weights[seen] = _of_shares(counts[seen] / counts[1:].sum(), kind)
     weights[0] = 0
     return torch.from_numpy(weights.astype(np.float32))
+
+
+def _of_shares(
+    ratio: NDArray[np.float64], kind: Literal["log", "sqrt", "effective"]
+) -> NDArray[np.float64]:
+    if kind == "log":
+        log: NDArray[np.float64] = 1 / np.log(_LOG_OFFSET + ratio)
+        return log
+    weights = 1 / np.sqrt(ratio) if kind == "sqrt" else -1 / np.expm1(-ratio * len(ratio))
+    scaled: NDArray[np.float64] = weights / weights.mean()
+    return scaled

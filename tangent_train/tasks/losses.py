@@ -2,15 +2,35 @@
 
 from __future__ import annotations
 
+from typing import Any, Literal
+
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int64, UInt8
 from torch import Tensor
 from torch.nn import functional
 
-__all__ = ["UNKNOWN", "cross_entropy_norm", "cross_entropy_sum"]
+from tangent_train.errors import SettingError
+
+__all__ = [
+    "UNKNOWN",
+    "AuxiliaryTarget",
+    "RegionLoss",
+    "auxiliary_sum",
+    "check_region_loss",
+    "cross_entropy_norm",
+    "cross_entropy_sum",
+    "region_norm",
+    "region_sum",
+]
 
 UNKNOWN = 0
 """Class index of unlabelled pixels, everywhere."""
+
+AuxiliaryTarget = Literal["histogram", "labels"]
+"""What the cells of a coarser stage are compared with; see `auxiliary_sum`."""
+
+RegionLoss = Literal["lovasz", "dice"]
+"""Losses of an image as a whole; see `region_sum`."""
 
 
 def cross_entropy_sum(
@@ -30,10 +50,9 @@ def cross_entropy_sum(
         class_weights: Weight of every class.
         label_smoothing: Share of the target spread evenly over the classes.
     """
-    # A sum of millions of pixels: never in half precision.
-    exact = torch.promote_types(scores.dtype, torch.float32)
+    exact = _exact(scores)
     return functional.cross_entropy(
-        scores.to(exact),
+        exact,
         labels.long(),
         class_weights.to(exact),
         ignore_index=UNKNOWN,
@@ -47,5 +66,143 @@ def cross_entropy_norm(
 ) -> Tensor:
     """The class weights of the labelled pixels, added up: known before any network has run."""
     pixels = torch.bincount(labels.flatten(), minlength=len(class_weights))
-    weights = class_weights.to(torch.promote_types(class_weights.dtype, torch.float32))
-    return pixels[UNKNOWN + 1 :].to(weights) @ weights[UNKNOWN + 1 :]
+    weights = _exact(class_weights)
+    # Not a product of matrices: autocast would compute it in half precision.
+    return (pixels * weights)[UNKNOWN + 1 :].sum()
+
+
+def auxiliary_sum(
+    scores: Float[Tensor, "images classes rows columns"],
+    labels: UInt8[Tensor, "images height width"],
+    class_weights: Float[Tensor, " classes"],
+    target: AuxiliaryTarget = "histogram",
+) -> Tensor:
+    """Weighted cross-entropy of the cells of a coarser stage of a network, summed over pixels.
+
+    Either way its norm is the `cross_entropy_norm` of the pixels. `histogram` compares a cell with
+    the labels of all pixels whose centres lie in it. That is the cross-entropy of the pixels when
+    each has the scores of its cell; the scores are not enlarged for it. `labels` compares a cell
+    with the label of the pixel at its centre (of four that meet there, the lower right one), which
+    stands for as many pixels as a cell has.
+
+    Args:
+        scores: Logits of the cells, of any size.
+        labels: Class indices of the pixels; 0 is unknown and counts for nothing.
+        class_weights: Weight of every class.
+        target: What to compare with.
+    """
+    size = (scores.shape[-2], scores.shape[-1])
+    pixels_per_cell = labels.shape[-2:].numel() / (size[0] * size[1])
+    if target == "labels":
+        central = _central_labels(labels, size)
+        return pixels_per_cell * cross_entropy_sum(scores, central, class_weights)
+    if size == labels.shape[-2:]:
+        return cross_entropy_sum(scores, labels, class_weights)
+    exact = _exact(scores)
+    histograms = _histograms(labels, size, scores.shape[1])
+    histograms[:, UNKNOWN] = 0
+    # Pixels instead of probabilities: every pixel weighs the same, however many a cell has.
+    return functional.cross_entropy(
+        exact, histograms.to(exact), class_weights.to(exact), reduction="sum"
+    )
+
+
+def check_region_loss(name: str) -> None:
+    """Refuse a loss that `region_sum` cannot compute here.
+
+    Args:
+        name: The setting; ``none`` needs nothing.
+
+    Raises:
+        SettingError: An unknown one, or the package it comes from is not installed.
+    """
+    if name not in ("none", "lovasz", "dice"):
+        raise SettingError("task.region_loss", found=repr(name), expected="none, lovasz or dice")
+    if name != "none":
+        _implementations()
+
+
+def region_sum(
+    scores: Float[Tensor, "images classes height width"],
+    labels: UInt8[Tensor, "images height width"],
+    loss: RegionLoss,
+) -> Tensor:
+    """A loss that looks at every image as a whole, summed over those with a labelled pixel.
+
+    `lovasz` is the Lovász-Softmax loss, whose minimum is that of 1 − IoU (Berman et al., CVPR
+    2018), `dice` is 1 − 2·|A∩B| / (|A|+|B|) of probabilities; each the mean over the classes that
+    an image has. Unknown pixels count for nothing.
+
+    Args:
+        scores: Logits.
+        labels: Class indices; 0 is unknown.
+        loss: Which.
+
+    Raises:
+        SettingError: The package it comes from is not installed.
+    """
+    labelled = _labelled(labels)
+    exact, truth = scores[labelled].float(), labels[labelled].long()
+    implementation = getattr(_implementations(), f"{loss.capitalize()}Loss")
+    losses = [exact.sum() * 0]  # should there be none
+    # One by one: of several images the package's Dice makes one, and its Lovász fails when one of
+    # them has no labelled pixel.
+    for image_scores, image_labels in zip(exact, truth, strict=True):
+        chosen = {}  # Lovász takes the classes of the image by itself
+        if loss == "dice":
+            chosen["classes"] = image_labels[image_labels != UNKNOWN].unique().tolist()
+        compute = implementation("multiclass", ignore_index=UNKNOWN, **chosen)
+        losses.append(compute(image_scores[None], image_labels[None]))
+    return torch.stack(losses).sum()
+
+
+def region_norm(labels: UInt8[Tensor, "images height width"]) -> Tensor:
+    """The number of images with a labelled pixel, which `region_sum` is divided by."""
+    return _labelled(labels).sum().float()
+
+
+def _exact(values: Tensor) -> Tensor:
+    """Sums of millions of pixels: never in half precision."""
+    return values.to(torch.promote_types(values.dtype, torch.float32))
+
+
+def _labelled(labels: Tensor) -> Tensor:
+    return (labels != UNKNOWN).flatten(1).any(dim=1)
+
+
+def _centers(count: int, size: int, device: torch.device) -> Int64[Tensor, " count"]:
+    """Which of `size` equal parts of a line the centres of `count` equal parts lie in."""
+    return (2 * torch.arange(count, device=device) + 1) * size // (2 * count)
+
+
+def _central_labels(labels: Tensor, size: tuple[int, int]) -> Tensor:
+    rows, columns = (
+        _centers(n, of, labels.device) for n, of in zip(size, labels.shape[-2:], strict=True)
+    )
+    return labels[:, rows[:, None], columns]
+
+
+def _histograms(
+    labels: Tensor, size: tuple[int, int], classes: int
+) -> Int64[Tensor, "images classes rows columns"]:
+    """Pixels of every class whose centres lie in each cell."""
+    (height, width), device = labels.shape[-2:], labels.device
+    rows, columns = _centers(height, size[0], device), _centers(width, size[1], device)
+    images = torch.arange(len(labels), device=device)
+    cells = (images[:, None, None] * size[0] + rows[:, None]) * size[1] + columns
+    bins = cells * classes + labels
+    counts = torch.bincount(bins.flatten(), minlength=len(labels) * size[0] * size[1] * classes)
+    return counts.view(len(labels), *size, classes).permute(0, 3, 1, 2)
+
+
+def _implementations() -> Any:
+    try:
+        from segmentation_models_pytorch import losses  # type: ignore[import-untyped]
+    except ImportError as error:
+        raise SettingError(
+            "task.region_loss",
+            found="no segmentation-models-pytorch",
+            expected="the package that brings the loss, or task.region_loss=none",
+            remedy="Run: pip install 'tangent-train[networks]'",
+        ) from error
+    return losses

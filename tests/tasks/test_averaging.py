@@ -1,0 +1,269 @@
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import lightning
+import pytest
+import torch
+from lightning.pytorch.callbacks import Callback
+from lightning.pytorch.strategies import DDPStrategy
+from lightning.pytorch.utilities.exceptions import SIGTERMException
+from torch import Tensor, nn
+from torch.nn import functional
+from torch.utils.data import DataLoader
+
+from tangent_train.errors import SettingError
+from tangent_train.tasks.averaging import AveragedWeights
+from tangent_train.tasks.checkpoints import (
+    AtomicCheckpointIO,
+    CheckpointContents,
+    LastCheckpoint,
+    best_checkpoint,
+)
+
+DECAY = 0.3  # from the fourth step on: (1 + t) / (10 + t) is less before
+STEPS = 4
+
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:Checkpoint directory .* exists and is not empty"),
+    # All batches are the same.
+    pytest.mark.filterwarnings("ignore:.* your dataloader is not resumable"),
+]
+
+
+class Learner(lightning.LightningModule):
+    """Batch statistics, and dropout that draws from torch's generator at every step."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        self.network = nn.Sequential(
+            nn.Conv2d(2, 4, 3), nn.BatchNorm2d(4), nn.Dropout(0.3), nn.Conv2d(4, 3, 1)
+        )
+        self.register_buffer("weights", torch.ones(3))
+
+    def setup(self, stage: str) -> None:
+        if stage == "fit":  # by then Lightning has copied the module
+            self.weights = torch.tensor([0.0, 1.0, 3.0])
+
+    def training_step(self, batch: Any, batch_idx: int) -> Tensor:
+        images, labels = batch
+        return functional.cross_entropy(self.network(images), labels, self.weights)
+
+    def validation_step(self, batch: Any, batch_idx: int) -> None:
+        # Falls from epoch to epoch: the first is the best.
+        self.log("val/miou", self.training_step(batch, batch_idx), sync_dist=True)
+
+    def configure_optimizers(self) -> Any:
+        return torch.optim.Adam(self.parameters(), lr=0.03)
+
+    def train_dataloader(self) -> DataLoader[Any]:
+        return _loader(_data() * STEPS)
+
+    def val_dataloader(self) -> DataLoader[Any]:
+        return _loader(_data())
+
+
+def _loader(samples: Any) -> DataLoader[Any]:
+    # A generator of its own: loaders draw from torch's, which dropout shall have to itself.
+    return DataLoader(samples, batch_size=6, generator=torch.Generator())
+
+
+def _data() -> Any:
+    generator = torch.Generator().manual_seed(0)
+    images = torch.randn(6, 2, 8, 8, generator=generator)
+    labels = torch.randint(1, 3, (6, 6, 6), generator=generator)
+    return list(zip(images, labels, strict=True))
+
+
+class Reference(Callback):
+    """The average by its definition, of every tensor in float64, after every step and epoch."""
+
+    def __init__(self) -> None:
+        self.steps = 0
+        self.average: dict[str, Tensor] = {}
+        self.epochs: list[dict[str, Tensor]] = []
+
+    def on_train_batch_end(self, trainer: Any, pl_module: Any, *_: Any) -> None:
+        if trainer.global_step == self.steps:
+            return  # accumulated
+        now = {n: v.detach().double().clone() for n, v in pl_module.state_dict().items()}
+        decay = min(DECAY, (1 + self.steps) / (10 + self.steps)) if self.steps else 0.0
+        for name, value in now.items():
+            whole = name.endswith("num_batches_tracked")
+            old = self.average.get(name, value)
+            self.average[name] = value if whole else decay * old + (1 - decay) * value
+        self.steps += 1
+        self.trained = now
+
+    def on_train_epoch_end(self, trainer: Any, pl_module: Any) -> None:
+        self.epochs.append(dict(self.average))
+
+
+class Ending(Callback):
+    """What a SIGTERM after a step does."""
+
+    def __init__(self, last: LastCheckpoint, step: int) -> None:
+        self.last, self.step = last, step
+
+    def on_train_batch_end(self, trainer: Any, *_: Any) -> None:
+        self.last._told_to_end = trainer.global_step == self.step
+
+
+def _trainer(
+    folder: Path, *callbacks: Callback, decay: float | None = DECAY, end: int = -1, **settings: Any
+) -> lightning.Trainer:
+    last = LastCheckpoint(folder)
+    averaging = [] if decay is None else [AveragedWeights(decay)]
+    contents = CheckpointContents({"config": {}})
+    quiet: dict[str, Any] = {
+        "max_epochs": 3,
+        "logger": False,
+        "enable_progress_bar": False,
+        "enable_model_summary": False,
+        "accelerator": "cpu",
+        "num_sanity_val_steps": 0,
+        "plugins": [AtomicCheckpointIO()],
+        "callbacks": [
+            best_checkpoint(folder), last, Ending(last, end), *averaging, contents, *callbacks
+        ],
+    }  # fmt: skip
+    return lightning.Trainer(**(quiet | settings))
+
+
+def _read(path: Path) -> dict[str, Any]:
+    content: dict[str, Any] = torch.load(path, weights_only=True)
+    return content
+
+
+def _assert_close(found: dict[str, Tensor], expected: dict[str, Tensor]) -> None:
+    found = {name: value.double() for name, value in found.items()}
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize("accumulated", [1, 2])
+def test_checkpoints_hold_the_average_and_the_weights_to_go_on_with(
+    tmp_path: Path, accumulated: int
+) -> None:
+    reference, learner = Reference(), Learner()
+    trainer = _trainer(tmp_path, reference, accumulate_grad_batches=accumulated)
+    trainer.fit(learner)
+    assert reference.steps == 3 * STEPS // accumulated
+    best, last = _read(tmp_path / "best.ckpt"), _read(tmp_path / "last.ckpt")
+    _assert_close(best["state_dict"], reference.epochs[0])
+    _assert_close(last["state_dict"], reference.average)
+    _assert_close(last["current_model_state"], reference.trained)
+    assert best["state_dict"].keys() == learner.state_dict().keys()
+    _assert_close(learner.state_dict(), reference.average)
+    apart = [(value - reference.trained[n]).abs().max() for n, value in reference.average.items()]
+    assert max(apart) > 0.01, "the average is another network"
+
+
+def test_what_is_validated_is_the_average(tmp_path: Path) -> None:
+    trainer = _trainer(tmp_path)
+    trainer.fit(Learner())
+    evaluated = Learner()
+    evaluated.load_state_dict(_read(tmp_path / "best.ckpt")["state_dict"])
+    (figures,) = trainer.validate(evaluated, verbose=False)
+    assert figures["val/miou"] == pytest.approx(float(trainer.checkpoint_callback.best_model_score))  # type: ignore[union-attr]
+
+
+def test_the_training_itself_does_not_change(tmp_path: Path) -> None:
+    with_average, without = Reference(), Reference()
+    _trainer(tmp_path / "with", with_average).fit(Learner())
+    _trainer(tmp_path / "without", without, decay=None).fit(Learner())
+    torch.testing.assert_close(with_average.trained, without.trained, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("step", [1, STEPS, STEPS + 2])
+def test_a_run_cut_short_goes_on_as_if_nothing_had_happened(tmp_path: Path, step: int) -> None:
+    _trainer(tmp_path / "whole").fit(Learner())
+    with pytest.raises(SIGTERMException):
+        _trainer(tmp_path / "parts", end=step).fit(Learner())
+    last = tmp_path / "parts" / "last.ckpt"
+    assert _read(last)["global_step"] == step
+    torch.manual_seed(77)
+    _trainer(tmp_path / "parts").fit(Learner(), ckpt_path=last, weights_only=True)
+    found, expected = _read(last), _read(tmp_path / "whole" / "last.ckpt")
+    names = ("state_dict", "current_model_state", "averaging_state", "optimizer_states")
+    for part in (*names, "global_step"):
+        torch.testing.assert_close(found[part], expected[part], rtol=0, atol=0)
+    best, whole = (_read(tmp_path / name / "best.ckpt") for name in ("parts", "whole"))
+    torch.testing.assert_close(best["state_dict"], whole["state_dict"], rtol=0, atol=0)
+
+
+def test_the_untrained_state_can_be_resumed(tmp_path: Path) -> None:
+    class Untrained(Callback):
+        def on_train_batch_start(self, *_: Any) -> None:
+            raise KeyboardInterrupt
+
+    with pytest.raises(SystemExit):
+        _trainer(tmp_path / "parts", Untrained()).fit(Learner())
+    last = tmp_path / "parts" / "last.ckpt"
+    assert _read(last)["global_step"] == 0
+    _trainer(tmp_path / "parts").fit(Learner(), ckpt_path=last, weights_only=True)
+    _trainer(tmp_path / "whole").fit(Learner())
+    expected = _read(tmp_path / "whole" / "last.ckpt")["state_dict"]
+    torch.testing.assert_close(_read(last)["state_dict"], expected, rtol=0, atol=0)
+
+
+def test_a_later_validation_of_other_weights_gets_those(tmp_path: Path) -> None:
+    trainer, learner = _trainer(tmp_path), Learner()
+    trainer.fit(learner)
+    other = copy.deepcopy(Learner().state_dict())
+    learner.load_state_dict(other)
+    (figures,) = trainer.validate(learner, verbose=False)
+    (expected,) = _trainer(tmp_path, decay=None).validate(learner, verbose=False)
+    assert figures == expected
+    torch.testing.assert_close(learner.state_dict(), other, rtol=0, atol=0)
+
+
+@pytest.fixture
+def same_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lightning leaves variables behind that tell later processes that they are part of a run."""
+    for name in ("LOCAL_RANK", "NODE_RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT"):
+        monkeypatch.setenv(name, "")
+        monkeypatch.delenv(name)
+
+
+class Group(Callback):
+    def teardown(self, *_: Any, **__: Any) -> None:
+        torch.distributed.destroy_process_group()
+
+
+@pytest.mark.usefixtures("same_environment")
+def test_processes_average_as_one_does(tmp_path: Path) -> None:
+    reference = Reference()
+    strategy = DDPStrategy(process_group_backend="gloo")
+    _trainer(tmp_path, reference, Group(), strategy=strategy, devices=1).fit(Learner())
+    _assert_close(_read(tmp_path / "last.ckpt")["state_dict"], reference.average)
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning:torch")
+def test_a_compiled_network_is_averaged_under_its_usual_names(tmp_path: Path) -> None:
+    reference, learner = Reference(), Learner()
+    learner.network.compile(backend="aot_eager")
+    _trainer(tmp_path, reference, max_epochs=1).fit(learner)
+    _assert_close(_read(tmp_path / "best.ckpt")["state_dict"], reference.average)
+
+
+def test_the_average_is_on_the_device_of_the_training() -> None:
+    averaging = AveragedWeights(0.9)
+    trainer: Any = SimpleNamespace(strategy=SimpleNamespace(root_device=torch.device("meta")))
+    averaging.setup(trainer, Learner(), "fit")
+    assert averaging._average_model is not None
+    assert {p.device.type for p in averaging._average_model.parameters()} == {"meta"}
+
+
+def test_weights_of_half_precision_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(SettingError, match=r"trainer\.precision, with ema: found bf16-true"):
+        _trainer(tmp_path, precision="bf16-true").fit(Learner())
+
+
+@pytest.mark.parametrize("decay", [0.0, 1.0, 1, -0.5, float("nan"), "0.9", None, True])
+def test_impossible_decays_are_refused(decay: Any) -> None:
+    with pytest.raises(SettingError, match="ema: found"):
+        AveragedWeights(decay)
