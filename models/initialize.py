@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,12 +11,17 @@ from rich.table import Table
 from torch import Tensor, nn
 
 from models.pretrained import read_tensors
-from models.stem import with_channels
+from models.stem import of_channels, with_channels
 from tangent_train.errors import DataError
 
 __all__ = ["Origins", "initialize", "origins_table"]
 
+Channels = tuple[Sequence[str], Sequence[str]]
+"""Names of the channels of images, in a file and here."""
+
 _LISTED = 8
+_HELD = "network"
+"""What the modules of this package call the network they hold, `SphereContext` for one."""
 
 
 class Origins(NamedTuple):
@@ -37,11 +42,13 @@ class Origins(NamedTuple):
     unused: tuple[str, ...]
 
 
-def initialize(network: nn.Module, path: Path | str) -> Origins:
+def initialize(network: nn.Module, path: Path | str, channels: Channels | None = None) -> Origins:
     """Load what fits from a checkpoint, a state dict or a safetensors file, in place.
 
     Names are compared behind the prefix under which most of them are the network's (``module.``,
-    ``network.``, …), in the file or, where that has none, in the network. Of the first convolution,
+    ``model.net.``, …), in the file or, where that has none, in the network. ``network.`` counts
+    nowhere: a network fits into modules that hold one, as `SphereContext` and `AuxiliaryHead` do,
+    and out of them, their own tensors among themselves. Of the first convolution,
     filters of further input channels start at zero, so RGB-D begins as RGB; ones the network has no
     channel for are left out. Other tensors of another shape stay as they are: the last layer, for
     another number of classes.
@@ -49,6 +56,8 @@ def initialize(network: nn.Module, path: Path | str) -> Origins:
     Args:
         network: Into which.
         path: The file. Nothing but tensors and plain values is unpickled.
+        channels: Names of the channels of the images that the file's network takes, and of those
+            that this one takes: filters go by name. By default the first ones are the same.
 
     Raises:
         DataError: The file cannot be read, or nothing in it fits.
@@ -64,6 +73,8 @@ def initialize(network: nn.Module, path: Path | str) -> Origins:
         given = found.get(name)
         if given is None:
             fresh[name] = "not in the file"
+        elif name == stem and channels and _fits(given, tensor, channels):
+            loaded[name], adapted[name] = _by_channel(given, channels)
         elif given.shape == tensor.shape:
             loaded[name] = given
         elif name == stem and _differ_in_channels_only(given, tensor):
@@ -83,6 +94,25 @@ def initialize(network: nn.Module, path: Path | str) -> Origins:
     numbers = sum(tensor.numel() for tensor in own.values())
     share = sum(tensor.numel() for tensor in loaded.values()) / numbers
     return Origins(plain, share, adapted, fresh, tuple(name for name in found if name not in own))
+
+
+def _fits(given: Tensor, wanted: Tensor, channels: Channels) -> bool:
+    """Whether filters can and have to go by the names of their channels."""
+    counts = (given.shape[1], wanted.shape[1])
+    named = counts == (len(channels[0]), len(channels[1]))
+    return channels[0] != channels[1] and named and _differ_in_channels_only(given, wanted)
+
+
+def _by_channel(given: Tensor, channels: Channels) -> tuple[Tensor, str]:
+    """Filters for the channels wanted, and what became of the others."""
+    before, now = channels
+    places = {name: place for place, name in enumerate(before)}
+    new, lost = (
+        ", ".join(name for name in these if name not in those)
+        for these, those in ((now, before), (before, now))
+    )
+    notes = [f"starts at zero: {new}"] * bool(new) + [f"left out: {lost}"] * bool(lost)
+    return of_channels(given, [places.get(name) for name in now]), "; ".join(notes)
 
 
 def origins_table(origins: Origins, path: Path | str) -> Table:
@@ -105,7 +135,23 @@ def origins_table(origins: Origins, path: Path | str) -> Table:
 
 
 def _renamed(tensors: Mapping[str, Tensor], own: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The tensors by the network's names: behind, or with, the prefix under which most are its."""
+    """The tensors by the network's names, whatever modules hold the network here and there."""
+    inner, inner_own = ({_inner(name): name for name in names} for names in (tensors, own))
+    if len(inner) < len(tensors) or len(inner_own) < len(
+        own
+    ):  # names that only wrappers tell apart
+        return _by_prefix(tensors, own)
+    found = _by_prefix({name: tensors[full] for name, full in inner.items()}, inner_own)
+    return {inner_own.get(name, name): tensor for name, tensor in found.items()}
+
+
+def _inner(name: str) -> str:
+    """The name without the parts by which a network is called in modules that hold one."""
+    return ".".join(part for part in name.split(".") if part != _HELD)
+
+
+def _by_prefix(tensors: Mapping[str, Tensor], own: Iterable[str]) -> dict[str, Tensor]:
+    """The tensors by the names behind, or with, the prefix under which most are the network's."""
     prefix = _commonest(_prefixes(tensors, own))
     if prefix is not None:
         return {n.removeprefix(prefix): t for n, t in tensors.items() if n.startswith(prefix)}

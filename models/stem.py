@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor, nn
 
 from tangent_train.errors import SettingError
 
-__all__ = ["widen_stem", "with_channels"]
+__all__ = ["of_channels", "widen_stem", "with_channels"]
 
 _RGB = 3
 
@@ -56,3 +58,18 @@ def with_channels(weight: Tensor, channels: int) -> Tensor:
     further = max(0, channels - weight.shape[1])
     zeros = weight.new_zeros(weight.shape[0], further, *weight.shape[2:])
     return torch.cat([weight[:, :channels], zeros], dim=1)
+
+
+def of_channels(weight: Tensor, places: Sequence[int | None]) -> Tensor:
+    """Filters for these input channels.
+
+    Args:
+        weight: ``(out, in, h, w)``.
+        places: For every channel wanted, which one of `weight` it is; None for a new one, whose
+            filters are zero.
+
+    Returns:
+        ``(out, len(places), h, w)``.
+    """
+    zeros = torch.zeros_like(weight[:, 0])
+    return torch.stack([zeros if k is None else weight[:, k] for k in places], dim=1)

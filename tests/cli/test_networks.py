@@ -22,11 +22,17 @@ OF_SHAPES = {
 MAKER = {
     "deeplabv3_mobilenet": "torchvision.models.segmentation.deeplabv3.DeepLabV3",
     "fcn_resnet": "models.fcn_resnet.FCNResNet",
+    "fcn_resnet_context": "models.sphere_context.SphereContext",
     "hexunet": "models.hexunet.HexUNet",
     "smp_unet": "segmentation_models_pytorch.decoders.unet.model.Unet",
     "unet": "models.unet.UNet",
+    "unet_context": "models.sphere_context.SphereContext",
     "unet_small": "models.unet.UNet",
+    "unet_small_aux": "models.auxiliary_head.AuxiliaryHead",
+    "unet_small_context": "models.sphere_context.SphereContext",
+    "unet_small_sphere_rendering": "models.sphere_context.SphereContext",
 }
+DEPTH = {"fcn_resnet": "network.depth=50", "fcn_resnet_context": "network.network.depth=50"}
 
 
 def _composed(*overrides: str) -> DictConfig:
@@ -40,7 +46,7 @@ def test_every_network_is_tested() -> None:
 
 @pytest.mark.parametrize("network", sorted(MAKER))
 def test_every_network_takes_the_data_s_channels_and_classes(network: str) -> None:
-    shallow = ["network.depth=50"] if network == "fcn_resnet" else []
+    shallow = [DEPTH[network]] if network in DEPTH else []
     for inputs, channels in (("[rgb]", 3), ("[rgb,depth]", 4)):
         config = _composed(f"network={network}", f"data.inputs={inputs}", *shallow)
         _, task = build(config)
@@ -48,9 +54,33 @@ def test_every_network_takes_the_data_s_channels_and_classes(network: str) -> No
         assert f"{made.__module__}.{made.__name__}" == MAKER[network]
         scores = task(torch.randn(2, channels, 32, 32))
         assert scores.shape == (2, 14, 32, 32)
-    scores.square().mean().backward()
+    outputs = task.outputs(torch.randn(2, channels, 32, 32)).values()
+    sum(output.square().mean() for output in outputs).backward()
     unused = [name for name, p in task.named_parameters() if p.grad is None]
     assert not unused, "parameters without gradient"
+
+
+@pytest.mark.parametrize(
+    ("network", "stride", "channels", "classes"),
+    [
+        ("unet_context", 32, 256, 14),
+        ("unet_small_context", 16, 256, 14),
+        ("unet_small_aux", 16, 256, 14),
+    ],
+)
+def test_heads_and_context_are_at_the_deepest_features(
+    network: str, stride: int, channels: int, classes: int
+) -> None:
+    _, task = build(_composed(f"network={network}"))
+    seen: list[tuple[int, ...]] = []
+    head = next(m for n, m in task.named_modules() if n.endswith("auxiliary_head"))
+    head.register_forward_pre_hook(lambda _module, inputs: seen.append(tuple(inputs[0].shape)))
+    outputs = task.outputs(torch.randn(2, 4, 64, 96))
+    assert seen == [(2, channels, 64 // stride, 96 // stride)]
+    assert outputs["aux"].shape == (2, classes, 64 // stride, 96 // stride)
+    assert list(task.eval().outputs(torch.randn(2, 4, 64, 96))) == ["out"]
+    if network != "unet_small_aux":
+        assert task.network.mixer.norm.normalized_shape == (channels,)
 
 
 SHAPES = ("data=modelnet40", "data.root=nowhere", "task=classification")

@@ -10,11 +10,13 @@ from rich.console import Console
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
+from models import AuxiliaryHead, SphereContext, UNet
 from models.initialize import initialize, origins_table
 from tangent_train.errors import DataError
+from tests.models.sphere_networks import ATTENTION, STAGE, awake, small_unet
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
     from pathlib import Path
 
 
@@ -93,6 +95,36 @@ def test_channels_that_the_network_lacks_are_left_out(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("now", "places", "told"),
+    [
+        ("RGBDE", [0, 1, 2, 3, None], "starts at zero: E"),
+        ("RGBE", [0, 1, 2, None], "starts at zero: E; left out: D"),
+        ("RGBED", [0, 1, 2, None, 3], "starts at zero: E"),
+        ("RGB", [0, 1, 2], "left out: D"),
+    ],
+)
+def test_filters_go_by_the_names_of_their_channels(
+    tmp_path: Path, now: str, places: list[int | None], told: str
+) -> None:
+    rgbd, network = _network(4), _network(len(now))
+    torch.save(rgbd.state_dict(), tmp_path / "rgbd.pt")
+    origins = initialize(network, tmp_path / "rgbd.pt", (tuple("RGBD"), tuple(now)))
+    assert origins.adapted == {"0.weight": told}
+    before, after = rgbd.state_dict()["0.weight"], network.state_dict()["0.weight"]
+    for channel, place in enumerate(places):
+        expected = torch.zeros_like(before[:, 0]) if place is None else before[:, place]
+        torch.testing.assert_close(after[:, channel], expected, rtol=0, atol=0)
+
+
+def test_the_same_channels_need_no_adapting(tmp_path: Path) -> None:
+    rgbd, network = _network(4), _network(4)
+    torch.save(rgbd.state_dict(), tmp_path / "rgbd.pt")
+    origins = initialize(network, tmp_path / "rgbd.pt", (tuple("RGBD"), tuple("RGBD")))
+    assert not origins.adapted
+    assert origins.share == 1
+
+
 def test_what_does_not_fit_at_all_is_refused(tmp_path: Path) -> None:
     torch.save({"head.weight": torch.zeros(3)}, tmp_path / "other.pt")
     with pytest.raises(DataError, match=r"other\.pt: found no tensor that fits, but head\.weight"):
@@ -102,3 +134,69 @@ def test_what_does_not_fit_at_all_is_refused(tmp_path: Path) -> None:
         initialize(_network(), tmp_path / "broken.safetensors")
     with pytest.raises(DataError, match="no such file"):
         initialize(_network(), tmp_path / "nowhere.pt")
+
+
+def _wrapped(layers: str) -> nn.Module:
+    """A small UNet inside auxiliary heads (``a``) and contexts (``c``), the innermost first."""
+    network: nn.Module = small_unet()
+    stage = STAGE
+    for layer in layers:
+        if layer == "a":
+            network = AuxiliaryHead(network, stage, in_channels=3, num_classes=4)
+        else:
+            network = SphereContext(network, stage, ATTENTION, in_channels=3)
+        stage = f"network.{stage}"
+    return awake(network)
+
+
+def _kinds(names: Iterable[str]) -> set[str]:
+    """Which of the wrappers' own parts names belong to; others are the UNet's."""
+    parts = ("mixer", "auxiliary_head")
+    return {next((part for part in parts if part in name), "unet") for name in names}
+
+
+@pytest.mark.parametrize("saved", ["", "a", "c", "ac", "ca"])
+@pytest.mark.parametrize("wanted", ["", "a", "c", "ac", "ca"])
+@pytest.mark.parametrize("save", [torch.save, _save_checkpoint, _save_lightning])
+def test_networks_fit_into_each_others_wrappers(
+    save: Callable[[dict[str, Tensor], Path], None], saved: str, wanted: str, tmp_path: Path
+) -> None:
+    other, network = _wrapped(saved), _wrapped(wanted)
+    save(other.state_dict(), tmp_path / "other.ckpt")
+    origins = initialize(network, tmp_path / "other.ckpt")
+    part = {"a": "auxiliary_head", "c": "mixer"}
+    both = {part[layer] for layer in saved if layer in wanted}
+    assert _kinds(origins.loaded) == {"unet"} | both
+    assert _kinds(origins.fresh) == {part[layer] for layer in wanted if layer not in saved}
+    assert _kinds(origins.unused) == {part[layer] for layer in saved if layer not in wanted}
+    assert not origins.adapted
+    images = torch.randn(2, 3, 16, 16)
+    unets = [next(m for m in n.modules() if isinstance(m, UNet)).eval() for n in (other, network)]
+    assert torch.equal(unets[0](images), unets[1](images))
+    for name in both:
+        modules = [
+            next(m for full, m in n.named_modules() if full.rpartition(".")[2] == name)
+            for n in (other, network)
+        ]
+        torch.testing.assert_close(modules[0].state_dict(), modules[1].state_dict(), rtol=0, atol=0)
+
+
+def test_names_that_differ_in_wrappers_alone_are_told_apart(tmp_path: Path) -> None:
+    class Both(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.network = nn.ModuleDict({"head": nn.Conv2d(3, 4, 1)})
+            self.head = nn.Conv2d(3, 4, 1)
+
+    other, network = Both(), Both()
+    torch.save(other.state_dict(), tmp_path / "other.pt")
+    assert len(initialize(network, tmp_path / "other.pt").loaded) == 4
+    torch.testing.assert_close(network.state_dict(), other.state_dict(), rtol=0, atol=0)
+
+
+def test_the_first_convolution_is_that_of_the_network_inside(tmp_path: Path) -> None:
+    torch.save(_wrapped("").state_dict(), tmp_path / "rgb.pt")
+    rgbd = AuxiliaryHead(UNet(4, 4, (4, 6, 8)), STAGE, in_channels=4, num_classes=4)
+    context = SphereContext(rgbd, f"network.{STAGE}", ATTENTION, in_channels=4)
+    origins = initialize(context, tmp_path / "rgb.pt")
+    assert origins.adapted == {"network.network.stem.weight": "3 → 4 channels"}

@@ -1,0 +1,192 @@
+"""Attention over the sphere against its formula, written out slowly in float64."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from models import SphereAttention
+from models.sphere_attention import angular_attention
+from models.sphere_tokens import token_directions
+from tangent_train.errors import SettingError
+from tangent_train.geometry import random_rotation
+from tests.models.sphere_networks import awake, sphere_rays
+
+
+def _inputs(
+    images: int = 5, spheres: int = 2, channels: int = 12, size: tuple[int, int] = (2, 3)
+) -> tuple[Tensor, Tensor]:
+    """Tokens, and directions that differ from sphere to sphere."""
+    rays = torch.cat([sphere_rays(images).roll(shift, 1) for shift in range(spheres)])
+    if spheres > 1:
+        turn = torch.tensor(random_rotation(np.random.default_rng(1)), dtype=torch.float32)
+        rays = torch.cat([rays[:1], turn @ rays[1:]])
+    return torch.randn(spheres, images, channels, *size), token_directions(rays, *size)
+
+
+def _mixer(channels: int = 12, elevation: bool = False) -> SphereAttention:
+    mixer = SphereAttention(channels, heads=3, width=6, elevation=elevation)
+    awake(mixer)
+    torch.nn.init.uniform_(mixer.log_kappa, -2, 3)
+    return mixer.eval()
+
+
+def _slow(mixer: SphereAttention, tokens: Tensor, directions: Tensor) -> Tensor:
+    """The definition, one pair of tokens after the other."""
+    weights = {name: tensor.double() for name, tensor in mixer.state_dict().items()}
+    kappa = weights["log_kappa"].exp()
+    result = torch.zeros_like(tokens, dtype=torch.float64)
+    images, channels, rows, columns = tokens.shape[1:]
+    places = [(i, r, c) for i in range(images) for r in range(rows) for c in range(columns)]
+    for sphere, sphere_directions, out in zip(tokens, directions, result, strict=True):
+        x = torch.stack([sphere[i, :, r, c] for i, r, c in places]).double()
+        d = torch.stack([sphere_directions[i, :, r, c] for i, r, c in places]).double()
+        x = (x - x.mean(1, keepdim=True)) / (x.var(1, correction=0, keepdim=True) + 1e-5).sqrt()
+        x = x * weights["norm.weight"] + weights["norm.bias"]
+        if "elevation.weight" in weights:
+            x = x + d[:, 2:] * weights["elevation.weight"][:, 0]
+        projected = x @ weights["queries_keys_values.weight"].T
+        projected += weights["queries_keys_values.bias"]
+        q, k, v = projected.reshape(len(places), 3, mixer.heads, -1).unbind(1)
+        for i, place in enumerate(places):
+            heads = []
+            for head in range(mixer.heads):
+                logits = [
+                    float(q[i, head] @ k[j, head]) / math.sqrt(q.shape[-1])
+                    + float(kappa[head]) * (float(d[i] @ d[j]) - 1)
+                    for j in range(len(places))
+                ]
+                share = np.exp(logits) / np.exp(logits).sum()
+                heads.append(torch.tensor(share) @ v[:, head])
+            learned = weights["output.weight"] @ torch.cat(heads) + weights["output.bias"]
+            out[place[0], :, place[1], place[2]] = learned
+    assert result.shape[2] == channels
+    return result
+
+
+@pytest.mark.parametrize("elevation", [False, True])
+def test_it_computes_its_formula(elevation: bool) -> None:
+    mixer, (tokens, directions) = _mixer(elevation=elevation), _inputs()
+    expected = _slow(mixer, tokens, directions)
+    torch.testing.assert_close(mixer(tokens, directions).double(), expected, rtol=1e-4, atol=1e-5)
+    exact = mixer.double()(tokens.double(), directions)
+    torch.testing.assert_close(exact, expected, rtol=1e-6, atol=1e-6)
+
+
+def test_gradients_are_those_of_a_mask() -> None:
+    """The bias as a mask of torch's attention, which needs tokens × tokens of memory."""
+    queries, keys, values = torch.randn(3, 2, 3, 7, 5, dtype=torch.float64).unbind(0)
+    directions = functional.normalize(torch.randn(2, 7, 3, dtype=torch.float64), dim=-1)
+    kappa = torch.tensor([0.2, 3.0, 20.0], dtype=torch.float64)
+    leaves = [leaf.requires_grad_() for leaf in (queries, keys, values, kappa)]
+    weight = torch.randn_like(values)
+
+    def masked() -> Tensor:
+        cosine = (directions @ directions.mT)[:, None]
+        mask = kappa[:, None, None] * (cosine - 1)
+        return functional.scaled_dot_product_attention(queries, keys, values, attn_mask=mask)
+
+    found = angular_attention(queries, keys, values, directions, kappa)
+    torch.testing.assert_close(found, masked())
+    torch.testing.assert_close(
+        torch.autograd.grad((found * weight).sum(), leaves),
+        torch.autograd.grad((masked() * weight).sum(), leaves),
+    )
+    assert torch.autograd.gradcheck(angular_attention, (*leaves[:3], directions, kappa))
+
+
+def test_turning_all_directions_changes_nothing() -> None:
+    mixer, (tokens, directions) = _mixer(), _inputs()
+    turn = torch.tensor(random_rotation(np.random.default_rng(3)), dtype=torch.float32)
+    turned = torch.einsum("ab,snbrc->snarc", turn, directions)
+    expected = mixer(tokens, directions)
+    torch.testing.assert_close(mixer(tokens, turned), expected, rtol=1e-4, atol=1e-5)
+    assert not torch.allclose(mixer(tokens, directions.flip(1)), expected, atol=0.01)
+    with_elevation = _mixer(elevation=True)
+    difference = with_elevation(tokens, turned) - with_elevation(tokens, directions)
+    assert difference.abs().max() > 0.01
+
+
+def test_images_have_no_order_and_spheres_do_not_see_each_other() -> None:
+    mixer, (tokens, directions) = _mixer(), _inputs()
+    together = mixer(tokens, directions)
+    order = torch.tensor([3, 1, 4, 0, 2])
+    torch.testing.assert_close(mixer(tokens[:, order], directions[:, order]), together[:, order])
+    for sphere in range(2):
+        part = slice(sphere, sphere + 1)
+        torch.testing.assert_close(mixer(tokens[part], directions[part]), together[part])
+    fewer = mixer(tokens[:, :2], directions[:, :2])
+    assert not torch.allclose(fewer, together[:, :2], atol=0.01)
+
+
+def test_a_narrow_head_only_sees_what_looks_the_same_way() -> None:
+    mixer = SphereAttention(4, heads=1)
+    awake(mixer)
+    torch.nn.init.constant_(mixer.log_kappa, math.log(1e4))
+    tokens = torch.randn(1, 6, 4, 1, 1)
+    directions = torch.eye(3).repeat(2, 1)[None, :, :, None, None]
+    pairs = mixer(tokens[:, [0, 3]], directions[:, [0, 3]])
+    torch.testing.assert_close(mixer(tokens, directions)[:, [0, 3]], pairs)
+
+
+def test_it_starts_from_nothing_and_every_parameter_learns() -> None:
+    mixer, (tokens, directions) = SphereAttention(12, heads=3, elevation=True), _inputs()
+    assert not mixer(tokens, directions).any()
+    kappa = mixer.log_kappa.exp()
+    assert kappa[0] < 0.2
+    assert kappa[-1] > 20
+    torch.testing.assert_close(kappa[1] / kappa[0], kappa[2] / kappa[1])
+    target = torch.randn_like(tokens)
+    optimizer = torch.optim.SGD(mixer.parameters(), 0.1)
+    for _ in range(2):
+        optimizer.zero_grad()
+        loss: Any = functional.mse_loss(mixer(tokens, directions), target)
+        loss.backward()
+        optimizer.step()
+    for name, parameter in mixer.named_parameters():
+        assert parameter.grad is not None
+        assert parameter.grad.any(), name
+    assert not torch.equal(mixer.log_kappa.exp(), kappa)
+
+
+def test_half_precision_does_not_blur_directions() -> None:
+    mixer, (tokens, directions) = _mixer(), _inputs()
+    torch.nn.init.constant_(mixer.log_kappa, math.log(300.0))
+    expected = mixer(tokens, directions)
+    with torch.autocast("cpu", torch.bfloat16):
+        found = mixer(tokens, directions)
+    assert found.dtype == torch.bfloat16
+    torch.testing.assert_close(found.float(), expected, rtol=0.1, atol=0.1)
+    queries = torch.zeros(1, 1, 2, 4)
+    close = torch.tensor([[[1.0, 0, 0], [math.cos(0.05), math.sin(0.05), 0]]])
+    values = torch.tensor([[[[1.0, 0, 0, 0], [0, 1.0, 0, 0]]]])
+    with torch.autocast("cpu", torch.bfloat16):
+        share = angular_attention(queries, queries, values, close, torch.tensor([1000.0]))
+    expected_share = 1 / (1 + math.exp(1000 * (math.cos(0.05) - 1)))
+    assert float(share[0, 0, 0, 0]) == pytest.approx(expected_share, abs=1e-4)
+    whole = mixer.bfloat16()(tokens.bfloat16(), directions)
+    torch.testing.assert_close(whole.float(), expected, rtol=0.2, atol=0.2)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"heads": 0}, "heads of SphereAttention: found 0"),
+        ({"heads": 3, "width": 8}, "width of SphereAttention: found 8; .* multiple of its 3 heads"),
+        ({"width": 0}, "width of SphereAttention: found 0"),
+    ],
+)
+def test_impossible_sizes_are_refused(settings: dict[str, int], message: str) -> None:
+    with pytest.raises(SettingError, match=message):
+        SphereAttention(12, **settings)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("channels", "width"), [(4, 8), (20, 16), (100, 96), (2048, 128)])
+def test_width_is_that_of_the_tokens_up_to_a_limit(channels: int, width: int) -> None:
+    assert SphereAttention(channels, heads=8).output.in_features == width
