@@ -22,11 +22,13 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-__all__ = ["PanoramaArea", "area_of", "area_of_crop", "whole_area"]
+__all__ = ["NAMESPACE", "PanoramaArea", "area_of", "area_of_crop", "whole_area"]
 
 _Pixel = TypeVar("_Pixel", bound=np.generic)
 
-_NAMESPACE = "http://ns.google.com/photos/1.0/panorama/"
+NAMESPACE = "http://ns.google.com/photos/1.0/panorama/"
+"""Of all tags of the format."""
+
 _SIZES = (
     "FullPanoWidthPixels",
     "FullPanoHeightPixels",
@@ -148,7 +150,7 @@ def area_of(path: Path, size: tuple[int, int]) -> PanoramaArea | None:
     Raises:
         DataError: The file cannot be read, or the tags cannot be those of such an image.
     """
-    tags = read_xmp_tags(path, _NAMESPACE)
+    tags = read_xmp_tags(path, NAMESPACE)
     projection = tags.get("ProjectionType", "equirectangular")
     if projection != "equirectangular":
         raise DataError(
