@@ -138,7 +138,7 @@ def compare_samples(store: Stanford2D3DS, rounds: int) -> None:
     source = store.source("train")
 
     def sampler(representation: TangentRepresentation) -> Callable[[int], object]:
-        panoramas = TrainingImages(source, representation, 0)
+        panoramas = TrainingImages(source, representation, 0, ("rgb", "depth"))
         return lambda epoch: panoramas[epoch, epoch % len(panoramas)]
 
     few, everything = sampler(store.representation), sampler(whole)

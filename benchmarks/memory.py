@@ -85,14 +85,15 @@ def measure(panoramas: int, images_per_chunk: int | None, level: int) -> Step:
         enable_progress_bar=False,
         enable_model_summary=False,
     )
-    before = _peak_kib()
+    before = peak_kib()
     start = time.perf_counter()
     trainer.fit(task, DataLoader(samples, panoramas))
     seconds = (time.perf_counter() - start) / 3
-    return Step((_peak_kib() - before) / 1024, seconds)
+    return Step((peak_kib() - before) / 1024, seconds)
 
 
-def _peak_kib() -> int:
+def peak_kib() -> int:
+    """The peak of this process's memory so far, in KiB."""
     # Not getrusage: its peak is inherited from the process that started this one.
     status = Path("/proc/self/status").read_text()
     return int(status.partition("VmHWM:")[2].split()[0])

@@ -4,11 +4,17 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from lightning.pytorch.trainer.states import TrainerFn
 
-from datamodules.panoramas import FileSource, Panorama, Turn, TurnedPanoramas
+from datamodules.panoramas import (
+    FileSource,
+    Panorama,
+    Turn,
+    TurnedPanoramas,
+    UprightPanoramas,
+)
 from datamodules.segmentation_module import SPLITS, SegmentationDataModule, Split
 from datamodules.store import PreparedPanoramas, prepare_store
 from tangent_train.errors import SettingError
@@ -23,6 +29,9 @@ __all__ = ["PanoramaDataModule", "Split"]
 
 _HALF_TURN_DEG = 180
 
+Upright = Literal["pose", "auto"] | None
+"""Where it is known from which way is up in a panorama."""
+
 
 class PanoramaDataModule(SegmentationDataModule[Panorama]):
     """Panoramas of one data set.
@@ -35,6 +44,10 @@ class PanoramaDataModule(SegmentationDataModule[Panorama]):
         store: Folder of a prepared store, see `store`: panoramas are decoded once, then read from
             there. The samples are the same without.
         test_rotation: Turn the test panoramas: tilt in degrees, or `so3`, see `TurnedPanoramas`.
+        upright: Look at panoramas upright that are not. `pose`: those that say where up is (test
+            panoramas that `test_rotation` turned do). `auto`: as estimated from the image, up to
+            `max_tilt_deg`, see `UprightPanoramas`.
+        max_tilt_deg: The most that panoramas are tilted.
         **settings: All others of `SegmentationDataModule`.
 
     Attributes:
@@ -53,6 +66,8 @@ class PanoramaDataModule(SegmentationDataModule[Panorama]):
         panoramas_per_step: int = 4,
         store: str | Path | None = None,
         test_rotation: Turn = None,
+        upright: Upright = None,
+        max_tilt_deg: float = 45.0,
         **settings: Any,
     ) -> None:
         if not hasattr(representation, "erp_height"):
@@ -66,6 +81,12 @@ class PanoramaDataModule(SegmentationDataModule[Panorama]):
         self.erp_height = representation.erp_height
         self.store = None if store is None else Path(store)
         self.test_rotation = _checked_rotation(test_rotation)
+        if upright not in (None, "pose", "auto"):
+            raise SettingError("data.upright", found=upright, expected="null, pose or auto")
+        if not 0 < max_tilt_deg <= _HALF_TURN_DEG:
+            raise SettingError("data.max_tilt_deg", found=max_tilt_deg, expected="0 to 180")
+        self.upright = upright
+        self.max_tilt_deg = max_tilt_deg
 
     @abstractmethod
     def find_splits(self) -> Mapping[Split, FileSource]:
@@ -110,13 +131,16 @@ class PanoramaDataModule(SegmentationDataModule[Panorama]):
             prepare_store(list(sources.values()), whole=[sources[split] for split in whole])
 
     def opened(self, split: Split) -> ImageSource[Panorama]:
-        """The panoramas of one split: from the store, turned, if asked for."""
+        """The panoramas of one split: from the store, turned, looked at upright, if asked for."""
         files = self.open_split(split)
         source: ImageSource[Panorama] = files
         if self.store is not None:
             source = PreparedPanoramas(files, self.store)
         if split == "test" and self.test_rotation is not None:
-            source = TurnedPanoramas(source, self.test_rotation, self.seed)
+            known = self.upright == "pose"
+            source = TurnedPanoramas(source, self.test_rotation, self.seed, known=known)
+        if self.upright == "auto":
+            source = UprightPanoramas(source, self.max_tilt_deg)
         return source
 
 

@@ -18,6 +18,7 @@ from datamodules.sampling import sample_rng
 from datamodules.sources import ImageSource, count_labels
 from tangent_train.geometry import random_rotation, rotation_about
 from tangent_train.rendering import rotate_equirect
+from tangent_train.rendering.gravity import estimate_up, upright_rotation
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -34,6 +35,7 @@ __all__ = [
     "Panorama",
     "Turn",
     "TurnedPanoramas",
+    "UprightPanoramas",
     "mask_black",
     "meters_to_steps",
     "resize_area",
@@ -62,6 +64,7 @@ class Panorama(NamedTuple):
         depth: ``(H, W)`` uint16 distance from the centre in steps of 1/512 m, 0 where missing; or
             None. See `steps_to_meters`.
         labels: ``(H, W)`` uint8, 0 where unknown.
+        up: ``(3,)`` direction of the zenith, a unit vector; None where it is z, as it should be.
 
     The arrays may be shared or read-only: not to be written to.
     """
@@ -69,10 +72,13 @@ class Panorama(NamedTuple):
     rgb: NDArray[np.uint8]
     depth: NDArray[np.uint16] | None
     labels: NDArray[np.uint8]
+    up: NDArray[np.float64] | None = None
 
     def sampler(self, representation: Representation) -> Sampler:
-        """What draws its views: the representation, which is the same for all panoramas."""
-        return representation
+        """What draws its views: the representation, brought upright."""
+        if self.up is None:
+            return representation
+        return representation.turned(upright_rotation(self.up))
 
     def target(self, representation: Representation) -> NDArray[np.uint8]:
         """All labels: predictions are rendered back to the panorama."""
@@ -184,14 +190,21 @@ class TurnedPanoramas:
         rotation: Tilt in degrees about a random horizontal axis, after a random turn about the
             vertical; or `so3`, uniform over all rotations.
         seed: Seed of the turns.
+        known: Whether the panoramas say where up is, as those of a camera with a sensor for it.
     """
 
     def __init__(
-        self, source: ImageSource[Panorama], rotation: float | Literal["so3"], seed: int
+        self,
+        source: ImageSource[Panorama],
+        rotation: float | Literal["so3"],
+        seed: int,
+        *,
+        known: bool = False,
     ) -> None:
         self._source = source
         self._rotation = rotation
         self._seed = seed
+        self._known = known
 
     def __len__(self) -> int:
         return len(self._source)
@@ -213,17 +226,50 @@ class TurnedPanoramas:
 
     def read(self, index: int) -> Panorama:
         """One turned panorama: RGB bilinear, depth and labels nearest."""
-        rgb, depth, labels = self._source.read(index)
+        rgb, depth, labels, _ = self._source.read(index)
         rotation = self.rotation(index)
         return Panorama(
             rotate_equirect(rgb, rotation, "bilinear"),
             None if depth is None else rotate_equirect(depth, rotation, "nearest"),
             rotate_equirect(labels, rotation, "nearest"),
+            rotation[:, 2] if self._known else None,
         )
 
     def label_counts(self, index: int) -> NDArray[np.int64]:
         """The pixels of every label of one turned panorama."""
         return count_labels(self.read(index).labels)
+
+
+class UprightPanoramas:
+    """The panoramas of another source with an estimate of where up is.
+
+    They are looked at upright, whatever way the camera was held; their pixels and labels stay where
+    they are.
+
+    Args:
+        source: Where they come from.
+        max_tilt_deg: The most they may be tilted, see `estimate_up`.
+    """
+
+    def __init__(self, source: ImageSource[Panorama], max_tilt_deg: float) -> None:
+        self._source = source
+        self._max_tilt_deg = max_tilt_deg
+
+    def __len__(self) -> int:
+        return len(self._source)
+
+    def name(self, index: int) -> str:
+        """The name in the source."""
+        return self._source.name(index)
+
+    def read(self, index: int) -> Panorama:
+        """One panorama; up is that of the image, or z where nothing says it."""
+        panorama = self._source.read(index)
+        return panorama._replace(up=estimate_up(panorama.rgb, self._max_tilt_deg).up)
+
+    def label_counts(self, index: int) -> NDArray[np.int64]:
+        """The pixels of every label."""
+        return self._source.label_counts(index)
 
 
 def steps_to_meters(steps: NDArray[np.uint16]) -> NDArray[np.float32]:

@@ -52,6 +52,14 @@ class PhotoDataModule(SegmentationDataModule[Photo]):
                 remedy="Choose representation=perspective, or panoramas, as data=synthrooms.",
             )
         super().__init__(representation, photos_per_step, **settings)
+        if "elevation" in self.inputs:
+            raise SettingError(
+                "data.inputs",
+                found=list(self.inputs),
+                expected="no elevation: nobody knows where the horizon of a photo is",
+                remedy="Train on photos without it, then on panoramas with it and init_from=…: "
+                "its filters start at zero.",
+            )
 
     def check_camera(
         self, path: Path, camera_matrix: NDArray[np.float64], size: tuple[int, int]

@@ -34,6 +34,11 @@ class Photo(NamedTuple):
     labels: NDArray[np.uint8]
     camera_matrix: NDArray[np.float64]
 
+    @property
+    def up(self) -> None:
+        """Not known."""
+        return
+
     def sampler(self, representation: PerspectiveRepresentation) -> PhotoSampler:
         """What draws its crops, which depend on its camera."""
         height, width = self.labels.shape

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -16,32 +17,52 @@ from datamodules.colors import jitter_colors
 from datamodules.panoramas import STEPS_PER_M
 from datamodules.sampling import Seed, sample_rng
 from tangent_train.errors import SettingError
+from tangent_train.geometry import equirect_elevations
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from datamodules.sources import ImageSource, LabelledImage
+    from datamodules.sources import ImageSource, LabelledImage, ShownImage
     from tangent_train.rendering.representation import Views
 
 __all__ = [
+    "INPUT_CHANNELS",
     "RGBD_NORMALIZATION",
     "RGB_NORMALIZATION",
     "EvaluationImages",
     "EvaluationSample",
+    "Input",
     "Inputs",
     "Normalization",
     "TrainingImages",
     "TrainingSample",
+    "channel_names",
     "collate",
     "normalize",
     "render_inputs",
 ]
 
+Input = Literal["rgb", "depth", "validity", "elevation"]
+"""What a network may be shown of an image; see `INPUT_CHANNELS`."""
+
+INPUT_CHANNELS: dict[Input, int] = {"rgb": 3, "depth": 1, "validity": 1, "elevation": 1}
+"""Channels of every input, in the order of the channels of an image.
+
+* `rgb` and `depth` are normalized.
+* `validity`: 1 where depth is known and 0 where it is missing.
+* `elevation`: the sine of the angle between a pixel's ray and the horizon, −1 (down) to 1 (up).
+"""
+
+_COLORS = ("red", "green", "blue")
+
+_RENDERED: tuple[Input, ...] = ("rgb", "depth", "elevation")
+"""What is rendered; the validity is where there is depth."""
+
 MAX_DEPTH_M = 4.0
 """Depth is clipped to this (released code of the paper)."""
 
 Inputs = Sequence[Tensor]
-"""RGB and perhaps depth as they were rendered, see `TrainingSample`."""
+"""RGB, perhaps depth and elevation as they were rendered, see `TrainingSample`."""
 
 _Images = TypeVar("_Images", Inputs, Tensor)
 _Sample = TypeVar("_Sample", "TrainingSample[Inputs]", "EvaluationSample[Inputs]")
@@ -96,54 +117,75 @@ RGBD_NORMALIZATION = Normalization(
 """Stanford2D3DS with depth (ugscnn, used by the released code of the paper)."""
 
 
-def normalize(inputs: Sequence[Tensor], normalization: Normalization) -> Tensor:
+def channel_names(inputs: Sequence[Input]) -> tuple[str, ...]:
+    """The channels of an image of these inputs by name, colours apart.
+
+    >>> channel_names(["rgb", "depth"])
+    ('red', 'green', 'blue', 'depth')
+    """
+    return tuple(name for each in inputs for name in (_COLORS if each == "rgb" else (each,)))
+
+
+def normalize(
+    rendered: Sequence[Tensor], normalization: Normalization, inputs: Sequence[Input]
+) -> Tensor:
     """What a network takes, channels first.
 
     Args:
-        inputs: RGB ``(..., h, w, 3)`` uint8, and perhaps depth ``(..., h, w)`` in steps of 1/512 m,
-            0 where missing, at most `MAX_DEPTH_M`.
-        normalization: Of as many channels as there are.
+        rendered: RGB ``(..., h, w, 3)`` uint8; with depth ``(..., h, w)`` in steps of 1/512 m, 0
+            where missing, at most `MAX_DEPTH_M`; with elevation ``(..., h, w)`` float32.
+        normalization: Of RGB and depth.
+        inputs: What the network takes, in the order of `INPUT_CHANNELS`.
 
     Returns:
-        ``(..., 3 or 4, h, w)`` float32, on the same device.
+        ``(..., C, h, w)`` float32, on the same device.
 
     Raises:
         SettingError: The normalization is one of other channels.
     """
-    rgb, *depth = inputs
-    channels = 3 + len(depth)
-    if normalization.channels != channels:
+    parts = dict(zip([name for name in _RENDERED if name in inputs], rendered, strict=True))
+    measured = 3 + ("depth" in parts)
+    if normalization.channels != measured:
         raise SettingError(
             "normalization",
             found=f"{normalization.channels} channels",
-            expected=f"{channels}, as the inputs have",
+            expected=f"{measured}, as the inputs have",
         )
+    rgb = parts["rgb"]
     *batch, height, width, _ = rgb.shape
+    channels = sum(INPUT_CHANNELS[name] for name in inputs)
     images = rgb.new_empty((*batch, channels, height, width), dtype=torch.float32)
     images[..., :3, :, :] = rgb.movedim(-1, -3)
-    for steps in depth:
-        images[..., 3, :, :] = steps
+    if "depth" in parts:
+        images[..., 3, :, :] = parts["depth"]
     # One multiplication and one addition per value: (v / unit − mean) / std.
-    unit = [255] * 3 + [STEPS_PER_M] * len(depth)
+    unit = [255] * 3 + [STEPS_PER_M] * (measured - 3)
     scale = zip(unit, normalization.mean, normalization.std, strict=True)
     values = images.new_tensor([(1 / (step * std), mean / std) for step, mean, std in scale])
     factor, offset = values.T[..., None, None]
-    return images.mul_(factor).sub_(offset)
+    images[..., :measured, :, :].mul_(factor).sub_(offset)
+    if "validity" in inputs:
+        images[..., measured, :, :] = parts["depth"] > 0
+    if "elevation" in inputs:
+        images[..., -1, :, :] = parts["elevation"]
+    return images
 
 
 class TrainingSample(NamedTuple, Generic[_Images]):
     """One panorama or photo seen through P images; collated, each has a leading batch dimension.
 
     Attributes:
-        images: From the loader what was rendered, RGB ``(P, h, w, 3)`` uint8 and perhaps depth
-            ``(P, h, w)`` int16: a third of the bytes. On the device `normalize` makes them
-            ``(P, C, h, w)`` float32.
+        images: From the loader what was rendered, RGB ``(P, h, w, 3)`` uint8, perhaps depth
+            ``(P, h, w)`` int16 and elevation ``(P, h, w)`` float32: fewer bytes. On the device
+            `normalize` makes them ``(P, C, h, w)`` float32.
         labels: ``(P, h, w)`` uint8, 0 where unknown.
+        rays: ``(P, 3, 3)`` float32 where the images look, see `Views.rays`; or ``(0, 3, 3)``.
         index: Place in its split.
     """
 
     images: _Images
     labels: Tensor
+    rays: Tensor
     index: int  # type: ignore[assignment]  # nobody needs tuple.index
 
 
@@ -154,11 +196,15 @@ class EvaluationSample(NamedTuple, Generic[_Images]):
         images: N images of all of it, as in `TrainingSample`.
         target: uint8 labels, 0 where unknown: ``(H, W)`` of the panorama itself; ``(N, h, w)`` of
             the crops of a photo.
+        rays: As in `TrainingSample`.
+        rotations: ``(K, 3, 3)`` float64, see `Views.rotations`.
         index: Place in its split.
     """
 
     images: _Images
     target: Tensor
+    rays: Tensor
+    rotations: Tensor
     index: int  # type: ignore[assignment]  # nobody needs tuple.index
 
 
@@ -169,6 +215,7 @@ class TrainingImages(Dataset[TrainingSample[Inputs]]):
         source: The images.
         representation: What the network sees of them.
         seed: Seed of the run, 0 or more.
+        inputs: What the network is shown, see `INPUT_CHANNELS`.
         color_jitter: Strength of the colour augmentation, 0 to 1, see `jitter_colors`.
     """
 
@@ -177,11 +224,13 @@ class TrainingImages(Dataset[TrainingSample[Inputs]]):
         source: ImageSource[LabelledImage],
         representation: Any,
         seed: Seed,
+        inputs: Sequence[Input],
         color_jitter: float = 0.0,
     ) -> None:
         self._source = source
         self._representation = representation
         self._seed = seed
+        self._inputs = inputs
         self._color_jitter = color_jitter
 
     def __len__(self) -> int:
@@ -192,12 +241,13 @@ class TrainingImages(Dataset[TrainingSample[Inputs]]):
         image = self._source.read(index)
         rng = sample_rng(self._seed, epoch, index)
         views = image.sampler(self._representation).sample(rng)
-        rgb, *depth = render_inputs(image.rgb, image.depth, views)
+        rgb, *others = render_inputs(image, views, self._inputs)
         if self._color_jitter:
             rgb = jitter_colors(rgb, self._color_jitter, rng)
         return TrainingSample(
-            (rgb, *depth),
+            (rgb, *others),
             _tensor(views.render(image.labels, "nearest")),
+            torch.from_numpy(views.rays()),
             index,
         )
 
@@ -208,11 +258,15 @@ class EvaluationImages(Dataset[EvaluationSample[Inputs]]):
     Args:
         source: The images.
         representation: What the network sees of them.
+        inputs: What it is shown, see `INPUT_CHANNELS`.
     """
 
-    def __init__(self, source: ImageSource[LabelledImage], representation: Any) -> None:
+    def __init__(
+        self, source: ImageSource[LabelledImage], representation: Any, inputs: Sequence[Input]
+    ) -> None:
         self._source = source
         self._representation = representation
+        self._inputs = inputs
 
     def __len__(self) -> int:
         return len(self._source)
@@ -221,9 +275,13 @@ class EvaluationImages(Dataset[EvaluationSample[Inputs]]):
         _, index = key
         image = self._source.read(index)
         views = image.sampler(self._representation).whole()
-        images = render_inputs(image.rgb, image.depth, views)
-        target = image.target(self._representation)
-        return EvaluationSample(images, torch.tensor(target), index)
+        return EvaluationSample(
+            render_inputs(image, views, self._inputs),
+            torch.tensor(image.target(self._representation)),
+            torch.from_numpy(views.rays()),
+            torch.tensor(views.rotations()),
+            index,
+        )
 
 
 def collate(samples: list[_Sample]) -> _Sample:
@@ -233,31 +291,43 @@ def collate(samples: list[_Sample]) -> _Sample:
     """
     if len(samples) > 1:
         return default_collate(samples)
-    images, labels, index = samples[0]
+    images, *tensors, index = samples[0]
     kind: Any = type(samples[0])
-    return kind([image[None] for image in images], labels[None], torch.tensor([index]))
+    batched = [tensor[None] for tensor in tensors]
+    return kind([image[None] for image in images], *batched, torch.tensor([index]))
 
 
-def render_inputs(
-    rgb: NDArray[np.uint8], depth: NDArray[np.uint16] | None, views: Views
-) -> tuple[Tensor, ...]:
+def render_inputs(image: ShownImage, views: Views, inputs: Sequence[Input]) -> tuple[Tensor, ...]:
     """What a network is shown of an image, before `normalize`.
 
     Args:
-        rgb: ``(H, W, 3)``.
-        depth: ``(H, W)`` in steps of 1/512 m, 0 where missing; or None.
+        image: It, with depth where that is an input.
         views: Where it looks.
+        inputs: See `INPUT_CHANNELS`.
 
     Returns:
-        RGB ``(n, h, w, 3)`` uint8 and, with depth, ``(n, h, w)`` int16 steps up to `MAX_DEPTH_M`.
+        RGB ``(n, h, w, 3)`` uint8; with depth, ``(n, h, w)`` int16 steps up to `MAX_DEPTH_M`; with
+        elevation, ``(n, h, w)`` float32.
     """
-    colors = _tensor(views.render(rgb, "bilinear"))
-    if depth is None:
-        return (colors,)
-    steps = np.minimum(views.render(depth, "nearest"), int(MAX_DEPTH_M * STEPS_PER_M))
-    return colors, torch.from_numpy(steps.view(np.int16))  # torch hardly knows uint16
+    rendered = [_tensor(views.render(image.rgb, "bilinear"))]
+    if "depth" in inputs and image.depth is not None:
+        steps = np.minimum(views.render(image.depth, "nearest"), int(MAX_DEPTH_M * STEPS_PER_M))
+        rendered.append(torch.from_numpy(steps.view(np.int16)))  # torch hardly knows uint16
+    if "elevation" in inputs:
+        shape = (image.rgb.shape[0], image.rgb.shape[1])
+        upright = image.up is None
+        elevations = _upright_elevations(shape) if upright else equirect_elevations(shape, image.up)
+        rendered.append(_tensor(views.render(elevations, "bilinear")))
+    return tuple(rendered)
 
 
-def _tensor(array: NDArray[np.uint8]) -> Tensor:
+@lru_cache(maxsize=2)
+def _upright_elevations(shape: tuple[int, int]) -> NDArray[np.float32]:
+    elevations = equirect_elevations(shape)
+    elevations.setflags(write=False)
+    return elevations
+
+
+def _tensor(array: NDArray[Any]) -> Tensor:
     # What is rendered may be the panorama itself, shared or a read-only file: that is copied.
     return torch.from_numpy(array) if array.flags.owndata else torch.tensor(array)

@@ -9,9 +9,11 @@ import numpy as np
 
 from datamodules.class_weights import ClassWeights, class_weights
 from datamodules.samples import (
+    INPUT_CHANNELS,
     RGB_NORMALIZATION,
     RGBD_NORMALIZATION,
     EvaluationImages,
+    Input,
     Normalization,
     TrainingImages,
     collate,
@@ -28,7 +30,6 @@ if TYPE_CHECKING:
 
 __all__ = ["SPLITS", "SegmentationDataModule", "Split"]
 
-_INPUTS = (("rgb",), ("rgb", "depth"))
 _Image = TypeVar("_Image", bound=LabelledImage)
 
 
@@ -41,14 +42,14 @@ class SegmentationDataModule(SplitDataModule[ImageSource[_Image]], Generic[_Imag
     Args:
         representation: What the network sees of an image.
         images_per_step: Images per training step and process. Evaluation takes one at a time.
-        inputs: `rgb`, or `rgb` and `depth`.
+        inputs: What the network is shown, `rgb` and perhaps others of `INPUT_CHANNELS`.
         color_jitter: Strength of the colour augmentation, 0 (none) to 1, see `jitter_colors`.
-        normalization: Of the input channels; by default that of Stanford2D3DS.
+        normalization: Of RGB and depth; by default that of Stanford2D3DS.
         **settings: All others of `SplitDataModule`.
 
     Attributes:
-        inputs: As given.
-        in_channels: 3, or 4 with depth.
+        inputs: As given, in the order of the channels.
+        in_channels: Of all inputs together.
         normalization: As given, or the default.
 
     Raises:
@@ -62,24 +63,21 @@ class SegmentationDataModule(SplitDataModule[ImageSource[_Image]], Generic[_Imag
         representation: Any,
         images_per_step: int,
         *,
-        inputs: Sequence[str] = ("rgb", "depth"),
+        inputs: Sequence[Input] = ("rgb", "depth"),
         color_jitter: float = 0.0,
         normalization: Normalization | None = None,
         **settings: Any,
     ) -> None:
-        self.inputs = tuple(inputs)
-        if self.inputs not in _INPUTS:
-            raise SettingError(
-                "data.inputs", found=list(self.inputs), expected="[rgb] or [rgb, depth]"
-            )
+        self.inputs = checked_inputs(inputs)
         default = RGBD_NORMALIZATION if self.with_depth else RGB_NORMALIZATION
         super().__init__(representation, images_per_step, normalization or default, **settings)
-        if self.in_channels != default.channels:
+        if self.normalization.channels != default.channels:
             raise SettingError(
                 "data.normalization",
-                found=f"{self.in_channels} channels",
+                found=f"{self.normalization.channels} channels",
                 expected=f"{default.channels}, for data.inputs={list(self.inputs)}",
             )
+        self.in_channels = sum(INPUT_CHANNELS[name] for name in self.inputs)
         if not isinstance(color_jitter, int | float) or not 0 <= color_jitter <= 1:
             raise SettingError("data.color_jitter", found=color_jitter, expected="0 to 1")
         self.color_jitter = color_jitter
@@ -105,15 +103,17 @@ class SegmentationDataModule(SplitDataModule[ImageSource[_Image]], Generic[_Imag
     def training_samples(self) -> TrainingImages:
         """Samples `TrainingSample`."""
         source = self.source("train")
-        return TrainingImages(source, self.representation, self.drawn_from, self.color_jitter)
+        return TrainingImages(
+            source, self.representation, self.drawn_from, self.inputs, self.color_jitter
+        )
 
     def evaluation_samples(self, split: Split) -> EvaluationImages:
         """Samples `EvaluationSample`."""
-        return EvaluationImages(self.source(split), self.representation)
+        return EvaluationImages(self.source(split), self.representation, self.inputs)
 
     def normalized(self, batch: Any) -> Tensor:
         """The images of a `TrainingSample` or `EvaluationSample`."""
-        return normalize(batch.images, self.normalization)
+        return normalize(batch.images, self.normalization, self.inputs)
 
     def collate(self) -> Callable[[list[Any]], Any]:
         """One sample alone is not copied."""
@@ -134,3 +134,20 @@ class SegmentationDataModule(SplitDataModule[ImageSource[_Image]], Generic[_Imag
             for found in in_threads(source.label_counts, len(source)):
                 counts += found[: len(counts)]
         return class_weights(counts, kind)
+
+
+def checked_inputs(inputs: Sequence[Input]) -> tuple[Input, ...]:
+    """Names of inputs in the order of their channels.
+
+    Raises:
+        SettingError: One is unknown or there twice, RGB is missing, or validity is without depth.
+    """
+    ordered = tuple(name for name in INPUT_CHANNELS if name in inputs)
+    known = sorted(ordered) == sorted(inputs)
+    if not known or "rgb" not in inputs or ("validity" in inputs and "depth" not in inputs):
+        raise SettingError(
+            "data.inputs",
+            found=list(inputs),
+            expected="rgb, perhaps depth, elevation and, with depth, validity",
+        )
+    return ordered

@@ -118,7 +118,7 @@ class EvaluationShapes(Dataset[ShapeSample]):
         """The views of a turned shape: turned back, they see of the sphere what it shows them."""
         grid = getattr(self._representation, "grid", None)
         if grid is None:
-            return EquirectViews(rotation)
+            return EquirectViews(rotation.T)
         return PinholeViews(grid.with_rotation(rotation.T))
 
 

@@ -15,11 +15,18 @@ if TYPE_CHECKING:
 
     from tangent_train.rendering.representation import Sampler
 
-__all__ = ["ImageSource", "LabelledImage", "RememberedImages", "count_labels", "in_threads"]
+__all__ = [
+    "ImageSource",
+    "LabelledImage",
+    "RememberedImages",
+    "ShownImage",
+    "count_labels",
+    "in_threads",
+]
 
 
-class LabelledImage(Protocol):
-    """A panorama or a photo: a named tuple of arrays, not to be written to."""
+class ShownImage(Protocol):
+    """What a network is shown views of."""
 
     @property
     def rgb(self) -> NDArray[np.uint8]:
@@ -33,6 +40,15 @@ class LabelledImage(Protocol):
         None where the data set has, or is asked for, none.
         """
         ...
+
+    @property
+    def up(self) -> NDArray[np.float64] | None:
+        """``(3,)`` direction of the zenith in a panorama; None where that is z, and in photos."""
+        ...
+
+
+class LabelledImage(ShownImage, Protocol):
+    """A panorama or a photo: a named tuple of arrays, not to be written to."""
 
     @property
     def labels(self) -> NDArray[np.uint8]:

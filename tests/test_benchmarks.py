@@ -1,10 +1,12 @@
 from __future__ import annotations
 
 import re
+import runpy
+import sys
 
 import pytest
 
-from benchmarks import keypoints, loader, memory, rendering, training
+from benchmarks import costs, keypoints, loader, memory, rendering, training
 
 
 @pytest.mark.slow
@@ -54,3 +56,40 @@ def test_the_keypoint_benchmark_finds_keypoints_in_all_ways(
     counts = re.findall(r"(\d+) keypoints +[\d.]+ ms", capsys.readouterr().out)
     assert len(counts) == 8
     assert min(map(int, counts)) > 100
+
+
+@pytest.mark.slow
+def test_the_costs_are_those_of_what_was_added(capsys: pytest.CaptureFixture[str]) -> None:
+    costs.main(["--quick"])
+    found = re.findall(
+        r"^  (.+?) +([\d,]+) parameters +([\d.]+) ms +([\d.]+)× +(\d+) MiB$",
+        capsys.readouterr().out,
+        re.MULTILINE,
+    )
+    assert [name for name, *_ in found] == list(costs.ADDITIONS)
+    parameters = {name: int(count.replace(",", "")) for name, count, *_ in found}
+    plain, head, attention = (
+        parameters[name] for name in ("plain", "auxiliary head", "auxiliary head, attention")
+    )
+    assert plain < head < attention
+    assert parameters["elevation"] == plain + 3 * 3 * 16, "one more plane of the first convolution"
+    assert parameters["Lovász"] == parameters["average of the weights"] == plain
+    assert float(found[0][3]) == 1
+    assert min(float(milliseconds) for _, _, milliseconds, *_ in found) > 0
+    mebibytes = {name: int(memory) for name, *_, memory in found}
+    assert mebibytes["10 images at once"] <= 1.1 * mebibytes["plain"]
+
+
+def test_one_benchmark_is_run_by_its_name(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def run(*arguments: str) -> None:
+        monkeypatch.setattr(sys, "argv", ["benchmarks", *arguments])
+        runpy.run_module("benchmarks", run_name="__main__")
+
+    with pytest.raises(SystemExit, match="found 'speed'; expected one of rendering,"):
+        run("speed")
+    with pytest.raises(SystemExit) as ended:
+        run("accuracy", "--help")
+    assert ended.value.code == 0
+    assert "few_attention_so3" in capsys.readouterr().out.replace("\n", "")

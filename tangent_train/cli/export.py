@@ -87,7 +87,7 @@ def _opset(given: Any) -> int | None:
 
 def _summary(written: Export, output: Path) -> str:
     trained = written.trained
-    channels, classes = trained.normalization.channels, len(trained.class_names)
+    channels, classes = trained.in_channels, len(trained.class_names)
     if trained.fixed_size is not None:
         sides = "×".join(map(str, trained.fixed_size))
     elif trained.size_multiple > 1:

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 
 __all__ = ["predict"]
 
-_KEPT = ("checkpoint", "projection", "level", "base_level", "blend", "rotations")
+_KEPT = ("checkpoint", "projection", "level", "base_level", "blend", "rotations", "upright")
 """What results that are gone on with have to agree in."""
 
 
@@ -153,7 +153,7 @@ def _labeller(settings: PredictSettings, trained: TrainedNetwork) -> Labeller:
     if settings.projection == "perspective":
         return PhotoLabeller(PhotoPredictor(*seen), names, settings.fov, depth)
     predictor = PanoramaPredictor(*seen, settings.rotations)
-    return PanoramaLabeller(predictor, names, settings.crop, depth)
+    return PanoramaLabeller(predictor, names, settings.crop, depth, settings.upright)
 
 
 def _depth(settings: PredictSettings, trained: TrainedNetwork) -> DepthFolder | None:

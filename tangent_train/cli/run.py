@@ -20,12 +20,14 @@ from lightning.pytorch.utilities.exceptions import SIGTERMException
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
+from datamodules.samples import channel_names
 from models.initialize import initialize, origins_table
 from tangent_train.cli.build import build
 from tangent_train.cli.resume import check_resumed
 from tangent_train.cli.sweep import OBJECTIVE_FILE
 from tangent_train.errors import SettingError
 from tangent_train.files import write_text
+from tangent_train.tasks.averaging import AveragedWeights
 from tangent_train.tasks.callbacks import ProgressBar
 from tangent_train.tasks.checkpoints import (
     AtomicCheckpointIO,
@@ -34,7 +36,7 @@ from tangent_train.tasks.checkpoints import (
     best_checkpoint,
 )
 from tangent_train.tasks.tensorboard_pictures import TrainingSpeed
-from tangent_train.tasks.trained import read_checkpoint
+from tangent_train.tasks.trained import inputs_in, read_checkpoint, stored_inputs
 
 __all__ = ["build", "evaluate", "prepare", "train"]
 
@@ -59,11 +61,14 @@ def train(config: DictConfig) -> float | None:
         check_resumed(_resolved(config), read_checkpoint(resumed)["resolved_config"])
     data, task = build(config)
     if config.init_from is not None and resumed is None:
-        origins = initialize(task.network, config.init_from)
+        channels = _channels(Path(config.init_from), data)
+        origins = initialize(task.network, config.init_from, channels)
         rank_zero_only(_console().print)(origins_table(origins, config.init_from))
     write_text(folder / "config.yaml", OmegaConf.to_yaml(config, resolve=True))
     last = LastCheckpoint(checkpoints, config.checkpoint_every_n_steps)
     callbacks = [last, LearningRateMonitor()]
+    if config.get("ema") is not None:  # configs of older runs do not have it
+        callbacks.append(AveragedWeights(config.ema))
     if data.validation_fraction:
         callbacks.append(best_checkpoint(checkpoints, task.monitor))
     trainer = _trainer(config, folder, data, task, callbacks)
@@ -133,7 +138,7 @@ def _trainer(
         "config": OmegaConf.to_container(config),
         "resolved_config": _resolved(config),
         "class_names": list(data.class_names),
-        "normalization": _plain_normalization(data),
+        **_shown(data),
     }
     common = [CheckpointContents(contents), *task.pictures(folder, config)]
     common += [TrainingSpeed(), ProgressBar()]
@@ -178,7 +183,9 @@ def _test(trainer: lightning.Trainer, task: Any, data: Any, checkpoint: Path, fo
 
 def _check_fits(content: dict[str, Any], data: Any, checkpoint: Path) -> None:
     """Refuse data whose labels or inputs mean something else to the network."""
-    own = {"class_names": list(data.class_names), "normalization": _plain_normalization(data)}
+    own = {"class_names": list(data.class_names), **_shown(data)}
+    if "inputs" in own:  # which older checkpoints do not say
+        content = content | {"inputs": list(stored_inputs(content))}
     for name, value in own.items():
         if content[name] != value:
             raise SettingError(
@@ -190,8 +197,17 @@ def _check_fits(content: dict[str, Any], data: Any, checkpoint: Path) -> None:
             )
 
 
-def _plain_normalization(data: Any) -> dict[str, list[float]]:
-    return {"mean": list(data.normalization.mean), "std": list(data.normalization.std)}
+def _channels(path: Path, data: Any) -> Any:
+    """Names of the channels that the network of a file takes, and of those of the data."""
+    before, now = inputs_in(path), getattr(data, "inputs", None)
+    return None if None in (before, now) else (channel_names(before), channel_names(now))
+
+
+def _shown(data: Any) -> dict[str, Any]:
+    """What a network is shown of the data, as plain values."""
+    mean, std = list(data.normalization.mean), list(data.normalization.std)
+    inputs = {"inputs": list(data.inputs)} if hasattr(data, "inputs") else {}  # shapes have one
+    return {"normalization": {"mean": mean, "std": std}, **inputs}
 
 
 def _best_on_validation(trainer: lightning.Trainer, folder: Path) -> float | None:

@@ -23,6 +23,7 @@ from tangent_train.geometry.camera import (
 from tangent_train.geometry.cube import CubeGrid
 from tangent_train.geometry.equirect import (
     equirect_directions,
+    equirect_elevations,
     equirect_latitudes,
     equirect_shape,
     equirect_solid_angles,
@@ -55,6 +56,7 @@ __all__ = [
     "camera_matrix_from_fov",
     "checked_rotation",
     "equirect_directions",
+    "equirect_elevations",
     "equirect_latitudes",
     "equirect_shape",
     "equirect_solid_angles",

@@ -10,6 +10,7 @@ from tangent_train.geometry.sphere import lonlat_to_xyz
 
 __all__ = [
     "equirect_directions",
+    "equirect_elevations",
     "equirect_latitudes",
     "equirect_shape",
     "equirect_solid_angles",
@@ -94,6 +95,31 @@ def equirect_directions(shape: tuple[int, int]) -> NDArray[np.float64]:
     height, width = shape
     lon = (np.arange(width) + 0.5) / width * 2 * np.pi - np.pi
     return lonlat_to_xyz(np.stack(np.meshgrid(lon, equirect_latitudes(height)), axis=-1))
+
+
+def equirect_elevations(
+    shape: tuple[int, int], up_xyz: ArrayLike = (0.0, 0.0, 1.0)
+) -> NDArray[np.float32]:
+    """How far every ERP pixel looks upwards: the sine of its angle above the horizon.
+
+    Args:
+        shape: ``(H, W)``.
+        up_xyz: ``(3,)`` the direction of the zenith, a unit vector.
+
+    Returns:
+        ``(H, W)`` from −1, straight down, to 1.
+
+    >>> np.degrees(np.arcsin(equirect_elevations((2, 4))[:, 0])).round().tolist()
+    [45.0, -45.0]
+    """
+    height, width = shape
+    up = np.asarray(up_xyz, np.float64)
+    latitudes = equirect_latitudes(height)
+    lon = (np.arange(width) + 0.5) / width * 2 * np.pi - np.pi
+    across = (np.cos(lon) * up[0] + np.sin(lon) * up[1]).astype(np.float32)
+    elevations = np.outer(np.cos(latitudes).astype(np.float32), across)
+    elevations += (np.sin(latitudes) * up[2]).astype(np.float32)[:, None]
+    return elevations
 
 
 def equirect_solid_angles(shape: tuple[int, int]) -> NDArray[np.float64]:

@@ -22,6 +22,7 @@ from torch import Tensor
 from tangent_train.errors import SettingError
 from tangent_train.geometry import normalize_camera, shift_range
 from tangent_train.rendering.forward import Interpolation
+from tangent_train.rendering.views import NO_RAYS, UNTURNED
 
 __all__ = ["PerspectiveRepresentation", "PhotoCrops", "PhotoSampler"]
 
@@ -59,6 +60,14 @@ class PhotoCrops:
         draw = _nearest if interpolation == "nearest" else _smooth
         crops = np.stack([draw(image, box, self.size) for box in self.boxes])
         return np.ascontiguousarray(crops[:, :, ::-1]) if self.mirrored else crops
+
+    def rays(self) -> NDArray[np.float32]:
+        """None: nobody says where on a sphere a photo is."""
+        return NO_RAYS
+
+    def rotations(self) -> NDArray[np.float64]:
+        """None."""
+        return UNTURNED
 
     def owned(self) -> NDArray[np.bool_]:
         """Which pixels of a crop lie nearer to its centre than to any other's, ``(n, h, w)``.
@@ -238,9 +247,17 @@ class PerspectiveRepresentation:
         return PhotoSampler(camera_matrix, size, self)
 
     def to_labels(
-        self, scores: Float[Tensor, "images classes height width"], shape: tuple[int, ...]
+        self,
+        scores: Float[Tensor, "images classes height width"],
+        shape: tuple[int, ...],
+        rotations: NDArray[np.float64] = UNTURNED,
     ) -> Integer[Tensor, "images height width"]:
         """The best class of every pixel of every crop.
+
+        Args:
+            scores: Of all crops.
+            shape: Of the truth, ``(n, h, w)``.
+            rotations: Ignored: photos are not turned.
 
         Raises:
             SettingError: The scores are not those of the crops.

@@ -9,11 +9,14 @@ else about it.
 
 from __future__ import annotations
 
+import copy
 import math
-from typing import Any, Literal, Protocol, TypeVar, runtime_checkable
+from typing import Any, Literal, Protocol, Self, TypeVar, runtime_checkable
 
 import numpy as np
+import torch
 from jaxtyping import Float, Integer
+from numpy.typing import NDArray
 from torch import Tensor
 
 from tangent_train.errors import SettingError
@@ -24,8 +27,9 @@ from tangent_train.geometry import (
     random_rotation,
     rotation_about,
 )
-from tangent_train.rendering.backward import Blend, tangent_to_labels
-from tangent_train.rendering.views import EquirectViews, PinholeViews, Views
+from tangent_train.rendering.backward import Blend, tangent_to_equirect, tangent_to_labels
+from tangent_train.rendering.rotate import rotate_equirect
+from tangent_train.rendering.views import UNTURNED, EquirectViews, ManyViews, PinholeViews, Views
 
 __all__ = [
     "Assembler",
@@ -36,12 +40,18 @@ __all__ = [
     "Sampler",
     "TangentRepresentation",
     "Views",
+    "spun",
+    "turns",
 ]
 
 RotationAugmentation = Literal["none", "yaw", "so3"]
 """How training panoramas are turned: not, about the vertical, or any way."""
 
+_SYMMETRY_DEG = 72.0
+"""The icosahedron looks the same after this turn about the vertical."""
+
 _Choice = TypeVar("_Choice", bound=str)
+_Grid = TypeVar("_Grid", bound=PinholeGrid)
 
 
 class Sampler(Protocol):
@@ -65,8 +75,8 @@ class Assembler(Protocol):
         """Rows and columns of the images."""
         ...
 
-    def to_labels(self, scores: Tensor, shape: Any) -> Tensor:
-        """Class indices of the shape of the truth, from the scores of all images."""
+    def to_labels(self, scores: Tensor, shape: Any, rotations: NDArray[np.float64] = ...) -> Tensor:
+        """Class indices of the shape of the truth, from the scores of all images of `whole`."""
         ...
 
 
@@ -79,10 +89,23 @@ class Representation(Sampler, Assembler, Protocol):
         """Rows of the panorama it reads and is scored on."""
         ...
 
+    def turned(self, rotation: NDArray[np.float64]) -> Self:
+        """The same, looking in turned directions R·d: what panoramas that are not upright need."""
+        ...
+
     def to_labels(
-        self, scores: Float[Tensor, "images classes height width"], shape: tuple[int, int]
+        self,
+        scores: Float[Tensor, "images classes height width"],
+        shape: tuple[int, int],
+        rotations: NDArray[np.float64] = UNTURNED,
     ) -> Integer[Tensor, "rows columns"]:
-        """Class index of every pixel of the panorama, from the scores of `whole`."""
+        """Class index of every pixel of the panorama.
+
+        Args:
+            scores: Of all images of `whole`.
+            shape: ``(H, W)`` of the panorama.
+            rotations: Of the views, see `Views.rotations`.
+        """
         ...
 
 
@@ -97,6 +120,8 @@ class PinholeRepresentation:
         erp_height: Rows of the panorama, default `equirect_shape(level)`.
         blend: How overlapping images are joined in evaluation.
         faces_per_panorama: Images drawn at random for a training sample; all by default.
+        average_rotations: Turns of the images as a whole that evaluation averages over, see
+            `turns`.
 
     Raises:
         SettingError: A value is impossible.
@@ -111,6 +136,7 @@ class PinholeRepresentation:
         erp_height: int | None,
         blend: Blend = "nearest",
         faces_per_panorama: int | None = None,
+        average_rotations: int = 1,
     ) -> None:
         self.grid = grid
         self.rotation = _checked_choice("rotation", rotation, ("none", "yaw", "so3"))
@@ -118,11 +144,18 @@ class PinholeRepresentation:
         self.erp_height = _erp_height(erp_height, level)
         self.blend = _checked_choice("blend", blend, ("nearest", "feather"))
         self.faces_per_panorama = faces_per_panorama
+        self._turns = turns(average_rotations, "representation.average_rotations")
 
     @property
     def image_size(self) -> tuple[int, int]:
         """Rows and columns of the images."""
         return self.grid.dim, self.grid.dim
+
+    def turned(self, rotation: NDArray[np.float64]) -> Self:
+        """The same with the images turned as a whole, R·d; instead of a turn before."""
+        turned = copy.copy(self)
+        turned.grid = self.grid.with_rotation(_unless_identity(rotation))
+        return turned
 
     def sample(self, rng: np.random.Generator) -> Views:
         """All images or a random subset, (perhaps) turned as a whole and mirrored one by one."""
@@ -131,24 +164,41 @@ class PinholeRepresentation:
             yaw = self.rotation == "yaw"
             angle = rng.uniform(0, 2 * math.pi)
             turn = rotation_about((0, 0, 1), angle) if yaw else random_rotation(rng)
-            grid = grid.with_rotation(turn)
+            grid = spun(grid, turn)
         faces = None
         if self.faces_per_panorama is not None:
             faces = rng.choice(grid.num_images, self.faces_per_panorama, replace=False)
         return PinholeViews(grid, faces, self.mirror and bool(rng.random() < 0.5))
 
     def whole(self) -> Views:
-        """All images."""
-        return PinholeViews(self.grid)
+        """All images, of every turn that is averaged over."""
+        views = [PinholeViews(spun(self.grid, turn)) for turn in self._turns]
+        return views[0] if len(views) == 1 else ManyViews(tuple(views))
 
     def to_labels(
-        self, scores: Float[Tensor, "images classes height width"], shape: tuple[int, int]
+        self,
+        scores: Float[Tensor, "images classes height width"],
+        shape: tuple[int, int],
+        rotations: NDArray[np.float64] = UNTURNED,
     ) -> Integer[Tensor, "rows columns"]:
-        """Render the scores (not labels) back to the panorama, then take the best class."""
-        if self.blend == "feather":
+        """Render the scores (not labels) back to the panorama, then take the best class.
+
+        Of several rotations it is the class with the highest mean probability.
+        """
+        if self.blend == "feather" or len(rotations) > 1:
             scores = scores.softmax(dim=1)
-        labels: Tensor = tangent_to_labels(scores, self.grid, shape, self.blend)
-        return labels
+        grids = [self.grid.with_rotation(_unless_identity(rotation)) for rotation in rotations]
+        if len(grids) == 1:
+            labels: Tensor = tangent_to_labels(scores, grids[0], shape, self.blend)
+            return labels
+        of_grids = scores.unflatten(0, (len(grids), -1))
+        first, *others = (
+            tangent_to_equirect(part, grid, shape, self.blend)
+            for part, grid in zip(of_grids, grids, strict=True)
+        )
+        for other in others:
+            first += other
+        return first.argmax(dim=0)
 
 
 class TangentRepresentation(PinholeRepresentation):
@@ -167,6 +217,7 @@ class TangentRepresentation(PinholeRepresentation):
             (`nearest`), or probabilities averaged with weights that fall to the borders
             (`feather`).
         erp_height: Rows of the panorama, default `equirect_shape(level)`.
+        average_rotations: Turns of the icosahedron that evaluation averages over, see `turns`.
 
     Raises:
         SettingError: An impossible combination.
@@ -185,6 +236,7 @@ class TangentRepresentation(PinholeRepresentation):
         mirror: bool = False,
         blend: Blend = "nearest",
         erp_height: int | None = None,
+        average_rotations: int = 1,
     ) -> None:
         if crop_multiple is not None:
             _at_least("crop_multiple", crop_multiple, 1)
@@ -202,7 +254,9 @@ class TangentRepresentation(PinholeRepresentation):
                 found=faces_per_panorama,
                 expected=f"1 to {count} at base level {base_level}, or null for all",
             )
-        super().__init__(grid, level, rotation, mirror, erp_height, blend, faces_per_panorama)
+        super().__init__(
+            grid, level, rotation, mirror, erp_height, blend, faces_per_panorama, average_rotations
+        )
 
 
 class EquirectRepresentation:
@@ -236,6 +290,13 @@ class EquirectRepresentation:
         self.crop_deg = crop_deg
         self.rotation = _checked_choice("rotation", rotation, ("none", "yaw", "so3"))
         self.mirror = mirror
+        self._turn: NDArray[np.float64] | None = None
+
+    def turned(self, rotation: NDArray[np.float64]) -> Self:
+        """The same of panoramas looked at turned, R·d; instead of a turn before."""
+        turned = copy.copy(self)
+        turned._turn = _unless_identity(rotation)
+        return turned
 
     @property
     def image_size(self) -> tuple[int, int]:
@@ -248,24 +309,69 @@ class EquirectRepresentation:
         if self.crop_deg is not None or self.rotation == "yaw":
             width = round(2 * self.erp_height * (self.crop_deg or 360) / 360)
             columns = (rng.random(), width)
-        rotation = random_rotation(rng) if self.rotation == "so3" else None
+        rotation = self._turn
+        if self.rotation == "so3":
+            turn = random_rotation(rng).T
+            rotation = turn if rotation is None else rotation @ turn
         return EquirectViews(rotation, columns, self.mirror and bool(rng.random() < 0.5))
 
     def whole(self) -> Views:
-        """The panorama as it is."""
-        return EquirectViews()
+        """The whole panorama."""
+        return EquirectViews(self._turn)
 
     def to_labels(
-        self, scores: Float[Tensor, "images classes height width"], shape: tuple[int, int]
+        self,
+        scores: Float[Tensor, "images classes height width"],
+        shape: tuple[int, int],
+        rotations: NDArray[np.float64] = UNTURNED,
     ) -> Integer[Tensor, "rows columns"]:
-        """The best class of every pixel; the scores are already those of the panorama."""
+        """The best class of every pixel; the scores are already those of the (turned) panorama."""
         if scores.shape[0] != 1 or tuple(scores.shape[-2:]) != tuple(shape):
             raise SettingError(
                 "scores of an equirectangular network",
                 found=tuple(scores.shape),
                 expected=f"one image of {shape[0]}×{shape[1]}",
             )
-        return scores[0].argmax(dim=0)
+        labels = scores[0].argmax(dim=0)
+        if _unless_identity(rotations[0]) is None:
+            return labels
+        small = labels.to(torch.int32).cpu().numpy().astype(np.uint16)
+        back = rotate_equirect(small, rotations[0], "nearest").astype(np.int64)
+        return torch.from_numpy(back).to(labels.device)
+
+
+def turns(count: int, setting: str) -> list[NDArray[np.float64]]:
+    """Rotations of the icosahedron to average over, evenly about the vertical; none is the first.
+
+    Images stay upright, as most networks know them: any rotation at all halves their scores.
+
+    Args:
+        count: How many, 1 or more.
+        setting: Its name, for the message.
+
+    Raises:
+        SettingError: Fewer.
+    """
+    if not isinstance(count, int) or count < 1:
+        raise SettingError(setting, found=count, expected="a whole number from 1")
+    step = math.radians(_SYMMETRY_DEG / count)
+    return [rotation_about((0, 0, 1), step * k) for k in range(count)]
+
+
+def spun(grid: _Grid, turn: NDArray[np.float64]) -> _Grid:
+    """A grid turned about its own axes: with a rotation R it has, directions become R·turn·d.
+
+    Args:
+        grid: The images.
+        turn: ``(3, 3)`` rotation.
+    """
+    rotation = turn if grid.rotation is None else grid.rotation @ turn
+    return grid.with_rotation(_unless_identity(rotation))
+
+
+def _unless_identity(rotation: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """None for no turn at all: the tables of grids that are not turned are those kept."""
+    return None if np.array_equal(rotation, np.eye(3)) else rotation
 
 
 def _erp_height(rows: int | None, level: int) -> int:

@@ -19,7 +19,10 @@ from torch.optim.lr_scheduler import LRScheduler
 from datamodules.split_module import Kind
 from tangent_train.errors import SettingError
 
-__all__ = ["Task", "check_at_once"]
+__all__ = ["Part", "Task", "check_at_once"]
+
+Part = tuple[tuple[Tensor, ...], Tensor]
+"""Inputs of the network and their labels."""
 
 
 class Task(lightning.LightningModule, ABC):
@@ -86,16 +89,35 @@ class Task(lightning.LightningModule, ABC):
         """An empty input of the network, of the size of the run."""
 
     @abstractmethod
-    def training_pairs(self, batch: Any) -> tuple[Tensor, Tensor]:
-        """Inputs of the network and their labels, of the same length."""
+    def training_labels(self, batch: Any) -> Tensor:
+        """The labels of all inputs of a batch."""
 
     @abstractmethod
-    def loss_sum(self, scores: Tensor, labels: Tensor) -> Tensor:
-        """The loss of some of them, a sum."""
+    def training_parts(self, batch: Any) -> list[Part]:
+        """A batch in parts that are trained one after the other, a bound on memory."""
 
     @abstractmethod
-    def loss_norm(self, labels: Tensor) -> Tensor:
-        """What the loss of all of them is divided by: known before any network has run."""
+    def loss_sums(self, inputs: tuple[Tensor, ...], labels: Tensor) -> Tensor:
+        """The terms of the loss of one part, each a sum.
+
+        Args:
+            inputs: Of the network.
+            labels: Of the inputs.
+
+        Returns:
+            ``(terms,)``.
+        """
+
+    @abstractmethod
+    def loss_norms(self, labels: Tensor) -> Tensor:
+        """What the terms of the loss of all are divided by: known before any network has run.
+
+        Args:
+            labels: Of all inputs.
+
+        Returns:
+            ``(terms,)``.
+        """
 
     @abstractmethod
     def evaluate(self, batch: Any) -> Tensor:
@@ -148,10 +170,6 @@ class Task(lightning.LightningModule, ABC):
             checkpoint: What was evaluated.
         """
 
-    def inputs_per_chunk(self, inputs: Tensor) -> int:
-        """How many inputs of the network are trained at once."""
-        return self.images_per_chunk or len(inputs)
-
     def on_train_start(self) -> None:
         """Refuse to resume a schedule that was made for another length of training.
 
@@ -172,38 +190,36 @@ class Task(lightning.LightningModule, ABC):
     def training_step(self, batch: Any, batch_idx: int) -> Tensor:
         """One gradient of the whole batch, over all chunks and processes.
 
-        All chunks but the last are back-propagated here, Lightning does the last one. On several
+        All parts but the last are back-propagated here, Lightning does the last one. On several
         processes this is still inside `DistributedDataParallel.forward`, which exchanges gradients
-        only in a backward pass that follows it: once, after the last chunk.
+        only in a backward pass that follows it: once, after the last part.
         """
-        inputs, labels = self.training_pairs(batch)
-        norm = self._whole_norm(labels)
+        norms = self._whole_norms(self.training_labels(batch))
         batches = self.trainer.accumulate_grad_batches
         if batch_idx % batches == 0:
             self.trainer.optimizers[0].zero_grad()
-        size = self.inputs_per_chunk(inputs)
-        *chunks, last = zip(torch.split(inputs, size), torch.split(labels, size), strict=True)
-        value = torch.zeros_like(norm)
-        for chunk in chunks:
-            loss = self._loss(*chunk, norm)
+        *parts, last = self.training_parts(batch)
+        value = norms.new_zeros(())
+        for part in parts:
+            loss = self._loss(part, norms)
             self.trainer.strategy.backward(loss / batches, None)
             value += loss.detach()
-        loss = self._loss(*last, norm)
+        loss = self._loss(last, norms)
         # The mean over processes, each divided by the mean norm, is the loss of the whole batch.
         self.log("train/loss", value + loss.detach(), prog_bar=True, sync_dist=True)
         return loss
 
     def optimizer_zero_grad(self, *_: Any) -> None:
-        """Nothing: `training_step` clears the gradients before its first chunk."""
+        """Nothing: `training_step` clears the gradients before its first part."""
 
-    def _whole_norm(self, labels: Tensor) -> Tensor:
-        """Norm of the loss over all processes; as their gradients are averaged, its mean."""
-        norm = self.loss_norm(labels)
-        mean: Tensor = self.trainer.strategy.reduce(norm, reduce_op="mean")
-        return mean.clamp(min=torch.finfo(norm.dtype).tiny)
+    def _whole_norms(self, labels: Tensor) -> Tensor:
+        """Norms of the loss over all processes; as their gradients are averaged, their mean."""
+        norms = self.loss_norms(labels)
+        mean: Tensor = self.trainer.strategy.reduce(norms, reduce_op="mean")
+        return mean.clamp(min=torch.finfo(norms.dtype).tiny)
 
-    def _loss(self, inputs: Tensor, labels: Tensor, norm: Tensor) -> Tensor:
-        return self.loss_sum(self(inputs), labels) / norm
+    def _loss(self, part: Part, norms: Tensor) -> Tensor:
+        return (self.loss_sums(*part) / norms).sum()
 
     def validation_step(self, batch: Any, batch_idx: int) -> Tensor:
         """Count a batch of the validation split."""

@@ -17,7 +17,7 @@ from torch.optim.lr_scheduler import LRScheduler
 
 from datamodules.split_module import Kind
 from tangent_train.errors import SettingError
-from tangent_train.tasks.base import Task
+from tangent_train.tasks.base import Part, Task
 from tangent_train.tasks.classification_metrics import ClassCounts, classification_scores
 from tangent_train.tasks.classification_results import (
     classification_results,
@@ -110,26 +110,31 @@ class ClassificationTask(Task):
         views = 1 if grid is None else grid.num_images
         return torch.zeros(1, views, channels, *self.representation.image_size)
 
-    def training_pairs(self, batch: Any) -> tuple[Tensor, Tensor]:
-        """Views of the shapes ``(B, N, C, h, w)``, and their classes ``(B,)``."""
-        return batch.images, batch.label
+    def training_labels(self, batch: Any) -> Tensor:
+        """Classes of the shapes ``(B,)``."""
+        labels: Tensor = batch.label
+        return labels
 
-    def inputs_per_chunk(self, inputs: Tensor) -> int:
-        """How many shapes are trained at once."""
-        if self.images_per_chunk is None:
-            return len(inputs)
-        return max(1, self.images_per_chunk // inputs.shape[1])
+    def training_parts(self, batch: Any) -> list[Part]:
+        """Whole shapes, their views ``(b, N, C, h, w)`` as many as `images_per_chunk` allows."""
+        views = batch.images
+        size = len(views)
+        if self.images_per_chunk is not None:
+            size = max(1, self.images_per_chunk // views.shape[1])
+        parts = zip(torch.split(views, size), torch.split(batch.label, size), strict=True)
+        return [((inputs,), labels) for inputs, labels in parts]
 
-    def loss_sum(self, scores: Tensor, labels: Tensor) -> Tensor:
+    def loss_sums(self, inputs: tuple[Tensor, ...], labels: Tensor) -> Tensor:
         """Cross-entropy, summed over the shapes."""
+        scores = self(*inputs)
         exact = torch.promote_types(scores.dtype, torch.float32)
         return functional.cross_entropy(
             scores.to(exact), labels, reduction="sum", label_smoothing=self.label_smoothing
-        )
+        )[None]
 
-    def loss_norm(self, labels: Tensor) -> Tensor:
+    def loss_norms(self, labels: Tensor) -> Tensor:
         """The number of shapes."""
-        return torch.tensor(float(len(labels)), device=labels.device)
+        return torch.tensor([float(len(labels))], device=labels.device)
 
     def evaluate(self, batch: Any) -> Tensor:
         """Count a batch of shapes; returns the predictions ``(B,)``."""

@@ -69,7 +69,7 @@ class Plan:
 def random_images(trained: TrainedNetwork, count: int, size: tuple[int, int]) -> Tensor:
     """Images ``(count, C, h, w)`` as a normalized network takes them, always the same."""
     generator = torch.Generator().manual_seed(count)
-    return torch.randn(count, trained.normalization.channels, *size, generator=generator)
+    return torch.randn(count, trained.in_channels, *size, generator=generator)
 
 
 def _write_onnx(plan: Plan, path: Path) -> None:

@@ -18,7 +18,7 @@ from tangent_train.errors import DataError, SettingError
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from datamodules.samples import Normalization
+    from datamodules.samples import Input, Normalization
 
 __all__ = [
     "PRETRAINED",
@@ -60,8 +60,8 @@ class TrainedNetwork:
         network: In evaluation mode; ``(B, C, h, w)`` float32, normalized, to scores ``(B, K+1, h,
             w)``, the unknown class first.
         class_names: K + 1 names, the unknown class first.
-        inputs: ``("rgb",)`` or ``("rgb", "depth")``.
-        normalization: Of the images.
+        inputs: What it is shown, see `datamodules.samples.INPUT_CHANNELS`.
+        normalization: Of RGB and depth.
         level: Level s it was trained at.
         representation: The section of the config it was trained with, resolved.
         image_size: Rows and columns of the images that representation evaluates on.
@@ -73,7 +73,7 @@ class TrainedNetwork:
 
     network: nn.Module
     class_names: tuple[str, ...]
-    inputs: tuple[str, ...]
+    inputs: tuple[Input, ...]
     normalization: Normalization
     level: int
     representation: Mapping[str, Any]
@@ -81,6 +81,13 @@ class TrainedNetwork:
     size_multiple: int = 1
     fixed_size: tuple[int, int] | None = None
     settings: Mapping[str, Any] | None = None
+
+    @property
+    def in_channels(self) -> int:
+        """Channels of its images."""
+        from datamodules.samples import INPUT_CHANNELS
+
+        return sum(INPUT_CHANNELS[name] for name in self.inputs)
 
 
 class Scores(nn.Module):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -17,12 +18,14 @@ from torch.optim.lr_scheduler import LRScheduler
 from datamodules.split_module import Kind
 from tangent_train.errors import SettingError
 from tangent_train.rendering import Assembler
-from tangent_train.tasks.base import Task, check_at_once
+from tangent_train.rendering.views import UNTURNED
+from tangent_train.tasks.base import Part, Task, check_at_once
 from tangent_train.tasks.callbacks import PredictionPanels
 from tangent_train.tasks.html.evaluation import write_evaluation_report
-from tangent_train.tasks.losses import cross_entropy_norm, cross_entropy_sum
+from tangent_train.tasks.losses import AuxiliaryTarget, RegionLoss
 from tangent_train.tasks.metrics import AbsentClass, ConfusionMatrix, segmentation_scores
 from tangent_train.tasks.results import evaluation_results, results_table, write_results
+from tangent_train.tasks.segmentation_loss import SegmentationLoss
 from tangent_train.tasks.tensorboard_pictures import ValidationPictures
 
 __all__ = ["SegmentationTask"]
@@ -38,16 +41,23 @@ class SegmentationTask(Task):
     sphere, or all of a photo; the scores are rendered back and compared with its own labels.
 
     Args:
-        network: Any module ``(B, C, h, w) -> (B, K+1, h, w)`` or a dict with that under ``"out"``;
-            the first score belongs to the unknown class, which is never predicted.
+        network: Any module ``(B, C, h, w) -> (B, K+1, h, w)`` or a dict with that under ``"out"``,
+            and perhaps scores of an auxiliary head under ``"aux"``; the first score belongs to the
+            unknown class, which is never predicted. One whose `forward` also takes ``rays`` and
+            ``images_per_chunk`` is told where on the sphere its images look, and bounds its memory
+            itself (`models.SphereContext`).
         representation: What made the images; it assembles the scores.
         class_names: K + 1 names, the unknown class first.
         optimizer: Makes the optimizer from parameters.
         scheduler: Makes a learning rate scheduler from the optimizer, or None. When it takes
             `total_steps`, it is told the length of the training and stepped every step.
         class_weights: Weights of the loss: a name that the data module knows (``none``, ``log``,
-            ``sqrt``) or K + 1 numbers.
+            ``sqrt``, ``effective``) or K + 1 numbers.
         label_smoothing: Share of the target spread over all classes.
+        auxiliary_weight: See `SegmentationLoss`.
+        auxiliary_target: See `SegmentationLoss`.
+        region_loss: See `SegmentationLoss`.
+        region_weight: See `SegmentationLoss`.
         images_per_chunk: Images trained at once, a bound on memory; None for the whole batch.
         images_per_forward: Images evaluated at once, a bound on memory; training is not affected.
         absent_class: What classes absent from the truth do to the means.
@@ -68,8 +78,12 @@ class SegmentationTask(Task):
         class_names: Sequence[str],
         optimizer: Callable[..., Optimizer],
         scheduler: Callable[..., LRScheduler] | None = None,
-        class_weights: Literal["none", "log", "sqrt"] | Sequence[float] = "log",
+        class_weights: Literal["none", "log", "sqrt", "effective"] | Sequence[float] = "log",
         label_smoothing: float = 0.0,
+        auxiliary_weight: float = 0.4,
+        auxiliary_target: AuxiliaryTarget = "histogram",
+        region_loss: RegionLoss | Literal["none"] = "none",
+        region_weight: float = 1.0,
         images_per_chunk: int | None = None,
         images_per_forward: int = 32,
         absent_class: AbsentClass = "skip",
@@ -91,6 +105,10 @@ class SegmentationTask(Task):
         if absent_class not in ("skip", "zero"):
             raise SettingError("task.absent_class", found=absent_class, expected="skip or zero")
         self.weighting = class_weights
+        self.loss = SegmentationLoss(
+            label_smoothing, auxiliary_weight, auxiliary_target, region_loss, region_weight
+        )
+        self.takes_rays = _takes_rays(network)
         self.images_per_forward = images_per_forward
         self.absent_class: AbsentClass = absent_class
         self.register_buffer("class_weights", torch.ones(len(self.class_names)))
@@ -113,16 +131,33 @@ class SegmentationTask(Task):
         self.class_weights.copy_(weights)
 
     def forward(
-        self, images: Float[Tensor, "images channels height width"]
+        self,
+        images: Float[Tensor, "images channels height width"],
+        rays: Float[Tensor, "spheres of_each 3 3"] | None = None,
     ) -> Float[Tensor, "images classes height width"]:
         """Scores of every pixel, the unknown class first.
+
+        Args:
+            images: Of one or several spheres.
+            rays: Where they look, see `Views.rays`, for networks that take it.
 
         Raises:
             SettingError: The network's scores do not fit the images or the classes.
         """
-        scores = self.network(images.contiguous(memory_format=self.memory_format))
-        if isinstance(scores, dict):
-            scores = scores["out"]
+        return self.outputs(images, rays)["out"]
+
+    def outputs(self, images: Tensor, rays: Tensor | None = None) -> Mapping[str, Tensor]:
+        """All scores that the network returns, by name; see `forward`."""
+        images = images.contiguous(memory_format=self.memory_format)
+        if rays is None:
+            returned = self.network(images)
+        else:
+            at_once = self.images_per_chunk if self.training else self.images_per_forward
+            returned = self.network(images, rays, at_once)
+        outputs: Mapping[str, Tensor] = (
+            returned if isinstance(returned, dict) else {"out": returned}
+        )
+        scores = outputs["out"]
         expected = (images.shape[0], len(self.class_names), *images.shape[-2:])
         if tuple(scores.shape) != expected:
             raise SettingError(
@@ -131,50 +166,72 @@ class SegmentationTask(Task):
                 expected=expected,
                 remedy="Set network.num_classes to the number of classes, unknown included.",
             )
-        return scores
+        return outputs
 
     def example(self, channels: int) -> Tensor:
         """One empty image ``(1, C, h, w)``."""
         return torch.zeros(1, channels, *self.representation.image_size)
 
-    def training_pairs(self, batch: Any) -> tuple[Tensor, Tensor]:
-        """Images of all panoramas or photos ``(n, C, h, w)``, and their labels ``(n, h, w)``."""
-        return batch.images.flatten(0, 1), batch.labels.flatten(0, 1)
+    def training_labels(self, batch: Any) -> Tensor:
+        """Labels of all images of all panoramas or photos ``(n, h, w)``."""
+        labels: Tensor = batch.labels
+        return labels.flatten(0, 1)
 
-    def loss_sum(self, scores: Tensor, labels: Tensor) -> Tensor:
-        """Weighted cross-entropy of the labelled pixels, summed."""
-        return cross_entropy_sum(scores, labels, self.class_weights, self.label_smoothing)
+    def training_parts(self, batch: Any) -> list[Part]:
+        """Images of all panoramas or photos ``(n, C, h, w)``, `images_per_chunk` at once.
 
-    def loss_norm(self, labels: Tensor) -> Tensor:
-        """The class weights of the labelled pixels, added up."""
-        return cross_entropy_norm(labels, self.class_weights)
+        A network that takes rays gets all of them and divides them itself.
+        """
+        images, labels = batch.images.flatten(0, 1), self.training_labels(batch)
+        if self.takes_rays and batch.rays.numel():
+            return [((images, batch.rays), labels)]
+        size = self.images_per_chunk or len(images)
+        parts = zip(torch.split(images, size), torch.split(labels, size), strict=True)
+        return [((part,), of_part) for part, of_part in parts]
+
+    def loss_sums(self, inputs: tuple[Tensor, ...], labels: Tensor) -> Tensor:
+        """See `SegmentationLoss.sums`."""
+        return self.loss.sums(self.outputs(*inputs), labels, self.class_weights)
+
+    def loss_norms(self, labels: Tensor) -> Tensor:
+        """See `SegmentationLoss.norms`."""
+        return self.loss.norms(labels, self.class_weights)
 
     @torch.no_grad()
     def predict_labels(
-        self, images: Float[Tensor, "images channels height width"], shape: tuple[int, ...]
+        self,
+        images: Float[Tensor, "images channels height width"],
+        shape: tuple[int, ...],
+        rays: Float[Tensor, "images 3 3"] | None = None,
+        rotations: Float[Tensor, "rotations 3 3"] | None = None,
     ) -> Integer[Tensor, ...]:
         """Class index (never unknown) of every pixel of one panorama, or of the crops of a photo.
 
         Args:
             images: The representation's views of the whole.
             shape: Of the truth: ``(H, W)`` of the panorama, or ``(n, h, w)`` of the crops.
+            rays: Of the views.
+            rotations: Of the views; by default they are not turned.
 
         Returns:
             Class indices 1 … K of that shape.
         """
-        size = self.images_per_forward
-        parts = [images[start : start + size] for start in range(0, len(images), size)]
-        scores = torch.cat([self(part)[:, 1:].float() for part in parts])
-        return self.representation.to_labels(scores, shape) + 1
+        turns = UNTURNED if rotations is None else rotations.cpu().numpy()
+        if self.takes_rays and rays is not None and rays.numel():
+            scores = self(images, rays.unflatten(0, (len(turns), -1)))[:, 1:].float()
+        else:
+            parts = torch.split(images, self.images_per_forward)
+            scores = torch.cat([self(part)[:, 1:].float() for part in parts])
+        return self.representation.to_labels(scores, shape, turns) + 1
 
     def evaluate(self, batch: Any) -> Tensor:
         """Count a batch of panoramas or photos; returns the predictions."""
-        predictions = [
-            self.predict_labels(images, tuple(target.shape))
-            for images, target in zip(batch.images, batch.target, strict=True)
-        ]
-        for prediction, target in zip(predictions, batch.target, strict=True):
-            self.confusion.update(prediction, target)
+        predictions = []
+        for images, target, rays, rotations in zip(
+            batch.images, batch.target, batch.rays, batch.rotations, strict=True
+        ):
+            predictions.append(self.predict_labels(images, tuple(target.shape), rays, rotations))
+            self.confusion.update(predictions[-1], target)
         return torch.stack(predictions)
 
     def log_scores(self, stage: str) -> None:
@@ -210,3 +267,11 @@ class SegmentationTask(Task):
         callbacks: list[Any] = self.trainer.callbacks  # type: ignore[attr-defined]
         images = [i for c in callbacks if isinstance(c, PredictionPanels) for i in c.images]
         write_evaluation_report(path, results, self.class_names, images, checkpoint)
+
+
+def _takes_rays(network: nn.Module) -> bool:
+    """Whether it can be told where its images look, or hands what it is told to one that can."""
+    parameters = inspect.signature(network.forward).parameters
+    held = getattr(network, "network", None)
+    hands_on = any(p.kind is p.VAR_POSITIONAL for p in parameters.values())
+    return "rays" in parameters or (hands_on and held is not None and _takes_rays(held))

@@ -15,10 +15,12 @@ from tangent_train.tasks.networks import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-__all__ = ["TrainedNetwork", "load_trained", "read_checkpoint"]
+    from datamodules.samples import Input
+
+__all__ = ["TrainedNetwork", "inputs_in", "load_trained", "read_checkpoint", "stored_inputs"]
 
 _PREFIX = "network."
 """Begins the names of the network's tensors in a checkpoint."""
@@ -83,6 +85,26 @@ def read_checkpoint(path: Path, needed: Sequence[str] = ("config", "state_dict")
     return dict(content)
 
 
+def stored_inputs(content: Mapping[str, Any]) -> tuple[Input, ...]:
+    """What the network in a checkpoint is shown of images.
+
+    Args:
+        content: Of the checkpoint, with its normalization.
+    """
+    # Older checkpoints do not say it; those of shapes neither, whose six channels are all there is.
+    depth: tuple[Input, ...] = ("rgb", "depth")
+    return tuple(content.get("inputs") or depth[: len(content["normalization"]["mean"]) - 2])
+
+
+def inputs_in(path: Path) -> tuple[Input, ...] | None:
+    """What the network in a file is shown, if it is a checkpoint of this package, which say it."""
+    try:
+        content = read_checkpoint(path, ("normalization",))
+    except DataError:
+        return None
+    return stored_inputs(content)
+
+
 def _check_kind(path: Path, content: dict[str, Any]) -> None:
     """Refuse networks that do not label pixels."""
     kind = content.get("kind", "segmentation")  # which older checkpoints do not say
@@ -96,7 +118,7 @@ def _check_kind(path: Path, content: dict[str, Any]) -> None:
 
 
 def _from_checkpoint(path: Path) -> TrainedNetwork:
-    from datamodules.samples import Normalization
+    from datamodules.samples import INPUT_CHANNELS, Normalization
 
     content = read_checkpoint(path, _NEEDED)
     _check_kind(path, content)
@@ -106,7 +128,8 @@ def _from_checkpoint(path: Path) -> TrainedNetwork:
         raise DataError(path, found=f"no {missing[0]} in its config", expected=_EXPECTED)
     class_names = tuple(content["class_names"])
     normalization = Normalization(**content["normalization"])
-    channels = normalization.channels
+    inputs = stored_inputs(content)
+    channels = sum(INPUT_CHANNELS[name] for name in inputs)
     settings = completed_settings(config["network"], channels, len(class_names), restored=True)
     tensors = {
         name.removeprefix(_PREFIX): tensor
@@ -119,7 +142,7 @@ def _from_checkpoint(path: Path) -> TrainedNetwork:
     return TrainedNetwork(
         network=network,
         class_names=class_names,
-        inputs=("rgb", "depth")[: channels - 2],
+        inputs=inputs,
         normalization=normalization,
         level=config["level"],
         representation=config["representation"],

@@ -154,13 +154,48 @@ def test_a_run_starts_from_the_network_of_another(
     rgb = ["data.inputs=[rgb]", "trainer.max_epochs=1", "hydra.run.dir=begun"]
     _run(monkeypatch, "train", *SETTINGS, rooms, *rgb, f"init_from={checkpoint}")
     table = capsys.readouterr().out
-    assert "4 → 3 channels" in table
+    assert "left out: depth" in table
     assert re.search(r"fresh +│ +0 ", table)
     assert _results(tmp_path / "begun")["images"] == 2
     foreign = tmp_path / "foreign.pt"
     torch.save({"x": torch.zeros(1)}, foreign)
     with pytest.raises(SystemExit, match=r"foreign\.pt: found no tensor that fits, but x"):
         _run(monkeypatch, "train", *SETTINGS, rooms, f"init_from={foreign}")
+
+
+def test_further_inputs_start_at_zero_and_stay_in_the_checkpoint(
+    run_folder: Path,
+    rooms: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Attention, elevation and averaged weights on top of a plain network, then an evaluation."""
+    monkeypatch.chdir(tmp_path)
+    further = [
+        "data.inputs=[rgb,depth,validity,elevation]",
+        "network=unet_small_context",
+        "network.stage=network.downs.0",
+        "network.network.stage=downs.0",
+        "network.network.network.widths=[4,8]",
+        "representation.average_rotations=2",
+        "ema=0.9",
+        "trainer.max_epochs=1",
+        "hydra.run.dir=begun",
+    ]
+    checkpoint = run_folder / "checkpoints" / "best.ckpt"
+    settings = [text for text in SETTINGS if not text.startswith("network.")]
+    _run(monkeypatch, "train", *settings, rooms, *further, f"init_from={checkpoint}")
+    assert "stem.weight: starts at zero: validity," in capsys.readouterr().out
+    best = tmp_path / "begun/checkpoints/best.ckpt"
+    content = torch.load(best, weights_only=True)
+    assert content["inputs"] == ["rgb", "depth", "validity", "elevation"]
+    again = [f"checkpoint={best}", "hydra.run.dir=again"]
+    _run(monkeypatch, "evaluate", *again)
+    figures = [_results(tmp_path / folder)["confusion"] for folder in ("begun", "again")]
+    assert figures[0] == figures[1]
+    with pytest.raises(SystemExit, match=r"found inputs \['rgb', 'depth'\]"):
+        _run(monkeypatch, "evaluate", *again, "data.inputs=[rgb,depth]", "hydra.run.dir=other")
 
 
 def test_settings_of_the_checkpoint_reach_what_refers_to_them(

@@ -27,6 +27,12 @@ class StripViews:
         parts = np.split(np.roll(image, self.shift, axis=1), STRIPS, axis=1)
         return np.stack([parts[i] for i in self.strips])
 
+    def rays(self) -> NDArray[np.float32]:
+        return np.zeros((0, 3, 3), np.float32)
+
+    def rotations(self) -> NDArray[np.float64]:
+        return np.eye(3)[None]
+
 
 @dataclass(frozen=True)
 class StripRepresentation:
@@ -45,7 +51,12 @@ class StripRepresentation:
     def whole(self) -> StripViews:
         return StripViews(tuple(range(STRIPS)))
 
-    def to_labels(self, scores: Any, shape: tuple[int, int]) -> Any:
+    def turned(self, rotation: NDArray[np.float64]) -> StripRepresentation:
+        raise NotImplementedError
+
+    def to_labels(
+        self, scores: Any, shape: tuple[int, int], rotations: NDArray[np.float64] | None = None
+    ) -> Any:
         raise NotImplementedError
 
 

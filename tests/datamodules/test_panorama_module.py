@@ -15,10 +15,14 @@ from datamodules.panoramas import Panorama
 from datamodules.samples import RGB_NORMALIZATION, RGBD_NORMALIZATION, EvaluationSample, normalize
 from datamodules.stanford2d3ds import Stanford2D3DS
 from tangent_train.errors import SettingError
+from tangent_train.rendering import TangentRepresentation
+from tangent_train.rendering.gravity import Gravity
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
+
+    from numpy.typing import NDArray
 
     from datamodules.samples import TrainingSample
 
@@ -66,7 +70,9 @@ def test_training_batches(make_module: MakeModule) -> None:
     assert [len(batch.labels) for batch in batches] == [4, 4, 1]
     assert [image.shape for image in batches[0].images] == [(4, 2, 16, 8, 3), (4, 2, 16, 8)]
     images = module.on_after_batch_transfer(batches[0], 0).images
-    torch.testing.assert_close(images, normalize(batches[0].images, module.normalization))
+    torch.testing.assert_close(
+        images, normalize(batches[0].images, module.normalization, module.inputs)
+    )
     assert batches[0].labels.shape == (4, 2, 16, 8)
     assert batches[0].labels.dtype == torch.uint8
 
@@ -140,10 +146,56 @@ def test_only_test_panoramas_turn(make_module: MakeModule) -> None:
     plain, turned = make_module(), make_module(test_rotation=30)
     for split in SPLITS:
         before, after = plain.source(split).read(0), turned.source(split).read(0)
-        for i in range(len(Panorama._fields)):
+        for i, name in enumerate(Panorama._fields):
+            if name == "up":
+                continue
             same = np.array_equal(np.asarray(before[i]), np.asarray(after[i]))
             assert same is (split != "test")
     assert turned.sample_name("test", 1) == plain.sample_name("test", 1)
+
+
+def test_turned_panoramas_are_looked_at_upright_where_up_is_known(make_module: MakeModule) -> None:
+    turned, known = make_module(test_rotation=30), make_module(test_rotation=30, upright="pose")
+    panorama, aware = turned.source("test").read(0), known.source("test").read(0)
+    np.testing.assert_array_equal(panorama.rgb, aware.rgb)
+    np.testing.assert_array_equal(panorama.labels, aware.labels)
+    assert panorama.up is None
+    assert aware.up is not None
+    assert np.degrees(np.arccos(aware.up[2])) == pytest.approx(30)
+    representation = TangentRepresentation(0, 3)
+    rotation = aware.sampler(representation).whole().rotations()[0]
+    np.testing.assert_allclose(rotation @ [0, 0, 1], aware.up, atol=1e-12)
+    for split in ("train", "val"):
+        assert known.source(split).read(0).up is None
+
+
+def test_up_is_estimated_from_every_image(
+    make_module: MakeModule, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[float] = []
+
+    def estimate(rgb: NDArray[np.uint8], max_tilt_deg: float) -> Gravity:
+        asked.append(max_tilt_deg)
+        return Gravity(np.array([0.6, 0.0, 0.8]), float(rgb.mean()))
+
+    monkeypatch.setattr("datamodules.panoramas.estimate_up", estimate)
+    module = make_module(upright="auto", max_tilt_deg=60, in_memory=True)
+    for split in SPLITS:
+        source = module.source(split)
+        before = len(asked)
+        for _ in range(3):
+            np.testing.assert_array_equal(source.read(0).up, [0.6, 0.0, 0.8])
+        assert len(asked) == before, "once, when it was read into memory"
+        assert source.name(0)
+    assert set(asked) == {60}
+    counts = module.source("train").label_counts(0)
+    np.testing.assert_array_equal(counts, make_module().source("train").label_counts(0))
+
+
+@pytest.mark.parametrize("settings", [{"upright": "maybe"}, {"max_tilt_deg": 0}])
+def test_impossible_settings_of_upright(make_module: MakeModule, settings: dict[str, Any]) -> None:
+    with pytest.raises(SettingError, match=r"data\.(upright|max_tilt_deg): found"):
+        make_module(**settings)
 
 
 @pytest.mark.parametrize("world_size", [2, 3])
@@ -287,7 +339,7 @@ def test_classes_never_seen_weigh_nothing(
 
 
 def test_class_weights_of_another_kind(make_module: MakeModule) -> None:
-    with pytest.raises(SettingError, match="log, sqrt or none"):
+    with pytest.raises(SettingError, match="log, sqrt, effective or none"):
         make_module().class_weights("cbrt")  # type: ignore[arg-type]
 
 

@@ -201,7 +201,8 @@ def test_turns_are_those_of_seed_and_index() -> None:
 @pytest.mark.parametrize("rotation", [40.0, "so3"])
 def test_image_depth_and_labels_turn_together(rotation: float | Literal["so3"]) -> None:
     turned = TurnedPanoramas(Memory([_positions()]), rotation, seed=5)
-    rgb, depth, labels = turned.read(0)
+    rgb, depth, labels, up = turned.read(0)
+    assert up is None
     # The output direction d shows the input at Rᵀd, whose height is the third row of Rᵀ times d.
     height = equirect_directions((32, 64)) @ turned.rotation(0)[:, 2]
     np.testing.assert_allclose(labels.astype(float), 100 + 100 * height, atol=8)

@@ -15,14 +15,18 @@ from datamodules.samples import (
     RGBD_NORMALIZATION,
     EvaluationImages,
     EvaluationSample,
+    Input,
     Normalization,
     TrainingImages,
     TrainingSample,
     collate,
     normalize,
+    render_inputs,
 )
+from datamodules.segmentation_module import checked_inputs
 from tangent_train.errors import SettingError
-from tangent_train.rendering.representation import EquirectRepresentation
+from tangent_train.geometry import equirect_directions
+from tangent_train.rendering.representation import EquirectRepresentation, TangentRepresentation
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -30,6 +34,7 @@ if TYPE_CHECKING:
     from datamodules.sources import ImageSource
     from tangent_train.rendering.representation import Representation
 
+DEPTH: tuple[Input, ...] = ("rgb", "depth")
 IDENTITY = Normalization((0, 0, 0, 0), (1 / 255, 1 / 255, 1 / 255, 1))
 
 
@@ -62,7 +67,7 @@ def test_normalize_against_the_formula(depth: bool) -> None:
     steps = rng.integers(0, 2049, (3, 2, 4, 5)).astype(np.int16)
     inputs = [torch.from_numpy(array) for array in ((rgb, steps) if depth else (rgb,))]
     normalization = RGBD_NORMALIZATION if depth else RGB_NORMALIZATION
-    images = normalize(inputs, normalization)
+    images = normalize(inputs, normalization, DEPTH if depth else ("rgb",))
     assert images.shape == (3, 2, 4 if depth else 3, 4, 5)
     assert images.dtype == torch.float32
     assert images.is_contiguous()
@@ -98,7 +103,82 @@ def test_normalization_of_other_channels(depth: bool, normalization: Normalizati
     inputs = [torch.zeros((1, 2, 2, 3), dtype=torch.uint8)]
     inputs += [torch.zeros((1, 2, 2), dtype=torch.int16)] * depth
     with pytest.raises(SettingError, match="channels"):
-        normalize(inputs, normalization)
+        normalize(inputs, normalization, DEPTH if depth else ("rgb",))
+
+
+# --- other inputs -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("up", [None, (0.6, 0.0, 0.8), (0.0, 0.0, -1.0)])
+@pytest.mark.parametrize(
+    "representation",
+    [
+        TangentRepresentation(0, 5, rotation="so3", faces_per_panorama=4, mirror=True),
+        EquirectRepresentation(5, rotation="so3", mirror=True),
+        EquirectRepresentation(5, crop_deg=90, rotation="yaw", mirror=True),
+    ],
+)
+def test_elevation_is_how_far_a_pixel_looks_up(
+    representation: Representation, up: tuple[float, float, float] | None
+) -> None:
+    """Against directions rendered as three pictures: the same pixels, another way to the angle."""
+    shape = (64, 128)
+    zenith = None if up is None else np.array(up)
+    image = Panorama(np.zeros((*shape, 3), np.uint8), None, np.zeros(shape, np.uint8), zenith)
+    for seed in range(4):
+        views = representation.sample(np.random.default_rng(seed))
+        elevation = render_inputs(image, views, ("rgb", "elevation"))[1].numpy()
+        directions = views.render(equirect_directions(shape).astype(np.float32), "bilinear")
+        expected = directions @ np.array((0, 0, 1) if up is None else up)
+        np.testing.assert_allclose(elevation, expected, atol=1e-5)
+        assert elevation.dtype == np.float32
+    whole = representation.turned(np.eye(3)).whole()
+    elevation = render_inputs(image, whole, ("rgb", "elevation"))[1].numpy()
+    assert -1 <= elevation.min() < -0.99
+    assert 0.99 < elevation.max() <= 1
+
+
+def test_the_elevation_of_tangent_images_is_that_of_their_rays() -> None:
+    shape, representation = (128, 256), TangentRepresentation(0, 6)
+    image = Panorama(np.zeros((*shape, 3), np.uint8), None, np.zeros(shape, np.uint8))
+    elevation = render_inputs(image, representation.whole(), ("rgb", "elevation"))[1].numpy()
+    np.testing.assert_allclose(elevation, representation.grid.directions()[..., 2], atol=4e-4)
+
+
+def test_validity_and_elevation_follow_the_measured_channels() -> None:
+    rgb = torch.full((2, 3, 3, 3), 255, dtype=torch.uint8)
+    depth = torch.tensor([[0, 1, 2048]] * 3, dtype=torch.int16).expand(2, 3, 3)
+    elevation = torch.linspace(-1, 1, 18).reshape(2, 3, 3)
+    every: tuple[Input, ...] = ("rgb", "depth", "validity", "elevation")
+    images = normalize([rgb, depth, elevation], IDENTITY, every)
+    assert images.shape == (2, 6, 3, 3)
+    assert images[0, 3, 0].tolist() == [0, 1 / 512, 4]
+    assert images[:, 4].unique(dim=0).tolist() == [[[0, 1, 1]] * 3]
+    torch.testing.assert_close(images[:, 5], elevation)
+    without = normalize([rgb, depth], IDENTITY, every[:3])
+    torch.testing.assert_close(without, images[:, :5])
+    flat = normalize([rgb, elevation], RGB_NORMALIZATION, ("rgb", "elevation"))
+    torch.testing.assert_close(flat[:, 3], elevation)
+
+
+@pytest.mark.parametrize(
+    "inputs",
+    [
+        (),
+        ("depth",),
+        ("rgb", "validity"),
+        ("rgb", "rgb"),
+        ("rgb", "heat"),
+        ("rgb", "elevation") * 2,
+    ],
+)
+def test_impossible_inputs(inputs: Any) -> None:
+    with pytest.raises(SettingError, match=r"data\.inputs: found .* expected rgb"):
+        checked_inputs(inputs)
+
+
+def test_inputs_come_in_the_order_of_the_channels() -> None:
+    assert checked_inputs(["elevation", "depth", "rgb"]) == ("rgb", "depth", "elevation")
 
 
 # --- samples -----------------------------------------------------------------------------------
@@ -106,7 +186,7 @@ def test_normalization_of_other_channels(depth: bool, normalization: Normalizati
 
 def _training(strips: Representation, seed: int = 0) -> TrainingImages:
     source: ImageSource[Panorama] = Positions()
-    return TrainingImages(source, strips, seed)
+    return TrainingImages(source, strips, seed, DEPTH)
 
 
 def test_training_sample(strips: Representation) -> None:
@@ -128,9 +208,9 @@ def test_depth_is_clipped_and_missing_is_zero(
     steps = np.tile(np.array([0, 1, 2047, 2048, 2049, 32768, 65535, 0], np.uint16), (16, 4))
     panorama = Positions().read(0)._replace(depth=steps)
     monkeypatch.setattr(Positions, "read", lambda *_: panorama)
-    images = EvaluationImages(Positions(), strips)[0, 0].images
+    images = EvaluationImages(Positions(), strips, DEPTH)[0, 0].images
     assert images[1][0, 0].tolist() == [0, 1, 2047, 2048, 2048, 2048, 2048, 0]
-    assert normalize(images, IDENTITY)[0, 3, 0, 3] == 4  # metres
+    assert normalize(images, IDENTITY, DEPTH)[0, 3, 0, 3] == 4  # metres
 
 
 def test_views_are_those_of_seed_epoch_and_index(strips: Representation) -> None:
@@ -141,10 +221,10 @@ def test_views_are_those_of_seed_epoch_and_index(strips: Representation) -> None
 
 
 def test_evaluation_sample(strips: Representation) -> None:
-    dataset = EvaluationImages(Positions(), strips)
+    dataset = EvaluationImages(Positions(), strips, DEPTH)
     sample = dataset[0, 2]
     assert len(dataset) == len(_training(strips)) == 3
-    images = normalize(sample.images, IDENTITY)
+    images = normalize(sample.images, IDENTITY, DEPTH)
     assert images.shape == (4, 4, 16, 8)
     assert sample.index == 2
     np.testing.assert_array_equal(sample.target.numpy(), Positions().read(2).labels)
@@ -155,7 +235,7 @@ def test_evaluation_sample(strips: Representation) -> None:
 @pytest.mark.parametrize("count", [1, 2])
 def test_batches_are_those_of_torch(strips: Representation, count: int) -> None:
     training: Any = _training(strips)
-    evaluation: Any = EvaluationImages(Positions(), strips)
+    evaluation: Any = EvaluationImages(Positions(), strips, DEPTH)
     for samples in ([d[0, i] for i in range(count)] for d in (training, evaluation)):
         found, expected = collate(samples), default_collate(samples)
         assert type(found) is type(expected)
@@ -172,8 +252,8 @@ def test_samples_share_no_memory_with_panoramas(
     monkeypatch.setattr(Positions, "read", lambda *_: panorama)
     whole = EquirectRepresentation(level=3)
     for dataset in (
-        TrainingImages(Positions(), whole, 0),
-        EvaluationImages(Positions(), whole),
+        TrainingImages(Positions(), whole, 0, DEPTH),
+        EvaluationImages(Positions(), whole, DEPTH),
     ):
         for tensor in (*(sample := dataset[0, 0]).images, sample[1]):
             assert not any(np.shares_memory(tensor.numpy(), part) for part in panorama)
@@ -186,7 +266,7 @@ def test_samples_collate(strips: Representation) -> None:
     assert [image.shape for image in batch.images] == [(2, 2, 16, 8, 3), (2, 2, 16, 8)]
     assert batch.labels.dtype == torch.uint8
     assert torch.as_tensor(batch.index).tolist() == [0, 2]
-    whole = default_collate([EvaluationImages(Positions(), strips)[0, 1]])
+    whole = default_collate([EvaluationImages(Positions(), strips, DEPTH)[0, 1]])
     assert isinstance(whole, EvaluationSample)
     assert whole.target.shape == (1, 16, 32)
 
@@ -196,8 +276,8 @@ def test_samples_collate(strips: Representation) -> None:
 
 def test_jitter_changes_the_colours_and_nothing_else(strips: Representation) -> None:
     plain, jittered = (
-        TrainingImages(Positions(), strips, 0),
-        TrainingImages(Positions(), strips, 0, 0.5),
+        TrainingImages(Positions(), strips, 0, DEPTH),
+        TrainingImages(Positions(), strips, 0, DEPTH, 0.5),
     )
     for epoch in range(3):
         before, after = plain[epoch, 1], jittered[epoch, 1]

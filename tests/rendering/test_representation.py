@@ -1,18 +1,24 @@
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
 
 from tangent_train.errors import SettingError
-from tangent_train.geometry import equirect_directions
+from tangent_train.geometry import TangentGrid, equirect_directions, rotation_about
 from tangent_train.rendering import (
+    Blend,
     CubemapRepresentation,
     EquirectRepresentation,
     Representation,
     TangentRepresentation,
+    rotate_equirect,
+    tangent_to_equirect,
 )
+from tangent_train.rendering.views import PinholeViews
 
 SHAPE = (64, 128)
 
@@ -199,3 +205,76 @@ def test_impossible_equirectangular_settings_are_refused() -> None:
 def test_impossible_cubes_are_refused(settings: dict[str, object], message: str) -> None:
     with pytest.raises(SettingError, match=message):
         CubemapRepresentation(**{"level": 5, **settings})  # type: ignore[arg-type]
+
+
+# Turned as a whole, averaged over turns, and where the images look.
+
+TILT = rotation_about((1, 2, 0), math.radians(50)) @ rotation_about((0, 0, 1), 1)
+
+
+@pytest.mark.parametrize("representation", REPRESENTATIONS)
+def test_turned_views_see_the_panorama_turned_back(representation: Representation) -> None:
+    """Independent: turning what is looked at instead, with `rotate_equirect`."""
+    waves = 100 + 50 * np.sin(3 * equirect_directions(SHAPE) @ [[1, 0.3], [0, 1], [1, -0.5]])
+    image = waves.astype(np.float32)
+    views = representation.turned(TILT).whole().render(image, "bilinear")
+    expected = representation.whole().render(rotate_equirect(image, TILT.T), "bilinear")
+    np.testing.assert_allclose(views, expected, atol=2)
+    np.testing.assert_array_equal(representation.turned(TILT).whole().rotations(), TILT[None])
+
+
+@pytest.mark.parametrize("representation", REPRESENTATIONS)
+def test_labels_of_turned_views_come_back_where_they_were(representation: Representation) -> None:
+    labels = _labels()
+    views = representation.turned(TILT).whole()
+    scores = _scores(views.render(labels, "nearest"))
+    back = representation.to_labels(scores, SHAPE, views.rotations())
+    assert back.dtype == torch.int64
+    assert np.mean(back.numpy() == labels) > 0.95
+    wrong = representation.to_labels(scores, SHAPE).numpy()
+    assert np.mean(wrong == labels) < 0.5
+
+
+@pytest.mark.parametrize("blend", ["nearest", "feather"])
+def test_averaged_turns_have_the_highest_mean_probability(blend: Blend) -> None:
+    """Against all probabilities rendered one by one."""
+    representation = TangentRepresentation(0, 4, blend=blend, average_rotations=3).turned(TILT)
+    views = representation.whole()
+    rotations = views.rotations()
+    assert rotations.shape == (3, 3, 3)
+    np.testing.assert_allclose(rotations[:, :, 2], np.tile(TILT[:, 2], (3, 1)), atol=1e-12)
+    shape = (32, 64)
+    assert views.render(np.zeros((*shape, 3), np.uint8), "bilinear").shape == (60, 16, 16, 3)
+    scores = torch.randn(60, 5, 16, 16, generator=torch.Generator().manual_seed(0))
+    mean = np.zeros((5, *shape))
+    for k, rotation in enumerate(rotations):
+        grid = TangentGrid(0, 4, rotation=rotation)
+        part = scores[20 * k : 20 * k + 20].double().softmax(dim=1)
+        mean += tangent_to_equirect(part, grid, shape, blend).numpy() / 3
+    labels = representation.to_labels(scores, shape, rotations).numpy()
+    best = np.sort(mean, axis=0)
+    clear = best[-1] - best[-2] > 1e-5
+    assert clear.mean() > 0.99
+    np.testing.assert_array_equal(labels[clear], mean.argmax(axis=0)[clear])
+
+
+def test_averaging_over_no_turn_is_refused() -> None:
+    with pytest.raises(SettingError, match=r"representation\.average_rotations: found 0"):
+        TangentRepresentation(0, 5, average_rotations=0)
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_rays_say_where_the_pixels_look(mirrored: bool) -> None:
+    grid = TangentGrid(1, 5, 20, TILT)
+    faces = np.array([3, 77, 12])
+    views = PinholeViews(grid, faces, mirrored)
+    edges = (2 * np.arange(20) + 1) / 20 - 1
+    x, y = np.meshgrid(edges, edges)
+    seen = np.einsum("nwc,ijc->nijw", views.rays(), np.stack([x, y, np.ones_like(x)], axis=-1))
+    seen /= np.linalg.norm(seen, axis=-1, keepdims=True)
+    expected = grid.directions(faces)
+    np.testing.assert_allclose(seen, expected[:, :, ::-1] if mirrored else expected, atol=1e-6)
+
+
+def test_what_is_no_pinhole_image_has_no_rays() -> None:
+    assert EquirectRepresentation(5).whole().rays().shape == (0, 3, 3)

@@ -28,6 +28,8 @@ class Training(NamedTuple):
 class Evaluation(NamedTuple):
     images: Tensor
     target: Tensor
+    rays: Tensor
+    rotations: Tensor
     index: int  # type: ignore[assignment]  # nobody needs tuple.index
 
 
@@ -48,7 +50,8 @@ class Data(lightning.LightningDataModule):
             tensor = torch.from_numpy(images).permute(0, 3, 1, 2).contiguous()
             labels = torch.from_numpy(whole.render(truth, "nearest"))
             self.train.append(Training(tensor, labels, index))
-            self.test.append(Evaluation(tensor, torch.from_numpy(truth), index))
+            where = torch.tensor(whole.rays()), torch.tensor(whole.rotations())
+            self.test.append(Evaluation(tensor, torch.from_numpy(truth), *where, index))
 
     def train_dataloader(self) -> DataLoader[Any]:
         return DataLoader(self.train, batch_size=2)  # type: ignore[arg-type]

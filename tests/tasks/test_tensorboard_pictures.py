@@ -200,7 +200,7 @@ def test_crops_of_a_photo_stand_side_by_side(
     task = _task(PHOTOS, data.class_names)
     _fit(tmp_path, data, task, count=1, max_epochs=1)
     events, source = _events(tmp_path), data.source("val")
-    sample: Any = EvaluationImages(source, PHOTOS)[0, 0]
+    sample: Any = EvaluationImages(source, PHOTOS, data.inputs)[0, 0]
     rgb, truth = sample.images[0].numpy(), sample.target.numpy()
     assert len(rgb) > 1, "several crops"
     (tag,) = _tags(events, "images", "val_images/")

@@ -33,7 +33,7 @@ def what_happens(settings: PredictSettings, trained: TrainedNetwork, count: int)
     return (
         f"{count} {noun}{'s' if count != 1 else ''}, {len(trained.class_names) - 1} classes, "
         f"level {shown} (the network's is {trained.level}), blend {settings.blend}, "
-        f"{'RGB and depth' if 'depth' in trained.inputs else 'RGB'}"
+        f"{', '.join(trained.inputs)}"
     )
 
 
@@ -59,6 +59,7 @@ def summary(
         "base_level": settings.base_level,
         "blend": settings.blend,
         "rotations": settings.rotations,
+        "upright": settings.upright,
         "classes": _mean_shares(entries, trained.class_names),
         "images": entries,
     }

@@ -12,6 +12,7 @@ from tangent_train.cli import values
 from tangent_train.errors import SettingError
 
 if TYPE_CHECKING:
+    from datamodules.panorama_module import Upright
     from tangent_train.rendering import Blend
     from tangent_train.tasks.prediction.predictor import Level
 
@@ -36,6 +37,7 @@ class PredictSettings:
     base_level: int | None
     blend: Blend
     rotations: int
+    upright: Upright
     probabilities: bool
     report: int
     overwrite: bool
@@ -53,7 +55,7 @@ class PredictSettings:
         _check_given(config)
         projection = values.choice(config, "projection", ("equirectangular", "perspective"))
         other = "panoramas" if projection == "perspective" else "photos"
-        for name in ("crop", "rotations") if projection == "perspective" else ("fov",):
+        for name in ("crop", "rotations", "upright") if projection == "perspective" else ("fov",):
             if config[name] not in (None, 1):
                 remedy = "" if other == "panoramas" else "Add projection=perspective."
                 raise SettingError(
@@ -79,6 +81,9 @@ class PredictSettings:
             base_level=values.optional_whole(config, "base_level", 0),
             blend=values.choice(config, "blend", ("feather", "nearest")),
             rotations=values.whole(config, "rotations", 1),
+            upright=None
+            if config["upright"] is None
+            else values.choice(config, "upright", ("pose", "auto")),
             probabilities=values.flag(config, "probabilities"),
             report=values.whole(config, "report", 0),
             overwrite=values.flag(config, "overwrite"),

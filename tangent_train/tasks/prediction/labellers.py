@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from datamodules.gpano import area_of, area_of_crop, whole_area
+from datamodules.gpano_pose import up_of
 from datamodules.image_files import find_depth, photo_fov_deg, read_depth_m, read_rgb
 from datamodules.panoramas import meters_to_steps, resize_nearest
 from tangent_train.errors import DataError
 from tangent_train.geometry import camera_matrix_from_fov
+from tangent_train.rendering.gravity import estimate_up
 from tangent_train.tasks.prediction.predictor import Done, InputImage
 from tangent_train.tasks.prediction.seams import seam_score
 from tangent_train.tasks.prediction.summary import class_shares
@@ -23,6 +26,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from datamodules.gpano import PanoramaArea
+    from datamodules.panorama_module import Upright
     from tangent_train.rendering.mosaic import ScoreMosaic
     from tangent_train.tasks.prediction.panoramas import PanoramaPredictor
     from tangent_train.tasks.prediction.photos import PhotoPredictor
@@ -113,12 +117,15 @@ class PanoramaLabeller:
         class_names: K + 1 names.
         crop: What all of them show, see `area_of_crop`; None for what they say themselves.
         depth: Their depth, for networks that take it.
+        upright: Look at them upright: as they say themselves (``pose``), or else as estimated
+            (``auto``); None for as they are.
     """
 
     predictor: PanoramaPredictor
     class_names: Sequence[str]
     crop: Sequence[float] | None = None
     depth: DepthFolder | None = None
+    upright: Upright = None
 
     def label(self, path: Path, name: str, done: Done, *, averaged: bool) -> Labelled:
         """Labels of one panorama; see `Labeller`."""
@@ -129,9 +136,9 @@ class PanoramaLabeller:
         else:
             area = area_of(path, size) or whole_area(path, size)
         depth = None if self.depth is None else area.place(self.depth.read(name, size))
-        prediction = self.predictor.predict(
-            InputImage(area.place(rgb), depth), done, averaged=averaged
-        )
+        whole = area.place(rgb)
+        image = InputImage(whole, depth, self._up(path, whole))
+        prediction = self.predictor.predict(image, done, averaged=averaged)
         labels = prediction.mosaic.labels() + np.uint8(1)  # 0 is the unknown class
         if not area.is_whole:
             labels[~area.known] = 0
@@ -141,8 +148,18 @@ class PanoramaLabeller:
             figures |= {"seam_border": seam.border, "seam_inside": seam.inside}
             figures["seam_ratio"] = seam.ratio
         figures["classes"] = class_shares(labels, self.class_names)
+        if image.up is not None:
+            figures["tilt_deg"] = round(math.degrees(math.acos(np.clip(image.up[2], -1, 1))), 2)
         mosaic = prediction.mosaic if averaged else None  # 4·K bytes a pixel
         return Labelled(rgb, area.cut(labels), figures, mosaic, area)
+
+    def _up(self, path: Path, rgb: NDArray[np.uint8]) -> NDArray[np.float64] | None:
+        if self.upright is None:
+            return None
+        known = up_of(path)
+        if known is None and self.upright == "auto":
+            return estimate_up(rgb).up
+        return known
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+from dataclasses import replace
 from functools import lru_cache, partial
 from typing import TYPE_CHECKING
 
@@ -12,42 +12,24 @@ import torch
 
 from datamodules.panoramas import resize_area, resize_depth
 from tangent_train.errors import SettingError
-from tangent_train.geometry import nearest_level, rotation_about
+from tangent_train.geometry import nearest_level
+from tangent_train.rendering.gravity import upright_rotation
 from tangent_train.rendering.mosaic import ScoreMosaic
 from tangent_train.rendering.perspective import PhotoCrops
-from tangent_train.rendering.representation import PinholeRepresentation
+from tangent_train.rendering.representation import PinholeRepresentation, spun, turns
 from tangent_train.rendering.views import PinholeViews
 from tangent_train.tasks.prediction.predictor import Done, InputImage, Level, Prediction, Runner
 from tangent_train.tasks.prediction.seen import panorama_representation
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
     from torch import Tensor
 
     from tangent_train.rendering import Blend, EquirectRepresentation
     from tangent_train.tasks.networks import TrainedNetwork
 
-__all__ = ["PanoramaPredictor", "turns"]
+__all__ = ["PanoramaPredictor"]
 
-_SYMMETRY_DEG = 72.0
-"""The icosahedron looks the same after this turn about the vertical."""
-
-
-def turns(count: int) -> list[NDArray[np.float64] | None]:
-    """Rotations of the icosahedron to average over, evenly about the vertical; none is the first.
-
-    Images stay upright, as most networks know them: any rotation at all halves their scores.
-
-    Args:
-        count: How many, 1 or more.
-
-    Raises:
-        SettingError: Fewer.
-    """
-    if not isinstance(count, int) or count < 1:
-        raise SettingError("rotations", found=count, expected="a whole number from 1")
-    step = math.radians(_SYMMETRY_DEG / count)
-    return [None, *(rotation_about((0, 0, 1), step * k) for k in range(1, count))]
+_SHOW_TANGENT = "Give base_level= to show it tangent images."
 
 
 class PanoramaPredictor:
@@ -75,7 +57,7 @@ class PanoramaPredictor:
         rotations: int = 1,
     ) -> None:
         self._runner = runner
-        self._turns = turns(rotations)
+        self._turns = turns(rotations, "rotations")
         self._blend = blend
         self._level = trained.level if level is None else level
         self._seen = lru_cache(maxsize=4)(
@@ -101,6 +83,8 @@ class PanoramaPredictor:
         small = _shrunk(image, (seen.erp_height, 2 * seen.erp_height))
         averaged = averaged or len(self._turns) > 1
         if isinstance(seen, PinholeRepresentation):
+            if image.up is not None:
+                seen = seen.turned(upright_rotation(image.up))
             blend = self._blend if seen.grid.overlapping else "nearest"
             mosaic = ScoreMosaic(
                 (height, width), self._runner.num_classes, blend, averaged=averaged
@@ -109,6 +93,13 @@ class PanoramaPredictor:
             views = seen.grid.num_images * len(self._turns)
             return Prediction(mosaic, level, views, seen.grid)
         self._check_turns(seen)
+        if image.up is not None:
+            raise SettingError(
+                "upright",
+                found="a panorama to be looked at upright",
+                expected="null for a network that sees equirectangular images",
+                remedy=_SHOW_TANGENT,
+            )
         mosaic = ScoreMosaic(
             (height, width), self._runner.num_classes, "nearest", averaged=averaged
         )
@@ -121,10 +112,12 @@ class PanoramaPredictor:
     ) -> None:
         count = seen.grid.num_images
         for turn in self._turns:
-            grid = seen.grid if turn is None else seen.grid.with_rotation(turn)
-            for faces in self._runner.parts(count, seen.image_size):
-                scores = self._runner.scores(image, PinholeViews(grid, faces))
-                mosaic.add(scores, grid, faces)
+            grid = spun(seen.grid, turn)
+            parts = self._runner.parts(count, seen.image_size)
+            views = [PinholeViews(grid, faces) for faces in parts]
+            contexts = self._runner.contexts(image, views)
+            for faces, part, context in zip(parts, views, contexts, strict=True):
+                mosaic.add(self._runner.scores(image, part, context), grid, faces)
                 done(len(faces) / count / len(self._turns))
 
     def _add_whole(
@@ -145,7 +138,7 @@ class PanoramaPredictor:
                 "rotations",
                 found=len(self._turns),
                 expected="1 for a network that sees equirectangular images",
-                remedy="Give base_level= to show it tangent images.",
+                remedy=_SHOW_TANGENT,
             )
 
 
@@ -154,7 +147,7 @@ def _shrunk(image: InputImage, shape: tuple[int, int]) -> InputImage:
     if image.rgb.shape[0] <= shape[0]:
         return image
     depth = None if image.depth is None else resize_depth(image.depth, shape)
-    return InputImage(resize_area(image.rgb, shape), depth)
+    return replace(image, rgb=resize_area(image.rgb, shape), depth=depth)
 
 
 def _enlarged(image: InputImage, shape: tuple[int, int]) -> InputImage:
@@ -168,7 +161,7 @@ def _enlarged(image: InputImage, shape: tuple[int, int]) -> InputImage:
     depth = None
     if image.depth is not None:
         depth = cv2.resize(image.depth, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
-    return InputImage(np.ascontiguousarray(rgb), depth)
+    return replace(image, rgb=np.ascontiguousarray(rgb), depth=depth)
 
 
 def _wrapped(scores: Tensor) -> Tensor:

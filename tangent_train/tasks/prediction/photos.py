@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from datamodules.panoramas import resize_area, resize_depth
 from datamodules.photos import distance_from_z_depth
+from tangent_train.errors import SettingError
 from tangent_train.geometry import nearest_level
 from tangent_train.rendering.mosaic import ScoreMosaic
 from tangent_train.rendering.perspective import PhotoCrops
@@ -56,6 +57,13 @@ class PhotoPredictor:
         base_level: int | None = None,
         blend: Blend = "feather",
     ) -> None:
+        if "elevation" in trained.inputs:
+            raise SettingError(
+                "projection",
+                found="perspective",
+                expected="equirectangular: the network is shown how far each pixel looks up, "
+                "which nobody knows of photos",
+            )
         self._runner, self._blend = runner, blend
         self._level = trained.level if level is None else level
         self._seen = lru_cache(maxsize=4)(

@@ -10,9 +10,12 @@ import numpy as np
 import torch
 
 from datamodules.samples import normalize, render_inputs
+from models.sphere_context import SphereContext
 from tangent_train.errors import SettingError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
     from torch import Tensor
 
@@ -43,10 +46,12 @@ class InputImage:
     Attributes:
         rgb: ``(H, W, 3)`` uint8.
         depth: ``(H, W)`` distance from the centre in steps of 1/512 m, 0 where missing; or None.
+        up: ``(3,)`` direction of the zenith of a panorama; None where it is z.
     """
 
     rgb: NDArray[np.uint8]
     depth: NDArray[np.uint16] | None = None
+    up: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)
@@ -90,7 +95,10 @@ class Runner:
             raise SettingError(
                 "device", found=f"{device} ({error})", expected="cpu, or a device of this machine"
             ) from error
+        inner = getattr(self._network, "network", None)  # of `Scores`
+        self._of_sphere = inner if isinstance(inner, SphereContext) else None
         self._normalization = trained.normalization
+        self._inputs = trained.inputs
         self._at_once = views_at_once
         self.num_classes = len(trained.class_names) - 1
 
@@ -100,9 +108,41 @@ class Runner:
         return [np.arange(start, min(start + step, count)) for start in range(0, count, step)]
 
     @torch.inference_mode()
-    def scores(self, image: InputImage, views: Views) -> Tensor:
-        """``(n, K, h, w)`` scores of the views; the unknown class, never predicted, is left out."""
-        inputs = [part.to(self._device) for part in render_inputs(image.rgb, image.depth, views)]
-        images = normalize(inputs, self._normalization).contiguous(memory_format=_FORMAT)
-        scores: Tensor = self._network(images)
+    def contexts(self, image: InputImage, views: Sequence[Views]) -> list[Tensor | None]:
+        """What views of one sphere learn from each other, for `scores`.
+
+        Args:
+            image: The panorama.
+            views: All of the sphere, in parts that are shown together.
+
+        Returns:
+            For each part; None where the network looks at every image alone.
+        """
+        network = self._of_sphere
+        if network is None:
+            return [None] * len(views)
+        tokens = [network.encode(self._images(image, part)) for part in views]
+        rays = torch.from_numpy(np.concatenate([part.rays() for part in views]))
+        context = network.mix(rays[None].to(self._device), torch.cat(tokens))
+        return list(context.split([len(part) for part in tokens]))
+
+    @torch.inference_mode()
+    def scores(self, image: InputImage, views: Views, context: Tensor | None = None) -> Tensor:
+        """``(n, K, h, w)`` scores of the views; the unknown class, never predicted, is left out.
+
+        Args:
+            image: A panorama or photo.
+            views: Some that are shown together.
+            context: Theirs, from `contexts`.
+        """
+        images = self._images(image, views)
+        if self._of_sphere is None or context is None:
+            scores: Tensor = self._network(images)
+        else:
+            scores = self._of_sphere.decode(images, context)
         return scores[:, 1:]
+
+    def _images(self, image: InputImage, views: Views) -> Tensor:
+        rendered = [part.to(self._device) for part in render_inputs(image, views, self._inputs)]
+        images = normalize(rendered, self._normalization, self._inputs)
+        return images.contiguous(memory_format=_FORMAT)

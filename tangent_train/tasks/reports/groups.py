@@ -135,7 +135,9 @@ class Group:
     @property
     def inputs(self) -> str:
         """RGB or RGB-D, as the paper writes it."""
-        return "RGB-D" if "depth" in (self.setting("data.inputs") or ()) else "RGB"
+        names = self.setting("data.inputs") or ()
+        further = [name for name in names if name not in ("rgb", "depth")]
+        return " + ".join(["RGB-D" if "depth" in names else "RGB", *further])
 
     @property
     def base_level(self) -> int | str:

@@ -11,13 +11,17 @@ import pytest
 import torch
 
 from datamodules import Stanford2D3DS
+from datamodules.samples import normalize, render_inputs
 from tangent_train.errors import SettingError
-from tangent_train.geometry import equirect_directions
-from tangent_train.tasks.networks import make
-from tangent_train.tasks.prediction.panoramas import PanoramaPredictor, turns
+from tangent_train.geometry import equirect_directions, rotation_about
+from tangent_train.rendering import rotate_equirect
+from tangent_train.rendering.representation import turns
+from tangent_train.tasks.networks import Scores, make
+from tangent_train.tasks.prediction.panoramas import PanoramaPredictor
 from tangent_train.tasks.prediction.predictor import InputImage, Prediction, Runner
 from tangent_train.tasks.prediction.seen import panorama_representation
 from tangent_train.tasks.segmentation import SegmentationTask
+from tests.models.sphere_networks import awake, small_context
 from tests.tasks.prediction.trained import CUBE, ERP, PERSPECTIVE, TANGENT, trained_network
 
 if TYPE_CHECKING:
@@ -75,6 +79,59 @@ def test_labels_are_those_of_an_evaluation(
     np.testing.assert_array_equal(prediction.mosaic.labels() + 1, expected)
 
 
+@pytest.mark.parametrize("at_once", [7, 1000])
+def test_images_of_a_sphere_see_each_other_as_in_an_evaluation(at_once: int) -> None:
+    torch.manual_seed(0)
+    network = small_context().eval()
+    awake(network)
+    image, made = InputImage(_sphere(32)), make(TANGENT)
+    trained = trained_network(TANGENT, network=Scores(network))
+    labels = _predict(trained, image, at_once, blend="nearest").mosaic.labels()
+    task = SegmentationTask(
+        network, made, trained.class_names, functools.partial(torch.optim.SGD, lr=1.0)
+    ).eval()
+    whole = made.whole()
+    images = normalize(
+        render_inputs(image, whole, trained.inputs), trained.normalization, trained.inputs
+    )
+    rays = torch.tensor(whole.rays())
+    expected = task.predict_labels(images, (32, 64), rays).numpy() - 1
+    np.testing.assert_array_equal(labels, expected)
+    assert len(np.unique(labels)) > 1
+    with torch.no_grad():
+        difference = task(images, rays[None]) - task(images)
+    assert difference.abs().max() > 0.01, "the context does something"
+
+
+def test_a_network_is_shown_how_far_up_it_looks() -> None:
+    """Its only input that matters: what is above the horizon is bright, what is below dark."""
+    network = torch.nn.Conv2d(4, 4, 1)
+    with torch.no_grad():
+        network.weight.zero_()
+        network.weight[1, 3], network.weight[3, 3] = -1, 1
+        network.bias.copy_(torch.tensor([9.0, 0, -9, 0]))  # type: ignore[union-attr]
+    trained = trained_network(TANGENT, network=network, inputs=("rgb", "elevation"))
+    labels = _predict(trained, InputImage(_sphere(32))).mosaic.labels()
+    assert (labels[:15] == 2).all()
+    assert (labels[17:] == 0).all()
+    up = np.array([1.0, 0.0, 0.0])  # tilted forwards by a right angle
+    tilted = _predict(trained, InputImage(_sphere(32), up=up)).mosaic.labels()
+    assert (tilted[:, 20:44] == 2).mean() > 0.85, "around the middle column"
+    assert (tilted[:, [0, 63]] == 0).mean() > 0.85
+
+
+def test_a_tilted_panorama_is_looked_at_upright() -> None:
+    """A network that knows rows only, on images that are turned upright."""
+    trained, rgb = trained_network(TANGENT), _sphere(64)
+    rotation = rotation_about((1, 2, 0), np.radians(40))
+    upright = _predict(trained, InputImage(rgb)).mosaic.labels()
+    tilted = InputImage(rotate_equirect(rgb, rotation), up=rotation @ [0, 0, 1])
+    labels = _predict(trained, tilted).mosaic.labels()
+    assert (labels == rotate_equirect(upright, rotation, "nearest")).mean() > 0.93
+    with pytest.raises(SettingError, match=r"upright: found .*base_level="):
+        _predict(trained_network(ERP), tilted)
+
+
 @pytest.mark.parametrize("at_once", [1, 7, 1000])
 def test_the_number_of_images_at_once_changes_nothing(at_once: int) -> None:
     image, trained = InputImage(_sphere(32)), trained_network(TANGENT)
@@ -123,10 +180,9 @@ def test_a_larger_panorama_is_shrunk_without_aliasing() -> None:
 
 
 def test_rotations_are_turned_about_the_vertical_and_averaged() -> None:
-    rotations = turns(3)
-    assert rotations[0] is None
-    for k, rotation in enumerate(rotations[1:], start=1):
-        assert rotation is not None
+    rotations = turns(3, "rotations")
+    assert rotations[0].tolist() == np.eye(3).tolist()
+    for k, rotation in enumerate(rotations):
         np.testing.assert_allclose(rotation @ [0, 0, 1], [0, 0, 1], atol=1e-12)
         assert np.degrees(np.arctan2(rotation[1, 0], rotation[0, 0])) == pytest.approx(24 * k)
     prediction = _predict(trained_network(TANGENT), InputImage(_sphere(32)), rotations=3)
@@ -153,7 +209,7 @@ def test_networks_trained_on_photos_see_tangent_images() -> None:
 
 def test_impossible_settings_are_refused() -> None:
     with pytest.raises(SettingError, match="rotations: found 0"):
-        turns(0)
+        turns(0, "rotations")
     image = InputImage(_sphere(32))
     with pytest.raises(SettingError, match=r"rotations: found 2.*base_level="):
         _predict(trained_network(ERP), image, rotations=2)

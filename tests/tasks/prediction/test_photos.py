@@ -74,7 +74,8 @@ def test_photos_with_the_networks_pixels_are_labelled_pixel_by_pixel(
         depth = distance_from_z_depth(z_depth, camera_matrix_from_fov(fov_deg, size))
         inputs.append(torch.from_numpy(depth.astype(np.int32))[None])
     with torch.no_grad():
-        expected = network(normalize(inputs, trained.normalization))[0, 1:].argmax(0).numpy()
+        images = normalize(inputs, trained.normalization, trained.inputs)
+        expected = network(images)[0, 1:].argmax(0).numpy()
     image = InputImage(rgb, z_depth)
     prediction = _predict(trained, image, fov_deg, blend=blend)
     labels = prediction.mosaic.labels()
