@@ -315,8 +315,8 @@ def render_inputs(image: ShownImage, views: Views, inputs: Sequence[Input]) -> t
         rendered.append(torch.from_numpy(steps.view(np.int16)))  # torch hardly knows uint16
     if "elevation" in inputs:
         shape = (image.rgb.shape[0], image.rgb.shape[1])
-        upright = image.up is None
-        elevations = _upright_elevations(shape) if upright else equirect_elevations(shape, image.up)
+        up = image.up
+        elevations = _upright_elevations(shape) if up is None else equirect_elevations(shape, up)
         rendered.append(_tensor(views.render(elevations, "bilinear")))
     return tuple(rendered)
 

@@ -134,7 +134,7 @@ class SphereContext(nn.Module):
     ) -> Float[Tensor, "images features rows columns"]:
         """What is added to the tokens of all images of the spheres: the second step."""
         directions = token_directions(rays, tokens.shape[-2], tokens.shape[-1])
-        context: Tensor = self.mixer(tokens.unflatten(0, rays.shape[:2]), directions)
+        context: Tensor = self.mixer(tokens.reshape(*rays.shape[:2], *tokens.shape[1:]), directions)
         return context.flatten(0, 1)
 
     def decode(

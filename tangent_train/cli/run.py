@@ -200,7 +200,9 @@ def _check_fits(content: dict[str, Any], data: Any, checkpoint: Path) -> None:
 def _channels(path: Path, data: Any) -> Any:
     """Names of the channels that the network of a file takes, and of those of the data."""
     before, now = inputs_in(path), getattr(data, "inputs", None)
-    return None if None in (before, now) else (channel_names(before), channel_names(now))
+    if before is None or now is None:
+        return None
+    return channel_names(before), channel_names(now)
 
 
 def _shown(data: Any) -> dict[str, Any]:

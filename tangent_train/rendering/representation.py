@@ -191,7 +191,7 @@ class PinholeRepresentation:
         if len(grids) == 1:
             labels: Tensor = tangent_to_labels(scores, grids[0], shape, self.blend)
             return labels
-        of_grids = scores.unflatten(0, (len(grids), -1))
+        of_grids = scores.reshape(len(grids), -1, *scores.shape[1:])
         first, *others = (
             tangent_to_equirect(part, grid, shape, self.blend)
             for part, grid in zip(of_grids, grids, strict=True)

@@ -218,7 +218,7 @@ class SegmentationTask(Task):
         """
         turns = UNTURNED if rotations is None else rotations.cpu().numpy()
         if self.takes_rays and rays is not None and rays.numel():
-            scores = self(images, rays.unflatten(0, (len(turns), -1)))[:, 1:].float()
+            scores = self(images, rays.reshape(len(turns), -1, 3, 3))[:, 1:].float()
         else:
             parts = torch.split(images, self.images_per_forward)
             scores = torch.cat([self(part)[:, 1:].float() for part in parts])

@@ -176,7 +176,8 @@ def test_up_is_estimated_from_every_image(
 
     def estimate(rgb: NDArray[np.uint8], max_tilt_deg: float) -> Gravity:
         asked.append(max_tilt_deg)
-        return Gravity(np.array([0.6, 0.0, 0.8]), float(rgb.mean()))
+        up = np.array([0.6, 0.0, 0.8])
+        return Gravity(up, float(rgb.mean()), up[None])
 
     monkeypatch.setattr("datamodules.panoramas.estimate_up", estimate)
     module = make_module(upright="auto", max_tilt_deg=60, in_memory=True)

@@ -10,7 +10,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from torch import nn
 
-from datamodules.samples import Normalization
+from datamodules.samples import Input, Normalization
 from tangent_train.cli.compose import config_folder
 from tangent_train.cli.run import build
 from tangent_train.tasks.networks import Scores, TrainedNetwork, make, size_multiple_of
@@ -44,10 +44,11 @@ def small_trained(
     torch.manual_seed(1)
     scores = Scores(with_statistics(network or make(settings))).eval()
     multiple = size_multiple_of(scores, channels)
+    depth: tuple[Input, ...] = ("rgb", "depth")
     return TrainedNetwork(
         network=scores,
         class_names=NAMES,
-        inputs=("rgb", "depth")[: channels - 2],
+        inputs=depth[: channels - 2],
         normalization=Normalization(
             [0.5, 0.4, 0.3, 1.1][:channels], [0.2, 0.25, 0.3, 0.8][:channels]
         ),

@@ -152,7 +152,7 @@ def test_training_tells_such_a_network_where_all_images_look_and_leaves_the_chun
     )
     images, labels = _batch()
     samples: Any = [Training(i, k, torch.eye(3).expand(3, 3, 3)) for i, k in
-                    zip(images.split(3), labels.split(3), strict=True)]  # fmt: skip
+                    zip(torch.split(images, 3), torch.split(labels, 3), strict=True)]  # fmt: skip
     _trainer(max_steps=1, limit_val_batches=0).fit(task, DataLoader(samples, 2))
     assert network.told == [((2, 3, 3, 3), 3)]
 

@@ -124,7 +124,7 @@ class Runner:
         tokens = [network.encode(self._images(image, part)) for part in views]
         rays = torch.from_numpy(np.concatenate([part.rays() for part in views]))
         context = network.mix(rays[None].to(self._device), torch.cat(tokens))
-        return list(context.split([len(part) for part in tokens]))
+        return list(torch.split(context, [len(part) for part in tokens]))
 
     @torch.inference_mode()
     def scores(self, image: InputImage, views: Views, context: Tensor | None = None) -> Tensor:
