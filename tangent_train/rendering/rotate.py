@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from tangent_train.geometry import checked_rotation
 from tangent_train.rendering.checks import check_interpolation, check_numpy_image
@@ -69,11 +70,19 @@ def rotate_equirect(
     """
     check_interpolation(interpolation)
     check_numpy_image(image, interpolation)
-    shape = image.shape[:2]
-    u, v = np.empty((2, *shape), map_dtype(image.dtype == np.float64, interpolation))
-    inverse = np.ascontiguousarray(checked_rotation(rotation).T)
+    shape = (image.shape[0], image.shape[1])
+    dtype = map_dtype(image.dtype == np.float64, interpolation)
+    turned = checked_rotation(rotation)
+    return _sampled(image, _rotation_map(turned.tobytes(), shape, dtype), interpolation)
+
+
+@lru_cache(maxsize=1)
+def _rotation_map(rotation: bytes, shape: tuple[int, int], dtype: DTypeLike) -> EquirectMap:
+    """Where each direction comes from; kept for the other parts of the same panorama."""
+    u, v = np.empty((2, *shape), dtype)
+    inverse = np.ascontiguousarray(np.frombuffer(rotation).reshape(3, 3).T)
     over_rows(rotation_map, shape, inverse, *directions_of_rows(*shape), u, v)
-    return _sampled(image, EquirectMap(u, v, shape), interpolation)
+    return EquirectMap(u, v, shape)
 
 
 def _sampled(
