@@ -34,7 +34,7 @@ from datamodules.panoramas import (
     resize_depth,
     resize_nearest,
 )
-from datamodules.samples import Normalization
+from datamodules.samples import Input, Normalization
 from datamodules.sources import count_labels, in_threads
 from tangent_train.errors import SettingError
 
@@ -139,8 +139,8 @@ class FolderPanoramas(PanoramaDataModule):
         split_seed: Of the drawing of both. Not the seed of the run: networks of other seeds are
             compared on the same panoramas, and none is ever tested on what another was trained on.
         depth_units_per_m: Units in a metre of depth files of whole numbers, 1000 for millimetres.
-        inputs: `rgb`, or `rgb` and `depth`. Depth is clipped to 4 m.
-        normalization: Of the input channels, or a mapping with its `mean` and `std`; by default
+        inputs: See `SegmentationDataModule`. Depth is clipped to 4 m.
+        normalization: Of RGB and depth, or a mapping with its `mean` and `std`; by default
             that of Stanford2D3DS.
         **settings: All others of `PanoramaDataModule`.
 
@@ -161,7 +161,7 @@ class FolderPanoramas(PanoramaDataModule):
         validation_fraction: float = 0.1,
         split_seed: int = 0,
         depth_units_per_m: float = 1000,
-        inputs: Sequence[str] = ("rgb",),
+        inputs: Sequence[Input] = ("rgb",),
         normalization: Normalization | Mapping[str, Sequence[float]] | None = None,
         **settings: Any,
     ) -> None:

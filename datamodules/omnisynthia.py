@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from datamodules.samples import Normalization
+    from datamodules.samples import Input, Normalization
     from tangent_train.rendering.representation import Representation
 
 __all__ = ["OmniSynthia", "SynthiaPanoramas"]
@@ -132,9 +132,9 @@ class OmniSynthia(PanoramaDataModule):
             sequence, at least one, never all; 0 for no validation.
         frames: About how many panoramas of each sequence to make, see `choose_frames`.
         panorama_height: Rows of those that are made.
-        inputs: `rgb`, or `rgb` and `depth`. Depth is clipped to 4 m, which is little in a street;
+        inputs: See `SegmentationDataModule`. Depth is clipped to 4 m, which is little in a street;
             the published panoramas have the z-depth of the views instead of distance.
-        normalization: Of the input channels, see `default_normalization`.
+        normalization: Of RGB and depth, see `default_normalization`.
         **settings: All others of `PanoramaDataModule`.
 
     Raises:
@@ -153,7 +153,7 @@ class OmniSynthia(PanoramaDataModule):
         validation_fraction: float = 0.1,
         frames: int = FRAMES,
         panorama_height: int = HEIGHT,
-        inputs: Sequence[str] = ("rgb",),
+        inputs: Sequence[Input] = ("rgb",),
         normalization: Normalization | None = None,
         **settings: Any,
     ) -> None:

@@ -8,15 +8,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from lightning.pytorch.trainer.states import TrainerFn
 
-from datamodules.panoramas import (
-    FileSource,
-    Panorama,
-    Turn,
-    TurnedPanoramas,
-    UprightPanoramas,
-)
+from datamodules.panoramas import FileSource, Panorama, Turn
 from datamodules.segmentation_module import SPLITS, SegmentationDataModule, Split
 from datamodules.store import PreparedPanoramas, prepare_store
+from datamodules.turned_panoramas import PosedPanoramas, TurnedPanoramas, UprightPanoramas
 from tangent_train.errors import SettingError
 
 if TYPE_CHECKING:
@@ -44,10 +39,10 @@ class PanoramaDataModule(SegmentationDataModule[Panorama]):
         store: Folder of a prepared store, see `store`: panoramas are decoded once, then read from
             there. The samples are the same without.
         test_rotation: Turn the test panoramas: tilt in degrees, or `so3`, see `TurnedPanoramas`.
-        upright: Look at panoramas upright that are not. `pose`: those that say where up is (test
-            panoramas that `test_rotation` turned do). `auto`: as estimated from the image, up to
-            `max_tilt_deg`, see `UprightPanoramas`.
-        max_tilt_deg: The most that panoramas are tilted.
+        upright: Look at panoramas upright that are not. `pose`: as their files say (GPano) and, of
+            test panoramas, as they were turned. `auto`: as their files say, else as estimated from
+            the image.
+        max_tilt_deg: Of `auto`: some degrees more than they are tilted, see `estimate_up`.
         **settings: All others of `SegmentationDataModule`.
 
     Attributes:
@@ -67,7 +62,7 @@ class PanoramaDataModule(SegmentationDataModule[Panorama]):
         store: str | Path | None = None,
         test_rotation: Turn = None,
         upright: Upright = None,
-        max_tilt_deg: float = 45.0,
+        max_tilt_deg: float = 60.0,
         **settings: Any,
     ) -> None:
         if not hasattr(representation, "erp_height"):
@@ -84,7 +79,9 @@ class PanoramaDataModule(SegmentationDataModule[Panorama]):
         if upright not in (None, "pose", "auto"):
             raise SettingError("data.upright", found=upright, expected="null, pose or auto")
         if not 0 < max_tilt_deg <= _HALF_TURN_DEG:
-            raise SettingError("data.max_tilt_deg", found=max_tilt_deg, expected="0 to 180")
+            raise SettingError(
+                "data.max_tilt_deg", found=max_tilt_deg, expected="more than 0, at most 180"
+            )
         self.upright = upright
         self.max_tilt_deg = max_tilt_deg
 
@@ -136,6 +133,8 @@ class PanoramaDataModule(SegmentationDataModule[Panorama]):
         source: ImageSource[Panorama] = files
         if self.store is not None:
             source = PreparedPanoramas(files, self.store)
+        if self.upright is not None:
+            source = PosedPanoramas(source, files)
         if split == "test" and self.test_rotation is not None:
             known = self.upright == "pose"
             source = TurnedPanoramas(source, self.test_rotation, self.seed, known=known)

@@ -14,11 +14,8 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol, TypeVar
 import cv2
 import numpy as np
 
-from datamodules.sampling import sample_rng
-from datamodules.sources import ImageSource, count_labels
-from tangent_train.geometry import random_rotation, rotation_about
-from tangent_train.rendering import rotate_equirect
-from tangent_train.rendering.gravity import estimate_up, upright_rotation
+from datamodules.sources import ImageSource
+from tangent_train.rendering.gravity import upright_rotation
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -34,8 +31,6 @@ __all__ = [
     "Mask",
     "Panorama",
     "Turn",
-    "TurnedPanoramas",
-    "UprightPanoramas",
     "mask_black",
     "meters_to_steps",
     "resize_area",
@@ -50,7 +45,7 @@ Mask = Literal["labels", "any_black", "all_black"]
 """Which pixels count as unknown besides those without a label; see `mask_black`."""
 
 Turn = float | Literal["so3"] | None
-"""How test panoramas are turned: tilted by degrees, any way, or not; see `TurnedPanoramas`."""
+"""How test panoramas are turned: tilted by degrees, any way, or not."""
 
 STEPS_PER_M = 512
 """Depth is in steps of 1/512 m, as in the files of Stanford2D3DS."""
@@ -177,99 +172,6 @@ def mask_black(labels: NDArray[np.uint8], rgb: NDArray[np.uint8], mask: Mask) ->
         return labels
     black = rgb == 0
     return np.where(black.any(-1) if mask == "any_black" else black.all(-1), np.uint8(0), labels)
-
-
-class TurnedPanoramas:
-    """The panoramas of another source as seen by a camera that is not upright.
-
-    The labels turn with the image, so the score is that of the turned panorama. The same panorama
-    is turned the same way in every run with the same seed.
-
-    Args:
-        source: Where they come from.
-        rotation: Tilt in degrees about a random horizontal axis, after a random turn about the
-            vertical; or `so3`, uniform over all rotations.
-        seed: Seed of the turns.
-        known: Whether the panoramas say where up is, as those of a camera with a sensor for it.
-    """
-
-    def __init__(
-        self,
-        source: ImageSource[Panorama],
-        rotation: float | Literal["so3"],
-        seed: int,
-        *,
-        known: bool = False,
-    ) -> None:
-        self._source = source
-        self._rotation = rotation
-        self._seed = seed
-        self._known = known
-
-    def __len__(self) -> int:
-        return len(self._source)
-
-    def name(self, index: int) -> str:
-        """The name in the source."""
-        return self._source.name(index)
-
-    def rotation(self, index: int) -> NDArray[np.float64]:
-        """The turn of one panorama, ``(3, 3)``: what was seen at d is now seen at R d."""
-        rng = sample_rng(self._seed, 0, index)
-        if self._rotation == "so3":
-            return random_rotation(rng)
-        yaw, azimuth = rng.uniform(0, 2 * math.pi, 2)
-        tilt = rotation_about(
-            (math.cos(azimuth), math.sin(azimuth), 0), math.radians(self._rotation)
-        )
-        return tilt @ rotation_about((0, 0, 1), yaw)
-
-    def read(self, index: int) -> Panorama:
-        """One turned panorama: RGB bilinear, depth and labels nearest."""
-        rgb, depth, labels, _ = self._source.read(index)
-        rotation = self.rotation(index)
-        return Panorama(
-            rotate_equirect(rgb, rotation, "bilinear"),
-            None if depth is None else rotate_equirect(depth, rotation, "nearest"),
-            rotate_equirect(labels, rotation, "nearest"),
-            rotation[:, 2] if self._known else None,
-        )
-
-    def label_counts(self, index: int) -> NDArray[np.int64]:
-        """The pixels of every label of one turned panorama."""
-        return count_labels(self.read(index).labels)
-
-
-class UprightPanoramas:
-    """The panoramas of another source with an estimate of where up is.
-
-    They are looked at upright, whatever way the camera was held; their pixels and labels stay where
-    they are.
-
-    Args:
-        source: Where they come from.
-        max_tilt_deg: The most they may be tilted, see `estimate_up`.
-    """
-
-    def __init__(self, source: ImageSource[Panorama], max_tilt_deg: float) -> None:
-        self._source = source
-        self._max_tilt_deg = max_tilt_deg
-
-    def __len__(self) -> int:
-        return len(self._source)
-
-    def name(self, index: int) -> str:
-        """The name in the source."""
-        return self._source.name(index)
-
-    def read(self, index: int) -> Panorama:
-        """One panorama; up is that of the image, or z where nothing says it."""
-        panorama = self._source.read(index)
-        return panorama._replace(up=estimate_up(panorama.rgb, self._max_tilt_deg).up)
-
-    def label_counts(self, index: int) -> NDArray[np.int64]:
-        """The pixels of every label."""
-        return self._source.label_counts(index)
 
 
 def steps_to_meters(steps: NDArray[np.uint16]) -> NDArray[np.float32]:

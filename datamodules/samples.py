@@ -18,6 +18,7 @@ from datamodules.panoramas import STEPS_PER_M
 from datamodules.sampling import Seed, sample_rng
 from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_elevations
+from tangent_train.rendering.gravity import upright_rotation
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -40,6 +41,7 @@ __all__ = [
     "collate",
     "normalize",
     "render_inputs",
+    "world_rays",
 ]
 
 Input = Literal["rgb", "depth", "validity", "elevation"]
@@ -179,7 +181,7 @@ class TrainingSample(NamedTuple, Generic[_Images]):
             ``(P, h, w)`` int16 and elevation ``(P, h, w)`` float32: fewer bytes. On the device
             `normalize` makes them ``(P, C, h, w)`` float32.
         labels: ``(P, h, w)`` uint8, 0 where unknown.
-        rays: ``(P, 3, 3)`` float32 where the images look, see `Views.rays`; or ``(0, 3, 3)``.
+        rays: ``(P, 3, 3)`` float32 where the images look, see `world_rays`; or ``(0, 3, 3)``.
         index: Place in its split.
     """
 
@@ -197,7 +199,7 @@ class EvaluationSample(NamedTuple, Generic[_Images]):
         target: uint8 labels, 0 where unknown: ``(H, W)`` of the panorama itself; ``(N, h, w)`` of
             the crops of a photo.
         rays: As in `TrainingSample`.
-        rotations: ``(K, 3, 3)`` float64, see `Views.rotations`.
+        rotations: ``(K, 3, 3)`` float32, see `Views.rotations`.
         index: Place in its split.
     """
 
@@ -247,7 +249,7 @@ class TrainingImages(Dataset[TrainingSample[Inputs]]):
         return TrainingSample(
             (rgb, *others),
             _tensor(views.render(image.labels, "nearest")),
-            torch.from_numpy(views.rays()),
+            torch.from_numpy(world_rays(views, image.up)),
             index,
         )
 
@@ -278,8 +280,8 @@ class EvaluationImages(Dataset[EvaluationSample[Inputs]]):
         return EvaluationSample(
             render_inputs(image, views, self._inputs),
             torch.tensor(image.target(self._representation)),
-            torch.from_numpy(views.rays()),
-            torch.tensor(views.rotations()),
+            torch.from_numpy(world_rays(views, image.up)),
+            torch.from_numpy(views.rotations().astype(np.float32)),
             index,
         )
 
@@ -319,6 +321,17 @@ def render_inputs(image: ShownImage, views: Views, inputs: Sequence[Input]) -> t
         elevations = _upright_elevations(shape) if up is None else equirect_elevations(shape, up)
         rendered.append(_tensor(views.render(elevations, "bilinear")))
     return tuple(rendered)
+
+
+def world_rays(views: Views, up: NDArray[np.float64] | None) -> NDArray[np.float32]:
+    """Where images look in a world whose zenith is z, see `Views.rays`.
+
+    Args:
+        views: Of a panorama.
+        up: Its zenith; None where that is z.
+    """
+    rays = views.rays()
+    return rays if up is None else upright_rotation(up).T.astype(np.float32) @ rays
 
 
 @lru_cache(maxsize=2)

@@ -14,7 +14,6 @@ from datamodules.samples import Normalization
 from datamodules.sampling import Seed, sample_rng
 from datamodules.sphere_files import STEPS
 from tangent_train.geometry import random_rotation, rotation_about
-from tangent_train.rendering.views import EquirectViews, PinholeViews
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -102,9 +101,10 @@ class EvaluationShapes(Dataset[ShapeSample]):
 
     def __getitem__(self, key: tuple[int, int]) -> ShapeSample:
         _, index = key
-        views = self._representation.whole()
-        if self._rotation is not None:
-            views = self._turned(self.rotation(index))
+        representation = self._representation
+        if self._rotation is not None:  # turned back, it sees of the sphere what a turned one shows
+            representation = representation.turned(self.rotation(index).T)
+        views = representation.whole()
         return _sample(self._source, index, views)
 
     def rotation(self, index: int) -> NDArray[np.float64]:
@@ -113,13 +113,6 @@ class EvaluationShapes(Dataset[ShapeSample]):
         if self._rotation == "so3":
             return random_rotation(rng)
         return rotation_about((0, 0, 1), rng.uniform(0, 2 * math.pi))
-
-    def _turned(self, rotation: NDArray[np.float64]) -> Views:
-        """The views of a turned shape: turned back, they see of the sphere what it shows them."""
-        grid = getattr(self._representation, "grid", None)
-        if grid is None:
-            return EquirectViews(rotation.T)
-        return PinholeViews(grid.with_rotation(rotation.T))
 
 
 def _sample(source: Shapes, index: int, views: Views) -> ShapeSample:

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from datamodules.samples import Normalization
+    from datamodules.samples import Input, Normalization
     from tangent_train.rendering.perspective import PerspectiveRepresentation
 
 __all__ = ["SynthiaPerspective", "SynthiaPhotos"]
@@ -111,8 +111,8 @@ class SynthiaPerspective(PhotoDataModule):
         validation_fraction: Share of the training frames for validation: the last ones of each
             sequence, at least one, never all; 0 for no validation. As of the panoramas.
         frames: About how many frames of each sequence to use, see `choose_frames`.
-        inputs: `rgb`, or `rgb` and `depth`. Depth is clipped to 4 m, which is little in a street.
-        normalization: Of the input channels, see `default_normalization`.
+        inputs: See `SegmentationDataModule`. Depth is clipped to 4 m, which is little in a street.
+        normalization: Of RGB and depth, see `default_normalization`.
         **settings: All others of `PhotoDataModule`.
 
     Raises:
@@ -130,7 +130,7 @@ class SynthiaPerspective(PhotoDataModule):
         test_sequences: Sequence[str] = TEST,
         validation_fraction: float = 0.1,
         frames: int = FRAMES,
-        inputs: Sequence[str] = ("rgb",),
+        inputs: Sequence[Input] = ("rgb",),
         normalization: Normalization | None = None,
         **settings: Any,
     ) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from datamodules.panoramas import STEPS_PER_M
 from datamodules.png import read_png
-from datamodules.samples import RGBD_NORMALIZATION, Normalization
+from datamodules.samples import RGBD_NORMALIZATION, Input, Normalization
 from tangent_train.errors import DataError
 
 if TYPE_CHECKING:
@@ -57,13 +57,13 @@ _LAST_ID = 15
 _NO_CLASS = 254
 
 
-def default_normalization(inputs: Sequence[str]) -> Normalization:
+def default_normalization(inputs: Sequence[Input]) -> Normalization:
     """Normalization of SYNTHIA: of RGB as in the released code of the paper.
 
     Nobody published one of its depth; this is that of Stanford2D3DS, clipped alike.
 
     Args:
-        inputs: `rgb`, or `rgb` and `depth`.
+        inputs: See `SegmentationDataModule`.
     """
     return _RGBD if "depth" in inputs else _RGB
 

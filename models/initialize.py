@@ -10,6 +10,7 @@ from typing import NamedTuple
 from rich.table import Table
 from torch import Tensor, nn
 
+from models.held import HELD
 from models.pretrained import read_tensors
 from models.stem import of_channels, with_channels
 from tangent_train.errors import DataError
@@ -20,8 +21,6 @@ Channels = tuple[Sequence[str], Sequence[str]]
 """Names of the channels of images, in a file and here."""
 
 _LISTED = 8
-_HELD = "network"
-"""What the modules of this package call the network they hold, `SphereContext` for one."""
 
 
 class Origins(NamedTuple):
@@ -147,7 +146,7 @@ def _renamed(tensors: Mapping[str, Tensor], own: Mapping[str, Tensor]) -> dict[s
 
 def _inner(name: str) -> str:
     """The name without the parts by which a network is called in modules that hold one."""
-    return ".".join(part for part in name.split(".") if part != _HELD)
+    return ".".join(part for part in name.split(".") if part != HELD)
 
 
 def _by_prefix(tensors: Mapping[str, Tensor], own: Iterable[str]) -> dict[str, Tensor]:

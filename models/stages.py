@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from models.held import HELD
 from tangent_train.errors import SettingError
 
 __all__ = ["stage_channels"]
@@ -19,9 +20,6 @@ _SIDES = (64, 224, 896)
 
 _LISTED_DEPTH = 2
 """Of the names in messages, levels of modules."""
-
-_WRAPPED = "network"
-"""Under this name the networks of this package hold others."""
 
 
 def stage_channels(
@@ -101,5 +99,5 @@ def _seen(network: nn.Module, images: Tensor) -> dict[str, int] | None:
 
 def _listed(network: nn.Module, given: dict[str, int] | None) -> str:
     names = [name for name, _ in network.named_modules()] if given is None else list(given)
-    depths = {name: sum(part != _WRAPPED for part in name.split(".")) for name in names if name}
+    depths = {name: sum(part != HELD for part in name.split(".")) for name in names if name}
     return ", ".join(name for name, depth in depths.items() if 1 <= depth <= _LISTED_DEPTH)

@@ -9,6 +9,8 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
+from models.held import held_networks
+from models.sphere_context import SphereContext
 from tangent_train.cli import values
 from tangent_train.errors import SettingError
 from tangent_train.tasks.export import SUFFIXES, Export, Format, export_network
@@ -44,10 +46,15 @@ def export(config: DictConfig) -> None:
         )
     console = Console(soft_wrap=True, highlight=False)
     with console.status(f"Writing {output.name} …"):
-        written = export_network(
-            load_trained(checkpoint), output, form, image_size=size, opset=opset
-        )
+        trained = load_trained(checkpoint)
+        written = export_network(trained, output, form, image_size=size, opset=opset)
     console.print(_summary(written, output))
+    held = held_networks(trained.network)
+    if form != "safetensors" and any(isinstance(network, SphereContext) for network in held):
+        console.print(
+            f"In {output.name} every image is alone: the images of a sphere do not see each other. "
+            "With the checkpoint or format=safetensors they do."
+        )
 
 
 def _given(settings: dict[str, Any], name: str, expected: str) -> Path:

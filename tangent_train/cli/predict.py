@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 
 __all__ = ["predict"]
 
-_KEPT = ("checkpoint", "projection", "level", "base_level", "blend", "rotations", "upright")
+_KEPT = ("checkpoint", "projection", "level", "base_level", "blend", "rotations")
 """What results that are gone on with have to agree in."""
 
 
@@ -126,11 +126,11 @@ def _earlier(
     try:
         content = json.loads((output.path / "summary.json").read_bytes())
         entries = {entry["name"]: entry for entry in content["images"] if "error" not in entry}
-        before = {name: content[name] for name in _KEPT}
+        before = {name: content[name] for name in _KEPT} | {"upright": content.get("upright")}
     except (OSError, ValueError, KeyError, TypeError):
         return {}
     now = summary(settings, trained, [])
-    for name, value in before.items():
+    for name, value in before.items():  # older ones do not say `upright`
         if value != now[name]:
             raise SettingError(
                 name,
@@ -152,7 +152,8 @@ def _labeller(settings: PredictSettings, trained: TrainedNetwork) -> Labeller:
     names = trained.class_names
     if settings.projection == "perspective":
         return PhotoLabeller(PhotoPredictor(*seen), names, settings.fov, depth)
-    predictor = PanoramaPredictor(*seen, settings.rotations)
+    upright = settings.upright is not None
+    predictor = PanoramaPredictor(*seen, settings.rotations, upright=upright)
     return PanoramaLabeller(predictor, names, settings.crop, depth, settings.upright)
 
 

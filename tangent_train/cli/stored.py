@@ -11,6 +11,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
 
 from tangent_train.cli.compose import STORED, compose_option, config_folder, search_path
+from tangent_train.cli.resume import LATER_SETTINGS
 from tangent_train.errors import DataError, SettingError
 
 if TYPE_CHECKING:
@@ -134,4 +135,10 @@ def checkpoint_config(path: Path) -> dict[str, Any]:
     container = OmegaConf.to_container(OmegaConf.create(content["config"]), resolve=False)
     if not isinstance(container, dict):
         raise DataError("stored config", found=type(container).__name__, expected="a mapping")
-    return {str(key): value for key, value in container.items()}
+    stored = {str(key): value for key, value in container.items()}
+    for name, (value, beside) in LATER_SETTINGS.items():
+        section, _, setting = name.rpartition(".")
+        inside = stored.get(section) if section else stored
+        if isinstance(inside, dict) and beside in inside:
+            inside.setdefault(setting, value)
+    return stored

@@ -39,7 +39,7 @@ class Gravity(NamedTuple):
     candidates: NDArray[np.float64]
 
 
-def estimate_up(rgb: NDArray[np.uint8], max_tilt_deg: float = 45.0) -> Gravity:
+def estimate_up(rgb: NDArray[np.uint8], max_tilt_deg: float = 60.0) -> Gravity:
     """Estimate the direction of up from the straight edges of rooms and buildings.
 
     Most of them follow three directions at right angles, one of which is the vertical: the frame

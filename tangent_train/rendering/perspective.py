@@ -250,14 +250,14 @@ class PerspectiveRepresentation:
         self,
         scores: Float[Tensor, "images classes height width"],
         shape: tuple[int, ...],
-        rotations: NDArray[np.float64] = UNTURNED,
+        rotation: NDArray[np.floating] | None = None,
     ) -> Integer[Tensor, "images height width"]:
         """The best class of every pixel of every crop.
 
         Args:
             scores: Of all crops.
             shape: Of the truth, ``(n, h, w)``.
-            rotations: Ignored: photos are not turned.
+            rotation: Ignored: photos are not turned.
 
         Raises:
             SettingError: The scores are not those of the crops.

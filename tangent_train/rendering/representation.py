@@ -29,7 +29,7 @@ from tangent_train.geometry import (
 )
 from tangent_train.rendering.backward import Blend, tangent_to_equirect, tangent_to_labels
 from tangent_train.rendering.rotate import rotate_equirect
-from tangent_train.rendering.views import UNTURNED, EquirectViews, ManyViews, PinholeViews, Views
+from tangent_train.rendering.views import EquirectViews, ManyViews, PinholeViews, Views
 
 __all__ = [
     "Assembler",
@@ -75,8 +75,10 @@ class Assembler(Protocol):
         """Rows and columns of the images."""
         ...
 
-    def to_labels(self, scores: Tensor, shape: Any, rotations: NDArray[np.float64] = ...) -> Tensor:
-        """Class indices of the shape of the truth, from the scores of all images of `whole`."""
+    def to_labels(
+        self, scores: Tensor, shape: Any, rotation: NDArray[np.float64] | None = None
+    ) -> Tensor:
+        """Class indices of the shape of the truth, from the scores of all images."""
         ...
 
 
@@ -97,14 +99,14 @@ class Representation(Sampler, Assembler, Protocol):
         self,
         scores: Float[Tensor, "images classes height width"],
         shape: tuple[int, int],
-        rotations: NDArray[np.float64] = UNTURNED,
+        rotation: NDArray[np.float64] | None = None,
     ) -> Integer[Tensor, "rows columns"]:
         """Class index of every pixel of the panorama.
 
         Args:
-            scores: Of all images of `whole`.
+            scores: Of all images of `whole`, those of one turn.
             shape: ``(H, W)`` of the panorama.
-            rotations: Of the views, see `Views.rotations`.
+            rotation: Of the views, one of `Views.rotations`; None where they are not turned.
         """
         ...
 
@@ -179,26 +181,30 @@ class PinholeRepresentation:
         self,
         scores: Float[Tensor, "images classes height width"],
         shape: tuple[int, int],
-        rotations: NDArray[np.float64] = UNTURNED,
+        rotation: NDArray[np.float64] | None = None,
     ) -> Integer[Tensor, "rows columns"]:
-        """Render the scores (not labels) back to the panorama, then take the best class.
-
-        Of several rotations it is the class with the highest mean probability.
-        """
-        if self.blend == "feather" or len(rotations) > 1:
+        """Render the scores (not labels) back to the panorama, then take the best class."""
+        if self.blend == "feather":
             scores = scores.softmax(dim=1)
-        grids = [self.grid.with_rotation(_unless_identity(rotation)) for rotation in rotations]
-        if len(grids) == 1:
-            labels: Tensor = tangent_to_labels(scores, grids[0], shape, self.blend)
-            return labels
-        of_grids = scores.reshape(len(grids), -1, *scores.shape[1:])
-        first, *others = (
-            tangent_to_equirect(part, grid, shape, self.blend)
-            for part, grid in zip(of_grids, grids, strict=True)
-        )
-        for other in others:
-            first += other
-        return first.argmax(dim=0)
+        grid = self.grid.with_rotation(_unless_identity(rotation))
+        labels: Tensor = tangent_to_labels(scores, grid, shape, self.blend)
+        return labels
+
+    def to_probabilities(
+        self,
+        scores: Float[Tensor, "images classes height width"],
+        shape: tuple[int, int],
+        rotation: NDArray[np.float64] | None = None,
+    ) -> Float[Tensor, "classes rows columns"]:
+        """Probabilities at every pixel of the panorama, to be averaged over turns.
+
+        Args:
+            scores: Of all images of one turn.
+            shape: ``(H, W)`` of the panorama.
+            rotation: Of the views; None where they are not turned.
+        """
+        grid = self.grid.with_rotation(_unless_identity(rotation))
+        return tangent_to_equirect(scores.softmax(dim=1), grid, shape, self.blend)
 
 
 class TangentRepresentation(PinholeRepresentation):
@@ -323,7 +329,7 @@ class EquirectRepresentation:
         self,
         scores: Float[Tensor, "images classes height width"],
         shape: tuple[int, int],
-        rotations: NDArray[np.float64] = UNTURNED,
+        rotation: NDArray[np.float64] | None = None,
     ) -> Integer[Tensor, "rows columns"]:
         """The best class of every pixel; the scores are already those of the (turned) panorama."""
         if scores.shape[0] != 1 or tuple(scores.shape[-2:]) != tuple(shape):
@@ -333,10 +339,11 @@ class EquirectRepresentation:
                 expected=f"one image of {shape[0]}×{shape[1]}",
             )
         labels = scores[0].argmax(dim=0)
-        if _unless_identity(rotations[0]) is None:
+        turn = _unless_identity(rotation)
+        if turn is None:
             return labels
         small = labels.to(torch.int32).cpu().numpy().astype(np.uint16)
-        back = rotate_equirect(small, rotations[0], "nearest").astype(np.int64)
+        back = rotate_equirect(small, turn, "nearest").astype(np.int64)
         return torch.from_numpy(back).to(labels.device)
 
 
@@ -369,9 +376,9 @@ def spun(grid: _Grid, turn: NDArray[np.float64]) -> _Grid:
     return grid.with_rotation(_unless_identity(rotation))
 
 
-def _unless_identity(rotation: NDArray[np.float64]) -> NDArray[np.float64] | None:
+def _unless_identity(rotation: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
     """None for no turn at all: the tables of grids that are not turned are those kept."""
-    return None if np.array_equal(rotation, np.eye(3)) else rotation
+    return None if rotation is None or np.array_equal(rotation, np.eye(3)) else rotation
 
 
 def _erp_height(rows: int | None, level: int) -> int:

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from datamodules.samples import Normalization
+from datamodules.samples import Input, Normalization
 from models.onnx_network import OnnxNetwork
 from tangent_train.errors import DataError
 from tangent_train.tasks.networks import TrainedNetwork, network_from
@@ -86,6 +86,34 @@ def load_safetensors(path: Path) -> TrainedNetwork:
         DataError: It is no such file, or none of ours, its network cannot be made, or the package
             safetensors is missing.
     """
+    with _safetensors(path) as file:
+        text = (file.metadata() or {}).get(METADATA_KEY)
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no dict
+    content = _content(path, text)
+    if not content["settings"]:
+        raise DataError(path, found="no settings of the network inside", expected=_EXPECTED)
+    network = network_from(path, content["settings"], tensors)
+    return _trained(path, text, network)
+
+
+def safetensors_inputs(path: Path) -> tuple[Input, ...]:
+    """What the network of a file is shown.
+
+    Raises:
+        DataError: See `load_safetensors`.
+    """
+    with _safetensors(path) as file:
+        text = (file.metadata() or {}).get(METADATA_KEY)
+    return tuple(_content(path, text)["inputs"])
+
+
+@contextmanager
+def _safetensors(path: Path) -> Iterator[Any]:
+    """An open file.
+
+    Raises:
+        DataError: It is no such file, or the package safetensors is missing.
+    """
     if not path.is_file():
         raise DataError(path, found="no such file", expected=_EXPECTED)
     try:
@@ -99,15 +127,9 @@ def load_safetensors(path: Path) -> TrainedNetwork:
         ) from error
     try:
         with safe_open(path, framework="pt") as file:
-            text = (file.metadata() or {}).get(METADATA_KEY)
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no dict
+            yield file
     except (SafetensorError, OSError) as error:
         raise _unreadable(path, error) from error
-    content = _content(path, text)
-    if not content["settings"]:
-        raise DataError(path, found="no settings of the network inside", expected=_EXPECTED)
-    network = network_from(path, content["settings"], tensors)
-    return _trained(path, text, network)
 
 
 def is_torchscript(path: Path) -> bool:

@@ -16,9 +16,9 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
 from datamodules.split_module import Kind
+from models.held import held_networks
 from tangent_train.errors import SettingError
-from tangent_train.rendering import Assembler
-from tangent_train.rendering.views import UNTURNED
+from tangent_train.rendering import Assembler, EquirectRepresentation
 from tangent_train.tasks.base import Part, Task, check_at_once
 from tangent_train.tasks.callbacks import PredictionPanels
 from tangent_train.tasks.html.evaluation import write_evaluation_report
@@ -108,7 +108,16 @@ class SegmentationTask(Task):
         self.loss = SegmentationLoss(
             label_smoothing, auxiliary_weight, auxiliary_target, region_loss, region_weight
         )
-        self.takes_rays = _takes_rays(network)
+        self.takes_rays = any(
+            "rays" in inspect.signature(held.forward).parameters for held in held_networks(network)
+        )
+        if self.takes_rays and isinstance(representation, EquirectRepresentation):
+            raise SettingError(
+                "representation",
+                found="equirectangular images",
+                expected="tangent images or a cube's for a network whose images see each other",
+                remedy="One image sees all of itself: use the network without its context.",
+            )
         self.images_per_forward = images_per_forward
         self.absent_class: AbsentClass = absent_class
         self.register_buffer("class_weights", torch.ones(len(self.class_names)))
@@ -216,13 +225,27 @@ class SegmentationTask(Task):
         Returns:
             Class indices 1 … K of that shape.
         """
-        turns = UNTURNED if rotations is None else rotations.cpu().numpy()
+        if rotations is None or len(rotations) == 1:
+            turn = None if rotations is None else rotations[0].cpu().double().numpy()
+            return self.representation.to_labels(self._scores(images, rays), shape, turn) + 1
+        representation: Any = self.representation  # one whose `whole` has several turns
+        total: Tensor | None = None
+        of_turns = [None] * len(rotations) if rays is None else rays.chunk(len(rotations))
+        for turned, seen, turn in zip(
+            images.chunk(len(rotations)), of_turns, rotations.cpu().double().numpy(), strict=True
+        ):
+            scores = self._scores(turned, seen)
+            probabilities = representation.to_probabilities(scores, shape, turn)
+            total = probabilities if total is None else total.add_(probabilities)
+        best: Tensor = total.argmax(dim=0) + 1  # type: ignore[union-attr]
+        return best
+
+    def _scores(self, images: Tensor, rays: Tensor | None) -> Tensor:
+        """Scores of all classes but the unknown one, of all images of a panorama or photo."""
         if self.takes_rays and rays is not None and rays.numel():
-            scores = self(images, rays.reshape(len(turns), -1, 3, 3))[:, 1:].float()
-        else:
-            parts = torch.split(images, self.images_per_forward)
-            scores = torch.cat([self(part)[:, 1:].float() for part in parts])
-        return self.representation.to_labels(scores, shape, turns) + 1
+            return self(images, rays[None])[:, 1:].float()
+        parts = torch.split(images, self.images_per_forward)
+        return torch.cat([self(part)[:, 1:].float() for part in parts])
 
     def evaluate(self, batch: Any) -> Tensor:
         """Count a batch of panoramas or photos; returns the predictions."""
@@ -267,11 +290,3 @@ class SegmentationTask(Task):
         callbacks: list[Any] = self.trainer.callbacks  # type: ignore[attr-defined]
         images = [i for c in callbacks if isinstance(c, PredictionPanels) for i in c.images]
         write_evaluation_report(path, results, self.class_names, images, checkpoint)
-
-
-def _takes_rays(network: nn.Module) -> bool:
-    """Whether it can be told where its images look, or hands what it is told to one that can."""
-    parameters = inspect.signature(network.forward).parameters
-    held = getattr(network, "network", None)
-    hands_on = any(p.kind is p.VAR_POSITIONAL for p in parameters.values())
-    return "rays" in parameters or (hands_on and held is not None and _takes_rays(held))

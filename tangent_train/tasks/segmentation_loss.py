@@ -72,7 +72,7 @@ class SegmentationLoss:
         """
         scores = outputs["out"]
         pixels = cross_entropy_sum(scores, labels, class_weights, self.label_smoothing)
-        if "aux" in outputs and self.auxiliary_weight:
+        if "aux" in outputs:
             auxiliary = auxiliary_sum(outputs["aux"], labels, class_weights, self.auxiliary_target)
             pixels = pixels + self.auxiliary_weight * auxiliary
         if self.region_loss == "none":
@@ -87,4 +87,6 @@ class SegmentationLoss:
             labels: ``(n, h, w)`` of all.
             class_weights: ``(K + 1,)``.
         """
-        return torch.stack([cross_entropy_norm(labels, class_weights), region_norm(labels)])
+        pixels = cross_entropy_norm(labels, class_weights)
+        regions = torch.ones_like(pixels) if self.region_loss == "none" else region_norm(labels)
+        return torch.stack([pixels, regions])

@@ -97,12 +97,15 @@ def stored_inputs(content: Mapping[str, Any]) -> tuple[Input, ...]:
 
 
 def inputs_in(path: Path) -> tuple[Input, ...] | None:
-    """What the network in a file is shown, if it is a checkpoint of this package, which say it."""
+    """What the network in a checkpoint or safetensors file is shown, where that is said."""
+    from tangent_train.tasks import exported
+
     try:
-        content = read_checkpoint(path, ("normalization",))
+        if path.suffix.lower() == ".safetensors":
+            return exported.safetensors_inputs(path)
+        return stored_inputs(read_checkpoint(path, ("normalization",)))
     except DataError:
         return None
-    return stored_inputs(content)
 
 
 def _check_kind(path: Path, content: dict[str, Any]) -> None:

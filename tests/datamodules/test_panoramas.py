@@ -7,7 +7,6 @@ import pytest
 
 from datamodules.panoramas import (
     Panorama,
-    TurnedPanoramas,
     mask_black,
     resize_area,
     resize_depth,
@@ -15,7 +14,6 @@ from datamodules.panoramas import (
     steps_to_meters,
 )
 from datamodules.sources import RememberedImages, count_labels, in_threads
-from tangent_train.geometry import equirect_directions
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -171,51 +169,6 @@ def test_remembered_panoramas_are_the_same_and_read_once(depth: bool) -> None:
             )
     assert source.reads == [1, 1, 1]
     assert remembered.name(1) == "panorama 1"
-
-
-def _positions() -> Panorama:
-    """A panorama whose labels, colours and depth tell the direction's height z."""
-    z = np.round(100 + 100 * equirect_directions((32, 64))[..., 2])
-    labels = z.astype(np.uint8)
-    return Panorama(np.stack([labels] * 3, axis=-1), z.astype(np.uint16), labels)
-
-
-@pytest.mark.parametrize("tilt", [0.0, 30.0, 90.0, 180.0])
-def test_tilt_is_exact_and_yaw_random(tilt: float) -> None:
-    turned = TurnedPanoramas(Memory([_positions()] * 3), tilt, seed=1)
-    rotations = [turned.rotation(i) for i in range(3)]
-    for rotation in rotations:
-        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
-        assert np.degrees(np.arccos(np.clip(rotation[2, 2], -1, 1))) == pytest.approx(tilt)
-    assert not np.allclose(rotations[0], rotations[1])
-
-
-def test_turns_are_those_of_seed_and_index() -> None:
-    source = Memory([_positions()] * 2)
-    first, again, other = (TurnedPanoramas(source, "so3", seed) for seed in (1, 1, 2))
-    np.testing.assert_array_equal(first.rotation(0), again.rotation(0))
-    assert not np.allclose(first.rotation(0), first.rotation(1))
-    assert not np.allclose(first.rotation(0), other.rotation(0))
-
-
-@pytest.mark.parametrize("rotation", [40.0, "so3"])
-def test_image_depth_and_labels_turn_together(rotation: float | Literal["so3"]) -> None:
-    turned = TurnedPanoramas(Memory([_positions()]), rotation, seed=5)
-    rgb, depth, labels, up = turned.read(0)
-    assert up is None
-    # The output direction d shows the input at Rᵀd, whose height is the third row of Rᵀ times d.
-    height = equirect_directions((32, 64)) @ turned.rotation(0)[:, 2]
-    np.testing.assert_allclose(labels.astype(float), 100 + 100 * height, atol=8)
-    np.testing.assert_allclose(rgb[..., 1].astype(float), 100 + 100 * height, atol=8)
-    np.testing.assert_array_equal(turned.label_counts(0), count_labels(labels))
-    assert depth is not None
-    np.testing.assert_array_equal(depth, labels)  # both nearest: the same source pixels
-    assert (len(turned), turned.name(0)) == (1, "panorama 0")
-
-
-def test_turning_without_depth() -> None:
-    source = Memory([_panorama(np.random.default_rng(0), depth=False)])
-    assert TurnedPanoramas(source, "so3", 0).read(0).depth is None
 
 
 def test_labels_are_counted() -> None:

@@ -9,9 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
-from datamodules.panoramas import Panorama, TurnedPanoramas
+from datamodules.panoramas import Panorama
 from datamodules.synthrooms.generate import generate_rooms
 from datamodules.synthrooms.settings import RoomSettings
+from datamodules.turned_panoramas import TurnedPanoramas
 from tangent_train.rendering.gravity import estimate_up
 
 if TYPE_CHECKING:

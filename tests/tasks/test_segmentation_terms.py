@@ -168,7 +168,7 @@ def test_evaluation_tells_it_the_rays_of_every_turn() -> None:
     where = torch.tensor(views.rays()), torch.tensor(views.rotations())
     samples: Any = [Evaluation(torch.zeros(40, 2, 16, 16), target, *where)]
     _trainer().test(task, DataLoader(samples), verbose=False)
-    assert network.told == [((2, 20, 3, 3), 7)]
+    assert network.told == [((1, 20, 3, 3), 7)] * 2
     pixels = task.matrices.pixels
     assert pixels[1, 1] + pixels[2, 2] == pixels.sum() == 32 * 64
 

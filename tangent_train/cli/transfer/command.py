@@ -172,11 +172,20 @@ def _compared(config: DictConfig) -> dict[str, dict[str, Any]]:
         raise SettingError(
             "compare", found=names, expected="a list of options of representation, or []"
         )
-    return {
+    found = {
         name: compose_option("representation", name, _search_path())
         for name in dict.fromkeys(names)
         if name != own
     }
+    equirect = [n for n, s in found.items() if s["_target_"].endswith("EquirectRepresentation")]
+    if equirect and "models.SphereContext" in str(config.network):
+        raise SettingError(
+            "compare",
+            found=equirect[0],
+            expected="no equirectangular images for a network whose images see each other",
+            remedy="For example compare=[cubemap].",
+        )
+    return found
 
 
 def _search_path() -> list[str]:

@@ -29,8 +29,6 @@ if TYPE_CHECKING:
 
 __all__ = ["PanoramaPredictor"]
 
-_SHOW_TANGENT = "Give base_level= to show it tangent images."
-
 
 class PanoramaPredictor:
     """Labels panoramas.
@@ -42,6 +40,7 @@ class PanoramaPredictor:
         base_level: Base level b of the tangent images; None as trained.
         blend: How overlapping images are joined; those that do not overlap are ``nearest``.
         rotations: Average over as many turned icosahedra, see `turns`.
+        upright: Whether some panoramas will say that up is elsewhere than z.
 
     Raises:
         SettingError: A setting that cannot work.
@@ -55,9 +54,12 @@ class PanoramaPredictor:
         base_level: int | None = None,
         blend: Blend = "feather",
         rotations: int = 1,
+        *,
+        upright: bool = False,
     ) -> None:
         self._runner = runner
         self._turns = turns(rotations, "rotations")
+        self._upright = upright
         self._blend = blend
         self._level = trained.level if level is None else level
         self._seen = lru_cache(maxsize=4)(
@@ -93,13 +95,6 @@ class PanoramaPredictor:
             views = seen.grid.num_images * len(self._turns)
             return Prediction(mosaic, level, views, seen.grid)
         self._check_turns(seen)
-        if image.up is not None:
-            raise SettingError(
-                "upright",
-                found="a panorama to be looked at upright",
-                expected="null for a network that sees equirectangular images",
-                remedy=_SHOW_TANGENT,
-            )
         mosaic = ScoreMosaic(
             (height, width), self._runner.num_classes, "nearest", averaged=averaged
         )
@@ -133,13 +128,19 @@ class PanoramaPredictor:
         mosaic.add_crops(_wrapped(scores), crop, np.array([0]))
 
     def _check_turns(self, seen: PinholeRepresentation | EquirectRepresentation) -> None:
-        if len(self._turns) > 1 and not isinstance(seen, PinholeRepresentation):
-            raise SettingError(
-                "rotations",
-                found=len(self._turns),
-                expected="1 for a network that sees equirectangular images",
-                remedy=_SHOW_TANGENT,
-            )
+        if isinstance(seen, PinholeRepresentation):
+            return
+        for name, found, expected in (
+            ("rotations", len(self._turns), 1),
+            ("upright", self._upright, False),
+        ):
+            if found != expected:
+                raise SettingError(
+                    name,
+                    found=found,
+                    expected=f"{expected or 'null'} for a network that sees equirectangular images",
+                    remedy="Give base_level= to show it tangent images.",
+                )
 
 
 def _shrunk(image: InputImage, shape: tuple[int, int]) -> InputImage:

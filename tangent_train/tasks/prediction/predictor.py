@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import torch
 
-from datamodules.samples import normalize, render_inputs
+from datamodules.samples import normalize, render_inputs, world_rays
+from models.held import held_networks
 from models.sphere_context import SphereContext
 from tangent_train.errors import SettingError
 
@@ -95,8 +96,8 @@ class Runner:
             raise SettingError(
                 "device", found=f"{device} ({error})", expected="cpu, or a device of this machine"
             ) from error
-        inner = getattr(self._network, "network", None)  # of `Scores`
-        self._of_sphere = inner if isinstance(inner, SphereContext) else None
+        held = held_networks(self._network)
+        self._of_sphere = next((n for n in held if isinstance(n, SphereContext)), None)
         self._normalization = trained.normalization
         self._inputs = trained.inputs
         self._at_once = views_at_once
@@ -122,7 +123,7 @@ class Runner:
         if network is None:
             return [None] * len(views)
         tokens = [network.encode(self._images(image, part)) for part in views]
-        rays = torch.from_numpy(np.concatenate([part.rays() for part in views]))
+        rays = torch.from_numpy(np.concatenate([world_rays(part, image.up) for part in views]))
         context = network.mix(rays[None].to(self._device), torch.cat(tokens))
         return list(torch.split(context, [len(part) for part in tokens]))
 

@@ -128,8 +128,8 @@ def test_a_tilted_panorama_is_looked_at_upright() -> None:
     tilted = InputImage(rotate_equirect(rgb, rotation), up=rotation @ [0, 0, 1])
     labels = _predict(trained, tilted).mosaic.labels()
     assert (labels == rotate_equirect(upright, rotation, "nearest")).mean() > 0.93
-    with pytest.raises(SettingError, match=r"upright: found .*base_level="):
-        _predict(trained_network(ERP), tilted)
+    with pytest.raises(SettingError, match=r"upright: found True.*base_level="):
+        PanoramaPredictor(trained_network(ERP), Runner(trained), upright=True)
 
 
 @pytest.mark.parametrize("at_once", [1, 7, 1000])
