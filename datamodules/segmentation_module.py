@@ -143,11 +143,11 @@ def checked_inputs(inputs: Sequence[Input]) -> tuple[Input, ...]:
         SettingError: One is unknown or there twice, RGB is missing, or validity is without depth.
     """
     ordered = tuple(name for name in INPUT_CHANNELS if name in inputs)
-    known = sorted(ordered) == sorted(inputs)
+    known = not isinstance(inputs, str) and sorted(ordered) == sorted(inputs)
     if not known or "rgb" not in inputs or ("validity" in inputs and "depth" not in inputs):
         raise SettingError(
             "data.inputs",
-            found=list(inputs),
-            expected="rgb, perhaps depth, elevation and, with depth, validity",
+            found=inputs if isinstance(inputs, str) else list(inputs),
+            expected="a list: rgb, perhaps depth, elevation and, with depth, validity",
         )
     return ordered

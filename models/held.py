@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Iterator
 
 from torch import nn
@@ -13,8 +14,13 @@ HELD = "network"
 
 
 def held_networks(network: nn.Module) -> Iterator[nn.Module]:
-    """A network, the one it holds, the one that holds, and so on."""
+    """A network, the one it hands all its arguments on to, the one that does that, and so on.
+
+    What hands on nothing but images (``forward`` without ``*arguments``) is the last.
+    """
     held: object = network
     while isinstance(held, nn.Module):
         yield held
-        held = getattr(held, HELD, None)
+        parameters = inspect.signature(held.forward).parameters.values()
+        hands_on = any(parameter.kind is parameter.VAR_POSITIONAL for parameter in parameters)
+        held = getattr(held, HELD, None) if hands_on else None

@@ -49,7 +49,7 @@ def export(config: DictConfig) -> None:
         trained = load_trained(checkpoint)
         written = export_network(trained, output, form, image_size=size, opset=opset)
     console.print(_summary(written, output))
-    held = held_networks(trained.network)
+    held = held_networks(getattr(trained.network, "network", trained.network))  # in `Scores`
     if form != "safetensors" and any(isinstance(network, SphereContext) for network in held):
         console.print(
             f"In {output.name} every image is alone: the images of a sphere do not see each other. "

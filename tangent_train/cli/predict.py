@@ -51,6 +51,9 @@ __all__ = ["predict"]
 _KEPT = ("checkpoint", "projection", "level", "base_level", "blend", "rotations")
 """What results that are gone on with have to agree in."""
 
+_LATER = ("upright", "max_tilt_deg")
+"""Likewise, of results that say it; older ones are of panoramas taken as they were."""
+
 
 def predict(config: DictConfig) -> None:
     """Label images and write what was found.
@@ -126,11 +129,12 @@ def _earlier(
     try:
         content = json.loads((output.path / "summary.json").read_bytes())
         entries = {entry["name"]: entry for entry in content["images"] if "error" not in entry}
-        before = {name: content[name] for name in _KEPT} | {"upright": content.get("upright")}
+        before = {name: content[name] for name in _KEPT}
+        before |= {name: content[name] for name in _LATER if name in content}
     except (OSError, ValueError, KeyError, TypeError):
         return {}
     now = summary(settings, trained, [])
-    for name, value in before.items():  # older ones do not say `upright`
+    for name, value in before.items():
         if value != now[name]:
             raise SettingError(
                 name,
@@ -154,7 +158,8 @@ def _labeller(settings: PredictSettings, trained: TrainedNetwork) -> Labeller:
         return PhotoLabeller(PhotoPredictor(*seen), names, settings.fov, depth)
     upright = settings.upright is not None
     predictor = PanoramaPredictor(*seen, settings.rotations, upright=upright)
-    return PanoramaLabeller(predictor, names, settings.crop, depth, settings.upright)
+    tilts = settings.upright, settings.max_tilt_deg
+    return PanoramaLabeller(predictor, names, settings.crop, depth, *tilts)
 
 
 def _depth(settings: PredictSettings, trained: TrainedNetwork) -> DepthFolder | None:

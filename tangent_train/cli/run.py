@@ -209,7 +209,7 @@ def _shown(data: Any) -> dict[str, Any]:
     """What a network is shown of the data, as plain values."""
     mean, std = list(data.normalization.mean), list(data.normalization.std)
     inputs = {"inputs": list(data.inputs)} if hasattr(data, "inputs") else {}  # shapes have one
-    return {"normalization": {"mean": mean, "std": std}, **inputs}
+    return {**inputs, "normalization": {"mean": mean, "std": std}}
 
 
 def _best_on_validation(trainer: lightning.Trainer, folder: Path) -> float | None:

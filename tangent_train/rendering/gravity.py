@@ -21,6 +21,8 @@ _UP = np.array([0.0, 0.0, 1.0])
 _EVEN_CHANCE = 3.1  # significance of frames of which half are right
 _STEEPNESS = 3.0
 _ACCEPTED = 0.5
+_LEAST_ROWS = 64
+"""With fewer, noise looks like a room."""
 _DISTINCT = np.cos(np.radians(6))
 
 
@@ -44,16 +46,16 @@ def estimate_up(rgb: NDArray[np.uint8], max_tilt_deg: float = 60.0) -> Gravity:
 
     Most of them follow three directions at right angles, one of which is the vertical: the frame
     that most edges follow (Coughlan and Yuille, "Manhattan World", ICCV 1999) gives its axes, to a
-    fraction of a degree. Up to 45° of tilt, up is the axis nearest to the panorama's own. Beyond,
-    it is chosen by what rooms look like (see `up_probabilities`): of SynthRooms held at any angle,
-    one in six gets another axis of the room.
+    fraction of a degree. Where only one of them is within `max_tilt_deg` of the panorama's own
+    vertical, it is up. Of several, one is chosen by what rooms look like (see `up_probabilities`):
+    of SynthRooms held at any angle, one in six gets another axis of the room.
 
     An estimate that is less probable than not is no estimate: pictures of nature, noise and
     pictures without edges leave the panorama as it is.
 
     Args:
-        rgb: ``(H, W, 3)`` uint8 whole panorama, 128 rows or more for good results. Black (0, 0, 0)
-            areas count as missing.
+        rgb: ``(H, W, 3)`` uint8 whole panorama. 128 rows or more give good results, less than 64
+            none. Black (0, 0, 0) areas count as missing.
         max_tilt_deg: The farthest that up may be from ``(0, 0, 1)``, above 0; 180 is any
             orientation. Allow some degrees more than the camera was tilted: of a panorama beyond
             it, another axis of the room may be within.
@@ -67,6 +69,8 @@ def estimate_up(rgb: NDArray[np.uint8], max_tilt_deg: float = 60.0) -> Gravity:
         raise SettingError("panorama", found=found, expected="(H, W, 3) of dtype uint8")
     if not 0 < max_tilt_deg <= 180:
         raise SettingError("max_tilt_deg", found=max_tilt_deg, expected="above 0, at most 180")
+    if rgb.shape[0] < _LEAST_ROWS:
+        return Gravity(_UP.copy(), 0.0, np.zeros((0, 3)))
     segments = find_line_segments(rgb)
     frames = find_manhattan_frames(segments)
     lowest = math.cos(math.radians(max_tilt_deg)) - 1e-9

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Iterable
 from typing import Any, Literal, Protocol, Self, TypeVar, runtime_checkable
 
 import numpy as np
@@ -27,7 +28,8 @@ from tangent_train.geometry import (
     random_rotation,
     rotation_about,
 )
-from tangent_train.rendering.backward import Blend, tangent_to_equirect, tangent_to_labels
+from tangent_train.rendering.backward import Blend, tangent_to_labels
+from tangent_train.rendering.mosaic import ScoreMosaic
 from tangent_train.rendering.rotate import rotate_equirect
 from tangent_train.rendering.views import EquirectViews, ManyViews, PinholeViews, Views
 
@@ -122,8 +124,6 @@ class PinholeRepresentation:
         erp_height: Rows of the panorama, default `equirect_shape(level)`.
         blend: How overlapping images are joined in evaluation.
         faces_per_panorama: Images drawn at random for a training sample; all by default.
-        average_rotations: Turns of the images as a whole that evaluation averages over, see
-            `turns`.
 
     Raises:
         SettingError: A value is impossible.
@@ -138,7 +138,6 @@ class PinholeRepresentation:
         erp_height: int | None,
         blend: Blend = "nearest",
         faces_per_panorama: int | None = None,
-        average_rotations: int = 1,
     ) -> None:
         self.grid = grid
         self.rotation = _checked_choice("rotation", rotation, ("none", "yaw", "so3"))
@@ -146,7 +145,6 @@ class PinholeRepresentation:
         self.erp_height = _erp_height(erp_height, level)
         self.blend = _checked_choice("blend", blend, ("nearest", "feather"))
         self.faces_per_panorama = faces_per_panorama
-        self._turns = turns(average_rotations, "representation.average_rotations")
 
     @property
     def image_size(self) -> tuple[int, int]:
@@ -173,9 +171,8 @@ class PinholeRepresentation:
         return PinholeViews(grid, faces, self.mirror and bool(rng.random() < 0.5))
 
     def whole(self) -> Views:
-        """All images, of every turn that is averaged over."""
-        views = [PinholeViews(spun(self.grid, turn)) for turn in self._turns]
-        return views[0] if len(views) == 1 else ManyViews(tuple(views))
+        """All images."""
+        return PinholeViews(self.grid)
 
     def to_labels(
         self,
@@ -189,22 +186,6 @@ class PinholeRepresentation:
         grid = self.grid.with_rotation(_unless_identity(rotation))
         labels: Tensor = tangent_to_labels(scores, grid, shape, self.blend)
         return labels
-
-    def to_probabilities(
-        self,
-        scores: Float[Tensor, "images classes height width"],
-        shape: tuple[int, int],
-        rotation: NDArray[np.float64] | None = None,
-    ) -> Float[Tensor, "classes rows columns"]:
-        """Probabilities at every pixel of the panorama, to be averaged over turns.
-
-        Args:
-            scores: Of all images of one turn.
-            shape: ``(H, W)`` of the panorama.
-            rotation: Of the views; None where they are not turned.
-        """
-        grid = self.grid.with_rotation(_unless_identity(rotation))
-        return tangent_to_equirect(scores.softmax(dim=1), grid, shape, self.blend)
 
 
 class TangentRepresentation(PinholeRepresentation):
@@ -260,9 +241,35 @@ class TangentRepresentation(PinholeRepresentation):
                 found=faces_per_panorama,
                 expected=f"1 to {count} at base level {base_level}, or null for all",
             )
-        super().__init__(
-            grid, level, rotation, mirror, erp_height, blend, faces_per_panorama, average_rotations
-        )
+        super().__init__(grid, level, rotation, mirror, erp_height, blend, faces_per_panorama)
+        self._turns = turns(average_rotations, "representation.average_rotations")
+
+    def whole(self) -> Views:
+        """All images, of every turn that is averaged over."""
+        views = [PinholeViews(spun(self.grid, turn)) for turn in self._turns]
+        return views[0] if len(views) == 1 else ManyViews(tuple(views))
+
+    def to_averaged_labels(
+        self, scores: Iterable[Tensor], shape: tuple[int, int], rotations: NDArray[np.float64]
+    ) -> Integer[Tensor, "rows columns"]:
+        """The class with the highest mean probability over several turns, as in prediction.
+
+        Args:
+            scores: Of all images of each turn, one turn after the other.
+            shape: ``(H, W)`` of the panorama.
+            rotations: Of the turns, see `Views.rotations`.
+
+        Returns:
+            Class indices, on the CPU.
+        """
+        mosaic: ScoreMosaic | None = None
+        for of_turn, rotation in zip(scores, rotations, strict=True):
+            mosaic = mosaic or ScoreMosaic(shape, of_turn.shape[1], self.blend, averaged=True)
+            grid = self.grid.with_rotation(_unless_identity(rotation))
+            mosaic.add(of_turn, grid, np.arange(grid.num_images))
+        if mosaic is None:
+            raise SettingError("rotations", found=0, expected="one or more")
+        return torch.from_numpy(mosaic.labels().astype(np.int64))
 
 
 class EquirectRepresentation:

@@ -228,17 +228,13 @@ class SegmentationTask(Task):
         if rotations is None or len(rotations) == 1:
             turn = None if rotations is None else rotations[0].cpu().double().numpy()
             return self.representation.to_labels(self._scores(images, rays), shape, turn) + 1
-        representation: Any = self.representation  # one whose `whole` has several turns
-        total: Tensor | None = None
         of_turns = [None] * len(rotations) if rays is None else rays.chunk(len(rotations))
-        for turned, seen, turn in zip(
-            images.chunk(len(rotations)), of_turns, rotations.cpu().double().numpy(), strict=True
-        ):
-            scores = self._scores(turned, seen)
-            probabilities = representation.to_probabilities(scores, shape, turn)
-            total = probabilities if total is None else total.add_(probabilities)
-        best: Tensor = total.argmax(dim=0) + 1  # type: ignore[union-attr]
-        return best
+        parts = zip(images.chunk(len(rotations)), of_turns, strict=True)
+        representation: Any = self.representation  # one whose `whole` has several turns
+        labels: Tensor = representation.to_averaged_labels(
+            (self._scores(*part) for part in parts), shape, rotations.cpu().double().numpy()
+        )
+        return labels.to(images.device) + 1
 
     def _scores(self, images: Tensor, rays: Tensor | None) -> Tensor:
         """Scores of all classes but the unknown one, of all images of a panorama or photo."""

@@ -170,10 +170,11 @@ def test_validity_and_elevation_follow_the_measured_channels() -> None:
         ("rgb", "rgb"),
         ("rgb", "heat"),
         ("rgb", "elevation") * 2,
+        "rgb",
     ],
 )
 def test_impossible_inputs(inputs: Any) -> None:
-    with pytest.raises(SettingError, match=r"data\.inputs: found .* expected rgb"):
+    with pytest.raises(SettingError, match=r"data\.inputs: found .* expected a list: rgb"):
         checked_inputs(inputs)
 
 

@@ -116,6 +116,7 @@ def _without_structure() -> dict[str, NDArray[np.uint8]]:
         "one pixel": np.full((1, 1, 3), 90, np.uint8),
         "ramp": np.broadcast_to(ramp[:, None, None], (128, 256, 3)).copy(),
         "noise": noise,
+        "noise of few rows": noise[:32, :64].copy(),
         "noise on a part": cut,
         "waves": _waves(1),
         "other waves": _waves(2),

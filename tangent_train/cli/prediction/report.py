@@ -60,6 +60,7 @@ def summary(
         "blend": settings.blend,
         "rotations": settings.rotations,
         "upright": settings.upright,
+        "max_tilt_deg": settings.max_tilt_deg,
         "classes": _mean_shares(entries, trained.class_names),
         "images": entries,
     }

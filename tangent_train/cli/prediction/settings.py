@@ -38,6 +38,7 @@ class PredictSettings:
     blend: Blend
     rotations: int
     upright: Upright
+    max_tilt_deg: float
     probabilities: bool
     report: int
     overwrite: bool
@@ -84,6 +85,7 @@ class PredictSettings:
             upright=None
             if config["upright"] is None
             else values.choice(config, "upright", ("pose", "auto")),
+            max_tilt_deg=values.number(config, "max_tilt_deg", 0, 180),
             probabilities=values.flag(config, "probabilities"),
             report=values.whole(config, "report", 0),
             overwrite=values.flag(config, "overwrite"),

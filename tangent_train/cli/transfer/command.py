@@ -178,7 +178,7 @@ def _compared(config: DictConfig) -> dict[str, dict[str, Any]]:
         if name != own
     }
     equirect = [n for n, s in found.items() if s["_target_"].endswith("EquirectRepresentation")]
-    if equirect and "models.SphereContext" in str(config.network):
+    if equirect and "SphereContext" in str(config.network):
         raise SettingError(
             "compare",
             found=equirect[0],

@@ -119,6 +119,7 @@ class PanoramaLabeller:
         depth: Their depth, for networks that take it.
         upright: Look at them upright: as they say themselves (``pose``), or else as estimated
             (``auto``); None for as they are.
+        max_tilt_deg: Of estimates, see `estimate_up`.
     """
 
     predictor: PanoramaPredictor
@@ -126,6 +127,7 @@ class PanoramaLabeller:
     crop: Sequence[float] | None = None
     depth: DepthFolder | None = None
     upright: Upright = None
+    max_tilt_deg: float = 60.0
 
     def label(self, path: Path, name: str, done: Done, *, averaged: bool) -> Labelled:
         """Labels of one panorama; see `Labeller`."""
@@ -158,7 +160,8 @@ class PanoramaLabeller:
             return None
         known = up_of(path)
         if known is None and self.upright == "auto":
-            return estimate_up(rgb).up
+            found = estimate_up(rgb, self.max_tilt_deg)
+            return found.up if found.confidence else None
         return known
 
 

@@ -96,7 +96,7 @@ class Runner:
             raise SettingError(
                 "device", found=f"{device} ({error})", expected="cpu, or a device of this machine"
             ) from error
-        held = held_networks(self._network)
+        held = held_networks(getattr(self._network, "network", self._network))  # in `Scores`
         self._of_sphere = next((n for n in held if isinstance(n, SphereContext)), None)
         self._normalization = trained.normalization
         self._inputs = trained.inputs
