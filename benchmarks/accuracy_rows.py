@@ -40,7 +40,7 @@ PLAIN = Variant("plain")
 
 _NEAREST = Variant("blend nearest", ("representation.blend=nearest",), ("null",))
 _AVERAGED = Variant("4 turned icosahedra", ("representation.average_rotations=4",), ("null", "so3"))
-_AUTO = Variant("upright=auto", ("data.upright=auto",), ("null", "20", "45"))
+_AUTO = Variant("upright=auto", ("data.upright=auto", "data.max_tilt_deg=60"), ("null", "20", "45"))
 _AUTO_ANY = Variant("upright=auto, any tilt", ("data.upright=auto", "data.max_tilt_deg=180"))
 _POSE = Variant("upright=pose", ("data.upright=pose",), ("45", "so3"), told_up=True)
 
