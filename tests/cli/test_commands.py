@@ -218,7 +218,7 @@ def test_settings_of_the_checkpoint_reach_what_refers_to_them(
         ("network=unet", "expected overrides of single settings"),
         ("representation=erb", "unknown representation: .*Did you mean erp"),
         ("representation=tangent,erp", "unknown representation: found 'tangent,erp'"),
-        ("data.inputs=[rgb]", "found normalization .* which the network was trained with"),
+        ("data.inputs=[rgb]", "found inputs .* which the network was trained with"),
         ("data=omnisynthia", r"found class names .*'sky'.*; expected .*'beam'"),
     ],
 )
