@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, TypeVar, get_args
 
 import numpy as np
 import torch
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from tangent_train.rendering.representation import Views
 
 __all__ = [
-    "INPUT_CHANNELS",
+    "INPUTS",
     "RGBD_NORMALIZATION",
     "RGB_NORMALIZATION",
     "EvaluationImages",
@@ -45,15 +45,15 @@ __all__ = [
 ]
 
 Input = Literal["rgb", "depth", "validity", "elevation"]
-"""What a network may be shown of an image; see `INPUT_CHANNELS`."""
-
-INPUT_CHANNELS: dict[Input, int] = {"rgb": 3, "depth": 1, "validity": 1, "elevation": 1}
-"""Channels of every input, in the order of the channels of an image.
+"""What a network may be shown of an image, in the order of its channels, see `channel_names`.
 
 * `rgb` and `depth` are normalized.
 * `validity`: 1 where depth is known and 0 where it is missing.
 * `elevation`: the sine of the angle between a pixel's ray and the horizon, −1 (down) to 1 (up).
 """
+
+INPUTS: tuple[Input, ...] = get_args(Input)
+"""All of them."""
 
 _COLORS = ("red", "green", "blue")
 
@@ -137,7 +137,7 @@ def normalize(
         rendered: RGB ``(..., h, w, 3)`` uint8; with depth ``(..., h, w)`` in steps of 1/512 m, 0
             where missing, at most `MAX_DEPTH_M`; with elevation ``(..., h, w)`` float32.
         normalization: Of RGB and depth.
-        inputs: What the network takes, in the order of `INPUT_CHANNELS`.
+        inputs: What the network takes, in the order of `INPUTS`.
 
     Returns:
         ``(..., C, h, w)`` float32, on the same device.
@@ -155,7 +155,7 @@ def normalize(
         )
     rgb = parts["rgb"]
     *batch, height, width, _ = rgb.shape
-    channels = sum(INPUT_CHANNELS[name] for name in inputs)
+    channels = len(channel_names(inputs))
     images = rgb.new_empty((*batch, channels, height, width), dtype=torch.float32)
     images[..., :3, :, :] = rgb.movedim(-1, -3)
     if "depth" in parts:
@@ -217,7 +217,7 @@ class TrainingImages(Dataset[TrainingSample[Inputs]]):
         source: The images.
         representation: What the network sees of them.
         seed: Seed of the run, 0 or more.
-        inputs: What the network is shown, see `INPUT_CHANNELS`.
+        inputs: What the network is shown, see `Input`.
         color_jitter: Strength of the colour augmentation, 0 to 1, see `jitter_colors`.
     """
 
@@ -260,7 +260,7 @@ class EvaluationImages(Dataset[EvaluationSample[Inputs]]):
     Args:
         source: The images.
         representation: What the network sees of them.
-        inputs: What it is shown, see `INPUT_CHANNELS`.
+        inputs: What it is shown, see `Input`.
     """
 
     def __init__(
@@ -305,7 +305,7 @@ def render_inputs(image: ShownImage, views: Views, inputs: Sequence[Input]) -> t
     Args:
         image: It, with depth where that is an input.
         views: Where it looks.
-        inputs: See `INPUT_CHANNELS`.
+        inputs: See `Input`.
 
     Returns:
         RGB ``(n, h, w, 3)`` uint8; with depth, ``(n, h, w)`` int16 steps up to `MAX_DEPTH_M`; with

@@ -9,13 +9,14 @@ import numpy as np
 
 from datamodules.class_weights import ClassWeights, class_weights
 from datamodules.samples import (
-    INPUT_CHANNELS,
+    INPUTS,
     RGB_NORMALIZATION,
     RGBD_NORMALIZATION,
     EvaluationImages,
     Input,
     Normalization,
     TrainingImages,
+    channel_names,
     collate,
     normalize,
 )
@@ -42,7 +43,7 @@ class SegmentationDataModule(SplitDataModule[ImageSource[_Image]], Generic[_Imag
     Args:
         representation: What the network sees of an image.
         images_per_step: Images per training step and process. Evaluation takes one at a time.
-        inputs: What the network is shown, `rgb` and perhaps others of `INPUT_CHANNELS`.
+        inputs: What the network is shown, `rgb` and perhaps others, see `Input`.
         color_jitter: Strength of the colour augmentation, 0 (none) to 1, see `jitter_colors`.
         normalization: Of RGB and depth; by default that of Stanford2D3DS.
         **settings: All others of `SplitDataModule`.
@@ -77,7 +78,7 @@ class SegmentationDataModule(SplitDataModule[ImageSource[_Image]], Generic[_Imag
                 found=f"{self.normalization.channels} channels",
                 expected=f"{default.channels}, for data.inputs={list(self.inputs)}",
             )
-        self.in_channels = sum(INPUT_CHANNELS[name] for name in self.inputs)
+        self.in_channels = len(channel_names(self.inputs))
         if not isinstance(color_jitter, int | float) or not 0 <= color_jitter <= 1:
             raise SettingError("data.color_jitter", found=color_jitter, expected="0 to 1")
         self.color_jitter = color_jitter
@@ -142,7 +143,7 @@ def checked_inputs(inputs: Sequence[Input]) -> tuple[Input, ...]:
     Raises:
         SettingError: One is unknown or there twice, RGB is missing, or validity is without depth.
     """
-    ordered = tuple(name for name in INPUT_CHANNELS if name in inputs)
+    ordered = tuple(name for name in INPUTS if name in inputs)
     known = not isinstance(inputs, str) and sorted(ordered) == sorted(inputs)
     if not known or "rgb" not in inputs or ("validity" in inputs and "depth" not in inputs):
         raise SettingError(

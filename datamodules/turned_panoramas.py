@@ -137,6 +137,5 @@ class UprightPanoramas(_Wrapped):
         if panorama.up is not None:
             return panorama
         if index not in self._ups:
-            found = estimate_up(panorama.rgb, self._max_tilt_deg)
-            self._ups[index] = found.up if found.confidence else None
+            self._ups[index] = estimate_up(panorama.rgb, self._max_tilt_deg).found
         return panorama._replace(up=self._ups[index])

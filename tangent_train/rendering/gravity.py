@@ -40,6 +40,11 @@ class Gravity(NamedTuple):
     confidence: float
     candidates: NDArray[np.float64]
 
+    @property
+    def found(self) -> NDArray[np.float64] | None:
+        """`up`, where one was found."""
+        return self.up if self.confidence else None
+
 
 def estimate_up(rgb: NDArray[np.uint8], max_tilt_deg: float = 60.0) -> Gravity:
     """Estimate the direction of up from the straight edges of rooms and buildings.

@@ -60,7 +60,7 @@ class TrainedNetwork:
         network: In evaluation mode; ``(B, C, h, w)`` float32, normalized, to scores ``(B, K+1, h,
             w)``, the unknown class first.
         class_names: K + 1 names, the unknown class first.
-        inputs: What it is shown, see `datamodules.samples.INPUT_CHANNELS`.
+        inputs: What it is shown, see `datamodules.samples.Input`.
         normalization: Of RGB and depth.
         level: Level s it was trained at.
         representation: The section of the config it was trained with, resolved.
@@ -85,9 +85,9 @@ class TrainedNetwork:
     @property
     def in_channels(self) -> int:
         """Channels of its images."""
-        from datamodules.samples import INPUT_CHANNELS
+        from datamodules.samples import channel_names
 
-        return sum(INPUT_CHANNELS[name] for name in self.inputs)
+        return len(channel_names(self.inputs))
 
 
 class Scores(nn.Module):

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
+from datamodules.class_weights import ClassWeights
 from datamodules.split_module import Kind
 from models.held import held_networks
 from tangent_train.errors import SettingError
@@ -78,7 +79,7 @@ class SegmentationTask(Task):
         class_names: Sequence[str],
         optimizer: Callable[..., Optimizer],
         scheduler: Callable[..., LRScheduler] | None = None,
-        class_weights: Literal["none", "log", "sqrt", "effective"] | Sequence[float] = "log",
+        class_weights: ClassWeights | Sequence[float] = "log",
         label_smoothing: float = 0.0,
         auxiliary_weight: float = 0.4,
         auxiliary_target: AuxiliaryTarget = "histogram",

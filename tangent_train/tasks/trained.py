@@ -121,7 +121,7 @@ def _check_kind(path: Path, content: dict[str, Any]) -> None:
 
 
 def _from_checkpoint(path: Path) -> TrainedNetwork:
-    from datamodules.samples import INPUT_CHANNELS, Normalization
+    from datamodules.samples import Normalization, channel_names
 
     content = read_checkpoint(path, _NEEDED)
     _check_kind(path, content)
@@ -132,7 +132,7 @@ def _from_checkpoint(path: Path) -> TrainedNetwork:
     class_names = tuple(content["class_names"])
     normalization = Normalization(**content["normalization"])
     inputs = stored_inputs(content)
-    channels = sum(INPUT_CHANNELS[name] for name in inputs)
+    channels = len(channel_names(inputs))
     settings = completed_settings(config["network"], channels, len(class_names), restored=True)
     tensors = {
         name.removeprefix(_PREFIX): tensor

@@ -14,6 +14,7 @@ from torch.utils.data import DataLoader
 from tangent_train.errors import SettingError
 from tangent_train.rendering import TangentRepresentation
 from tangent_train.tasks import SegmentationTask
+from tests.tasks.quiet_trainer import quiet_trainer
 
 NAMES = ("unknown", "a", "b")
 SHAPE = (32, 64)
@@ -85,23 +86,11 @@ def _task(
     return SegmentationTask(network, representation, NAMES, optimizer, **settings)
 
 
-def _trainer(**settings: Any) -> lightning.Trainer:
-    quiet: dict[str, Any] = {
-        "logger": False,
-        "enable_checkpointing": False,
-        "enable_progress_bar": False,
-        "enable_model_summary": False,
-        "accelerator": "cpu",
-        "num_sanity_val_steps": 0,
-    }
-    return lightning.Trainer(**(quiet | settings))
-
-
 def test_evaluation_scores_every_panorama_against_its_own_labels(
     representation: TangentRepresentation,
 ) -> None:
     task = _task(SignNetwork(), representation, images_per_forward=7)
-    trainer = _trainer()
+    trainer = quiet_trainer()
     (figures,) = trainer.test(task, datamodule=Data(representation), verbose=False)
     assert task.matrices.images == 3
     assert task.matrices.pixels[0].sum() == 0, "unknown truth counts for nothing"
@@ -121,7 +110,7 @@ def test_the_batch_of_spheres_gives_one_gradient(representation: TangentRepresen
     )
     expected = torch.autograd.grad(loss, list(network.parameters()))
     before = [p.detach().clone() for p in network.parameters()]
-    _trainer(max_steps=1, limit_val_batches=0).fit(task, datamodule=data)
+    quiet_trainer(max_steps=1, limit_val_batches=0).fit(task, datamodule=data)
     for old, new, gradient in zip(before, network.parameters(), expected, strict=True):
         torch.testing.assert_close((old - new) / 0.1, gradient, rtol=1e-4, atol=1e-6)
 
@@ -134,7 +123,9 @@ def test_all_unknown_batches_leave_the_network_alone(
         sample.labels.zero_()
     network = nn.Conv2d(2, 3, 1)
     before = [p.detach().clone() for p in network.parameters()]
-    _trainer(max_steps=2, limit_val_batches=0).fit(_task(network, representation), datamodule=data)
+    quiet_trainer(max_steps=2, limit_val_batches=0).fit(
+        _task(network, representation), datamodule=data
+    )
     for old, new in zip(before, network.parameters(), strict=True):
         torch.testing.assert_close(old, new.detach())
 
@@ -144,11 +135,11 @@ def test_class_weights_come_from_the_data_or_the_settings(
 ) -> None:
     data = Data(representation)
     task = _task(nn.Conv2d(2, 3, 1), representation, class_weights="log")
-    _trainer(max_steps=1, limit_val_batches=0).fit(task, datamodule=data)
+    quiet_trainer(max_steps=1, limit_val_batches=0).fit(task, datamodule=data)
     assert task.class_weights.tolist() == [0.0, 1.0, 3.0]
     wrong = _task(nn.Conv2d(2, 3, 1), representation, class_weights=[1.0, 2.0])
     with pytest.raises(SettingError, match=r"task\.class_weights: found 2 numbers"):
-        _trainer(max_steps=1, limit_val_batches=0).fit(wrong, datamodule=data)
+        quiet_trainer(max_steps=1, limit_val_batches=0).fit(wrong, datamodule=data)
 
 
 @pytest.mark.parametrize(
@@ -169,7 +160,7 @@ def test_schedulers_step_by_epoch_or_over_the_whole_training(
         def on_train_batch_start(self, trainer: Any, *_: Any) -> None:
             seen.append(trainer.optimizers[0].param_groups[0]["lr"])
 
-    _trainer(max_epochs=2, callbacks=[Watch()]).fit(task, datamodule=Data(representation))
+    quiet_trainer(max_epochs=2, callbacks=[Watch()]).fit(task, datamodule=Data(representation))
     assert len(seen) == 4
     if rates is not None:
         assert set(seen) == rates

@@ -5,7 +5,6 @@ from __future__ import annotations
 from functools import partial
 from typing import Any, NamedTuple
 
-import lightning
 import pytest
 import torch
 from torch import Tensor, nn
@@ -16,6 +15,7 @@ from tangent_train.errors import SettingError
 from tangent_train.rendering import TangentRepresentation
 from tangent_train.tasks import SegmentationTask
 from tangent_train.tasks.segmentation_loss import SegmentationLoss
+from tests.tasks.quiet_trainer import quiet_trainer
 
 NAMES = ("unknown", "a", "b")
 WEIGHTS = torch.tensor([0.0, 1.0, 3.0])
@@ -128,18 +128,6 @@ def _centers(count: int) -> Tensor:
     return (2 * torch.arange(count) + 1) / count - 1
 
 
-def _trainer(**settings: Any) -> lightning.Trainer:
-    return lightning.Trainer(
-        logger=False,
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        accelerator="cpu",
-        num_sanity_val_steps=0,
-        **settings,
-    )
-
-
 def test_training_tells_such_a_network_where_all_images_look_and_leaves_the_chunks_to_it() -> None:
     network = Looking()
     task = SegmentationTask(
@@ -153,7 +141,7 @@ def test_training_tells_such_a_network_where_all_images_look_and_leaves_the_chun
     images, labels = _batch()
     samples: Any = [Training(i, k, torch.eye(3).expand(3, 3, 3)) for i, k in
                     zip(torch.split(images, 3), torch.split(labels, 3), strict=True)]  # fmt: skip
-    _trainer(max_steps=1, limit_val_batches=0).fit(task, DataLoader(samples, 2))
+    quiet_trainer(max_steps=1, limit_val_batches=0).fit(task, DataLoader(samples, 2))
     assert network.told == [((2, 3, 3, 3), 3)]
 
 
@@ -167,7 +155,7 @@ def test_evaluation_tells_it_the_rays_of_every_turn() -> None:
     views = TANGENT.whole()
     where = torch.tensor(views.rays()), torch.tensor(views.rotations())
     samples: Any = [Evaluation(torch.zeros(40, 2, 16, 16), target, *where)]
-    _trainer().test(task, DataLoader(samples), verbose=False)
+    quiet_trainer().test(task, DataLoader(samples), verbose=False)
     assert network.told == [((1, 20, 3, 3), 7)] * 2
     pixels = task.matrices.pixels
     assert pixels[1, 1] + pixels[2, 2] == pixels.sum() == 32 * 64

@@ -160,8 +160,7 @@ class PanoramaLabeller:
             return None
         known = up_of(path)
         if known is None and self.upright == "auto":
-            found = estimate_up(rgb, self.max_tilt_deg)
-            return found.up if found.confidence else None
+            return estimate_up(rgb, self.max_tilt_deg).found
         return known
 
 
