@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from datamodules.image_opening import MOST_PIXELS
+from datamodules.image_opening import check_pixels
 from tangent_train.errors import DataError
 
 if TYPE_CHECKING:
@@ -102,10 +102,9 @@ def _read_header(path: Path) -> _Header:
             remedy="Flatten the image.",
         )
     height, width = bottom - top + 1, right - left + 1
-    if not 0 < height * width <= MOST_PIXELS:
-        raise DataError(
-            path, found=f"{height}×{width} pixels", expected="as many as 16384×32768, at most"
-        )
+    if not height * width > 0:
+        raise DataError(path, found=f"{height}×{width} pixels", expected="some")
+    check_pixels(path, height, width)
     return _Header((height, width), channels)
 
 

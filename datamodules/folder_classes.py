@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,6 +24,7 @@ UNKNOWN_NAME = "unknown"
 
 _MOST_CLASSES = 255  # labels are uint8, and 0 is taken
 _MOST_VALUE = 65535
+_UNKNOWN_VALUES = (255, 65535)
 _MOST_SHOWN = 8
 _COLOR = re.compile(r"#[0-9a-fA-F]{6}")
 _EXPECTED = (
@@ -41,12 +42,14 @@ class FolderClasses:
         codes: ``(n,)`` int32, in rising order: values, or colours as R · 65536 + G · 256 + B.
         labels: ``(n,)`` uint8, the class of each.
         in_colors: Whether the codes are colours.
+        length: Of the list that named the classes; None where they were given values or colours.
     """
 
     names: tuple[str, ...]
     codes: NDArray[np.int32]
     labels: NDArray[np.uint8]
     in_colors: bool
+    length: int | None = None
 
     @property
     def fingerprint(self) -> str:
@@ -71,6 +74,28 @@ class FolderClasses:
         codes = self.pack(stored)
         place = np.minimum(np.searchsorted(self.codes, codes), len(self.codes) - 1)
         return np.where(self.codes[place] == codes, self.labels[place], np.uint8(0))
+
+    def check(self, stored: NDArray[np.integer], path: Path) -> None:
+        """Make sure that no value is past the end of the list that names the classes.
+
+        Args:
+            stored: As of `decode`.
+            path: Where it is from.
+
+        Raises:
+            DataError: One is, that does not mark unknown pixels (255, and 65535 of 16 bits).
+        """
+        if self.length is None:
+            return
+        past = stored[(stored >= self.length) & ~np.isin(stored, _UNKNOWN_VALUES)]
+        if past.size:
+            raise DataError(
+                path,
+                found=f"value {past.min()} in {past.size} pixel{'s' * (past.size > 1)}",
+                expected=f"0 to {self.length - 1}, the places in the list of classes.json, or "
+                f"{_UNKNOWN_VALUES[0]}",
+                remedy="Name the class, or write null in its place in the list.",
+            )
 
     def pack(self, stored: NDArray[np.integer]) -> NDArray[np.int32]:
         """One number for each pixel of a label image, as in `codes`."""
@@ -131,7 +156,8 @@ def read_classes(path: Path) -> FolderClasses:
     else:
         raise DataError(path, found=json.dumps(content), expected=_EXPECTED)
     _check_names(path, [name for name, _ in codes])
-    return _classes(path, codes)
+    classes = _classes(path, codes)
+    return replace(classes, length=None if isinstance(content, _Pairs) else len(content))
 
 
 class _Pairs(list[tuple[Any, Any]]):

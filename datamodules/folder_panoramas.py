@@ -39,7 +39,7 @@ from datamodules.sources import count_labels, in_threads
 from tangent_train.errors import SettingError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -107,13 +107,33 @@ class FolderSource:
         Raises:
             DataError: A file is broken.
         """
+        return self._read(index, strict=False)
+
+    def read_strictly(self, index: int) -> Panorama:
+        """The same, if all its values are in the list of classes, where that is a list.
+
+        Raises:
+            DataError: A file is broken, or they are not.
+        """
+        return self._read(index, strict=True)
+
+    def readers(self, index: int) -> Iterator[Callable[[], object]]:
+        """What reads the files of one panorama, one after the other."""
+        files = self._panoramas[index]
+        yield lambda: read_rgb(files.rgb)
+        yield lambda: self._labels(files.labels, strict=True)
+        if files.depth is not None:
+            depth = files.depth
+            yield lambda: read_depth_m(depth, self._depth_units_per_m)
+
+    def _read(self, index: int, *, strict: bool) -> Panorama:
         files = self._panoramas[index]
         depth = None
         if files.depth is not None:
             steps = meters_to_steps(read_depth_m(files.depth, self._depth_units_per_m))
             depth = resize_depth(steps, self._shape)
         rgb = resize_area(read_rgb(files.rgb), self._shape)
-        return Panorama(rgb, depth, self._labels(files.labels))
+        return Panorama(rgb, depth, self._labels(files.labels, strict=strict))
 
     def label_counts(self, index: int) -> NDArray[np.int64]:
         """The pixels of every label of one panorama, ``(256,)``.
@@ -123,8 +143,10 @@ class FolderSource:
         """
         return count_labels(self._labels(self._panoramas[index].labels))
 
-    def _labels(self, path: Path) -> NDArray[np.uint8]:
+    def _labels(self, path: Path, *, strict: bool = False) -> NDArray[np.uint8]:
         codes = read_codes(path, in_colors=self._classes.in_colors)
+        if strict:
+            self._classes.check(codes, path)
         return self._classes.decode(resize_nearest(codes, self._shape))
 
 
@@ -186,19 +208,29 @@ class FolderPanoramas(PanoramaDataModule):
             DataError: Something is missing or cannot be used.
             SettingError: The panoramas are too small for the representation.
         """
-        panoramas = list_panoramas(self.root, with_depth=self.with_depth)
-        splits = self._division.divide(panoramas)
+        noted, classes = self.problems.noted, self._classes
+        panoramas = list_panoramas(self.root, with_depth=self.with_depth, noted=noted)
+        # Before any are left out: the splits do not depend on what is broken.
+        splits = self._division.divide(panoramas, noted)
 
         def check(index: int) -> None:
-            check_panorama(panoramas[index], self.erp_height, in_colors=self._classes.in_colors)
+            files = panoramas[index]
+            check_panorama(files, self.erp_height, in_colors=classes.in_colors, noted=noted)
 
         for _ in in_threads(check, len(panoramas)):
             pass
-        check_class_codes(panoramas, self._classes)
+        check_class_codes(self._whole(panoramas), classes, noted)
         return {
-            split: FolderSource(chosen, self._classes, self.erp_height, self.depth_units_per_m)
+            split: FolderSource(
+                self._whole(chosen), classes, self.erp_height, self.depth_units_per_m
+            )
             for split, chosen in splits.items()
         }
+
+    def _whole(self, panoramas: Sequence[PanoramaFiles]) -> list[PanoramaFiles]:
+        """Those that nothing was noted of."""
+        broken = self.problems.items
+        return [files for files in panoramas if files.name not in broken]
 
 
 def _normalization(

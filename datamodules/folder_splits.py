@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from datamodules.group_drawing import draw_groups
+from datamodules.problems import Noted, raised
 from datamodules.segmentation_module import SPLITS, Split
 from tangent_train.errors import DataError, SettingError
 
@@ -56,16 +57,19 @@ class FolderSplits:
         if self.seed < 0:
             raise SettingError("data.split_seed", found=self.seed, expected="0 or more")
 
-    def divide(self, panoramas: Sequence[PanoramaFiles]) -> dict[Split, list[PanoramaFiles]]:
+    def divide(
+        self, panoramas: Sequence[PanoramaFiles], noted: Noted = raised
+    ) -> dict[Split, list[PanoramaFiles]]:
         """The panoramas of every split, each in the order given.
 
         Args:
             panoramas: All of the data set.
+            noted: Where wrong lines of lists go, to go on after them.
 
         Raises:
             DataError: A list cannot be used, or there are too few scenes to draw from.
         """
-        listed = self._read_lists(panoramas)
+        listed = self._read_lists(panoramas, noted)
         named = {name for names in listed.values() for name in names}
         rest = [files for files in panoramas if files.name not in named]
         if "test" in listed:
@@ -87,7 +91,9 @@ class FolderSplits:
             split: [files for files in panoramas if files.name in chosen[split]] for split in SPLITS
         }
 
-    def _read_lists(self, panoramas: Sequence[PanoramaFiles]) -> dict[Split, set[str]]:
+    def _read_lists(
+        self, panoramas: Sequence[PanoramaFiles], noted: Noted
+    ) -> dict[Split, set[str]]:
         """The names in each list that is there."""
         names = {files.name: files.name for files in panoramas}
         # With the ending of the image is right as well.
@@ -100,21 +106,8 @@ class FolderSplits:
                 continue
             listed[split] = set()
             for line in _lines(path):
-                if line not in names:
-                    raise DataError(
-                        path,
-                        found=f"{line!r}, of which there is no image",
-                        expected="names of files in images/, as scene/name",
-                    )
-                name = names[line]
-                if name in owners:
-                    raise DataError(
-                        path,
-                        found=f"{line!r}, also in {owners[name]}",
-                        expected="every panorama once, in one of the lists",
-                    )
-                owners[name] = path
-                listed[split].add(name)
+                with noted((split, line)):
+                    listed[split].add(_listed_name(path, line, names, owners))
         return listed
 
     def _draw(self, split: Split, panoramas: Sequence[PanoramaFiles], fraction: float) -> set[str]:
@@ -140,6 +133,25 @@ class FolderSplits:
                 remedy=f"{_named_in(split).capitalize()}.",
             )
         return names
+
+
+def _listed_name(path: Path, line: str, names: dict[str, str], owners: dict[str, Path]) -> str:
+    """The panorama that a line of a list names, which is then that list's own."""
+    if line not in names:
+        raise DataError(
+            path,
+            found=f"{line!r}, of which there is no image",
+            expected="names of files in images/, as scene/name",
+        )
+    name = names[line]
+    if name in owners:
+        raise DataError(
+            path,
+            found=f"{line!r}, also in {owners[name]}",
+            expected="every panorama once, in one of the lists",
+        )
+    owners[name] = path
+    return name
 
 
 def _named_in(split: Split) -> str:

@@ -39,6 +39,7 @@ _SIZES = (
 )
 _TOLERANCE = 0.02  # of pixels that should be square: angles and sizes are given in round numbers
 _MOST_COLUMNS = 32768  # of the whole panorama, as of images that are one
+_MOST_NUMBER = 1e9  # of pixels, of a tag that may be one
 _SAY_IT = "Say with crop=[west,east,south,north] in degrees what the image shows."
 _NOT_WHOLE = (
     "If it is a part of a panorama, say which with crop=[west,east,south,north] in degrees or with "
@@ -297,8 +298,11 @@ def _agree(one: float, other: float) -> bool:
 
 def _number(path: Path, name: str, text: str) -> int:
     try:
-        return round(float(text))
-    except (ValueError, OverflowError):
+        number = float(text)
+    except ValueError:
+        number = float("nan")
+    if not abs(number) <= _MOST_NUMBER:
         raise DataError(
             path, found=f"GPano:{name} {text!r}", expected="a number of pixels", remedy=_SAY_IT
-        ) from None
+        )
+    return round(number)

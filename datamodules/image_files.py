@@ -13,6 +13,7 @@ from PIL import ExifTags
 
 from datamodules.exr import read_exr, read_exr_size
 from datamodules.image_opening import open_image, oriented_array, oriented_size
+from datamodules.links import note_links
 from tangent_train.errors import DataError, SettingError
 
 if TYPE_CHECKING:
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
     from PIL import Image
+
+    from datamodules.problems import Noted
 
 __all__ = [
     "DEPTH_SUFFIXES",
@@ -47,13 +50,15 @@ _FILM_DIAGONAL_MM = math.hypot(36, 24)
 _DEPTH = "16-bit grey PNG or TIFF, 32-bit float TIFF, .npy or .exr"
 
 
-def find_images(pattern: str | Path) -> list[Path]:
+def find_images(pattern: str | Path, noted: Noted | None = None) -> list[Path]:
     """The images that a setting names.
 
     Args:
         pattern: A file; a folder, which is searched with all its folders; or a pattern with ``*``,
             ``?``, ``[…]`` and, for folders of any depth, ``**``. A file or folder whose own name
             holds such characters is that file. ``~`` is the home folder.
+        noted: Where what is passed over goes: folders that cannot be opened, links that lead
+            nowhere or in a circle.
 
     Returns:
         In the order of their paths. Of folders and patterns only those whose names end in one of
@@ -68,7 +73,7 @@ def find_images(pattern: str | Path) -> list[Path]:
     if path.is_file():
         return [path]
     if path.is_dir():
-        found = list(_walk(path))
+        found = list(_walk(path, noted))
     else:
         found = [Path(name) for name in glob.glob(str(path), recursive=True)]  # noqa: PTH207
     images = sorted({file for file in found if file.suffix.lower() in IMAGE_SUFFIXES})
@@ -83,12 +88,21 @@ def find_images(pattern: str | Path) -> list[Path]:
     return images
 
 
-def _walk(folder: Path) -> Iterator[Path]:
+def _walk(folder: Path, noted: Noted | None) -> Iterator[Path]:
     """The files of a folder and its folders, linked ones as well, each once, but hidden ones."""
     seen = set()
-    for parent, folders, names in os.walk(folder, followlinks=True):
+
+    def closed(error: OSError) -> None:
+        if noted is not None:
+            with noted(Path(error.filename)):
+                raise error
+
+    for parent, folders, names in os.walk(folder, followlinks=True, onerror=closed):
         real = os.path.realpath(parent)
         folders[:] = [] if real in seen else [name for name in folders if name[0] != "."]
+        if noted is not None:
+            passed_over = note_links(Path(parent), (*folders, *names), noted)
+            folders[:] = [name for name in folders if name not in passed_over]
         yield from (Path(parent, name) for name in names if real not in seen and name[0] != ".")
         seen.add(real)
 
@@ -255,8 +269,10 @@ def read_array(path: Path, *, mapped: bool = False) -> NDArray[Any]:
         DataError: It cannot be read, or is no array of NumPy's.
     """
     try:
-        array = np.load(path, mmap_mode="r" if mapped else None, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+        with np.errstate(over="ignore"):  # by the sizes in a broken header
+            array = np.load(path, mmap_mode="r" if mapped else None, allow_pickle=False)
+    # Broken headers raise anything, tokenize.TokenError and MemoryError as well.
+    except Exception as error:
         raise DataError(
             path, found=error, expected="a NumPy array of numbers", remedy="Save it again."
         ) from error

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from PIL import ExifTags, Image
 
-from tangent_train.errors import DataError
+from tangent_train.errors import DataError, SettingError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -16,11 +17,15 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-__all__ = ["MOST_PIXELS", "open_image", "oriented_array", "oriented_size"]
+__all__ = ["MOST_PIXELS", "check_pixels", "open_image", "oriented_array", "oriented_size"]
 
 _FORMATS = ("JPEG", "PNG", "TIFF", "WEBP")
-MOST_PIXELS = 32768 * 16384
-_MOST = "at most 32768×16384 pixels"
+
+MOST_PIXELS = "TANGENT_MOST_PIXELS"
+"""Variable of the environment, which all processes of a run share: pixels of an image that is
+decoded, at most. A file of a few kilobytes can promise more than fit into memory."""
+
+_MOST = 32768 * 16384
 
 # EXIF orientation: are rows and columns exchanged, and which of them run backwards afterwards?
 _ORIENTATIONS = {
@@ -48,15 +53,16 @@ def open_image(path: Path) -> Iterator[Image.Image]:
         DataError: It cannot be read, is none of these, is too large, or turns out to be broken
             while the block reads it.
     """
-    _allow_panoramas()
+    most = _most_pixels()
+    _allow_panoramas(most)
     try:
         with Image.open(path, formats=_FORMATS) as image:
-            _check_size(path, image)
+            check_pixels(path, image.height, image.width)
             yield image
     except (DataError, MemoryError):
         raise
     except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
-        raise _too_large(path, error) from error
+        raise _too_large(path, error, most) from error
     # Decoders that meet a broken file raise anything from OSError to SyntaxError and IndexError.
     except Exception as error:
         raise DataError(
@@ -65,6 +71,30 @@ def open_image(path: Path) -> Iterator[Image.Image]:
             expected="a whole JPEG, PNG, TIFF or WebP image",
             remedy="Copy or export the file again.",
         ) from error
+
+
+def check_pixels(path: Path, height: int, width: int) -> None:
+    """Refuse an image that is too large to be decoded, by what its header says.
+
+    Args:
+        path: The file, for the message.
+        height: Rows.
+        width: Columns.
+
+    Raises:
+        DataError: It has more pixels than `MOST_PIXELS` allows.
+        SettingError: That is no number.
+    """
+    most = _most_pixels()
+    if height * width > most:
+        raise _too_large(path, f"{height}×{width} pixels", most)
+
+
+def _most_pixels() -> int:
+    text = os.environ.get(MOST_PIXELS, str(_MOST))
+    if not text.isdecimal() or int(text) < 1:
+        raise SettingError(MOST_PIXELS, found=repr(text), expected="a whole number, 1 or more")
+    return int(text)
 
 
 def oriented_size(image: Image.Image) -> tuple[int, int]:
@@ -100,20 +130,20 @@ def _orientation(image: Image.Image) -> tuple[bool, int, int]:
     return _ORIENTATIONS.get(orientation, upright) if isinstance(orientation, int) else upright
 
 
-def _allow_panoramas() -> None:
+def _allow_panoramas(most: int) -> None:
     """Raise Pillow's limit, which 16384×8192 exceeds; each file is compared with ours."""
     limit = Image.MAX_IMAGE_PIXELS
-    if limit is not None and limit < MOST_PIXELS:
-        Image.MAX_IMAGE_PIXELS = MOST_PIXELS
+    if limit is not None and limit < most:
+        Image.MAX_IMAGE_PIXELS = most
 
 
-def _check_size(path: Path, image: Image.Image) -> None:
-    if image.width * image.height > MOST_PIXELS:
-        raise _too_large(path, f"{image.height}×{image.width} pixels")
-
-
-def _too_large(path: Path, found: object) -> DataError:
-    return DataError(path, found=found, expected=_MOST, remedy="Shrink the image.")
+def _too_large(path: Path, found: object, most: int) -> DataError:
+    return DataError(
+        path,
+        found=found,
+        expected=f"at most {most} pixels",
+        remedy=f"Shrink the image; or, if you trust it and have the memory, set {MOST_PIXELS}.",
+    )
 
 
 def _reason(error: Exception) -> str:

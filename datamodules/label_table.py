@@ -33,6 +33,8 @@ CLASSES: tuple[str, ...] = (
 )
 """The 13 classes; the label of a class is its place here plus one."""
 
+_MISSING = 0x0D0D0D
+
 UNKNOWN = 0
 """The label of pixels without a class: ignored in training and evaluation."""
 
@@ -66,7 +68,7 @@ class LabelTable:
         remedy = "Copy semantic_labels.json of the Stanford2D3DS release."
         try:
             names = json.loads(Path(path).read_bytes())
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, RecursionError) as error:
             raise DataError(path, found=error, expected=expected, remedy=remedy) from error
         if not isinstance(names, list) or not names:
             raise DataError(path, found=type(names).__name__, expected=expected, remedy=remedy)
@@ -76,6 +78,27 @@ class LabelTable:
         if strange:
             raise DataError(path, found=f"class {strange[0]!r}", expected=expected, remedy=remedy)
         return cls(np.array([ids[name] for name in classes], np.uint8))
+
+    def check(self, colors: NDArray[np.uint8], path: Path) -> None:
+        """Make sure that all instances are in the table.
+
+        Args:
+            colors: As of `decode`.
+            path: Where they are from.
+
+        Raises:
+            DataError: There are others, not only the mark of missing labels.
+        """
+        index = _indices(colors)
+        past = index[(index >= len(self.class_ids)) & (index != _MISSING)]
+        if past.size:
+            raise DataError(
+                path,
+                found=f"instance {past.min()} in {past.size} pixel{'s' * (past.size > 1)}",
+                expected=f"0 to {len(self.class_ids) - 1}, the entries of the class table, or "
+                f"#{_MISSING:06X} where labels are missing",
+                remedy="Use the file and semantic_labels.json of one release.",
+            )
 
     def decode(self, colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Labels of a `semantic` image.
@@ -90,7 +113,12 @@ class LabelTable:
         >>> table.decode(np.array([[[0, 0, 2], [0, 0, 3], [13, 13, 13]]], np.uint8)).tolist()
         [[12, 0, 0]]
         """
-        red, green, blue = np.moveaxis(colors.astype(np.int32), -1, 0)
-        index: NDArray[Any] = (red << 16) | (green << 8) | blue
+        index = _indices(colors)
         past_the_end = len(self.class_ids)
         return np.append(self.class_ids, np.uint8(UNKNOWN))[np.minimum(index, past_the_end)]
+
+
+def _indices(colors: NDArray[np.uint8]) -> NDArray[Any]:
+    """Place in the table of every pixel, ``(H, W)`` int32."""
+    red, green, blue = np.moveaxis(colors.astype(np.int32), -1, 0)
+    return (red << 16) | (green << 8) | blue

@@ -33,6 +33,8 @@ def claim_folder(
     wanted = {"generator": generator, "version": version, "settings": dict(settings)}
     path = root / manifest
     remedy = "Name another folder, or remove this one to make it anew."
+    # Before the manifest: whoever makes the same at the same time writes that first.
+    foreign = sorted(p.name for p in root.iterdir() if p.name[0] != ".") if root.is_dir() else []
     if path.exists():
         found = _read_manifest(path, generator)
         if found != wanted:
@@ -43,24 +45,22 @@ def claim_folder(
                 remedy=remedy,
             )
         return
-    if root.exists():
-        if not root.is_dir():
-            raise DataError(root, found="a file", expected="a folder", remedy=remedy)
-        foreign = sorted(path.name for path in root.iterdir() if not path.name.startswith("."))
-        if foreign:
-            raise DataError(
-                root,
-                found=f"files that are not {generator}' ({', '.join(foreign[:3])}, …)",
-                expected="a new or empty folder",
-                remedy="Name another folder.",
-            )
+    if root.exists() and not root.is_dir():
+        raise DataError(root, found="a file", expected="a folder", remedy=remedy)
+    if foreign:
+        raise DataError(
+            root,
+            found=f"files that are not {generator}' ({', '.join(foreign[:3])}, …)",
+            expected="a new or empty folder",
+            remedy="Name another folder.",
+        )
     write_text(path, json.dumps(wanted, indent=1) + "\n")
 
 
 def _read_manifest(manifest: Path, generator: str) -> dict[str, Any]:
     try:
         found = json.loads(manifest.read_text(encoding="utf-8"))
-    except ValueError:
+    except (ValueError, RecursionError):
         found = None
     if not isinstance(found, dict):
         raise DataError(

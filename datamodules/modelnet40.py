@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from lightning.pytorch.trainer.states import TrainerFn
 
 from datamodules.group_drawing import draw_groups
+from datamodules.processes import in_processes, number_of_processes
 from datamodules.samples import Normalization
 from datamodules.shape_files import MODELNET40, ShapeFile, find_shapes
 from datamodules.shape_samples import (
@@ -23,12 +24,13 @@ from datamodules.shape_samples import (
     TrainingShapes,
     normalize_spheres,
 )
+from datamodules.sphere_files import mesh_problem
 from datamodules.sphere_store import Shapes, SphereFolder
 from datamodules.split_module import Kind, Split, SplitDataModule
 from tangent_train.errors import DataError, SettingError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from torch import Tensor
 
@@ -36,12 +38,13 @@ if TYPE_CHECKING:
 
 __all__ = ["ModelNet40"]
 
+_PER_PROCESS = 100
+
 
 class ModelNet40(SplitDataModule[Shapes]):
     """Shapes as spheres, to be classified.
 
-    The spheres are made once, on all cores, before the first run (`prepare_data`); meshes that
-    cannot be used are named, listed and left out.
+    The spheres are made once, on all cores, before the first run (`prepare_data`).
 
     Args:
         root: Folder of the meshes, see `shape_files`.
@@ -138,13 +141,32 @@ class ModelNet40(SplitDataModule[Shapes]):
         """
         meshes = self._all_meshes()
         chosen = self._choose_for_validation(meshes)
+        unusable = self.spheres.unusable(meshes)
         splits: dict[Split, list[ShapeFile]] = {"train": [], "val": [], "test": []}
-        for mesh in self.spheres.usable(meshes):
-            splits["val" if mesh.name in chosen else mesh.part].append(mesh)
+        for mesh in meshes:
+            if mesh.name in unusable:
+                self._note(mesh, unusable[mesh.name])
+            else:
+                splits["val" if mesh.name in chosen else mesh.part].append(mesh)
         for split in ("train", "test"):
             if not splits[split]:
                 raise DataError(self.root, found=f"no usable {split} shape", expected="some")
         return {split: self._shapes(found) for split, found in splits.items()}
+
+    def content(self, splits: Mapping[Split, Shapes]) -> tuple[int, Iterator[None]]:
+        """All meshes, whether their spheres are made or not."""
+        del splits
+        meshes = self._all_meshes()
+
+        def reading() -> Iterator[None]:
+            pieces = [(mesh,) for mesh in meshes]
+            processes = number_of_processes(None, len(meshes), _PER_PROCESS)
+            for mesh, found in in_processes(_mesh_problem, pieces, processes):
+                if found is not None:
+                    self._note(mesh, found)
+                yield
+
+        return len(meshes), reading()
 
     def remembered(self, source: Shapes) -> Shapes:
         """Spheres kept in memory."""
@@ -166,6 +188,9 @@ class ModelNet40(SplitDataModule[Shapes]):
     def normalized(self, batch: ShapeSample) -> Tensor:
         """The views of a `ShapeSample`, ``(B, N, 6, h, w)`` float32."""
         return normalize_spheres(batch.images, self.normalization)
+
+    def _note(self, mesh: ShapeFile, found: str) -> None:
+        self.problems.add(DataError(found), mesh.name, mesh.path)
 
     def _all_meshes(self) -> list[ShapeFile]:
         """All meshes, looked for once."""
@@ -192,6 +217,10 @@ class ModelNet40(SplitDataModule[Shapes]):
             [self.spheres.path(mesh) for mesh in meshes],
             self.spheres.shape,
         )
+
+
+def _mesh_problem(mesh: ShapeFile) -> tuple[ShapeFile, str | None]:
+    return mesh, mesh_problem(mesh.path)
 
 
 def _checked_normalization(

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from datamodules.panorama_module import PanoramaDataModule, Split
 from datamodules.panoramas import Panorama, resize_area, resize_depth, resize_nearest
 from datamodules.png import check_panorama_size, read_color_png
+from datamodules.problems import Problems
 from datamodules.sources import count_labels
 from datamodules.synthia_files import (
     GET_IT,
@@ -37,7 +38,7 @@ from datamodules.synthia_splits import FRAMES, TEST, TRAIN, SequenceSplits
 from tangent_train.errors import DataError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     import numpy as np
     from numpy.typing import NDArray
@@ -46,6 +47,8 @@ if TYPE_CHECKING:
     from tangent_train.rendering.representation import Representation
 
 __all__ = ["OmniSynthia", "SynthiaPanoramas"]
+
+_SKIP = "data.skip_broken=true leaves out these frames."
 
 
 class _PanoramaName(NamedTuple):
@@ -108,6 +111,15 @@ class SynthiaPanoramas:
             depth = depth_steps(resize_depth(read_first_channel(files.depth), self._shape))
         return Panorama(rgb, depth, self._labels(files.labels))
 
+    def readers(self, index: int) -> Iterator[Callable[[], object]]:
+        """What reads the files of one panorama, one after the other."""
+        files = self._panoramas[index].files
+        yield lambda: read_color_png(files.rgb)
+        yield lambda: self._labels(files.labels)
+        if files.depth is not None:
+            depth = files.depth
+            yield lambda: read_first_channel(depth)
+
     def label_counts(self, index: int) -> NDArray[np.int64]:
         """The pixels of every label of one panorama, ``(256,)``.
 
@@ -166,6 +178,7 @@ class OmniSynthia(PanoramaDataModule):
         self.validation_fraction = validation_fraction
         self.frames = frames
         self.panorama_height = panorama_height
+        self._not_made = Problems()
 
     def make_files(self) -> None:
         """Make the panoramas of sequences that have none yet, or are not finished.
@@ -174,9 +187,16 @@ class OmniSynthia(PanoramaDataModule):
             DataError: There is nothing to make them from, or it is broken.
         """
         check_root(self.root)
+        self._not_made = problems = Problems()
         make_panoramas(
-            self.root, self._division.sequences, frames=self.frames, height=self.panorama_height
+            self.root,
+            self._division.sequences,
+            frames=self.frames,
+            height=self.panorama_height,
+            noted=problems.noted,
         )
+        if not self.skip_broken:
+            problems.refuse(self.root, left=1, more=_SKIP)
 
     def find_splits(self) -> dict[Split, SynthiaPanoramas]:
         """The panoramas of all splits, checked.
@@ -186,26 +206,33 @@ class OmniSynthia(PanoramaDataModule):
             SettingError: The panoramas are too small for the representation.
         """
         check_root(self.root)
+        self.problems.add_all(self._not_made)
         return {
-            split: SynthiaPanoramas(panoramas, self.erp_height)
+            split: SynthiaPanoramas(self.problems.without(panoramas), self.erp_height)
             for split, panoramas in self._division.divide(self._panoramas).items()
         }
 
     def _panoramas(self, sequence: str) -> list[_PanoramaName]:
         """The panoramas of a sequence, all of them checked."""
         folder = sequence_folder(self.root, sequence)
-        frames = list_panoramas(folder)
-        if not frames:
-            raise DataError(
-                folder / "pano" / "RGB",
-                found="no panoramas",
-                expected="000000.png and others",
-                remedy=f"Run tangent-prepare to make them from the views. {GET_IT}",
-            )
+        noted = self.problems.noted
+        frames: list[str] = []
+        with noted():
+            frames = list_panoramas(folder)
+            if not frames:
+                raise DataError(
+                    folder / "pano" / "RGB",
+                    found="no panoramas",
+                    expected="000000.png and others",
+                    remedy=f"Run tangent-prepare to make them from the views. {GET_IT}",
+                )
         found = []
         for frame in frames:
             files = panorama_files(folder, frame, with_depth=self.with_depth)
-            size = check_files(files, PANORAMA_FORMATS)
-            check_panorama_size(files.rgb, size, self.erp_height)
-            found.append(_PanoramaName(sequence, frame, files))
+            panorama = _PanoramaName(sequence, frame, files)
+            size = check_files(files, PANORAMA_FORMATS, noted, panorama)
+            with noted(panorama, files.rgb):
+                if any(size):
+                    check_panorama_size(files.rgb, size, self.erp_height)
+            found.append(panorama)
         return found

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from lightning.pytorch.trainer.states import TrainerFn
 
-from datamodules.panoramas import FileSource, Panorama, Turn
+from datamodules.panoramas import FileSource, Panorama, ReadablePanoramas, Turn
 from datamodules.segmentation_module import SPLITS, SegmentationDataModule, Split
+from datamodules.sources import read_strictly
 from datamodules.store import PreparedPanoramas, prepare_store
 from datamodules.turned_panoramas import PosedPanoramas, TurnedPanoramas, UprightPanoramas
-from tangent_train.errors import SettingError
+from tangent_train.errors import DataError, SettingError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -93,6 +94,27 @@ class PanoramaDataModule(SegmentationDataModule[Panorama]):
         """The panoramas of one split as they are on disk."""
         source: Any = super().open_split(split)  # one that `find_splits` gave
         return source
+
+    def read_once(self, source: ImageSource[Panorama], index: int) -> None:
+        """See `SegmentationDataModule`; what is in the store can be read."""
+        files: Any = source
+        if self.store is not None:
+            try:
+                PreparedPanoramas(files, self.store).checked(index, content=False)
+            except DataError:  # not made yet, or anew
+                pass
+            else:
+                return
+        read_strictly(source, index)
+
+    def chosen(self, source: ImageSource[Panorama], indices: Sequence[int]) -> FileSource:
+        """Some of the panoramas of a source."""
+        files: Any = source
+        return ReadablePanoramas(files, indices)
+
+    def sampled_splits(self) -> Sequence[Split]:
+        """None with a store: all that it lacks is read whole."""
+        return super().sampled_splits() if self.store is None else ()
 
     def prepare_data(self) -> None:
         """Make the files, and what the store lacks if there is to be one.

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol, TypeVar
 import cv2
 import numpy as np
 
-from datamodules.sources import ImageSource
+from datamodules.sources import ImageSource, ReadableImages
 from tangent_train.rendering.gravity import upright_rotation
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -30,6 +30,7 @@ __all__ = [
     "FileSource",
     "Mask",
     "Panorama",
+    "ReadablePanoramas",
     "Turn",
     "mask_black",
     "meters_to_steps",
@@ -105,6 +106,38 @@ class FileSource(ImageSource["Panorama"], Protocol):
     def files(self, index: int) -> Mapping[str, Path]:
         """The file of every part of one panorama: `rgb`, `labels` and, where read, `depth`."""
         ...
+
+
+class ReadablePanoramas(ReadableImages[Panorama]):
+    """Some of the panoramas of another source, see `ReadableImages`.
+
+    Args:
+        source: Where they come from.
+        indices: Which, by their numbers there.
+    """
+
+    def __init__(self, source: FileSource, indices: Sequence[int]) -> None:
+        super().__init__(source, indices)
+        self._files = source
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """See `FileSource`, as all others."""
+        return self._files.shape
+
+    @property
+    def variant(self) -> str:
+        """As of the source."""
+        return self._files.variant
+
+    @property
+    def settings(self) -> Mapping[str, str]:
+        """As of the source."""
+        return self._files.settings
+
+    def files(self, index: int) -> Mapping[str, Path]:
+        """As of the source."""
+        return self._files.files(self._indices[index])
 
 
 def resize_area(image: NDArray[np.uint8], shape: tuple[int, int]) -> NDArray[np.uint8]:

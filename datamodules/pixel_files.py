@@ -6,10 +6,12 @@ from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
+from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
 from datamodules.exr import read_exr
 from datamodules.image_files import read_array, read_rgb
-from datamodules.image_opening import open_image, oriented_array
+from datamodules.image_opening import check_pixels, open_image, oriented_array
+from datamodules.png import decoded
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import atomic_path, write_bytes
 
@@ -51,6 +53,8 @@ LOSSY_SUFFIXES = (".jpg", ".jpeg", ".webp")
 _PNG, _PNG_BITS, _PNG_COLOR = b"\x89PNG\r\n\x1a\n", 24, 25
 _GREY_WITH_ALPHA = 4
 _TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+_BIG = (b"+\0", b"\0+")
+_COLUMNS, _ROWS = 256, 257  # tags of TIFF
 _GREY_MODES = ("1", "L", "LA")
 
 
@@ -102,12 +106,31 @@ def _read_array(path: Path) -> NDArray[Any]:
 
 def _read_deep(path: Path, *, grey: bool) -> NDArray[Any] | None:
     """Pixels of more than 8 bits, which Pillow would cut to 8; None if they have only 8."""
-    image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+    size = _size(path)
+    if size is None:
+        return None  # Pillow will say what is wrong
+    check_pixels(path, *size)
+    image = decoded(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
     if image is None or image.dtype == np.uint8:
         return None
     if image.ndim == 2 or grey:
         return np.ascontiguousarray(image if image.ndim == 2 else image[..., 0])
     return np.ascontiguousarray(image[..., 2::-1] if image.shape[2] in (3, 4) else image)
+
+
+def _size(path: Path) -> tuple[int, int] | None:
+    """Rows and columns by the header of a PNG or TIFF file, whose pixels Pillow may not know."""
+    with path.open("rb") as file:
+        head = file.read(_PNG_BITS)
+        if head.startswith(_PNG):
+            return int.from_bytes(head[20:24], "big"), int.from_bytes(head[16:20], "big")
+        try:
+            directory = ImageFileDirectory_v2(head[: 16 if head[2:4] in _BIG else 8])
+            file.seek(directory.next)
+            directory.load(file)
+            return int(directory[_ROWS]), int(directory[_COLUMNS])
+        except Exception:  # its reader raises many kinds of errors
+            return None
 
 
 def check_writable(suffix: str, dtype: DTypeLike, channels: int) -> None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 import cv2
 import numpy as np
 
+from datamodules.image_opening import check_pixels
 from tangent_train.errors import DataError, SettingError
 
 if TYPE_CHECKING:
@@ -21,13 +22,16 @@ __all__ = [
     "PngHeader",
     "check_panorama_size",
     "check_png",
+    "check_png_end",
+    "decoded",
     "read_color_png",
     "read_depth_png",
     "read_png",
     "read_png_header",
 ]
 
-_START = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR"
+_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_START = _SIGNATURE + b"\x00\x00\x00\rIHDR"
 _HEADER_BYTES = 26  # the signature, IHDR's length and name, then its first ten bytes
 _COLOR_TYPES = {0: "grey", 2: "RGB", 3: "palette", 4: "grey with alpha", 6: "RGBA"}
 _REMEDY = "Copy or extract the file again."
@@ -61,11 +65,35 @@ def read_png_header(path: Path) -> PngHeader:
     if len(start) < _HEADER_BYTES or not start.startswith(_START):
         raise DataError(path, found="no PNG header", expected="a PNG file", remedy=_REMEDY)
     if not whole:
-        raise DataError(
-            path, found=f"{size} bytes, parts missing", expected="a whole PNG", remedy=_REMEDY
-        )
+        raise _cut_off(path, size)
     width, height, bits, color = struct.unpack(">IIBB", start[len(_START) :])
     return PngHeader(height, width, bits, _COLOR_TYPES.get(color, f"color type {color}"))
+
+
+def check_png_end(path: Path) -> None:
+    """Make sure that nothing is missing at the end of a file, if it is a PNG.
+
+    What comes behind the end is no matter: some programs leave notes there.
+
+    Raises:
+        DataError: It is cut off, or cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            if file.read(len(_SIGNATURE)) != _SIGNATURE:
+                return
+            size = file.seek(0, os.SEEK_END)
+            end = _chunks_end(file)
+    except OSError as error:
+        raise DataError(path, found=error, expected="an image", remedy=_REMEDY) from error
+    if end is None or end > size:
+        raise _cut_off(path, size)
+
+
+def _cut_off(path: Path, size: int) -> DataError:
+    return DataError(
+        path, found=f"{size} bytes, parts missing", expected="a whole PNG", remedy=_REMEDY
+    )
 
 
 def check_png(path: Path, bits: int, colors: Sequence[str]) -> PngHeader:
@@ -151,21 +179,35 @@ def read_depth_png(path: Path) -> NDArray[np.uint16]:
 
 
 def read_png(path: Path, flags: int) -> NDArray[Any]:
-    """Decode an image as OpenCV does: blue first.
+    """Decode a PNG file as OpenCV does: blue first.
 
     Args:
         path: The file.
         flags: Of `cv2.imdecode`.
 
     Raises:
-        DataError: The file is broken.
+        DataError: The file is broken, or too large to be decoded.
     """
     # Decoding from memory keeps "cannot open" and "cannot decode" apart, and any path works.
     try:
         content = np.frombuffer(path.read_bytes(), np.uint8)
     except OSError as error:
         raise DataError(path, found=error, expected="a PNG file", remedy=_REMEDY) from error
-    image = cv2.imdecode(content, flags) if content.size else None
+    head = content[:_HEADER_BYTES].tobytes()
+    image = None
+    # Nothing else is given to the decoder, which knows more formats than are needed.
+    if head.startswith(_START) and len(head) == _HEADER_BYTES:
+        width, height = struct.unpack_from(">II", head, len(_START))
+        check_pixels(path, height, width)
+        image = decoded(content, flags)
     if image is None:
         raise DataError(path, found="a broken PNG", expected="one that decodes", remedy=_REMEDY)
     return image
+
+
+def decoded(content: NDArray[np.uint8], flags: int) -> NDArray[Any] | None:
+    """Pixels of an image as OpenCV decodes it: blue first; None where it cannot."""
+    try:
+        return cv2.imdecode(content, flags) if content.size else None
+    except cv2.error:  # more pixels than OpenCV allows
+        return None

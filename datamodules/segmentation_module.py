@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 import numpy as np
 
 from datamodules.class_weights import ClassWeights, class_weights
+from datamodules.data_check import read_parts, unreadable
 from datamodules.samples import (
     INPUTS,
     RGB_NORMALIZATION,
@@ -20,12 +21,19 @@ from datamodules.samples import (
     collate,
     normalize,
 )
-from datamodules.sources import ImageSource, LabelledImage, RememberedImages, in_threads
+from datamodules.sources import (
+    ImageSource,
+    LabelledImage,
+    ReadableImages,
+    RememberedImages,
+    in_threads,
+    read_strictly,
+)
 from datamodules.split_module import SPLITS, Kind, Split, SplitDataModule
 from tangent_train.errors import SettingError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from torch import Tensor
 
@@ -97,9 +105,39 @@ class SegmentationDataModule(SplitDataModule[ImageSource[_Image]], Generic[_Imag
             SettingError: The images are too small for the representation.
         """
 
+    def content(self, splits: Mapping[Split, ImageSource[_Image]]) -> tuple[int, Iterator[None]]:
+        """All files of all images, see `read_parts`."""
+        return read_parts(splits, self.problems)
+
+    def readable(
+        self, splits: Mapping[Split, ImageSource[_Image]]
+    ) -> Mapping[Split, ImageSource[_Image]]:
+        """The same without the images that cannot be read."""
+        broken = unreadable(splits, self.read_once, self.problems, self.noun)
+        return {
+            split: self.chosen(source, [i for i in range(len(source)) if (split, i) not in broken])
+            for split, source in splits.items()
+        }
+
+    def read_once(self, source: ImageSource[_Image], index: int) -> None:
+        """Make sure that an image of `find_splits` can be read.
+
+        Raises:
+            DataError: It is broken.
+        """
+        read_strictly(source, index)
+
+    def chosen(self, source: ImageSource[_Image], indices: Sequence[int]) -> ImageSource[_Image]:
+        """Some of the images of a source of `find_splits`."""
+        return ReadableImages(source, indices)
+
+    def sampled_splits(self) -> Sequence[Split]:
+        """Those that are not read into memory as training begins."""
+        return ("test",) if self.in_memory else SPLITS
+
     def remembered(self, source: ImageSource[_Image]) -> ImageSource[_Image]:
         """Decoded images, see `RememberedImages`."""
-        return RememberedImages(source)
+        return RememberedImages(source, self.root)
 
     def training_samples(self) -> TrainingImages:
         """Samples `TrainingSample`."""

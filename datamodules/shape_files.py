@@ -15,6 +15,7 @@ other folders are skipped.
 
 from __future__ import annotations
 
+import os
 import re
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
@@ -73,7 +74,12 @@ def find_shapes(root: Path) -> list[ShapeFile]:
     """
     if not root.is_dir():
         raise DataError(root, found="no such folder", expected="the data set", remedy=_GET_IT)
-    by_class, by_split = list(_by_class(root)), list(_by_split(root))
+    try:
+        by_class, by_split = list(_by_class(root)), list(_by_split(root))
+    except OSError as error:
+        raise DataError(
+            error.filename, found=os.strerror(error.errno or 0), expected="a folder of meshes"
+        ) from error
     if by_class and by_split:
         raise DataError(
             root,

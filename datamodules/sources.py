@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
+from datamodules.problems import Problems
+
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator
+    from collections.abc import Callable, Generator, Sequence
 
     from numpy.typing import NDArray
 
@@ -18,10 +20,12 @@ if TYPE_CHECKING:
 __all__ = [
     "ImageSource",
     "LabelledImage",
+    "ReadableImages",
     "RememberedImages",
     "ShownImage",
     "count_labels",
     "in_threads",
+    "read_strictly",
 ]
 
 
@@ -89,6 +93,38 @@ class ImageSource(Protocol[_Image_co]):
         ...
 
 
+class ReadableImages(Generic[_Image_co]):
+    """Some of the images of another source, as those that are not broken.
+
+    Args:
+        source: Where they come from.
+        indices: Which, by their numbers there.
+    """
+
+    def __init__(self, source: ImageSource[_Image_co], indices: Sequence[int]) -> None:
+        self._source = source
+        self._indices = tuple(indices)
+
+    def __len__(self) -> int:
+        return len(self._indices)
+
+    def name(self, index: int) -> str:
+        """The name in the source."""
+        return self._source.name(self._indices[index])
+
+    def read(self, index: int) -> _Image_co:
+        """The image as the source gives it."""
+        return self._source.read(self._indices[index])
+
+    def read_strictly(self, index: int) -> _Image_co:
+        """See `read_strictly`."""
+        return read_strictly(self._source, self._indices[index])
+
+    def label_counts(self, index: int) -> NDArray[np.int64]:
+        """Its pixels of every label."""
+        return self._source.label_counts(self._indices[index])
+
+
 class RememberedImages(Generic[_Image]):
     """The images of another source, read once, now, and kept in memory.
 
@@ -97,11 +133,17 @@ class RememberedImages(Generic[_Image]):
 
     Args:
         source: Where they come from.
+        root: The folder of the data set.
+
+    Raises:
+        DataError: Some are broken; all of these are named.
     """
 
-    def __init__(self, source: ImageSource[_Image]) -> None:
+    def __init__(self, source: ImageSource[_Image], root: object = "data") -> None:
         self._source = source
-        self._kept = list(in_threads(self._read, len(source)))
+        self._problems = Problems()
+        self._kept = [image for read in in_threads(self._read, len(source)) for image in read]
+        self._problems.refuse(root, left=len(self._kept))
 
     def __len__(self) -> int:
         return len(self._kept)
@@ -118,11 +160,30 @@ class RememberedImages(Generic[_Image]):
         """Its pixels of every label."""
         return count_labels(self._kept[index].labels)
 
-    def _read(self, index: int) -> _Image:
-        # Copies: arrays that are views of a file would keep it open.
-        image: Any = self._source.read(index)
-        kept: _Image = image._make(None if part is None else np.array(part) for part in image)
+    def _read(self, index: int) -> list[_Image]:
+        """The image; none after an error."""
+        kept: list[_Image] = []
+        with self._problems.noted(index):
+            image: Any = read_strictly(self._source, index)
+            # Copies: arrays that are views of a file would keep it open.
+            copies = (None if part is None else np.array(part) for part in image)
+            kept.append(image._make(copies))
         return kept
+
+
+def read_strictly(source: ImageSource[_Image_co], index: int) -> _Image_co:
+    """Read an image for the first time: what every further time is forgiven is an error now.
+
+    Args:
+        source: One that may have a `read_strictly` of its own, which finds more than its `read`, as
+            labels past the end of the class table.
+        index: Which.
+
+    Raises:
+        DataError: The image is broken.
+    """
+    read: Callable[[int], _Image_co] = getattr(source, "read_strictly", source.read)
+    return read(index)
 
 
 def count_labels(labels: NDArray[np.uint8]) -> NDArray[np.int64]:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from datamodules.image_files import read_array
 from datamodules.mesh_spheres import CHANNELS, clean_mesh, mesh_spheres
 from datamodules.off_files import read_off
 from tangent_train.errors import DataError
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-__all__ = ["STEPS", "is_current", "make_sphere", "read_sphere", "stamp"]
+__all__ = ["STEPS", "is_current", "make_sphere", "mesh_problem", "read_sphere", "stamp"]
 
 STEPS = 16384
 """Steps of the stored values in 1."""
@@ -56,15 +57,27 @@ def make_sphere(source: Path, target: Path, shape: tuple[int, int]) -> str | Non
         # Asked before the file is read: a change meanwhile is noticed later.
         made_from = stamp(source)
         spheres = mesh_spheres(clean_mesh(read_off(source)), shape)
-    except OSError as error:
-        return f"{source}: {error}"
-    except DataError as error:
-        return str(error)
+    except (OSError, DataError) as error:
+        return _named(source, error)
     steps = np.rint(spheres * STEPS).astype(np.uint16)
     with atomic_path(target) as temporary, temporary.open("wb") as file:
-        np.save(file, steps)
+        np.save(file, steps, allow_pickle=False)
         file.write(f"\n{json.dumps({'made from': made_from})}\n".encode())
     return None
+
+
+def mesh_problem(source: Path) -> str | None:
+    """What is wrong with a mesh, as `make_sphere` finds it; None where nothing is."""
+    try:
+        clean_mesh(read_off(source))
+    except (OSError, DataError) as error:
+        return _named(source, error)
+    return None
+
+
+def _named(source: Path, error: Exception) -> str:
+    """An error that names its file."""
+    return str(error) if str(error).startswith(str(source)) else f"{source}: {error}"
 
 
 def is_current(source: Path, target: Path) -> bool:
@@ -74,7 +87,7 @@ def is_current(source: Path, target: Path) -> bool:
             file.seek(-min(_TAIL, os.fstat(file.fileno()).st_size), os.SEEK_END)
             line = file.read().rpartition(b"\n{")[2]
         return bool(json.loads(b"{" + line) == {"made from": stamp(source)})
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return False
 
 
@@ -89,10 +102,13 @@ def read_sphere(path: Path, shape: tuple[int, int]) -> NDArray[np.uint16]:
         DataError: It is missing or broken.
     """
     try:
-        steps: NDArray[np.uint16] = np.load(path)
-    except (OSError, ValueError, EOFError) as error:
+        steps: NDArray[np.uint16] = read_array(path)
+    except DataError as error:
         raise DataError(
-            path, found=f"nothing to read ({error})", expected="prepared spheres", remedy=_REMEDY
+            path,
+            found=f"nothing to read ({error.found})",
+            expected="prepared spheres",
+            remedy=_REMEDY,
         ) from error
     if steps.dtype != np.uint16 or steps.shape != (*shape, CHANNELS):
         raise DataError(

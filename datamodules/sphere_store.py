@@ -122,7 +122,7 @@ class SphereFolder:
             meshes: Of what.
             workers: Processes; 0 and 1 work in this one. By default one per CPU core, fewer for
                 little work.
-            progress: Whether to show a progress bar, and what had to be left out.
+            progress: Whether to show a progress bar, and what cannot be used.
 
         Returns:
             How many were made.
@@ -156,8 +156,13 @@ class SphereFolder:
 
     def usable(self, meshes: Sequence[ShapeFile]) -> list[ShapeFile]:
         """Those of the meshes that were not found to be unusable."""
-        unusable = self._read_unusable()
-        return [mesh for mesh in meshes if not self._is_known(mesh, unusable)]
+        unusable = self.unusable(meshes)
+        return [mesh for mesh in meshes if mesh.name not in unusable]
+
+    def unusable(self, meshes: Sequence[ShapeFile]) -> dict[str, str]:
+        """The names of the others, and what was wrong with them."""
+        listed = self._read_unusable()
+        return {m.name: listed[m.name].found for m in meshes if self._is_known(m, listed)}
 
     def _make(
         self, meshes: Sequence[ShapeFile], processes: int, unusable: dict[str, _Unusable]
@@ -181,7 +186,7 @@ class SphereFolder:
             return {name: _Unusable(**entry) for name, entry in content.items()}
         except (FileNotFoundError, NotADirectoryError):
             return {}
-        except (OSError, ValueError, TypeError, AttributeError) as error:
+        except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
             raise DataError(
                 path,
                 found=f"something else ({error})",
@@ -201,7 +206,7 @@ class SphereFolder:
         left_out = [mesh for mesh in meshes if self._is_known(mesh, unusable)]
         if not left_out:
             return
-        lines = [f"{len(left_out)} of {len(meshes)} shapes cannot be used and are left out:"]
+        lines = [f"{len(left_out)} of {len(meshes)} shapes cannot be used:"]
         lines += [f"  {unusable[mesh.name].found}" for mesh in left_out[:_NAMED]]
         lines.append(f"All are listed in {self.folder / _UNUSABLE}")
         Console(soft_wrap=True, highlight=False).print("\n".join(lines), markup=False)

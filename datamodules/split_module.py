@@ -8,14 +8,18 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, Protocol, Typ
 import cv2
 import torch
 from lightning import LightningDataModule
+from lightning.pytorch.trainer.states import TrainerFn
 from torch.utils.data import DataLoader, Dataset
 
+from datamodules.data_check import find_usable
+from datamodules.problems import Problems
 from datamodules.samples import Normalization
 from datamodules.sampling import EpochSampler
+from datamodules.watched_samples import WatchedLoader, WatchedSamples, explained
 from tangent_train.errors import SettingError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from torch import Tensor
@@ -65,6 +69,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Source]):
         stream: Another number draws another order and other views from the same seed: who trains
             on, a network that has seen those of stream 0, sees new ones.
         in_memory: Keep what is read in memory, see `remembered`.
+        skip_broken: Leave out what cannot be used, after reading all once, instead of refusing.
 
     Attributes:
         class_names: Name of every class.
@@ -74,6 +79,8 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Source]):
         normalization: As given.
         root: Folder of the data set.
         validation_fraction: Share of what is for training that is kept for validation.
+        is_made: Whether `make_files` makes all of it.
+        problems: What `find_splits` found to be wrong.
 
     Raises:
         SettingError: A setting that cannot work.
@@ -82,6 +89,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Source]):
     class_names: tuple[str, ...]
     kind: ClassVar[Kind]
     noun: ClassVar[str]
+    is_made: ClassVar[bool] = False
     root: Path
     validation_fraction: float
 
@@ -95,6 +103,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Source]):
         seed: int = 0,
         stream: int = 0,
         in_memory: bool = False,
+        skip_broken: bool = False,
     ) -> None:
         super().__init__()
         self.representation = representation
@@ -106,18 +115,42 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Source]):
         self.seed = at_least("data.seed", seed, 0)
         self.drawn_from = self.seed, at_least("data.stream", stream, 0)
         self.in_memory = in_memory
+        self.skip_broken = skip_broken
+        self.problems = Problems()
         self._splits: Mapping[Split, _Source] = {}
         self._sources: dict[Split, _Source] = {}
         self._start = (0, 0)
+        self._watched: dict[Split, WatchedSamples] = {}
 
     @abstractmethod
     def find_splits(self) -> Mapping[Split, _Source]:
         """What all splits have as it is on disk, checked without reading all of it.
 
+        What is wrong with some of it is noted in `problems`, and left out here.
+
         Raises:
             DataError: Something is missing or cannot be used.
             SettingError: It does not fit the representation.
         """
+
+    @abstractmethod
+    def content(self, splits: Mapping[Split, _Source]) -> tuple[int, Iterator[None]]:
+        """All that there is to read, whole, to note in `problems` what is broken.
+
+        Args:
+            splits: From `find_splits`.
+
+        Returns:
+            How many images or shapes, and what reads one after the other and yields each time.
+        """
+
+    def readable(self, splits: Mapping[Split, _Source]) -> Mapping[Split, _Source]:
+        """The same without what turns out to be broken when all is read, noted in `problems`."""
+        return splits
+
+    def sampled_splits(self) -> Sequence[Split]:
+        """The splits to read some of before training: those that are not read whole then."""
+        return ()
 
     @abstractmethod
     def remembered(self, source: _Source) -> _Source:
@@ -148,9 +181,13 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Source]):
 
         Args:
             stage: Ignored: what a test will need is checked before training already.
+
+        Raises:
+            DataError: Something is broken: all that was found is named.
+            SettingError: A setting does not suit the data.
         """
         if not self._splits:
-            self._splits = self.find_splits()
+            self._splits = find_usable(self)
 
     def open_split(self, split: Split) -> _Source:
         """What one split has as it is on disk."""
@@ -161,8 +198,15 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Source]):
         """Make the files of the data set, where it is one that is made."""
 
     def prepare_data(self) -> None:
-        """Make the files."""
+        """Make the files; before training, read some of them.
+
+        Raises:
+            DataError: Something is broken.
+        """
         self.make_files()
+        training = self.trainer is not None and self.trainer.state.fn == TrainerFn.FITTING
+        if training and not self.skip_broken:
+            self._splits = find_usable(self, self.sampled_splits())
 
     def prepare_all(self) -> None:
         """Make and check all that there is to make and check before any run."""
@@ -235,8 +279,8 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Source]):
 
     def train_dataloader(self) -> DataLoader[Any]:
         """Batches for training."""
-        length, dataset = len(self.source("train")), self.training_samples()
-        return self._loader(dataset, length, self.per_step, self._start, shuffle=True)
+        dataset = self.training_samples()
+        return self._loader("train", dataset, self.per_step, self._start, shuffle=True)
 
     def val_dataloader(self) -> DataLoader[Any] | list[DataLoader[Any]]:
         """Batches for validation; no loader when there is no validation split."""
@@ -246,24 +290,38 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Source]):
         """Batches for the test."""
         return self._evaluation_loader("test")
 
+    def explained(self, error: Exception) -> Exception:
+        """What to tell the user of an error during training or evaluation.
+
+        Args:
+            error: It.
+
+        Returns:
+            One that names the sample that a worker process died of; or the same.
+        """
+        return explained(error, self._watched.values())
+
     def _evaluation_loader(self, split: Split) -> DataLoader[Any]:
-        length, dataset = len(self.source(split)), self.evaluation_samples(split)
-        return self._loader(dataset, length, self.evaluation_size(), shuffle=False)
+        dataset = self.evaluation_samples(split)
+        return self._loader(split, dataset, self.evaluation_size(), shuffle=False)
 
     def _loader(
         self,
+        split: Split,
         dataset: Dataset[Any],
-        length: int,
         batch_size: int,
         start: tuple[int, int] = (0, 0),
         *,
         shuffle: bool,
     ) -> DataLoader[Any]:
         rank, world_size = _process()
-        return DataLoader(
-            dataset,
+        source = self.source(split)
+        watched = WatchedSamples(dataset, source.name, self.num_workers)
+        self._watched[split] = watched
+        return WatchedLoader(
+            watched,
             batch_size=batch_size,
-            sampler=EpochSampler(length, self.drawn_from, shuffle, rank, world_size, start),
+            sampler=EpochSampler(len(source), self.drawn_from, shuffle, rank, world_size, start),
             # Its own: the loader draws seeds for its workers, which would shift those of dropout.
             generator=torch.Generator().manual_seed(self.seed),
             num_workers=self.num_workers,

@@ -43,11 +43,12 @@ from datamodules.stanford_files import (
     check_panorama,
     list_pictures,
 )
+from datamodules.stanford_poses import read_panorama_pose
 from datamodules.stanford_splits import StanfordSplits
 from tangent_train.errors import SettingError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -118,10 +119,33 @@ class StanfordPanoramas:
         Raises:
             DataError: A file is broken.
         """
+        return self._read(index, strict=False)
+
+    def read_strictly(self, index: int) -> Panorama:
+        """The same, if all its labels are in the class table.
+
+        Raises:
+            DataError: A file is broken, or they are not.
+        """
+        return self._read(index, strict=True)
+
+    def readers(self, index: int) -> Iterator[Callable[[], object]]:
+        """What reads the files of one panorama one by one, and the pose where there is one."""
+        files = self._files[index]
+        yield lambda: read_color_png(files.rgb)
+        yield lambda: self._table.check(read_color_png(files.semantic), files.semantic)
+        if files.depth is not None:
+            depth = files.depth
+            yield lambda: read_depth_png(depth)
+        if files.pose.exists():
+            yield lambda: read_panorama_pose(files.pose)
+
+    def _read(self, index: int, *, strict: bool) -> Panorama:
         files = self._files[index]
         rgb = read_color_png(files.rgb)
         depth = None if files.depth is None else self._read_depth(files.depth)
-        return Panorama(resize_area(rgb, self._shape), depth, self._labels(files, rgb))
+        labels = self._labels(files, rgb, strict=strict)
+        return Panorama(resize_area(rgb, self._shape), depth, labels)
 
     def label_counts(self, index: int) -> NDArray[np.int64]:
         """The pixels of every label of one panorama, ``(256,)``.
@@ -133,8 +157,13 @@ class StanfordPanoramas:
         rgb = None if self._mask == "labels" else read_color_png(files.rgb)
         return count_labels(self._labels(files, rgb))
 
-    def _labels(self, files: PictureFiles, rgb: NDArray[np.uint8] | None) -> NDArray[np.uint8]:
-        labels = self._table.decode(resize_nearest(read_color_png(files.semantic), self._shape))
+    def _labels(
+        self, files: PictureFiles, rgb: NDArray[np.uint8] | None, *, strict: bool = False
+    ) -> NDArray[np.uint8]:
+        colors = read_color_png(files.semantic)
+        if strict:
+            self._table.check(colors, files.semantic)
+        labels = self._table.decode(resize_nearest(colors, self._shape))
         if rgb is None or self._mask == "labels":
             return labels
         return mask_black(labels, resize_nearest(rgb, self._shape), self._mask)
@@ -200,13 +229,15 @@ class Stanford2D3DS(PanoramaDataModule):
             DataError: Something is missing or cannot be used.
             SettingError: The panoramas are too small for the representation.
         """
-        table = self._division.read_label_table()
+        noted = self.problems.noted
+        table = self._division.read_label_table(noted)
         files = self._division.divide(
-            lambda area: list_pictures(self.root, area, "pano", self.with_depth)
+            lambda area: list_pictures(self.root, area, "pano", self.with_depth, noted), noted
         )
         for panorama in (picture for pictures in files.values() for picture in pictures):
-            check_panorama(panorama, self.erp_height)
+            check_panorama(panorama, self.erp_height, noted)
+        without = self.problems.without
         return {
-            split: StanfordPanoramas(chosen, table, self.erp_height, self.mask)
+            split: StanfordPanoramas(without(chosen), table, self.erp_height, self.mask)
             for split, chosen in files.items()
         }

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import os
 import re
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from datamodules.png import check_panorama_size, check_png
+from datamodules.problems import Noted, raised
 from tangent_train.errors import DataError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
     from pathlib import Path
+
 
 __all__ = [
     "AREAS",
@@ -18,6 +22,7 @@ __all__ = [
     "MISSING_DEPTH",
     "FileName",
     "PictureFiles",
+    "check_cameras",
     "check_panorama",
     "check_picture",
     "list_pictures",
@@ -115,7 +120,11 @@ class PictureFiles(NamedTuple):
 
 
 def list_pictures(
-    root: Path, area: str, group: Literal["pano", "data"], with_depth: bool
+    root: Path,
+    area: str,
+    group: Literal["pano", "data"],
+    with_depth: bool,
+    noted: Noted = raised,
 ) -> list[PictureFiles]:
     """The panoramas or photos of one area, in the order of their names.
 
@@ -124,59 +133,113 @@ def list_pictures(
         area: One of `AREAS`.
         group: Panoramas or photos.
         with_depth: Whether depth is wanted.
+        noted: Where errors go, to go on after them.
 
     Raises:
-        DataError: A folder or a partner of an RGB file is missing.
+        DataError: There are none, or other files.
     """
     folder = root / f"area_{area}" / group
     found = []
-    # Hidden files are leftovers of archives made on a Mac.
-    for rgb in sorted(folder.glob("rgb/[!.]*.png")):
-        name = FileName.parse(rgb.name)
-        depth = folder / "depth" / str(name._replace(domain="depth"))
-        semantic = folder / "semantic" / str(name._replace(domain="semantic"))
-        found.append(PictureFiles(area, name, rgb, semantic, depth if with_depth else None))
-    if not found:
-        kind = "panoramas" if group == "pano" else "photos"
-        raise DataError(
-            folder / "rgb", found=f"no {kind}", expected="camera_….png files", remedy=GET_IT
-        )
+    images: list[Path] = []
+    with noted():
+        images = _list_images(folder / "rgb", "panoramas" if group == "pano" else "photos")
+    for rgb in images:
+        with noted(rgb, rgb):
+            name = FileName.parse(rgb.name)
+            depth = folder / "depth" / str(name._replace(domain="depth"))
+            semantic = folder / "semantic" / str(name._replace(domain="semantic"))
+            found.append(PictureFiles(area, name, rgb, semantic, depth if with_depth else None))
     return found
 
 
-def check_panorama(files: PictureFiles, erp_height: int) -> None:
+def _list_images(folder: Path, kind: str) -> list[Path]:
+    """The images in a folder, in the order of their names."""
+    why = f"no {kind}"
+    try:
+        # Hidden files are leftovers of archives made on a Mac.
+        paths = [p for p in folder.iterdir() if p.suffix == ".png" and not p.name.startswith(".")]
+    except FileNotFoundError:
+        paths = []
+    except OSError as error:
+        paths, why = [], os.strerror(error.errno or 0)
+    if not paths:
+        raise DataError(folder, found=why, expected="camera_….png files", remedy=GET_IT)
+    return sorted(paths)
+
+
+def check_cameras(pictures: Iterable[PictureFiles], noted: Noted = raised) -> None:
+    """Check that no picture is there twice, as a copy in another room or area.
+
+    The two parts of area 5 share rooms, and are always in the same split: a camera may be in both.
+
+    Args:
+        pictures: Of all areas.
+        noted: Where errors go, to go on after them.
+
+    Raises:
+        DataError: One is.
+    """
+    seen: dict[tuple[str, str], list[PictureFiles]] = {}
+    for picture in pictures:
+        before = seen.setdefault((picture.name.camera, picture.name.frame), [])
+        for other in before:
+            with noted(picture):
+                if other.area == picture.area or other.room[0] != picture.room[0]:
+                    raise DataError(
+                        picture.rgb,
+                        found=f"the camera of {other.rgb}",
+                        expected="every camera in one room of one area",
+                        remedy="Remove the copy, with its depth, labels and pose.",
+                    )
+        before.append(picture)
+
+
+def check_panorama(files: PictureFiles, erp_height: int, noted: Noted = raised) -> None:
     """Check that all files are there, of one size and readable at `erp_height`; nothing is decoded.
+
+    Args:
+        files: Of the panorama.
+        erp_height: Rows that are wanted.
+        noted: Where errors go, to go on after them.
 
     Raises:
         DataError: A file is missing, cut off, or of another size or pixel format.
         SettingError: The panorama has fewer rows than wanted.
     """
-    header = check_png(files.rgb, *_FORMATS["rgb"])
-    check_panorama_size(files.rgb, header[:2], erp_height)
-    check_picture(files)
+    size = check_picture(files, noted)
+    with noted(files, files.rgb):
+        if size is not None:
+            check_panorama_size(files.rgb, size, erp_height)
 
 
-def check_picture(files: PictureFiles) -> tuple[int, int]:
+def check_picture(files: PictureFiles, noted: Noted = raised) -> tuple[int, int] | None:
     """Check that all images are there and of one size; nothing is decoded.
 
+    Args:
+        files: Of the panorama or photo.
+        noted: Where errors go, to go on after them.
+
     Returns:
-        Rows and columns.
+        Rows and columns; None after an error in the colours' file.
 
     Raises:
         DataError: A file is missing, cut off, or of another size or pixel format.
     """
-    header = check_png(files.rgb, *_FORMATS["rgb"])
-    height, width = header.height, header.width
-    partners = [(files.semantic, "semantic")]
+    size = None
+    partners = [(files.rgb, "rgb"), (files.semantic, "semantic")]
     if files.depth is not None:
         partners.append((files.depth, "depth"))
     for path, domain in partners:
-        other = check_png(path, *_FORMATS[domain])
-        if other[:2] != header[:2]:
-            raise DataError(
-                path,
-                found=f"{other.height}×{other.width} pixels",
-                expected=f"{height}×{width}, as {files.rgb.name}",
-                remedy="Copy or extract both files again.",
-            )
-    return height, width
+        with noted(files):
+            header = check_png(path, *_FORMATS[domain])
+            height, width = header.height, header.width
+            if domain == "rgb":
+                size = height, width
+            if size is not None and (height, width) != size:
+                raise DataError(
+                    path,
+                    found=f"{height}×{width} pixels",
+                    expected=f"{size[0]}×{size[1]}, as {files.rgb.name}",
+                    remedy="Copy or extract both files again.",
+                )
+    return size

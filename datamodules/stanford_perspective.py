@@ -33,7 +33,7 @@ from datamodules.stanford_splits import StanfordSplits
 from tangent_train.errors import DataError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -59,7 +59,7 @@ def read_camera_matrix(path: Path) -> NDArray[np.float64]:
     expected = "a pose file with a camera_k_matrix of 3×3 numbers, without skew"
     try:
         matrix = np.array(json.loads(path.read_bytes())["camera_k_matrix"], np.float64)
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         found = f"{type(error).__name__}: {error}"
         raise DataError(
             path, found=found, expected=expected, remedy="Copy or extract the file again."
@@ -104,6 +104,26 @@ class StanfordPhotos:
             depth = distance_from_z_depth(steps, camera_matrix)
         labels = self._table.decode(read_color_png(files.semantic))
         return Photo(read_color_png(files.rgb), depth, labels, camera_matrix)
+
+    def read_strictly(self, index: int) -> Photo:
+        """The same, if all its labels are in the class table.
+
+        Raises:
+            DataError: A file is broken, or they are not.
+        """
+        path = self._files[index].semantic
+        self._table.check(read_color_png(path), path)
+        return self.read(index)
+
+    def readers(self, index: int) -> Iterator[Callable[[], object]]:
+        """What reads the files of one photo, one after the other."""
+        files = self._files[index]
+        yield lambda: read_color_png(files.rgb)
+        yield lambda: self._table.check(read_color_png(files.semantic), files.semantic)
+        if files.depth is not None:
+            depth = files.depth
+            yield lambda: read_depth_png(depth)
+        yield lambda: read_camera_matrix(files.pose)
 
     def label_counts(self, index: int) -> NDArray[np.int64]:
         """The pixels of every label of one photo, ``(256,)``.
@@ -162,14 +182,20 @@ class Stanford2D3DSPerspective(PhotoDataModule):
         Raises:
             DataError: Something is missing or cannot be used; a photo sees less than a crop.
         """
-        table = self._division.read_label_table()
+        noted = self.problems.noted
+        table = self._division.read_label_table(noted)
         files = self._division.divide(
-            lambda area: list_pictures(self.root, area, "data", self.with_depth)
+            lambda area: list_pictures(self.root, area, "data", self.with_depth, noted), noted
         )
         photos = [photo for chosen in files.values() for photo in chosen]
         for _ in in_threads(lambda index: self._check(photos[index]), len(photos)):
             pass
-        return {split: StanfordPhotos(chosen, table) for split, chosen in files.items()}
+        without = self.problems.without
+        return {split: StanfordPhotos(without(chosen), table) for split, chosen in files.items()}
 
     def _check(self, files: PictureFiles) -> None:
-        self.check_camera(files.rgb, read_camera_matrix(files.pose), check_picture(files))
+        size = check_picture(files, self.problems.noted)
+        with self.problems.noted(files):
+            camera_matrix = read_camera_matrix(files.pose)
+            if size is not None:
+                self.check_camera(files.rgb, camera_matrix, size)

@@ -51,7 +51,9 @@ def read_panorama_pose(path: Path) -> PanoramaPose:
         angles = np.radians(angles)
     original = euler_rotation(angles)
     try:
-        return PanoramaPose(original @ rt[:, :3] @ original @ CAMERA_FROM_SPHERE, location)
+        with np.errstate(over="ignore", invalid="ignore"):  # huge numbers make no rotation
+            turn = original @ rt[:, :3] @ original @ CAMERA_FROM_SPHERE
+            return PanoramaPose(turn, location)
     except SettingError as error:
         raise DataError(
             path, found=f"a camera_rt_matrix that is no rotation ({error})", expected="one"
@@ -61,7 +63,7 @@ def read_panorama_pose(path: Path) -> PanoramaPose:
 def _read_record(path: Path) -> dict[str, Any]:
     try:
         record = json.loads(path.read_bytes())
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise DataError(path, found=error, expected="a pose as JSON", remedy=_REMEDY) from error
     if not isinstance(record, dict):
         raise DataError(path, found="other JSON", expected="a pose", remedy=_REMEDY)
@@ -73,7 +75,7 @@ def _numbers(
 ) -> NDArray[np.float64]:
     try:
         values = np.array(record.get(key), np.float64)
-    except (ValueError, TypeError):
+    except (ValueError, TypeError, OverflowError):
         values = np.array(np.nan)
     # Some releases have a fourth row 0 0 0 1.
     values = values[:3] if values.shape == (4, 4) else values

@@ -7,12 +7,14 @@ from typing import TYPE_CHECKING
 
 from datamodules.group_drawing import draw_groups
 from datamodules.label_table import LabelTable
+from datamodules.problems import Noted, raised
 from datamodules.segmentation_module import Split
-from datamodules.stanford_files import AREAS, FOLDS, GET_IT, PictureFiles
+from datamodules.stanford_files import AREAS, FOLDS, GET_IT, PictureFiles, check_cameras
 from tangent_train.errors import DataError, SettingError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
+
 
 __all__ = ["StanfordSplits"]
 
@@ -69,8 +71,11 @@ class StanfordSplits:
         self._seed = seed
         self._label_table = None if label_table is None else Path(label_table)
 
-    def read_label_table(self) -> LabelTable:
+    def read_label_table(self, noted: Noted = raised) -> LabelTable:
         """The class table, after a look at the folders.
+
+        Args:
+            noted: Where missing areas go, to go on after them.
 
         Raises:
             DataError: An area or the table is missing, or the table cannot be used.
@@ -79,30 +84,33 @@ class StanfordSplits:
             raise DataError(
                 self.root, found="no such folder", expected="the data set", remedy=GET_IT
             )
-        missing = [
-            f"area_{area}" for area in self.areas if not (self.root / f"area_{area}").is_dir()
-        ]
-        if missing:
-            raise DataError(
-                self.root,
-                found="no " + ", ".join(missing),
-                expected="all of " + ", ".join(f"area_{area}" for area in self.areas),
-                remedy=GET_IT,
-            )
+        missing = [f"area_{area}" for area in self.areas if not self._is_there(area)]
+        with noted():
+            if missing:
+                raise DataError(
+                    self.root,
+                    found="no " + ", ".join(missing),
+                    expected="all of " + ", ".join(f"area_{area}" for area in self.areas),
+                    remedy=GET_IT,
+                )
         return LabelTable.from_json(self._find_table())
 
     def divide(
-        self, list_area: Callable[[str], list[PictureFiles]]
+        self, list_area: Callable[[str], list[PictureFiles]], noted: Noted = raised
     ) -> dict[Split, list[PictureFiles]]:
         """The pictures of every split.
 
         Args:
-            list_area: Gives those of an area.
+            list_area: Gives those of an area that is there.
+            noted: Where pictures that are there twice go, to go on after them.
 
         Raises:
-            DataError: There is only one room to train on, and one is wanted for validation.
+            DataError: There is only one room to train on, and one is wanted for validation; or
+                pictures are there twice.
         """
-        files = [picture for area in self.areas for picture in list_area(area)]
+        there = [area for area in self.areas if self._is_there(area)]
+        files = [picture for area in there for picture in list_area(area)]
+        check_cameras(files, noted)
         training = [picture for picture in files if picture.area not in self._testing]
         rooms = self._choose_rooms(training)
         return {
@@ -110,6 +118,9 @@ class StanfordSplits:
             "val": [picture for picture in training if picture.room in rooms],
             "test": [picture for picture in files if picture.area in self._testing],
         }
+
+    def _is_there(self, area: str) -> bool:
+        return (self.root / f"area_{area}").is_dir()
 
     def _find_table(self) -> Path:
         if self._label_table is not None:

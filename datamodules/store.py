@@ -15,8 +15,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from datamodules.panoramas import Panorama
+from datamodules.problems import Problems
 from datamodules.progress import show_progress
-from datamodules.sources import in_threads
+from datamodules.sources import in_threads, read_strictly
 from datamodules.store_files import PAGE, StoredPanorama, broken, open_stored, write_stored
 from tangent_train.errors import DataError
 
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 __all__ = ["PreparedPanoramas", "prepare_store"]
 
 _SUFFIX = ".panorama"
+_SKIP = "data.skip_broken=true leaves out what is broken."
 _BYTES_PER_PIXEL = {"rgb": 3, "labels": 1, "depth": 2}
 
 
@@ -119,7 +121,7 @@ class PreparedPanoramas:
         """
         # Asked before the files are read: files changed meanwhile are noticed later.
         made_from = self._made_from(index)
-        write_stored(self.path(index), self._source.read(index), made_from)
+        write_stored(self.path(index), read_strictly(self._source, index), made_from)
 
     def _made_from(self, index: int) -> dict[str, dict[str, str]]:
         files = {}
@@ -152,8 +154,8 @@ def prepare_store(
         How many were made.
 
     Raises:
-        DataError: The disk is too full, before anything is written; or a file of the source is
-            broken.
+        DataError: The disk is too full, before anything is written; or files of the source are
+            broken, which are named after all others are made.
     """
     wanted = [(split, index) for split in splits for index in range(len(split))]
     lacking: set[int] = set()
@@ -168,14 +170,20 @@ def prepare_store(
     _follow(check, "Checking the store", len(wanted), show=progress and bool(whole))
     missing = [wanted[place] for place in sorted(lacking)]
 
+    problems = Problems()
+
     def make(place: int) -> None:
         split, index = missing[place]
-        split.make(index)
+        try:
+            split.make(index)
+        except DataError as error:  # of one file; a disk that is full stops all
+            problems.add(error, place)
 
     if missing:
         _check_disk(missing)
         before = len(wanted) - len(missing)
         _follow(make, "Preparing panoramas", len(missing), before=before, show=progress)
+        problems.refuse("data.store", left=before, more=_SKIP)
     return len(missing)
 
 

@@ -19,18 +19,21 @@ quarter turn further to the right.
 from __future__ import annotations
 
 import math
+import os
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from datamodules.png import check_png
+from datamodules.problems import Noted, raised
 from tangent_train.errors import DataError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Hashable, Mapping
     from pathlib import Path
 
     from numpy.typing import NDArray
+
 
 __all__ = [
     "GET_IT",
@@ -77,7 +80,7 @@ PANORAMA_FORMATS: Formats = {
 
 _SIZE = (760, 1280)
 _FOCAL, _CENTER = 532.740352, (640.0, 380.0)  # of images of that size, centre from pixel corners
-_NAME = "[0-9]" * 6
+_NAME = "[0-9]" * 6 + ".png"
 
 
 class PictureFiles(NamedTuple):
@@ -136,7 +139,19 @@ def list_panoramas(folder: Path) -> list[str]:
 
 
 def _names(*folders: Path) -> list[str]:
-    return sorted({path.stem for folder in folders for path in folder.glob(f"{_NAME}.png")})
+    paths = (path for folder in folders for path in _listed(folder))
+    return sorted({path.stem for path in paths if path.match(_NAME)})
+
+
+def _listed(folder: Path) -> list[Path]:
+    try:
+        return list(folder.iterdir())
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        raise DataError(
+            folder, found=os.strerror(error.errno or 0), expected="a folder of images"
+        ) from error
 
 
 # --- what the headers tell -----------------------------------------------------------------------
@@ -152,30 +167,35 @@ def check_root(root: Path) -> None:
         raise DataError(root, found="no such folder", expected="the data set", remedy=GET_IT)
 
 
-def check_files(files: PictureFiles, formats: Formats) -> tuple[int, int]:
+def check_files(
+    files: PictureFiles, formats: Formats, noted: Noted = raised, item: Hashable = None
+) -> tuple[int, int]:
     """Check that all files are there, whole, of one size and as released; nothing is decoded.
 
     Args:
         files: Of one view or panorama.
         formats: `VIEW_FORMATS` or `PANORAMA_FORMATS`.
+        noted: Where errors go, to go on after them.
+        item: What they are noted of.
 
     Returns:
-        Rows and columns.
+        Rows and columns; (0, 0) of none that could be read.
 
     Raises:
         DataError: A file is missing, cut off, or of another size or pixel format.
     """
     size = None
     for part, path in files.parts.items():
-        header = check_png(path, *formats[part])
-        size = size or (header.height, header.width)
-        if (header.height, header.width) != size:
-            raise DataError(
-                path,
-                found=f"{header.height}×{header.width} pixels",
-                expected=f"{size[0]}×{size[1]}, as {files.rgb}",
-                remedy="Copy or extract both files again.",
-            )
+        with noted(item):
+            header = check_png(path, *formats[part])
+            size = size or (header.height, header.width)
+            if (header.height, header.width) != size:
+                raise DataError(
+                    path,
+                    found=f"{header.height}×{header.width} pixels",
+                    expected=f"{size[0]}×{size[1]}, as {files.rgb}",
+                    remedy="Copy or extract both files again.",
+                )
     return size or (0, 0)
 
 

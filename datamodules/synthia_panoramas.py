@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 
 from datamodules.png import read_color_png
+from datamodules.problems import Noted, raised
 from datamodules.progress import show_progress
 from datamodules.synthia_files import (
     GET_IT,
@@ -48,6 +49,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from numpy.typing import NDArray
+
 
 __all__ = ["HEIGHT", "MANIFEST", "ViewStitcher", "make_panoramas"]
 
@@ -166,6 +168,7 @@ def make_panoramas(
     height: int = HEIGHT,
     workers: int | None = None,
     progress: bool = True,
+    noted: Noted = raised,
 ) -> int:
     """Write the panoramas of OmniSYNTHIA, as published, from the views of SYNTHIA.
 
@@ -179,6 +182,7 @@ def make_panoramas(
         height: Rows of the panoramas.
         workers: Threads; by default one per CPU core.
         progress: Whether to show a progress bar.
+        noted: Where broken views go, to go on with the other panoramas.
 
     Returns:
         How many were made.
@@ -198,11 +202,11 @@ def make_panoramas(
         folder = sequence_folder(root, sequence)
         if _claim(folder, frames, height):
             chosen = choose_frames(list_frames(folder), frames)
-            jobs += _unfinished(folder, chosen, height)
+            jobs += _unfinished(folder, chosen, height, noted)
             total += len(chosen)
     if jobs:
         # Threads: OpenCV leaves the GIL alone, and the tables are shared. As fast as processes.
-        with closing(_in_threads(jobs, workers)) as done:
+        with closing(_in_threads(jobs, workers, noted)) as done:
             show_progress(
                 done,
                 "Making panoramas",
@@ -231,7 +235,7 @@ def _claim(folder: Path, frames: int, height: int) -> bool:
         return not ready
     try:
         found = json.loads(manifest.read_text(encoding="utf-8"))
-    except ValueError:
+    except (ValueError, RecursionError):
         found = "something else"
     if found != wanted:
         raise DataError(
@@ -243,26 +247,29 @@ def _claim(folder: Path, frames: int, height: int) -> bool:
     return True
 
 
-def _unfinished(folder: Path, frames: Sequence[str], height: int) -> list[_Job]:
+def _unfinished(folder: Path, frames: Sequence[str], height: int, noted: Noted) -> list[_Job]:
     """What is to be made, after a check of all that it will be made from."""
     missing = [frame for frame in frames if not _is_whole(folder, frame, height)]
-    size = None
+    size: tuple[int, int] | None = None
+    whole = []
     for frame in missing:
-        for view in VIEWS:
-            files = view_files(folder, view, frame, with_depth=True)
-            found = check_files(files, VIEW_FORMATS)
-            size = size or found
-            if found != size:
-                raise DataError(
-                    files.rgb,
-                    found=f"{found[0]}×{found[1]} pixels",
-                    expected=f"{size[0]}×{size[1]}, as in the other views of the sequence",
-                    remedy="Extract the sequence again.",
-                )
-    if size is None:
+        with noted((folder, frame)):
+            for view in VIEWS:
+                files = view_files(folder, view, frame, with_depth=True)
+                found = check_files(files, VIEW_FORMATS)
+                size = size or found
+                if found != size:
+                    raise DataError(
+                        files.rgb,
+                        found=f"{found[0]}×{found[1]} pixels",
+                        expected=f"{size[0]}×{size[1]}, as in the other views of the sequence",
+                        remedy="Extract the sequence again.",
+                    )
+            whole.append(frame)
+    if size is None or not whole:
         return []
     stitcher = ViewStitcher(read_camera(folder, size), size, height)
-    return [_Job(folder, frame, stitcher) for frame in missing]
+    return [_Job(folder, frame, stitcher) for frame in whole]
 
 
 def _is_whole(folder: Path, frame: str, height: int) -> bool:
@@ -273,12 +280,17 @@ def _is_whole(folder: Path, frame: str, height: int) -> bool:
         return False
 
 
-def _in_threads(jobs: Sequence[_Job], workers: int | None) -> Generator[None]:
+def _in_threads(jobs: Sequence[_Job], workers: int | None, noted: Noted) -> Generator[None]:
     """Make panoramas; after an interrupt those begun are finished."""
     with ThreadPoolExecutor(max(1, os.cpu_count() or 1 if workers is None else workers)) as pool:
         try:
-            for future in as_completed([pool.submit(_make, job) for job in jobs]):
-                future.result()
+            futures = {pool.submit(_make, job): (job.folder, job.frame) for job in jobs}
+            for future in as_completed(futures):
+                try:
+                    future.result()
+                except DataError as error:  # of one frame; a disk that is full stops all
+                    with noted(futures[future]):
+                        raise error from None
                 yield
         finally:
             pool.shutdown(cancel_futures=True)

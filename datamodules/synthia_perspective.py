@@ -37,7 +37,7 @@ from datamodules.synthia_splits import FRAMES, TEST, TRAIN, SequenceSplits, choo
 from tangent_train.errors import DataError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     import numpy as np
     from numpy.typing import NDArray
@@ -86,6 +86,15 @@ class SynthiaPhotos:
             depth = depth_steps(distance_from_z_depth(centimeters, camera_matrix))
         rgb = read_color_png(files.rgb)
         return Photo(rgb, depth, _read_labels(files.labels), camera_matrix)
+
+    def readers(self, index: int) -> Iterator[Callable[[], object]]:
+        """What reads the files of one photo, one after the other."""
+        files = self._views[index].files
+        yield lambda: read_color_png(files.rgb)
+        yield lambda: _read_labels(files.labels)
+        if files.depth is not None:
+            depth = files.depth
+            yield lambda: read_first_channel(depth)
 
     def label_counts(self, index: int) -> NDArray[np.int64]:
         """The pixels of every label of one photo, ``(256,)``.
@@ -158,24 +167,29 @@ class SynthiaPerspective(PhotoDataModule):
     def _frames(self, sequence: str) -> list[list[_View]]:
         """The views of the chosen frames of a sequence, all of them checked."""
         folder = sequence_folder(self.root, sequence)
-        frames = choose_frames(list_frames(folder), self.frames)
-        if not frames:
-            raise DataError(
-                views_folder(folder, VIEWS[0]),
-                found="no views",
-                expected="000000.png and others",
-                remedy=GET_IT,
-            )
+        frames: list[str] = []
+        with self.problems.noted():
+            frames = choose_frames(list_frames(folder), self.frames)
+            if not frames:
+                raise DataError(
+                    views_folder(folder, VIEWS[0]),
+                    found="no views",
+                    expected="000000.png and others",
+                    remedy=GET_IT,
+                )
         return list(in_threads(lambda index: self._views(sequence, frames[index]), len(frames)))
 
     def _views(self, sequence: str, frame: str) -> list[_View]:
-        """The views of one frame, checked."""
+        """The views of one frame, checked, without those of which something was noted."""
+        noted = self.problems.noted
         folder = sequence_folder(self.root, sequence)
         views = []
         for view in VIEWS:
             files = view_files(folder, view, frame, with_depth=self.with_depth)
-            size = check_files(files, VIEW_FORMATS)
-            camera_matrix = read_camera(folder, size)
-            self.check_camera(files.rgb, camera_matrix, size)
-            views.append(_View(f"sequence_{sequence}/{frame}/{view}", files, camera_matrix))
-        return views
+            size = check_files(files, VIEW_FORMATS, noted, files)
+            with noted(files):
+                camera_matrix = read_camera(folder, size)
+                self.check_camera(files.rgb, camera_matrix, size)
+                views.append(_View(f"sequence_{sequence}/{frame}/{view}", files, camera_matrix))
+        broken = self.problems.items
+        return [view for view in views if view.files not in broken]

@@ -20,7 +20,7 @@ from datamodules.pixel_files import (
     write_pixels,
 )
 from tangent_train.errors import DataError, SettingError
-from tangent_train.files import atomic_path
+from tangent_train.files import atomic_path, reserve
 from tangent_train.geometry.resized_grid import ResizedGrid
 from tangent_train.rendering import Blend, tangent_to_equirect
 
@@ -203,6 +203,7 @@ class TangentResults:
             return
         with atomic_path(path) as temporary:
             mapped = open_memmap(temporary, "w+", arrays[0].dtype, (*shape, *channels))
+            reserve(temporary)
             self._render(arrays, grid, blend, mapped)
             mapped.flush()
 

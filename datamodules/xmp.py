@@ -69,6 +69,7 @@ def _unpacked(text: bytes) -> bytes | None:
 
 def _parse(path: Path, xmp: bytes, namespace: str) -> dict[str, str]:
     tags: dict[str, str] = {}
+    texts: dict[str, list[str]] = {}  # in pieces: adding up 16 MB of lines would take minutes
     open_names: list[str] = []
 
     def start(name: str, attributes: dict[str, str]) -> None:
@@ -80,7 +81,7 @@ def _parse(path: Path, xmp: bytes, namespace: str) -> dict[str, str]:
     def text(content: str) -> None:
         if open_names and open_names[-1].startswith(namespace):
             name = open_names[-1].removeprefix(namespace)
-            tags[name] = (tags.get(name, "") + content).strip()
+            texts.setdefault(name, []).append(content)
 
     def refuse(*_: object) -> None:
         raise DataError(
@@ -101,7 +102,7 @@ def _parse(path: Path, xmp: bytes, namespace: str) -> dict[str, str]:
         raise
     except (expat.ExpatError, LookupError, ValueError):  # broken, or of an unknown encoding
         return {}
-    return tags
+    return tags | {name: "".join(pieces).strip() for name, pieces in texts.items()}
 
 
 def _trimmed(xmp: bytes) -> bytes:

@@ -5,6 +5,9 @@ from __future__ import annotations
 __all__ = ["DataError", "SettingError"]
 
 
+_LONGEST = 400  # characters of what was found: a file may hold anything
+
+
 class _ExplainedError(ValueError):
     """An error that says what it is about, what was found, what was expected and the remedy.
 
@@ -21,9 +24,14 @@ class _ExplainedError(ValueError):
     ) -> None:
         message = str(subject)
         if found is not None:
-            message = f"{subject}: found {found}; expected {expected}. {remedy}".rstrip()
+            shown = str(found)
+            shown = shown if len(shown) <= _LONGEST else shown[:_LONGEST] + "…"
+            message = f"{subject}: found {shown}; expected {expected}. {remedy}".rstrip()
         super().__init__(message)
+        self.subject = subject
         self.found = found
+        self.expected = expected
+        self.remedy = remedy
 
 
 class SettingError(_ExplainedError):

@@ -32,6 +32,8 @@ class SynthRooms(Stanford2D3DS):
         SettingError: A setting that cannot work.
     """
 
+    is_made = True
+
     def __init__(
         self,
         root: str | Path,
@@ -59,6 +61,8 @@ class SynthRoomsPerspective(Stanford2D3DSPerspective):
     Raises:
         SettingError: A setting that cannot work.
     """
+
+    is_made = True
 
     def __init__(
         self,

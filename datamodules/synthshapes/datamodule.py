@@ -30,6 +30,8 @@ class SynthShapes(ModelNet40):
         SettingError: A setting that cannot work.
     """
 
+    is_made = True
+
     def __init__(
         self,
         root: str | Path,

@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from hydra.errors import InstantiationException
 from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from tangent_train.errors import SettingError
 from tangent_train.tasks.networks import completed_settings, make
 
-__all__ = ["build"]
+__all__ = ["build", "check_numbers"]
 
 _REMEDIES = {
     "classification": "Choose task=classification with a network for it (experiment=shapes/default "
@@ -25,6 +26,21 @@ _REMEDIES = {
     "network for it.",
 }
 """By what the data has labels for."""
+
+_SOME_STEPS = 100  # to try a scheduler with
+_ANY = 2**32
+_WHOLE = {
+    "level": (0, 13),  # 16384×32768 pixels, as large as files may be
+    "seed": (0, _ANY - 1),
+    "trainer.accumulate_grad_batches": (1, _ANY),
+    "trainer.check_val_every_n_epoch": (1, _ANY),
+    "trainer.max_epochs": (1, _ANY),
+    "trainer.max_steps": (1, _ANY),
+}
+"""Settings that are whole numbers, least and most; null where that is allowed."""
+
+_ENDLESS = ("trainer.max_epochs", "trainer.max_steps")
+"""Those of them of which −1 means no end."""
 
 
 def build(config: DictConfig) -> tuple[Any, Any]:
@@ -43,6 +59,7 @@ def build(config: DictConfig) -> tuple[Any, Any]:
     Raises:
         SettingError: A setting cannot work, or two of them not together.
     """
+    check_numbers(config)
     _check_compiler(config.task.get("compile"))
     representation = instantiate(config.representation)
     data = instantiate(config.data, representation=representation)
@@ -52,14 +69,52 @@ def build(config: DictConfig) -> tuple[Any, Any]:
     classes = len(data.class_names)
     task = instantiate(
         config.task,
-        network=make(completed_settings(network, data.in_channels, classes, restored=restored)),
+        network=_network(completed_settings(network, data.in_channels, classes, restored=restored)),
         representation=representation,
         class_names=data.class_names,
         optimizer=instantiate(config.optimizer),
         scheduler=instantiate(config.scheduler),
     )
     _try_network(task, data.in_channels)
+    _try_optimizer(task, config)
     return data, task
+
+
+def _network(settings: dict[str, Any]) -> Any:
+    try:
+        return make(settings)
+    except InstantiationException as error:
+        if not str(error).startswith("Error locating target"):
+            raise
+        raise SettingError(
+            "network._target_",
+            found=f"{settings['_target_']}, of which something cannot be imported",
+            expected="the full name of a class or function",
+            remedy="Install its package, or add the folder it is in to PYTHONPATH.",
+        ) from error
+
+
+def check_numbers(config: DictConfig) -> None:
+    """Refuse numbers that would be found out late, or with many lines about something else.
+
+    Args:
+        config: A composed config.
+
+    Raises:
+        SettingError: There is one.
+    """
+    for name, (least, most) in _WHOLE.items():
+        value = OmegaConf.select(config, name)
+        if value is None or (value == -1 and name in _ENDLESS):
+            continue
+        if type(value) is not int or not least <= value <= most:
+            expected = f"a whole number from {least}" + (f" to {most}" if most < _ANY else "")
+            raise SettingError(name, found=value, expected=expected)
+    clipped = OmegaConf.select(config, "trainer.gradient_clip_val")
+    if clipped is not None and not (type(clipped) in (int, float) and clipped >= 0):
+        raise SettingError(
+            "trainer.gradient_clip_val", found=clipped, expected="a number from 0, or null"
+        )
 
 
 def _check_kind(settings: DictConfig, data: Any) -> None:
@@ -107,6 +162,24 @@ def _try_network(task: Any, channels: int) -> None:
                 found=f"{type(task.network).__name__}, which does not take {tuple(images.shape)} "
                 f"({_place(error)}: {first_line})",
                 expected=f"one that maps {task.takes}",
+            ) from error
+
+
+def _try_optimizer(task: Any, config: DictConfig) -> None:
+    """Make optimizer and scheduler: nothing is computed, and a wrong number shows."""
+    for name, section in (("optimizer", config.optimizer), ("scheduler", config.scheduler)):
+        try:
+            if name == "optimizer":
+                task.make_optimizer(task.parameters())
+            else:
+                task.optimization(lambda: _SOME_STEPS)
+        except (AssertionError, TypeError, ValueError) as error:
+            plain = {k: value for k, value in section.items() if not str(k).startswith("_")}
+            written = ", ".join(f"{name}.{key}={value}" for key, value in plain.items())
+            raise SettingError(
+                name,
+                found=f"{written} ({error})",
+                expected=f"settings that {section._target_} takes",
             ) from error
 
 

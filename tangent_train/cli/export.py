@@ -46,7 +46,7 @@ def export(config: DictConfig) -> None:
         )
     console = Console(soft_wrap=True, highlight=False)
     with console.status(f"Writing {output.name} …"):
-        trained = load_trained(checkpoint)
+        trained = load_trained(checkpoint, values.names(settings, "trust"))
         written = export_network(trained, output, form, image_size=size, opset=opset)
     console.print(_summary(written, output))
     held = held_networks(getattr(trained.network, "network", trained.network))  # in `Scores`

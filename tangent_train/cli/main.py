@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from omegaconf import DictConfig
 
 __all__ = [
+    "check",
     "evaluate",
     "export",
     "keypoints",
@@ -32,6 +33,7 @@ __all__ = [
 ]
 
 _MODULES = {
+    "check": "check",
     "export": "export",
     "keypoints": "keypoints",
     "predict": "predict",
@@ -57,6 +59,11 @@ def evaluate() -> None:
 def prepare() -> None:
     """``tangent-prepare data=…``: make or check a data set."""
     _main("prepare")
+
+
+def check() -> None:
+    """``tangent-check data=…``: everything that is wrong with a data set."""
+    _main("check")
 
 
 def transfer() -> None:

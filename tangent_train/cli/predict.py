@@ -71,7 +71,7 @@ def predict(config: DictConfig) -> None:
     images = dict(zip(output_names(paths), paths, strict=True))
     if len(images) < len(paths):
         raise SettingError("input", found="an image twice", expected="every image once")
-    trained = load_trained(settings.checkpoint)
+    trained = load_trained(settings.checkpoint, settings.trust)
     output = OutputFolder(settings.output, trained.class_names, settings.probabilities)
     labeller = _labeller(settings, trained)
     earlier = _earlier(settings, trained, output) if settings.resume else {}
@@ -131,7 +131,7 @@ def _earlier(
         entries = {entry["name"]: entry for entry in content["images"] if "error" not in entry}
         before = {name: content[name] for name in _KEPT}
         before |= {name: content[name] for name in _LATER if name in content}
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return {}
     now = summary(settings, trained, [])
     for name, value in before.items():

@@ -14,6 +14,7 @@ LATER_SETTINGS: dict[str, tuple[Any, str]] = {
     "ema": (None, "init_from"),
     "data.upright": (None, "panoramas_per_step"),
     "data.max_tilt_deg": (60, "panoramas_per_step"),
+    "data.skip_broken": (False, "in_memory"),
     "representation.average_rotations": (1, "faces_per_panorama"),
     "task.auxiliary_weight": (0.4, "class_weights"),
     "task.auxiliary_target": ("histogram", "class_weights"),

@@ -10,7 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import lightning
+import torch
 from hydra.core.hydra_config import HydraConfig
+from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint
@@ -22,7 +24,8 @@ from rich.console import Console
 
 from datamodules.samples import channel_names
 from models.initialize import initialize, origins_table
-from tangent_train.cli.build import build
+from tangent_train.cli.build import build, check_numbers
+from tangent_train.cli.machine import machine_faults
 from tangent_train.cli.resume import check_resumed
 from tangent_train.cli.sweep import OBJECTIVE_FILE
 from tangent_train.errors import SettingError
@@ -38,7 +41,7 @@ from tangent_train.tasks.checkpoints import (
 from tangent_train.tasks.tensorboard_pictures import TrainingSpeed
 from tangent_train.tasks.trained import inputs_in, read_checkpoint, stored_inputs
 
-__all__ = ["build", "evaluate", "prepare", "train"]
+__all__ = ["best_on_validation", "build", "evaluate", "prepare", "train"]
 
 # lightning 2.6 asks torch's tree library in a way torch ≥ 2.13 deprecates: nothing to do about it.
 warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)`", FutureWarning)
@@ -55,6 +58,7 @@ def train(config: DictConfig) -> float | None:
     """
     folder = _run_folder()
     checkpoints = folder / "checkpoints"
+    check_numbers(config)
     lightning.seed_everything(config.seed, workers=True, verbose=False)
     resumed = None if config.resume is None else checkpoints / "last.ckpt"
     if resumed is not None:
@@ -72,7 +76,7 @@ def train(config: DictConfig) -> float | None:
     if data.validation_fraction:
         callbacks.append(best_checkpoint(checkpoints, task.monitor))
     trainer = _trainer(config, folder, data, task, callbacks)
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), machine_faults(folder, data):
         # The checkpoints of a resumed run are meant to be there.
         warnings.filterwarnings("ignore", "Checkpoint directory .* exists and is not empty")
         # Lightning looks for this in the loader; here the data module knows where to go on.
@@ -80,7 +84,7 @@ def train(config: DictConfig) -> float | None:
         try:
             trainer.fit(task, datamodule=data, ckpt_path=resumed, weights_only=True)
             # First: an error in the test must not cost a sweep its figure.
-            score = _best_on_validation(trainer, folder)
+            score = best_on_validation(trainer, folder)
             best = checkpoints / "best.ckpt"
             best = best if best.exists() else checkpoints / "last.ckpt"
             _test(trainer, task, data, best, folder)
@@ -110,10 +114,12 @@ def evaluate(config: DictConfig) -> None:
             remedy="For example: tangent-evaluate checkpoint=runs/…/checkpoints/best.ckpt",
         )
     folder = _run_folder()
+    check_numbers(config)
     lightning.seed_everything(config.seed, workers=True, verbose=False)
     data, task = build(config)
     trainer = _trainer(config, folder, data, task, [])
-    _test(trainer, task, data, Path(config.checkpoint), folder)
+    with machine_faults(folder, data):
+        _test(trainer, task, data, Path(config.checkpoint), folder)
 
 
 def prepare(config: DictConfig) -> None:
@@ -143,17 +149,24 @@ def _trainer(
     common = [CheckpointContents(contents), *task.pictures(folder, config)]
     common += [TrainingSpeed(), ProgressBar()]
     every, epochs = config.trainer.check_val_every_n_epoch, config.trainer.max_epochs
-    trainer: lightning.Trainer = instantiate(
-        config.trainer,
+    settings = {
         # A run shorter than that is validated at its end.
-        check_val_every_n_epoch=min(every, epochs) if every and epochs and epochs > 0 else every,
-        default_root_dir=str(folder),
-        callbacks=[*callbacks, *common],
-        logger=TensorBoardLogger(folder, name="", version="tensorboard"),
-        plugins=[AtomicCheckpointIO()],
+        "check_val_every_n_epoch": min(every, epochs) if every and (epochs or -1) > 0 else every,
+        "default_root_dir": str(folder),
+        "callbacks": [*callbacks, *common],
+        "logger": TensorBoardLogger(folder, name="", version="tensorboard"),
+        "plugins": [AtomicCheckpointIO()],
         # The data module's samplers count every image once on any number of processes.
-        use_distributed_sampler=False,
-    )
+        "use_distributed_sampler": False,
+    }
+    try:
+        trainer: lightning.Trainer = instantiate(config.trainer, **settings)
+    except InstantiationException as error:
+        raise SettingError(
+            "trainer",
+            found=f"what cannot work: {error.__cause__ or error}",
+            expected="settings that lightning.Trainer takes",
+        ) from error
     return trainer
 
 
@@ -212,9 +225,17 @@ def _shown(data: Any) -> dict[str, Any]:
     return {**inputs, "normalization": {"mean": mean, "std": std}}
 
 
-def _best_on_validation(trainer: lightning.Trainer, folder: Path) -> float | None:
+def best_on_validation(trainer: lightning.Trainer, folder: Path) -> float | None:
+    """The best figure on the validation split, kept for sweeps; None if there is none.
+
+    Args:
+        trainer: Of the run.
+        folder: Of the run.
+    """
     best = next((c for c in trainer.checkpoint_callbacks if isinstance(c, ModelCheckpoint)), None)
     if best is None or best.best_model_score is None:
+        return None
+    if not torch.isfinite(best.best_model_score):  # no labelled pixel
         return None
     score = float(best.best_model_score)
     if trainer.is_global_zero:

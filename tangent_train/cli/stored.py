@@ -15,7 +15,7 @@ from tangent_train.cli.resume import LATER_SETTINGS
 from tangent_train.errors import DataError, SettingError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Collection, Sequence
 
 __all__ = ["checkpoint_config", "stored_config_arguments", "with_stored_config"]
 
@@ -31,7 +31,9 @@ def with_stored_config(command: str, arguments: list[str]) -> tuple[str, list[st
 
     ``tangent-train resume=<run folder>`` takes the config inside the run's last checkpoint,
     ``tangent-evaluate checkpoint=<file>`` the one inside that, with other sections where
-    ``data=<option>`` or ``representation=<option>`` says so; overrides then apply to it.
+    ``data=<option>`` or ``representation=<option>`` says so; overrides then apply to it. Code that
+    is not of this package or the libraries of networks has to be named on the command line, by
+    ``trust=<its full name>`` or as an override: a config calls what it names.
 
     Args:
         command: train, evaluate, prepare or transfer.
@@ -49,7 +51,7 @@ def with_stored_config(command: str, arguments: list[str]) -> tuple[str, list[st
         stored, folder = _of_run(given, arguments)
     elif command == "evaluate" and _has_checkpoint(arguments):
         path = Path(given["checkpoint"]).absolute()
-        stored = checkpoint_config(path)
+        stored = checkpoint_config(path, *_trusted(arguments))
         _choose_sections(stored, arguments)
         stored["checkpoint"] = str(path)
         folder = "runs/evaluate/${now:%Y-%m-%d_%H-%M-%S}"
@@ -63,7 +65,7 @@ def with_stored_config(command: str, arguments: list[str]) -> tuple[str, list[st
 
 def stored_config_arguments(command: str, arguments: Sequence[str]) -> list[str]:
     """The arguments that say what the stored config is, which are no overrides of it."""
-    names = ["checkpoint=", "resume="]
+    names = ["checkpoint=", "resume=", "trust="]
     if command == "evaluate" and _has_checkpoint(arguments):
         names += [f"{group}=" for group in _CHOOSABLE]
     return [a for a in arguments if a.startswith(tuple(names))]
@@ -71,6 +73,21 @@ def stored_config_arguments(command: str, arguments: Sequence[str]) -> list[str]
 
 def _has_checkpoint(arguments: Sequence[str]) -> bool:
     return any(a.startswith("checkpoint=") and a != "checkpoint=" for a in arguments)
+
+
+def _trusted(arguments: Sequence[str]) -> tuple[set[str], set[str]]:
+    """Code that the command line names itself, and settings that it replaces."""
+    plain = [a.lstrip("+").partition("=")[::2] for a in arguments if "=" in a and a[0] not in "-~"]
+    trust = {
+        part.strip(" '\"")
+        for name, value in plain
+        if name == "trust"
+        for part in value.strip("[]").split(",")
+    }
+    # A network that is overridden where it was in the checkpoint is the user's own choice there;
+    # one that the checkpoint names elsewhere as well likewise.
+    trust |= {value for name, value in plain if name.endswith("._target_")}
+    return trust, {name for name, _ in plain}
 
 
 def _of_run(given: dict[str, str], arguments: list[str]) -> tuple[dict[str, Any], str]:
@@ -86,7 +103,7 @@ def _of_run(given: dict[str, str], arguments: list[str]) -> tuple[dict[str, Any]
             found=f"{elsewhere[0]} beside it",
             expected="neither a sweep nor another folder: a run goes on in its own",
         )
-    stored = checkpoint_config(_last_checkpoint(folder))
+    stored = checkpoint_config(_last_checkpoint(folder), *_trusted(arguments))
     stored["resume"] = str(folder)
     return stored, str(folder)
 
@@ -123,19 +140,30 @@ def _choose_sections(stored: dict[str, Any], arguments: list[str]) -> None:
             stored["data"][name] = before[name]
 
 
-def checkpoint_config(path: Path) -> dict[str, Any]:
+def checkpoint_config(
+    path: Path, trust: Collection[str] = (), overridden: Collection[str] = ()
+) -> dict[str, Any]:
     """The config inside a checkpoint, read without unpickling anything but tensors.
 
+    Args:
+        path: The checkpoint.
+        trust: Code it may name, see `check_stored`.
+        overridden: Settings that the command line replaces.
+
     Raises:
-        DataError: The file is missing, no checkpoint, or of another program.
+        DataError: The file is missing, no checkpoint, of another program, or names other code.
     """
+    from tangent_train.tasks.stored_settings import check_stored, without_resolvers
     from tangent_train.tasks.trained import read_checkpoint
 
     content = read_checkpoint(path)
-    container = OmegaConf.to_container(OmegaConf.create(content["config"]), resolve=False)
+    written = without_resolvers(path, content["config"], content.get("resolved_config"))
+    check_stored(path, written, trust, overridden)
+    container = OmegaConf.to_container(OmegaConf.create(written), resolve=False)
     if not isinstance(container, dict):
         raise DataError("stored config", found=type(container).__name__, expected="a mapping")
-    stored = {str(key): value for key, value in container.items()}
+    # A list of defaults would choose sections, and is none of the run's settings.
+    stored = {str(key): value for key, value in container.items() if key != "defaults"}
     for name, (value, beside) in LATER_SETTINGS.items():
         section, _, setting = name.rpartition(".")
         inside = stored.get(section) if section else stored

@@ -13,7 +13,7 @@ from typing import Any
 
 from tangent_train.errors import SettingError
 
-__all__ = ["choice", "flag", "number", "numbers", "optional_whole", "path", "whole"]
+__all__ = ["choice", "flag", "names", "number", "numbers", "optional_whole", "path", "whole"]
 
 Settings = Mapping[str, Any]
 
@@ -80,6 +80,19 @@ def flag(settings: Settings, name: str) -> bool:
     if not isinstance(value, bool):
         raise SettingError(name, found=value, expected="true or false")
     return value
+
+
+def names(settings: Settings, name: str) -> tuple[str, ...]:
+    """A name, a list of them, or None.
+
+    Raises:
+        SettingError: Something else.
+    """
+    value = settings[name]
+    listed = [value] if isinstance(value, str) else value or []
+    if not isinstance(listed, Sequence) or not all(isinstance(one, str) for one in listed):
+        raise SettingError(name, found=value, expected="a name, or a list of names")
+    return tuple(listed)
 
 
 def choice(settings: Settings, name: str, allowed: tuple[str, ...]) -> Any:

@@ -142,7 +142,7 @@ def read_cameras(path: Path) -> CameraFile:
     """
     try:
         content = json.loads(path.read_bytes())
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         found = "no such file" if isinstance(error, FileNotFoundError) else error
         raise DataError(
             path,
@@ -162,8 +162,9 @@ def read_cameras(path: Path) -> CameraFile:
             remedy="It was written by another version of tangent-render.",
         )
     try:
-        cameras = _parse(content)
-    except (KeyError, TypeError, ValueError) as error:
+        with np.errstate(over="ignore", invalid="ignore"):  # huge numbers make no rotation
+            cameras = _parse(content)
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         missing = f"no {error}" if isinstance(error, KeyError) else error
         raise DataError(path, found=missing, expected="a whole file", remedy=_REMEDY) from error
     _check(path, cameras, content)
@@ -197,7 +198,7 @@ def _check(path: Path, cameras: CameraFile, content: dict[str, Any]) -> None:
         found = [content["camera"]["matrix"]]
         found += [image["world_from_camera"] for image in content["images"]]
         matrices = np.array(found, np.float64)
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise DataError(path, found=error, expected="3×3 matrices", remedy=_REMEDY) from error
     grid = cameras.grid
     expected = [grid.camera_matrix, *(_world_from_camera(grid, face) for face in cameras.faces)]

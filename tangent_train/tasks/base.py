@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -18,6 +19,7 @@ from torch.optim.lr_scheduler import LRScheduler
 
 from datamodules.split_module import Kind
 from tangent_train.errors import SettingError
+from tangent_train.tasks.divergence import LossWatch, check_weights, stop
 
 __all__ = ["Part", "Task", "check_at_once"]
 
@@ -83,6 +85,7 @@ class Task(lightning.LightningModule, ABC):
         self.make_scheduler = scheduler
         self.label_smoothing = label_smoothing
         self.images_per_chunk = images_per_chunk
+        self._loss_watch = LossWatch()
 
     @abstractmethod
     def example(self, channels: int) -> Tensor:
@@ -206,8 +209,27 @@ class Task(lightning.LightningModule, ABC):
             value += loss.detach()
         loss = self._loss(last, norms)
         # The mean over processes, each divided by the mean norm, is the loss of the whole batch.
-        self.log("train/loss", value + loss.detach(), prog_bar=True, sync_dist=True)
+        whole: Any = self.trainer.strategy.reduce(value + loss.detach(), reduce_op="mean")
+        self.log("train/loss", whole, prog_bar=True)
+        self._loss_watch.begin(whole, batch)
         return loss
+
+    def on_after_backward(self) -> None:
+        """Stop before a step whose loss is no number, on all processes.
+
+        What gradients do when `trainer.precision=16-mixed` scales them too far is not looked at:
+        such steps are left out and the scale shrinks, as it should.
+
+        Raises:
+            SettingError: It is none.
+        """
+        found = self._loss_watch.end()  # None after all parts but the last
+        if found is not None and not math.isfinite(found[0]):
+            stop(self, *found)
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """See `check_weights`."""
+        check_weights(self)
 
     def optimizer_zero_grad(self, *_: Any) -> None:
         """Nothing: `training_step` clears the gradients before its first part."""
@@ -239,11 +261,19 @@ class Task(lightning.LightningModule, ABC):
 
     def configure_optimizers(self) -> Any:
         """Optimizer, and scheduler if there is one."""
+        return self.optimization(lambda: int(self.trainer.estimated_stepping_batches))
+
+    def optimization(self, count_steps: Callable[[], int]) -> Any:
+        """The same for any number of steps.
+
+        Args:
+            count_steps: Of the whole training; asked for where the scheduler wants to know.
+        """
         optimizer = self.make_optimizer(self.parameters())
         if self.make_scheduler is None:
             return optimizer
         by_step = "total_steps" in inspect.signature(self.make_scheduler).parameters
-        length = {"total_steps": int(self.trainer.estimated_stepping_batches)} if by_step else {}
+        length = {"total_steps": count_steps()} if by_step else {}
         scheduler = self.make_scheduler(optimizer, **length)
         interval = "step" if by_step else "epoch"
         return {

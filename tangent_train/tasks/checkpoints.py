@@ -15,8 +15,8 @@ from lightning.pytorch.callbacks import Callback, Checkpoint, ModelCheckpoint
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 from rich.console import Console
 
-from tangent_train.errors import SettingError
-from tangent_train.files import atomic_path
+from tangent_train.errors import DataError, SettingError
+from tangent_train.files import NoRoomError, atomic_path
 
 __all__ = [
     "AtomicCheckpointIO",
@@ -183,13 +183,18 @@ class LastCheckpoint(Checkpoint):
         pl_module: lightning.LightningModule,
         exception: BaseException,
     ) -> None:
-        """Say how to go on after SIGTERM and Ctrl-C; an error says for itself what to do."""
+        """Say how to go on after SIGTERM, Ctrl-C and what the machine does to a run.
+
+        An error says for itself what to do.
+        """
         terminated = isinstance(exception, SIGTERMException)
         interrupted = terminated or isinstance(exception, KeyboardInterrupt)
-        if interrupted and trainer.is_global_zero and self.path.exists():
+        if not interrupted and not _is_of_the_machine(exception):
+            return
+        if trainer.is_global_zero and self.path.exists():
             run_folder = self.path.parent.parent
             Console(stderr=True).print(
-                f"Interrupted. {self.path} has all up to "
+                f"{'Interrupted' if interrupted else 'Stopped'}. {self.path} has all up to "
                 f"{'here' if terminated else 'the last checkpoint'}; go on with\n"
                 f"  tangent-train resume={run_folder}",
                 soft_wrap=True,
@@ -205,6 +210,12 @@ class LastCheckpoint(Checkpoint):
 
     def _save(self, trainer: lightning.Trainer) -> None:
         trainer.save_checkpoint(self.path, weights_only=False)
+
+
+def _is_of_the_machine(exception: BaseException) -> bool:
+    """A full disk, a file that cannot be read, a worker that died: the run can go on later."""
+    of_worker = isinstance(exception, RuntimeError) and str(exception).startswith("DataLoader")
+    return of_worker or isinstance(exception, DataError | NoRoomError | OSError | EOFError)
 
 
 class BestCheckpoint(ModelCheckpoint):

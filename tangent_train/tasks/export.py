@@ -13,6 +13,7 @@ from tangent_train.errors import SettingError
 from tangent_train.files import atomic_path
 from tangent_train.tasks.export_formats import WRITE, Format, Plan, random_images
 from tangent_train.tasks.networks import TrainedNetwork
+from tangent_train.tasks.stored_settings import named_targets
 from tangent_train.tasks.trained import load_trained
 
 __all__ = ["SUFFIXES", "TOLERANCE", "Export", "Format", "export_network"]
@@ -151,7 +152,8 @@ def _check_onnx(network: nn.Module) -> None:
 @torch.no_grad()
 def _compared(plan: Plan, path: Path) -> Export:
     """Read the file as any user does and compare; raises `_DifferenceError`."""
-    exported = load_trained(path)
+    trained = plan.trained
+    exported = load_trained(path, named_targets([trained.settings, trained.representation]))
     difference = share = 0.0
     for size in plan.compared_sizes:
         for count in _BATCHES:

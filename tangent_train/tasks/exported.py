@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import re
 import warnings
 import zipfile
-from collections.abc import Iterator
+import zlib
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields
 from importlib.metadata import version
@@ -19,6 +21,7 @@ from datamodules.samples import Input, Normalization
 from models.onnx_network import OnnxNetwork
 from tangent_train.errors import DataError
 from tangent_train.tasks.networks import TrainedNetwork, network_from
+from tangent_train.tasks.stored_settings import check_stored
 
 __all__ = [
     "METADATA_KEY",
@@ -37,6 +40,9 @@ as an extra file of a TorchScript archive."""
 _jit: Any = torch.jit  # partly without types
 _EXPECTED = "a network written by tangent-export"
 _VERSION = "tangent_train_version"
+_TOUCHES_FILES = re.compile(rb"\b(?:save|from_file|load_tensor|(?:read|write)_file)\b")
+"""Of all operations that torch and torchvision know, those that take the name of a file."""
+
 _DESCRIBED = tuple(field.name for field in fields(TrainedNetwork) if field.name != "network")
 
 
@@ -53,22 +59,24 @@ def metadata_json(trained: TrainedNetwork) -> str:
     return json.dumps(content)
 
 
-def load_onnx(path: Path) -> TrainedNetwork:
+def load_onnx(path: Path, trust: Collection[str] = ()) -> TrainedNetwork:
     """Read an ONNX file; onnxruntime computes.
 
     Raises:
         DataError: It is none, or none of ours, or onnxruntime is missing.
     """
     network = OnnxNetwork(path)
-    return _trained(path, network.metadata.get(METADATA_KEY), network)
+    content = _content(path, network.metadata.get(METADATA_KEY), trust)
+    return _trained(content, network)
 
 
-def load_torchscript(path: Path) -> TrainedNetwork:
+def load_torchscript(path: Path, trust: Collection[str] = ()) -> TrainedNetwork:
     """Read a TorchScript archive, on the CPU.
 
     Raises:
-        DataError: It is none, or none of ours.
+        DataError: It is none, or none of ours, or would read or write files itself.
     """
+    _check_script(path)
     extra: dict[str, Any] = {METADATA_KEY: ""}
     try:
         with torchscript_without_warnings():
@@ -76,10 +84,10 @@ def load_torchscript(path: Path) -> TrainedNetwork:
     except (RuntimeError, ValueError) as error:
         raise _unreadable(path, error) from error
     text = extra[METADATA_KEY]
-    return _trained(path, text.decode() if isinstance(text, bytes) else text, network)
+    return _trained(_content(path, text, trust), network)
 
 
-def load_safetensors(path: Path) -> TrainedNetwork:
+def load_safetensors(path: Path, trust: Collection[str] = ()) -> TrainedNetwork:
     """Read tensors, and make the network they belong to.
 
     Raises:
@@ -89,11 +97,11 @@ def load_safetensors(path: Path) -> TrainedNetwork:
     with _safetensors(path) as file:
         text = (file.metadata() or {}).get(METADATA_KEY)
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no dict
-    content = _content(path, text)
+    content = _content(path, text, trust)
     if not content["settings"]:
         raise DataError(path, found="no settings of the network inside", expected=_EXPECTED)
     network = network_from(path, content["settings"], tensors)
-    return _trained(path, text, network)
+    return _trained(content, network)
 
 
 def safetensors_inputs(path: Path) -> tuple[Input, ...]:
@@ -140,6 +148,29 @@ def is_torchscript(path: Path) -> bool:
         return any(name.endswith("/constants.pkl") for name in archive.namelist())
 
 
+def _check_script(path: Path) -> None:
+    """Refuse programs that touch files, which TorchScript can do as soon as it is loaded.
+
+    Raises:
+        DataError: It would, or its parts cannot be told apart.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = archive.namelist()
+            code = [archive.read(name) for name in names if name.endswith(".py")]
+    except (OSError, ValueError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
+        raise _unreadable(path, error) from error
+    if len(set(names)) < len(names):  # other programs may read another one of that name
+        raise DataError(path, found="two parts of one name", expected=_EXPECTED)
+    found = next(filter(None, map(_TOUCHES_FILES.search, code)), None)
+    if found:
+        raise DataError(
+            path,
+            found=f"a program that calls {found[0].decode()}",
+            expected="one that computes and leaves files alone",
+        )
+
+
 @contextmanager
 def torchscript_without_warnings() -> Iterator[None]:
     """Leave out what torch says about TorchScript itself.
@@ -155,8 +186,7 @@ def torchscript_without_warnings() -> Iterator[None]:
         yield
 
 
-def _trained(path: Path, text: str | None, network: nn.Module) -> TrainedNetwork:
-    content = _content(path, text)
+def _trained(content: Mapping[str, Any], network: nn.Module) -> TrainedNetwork:
     fixed_size = content["fixed_size"]
     return TrainedNetwork(
         network=network.eval(),
@@ -172,8 +202,16 @@ def _trained(path: Path, text: str | None, network: nn.Module) -> TrainedNetwork
     )
 
 
-def _content(path: Path, text: str | None) -> dict[str, Any]:
-    """The metadata of a file; all fields are there."""
+def _content(
+    path: Path, text: str | bytes | None, trust: Collection[str] | None = None
+) -> dict[str, Any]:
+    """The metadata of a file; all fields are there, and name no code that is not trusted.
+
+    Args:
+        path: The file, for the messages.
+        text: The JSON.
+        trust: See `load_trained`; None where nothing is made of it.
+    """
     if not text:
         raise DataError(
             path,
@@ -184,7 +222,7 @@ def _content(path: Path, text: str | None) -> dict[str, Any]:
         )
     try:
         content = json.loads(text)
-    except json.JSONDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise DataError(
             path, found=f"'{METADATA_KEY}' in its metadata is no JSON ({error})", expected=_EXPECTED
         ) from error
@@ -196,6 +234,8 @@ def _content(path: Path, text: str | None) -> dict[str, Any]:
             found=f"no {missing[0]} in '{METADATA_KEY}' of its metadata",
             expected=_EXPECTED,
         )
+    if trust is not None:
+        check_stored(path, {name: known[name] for name in ("settings", "representation")}, trust)
     return known
 
 

@@ -112,11 +112,9 @@ class Scores(nn.Module):
 def make(settings: Mapping[str, Any]) -> Any:
     """What a section of a config describes.
 
-    All that stored configs name is made here: their `_target_` can be any function of any package
-    that is installed, so they must come from a file that somebody trusts as much as a program.
-
     Args:
-        settings: ``_target_`` and its arguments.
+        settings: ``_target_`` and its arguments. Whatever it names is called: settings that come
+            out of a file are for `stored_settings.check_stored` first.
 
     Raises:
         DataError: It says itself that a file cannot be used.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, get_args
 
 import torch
 from jaxtyping import Float, Integer
@@ -105,6 +105,7 @@ class SegmentationTask(Task):
         check_at_once("images_per_forward", images_per_forward)
         if absent_class not in ("skip", "zero"):
             raise SettingError("task.absent_class", found=absent_class, expected="skip or zero")
+        _check_weighting(class_weights, self.class_names)
         self.weighting = class_weights
         self.loss = SegmentationLoss(
             label_smoothing, auxiliary_weight, auxiliary_target, region_loss, region_weight
@@ -131,14 +132,7 @@ class SegmentationTask(Task):
         weights: Any = self.weighting
         if isinstance(weights, str):
             weights = self.trainer.datamodule.class_weights(weights)  # type: ignore[attr-defined]
-        weights = torch.as_tensor(weights, dtype=torch.float32)
-        if weights.shape != self.class_weights.shape:
-            raise SettingError(
-                "task.class_weights",
-                found=f"{weights.numel()} numbers",
-                expected=f"{len(self.class_names)}, one for each of {', '.join(self.class_names)}",
-            )
-        self.class_weights.copy_(weights)
+        self.class_weights.copy_(torch.as_tensor(weights, dtype=torch.float32))
 
     def forward(
         self,
@@ -287,3 +281,14 @@ class SegmentationTask(Task):
         callbacks: list[Any] = self.trainer.callbacks  # type: ignore[attr-defined]
         images = [i for c in callbacks if isinstance(c, PredictionPanels) for i in c.images]
         write_evaluation_report(path, results, self.class_names, images, checkpoint)
+
+
+def _check_weighting(weighting: str | Sequence[float], class_names: Sequence[str]) -> None:
+    kinds = ", ".join(get_args(ClassWeights))
+    each = f"{len(class_names)} numbers, one for each of {', '.join(class_names)}"
+    if isinstance(weighting, str):
+        if weighting not in get_args(ClassWeights):
+            expected = f"{kinds}; or {each}"
+            raise SettingError("task.class_weights", found=weighting, expected=expected)
+    elif len(weighting) != len(class_names):
+        raise SettingError("task.class_weights", found=f"{len(weighting)} numbers", expected=each)

@@ -13,9 +13,10 @@ from tangent_train.tasks.networks import (
     network_from,
     size_multiple_of,
 )
+from tangent_train.tasks.stored_settings import check_stored
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Collection, Mapping, Sequence
     from pathlib import Path
 
     from datamodules.samples import Input
@@ -27,31 +28,33 @@ _PREFIX = "network."
 
 _NEEDED = ("resolved_config", "class_names", "normalization", "state_dict")
 _SECTIONS = ("network", "representation", "level")
+_MADE = ("network", "representation")
 _EXPECTED = "a checkpoint written by tangent-train"
 
 
-def load_trained(path: Path) -> TrainedNetwork:
+def load_trained(path: Path, trust: Collection[str] = ()) -> TrainedNetwork:
     """A trained network, on the CPU and in evaluation mode, from a file of this package.
 
     Args:
         path: A checkpoint; or what `tangent-export` wrote, known by its suffix ``.onnx`` or
-            ``.safetensors``, TorchScript whatever its suffix. A checkpoint and a safetensors file
-            name the class of their network, which is called: trust those as much as a program.
+            ``.safetensors``, TorchScript whatever its suffix.
+        trust: Classes of networks that are called if the file names them, beside those of this
+            package, torch, torchvision, timm and segmentation-models-pytorch: ``my.module.Net``.
 
     Raises:
-        DataError: There is no such file, it holds something else, its network cannot be made, or
-            a package to read it is missing.
+        DataError: There is no such file, it holds something else, it names other code, its network
+            cannot be made, or a package to read it is missing.
     """
     from tangent_train.tasks import exported
 
     suffix = path.suffix.lower()
     if suffix == ".onnx":
-        return exported.load_onnx(path)
+        return exported.load_onnx(path, trust)
     if suffix == ".safetensors":
-        return exported.load_safetensors(path)
+        return exported.load_safetensors(path, trust)
     if path.is_file() and exported.is_torchscript(path):
-        return exported.load_torchscript(path)
-    return _from_checkpoint(path)
+        return exported.load_torchscript(path, trust)
+    return _from_checkpoint(path, trust)
 
 
 def read_checkpoint(path: Path, needed: Sequence[str] = ("config", "state_dict")) -> dict[str, Any]:
@@ -120,7 +123,7 @@ def _check_kind(path: Path, content: dict[str, Any]) -> None:
         )
 
 
-def _from_checkpoint(path: Path) -> TrainedNetwork:
+def _from_checkpoint(path: Path, trust: Collection[str]) -> TrainedNetwork:
     from datamodules.samples import Normalization, channel_names
 
     content = read_checkpoint(path, _NEEDED)
@@ -129,6 +132,7 @@ def _from_checkpoint(path: Path) -> TrainedNetwork:
     missing = [name for name in _SECTIONS if config.get(name) is None]
     if missing:
         raise DataError(path, found=f"no {missing[0]} in its config", expected=_EXPECTED)
+    check_stored(path, {name: config[name] for name in _MADE}, trust)
     class_names = tuple(content["class_names"])
     normalization = Normalization(**content["normalization"])
     inputs = stored_inputs(content)

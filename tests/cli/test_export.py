@@ -137,8 +137,8 @@ def test_what_is_wrong_is_said(
 def test_what_does_not_compute_the_same_is_no_success(
     checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def other(path: Path) -> object:
-        found = load_trained(path)
+    def other(path: Path, trust: set[str]) -> object:
+        found = load_trained(path, trust)
         torch.nn.init.zeros_(found.network.network.head.weight)  # type: ignore[union-attr, arg-type]
         return found
 

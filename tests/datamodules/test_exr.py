@@ -151,7 +151,7 @@ def test_a_channel_of_lower_resolution(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("corners", "message"),
     [
-        ((0, 0, 32767, 16384), "16385×32768 pixels; expected as many as 16384×32768, at most"),
+        ((0, 0, 32767, 16384), "16385×32768 pixels; expected at most 536870912 pixels"),
         ((0, 0, 32767, 16383), "pixels that cannot be decoded; expected an OpenEXR image"),
         ((0, 0, -5, -5), ".*; expected an OpenEXR image"),
         ((-(2**31), -(2**31), 2**31 - 1, 2**31 - 1), ".*; expected an OpenEXR image"),

@@ -142,7 +142,7 @@ def test_unusable_meshes_are_named_counted_and_left_out(
     broken[1].path.write_text("OFF\n3 1 0\n0 0 0\n0 0 0\n0 0 0\n3 0 1 2\n")
     assert _prepare(folder, meshes, progress=True) == len(meshes)
     printed = capsys.readouterr().out
-    assert f"2 of {len(meshes)} shapes cannot be used and are left out" in printed
+    assert f"2 of {len(meshes)} shapes cannot be used:" in printed
     assert f"{broken[0].path}, line 5: found 'nan'" in printed
     assert "extent of 0" in printed
     listed = json.loads((folder.folder / "unusable.json").read_text())

@@ -201,6 +201,7 @@ def _keypoints(arguments: Sequence[str], _folder: Path) -> list[str]:
 
 _RULES: Mapping[str, Callable[[Sequence[str], Path], list[str]]] = {
     "python": _benchmark,
+    "tangent-check": _preparation,
     "tangent-evaluate": _evaluation,
     "tangent-export": _nothing,
     "tangent-keypoints": _keypoints,

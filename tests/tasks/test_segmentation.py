@@ -137,9 +137,10 @@ def test_class_weights_come_from_the_data_or_the_settings(
     task = _task(nn.Conv2d(2, 3, 1), representation, class_weights="log")
     quiet_trainer(max_steps=1, limit_val_batches=0).fit(task, datamodule=data)
     assert task.class_weights.tolist() == [0.0, 1.0, 3.0]
-    wrong = _task(nn.Conv2d(2, 3, 1), representation, class_weights=[1.0, 2.0])
-    with pytest.raises(SettingError, match=r"task\.class_weights: found 2 numbers"):
-        quiet_trainer(max_steps=1, limit_val_batches=0).fit(wrong, datamodule=data)
+    with pytest.raises(SettingError, match=r"task\.class_weights: found 2 numbers; expected 3"):
+        _task(nn.Conv2d(2, 3, 1), representation, class_weights=[1.0, 2.0])
+    with pytest.raises(SettingError, match=r"task\.class_weights: found logg; expected .*sqrt"):
+        _task(nn.Conv2d(2, 3, 1), representation, class_weights="logg")
 
 
 @pytest.mark.parametrize(

@@ -82,7 +82,7 @@ def test_tensors_of_the_file_are_used_and_no_others_fetched(tmp_path: Path) -> N
         "class_weights": torch.ones(2),
     }
     torch.save(content, path)
-    trained = load_trained(path)
+    trained = load_trained(path, trust=[f"{__name__}.Remembering"])
     assert isinstance(trained.network, Scores)
     network = trained.network.network
     assert isinstance(network, Remembering)
@@ -163,7 +163,7 @@ def test_a_network_of_one_size_is_said_to_be_one(tmp_path: Path) -> None:
     content["resolved_config"]["representation"]["dim"] = [24, 40]
     content["state_dict"] = {f"network.{n}": t for n, t in OneSize().state_dict().items()}
     torch.save(content, path)
-    trained = load_trained(path)
+    trained = load_trained(path, trust=[f"{__name__}.OneSize"])
     assert (trained.image_size, trained.fixed_size) == ((24, 40), (24, 40))
 
 
@@ -237,8 +237,9 @@ def _no_classes(content: Any) -> None:
 )
 def test_what_cannot_be_loaded_says_why(edit: Any, message: str, tmp_path: Path) -> None:
     path = _edited(tmp_path / "best.ckpt", edit)
+    trust = ["no_such_package.nets.Net", "models.NoSuchNet", "models.missing.Net"]
     with pytest.raises(DataError, match=rf"(?s)^{re.escape(str(path))}: found {message}"):
-        load_trained(path)
+        load_trained(path, trust)
 
 
 def test_the_extra_of_a_missing_package_is_named(

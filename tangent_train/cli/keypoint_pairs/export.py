@@ -84,7 +84,7 @@ class ColmapExport:
         try:
             index = json.loads((self.folder / _INDEX).read_bytes())
             return index["kind"] == self.kind and set(names) <= set(index["pairs"])
-        except (OSError, ValueError, KeyError, TypeError):
+        except (OSError, ValueError, KeyError, TypeError, RecursionError):
             return False
 
     def has(self, name: str) -> bool:

@@ -118,7 +118,7 @@ class ResultsFolder:
             content = json.loads((self.path / RESULTS).read_bytes())
             if (content["program"], content["version"]) == (_PROGRAM, _VERSION):
                 return content["settings"], [PairEntry.of(plain) for plain in content["pairs"]]
-        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
             pass
         raise SettingError(
             "output",

@@ -45,6 +45,7 @@ class PredictSettings:
     resume: bool
     images_per_forward: int | None
     device: str
+    trust: tuple[str, ...]
 
     @classmethod
     def of(cls, config: Mapping[str, Any]) -> PredictSettings:
@@ -92,6 +93,7 @@ class PredictSettings:
             resume=values.flag(config, "resume"),
             images_per_forward=values.optional_whole(config, "images_per_forward", 1),
             device=str(config["device"]),
+            trust=values.names(config, "trust"),
         )
 
 

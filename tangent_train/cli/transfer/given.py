@@ -29,18 +29,22 @@ def check_given(config: DictConfig, folds: Sequence[int | None]) -> None:
         DataError: It is no checkpoint of tangent-train.
         SettingError: The transfer cannot start from it.
     """
+    from tangent_train.tasks.stored_settings import check_stored, named_targets
     from tangent_train.tasks.trained import read_checkpoint
 
     path = Path(config.checkpoint)
-    kind = read_checkpoint(path).get("kind", "segmentation")
+    content = read_checkpoint(path)
+    kind = content.get("kind", "segmentation")
     if kind != "segmentation":
         raise SettingError(
             f"checkpoint={path}",
             found=f"a network for {kind}",
             expected="one for segmentation: a transfer compares labels of pixels",
         )
-    given: Any = OmegaConf.to_container(OmegaConf.create(checkpoint_config(path)), resolve=True)
     wanted: Any = OmegaConf.to_container(config, resolve=True)
+    stored = checkpoint_config(path, named_targets(content["config"]))  # compared, not called
+    check_stored(path, stored["data"], named_targets(wanted))  # but this is imported
+    given: Any = OmegaConf.to_container(OmegaConf.create(stored), resolve=True)
     _check_network(path, given, wanted)
     theirs = _classes(given["data"])
     for data in (wanted["data"], wanted["photos"]["data"]):

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from tangent_train.errors import SettingError
-from tangent_train.files import atomic_path, write_bytes, write_text
+from tangent_train.files import atomic_path, reserve, write_bytes, write_text
 from tangent_train.tasks.pictures import colorize, overlay_picture
 
 if TYPE_CHECKING:
@@ -135,6 +135,7 @@ class OutputFolder:
             whole = tuple(map(np.arange, found.labels.shape))
             rows, columns = whole if found.area is None else found.area.places()
             array = np.lib.format.open_memmap(temporary, "w+", np.float16, shape)
+            reserve(temporary)
             for start in range(0, len(rows), _ROWS_AT_ONCE):
                 part = slice(start, start + _ROWS_AT_ONCE)
                 array[part] = mosaic.probabilities(rows[part])[:, columns]

@@ -9,9 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from omegaconf import OmegaConf
-
 from tangent_train.errors import DataError
+from tangent_train.tasks.stored_settings import read_settings
 
 __all__ = [
     "FIGURES",
@@ -190,7 +189,7 @@ def load_run(folder: Path) -> Run:
             expected="the settings of the run, beside its results",
         )
     try:
-        config = OmegaConf.to_container(OmegaConf.load(path), resolve=True)
+        config = read_settings(path)
     except Exception as error:
         raise DataError(path, found=_first_line(error), expected="the settings of a run") from error
     if not isinstance(config, dict):
@@ -205,7 +204,7 @@ def _results(path: Path) -> dict[str, Any]:
     try:
         results = json.loads(path.read_text())
         figures = _figures(results)
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise DataError(path, found=_first_line(error), expected=expected) from error
     except KeyError as error:
         raise DataError(path, found=f"no {error}", expected=expected) from error

@@ -1,0 +1,69 @@
+"""What ``tangent-check`` does: everything that is wrong with a data set, in one table."""
+
+from __future__ import annotations
+
+import sys
+from typing import TYPE_CHECKING
+
+from hydra.utils import instantiate
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from datamodules.data_check import check_all
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from omegaconf import DictConfig
+
+    from datamodules.problems import Problem
+
+__all__ = ["check"]
+
+
+def check(config: DictConfig) -> None:
+    """Read all of the data set of a run; leave with 1 if something is wrong.
+
+    On a terminal the problems are a table, elsewhere lines of file, finding and remedy with tabs
+    between them; what was looked at goes to the standard error output then.
+
+    Args:
+        config: The composed ``check.yaml``.
+    """
+    representation = instantiate(config.representation)
+    data = instantiate(config.data, representation=representation)
+    console = Console(highlight=False)
+    problems, count = check_all(data, progress=console.is_terminal)
+    listed = problems.listed()
+    read = f"{count} {data.noun} of {_printable(str(data.root))} were read"
+    if listed and console.is_terminal:
+        console.print(_table(listed))
+    for problem in () if console.is_terminal else listed:
+        sys.stdout.write("\t".join(map(_printable, problem[1:4])) + "\n")
+    found = f"{len(listed)} problem{'s' * (len(listed) > 1)}" if listed else "Nothing is wrong"
+    told = console if console.is_terminal or not listed else Console(stderr=True, highlight=False)
+    told.print(Text(f"{found}; {read}."), soft_wrap=True)
+    if listed:
+        sys.exit(1)
+
+
+def _table(problems: Sequence[Problem]) -> Table:
+    table = Table(show_lines=True)
+    # Folded, never cut: a path is of use as a whole.
+    table.add_column("file", overflow="fold", ratio=4)
+    table.add_column("finding", overflow="fold", ratio=3)
+    table.add_column("remedy", overflow="fold", ratio=3)
+    for problem in problems:
+        table.add_row(*(Text(_printable(cell)) for cell in problem[1:4]))
+    return table
+
+
+def _printable(text: str) -> str:
+    r"""Names of files may hold anything: line ends, commands of terminals, bytes that are no text.
+
+    >>> print(_printable("küche 1\n\x1b[2J\udcff.png"))
+    küche 1\n\x1b[2J\udcff.png
+    """
+    escaped = (c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+    return "".join(escaped)

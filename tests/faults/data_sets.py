@@ -1,0 +1,159 @@
+"""Small data sets of every kind in the real on-disk formats, below a folder with a trying name."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+
+from datamodules import (
+    FolderPanoramas,
+    ModelNet40,
+    OmniSynthia,
+    Stanford2D3DS,
+    Stanford2D3DSPerspective,
+    SynthiaPerspective,
+)
+from tangent_train.rendering import EquirectRepresentation, PerspectiveRepresentation
+from tests.datamodules.folder_format import write_data_set
+from tests.datamodules.shapes_format import write_tree
+from tests.datamodules.synthia_format import write_panoramas, write_views
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from datamodules.split_module import SplitDataModule
+    from tests.conftest import FabricateStanford
+
+NAME = "Küche 1 [b] 部屋 ∕ a,b=c"
+ERP = EquirectRepresentation(level=3)
+CROPS = PerspectiveRepresentation(level=5)
+BOTH: Any = ("rgb", "depth")
+SEQUENCES = {"01": 4, "02": 3, "04": 2}
+_OF_SYNTHIA: dict[str, Any] = {"train_sequences": ("01", "02"), "test_sequences": ("04",)}
+
+KINDS = ("folder", "stanford", "stanford photos", "omnisynthia", "synthia photos", "shapes")
+IMAGES = KINDS[:-1]
+
+
+def write(kind: str, root: Path, fabricate: FabricateStanford) -> Path:
+    """Write a data set of one of `KINDS`; returns its root."""
+    if kind == "folder":
+        return write_data_set(root, depth=True)
+    if kind == "shapes":
+        return write_tree(root)
+    if kind == "omnisynthia":
+        return write_panoramas(root, SEQUENCES)
+    if kind == "synthia photos":
+        return write_views(root, SEQUENCES)
+    return fabricate(root, photos=int(kind == "stanford photos"))
+
+
+def module(kind: str, root: Path, **settings: Any) -> SplitDataModule[Any]:
+    """Its data module, with depth."""
+    make: dict[str, Callable[..., SplitDataModule[Any]]] = {
+        "folder": lambda **more: FolderPanoramas(root, ERP, inputs=BOTH, **more),
+        "stanford": lambda **more: Stanford2D3DS(root, ERP, inputs=BOTH, **more),
+        "stanford photos": lambda **more: Stanford2D3DSPerspective(root, CROPS, **more),
+        "omnisynthia": lambda **more: OmniSynthia(root, ERP, inputs=BOTH, **_OF_SYNTHIA, **more),
+        "synthia photos": lambda **more: SynthiaPerspective(
+            root, CROPS, inputs=BOTH, **_OF_SYNTHIA, **more
+        ),
+        "shapes": lambda **more: ModelNet40(root, ERP, **more),
+    }
+    return make[kind](**settings)
+
+
+def colors(kind: str, root: Path) -> list[Path]:
+    """The files of the colours, or the meshes, in order."""
+    pattern = {
+        "folder": "images/**/*.*",
+        "stanford": "area_*/pano/rgb/*.png",
+        "stanford photos": "area_*/data/rgb/*.png",
+        "omnisynthia": "*/pano/RGB/*.png",
+        "synthia photos": "*/RGB/**/*.png",
+        "shapes": "**/*.off",
+    }
+    return sorted(root.glob(pattern[kind]))
+
+
+def partner(kind: str, path: Path, part: str) -> Path:
+    """The labels, the depth or the pose of an image.
+
+    Args:
+        kind: One of `KINDS`.
+        path: From `colors`.
+        part: ``labels``, ``depth`` or ``pose``.
+    """
+    if kind == "folder":
+        return path.parents[2] / part / path.parent.name / f"{path.stem}.png"
+    if kind.startswith("stanford"):
+        domain = "semantic" if part == "labels" else part
+        name = path.name.replace("domain_rgb", f"domain_{domain}")
+        other = path.parents[1] / domain / name
+        return other.with_suffix(".json") if part == "pose" else other
+    folder = {"depth": "Depth", "labels": "GT/LABELS"}[part]
+    folder += "_Correct" if (kind, part) == ("omnisynthia", "labels") else ""
+    place = path.parts.index("RGB")
+    return path.__class__(*path.parts[:place]) / folder / path.__class__(*path.parts[place + 1 :])
+
+
+def names(data: SplitDataModule[Any]) -> dict[str, list[str]]:
+    """What is in every split."""
+    sources = {split: data.open_split(split) for split in ("train", "val", "test")}
+    return {split: [s.name(index) for index in range(len(s))] for split, s in sources.items()}
+
+
+# --- what is done to files ------------------------------------------------------------------------
+
+
+def truncate(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-20])
+
+
+def corrupt(path: Path) -> None:
+    """Change bytes in the middle: the header, the chunks and the size stay as they are."""
+    content = bytearray(path.read_bytes())
+    middle = content.index(b"IDAT") + 12
+    content[middle : middle + 8] = bytes(255 - byte for byte in content[middle : middle + 8])
+    path.write_bytes(content)
+
+
+def change(path: Path, edit: Callable[[Any], Any]) -> None:
+    """Write an image with other pixels."""
+    image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+    path.write_bytes(cv2.imencode(".png", edit(image))[1].tobytes())
+
+
+def smaller(path: Path) -> None:
+    change(path, lambda image: image[::2, ::2])
+
+
+def to_8_bits(path: Path) -> None:
+    change(path, lambda image: (image >> 8).astype(np.uint8))
+
+
+def to_16_bits(path: Path) -> None:
+    change(path, lambda image: image.astype(np.uint16) << 8)
+
+
+def without_key(path: Path, key: str) -> None:
+    record = json.loads(path.read_bytes())
+    del record[key]
+    path.write_text(json.dumps(record))
+
+
+def link_to_itself(path: Path) -> None:
+    path.unlink()
+    path.symlink_to(path.name)
+
+
+def set_pixel(path: Path, value: Any) -> None:
+    def edit(image: Any) -> Any:
+        image[-1, -1] = value
+        return image
+
+    change(path, edit)

@@ -1,0 +1,83 @@
+"""Small trainings on files in the real format, whose network can be made to fail."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import lightning
+import torch
+from torch import Tensor, nn
+
+from datamodules.stanford2d3ds import Stanford2D3DS
+from tangent_train.rendering import TangentRepresentation
+from tangent_train.tasks import SegmentationTask
+from tangent_train.tasks.checkpoints import AtomicCheckpointIO, LastCheckpoint
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+
+class Faulty(nn.Module):
+    """A small network without batch statistics that does something wrong in one forward pass.
+
+    Args:
+        at: Which forward pass while training, from 0.
+        wrong: What happens to its scores then.
+    """
+
+    def __init__(
+        self, at: int = -1, wrong: Callable[[Tensor], Tensor] = lambda scores: scores * torch.nan
+    ) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        self.layer = nn.Conv2d(3, 14, 3, padding=1)
+        self.at = at
+        self.wrong = wrong
+        self.seen: list[Tensor] = []
+        self.weights: list[Tensor] = []
+
+    def forward(self, images: Tensor) -> Tensor:
+        scores: Tensor = self.layer(images)
+        if not self.training:
+            return scores
+        self.seen.append(images.detach().clone())
+        self.weights.append(self.layer.weight.detach().clone())
+        return self.wrong(scores) if len(self.seen) - 1 == self.at else scores
+
+
+def small_task(network: nn.Module, **settings: Any) -> SegmentationTask:
+    """A task on tangent images of the classes of Stanford2D3DS."""
+    optimizer = settings.pop("optimizer", partial(torch.optim.SGD, lr=0.01))
+    return SegmentationTask(
+        network,
+        TangentRepresentation(base_level=0, level=4),
+        Stanford2D3DS.class_names,
+        optimizer,
+        **{"class_weights": "none"} | settings,
+    )
+
+
+def small_data(root: Path, **settings: Any) -> Stanford2D3DS:
+    """Colours of panoramas of 32×64."""
+    settings = {"inputs": ["rgb"], "panoramas_per_step": 1, **settings}
+    return Stanford2D3DS(root, TangentRepresentation(base_level=0, level=4), **settings)
+
+
+def run_trainer(folder: Path, **settings: Any) -> lightning.Trainer:
+    """As runs make it, in a folder, without its pictures."""
+    last = LastCheckpoint(folder / "checkpoints", settings.pop("checkpoint_every", None))
+    settings["callbacks"] = [*settings.get("callbacks", []), last]
+    plugins = [AtomicCheckpointIO(), *settings.pop("plugins", [])]
+    common: dict[str, Any] = {
+        "accelerator": "cpu",
+        "default_root_dir": str(folder),
+        "enable_model_summary": False,
+        "enable_progress_bar": False,
+        "limit_val_batches": 0,
+        "logger": False,
+        "plugins": plugins,
+        "use_distributed_sampler": False,
+    }
+    return lightning.Trainer(**common | settings)

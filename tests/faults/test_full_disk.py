@@ -1,0 +1,270 @@
+"""Disks that are full: what was there stays, nothing half is left, and the message says what to do.
+
+A limit on the size of files is real and needs no rights; a small disk of its own is mounted where
+that is allowed.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import resource
+import shlex
+import subprocess
+import sys
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import lightning
+import numpy as np
+import pytest
+import torch
+from lightning.pytorch.loggers import TensorBoardLogger
+
+from datamodules.stanford2d3ds import Stanford2D3DS
+from tangent_train.cli.machine import machine_faults
+from tangent_train.files import NoRoomError, atomic_path, reserve, write_text
+from tangent_train.rendering import TangentRepresentation
+from tangent_train.tasks.checkpoints import AtomicCheckpointIO
+from tangent_train.tasks.metrics import ConfusionMatrices
+from tangent_train.tasks.results import evaluation_results, write_results
+from tests.faults.small_runs import Faulty, run_trainer, small_data, small_task
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+LIMIT = 1 << 16
+LARGE = 100_000
+COMMAND = Path(sys.executable).parent / "tangent-train"
+
+
+def _text(path: Path) -> None:
+    write_text(path, "x" * LARGE)
+
+
+def _torch(path: Path) -> None:
+    AtomicCheckpointIO().save_checkpoint({"weights": torch.zeros(LARGE)}, path)
+
+
+def _numpy(path: Path) -> None:
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        np.save(file, np.zeros(LARGE))
+
+
+def _mapped(path: Path) -> None:
+    with atomic_path(path) as temporary:
+        array = np.lib.format.open_memmap(temporary, "w+", np.float32, (LARGE,))
+        reserve(temporary)
+        array[:] = 1
+
+
+WRITERS: dict[str, Callable[[Path], None]] = {
+    "text": _text,
+    "torch": _torch,
+    "numpy": _numpy,
+    "mapped": _mapped,
+}
+
+
+@contextmanager
+def _small_files(limit: int = LIMIT) -> Iterator[None]:
+    """No file may become larger."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def _on_a_small_disk(
+    script: str, folder: Path, size: str = "64k"
+) -> subprocess.CompletedProcess[str]:
+    """Run a shell script in `folder`, with a disk of its own mounted at ``disk``."""
+    (folder / "disk").mkdir()
+    root = Path(__file__).parents[2]
+    mounted = f"mount -t tmpfs -o size={size} none disk\n{script}"
+    return subprocess.run(
+        ["unshare", "--user", "--map-root-user", "--mount", "sh", "-c", mounted],
+        check=False,
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": str(root)},
+        capture_output=True,
+        text=True,
+    )
+
+
+def _mounting_is_allowed() -> bool:
+    try:
+        return not subprocess.run(
+            ["unshare", "--user", "--map-root-user", "--mount", "true"],
+            check=False,
+            capture_output=True,
+        ).returncode
+    except OSError:
+        return False
+
+
+needs_a_disk = pytest.mark.skipif(
+    not sys.platform.startswith("linux") or not _mounting_is_allowed(),
+    reason="may not mount a disk",
+)
+
+ALL_WRITERS = """
+import os
+from pathlib import Path
+from tangent_train.files import NoRoomError
+from tests.faults.test_full_disk import WRITERS
+for name, write in WRITERS.items():
+    path = Path("disk", name)
+    path.write_text("old")
+    try:
+        write(path)
+    except NoRoomError as error:
+        print(name, error, path.read_text(), os.listdir("disk") == [name], sep="|")
+    path.unlink()
+"""
+
+
+@pytest.mark.parametrize("writer", WRITERS)
+def test_files_that_may_not_become_larger(tmp_path: Path, writer: str) -> None:
+    path = tmp_path / "file.ckpt"
+    path.write_text("old")
+    message = rf"{re.escape(str(path))}: found file too large .*Nothing .* has changed. Free some"
+    with _small_files(), pytest.raises(NoRoomError, match=message):
+        WRITERS[writer](path)
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@needs_a_disk
+def test_a_disk_that_is_full(tmp_path: Path) -> None:
+    done = _on_a_small_disk(f"{sys.executable} -c {shlex.quote(ALL_WRITERS)}", tmp_path)
+    assert done.returncode == 0, done.stderr
+    lines = [line.split("|") for line in done.stdout.splitlines()]
+    assert [line[0] for line in lines] == list(WRITERS)
+    for name, message, content, alone in lines:
+        assert message.startswith(f"disk/{name}: found no space left on device (0.0 GB free)")
+        assert (content, alone) == ("old", "True")
+
+
+def test_a_folder_that_cannot_be_made(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(OSError, match="File exists"):
+        write_text(tmp_path / "file" / "a", "x")
+
+
+def test_other_failures_are_not_taken_for_a_full_disk(tmp_path: Path) -> None:
+    for error in (RuntimeError("of a library"), OSError("without a number"), PermissionError(1)):
+
+        def fail(error: Exception = error) -> None:
+            with atomic_path(tmp_path / "a"):
+                raise error
+
+        with pytest.raises(type(error)) as caught:
+            fail()
+        assert caught.value is error
+
+
+def test_a_store_keeps_what_is_whole_and_goes_on(stanford_root: Path, tmp_path: Path) -> None:
+    store = tmp_path / "store"
+    representation = TangentRepresentation(base_level=0, level=4)
+    data = Stanford2D3DS(stanford_root, representation, store=store, inputs=["rgb"])
+    data.prepare_store(("test",))
+    before = {path: path.read_bytes() for path in store.rglob("*.panorama")}
+    assert len(before) == 5
+    smaller = min(map(len, before.values())) - 1
+    with _small_files(smaller), pytest.raises(NoRoomError, match=r"\.panorama: found file too"):
+        data.prepare_store()
+    files = {path for path in store.rglob("*") if path.is_file()}
+    assert files == set(before)
+    assert all(path.read_bytes() == content for path, content in before.items())
+    data.prepare_store(whole=("train", "val", "test"))
+    assert len(list(store.rglob("*.panorama"))) == 14
+
+
+def _results(figure: int) -> dict[str, Any]:
+    pixels = np.full((14, 14), figure)
+    bands = np.zeros((6, 14, 14), np.int64)
+    matrices = ConfusionMatrices(pixels, pixels.astype(float), bands, 5)
+    return evaluation_results(matrices, Stanford2D3DS.class_names, "skip")
+
+
+def test_results_that_do_not_fit_leave_the_old_ones(tmp_path: Path) -> None:
+    write_results(_results(1), tmp_path)
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    with _small_files(1000), pytest.raises(NoRoomError, match=r"results\.json: found"):
+        write_results(_results(2), tmp_path)
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+class Pictures(lightning.Callback):
+    """Logs a picture at every step."""
+
+    def on_train_batch_end(self, trainer: Any, *_: Any) -> None:
+        noise = np.random.default_rng(0).integers(0, 256, (3, 200, 200), np.uint8)
+        trainer.logger.experiment.add_image("noise", noise, trainer.global_step)
+
+
+@pytest.mark.filterwarnings("ignore:You defined a `validation_step`:UserWarning")
+def test_what_tensorboard_cannot_write_stops_with_a_checkpoint_to_go_on_from(
+    stanford_root: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    logger = TensorBoardLogger(tmp_path, name="", version="tensorboard")
+    trainer = run_trainer(tmp_path, max_epochs=9, logger=logger, callbacks=[Pictures()])
+    data = small_data(stanford_root)
+    message = rf"{re.escape(str(tmp_path))}: found file too large"
+    with (
+        pytest.raises(NoRoomError, match=message),
+        _small_files(3 * LIMIT),
+        machine_faults(tmp_path, data),
+    ):
+        trainer.fit(small_task(Faulty()), datamodule=data)
+    said = capfd.readouterr().err
+    assert f"tangent-train resume={tmp_path}" in said
+    assert "Exception in thread" not in said
+    content = torch.load(tmp_path / "checkpoints" / "last.ckpt", weights_only=True)
+    assert content["state_dict"]
+
+
+NETWORK = """
+_target_: torch.nn.Sequential
+_args_:
+  - {_target_: torch.nn.Conv2d, in_channels: 4, out_channels: 400, kernel_size: 9, padding: 4}
+  - {_target_: torch.nn.Conv2d, in_channels: 400, out_channels: 14, kernel_size: 1}
+"""
+
+
+@needs_a_disk
+@pytest.mark.slow
+def test_a_run_whose_disk_is_full_goes_on_when_there_is_room(
+    stanford_root: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "network").mkdir()
+    (tmp_path / "network" / "wide.yaml").write_text(NETWORK)
+    arguments = [
+        "--config-dir", ".", "network=wide", "data=stanford2d3ds", f"data.root={stanford_root}",
+        "level=4", "representation.crop_multiple=null", "trainer.max_epochs=2",
+        "trainer.accelerator=cpu", "panels=0", "tensorboard_images=0", "data.num_workers=0",
+        "task.class_weights=none", "hydra.run.dir=disk/run",
+    ]  # fmt: skip
+    # A checkpoint has 1.6 MB of weights and twice as much of Adam's state: two do not fit.
+    script = f"""
+    {COMMAND} {shlex.join(arguments)}; echo "status $?"
+    find disk -name '.partial*' -o -name last.ckpt -size +100k
+    mount -o remount,size=100m disk
+    {COMMAND} resume=disk/run; echo "status $?"
+    cp disk/run/results.json .
+    """
+    done = _on_a_small_disk(script, tmp_path, "4m")
+    assert done.stdout.count("status") == 2, done.stderr
+    first, last = done.stdout.split("status 1\n", 1)
+    assert "Results" not in first
+    assert last.startswith("disk/run/checkpoints/last.ckpt\n"), last
+    assert "status 0" in last, done.stderr
+    assert "Traceback" not in done.stderr
+    assert "disk/run/checkpoints/last.ckpt: found no space left on device" in done.stderr
+    assert "tangent-train resume=" in done.stderr
+    assert json.loads((tmp_path / "results.json").read_text())["images"] == 5

@@ -1,0 +1,102 @@
+"""What processes that are killed leave behind, and who removes it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tangent_train import files
+from tangent_train.files import atomic_path, write_text
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+SLOW_WRITER = """
+import sys, time
+from pathlib import Path
+from tangent_train.files import atomic_path
+with atomic_path(Path(sys.argv[1])) as temporary:
+    temporary.write_text("half")
+    print(temporary, flush=True)
+    time.sleep(600)
+"""
+
+
+@pytest.fixture(autouse=True)
+def new_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As if this process had not written anything yet."""
+    monkeypatch.setattr(files, "_tidied", set())
+
+
+@pytest.fixture
+def writer(tmp_path: Path) -> Iterator[tuple[subprocess.Popen[str], Path]]:
+    """A process in the middle of writing, and its temporary file."""
+    with subprocess.Popen(
+        [sys.executable, "-c", SLOW_WRITER, str(tmp_path / "file.txt")],
+        env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])},
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as process:
+        assert process.stdout is not None
+        yield process, Path(process.stdout.readline().strip())
+        process.kill()
+
+
+def _age(path: Path, hours: float) -> None:
+    then = time.time() - 3600 * hours
+    os.utime(path, (then, then))
+
+
+def test_what_a_killed_process_left_is_removed_by_the_next(
+    tmp_path: Path, writer: tuple[subprocess.Popen[str], Path]
+) -> None:
+    process, temporary = writer
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert temporary.read_text() == "half"
+    assert list(tmp_path.iterdir()) == [temporary], "no file that could be taken for a whole one"
+    _age(temporary, hours=2)
+    (tmp_path / "kept").mkdir()
+    (tmp_path / "kept" / ".partial-x").touch()
+    _age(tmp_path / "kept" / ".partial-x", hours=2)
+    write_text(tmp_path / "file.txt", "whole")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file.txt", "kept"]
+    assert (tmp_path / "kept" / ".partial-x").exists(), "only in the folder that is written to"
+
+
+def test_what_is_being_written_is_left_alone(
+    tmp_path: Path, writer: tuple[subprocess.Popen[str], Path]
+) -> None:
+    _, temporary = writer
+    _age(temporary, hours=100)  # a process that was stopped for days
+    write_text(tmp_path / "file.txt", "of another process")
+    assert temporary.read_text() == "half"
+
+
+def test_what_is_young_may_be_of_another_machine(tmp_path: Path) -> None:
+    (tmp_path / ".partial-young").touch()
+    _age(tmp_path / ".partial-young", hours=0.5)
+    (tmp_path / ".partial-folder").mkdir()
+    _age(tmp_path / ".partial-folder", hours=5)
+    write_text(tmp_path / "a", "x")
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "a",
+        ".partial-young",
+        ".partial-folder",
+    }
+
+
+def test_a_folder_is_looked_at_once(tmp_path: Path) -> None:
+    write_text(tmp_path / "a", "x")
+    (tmp_path / ".partial-old").touch()
+    _age(tmp_path / ".partial-old", hours=5)
+    with atomic_path(tmp_path / "b") as temporary:
+        temporary.write_text("x")
+    assert (tmp_path / ".partial-old").exists(), "thousands of files are not listed for each"

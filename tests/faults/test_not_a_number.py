@@ -1,0 +1,253 @@
+"""Losses and weights that are no numbers: training stops, keeps the batch, and harms nothing."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import pytest
+import torch
+from lightning.pytorch.plugins import MixedPrecision
+from torch import Tensor
+
+from datamodules.stanford2d3ds import Stanford2D3DS
+from tangent_train.errors import SettingError
+from tangent_train.tasks.divergence import BATCH_FILE
+from tests.faults.small_runs import Faulty, run_trainer, small_data, small_task
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+
+pytestmark = pytest.mark.filterwarnings("ignore:You defined a `validation_step`:UserWarning")
+
+FACES = 20
+
+
+def _batch(folder: Path) -> dict[str, Any]:
+    content: dict[str, Any] = torch.load(folder / BATCH_FILE, weights_only=True)
+    return content
+
+
+def _last(folder: Path) -> dict[str, Any]:
+    path = folder / "checkpoints" / "last.ckpt"
+    content: dict[str, Any] = torch.load(path, weights_only=True)
+    return content
+
+
+def _names_of_step(data: Stanford2D3DS, step: int) -> list[str]:
+    """What a step of the first epoch shows, by another loader."""
+    batch = list(data.train_dataloader())[step]
+    return [data.sample_name("train", index) for index in batch.index.tolist()]
+
+
+@pytest.mark.parametrize(
+    ("trainer", "settings", "at", "step"),
+    [
+        ({}, {}, 2, 2),
+        ({}, {"images_per_chunk": 7}, 2 * 3 + 1, 2),  # not the last part of its step
+        ({"accumulate_grad_batches": 2}, {}, 3, 1),  # the second batch of the second step
+    ],
+    ids=["plain", "in chunks", "accumulated"],
+)
+@pytest.mark.parametrize("value", [torch.nan, torch.inf], ids=str)
+def test_a_loss_that_is_no_number_stops_before_the_step(
+    stanford_root: Path,
+    tmp_path: Path,
+    trainer: dict[str, Any],
+    settings: dict[str, Any],
+    at: int,
+    step: int,
+    value: float,
+) -> None:
+    network = Faulty(at, lambda scores: scores.index_fill(1, torch.tensor([1]), value))
+    data = small_data(stanford_root)
+    expected = rf"loss of step {step} \(epoch 0, area_.*\): found (nan|inf), of images and weights"
+    with pytest.raises(SettingError, match=expected) as caught:
+        run_trainer(tmp_path, max_epochs=1, checkpoint_every=1, **trainer).fit(
+            small_task(network, **settings), datamodule=data
+        )
+    for word in ("optimizer.lr", "trainer.gradient_clip_val", str(tmp_path / BATCH_FILE)):
+        assert word in str(caught.value)
+    torch.testing.assert_close(network.layer.weight.detach(), network.weights[at], rtol=0, atol=0)
+    assert _last(tmp_path)["global_step"] == step
+    batch = _batch(tmp_path)
+    batches = step * trainer.get("accumulate_grad_batches", 1) + (1 if trainer else 0)
+    assert batch["names"] == _names_of_step(data, batches)
+    assert (batch["step"], batch["epoch"]) == (step, 0)
+    assert batch["images"].shape == (1, FACES, 3, 16, 16)
+    assert batch["labels"].shape == (1, FACES, 16, 16)
+    images = batch["images"].flatten(0, 1)
+    part = images[7:14] if settings else images
+    torch.testing.assert_close(part, network.seen[at], rtol=0, atol=0)
+
+
+def test_weights_that_are_no_numbers_never_replace_a_good_checkpoint(
+    stanford_root: Path, tmp_path: Path
+) -> None:
+    # The loss of a step is still a number, its gradient is not: that of a root at 0.
+    network = Faulty(1, lambda scores: scores + (scores * 0).sqrt())
+    task = small_task(network)
+    message = r"weights after step 2 \(epoch 0\): found .* in network\.layer\.weight, .*\.bias"
+    with pytest.raises(SettingError, match=message):
+        run_trainer(tmp_path, max_epochs=1, checkpoint_every=1).fit(
+            task, datamodule=small_data(stanford_root)
+        )
+    assert _last(tmp_path)["global_step"] == 1
+    assert all(tensor.isfinite().all() for tensor in _last(tmp_path)["state_dict"].values())
+
+
+def test_a_network_that_is_broken_already_is_said_to_be(
+    stanford_root: Path, tmp_path: Path
+) -> None:
+    network = Faulty(1, lambda scores: scores + (scores * 0).sqrt())
+    with pytest.raises(SettingError, match=r"loss of step 2 .* no numbers already, in network\."):
+        run_trainer(tmp_path, max_epochs=1).fit(
+            small_task(network), datamodule=small_data(stanford_root)
+        )
+    assert _last(tmp_path)["global_step"] == 0, "only that from the start"
+
+
+def test_a_statistic_of_batch_normalization_counts_as_a_weight(
+    stanford_root: Path, tmp_path: Path
+) -> None:
+    normalization: Any = torch.nn.BatchNorm2d(14)
+    normalization.running_var[3] = torch.nan
+    network = torch.nn.Sequential(Faulty(), normalization)
+    network.register_buffer("mask", torch.full((2,), -torch.inf))  # is one a network may have
+    with pytest.raises(SettingError, match=r"in network\.1\.running_var; expected numbers"):
+        run_trainer(tmp_path, max_epochs=1).fit(
+            small_task(network), datamodule=small_data(stanford_root)
+        )
+
+
+def test_images_that_are_no_numbers_are_named(
+    stanford_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = small_data(stanford_root)
+    normalized = data.normalized
+
+    def with_hole(batch: Any) -> Tensor:
+        images = normalized(batch)
+        images[0, 3, 1, 2, 5] = torch.nan
+        return images
+
+    monkeypatch.setattr(data, "normalized", with_hole)
+    with pytest.raises(SettingError, match="of images that hold values that are no numbers"):
+        run_trainer(tmp_path, max_epochs=1).fit(small_task(Faulty()), datamodule=data)
+    assert _batch(tmp_path)["images"].isnan().nonzero().tolist() == [[0, 3, 1, 2, 5]]
+
+
+class Scales(torch.nn.Module):
+    """Gradients of scores multiplied by a number in one backward pass."""
+
+    @staticmethod
+    def of(factor: float) -> Callable[[Tensor], Tensor]:
+        def grow(scores: Tensor) -> Tensor:
+            hooked: Any = scores
+            hooked.register_hook(lambda gradient: gradient * factor)
+            return scores
+
+        return grow
+
+
+def _half(device: str) -> tuple[dict[str, Any], Any]:
+    """Real half precision with a scaled loss, on the CPU as on a GPU."""
+    scaler = torch.amp.GradScaler(device, init_scale=2.0**14)
+    return {"plugins": [MixedPrecision("16-mixed", device, scaler)]}, scaler
+
+
+NO_GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+DEVICES = ["cpu", pytest.param("cuda", marks=[pytest.mark.gpu, NO_GPU])]
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_gradients_that_overflow_are_left_out_and_the_scale_shrinks(
+    stanford_root: Path, tmp_path: Path, device: str
+) -> None:
+    network = Faulty(1, Scales.of(1e38))
+    half, scaler = _half(device)
+    trainer = run_trainer(
+        tmp_path, max_steps=4, accelerator="gpu" if device == "cuda" else "cpu", devices=1, **half
+    )
+    trainer.fit(small_task(network), datamodule=small_data(stanford_root))
+    before, after, later = network.weights[1:4]
+    torch.testing.assert_close(before, after, rtol=0, atol=0)
+    assert not torch.equal(after, later), "and the next step is made"
+    assert scaler.get_scale() == 2.0**13
+    assert not (tmp_path / BATCH_FILE).exists()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_scores_beyond_half_precision_stop_and_another_precision_is_named(
+    stanford_root: Path, tmp_path: Path, device: str
+) -> None:
+    network = Faulty(1, lambda scores: scores * 1e6)  # beyond 65504
+    trainer = run_trainer(
+        tmp_path,
+        max_steps=4,
+        accelerator="gpu" if device == "cuda" else "cpu",
+        devices=1,
+        **_half(device)[0],
+    )
+    with pytest.raises(SettingError, match=r"loss of step 1 .* trainer\.precision=bf16-mixed"):
+        trainer.fit(small_task(network), datamodule=small_data(stanford_root))
+    assert _batch(tmp_path)["step"] == 1
+    exact = Faulty(1, lambda scores: scores * 1e6)
+    run_trainer(tmp_path / "exact", max_steps=4).fit(
+        small_task(exact, optimizer=partial(torch.optim.SGD, lr=1e-9)),
+        datamodule=small_data(stanford_root),
+    )
+    assert len(exact.seen) == 4, "as advised, it trains"
+
+
+ONE_OF_TWO = """
+import os
+import torch
+from tangent_train.cli.main import train
+from tangent_train.tasks import SegmentationTask
+
+original = SegmentationTask.loss_sums
+
+def loss_sums(self, inputs, labels):
+    sums = original(self, inputs, labels)
+    wrong = self.trainer.global_step == 2 and os.environ.get("LOCAL_RANK") == "1"
+    return sums * torch.nan if wrong else sums
+
+SegmentationTask.loss_sums = loss_sums
+if __name__ == "__main__":
+    train()
+"""
+
+
+@pytest.mark.slow
+def test_all_processes_stop_when_the_loss_of_one_is_no_number(
+    stanford_root: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "one_of_two.py").write_text(ONE_OF_TWO)
+    arguments = [
+        "data=stanford2d3ds", f"data.root={stanford_root}", "level=4", "network=unet_small",
+        "representation.crop_multiple=null", "data.panoramas_per_step=1", "data.num_workers=0",
+        "trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2", "trainer.max_epochs=2",
+        "panels=0", "data.validation_fraction=0.3", "hydra.run.dir=run",
+    ]  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, "one_of_two.py", *arguments],
+        check=False,
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert done.returncode == 1
+    assert "loss of step 2" in done.stderr
+    assert "Traceback" not in done.stderr
+    batches = [
+        torch.load(tmp_path / "run" / f"stopped_batch_{rank}.pt", weights_only=True)
+        for rank in (0, 1)
+    ]
+    assert batches[0]["names"] != batches[1]["names"], "each process keeps its own"
+    assert _last(tmp_path / "run")["global_step"] == 0

@@ -1,0 +1,157 @@
+"""Settings that cannot work are refused before any data is made or read, by name, with a remedy."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from tangent_train.cli import main
+from tests.tasks.prediction.trained import write_checkpoint
+
+ROOMS = ("train", "experiment=rooms/demo")
+PREDICT = ("predict", "checkpoint=x.ckpt", "input=image.png", "output=labels")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        # Misspelt.
+        (("train", "levl=5"), r"unknown setting: found 'levl'; .*Did you mean level\?"),
+        (("train", "optimizer.rl=1"), r"unknown setting: found 'optimizer.rl'; .*optimizer\.lr"),
+        (("train", "data=stanford"), r"unknown data: found 'stanford'; .*stanford2d3ds"),
+        (("train", "representation=tangents"), r"unknown representation: .*Did you mean tangent"),
+        (("train", "experiment=rooms/dmo"), r"unknown experiment: .*Did you mean rooms/demo"),
+        (("train", "level"), r"override 'level': found no override; expected setting=value"),
+        (("predict", "inputs=a"), r"unknown setting: found 'inputs'; .*Did you mean input"),
+        (("study", "fob"), r"unknown study: found 'fob'; .*Did you mean fov"),
+        # Levels and images.
+        (("train", "level=2", "representation.base_level=2"), r"dim: found 1; expected at least 2"),
+        (("train", "level=2", "representation.base_level=3"), r"base_level: found 3; .* level = 2"),
+        (("train", "level=20"), r"level: found 20; expected a whole number from 0 to 13"),
+        (("train", "level=5.5"), r"level: found 5\.5; expected a whole number"),
+        (("train", "representation.base_level=-1"), r"base_level: found -1; expected 0 to"),
+        (("train", "representation.dim=3"), r"dim: found 3; expected at least 24"),
+        (("train", "level=4"), r"image size for the UNet: found 16×16; .*multiples of 32"),
+        (("train", "network=hexunet", "level=3"), r"size for the HexUNet: found 8×8; .*of 16"),
+        (
+            (*ROOMS, "representation.faces_per_panorama=99"),
+            r"representation\.faces_per_panorama: found 99; expected 1 to 20",
+        ),
+        ((*ROOMS, "representation.faces_per_panorama=0"), r"faces_per_panorama: found 0; exp"),
+        (("train", "representation.blend=soft"), r"\.blend: found 'soft'; .*nearest, feather"),
+        (("train", "representation.rotation=any"), r"\.rotation: found 'any'; .*none, yaw, so3"),
+        # Classes, inputs and networks.
+        ((*ROOMS, "network.num_classes=5"), r"scores of the network: found .*5.*; expected .*14"),
+        ((*ROOMS, "network.in_channels=3"), r"network: found UNet, which does not take .*4, "),
+        (
+            (*ROOMS, "data.inputs=[rgb]", "network.in_channels=4"),
+            r"network: found UNet, which does not take \(1, 3, 48, 48\)",
+        ),
+        ((*ROOMS, "data.inputs=[depth,rgbd]"), r"data\.inputs: found .*; expected a list: rgb"),
+        ((*ROOMS, "task.class_weights=[1,2]"), r"class_weights: found 2 numbers; expected 14"),
+        ((*ROOMS, "task.class_weights=logg"), r"class_weights: found logg; expected .*log, sqrt"),
+        ((*ROOMS, "task=classification"), r"task: found classification, .*; expected segment"),
+        (
+            ("train", "experiment=shapes/default", "task=segmentation"),
+            r"task: found segmentation, .*; expected classification",
+        ),
+        ((*ROOMS, "network._target_=no.such.Net"), r"network\._target_: found no\.such\.Net, .*P"),
+        ((*ROOMS, "network=fcn_resnet", "network.depth=77"), r"depth: found 77; expected 50 or 1"),
+        # Folds and amounts.
+        ((*ROOMS, "data.fold=4"), r"data\.fold: found 4; expected 1, 2 or 3"),
+        ((*ROOMS, "data.panoramas_per_step=0"), r"panoramas_per_step: found 0; expected 1 or"),
+        ((*ROOMS, "data.validation_fraction=1"), r"validation_fraction: found 1; expected 0 to b"),
+        ((*ROOMS, "data.num_workers=-1"), r"num_workers: found -1; expected 0 or more"),
+        ((*ROOMS, "data.max_tilt_deg=400"), r"max_tilt_deg: found 400; expected .*180"),
+        ((*ROOMS, "data.rooms.height=7"), r"height: found 7; expected"),
+        # Training.
+        ((*ROOMS, "optimizer.lr=-1"), r"optimizer: found optimizer\.lr=-1, .*AdamW takes"),
+        ((*ROOMS, "optimizer.lr=fast"), r"optimizer: found optimizer\.lr=fast, .*; expected"),
+        ((*ROOMS, "+optimizer.speed=1"), r"optimizer: found .*optimizer\.speed=1.*; expected"),
+        ((*ROOMS, "scheduler.pct_start=7"), r"scheduler: found .*scheduler\.pct_start=7.*; exp"),
+        ((*ROOMS, "optimizer.lrr=1"), r"unknown setting: found 'optimizer\.lrr'; .*optimizer\.lr"),
+        ((*ROOMS, "trainer.max_epochs=0"), r"trainer\.max_epochs: found 0; expected .* from 1"),
+        ((*ROOMS, "trainer.max_epochs=two"), r"trainer\.max_epochs: found two; expected"),
+        ((*ROOMS, "trainer.precision=8"), r"trainer: found .*Precision 8.*; expected settings"),
+        ((*ROOMS, "trainer.accelerator=quantum"), r"trainer: found .*'quantum'.*; expected"),
+        ((*ROOMS, "trainer.devices=0"), r"trainer: found .*devices=0.*; expected"),
+        ((*ROOMS, "trainer.gradient_clip_val=-1"), r"gradient_clip_val: found -1; expected"),
+        ((*ROOMS, "trainer.accumulate_grad_batches=0"), r"accumulate_grad_batches: found 0; exp"),
+        ((*ROOMS, "task.label_smoothing=2"), r"label_smoothing: found 2; expected 0 to 1"),
+        ((*ROOMS, "task.images_per_chunk=0"), r"images_per_chunk: found 0; expected .* from 1"),
+        ((*ROOMS, "ema=2"), r"ema: found 2; expected a decay"),
+        ((*ROOMS, "panels=-1"), r"panels: found -1; expected 0 or more"),
+        ((*ROOMS, "checkpoint_every_n_steps=0"), r"checkpoint_every_n_steps: found 0; expected"),
+        ((*ROOMS, "seed=-1"), r"seed: found -1; expected a whole number from 0"),
+        ((*ROOMS, "seed=x"), r"seed: found x; expected a whole number"),
+        # Files.
+        (("evaluate", "checkpoint=nowhere.ckpt"), r"nowhere\.ckpt: found no such file; expected"),
+        (("evaluate",), r"checkpoint: found none; expected a checkpoint"),
+        (("evaluate", "checkpoint=."), r"found a folder; .*checkpoints/best\.ckpt"),
+        ((*ROOMS, "init_from=nowhere.ckpt"), r"nowhere\.ckpt: found no such file; expected"),
+        ((*ROOMS, "init_from=x.ckpt"), r"x\.ckpt: found no tensor that fits.*; expected"),
+        (("train", "resume=nowhere"), r"nowhere: found no checkpoints/last\.ckpt; expected"),
+        (("train", "data=stanford2d3ds", "data.root=nowhere"), r"nowhere.*: found .*; expected"),
+        (("predict", "checkpoint=x.ckpt", "input=image.png"), r"output: found none; expected"),
+        (("predict", "checkpoint=x.ckpt", "input=nothing", "output=o"), r"nothing: found nothing"),
+        ((*PREDICT, "blend=soft"), r"blend: found soft; expected feather or nearest"),
+        ((*PREDICT, "rotations=0"), r"rotations: found 0; expected a whole number, 1 or more"),
+        ((*PREDICT, "fov=65"), r"fov: found 65; .*Add projection=perspective"),
+        ((*PREDICT, "depth=."), r"depth: found \.; expected none, for a network that takes RGB"),
+        (("export", "checkpoint=x.ckpt", "output=net.doc"), r"output: found net\.doc; expected"),
+        (("transfer", "-m", "seed=0,1"), r"-m: found a sweep; expected folds="),
+        (("report", "nowhere"), r"nowhere: found no such folder; expected a run"),
+        (("render", "input=image.png", "output=o", "level=2", "base_level=5"), r"level: found 2"),
+        ((*PREDICT, "device=quantum"), r"device: found quantum .*; expected cpu, or a device"),
+        ((*PREDICT, "base_level=7"), r"base_level: found 7; expected 0 to level = 4"),
+        (("transfer", "experiment=rooms/transfer", "level=3"), r"stage S: image size .*found 4×4"),
+        (("keypoints", "output=o", "base_level=[0,x]"), r"base_level: found .*; expected"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, tuple) else "",
+)
+def test_impossible_settings(
+    arguments: tuple[str, ...], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_checkpoint(tmp_path / "x.ckpt")
+    (tmp_path / "image.png").touch()
+    command, *rest = arguments
+    monkeypatch.setattr(sys, "argv", [f"tangent-{command}", *rest])
+    with pytest.raises(SystemExit, match=rf"(?s)^tangent-{command}: .*{message}"):
+        getattr(main, command)()
+    assert not (tmp_path / "data").exists(), "nothing is made"
+
+
+def test_a_typing_mistake_is_answered_before_anything_heavy_is_imported(tmp_path: Path) -> None:
+    code = (
+        "import sys; from tangent_train.cli.main import train\n"
+        "sys.argv = ['tangent-train', 'levl=5']\n"
+        "try:\n    train()\nexcept SystemExit as refused:\n    print(refused)\n"
+        "assert not {'torch', 'lightning', 'cv2', 'numba'} & set(sys.modules), 'heavy import'"
+    )
+    start = time.monotonic()
+    done = subprocess.run(
+        [sys.executable, "-c", code], check=False, cwd=tmp_path, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Did you mean level?" in done.stdout
+    assert time.monotonic() - start < 20
+
+
+def test_a_network_for_more_inputs_than_the_data_has(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An RGB-D network on data of colours only."""
+    path = write_checkpoint(tmp_path / "x.ckpt", channels=4)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "image.png").touch()
+    monkeypatch.setattr(sys, "argv", ["tangent-predict", *PREDICT[1:]])
+    with pytest.raises(SystemExit, match=r"depth: found none; .*data\.inputs=\[rgb\]"):
+        main.predict()
+    content = torch.load(path, weights_only=True)
+    assert content["state_dict"]["network.weight"].shape[1] == 4

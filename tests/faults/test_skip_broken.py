@@ -1,0 +1,407 @@
+"""What is broken is told before training, or left out and counted if that is asked for."""
+
+from __future__ import annotations
+
+import sys
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from lightning.pytorch.trainer.states import TrainerFn
+
+from datamodules import data_check
+from tangent_train.cli import main
+from tangent_train.errors import DataError, SettingError
+from tests.datamodules.folder_format import write_classes
+from tests.faults import data_sets as sets
+from tests.faults.data_sets import colors, module, names, partner, write
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from datamodules.split_module import SplitDataModule
+    from tests.conftest import FabricateStanford
+
+PANORAMAS = ("folder", "stanford", "omnisynthia")
+
+
+def _as_in_training(data: SplitDataModule[Any]) -> SplitDataModule[Any]:
+    """As Lightning leaves it when `Trainer.fit` asks it to prepare its data."""
+    trainer: Any = SimpleNamespace(state=SimpleNamespace(fn=TrainerFn.FITTING))
+    data.trainer = trainer
+    return data
+
+
+def _damage(kind: str, root: Path) -> tuple[Path, Path]:
+    """An image whose header tells that it is broken, and one that has to be read for that."""
+    paths = [path for path in colors(kind, root) if kind != "folder" or path.suffix == ".png"]
+    cut, corrupted = paths[0], partner(kind, paths[-1], "labels")
+    sets.truncate(cut)
+    sets.corrupt(corrupted)
+    return cut, corrupted
+
+
+def _first_of(data: SplitDataModule[Any]) -> Any:
+    data.prepare_all()
+    return data.source("train").read(0)
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    return tmp_path / sets.NAME
+
+
+# --- left out -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", sets.IMAGES)
+def test_what_is_broken_is_left_out_and_counted(
+    kind: str, root: Path, fabricate_stanford: FabricateStanford, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write(kind, root, fabricate_stanford)
+    before = names(module(kind, root))
+    total = sum(map(len, before.values()))
+    _damage(kind, root)
+    capsys.readouterr()
+    data = module(kind, root, skip_broken=True)
+    data.prepare_all()
+    after = names(data)
+    printed = [line for line in capsys.readouterr().out.splitlines() if "left out" in line]
+    assert printed == [
+        f"2 of {total} {data.noun} are broken and left out (data.skip_broken=true); "
+        "tangent-check lists them."
+    ]
+    assert sum(map(len, after.values())) == total - 2
+    for split in before:
+        assert [name for name in before[split] if name in after[split]] == after[split]
+        source: Any = data.open_split(split)  # type: ignore[arg-type]
+        for index, name in enumerate(after[split]):
+            assert source.name(index) == name
+            assert source.read(index).labels.shape == source.read(index).rgb.shape[:2]
+    with pytest.raises(DataError, match="parts missing"):
+        module(kind, root).prepare_all()
+
+
+@pytest.mark.parametrize("kind", sets.IMAGES)
+def test_nothing_is_said_of_a_good_data_set(
+    kind: str, root: Path, fabricate_stanford: FabricateStanford, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write(kind, root, fabricate_stanford)
+    data = module(kind, root, skip_broken=True)
+    data.prepare_all()
+    assert names(data) == names(module(kind, root))
+    assert "left out" not in capsys.readouterr().out
+
+
+def test_broken_meshes_are_refused_or_left_out(
+    root: Path, fabricate_stanford: FabricateStanford, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write("shapes", root, fabricate_stanford)
+    before = names(module("shapes", root))
+    broken = [colors("shapes", root)[0], colors("shapes", root)[-1]]
+    for path in broken:
+        sets.truncate(path)
+    with pytest.raises(DataError, match="found 2 problems") as caught:
+        module("shapes", root).prepare_all()
+    assert all(str(path) in str(caught.value) for path in broken)
+    capsys.readouterr()
+    data = module("shapes", root, skip_broken=True)
+    data.prepare_all()
+    total = sum(map(len, before.values()))
+    assert f"2 of {total} shapes are broken and left out" in capsys.readouterr().out
+    gone = {str(path.relative_to(root).with_suffix("")) for path in broken}
+    after = names(data)
+    assert after == {split: [n for n in all_ if n not in gone] for split, all_ in before.items()}
+
+
+def test_a_split_that_has_nothing_left(root: Path, fabricate_stanford: FabricateStanford) -> None:
+    write("folder", root, fabricate_stanford)
+    (root / "test.txt").write_text("scene_0/view.0")
+    sets.corrupt(root / "labels" / "scene_0" / "view.0.png")
+    with pytest.raises(DataError, match=r"no panoramas for test that can be used"):
+        module("folder", root, skip_broken=True).setup()
+
+
+def test_a_missing_area_cannot_be_left_out(
+    root: Path, fabricate_stanford: FabricateStanford
+) -> None:
+    """Nobody asked for another fold."""
+    write("stanford", root, fabricate_stanford)
+    (root / "area_6").rename(root / "area_7")
+    sets.truncate(colors("stanford", root)[0])
+    with pytest.raises(DataError, match=r"found 2 problems(.|\n)*no area_6"):
+        module("stanford", root, skip_broken=True).setup()
+
+
+def test_a_level_that_no_panorama_has_is_said_once(
+    root: Path, fabricate_stanford: FabricateStanford
+) -> None:
+    write("stanford", root, fabricate_stanford)
+    data = module("stanford", root)
+    data.erp_height = 64  # type: ignore[attr-defined]
+    with pytest.raises(SettingError, match=r"representation\.erp_height: found 64") as caught:
+        data.setup()
+    assert "\n" not in str(caught.value)
+
+
+def test_frames_of_synthia_whose_views_are_broken(
+    tmp_path: Path, fabricate_stanford: FabricateStanford, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = write("synthia photos", tmp_path, fabricate_stanford)
+    views = colors("synthia photos", root)
+    sets.truncate(views[0])
+    sets.corrupt(views[1])
+    with pytest.raises(DataError, match="found 2 problems") as caught:
+        module("omnisynthia", root, panorama_height=32).prepare_all()
+    assert all(str(view) in str(caught.value) for view in views[:2])
+    data = module("omnisynthia", root, panorama_height=32, skip_broken=True)
+    data.prepare_all()
+    assert "2 of 9 panoramas are broken and left out" in capsys.readouterr().out
+    assert sum(map(len, names(data).values())) == 7
+
+
+# --- with a store and in memory -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", PANORAMAS)
+def test_a_store_has_no_holes_unless_they_are_asked_for(
+    kind: str, root: Path, fabricate_stanford: FabricateStanford, tmp_path: Path
+) -> None:
+    write(kind, root, fabricate_stanford)
+    total = len(colors(kind, root))
+    broken = [partner(kind, path, "labels") for path in (colors(kind, root)[i] for i in (5, -1))]
+    for path in broken:
+        sets.corrupt(path)
+    store = tmp_path / "store"
+    data = module(kind, root, store=store)
+    with pytest.raises(DataError, match="found 2 problems") as caught:
+        data.prepare_all()
+    assert all(str(path) in str(caught.value) for path in broken), "not only the first"
+    assert len(list(store.rglob("*.panorama"))) == total - 2, "what can be made is made"
+    data = module(kind, root, store=store, skip_broken=True)
+    data.prepare_all()
+    assert sum(map(len, names(data).values())) == total - 2
+    for split in ("train", "val", "test"):
+        source = data.source(split)
+        for index in range(len(source)):
+            assert source.read(index).rgb.shape == (16, 32, 3)
+
+
+def test_a_store_that_is_made_is_not_read_again_for_what_is_broken(
+    root: Path,
+    fabricate_stanford: FabricateStanford,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    write("stanford", root, fabricate_stanford)
+    settings: dict[str, Any] = {"store": tmp_path / "store", "skip_broken": True}
+    module("stanford", root, **settings).prepare_all()
+
+    def refuse(*_: Any) -> None:
+        raise AssertionError("all of it is in the store")
+
+    monkeypatch.setattr("datamodules.stanford2d3ds.read_color_png", refuse)
+    data = module("stanford", root, **settings)
+    data.prepare_all()
+    assert len(data.source("train")) > 0
+
+
+def test_labels_past_the_table_do_not_get_into_a_store_or_memory(
+    root: Path, fabricate_stanford: FabricateStanford, tmp_path: Path
+) -> None:
+    write("stanford", root, fabricate_stanford)
+    path = partner("stanford", colors("stanford", root)[0], "labels")
+    sets.set_pixel(path, [521 & 255, 521 >> 8, 0])
+    for settings in ({"store": tmp_path / "store"}, {"in_memory": True}):
+        data = module("stanford", root, validation_fraction=0, **settings)
+        with pytest.raises(DataError, match="instance 521"):
+            _first_of(data)
+
+
+def test_all_that_is_broken_is_told_when_it_is_read_into_memory(
+    root: Path, fabricate_stanford: FabricateStanford
+) -> None:
+    write("folder", root, fabricate_stanford)
+    (root / "test.txt").write_text("scene_0/view.0")
+    broken = [root / "labels" / f"scene_{scene}" / "view.1.png" for scene in (1, 2)]
+    for path in broken:
+        sets.corrupt(path)
+    data = module("folder", root, in_memory=True, validation_fraction=0)
+    with pytest.raises(DataError, match="found 2 problems") as caught:
+        data.source("train")
+    assert all(str(path) in str(caught.value) for path in broken)
+
+
+# --- as training begins -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", sets.IMAGES)
+def test_training_begins_with_a_look_at_some_images_of_all_splits(
+    kind: str,
+    root: Path,
+    fabricate_stanford: FabricateStanford,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(data_check, "SAMPLED", 100)
+    write(kind, root, fabricate_stanford)
+    _as_in_training(module(kind, root)).prepare_data()
+    broken = [partner(kind, path, "labels") for path in colors(kind, root)[1::3]]
+    for path in broken:
+        sets.corrupt(path)
+    assert len(broken) > 2
+    with pytest.raises(DataError, match=f"found {len(broken)} problems") as caught:
+        _as_in_training(module(kind, root)).prepare_data()
+    text = str(caught.value)
+    assert all(str(path) in text for path in broken), "all of these are looked at"
+    assert "tangent-check" in text
+    assert "data.skip_broken=true" in text
+
+
+def test_labels_past_the_table_are_seen_as_training_begins(
+    root: Path, fabricate_stanford: FabricateStanford
+) -> None:
+    write("folder", root, fabricate_stanford)
+    write_classes(root, [None, "wall", "floor", "floor 2"])
+    with pytest.raises(DataError, match="value 4 in"):
+        _as_in_training(module("folder", root)).prepare_data()
+
+
+class _Source:
+    """Images that note which of them are read."""
+
+    def __init__(self, split: str, length: int, seen: list[tuple[str, int]]) -> None:
+        self.split = split
+        self.length = length
+        self.seen = seen
+
+    def __len__(self) -> int:
+        return self.length
+
+    def read(self, index: int) -> None:
+        self.seen.append((self.split, index))
+
+
+def _seen(seed: int) -> list[tuple[str, int]]:
+    seen: list[tuple[str, int]] = []
+    lengths = {"train": 1000, "val": 100, "test": 400}
+    sources = {split: _Source(split, length, seen) for split, length in lengths.items()}
+    data: Any = SimpleNamespace(
+        find_splits=lambda: sources, skip_broken=False, seed=seed, root="data"
+    )
+    data_check.find_usable(data, ("train", "val", "test"))
+    return seen
+
+
+def test_the_look_is_short_and_goes_everywhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    first = _seen(seed=0)
+    assert len(first) == len(set(first)) == data_check.SAMPLED
+    counts = [sum(s == split for s, _ in first) for split in ("train", "val", "test")]
+    assert np.abs(np.array(counts) - np.array([1000, 100, 400]) * 32 / 1500).max() <= 1
+    assert set(_seen(seed=1)) != set(first), "other runs look at others"
+    assert set(_seen(seed=0)) == set(first)
+    monkeypatch.setattr(data_check, "_SECONDS", -1)
+    assert 0 < len(_seen(seed=0)) < data_check.SAMPLED, "images may be large, and disks slow"
+
+
+@pytest.mark.parametrize(
+    ("settings", "splits"),
+    [
+        ({}, ("train", "val", "test")),
+        ({"in_memory": True}, ("test",)),
+        ({"store": "store"}, ()),
+    ],
+)
+def test_what_is_read_anyway_is_not_read_twice(
+    settings: dict[str, Any],
+    splits: tuple[str, ...],
+    root: Path,
+    fabricate_stanford: FabricateStanford,
+) -> None:
+    write("stanford", root, fabricate_stanford)
+    assert tuple(module("stanford", root, **settings).sampled_splits()) == splits
+
+
+# --- the commands -------------------------------------------------------------------------------
+
+
+def _run(monkeypatch: pytest.MonkeyPatch, command: str, *arguments: str) -> None:
+    monkeypatch.setattr(sys, "argv", [f"tangent-{command}", *arguments])
+    getattr(main, command)()
+
+
+def test_a_training_refuses_then_goes_on_without(
+    tmp_path: Path,
+    fabricate_stanford: FabricateStanford,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    root = write("folder", tmp_path / "my rooms", fabricate_stanford)
+    (root / "test.txt").write_text("scene_0/view.0\nscene_0/view.1")
+    broken = [root / "labels" / f"scene_{scene}" / "view.0.png" for scene in (0, 2)]
+    for path in broken:
+        sets.corrupt(path)
+    arguments = ["data=folder", "level=4", "network=unet_small", "network.widths=[4,8]"]
+    arguments += ["representation.base_level=0", "data.num_workers=0", f"data.root='{root}'"]
+    arguments += ["trainer.max_epochs=1", "trainer.accelerator=cpu", "panels=0"]
+    with pytest.raises(SystemExit, match="found 2 problems") as caught:
+        _run(monkeypatch, "train", *arguments, "hydra.run.dir=run")
+    assert all(str(path) in str(caught.value) for path in broken)
+    assert not list((tmp_path / "run").rglob("*.ckpt"))
+    _run(monkeypatch, "train", *arguments, "hydra.run.dir=run", "data.skip_broken=true")
+    left_out = "2 of 12 panoramas are broken and left out (data.skip_broken=true)"
+    assert left_out in capsys.readouterr().out
+    checkpoint = f"checkpoint={tmp_path / 'run/checkpoints/last.ckpt'}"
+    _run(monkeypatch, "evaluate", checkpoint, "hydra.run.dir=again")
+    assert left_out in capsys.readouterr().out
+    for folder in ("run", "again"):
+        assert '"images": 1' in (tmp_path / folder / "results.json").read_text()
+
+
+def test_the_command_lists_problems_line_by_line(
+    tmp_path: Path,
+    fabricate_stanford: FabricateStanford,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    root = write("stanford", tmp_path / sets.NAME, fabricate_stanford)
+    arguments = ("data=stanford2d3ds", "level=3", f"data.root='{root}'")
+    _run(monkeypatch, "check", *arguments)
+    assert "Nothing is wrong; 14 panoramas" in capsys.readouterr().out
+    cut, corrupted = _damage("stanford", root)
+    with pytest.raises(SystemExit) as left:
+        _run(monkeypatch, "check", *arguments, "data.skip_broken=true")
+    assert left.value.code == 1
+    captured = capsys.readouterr()
+    lines = [line.split("\t") for line in captured.out.splitlines()]
+    assert [line[0] for line in lines] == sorted([str(cut), str(corrupted)])
+    assert lines[0][1:] == [
+        f"{cut.stat().st_size} bytes, parts missing; expected a whole PNG",
+        "Copy or extract the file again.",
+    ]
+    assert "2 problems; 13 panoramas" in captured.err
+
+
+def test_the_command_shows_a_table_on_a_terminal(
+    tmp_path: Path,
+    fabricate_stanford: FabricateStanford,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setenv("COLUMNS", "72")
+    root = write("folder", tmp_path / "rooms", fabricate_stanford)
+    strange = root / "images" / "scene_0" / "[red]line\nend\x1b[2J\udcff.png"
+    strange.write_bytes(b"nothing")
+    with pytest.raises(SystemExit):
+        _run(monkeypatch, "check", "data=folder", "level=3", f"data.root='{root}'")
+    printed = capsys.readouterr().out
+    assert "\x1b[2J" not in printed, "no command to the terminal"
+    rows = [line.split("│") for line in printed.splitlines() if line.startswith("│")]
+    path = "".join(cells[1].strip() for cells in rows)
+    assert str(root) in path, "folded, not cut"
+    assert r"[red]line\nend\x1b[2J\udcff.png" in path
+    assert "problem" in printed

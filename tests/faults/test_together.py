@@ -1,0 +1,177 @@
+"""Several processes that prepare, make or read the same files at the same time."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import zlib
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from pathlib import Path
+from threading import Barrier
+from typing import TYPE_CHECKING, Any
+
+import pytest
+import torch
+
+from datamodules.made_folders import claim_folder
+from datamodules.stanford2d3ds import Stanford2D3DS
+from datamodules.store_files import write_stored
+from datamodules.synthrooms.generate import generate_rooms
+from datamodules.synthrooms.settings import RoomSettings
+from tangent_train.errors import DataError
+from tangent_train.rendering import TangentRepresentation
+
+if TYPE_CHECKING:
+    from multiprocessing.context import ForkServerContext
+
+PROCESSES = 3
+PANORAMAS = 14
+
+
+@pytest.fixture(scope="module")
+def processes() -> ForkServerContext:
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(
+        ["datamodules.stanford2d3ds", "datamodules.synthrooms.generate", "tangent_train.rendering"]
+    )
+    return context
+
+
+def _data(root: Path, store: Path | None) -> Stanford2D3DS:
+    representation = TangentRepresentation(base_level=0, level=4)
+    return Stanford2D3DS(root, representation, store=store, panoramas_per_step=1)
+
+
+def _samples(data: Stanford2D3DS) -> int:
+    """A checksum of all that a training and a test see."""
+    checksum = 0
+    for batch in (*data.train_dataloader(), *data.test_dataloader()):
+        for part in batch:
+            for tensor in part if isinstance(part, list) else [part]:
+                checksum = zlib.crc32(tensor.contiguous().numpy().tobytes(), checksum)
+    return checksum
+
+
+def _prepare_and_read(root: Path, store: Path, barrier: Any) -> tuple[int, int]:
+    torch.set_num_threads(1)
+    data = _data(root, store)
+    barrier.wait()
+    data.prepare_data()
+    return len(list(store.rglob("[!.]*.panorama"))), _samples(data)
+
+
+@pytest.mark.slow
+def test_runs_that_prepare_the_same_store_at_once_see_the_same(
+    stanford_root: Path, tmp_path: Path, processes: ForkServerContext
+) -> None:
+    store = tmp_path / "store"
+    with processes.Manager() as manager, ProcessPoolExecutor(PROCESSES, processes) as pool:
+        barrier = manager.Barrier(PROCESSES)
+        runs = [
+            pool.submit(_prepare_and_read, stanford_root, store, barrier) for _ in range(PROCESSES)
+        ]
+        found = [run.result() for run in runs]
+    assert found == [(PANORAMAS, _samples(_data(stanford_root, None)))] * PROCESSES
+    assert not list(store.rglob(".partial*"))
+    data = _data(stanford_root, store)
+    before = {path: path.stat().st_mtime_ns for path in store.rglob("*.panorama")}
+    data.prepare_store(whole=("train", "val", "test"))
+    assert {path: path.stat().st_mtime_ns for path in before} == before, "all are whole"
+
+
+def _prepare_and_die(root: Path, store: Path, barrier: Any) -> None:
+    write, paths = write_stored, []
+
+    def fall(path: Path, *content: Any) -> None:
+        paths.append(path)
+        if len(paths) == 5:
+            barrier.wait()
+            os.kill(os.getpid(), signal.SIGKILL)
+        write(path, *content)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("datamodules.store.write_stored", fall)
+        _data(root, store).prepare_data()
+
+
+@pytest.mark.slow
+def test_a_run_that_is_killed_while_it_prepares_harms_no_other(
+    stanford_root: Path, tmp_path: Path, processes: ForkServerContext
+) -> None:
+    store, barrier = tmp_path / "store", processes.Barrier(2)
+    killed = processes.Process(target=_prepare_and_die, args=(stanford_root, store, barrier))
+    killed.start()
+    barrier.wait(120)
+    _data(stanford_root, store).prepare_data()
+    killed.join()
+    assert killed.exitcode == -signal.SIGKILL
+    data = _data(stanford_root, store)
+    data.prepare_store(whole=("train", "val", "test"))
+    assert len(list(store.rglob("[!.]*.panorama"))) == PANORAMAS
+    assert _samples(data) == _samples(_data(stanford_root, None))
+
+
+def test_what_is_made_by_two_at_once_is_claimed_by_both(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The other one claims the folder and makes its first file just after this one has looked.
+    root = tmp_path / "rooms"
+    looked: list[Path] = []
+    really_exists = Path.exists
+
+    def exists(path: Path) -> bool:
+        found = really_exists(path)
+        if path.name == "manifest.json" and not looked:
+            looked.append(path)
+            _claim(root)
+            (root / "area_1").mkdir()
+        return found
+
+    monkeypatch.setattr(Path, "exists", exists)
+    _claim(root)
+    assert looked
+    _claim(root)
+
+
+def _claim(root: Path) -> None:
+    claim_folder(root, "manifest.json", "SynthRooms", 1, {"seed": 0})
+
+
+@pytest.mark.parametrize("number", range(20))
+def test_many_may_claim_a_folder_at_the_same_moment(tmp_path: Path, number: int) -> None:
+    root, barrier = tmp_path / str(number), Barrier(4)
+
+    def claim(who: int) -> None:
+        barrier.wait()
+        _claim(root)
+        (root / f"area_{who}").mkdir()
+
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(claim, range(4)))
+    (root / "manifest.json").unlink()
+    with pytest.raises(DataError, match="files that are not SynthRooms"):
+        _claim(root)
+
+
+def _make(root: Path, barrier: Any) -> None:
+    barrier.wait()
+    generate_rooms(root, RoomSettings(rooms={"area_1": 2, "area_5a": 1}, height=32), workers=0)
+
+
+@pytest.mark.slow
+def test_runs_that_make_the_same_rooms_at_once(
+    tmp_path: Path, processes: ForkServerContext
+) -> None:
+    with processes.Manager() as manager, ProcessPoolExecutor(2, processes) as pool:
+        barrier = manager.Barrier(2)
+        for run in [pool.submit(_make, tmp_path / "rooms", barrier) for _ in range(2)]:
+            run.result()
+    generate_rooms(
+        tmp_path / "alone", RoomSettings(rooms={"area_1": 2, "area_5a": 1}, height=32), workers=0
+    )
+    found, expected = (
+        {p.relative_to(root): p.read_bytes() for p in root.rglob("*") if p.is_file()}
+        for root in (tmp_path / "rooms", tmp_path / "alone")
+    )
+    assert found == expected

@@ -1,0 +1,162 @@
+"""No pickle is loaded: a file with one that would create another file creates nothing."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from datamodules.image_files import read_array
+from datamodules.sphere_files import read_sphere
+from datamodules.store_files import open_stored
+from models.pretrained import read_tensors
+from tangent_train.cli import main
+from tangent_train.cli.keypoint_pairs.export import ColmapExport
+from tangent_train.errors import DataError
+from tangent_train.tasks.reports.runs import load_run
+from tangent_train.tasks.trained import load_trained, read_checkpoint
+from tests.tasks.prediction.trained import write_checkpoint
+
+
+class Creating:
+    """Unpickled, it creates a folder."""
+
+    def __init__(self, created: Path) -> None:
+        self._created = created
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os.mkdir, (str(self._created),)
+
+
+def _archive(path: Path, created: Path) -> None:
+    """A checkpoint that is right but for one entry."""
+    whole = write_checkpoint(path.with_suffix(".whole"))
+    content = torch.load(whole, weights_only=True)
+    torch.save(content | {"callbacks": Creating(created)}, path)
+    whole.unlink()
+
+
+def _legacy(path: Path, created: Path) -> None:
+    content = {"config": {}, "state_dict": {}, "callbacks": Creating(created)}
+    torch.save(content, path, _use_new_zipfile_serialization=False)
+
+
+def _pickle(path: Path, created: Path) -> None:
+    path.write_bytes(pickle.dumps(Creating(created)))
+
+
+def _array(path: Path, created: Path) -> None:
+    with path.open("wb") as file:
+        np.save(file, np.array([Creating(created)], object), allow_pickle=True)
+
+
+CREATORS = (_archive, _legacy, _pickle, _array)
+NAMES = ("x.ckpt", "x.pt", "x.pth", "x.onnx", "x.safetensors", "x.npy")
+
+
+@pytest.fixture
+def created(tmp_path: Path) -> Path:
+    return tmp_path / "created"
+
+
+def test_these_files_would_do_it(tmp_path: Path, created: Path) -> None:
+    """Else the tests below could not fail."""
+    for make in CREATORS:
+        make(tmp_path / "x", created)
+        if make is _array:
+            np.load(tmp_path / "x", allow_pickle=True)
+        elif make is _pickle:
+            pickle.loads((tmp_path / "x").read_bytes())
+        else:
+            torch.load(tmp_path / "x", weights_only=False)
+        assert created.exists()
+        created.rmdir()
+
+
+def _run(monkeypatch: pytest.MonkeyPatch, command: str, *arguments: str) -> str:
+    """What a command that is refused says."""
+    monkeypatch.setattr(sys, "argv", [f"tangent-{command}", *arguments])
+    with pytest.raises(SystemExit) as refused:
+        getattr(main, command)()
+    return str(refused.value)
+
+
+COMMANDS = {
+    "evaluate": ["checkpoint={file}"],
+    "predict": ["checkpoint={file}", "input=image.png", "output=labels"],
+    "export": ["checkpoint={file}", "output=net.onnx"],
+    "resume": ["resume=run"],
+    "init_from": ["init_from={file}", "level=5"],
+    "weights": ["network=fcn_resnet", "network.weights={file}", "level=4"],
+    "transfer": ["experiment=rooms/transfer", "checkpoint={file}"],
+    "keypoints": ["left={file}", "right={file}", "output=found"],
+    "render": ["input={file}", "output=tangent"],
+    "report": ["run"],
+}
+
+
+@pytest.mark.parametrize("make", CREATORS, ids=["archive", "legacy", "pickle", "array"])
+@pytest.mark.parametrize("what", COMMANDS)
+def test_no_command_unpickles(
+    what: str,
+    make: Any,
+    created: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    file = Path("x.npy") if what == "render" else Path("x.ckpt")
+    if what == "resume":
+        file = Path("run/checkpoints/last.ckpt")
+    if what == "report":
+        file = Path("run/results.json")
+    file.parent.mkdir(parents=True, exist_ok=True)
+    make(tmp_path / file, created)
+    (tmp_path / "image.png").touch()
+    command = {"resume": "train", "init_from": "train", "weights": "train"}.get(what, what)
+    message = _run(monkeypatch, command, *(text.format(file=file) for text in COMMANDS[what]))
+    assert not created.exists()
+    message += capsys.readouterr().out  # where one file of several is named
+    assert file.name in message
+    assert "found" in message
+    assert "expected" in message
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("make", CREATORS, ids=["archive", "legacy", "pickle", "array"])
+def test_no_reader_unpickles(make: Any, name: str, created: Path, tmp_path: Path) -> None:
+    path = tmp_path / name
+    make(path, created)
+    readers: tuple[Any, ...] = (
+        load_trained,
+        read_checkpoint,
+        read_tensors,
+        read_array,
+        open_stored,
+        lambda p: read_sphere(p, (4, 8)),
+    )
+    for read in readers:
+        with pytest.raises(DataError):
+            read(path)
+        assert not created.exists()
+
+
+def test_neither_do_archives_of_keypoints_nor_results(created: Path, tmp_path: Path) -> None:
+    export = ColmapExport(tmp_path, "colmap_text", ("erp",))
+    part = export._part("erp", "pair", "a")
+    part.parent.mkdir(parents=True)
+    with part.open("wb") as file:
+        np.savez(file, sides=np.array([Creating(created)], object))
+    with pytest.raises(ValueError, match="allow_pickle=False"):
+        export.finish(["a"])
+    _pickle(tmp_path / "results.json", created)
+    with pytest.raises(DataError, match=r"results\.json"):
+        load_run(tmp_path)
+    assert not created.exists()
