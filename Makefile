@@ -1,11 +1,12 @@
 # make demo   sets up, makes furnished rooms, trains on them and shows the results
 # make test   sets up and runs the whole test suite
+# make bench  measures speed and memory, under 10 minutes; make bench-compare looks for regressions
 PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 DEMO := runs/make_demo
 
-.PHONY: install demo test lint bench
+.PHONY: install demo test lint bench bench-compare
 
 install: $(READY)
 
@@ -40,3 +41,7 @@ lint: install
 
 bench: install
 	$(BIN)/python -m benchmarks
+
+# RESULTS=runs/bench/results.json compares what was measured; without it everything is measured.
+bench-compare: install
+	$(BIN)/python -m benchmarks compare $(RESULTS)

@@ -1,1 +1,1 @@
-"""Side-by-side speed, one command per area: ``python -m benchmarks.rendering``."""
+"""Side-by-side speed and memory: ``python -m benchmarks``."""

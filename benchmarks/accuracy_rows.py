@@ -85,9 +85,22 @@ _WHOLE = (
 )
 _ALL_FACES = ("representation.faces_per_panorama=null", "data.panoramas_per_step=2")
 _TEN = ("representation.faces_per_panorama=10", "data.panoramas_per_step=4")
+_THREE = ("representation.faces_per_panorama=3", "data.panoramas_per_step=13")
+_WIDE = (
+    "representation.crop_multiple=null",
+    "representation.dim=80",
+    "representation.faces_per_panorama=2",
+)
+_WIDER = (
+    "representation.crop_multiple=null",
+    "representation.dim=96",
+    "representation.faces_per_panorama=1",
+    "data.panoramas_per_step=10",
+)
 _ALL = (_CONTEXT, "data.inputs=[rgb,depth,validity,elevation]", "ema=0.999")
 _GRAVITY = (_AUTO, _POSE)
 _ANY_GRAVITY = (_AUTO_ANY, _POSE)
+_BEST = (_AVERAGED, *_GRAVITY)
 
 _EQUIRECT = (
     Row("erp", "whole equirectangular images, 2 a step", _ERP),
@@ -98,18 +111,40 @@ _EQUIRECT = (
 _PIXELS = (
     Row("tangent", "all 20 tangent images of 2 panoramas, not cropped, not blended", _WHOLE),
     Row("crop", "all 20, cropped to the owned cells, blended", _ALL_FACES),
-    Row("few", "5 of 20, of 8 panoramas", (), (_NEAREST, _AVERAGED, *_GRAVITY)),
+    Row("few", "5 of 20, of 8 panoramas", (), (_NEAREST, *_BEST)),
     Row("few_10", "10 of 20, of 4 panoramas", _TEN),
 )
 _ADDITIONS = (
-    Row("few_aux", "few, with an auxiliary head", (_AUX,), (_AVERAGED, *_GRAVITY)),
+    Row("few_aux", "few, with an auxiliary head", (_AUX,), _BEST),
     Row("few_elevation", "few, shown how far up every pixel looks", (_ELEVATION,), _GRAVITY),
     Row("few_validity", "few, shown where depth is missing", ("data.inputs=[rgb,depth,validity]",)),
-    Row("few_attention", "few_aux, whose images see each other", (_CONTEXT,), _GRAVITY),
+    Row("few_attention", "few_aux, whose images see each other", (_CONTEXT,), _BEST),
     Row(
         "few_attention_alone",
         "the same without the loss of the auxiliary head",
         (_CONTEXT, "task.auxiliary_weight=0"),
+    ),
+    Row("few_3_aux", "3 of 20, of 13 panoramas, with an auxiliary head", (*_THREE, _AUX), _BEST),
+    Row(
+        "few_3_elevation",
+        "few_3_aux, shown how far up every pixel looks",
+        (*_THREE, _AUX, _ELEVATION),
+        _BEST,
+    ),
+    Row(
+        "wide_aux",
+        "2 of 20, 80² wide, of 8 panoramas, with an auxiliary head",
+        (*_WIDE, _AUX),
+        _BEST,
+    ),
+    Row(
+        "wide_elevation",
+        "wide_aux, shown how far up every pixel looks",
+        (*_WIDE, _AUX, _ELEVATION),
+        _BEST,
+    ),
+    Row(
+        "wider_elevation", "1 of 20, 96² wide, of 10 panoramas", (*_WIDER, _AUX, _ELEVATION), _BEST
     ),
     Row("few_10_aux", "few_10, with an auxiliary head", (*_TEN, _AUX)),
     Row("few_10_attention", "few_10_aux, whose images see each other", (*_TEN, _CONTEXT)),
@@ -127,7 +162,7 @@ _LOSSES = (
     Row("few_dice", "few, Dice's loss beside cross-entropy", ("task.region_loss=dice",)),
     Row("few_ema", "few, the average of the weights", ("ema=0.999",)),
     Row("few_cosine", "few, the cosine schedule", ("scheduler=cosine",)),
-    Row("all", "few with attention, elevation, validity and averaged weights", _ALL, _GRAVITY),
+    Row("all", "few with attention, elevation, validity and averaged weights", _ALL, _BEST),
 )
 _TURNED = (
     Row("erp_so3", "erp, turned any way in training", (*_ERP, _SO3), _ANY_GRAVITY),

@@ -9,12 +9,9 @@ thread, and the time that the process computes; on one bf16, and the peak of wha
 from __future__ import annotations
 
 import argparse
-import statistics
 import time
 import warnings
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
-from multiprocessing import get_context
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -23,7 +20,7 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from benchmarks.accuracy_rows import EXPERIMENT
 from benchmarks.accuracy_run import composed
-from benchmarks.memory import peak_kib
+from benchmarks.measuring import Way, in_process, measure, peak_kib
 from tangent_train.cli.build import build
 
 if TYPE_CHECKING:
@@ -51,8 +48,8 @@ ADDITIONS: dict[str, tuple[str, ...]] = {
 }
 """Overrides of the experiment, by what they add."""
 
-WARM_UP = 2
-"""Steps before a measurement."""
+STEPS = 3
+"""That are taken to see the memory."""
 
 
 class Setting(NamedTuple):
@@ -87,13 +84,13 @@ def main(arguments: list[str] | None = None) -> None:
     setting = Setting(level, panoramas, options.device, tuple(options.settings))
     with one_thread(setting):
         steps = {name: TrainingStep(added, setting) for name, added in ADDITIONS.items()}
-        seconds = interleaved(steps, rounds, setting)
+        clock = time.process_time if setting.device == "cpu" else time.perf_counter
+        rows = measure([Way(name, step.run) for name, step in steps.items()], rounds, clock)
     first = steps["plain"]
     images = f"{first.image_count} images of {first.side}²"
     print(f"\none step: {images}, level {level}, {setting.device}")
-    for name, step in steps.items():
-        median = statistics.median(seconds[name])
-        ratio = median / statistics.median(seconds["plain"])
+    for row, (name, step) in zip(rows, steps.items(), strict=True):
+        median, ratio = row.median, row.median / rows[0].median
         mebibytes = memory_of(ADDITIONS[name], setting)
         print(
             f"  {name:<40}{step.parameters:>12,} parameters{median * 1e3:>9.1f} ms{ratio:>7.2f}×"
@@ -181,29 +178,10 @@ def _made_up(data: Any, setting: Setting, classes: int) -> _Batch:
     return _Batch(*(tensor.to(setting.device) for tensor in (images, labels, rays)))
 
 
-def interleaved(
-    steps: dict[str, TrainingStep], rounds: int, setting: Setting
-) -> dict[str, list[float]]:
-    """Seconds of every step in every round, all run in turn."""
-    clock = time.process_time if setting.device == "cpu" else time.perf_counter
-    for step in steps.values():
-        for _ in range(WARM_UP):
-            step.run()
-    seconds: dict[str, list[float]] = {name: [] for name in steps}
-    for _ in range(rounds):
-        for name, step in steps.items():
-            start = clock()
-            step.run()
-            seconds[name].append(clock() - start)
-    return seconds
-
-
 def memory_of(overrides: tuple[str, ...], setting: Setting) -> float:
     """Mebibytes that steps add to the peak of a process of its own."""
-    context = get_context("forkserver")
-    context.set_forkserver_preload([__name__])  # imports take longer than the steps
-    with ProcessPoolExecutor(1, context) as process:
-        return process.submit(_added_memory, overrides, setting).result()
+    mebibytes: float = in_process(_added_memory, overrides, setting)
+    return mebibytes
 
 
 def _added_memory(overrides: tuple[str, ...], setting: Setting) -> float:
@@ -211,7 +189,7 @@ def _added_memory(overrides: tuple[str, ...], setting: Setting) -> float:
     with one_thread(setting):
         step = TrainingStep(overrides, setting)
         before = peak_kib()
-        for _ in range(WARM_UP + 1):
+        for _ in range(STEPS):
             step.run()
     if setting.device == "cuda":
         return torch.cuda.max_memory_allocated() / 2**20

@@ -1,22 +1,19 @@
-"""Time to find keypoints, on a panorama and on tangent images: ``python -m benchmarks.keypoints``.
+"""Time to find keypoints, on a panorama and on tangent images: ``python -m benchmarks keypoints``.
 
-The panorama is a furnished room. All ways are run in turn, round after round, and medians are
-compared.
+The panorama is a furnished room.
 """
 
 from __future__ import annotations
 
 import argparse
-import tempfile
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import cv2
 import torch
 
-from benchmarks.rendering import Row, compare
-from datamodules.synthrooms.generate import generate_rooms
-from datamodules.synthrooms.settings import RoomSettings
+from benchmarks.measuring import Table, Way, measure
+from benchmarks.report import table_text
+from benchmarks.rooms import made_rooms
 from tangent_train.geometry import TangentGrid, equirect_shape
 from tangent_train.keypoints.detectors import Detector
 from tangent_train.keypoints.equirect import detect_on_equirect
@@ -29,7 +26,7 @@ if TYPE_CHECKING:
 
 def main(arguments: list[str] | None = None) -> None:
     """Make the panorama, then print what was measured."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks keypoints", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="a low level and few rounds")
     parser.add_argument("--level", type=int, default=9, help="of the panorama")
     parser.add_argument("--rounds", type=int, default=5, help="measurements per row")
@@ -39,35 +36,30 @@ def main(arguments: list[str] | None = None) -> None:
     height, width = panorama.shape[:2]
     print(f"keypoints, level {level}: {height}×{width}, {torch.get_num_threads()} threads")
     for name in ("sift", "orb"):
-        compare(f"{name}, margin 32", detection_rows(panorama, Detector(name), level), rounds)
+        rows = measure(detection_ways(panorama, Detector(name), level), rounds)
+        print(table_text(Table(f"keypoints: {name}", f"\n{name}, margin 32", rows)))
 
 
 def furnished_room(level: int) -> NDArray[np.uint8]:
     """A panorama of a made room."""
-    with tempfile.TemporaryDirectory() as folder:
-        height = equirect_shape(level)[0]
-        generate_rooms(Path(folder), RoomSettings(rooms={"1": 1}, height=height, supersample=1))
-        file = sorted(Path(folder).glob("area_1/pano/rgb/*.png"))[0]
-        image: Any = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+    file = sorted(made_rooms(equirect_shape(level)[0]).glob("area_1/pano/rgb/*.png"))[0]
+    image: Any = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
     return image
 
 
-def detection_rows(panorama: NDArray[np.uint8], detector: Detector, level: int) -> list[Row]:
+def detection_ways(panorama: NDArray[np.uint8], detector: Detector, level: int) -> list[Way]:
     """The panorama itself, then base levels 0 to 2."""
 
-    def row(name: str, run: Any) -> Row:
-        return Row(f"{name}: {len(run())} keypoints", run)
+    def way(name: str, run: Any, *, ours: bool = False) -> Way:
+        return Way(f"{name}: {len(run())} keypoints", run, ours)
 
-    def tangent(base_level: int) -> Row:
+    def tangent(base_level: int) -> Way:
         grid = TangentGrid(base_level, level)
-        return row(
+        return way(
             f"{grid.num_images} tangent images, b = {base_level}",
             lambda: detect_on_tangent_images(panorama, grid, detector),
+            ours=True,
         )
 
-    first = row("the panorama itself", lambda: detect_on_equirect(panorama, detector))
+    first = way("the panorama itself", lambda: detect_on_equirect(panorama, detector))
     return [first, *map(tangent, range(3))]
-
-
-if __name__ == "__main__":
-    main()

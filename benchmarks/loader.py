@@ -1,79 +1,58 @@
-"""Training samples per second from a prepared store and from PNGs: ``python -m benchmarks.loader``.
+"""Training samples from a prepared store, beside decoding PNGs.
 
-Makes panoramas of 2048×4096 in Stanford2D3DS's format and loads RGB-D and labels of 4 of the 80
-images of each (level 10, b = 1), one panorama per batch, with one worker process. What is compared
-runs in turn, round after round, and medians are compared. All files are in the page cache.
+RGB-D and labels of 4 of the 80 images of panoramas of 2048×4096 (level 10, b = 1), one panorama per
+batch, one worker process, all files in the page cache.
 """
 
 from __future__ import annotations
 
-import argparse
 import multiprocessing
-import re
-import statistics
-import tempfile
-import time
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import cv2
 
+from benchmarks.measuring import Options, Row, Table, Way, at_least, measure, memory_kib
+from benchmarks.rooms import AREAS, made_rooms
 from datamodules.samples import TrainingImages
-from datamodules.stanford2d3ds import FileName, Stanford2D3DS
-from datamodules.synthrooms.generate import generate_rooms
-from datamodules.synthrooms.settings import RoomSettings
+from datamodules.stanford2d3ds import Stanford2D3DS
 from tangent_train.rendering.representation import TangentRepresentation
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+__all__ = ["tables"]
 
 FACES = 4
-COPIES = 4
-"""Names of every panorama made for training."""
-WARM_UP = 150
+PNG = "PNG files"
+STORE = "prepared store"
+
+_COPIES = 3
+_WARM_UP = 150
 """Samples until the tables of all 80 images are made."""
 
 
-def main(arguments: list[str] | None = None) -> None:
-    """Make the panoramas, then print what was measured."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="a low level and few rounds")
-    parser.add_argument("--rounds", type=int, default=5, help="measurements per row")
-    options = parser.parse_args(arguments)
-    level, rounds = (6, 2) if options.quick else (10, options.rounds)
+def tables(options: Options) -> Iterator[Table]:
+    """Time, the worker's memory, and the share of all images that a few cost."""
+    level = 6 if options.quick else 10
     representation = TangentRepresentation(1, level, faces_per_panorama=FACES)
-    with tempfile.TemporaryDirectory() as folder:
-        root = Path(folder)
-        make_panoramas(root, representation.erp_height)
-        png, store = (
-            Stanford2D3DS(
-                root,
-                representation,
-                areas=("1", "5a"),
-                validation_fraction=0,
-                panoramas_per_step=1,
-                num_workers=1,
-                store=place,
-            )
-            for place in (None, root / "store")
-        )
-        start = time.perf_counter()
-        store.prepare_data()
-        count = sum(len(store.source(split)) for split in ("train", "test"))
-        took = (time.perf_counter() - start) / count
-        print(f"level {level}: {count} panoramas, prepared in {took:.2f} s each")
-        compare_loaders(png, store, rounds)
-        compare_samples(store, rounds)
+    root = made_rooms(representation.erp_height, _COPIES)
+    png, store = (_data(root, representation, place) for place in (None, root / "store"))
+    store.prepare_data()
+    yield from _loaders(level, png, store, options)
+    yield _few_of_all(store, options)
 
 
-def make_panoramas(root: Path, height: int) -> None:
-    """Some rooms, and each of their panoramas under several names."""
-    generate_rooms(root, RoomSettings(rooms={"1": 3, "5a": 1}, height=height, supersample=1))
-    for path in sorted(root.glob("area_1/pano/*/*.png")):
-        name = FileName.parse(path.name)
-        for copy in range(1, COPIES):
-            camera = f"{copy:x}{name.camera[1:]}"
-            path.with_name(str(name._replace(camera=camera))).hardlink_to(path)
+def _data(root: Path, representation: TangentRepresentation, store: Path | None) -> Stanford2D3DS:
+    return Stanford2D3DS(
+        root,
+        representation,
+        areas=AREAS,
+        validation_fraction=0,
+        panoramas_per_step=1,
+        num_workers=1,
+        store=store,
+    )
 
 
 class RunningLoader:
@@ -81,82 +60,88 @@ class RunningLoader:
 
     Args:
         data: Where it comes from.
+        epochs: That are loaded at once.
+
+    Attributes:
+        samples: That are loaded at once.
     """
 
-    def __init__(self, data: Stanford2D3DS) -> None:
+    def __init__(self, data: Stanford2D3DS, epochs: int) -> None:
         self._loader = data.train_dataloader()
-        self._epoch = 0
+        self._epochs, self._epoch = epochs, 0
+        self.samples = epochs * len(self._loader)
         before = set(multiprocessing.active_children())
-        self.first = self.rate(1)
+        self.load()
         (self._worker,) = set(multiprocessing.active_children()) - before
 
-    def rate(self, samples: int) -> float:
-        """Samples per second, over whole epochs of at least so many samples."""
-        start, count = time.perf_counter(), 0
-        while count < samples:
-            sampler: Any = self._loader.sampler
+    def load(self) -> None:
+        """Load the epochs."""
+        sampler: Any = self._loader.sampler
+        for _ in range(self._epochs):
             sampler.set_epoch(self._epoch)
             self._epoch += 1
-            count += sum(1 for _ in self._loader)
-        return count / (time.perf_counter() - start)
+            for _batch in self._loader:
+                pass
 
-    def memory(self) -> str:
+    def mebibytes(self) -> tuple[float, float]:
         """Memory of the worker: its own, and with all that it shares, at most so far.
 
         Shared are the libraries, what it inherited, and the files of the store in the page cache.
         """
-        process = Path(f"/proc/{self._worker.pid}")
-        if not process.exists():
-            return "memory unknown on this system"
-        text = (process / "smaps_rollup").read_text() + (process / "status").read_text()
-        kilobytes = dict(re.findall(r"(\w+):\s+(\d+) kB", text))
-        own, peak = (int(kilobytes[name]) / 1e3 for name in ("Private_Dirty", "VmHWM"))
-        return f"worker: {own:.0f} MB of its own, {peak:.0f} MB at most with what it shares"
+        pid = self._worker.pid or 0
+        own, peak = memory_kib("Private_Dirty", pid), memory_kib("VmHWM", pid)
+        return own / 2**10, peak / 2**10
 
 
-def compare_loaders(png: Stanford2D3DS, store: Stanford2D3DS, rounds: int) -> None:
-    """Samples per second of both, and the memory of the workers."""
-    loaders = {"PNG files": RunningLoader(png), "prepared store": RunningLoader(store)}
-    samples = {"PNG files": 1, "prepared store": 60}
-    loaders["prepared store"].rate(WARM_UP)
-    rates: dict[str, list[float]] = {name: [] for name in loaders}
-    for _ in range(rounds):
-        for name, loader in loaders.items():
-            rates[name].append(loader.rate(samples[name]))
-    print(f"\nloader, {FACES} of 80 images")
-    medians = {name: statistics.median(found) for name, found in rates.items()}
-    for name, loader in loaders.items():
-        ratio = medians[name] / medians["PNG files"]
-        print(f"  {name:<32}{medians[name]:>8.2f} samples/s{ratio:>7.1f}×  {loader.memory()}")
-    name, first = "prepared store, first epoch", loaders["prepared store"].first
-    print(f"  {name:<32}{first:>8.2f} samples/s  (content checked, tables made)")
+def _loaders(
+    level: int, png: Stanford2D3DS, store: Stanford2D3DS, options: Options
+) -> tuple[Table, Table]:
+    loaders = {PNG: RunningLoader(png, 1), STORE: RunningLoader(store, 1 if options.quick else 8)}
+    for _ in range(0 if options.quick else _WARM_UP // loaders[STORE].samples):
+        loaders[STORE].load()
+    ways = [
+        Way(name, loader.load, name == STORE, 1 / loader.samples)
+        for name, loader in loaders.items()
+    ]
+    what = f"level {level}, RGB-D, {FACES} of 80 images"
+    table = Table("loader: time", f"A training sample: {what}", measure(ways, options.times(5)))
+    table.goals = [at_least("as fast as from PNG files", 1 / table.ratio(STORE).median, 20)]
+    for row in table.rows:
+        table.notes.append(f"{row.name}: {1 / row.median:.1f} samples/s")
+    memory = {name: loader.mebibytes() for name, loader in loaders.items()}
+    rows = [Row(name, [own], name == STORE) for name, (own, _) in memory.items()]
+    of_worker = Table("loader: memory", f"Memory of the worker, its own: {what}", rows, "MiB")
+    of_worker.notes = [
+        f"{name}: at most {peak:.0f} MiB with what it shares with others"
+        for name, (_, peak) in memory.items()
+    ]
+    return table, of_worker
 
 
-def compare_samples(store: Stanford2D3DS, rounds: int) -> None:
+def _few_of_all(store: Stanford2D3DS, options: Options) -> Table:
     """A sample of a few images beside one of all, in this process."""
     whole = TangentRepresentation(1, store.representation.grid.level)
     source = store.source("train")
 
-    def sampler(representation: TangentRepresentation) -> Callable[[int], object]:
+    def sampler(representation: TangentRepresentation) -> Callable[[], object]:
         panoramas = TrainingImages(source, representation, 0, ("rgb", "depth"))
-        return lambda epoch: panoramas[epoch, epoch % len(panoramas)]
+        epochs = iter(range(10**9))
 
-    few, everything = sampler(store.representation), sampler(whole)
-    seconds: tuple[list[float], list[float]] = ([], [])
+        def run() -> object:
+            epoch = next(epochs)
+            return panoramas[epoch, epoch % len(panoramas)]
+
+        return run
+
+    some = f"{FACES} of 80 images"
+    ways = [
+        Way("all 80 images", sampler(whole)),
+        Way(some, sampler(store.representation), ours=True),
+    ]
     threads = cv2.getNumThreads()
     cv2.setNumThreads(0)  # as in a worker
-    everything(0)
-    for round_ in range(rounds):
-        for sample, times, repeats in zip((few, everything), seconds, (20, 1), strict=True):
-            for k in range(repeats):
-                start = time.perf_counter()
-                sample(repeats * round_ + k)
-                times.append(time.perf_counter() - start)
+    rows = measure(ways, options.times(9))
     cv2.setNumThreads(threads)
-    few_s, all_s = map(statistics.median, seconds)
-    print(f"\nsample from the store, in one thread\n  {FACES} of 80 images{few_s * 1e3:>10.1f} ms")
-    print(f"  80 of 80 images{all_s * 1e3:>9.1f} ms, {all_s / few_s:.1f}× as long")
-
-
-if __name__ == "__main__":
-    main()
+    table = Table("loader: few of all", "A sample from the store, one thread", rows)
+    table.notes = [f"{some}: 1/{1 / table.ratio(some).median:.1f} of the time of all"]
+    return table

@@ -14,6 +14,7 @@ from tangent_train.rendering import (
     tangent_to_equirect,
     tangent_to_labels,
 )
+from tangent_train.rendering.gpu_labels import usable
 from tangent_train.tasks import ConfusionMatrix
 
 pytestmark = [
@@ -56,6 +57,18 @@ def test_labels(blend: Blend) -> None:
     expected = tangent_to_labels(scores, GRID, SHAPE, blend)
     on_gpu = tangent_to_labels(scores.cuda(), GRID, SHAPE, blend).cpu()
     assert (on_gpu == expected).double().mean() > 0.9999, "all but ties of rounding"
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.float16])
+@pytest.mark.parametrize("classes", [1, 13, 300])
+def test_labels_of_one_kernel_are_those_of_torch(classes: int, dtype: torch.dtype) -> None:
+    assert usable(torch.device("cuda")), "Triton does not work here"
+    scores = _random(GRID.num_images, classes, GRID.dim, GRID.dim).to(dtype)
+    scores[0], scores[1], scores[2, 0] = torch.nan, -torch.inf, torch.nan
+    expected = tangent_to_labels(scores.double(), GRID, SHAPE)
+    on_gpu = tangent_to_labels(scores.cuda(), GRID, SHAPE).cpu()
+    least = 0.9999 if dtype == torch.float32 else 0.98  # what is rounded ties more often
+    assert (on_gpu == expected).double().mean() > least
 
 
 def test_confusion_matrices() -> None:

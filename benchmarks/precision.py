@@ -1,22 +1,24 @@
-"""Time of one training step of FCN-ResNet101: ``python -m benchmarks.training``.
+"""What precision and compilation bring to a training step: ``python -m benchmarks precision``.
 
-16 RGB-D images of 512², forward, backward and Adam's step, in float32 (TF32 off), in bf16 with
-channels last, and compiled. Rows run in turn, medians are compared. Without a GPU, two small images
-and nothing compiled: enough to see it run.
+FCN-ResNet101, 16 RGB-D images of 512², forward, backward and Adam's step, in float32 (TF32 off), in
+bf16 with channels last, and compiled. Without a GPU, two small images and nothing compiled: enough
+to see it run.
 """
 
 from __future__ import annotations
 
 import argparse
-import statistics
-import time
 from collections.abc import Callable
 
 import torch
 from torch.nn import functional
 from torch.utils.flop_counter import FlopCounterMode
 
+from benchmarks.measuring import Table, Way, measure
+from benchmarks.report import table_text
 from models import FCNResNet
+
+__all__ = ["main"]
 
 NUM_CLASSES = 14
 PEAKS = {"H200": 989e12, "H100": 989e12, "A100": 312e12}
@@ -25,7 +27,7 @@ PEAKS = {"H200": 989e12, "H100": 989e12, "A100": 312e12}
 
 def main(arguments: list[str] | None = None) -> None:
     """Print one row per way to take the step."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks precision", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="as without a GPU")
     parser.add_argument("--rounds", type=int, default=10, help="measurements per row")
     options = parser.parse_args(arguments)
@@ -36,33 +38,29 @@ def main(arguments: list[str] | None = None) -> None:
     torch.backends.cuda.matmul.allow_tf32 = False
     torch.backends.cudnn.allow_tf32 = False
     torch.backends.cudnn.benchmark = True
-    print(f"\nFCN-ResNet101, {images} RGB-D images of {side}², on {name}")
-    ways = {
-        "float32": make_step(device, images, side, fast=False, compiled=False),
-        "bf16, channels last": make_step(device, images, side, fast=True, compiled=False),
-    }
+
+    def step(*, fast: bool, compiled: bool) -> Callable[[], None]:
+        return make_step(device, images, side, fast=fast, compiled=compiled)
+
+    first = step(fast=False, compiled=False)
+    ways = [
+        Way("float32", first),
+        Way("bf16, channels last", step(fast=True, compiled=False), ours=True),
+    ]
     if not quick:
-        ways["bf16, channels last, compiled"] = make_step(
-            device, images, side, fast=True, compiled=True
-        )
+        compiled = step(fast=True, compiled=True)
+        ways.append(Way("bf16, channels last, compiled", compiled, ours=True))
     with FlopCounterMode(display=False) as counter:
-        ways["float32"]()
-    operations = counter.get_total_flops()
-    seconds: dict[str, list[float]] = {way: [] for way in ways}
-    for step in ways.values():
-        for _ in range(3):  # compiles, and chooses algorithms
-            step()
-    for _ in range(rounds):
-        for way, step in ways.items():
-            start = time.perf_counter()
-            step()
-            seconds[way].append(time.perf_counter() - start)
-    first = statistics.median(seconds["float32"])
+        first()
+    title = f"FCN-ResNet101, {images} RGB-D images of {side}², on {name}"
+    table = Table("precision", title, measure(ways, rounds))
     peak = next((peak for chip, peak in PEAKS.items() if chip in name), None)
-    for way, times in seconds.items():
-        median = statistics.median(times)
-        share = "" if peak is None else f"{operations / median / peak:>8.1%} of the bf16 peak"
-        print(f"  {way:<34}{median * 1e3:>10.1f} ms{first / median:>8.2f}× as fast{share}")
+    if peak is not None:
+        table.notes = [
+            f"{row.name}: {counter.get_total_flops() / row.median / peak:.1%} of the bf16 peak"
+            for row in table.rows
+        ]
+    print(table_text(table))
 
 
 def make_step(
@@ -89,7 +87,3 @@ def make_step(
             torch.cuda.synchronize()
 
     return step
-
-
-if __name__ == "__main__":
-    main()
