@@ -73,13 +73,16 @@ def owner_labels(scores: Tensor, face: Tensor, u: Tensor, v: Tensor, labels: Ten
 
 @cache
 def usable(device: torch.device) -> bool:
-    """Whether Triton works on this device, tried once."""
-    face = torch.zeros((1, 1), dtype=torch.uint8, device=device)
-    place = torch.zeros((1, 1), device=device)
-    scores = torch.tensor([0.0, 1.0], device=device)[:, None, None].expand(1, 2, 2, 2).contiguous()
-    labels = torch.zeros_like(face)
+    """Whether Triton works on this device: it is asked for labels that are known, once."""
+    u = torch.linspace(0, 3, _BLOCK + 1, device=device)[None]
+    v = u.flip(1)
+    rows, columns = torch.meshgrid(*[torch.arange(4.0, device=device)] * 2, indexing="ij")
+    level = torch.full_like(u, 1.4)
+    # Scores that are planes: between pixels they are known as well.
+    scores = torch.stack([columns, rows, torch.full_like(rows, 1.4)])[None]
+    labels = torch.zeros_like(u, dtype=torch.uint8)
     try:
-        owner_labels(scores, face, place, place, labels)
-        return bool(labels.item() == 1)
+        owner_labels(scores, torch.zeros_like(labels), u, v, labels)
+        return torch.equal(labels.long(), torch.stack([u, v, level]).argmax(dim=0))
     except Exception:  # it compiles with what is there: anything may be missing
         return False
