@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import torch
 
+from tangent_train import rendering
 from tangent_train.geometry import TangentGrid
 from tangent_train.rendering import backward, tangent_to_labels
 
@@ -108,6 +109,7 @@ def test_torch_renders_what_the_kernel_cannot(
 
 def test_without_triton_there_is_torch(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, "tangent_train.rendering.gpu_labels", raising=False)
+    monkeypatch.delattr(rendering, "gpu_labels", raising=False)
     monkeypatch.setitem(sys.modules, "triton", None)
     assert not backward._has_triton(torch.device("cuda"))
 
