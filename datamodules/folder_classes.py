@@ -165,6 +165,10 @@ class _Pairs(list[tuple[Any, Any]]):
 
 
 def _check_names(path: Path, names: list[Any]) -> None:
+    if not 1 <= len(names) <= _MOST_CLASSES:
+        raise DataError(
+            path, found=f"{len(names)} classes", expected=f"1 to {_MOST_CLASSES} classes"
+        )
     strange = [name for name in names if not isinstance(name, str) or not name.strip()]
     if strange:
         raise DataError(path, found=f"class name {strange[0]!r}", expected=_EXPECTED)
@@ -178,10 +182,6 @@ def _check_names(path: Path, names: list[Any]) -> None:
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise DataError(path, found=f"class {twice[0]!r} twice", expected="every name once")
-    if not 1 <= len(names) <= _MOST_CLASSES:
-        raise DataError(
-            path, found=f"{len(names)} classes", expected=f"1 to {_MOST_CLASSES} classes"
-        )
 
 
 def _classes(path: Path, codes: _Pairs) -> FolderClasses:

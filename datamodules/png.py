@@ -13,7 +13,7 @@ from datamodules.image_opening import check_pixels
 from tangent_train.errors import DataError, SettingError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -59,7 +59,7 @@ def read_png_header(path: Path) -> PngHeader:
         with path.open("rb") as file:
             start = file.read(_HEADER_BYTES)
             size = file.seek(0, os.SEEK_END)
-            whole = _chunks_end(file) == size
+            whole = _chunks_end(_reader(file)) == size
     except OSError as error:
         raise DataError(path, found=error, expected="a PNG file", remedy=_REMEDY) from error
     if len(start) < _HEADER_BYTES or not start.startswith(_START):
@@ -83,7 +83,7 @@ def check_png_end(path: Path) -> None:
             if file.read(len(_SIGNATURE)) != _SIGNATURE:
                 return
             size = file.seek(0, os.SEEK_END)
-            end = _chunks_end(file)
+            end = _chunks_end(_reader(file))
     except OSError as error:
         raise DataError(path, found=error, expected="an image", remedy=_REMEDY) from error
     if end is None or end > size:
@@ -147,12 +147,19 @@ def check_panorama_size(path: Path, size: tuple[int, int], erp_height: int) -> N
         )
 
 
-def _chunks_end(file: BinaryIO) -> int | None:
+def _reader(file: BinaryIO) -> Callable[[int], bytes]:
+    def eight_bytes_at(position: int) -> bytes:
+        file.seek(position)
+        return file.read(8)
+
+    return eight_bytes_at
+
+
+def _chunks_end(eight_bytes_at: Callable[[int], bytes]) -> int | None:
     """Where the IEND chunk ends, following the lengths of the chunks; None if there is none."""
     position = 8
     while True:
-        file.seek(position)
-        head = file.read(8)
+        head = eight_bytes_at(position)
         if len(head) < 8 or not head[4:].isalpha():
             return None
         position += 12 + int.from_bytes(head[:4], "big")
@@ -207,6 +214,11 @@ def read_png(path: Path, flags: int) -> NDArray[Any]:
 
 def decoded(content: NDArray[np.uint8], flags: int) -> NDArray[Any] | None:
     """Pixels of an image as OpenCV decodes it: blue first; None where it cannot."""
+    if content[: len(_SIGNATURE)].tobytes() == _SIGNATURE:
+        # OpenCV would take as much memory as a chunk says it has bytes, up to 2 GB.
+        end = _chunks_end(lambda position: content[position : position + 8].tobytes())
+        if end is None or end > content.size:
+            return None
     try:
         return cv2.imdecode(content, flags) if content.size else None
     except cv2.error:  # more pixels than OpenCV allows

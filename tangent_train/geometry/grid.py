@@ -18,6 +18,8 @@ from tangent_train.geometry.sphere import checked_rotation
 
 __all__ = ["TangentGrid"]
 
+_MOST_LEVEL = 30  # of panoramas with 2³¹ rows; powers of far greater numbers never come to an end
+
 
 class _FaceTable:
     """What depends on the base level alone: centres, axes, neighbours, the reach of a cell."""
@@ -122,6 +124,10 @@ class TangentGrid(PinholeGrid):
     ) -> None:
         if not 0 <= base_level <= level:
             raise SettingError("base_level", found=base_level, expected=f"0 to level = {level}")
+        if level > _MOST_LEVEL:
+            raise SettingError("level", found=level, expected=f"at most {_MOST_LEVEL}")
+        if dim is not None and dim > 2**_MOST_LEVEL:
+            raise SettingError("dim", found=dim, expected=f"at most {2**_MOST_LEVEL}")
         values = {
             "base_level": base_level,
             "level": level,

@@ -30,6 +30,7 @@ CAMERAS_FILE = "cameras.json"
 
 _FORMAT = "tangent images"
 _VERSION = 1
+_MOST_PIXELS = 2**20  # rows and columns of a panorama, which may be made of this size
 _CONVENTIONS = {
     "pixels": "Pixel centres are whole numbers: (0, 0) is the centre of the upper left pixel, "
     "columns count to the right, rows down. matrix (K) takes camera coordinates to (column, row). "
@@ -180,8 +181,10 @@ def _parse(content: dict[str, Any]) -> CameraFile:
     if not all(type(number) is int for number in numbers):
         raise SettingError("levels, dim, sizes and faces", found=numbers, expected="whole numbers")
     base_level, level, dim, height, width, *faces = numbers
-    if min(height, width) < 1:
-        raise SettingError("source", found=f"{height}×{width} pixels", expected="1 or more")
+    if not 1 <= min(height, width) <= max(height, width) <= _MOST_PIXELS:
+        raise SettingError(
+            "source", found=f"{height}×{width} pixels", expected=f"1 to {_MOST_PIXELS} each"
+        )
     turn = None if rotation is None else _in_room(np.array(rotation, np.float64).reshape(3, 3))
     grid = TangentGrid(base_level, level, dim, turn)
     grid.face_indices(faces)

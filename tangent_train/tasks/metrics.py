@@ -151,9 +151,7 @@ class ConfusionMatrix(Metric):
             )
         k = self.num_classes
         known = truth != UNKNOWN
-        pairs = truth[known].long() * k + prediction[known].long()
-        if pairs.numel() and (int(prediction[known].max()) >= k or int(truth.max()) >= k):
-            raise SettingError("class index", found="one too large", expected=f"less than {k}")
+        pairs = _checked(truth[known], k) * k + _checked(prediction[known], k)
         self.images += 1
         if truth.ndim == _PANORAMA_DIMENSIONS:
             self._count_panorama(pairs, known)
@@ -183,3 +181,12 @@ class ConfusionMatrix(Metric):
             bands=self.bands.cpu().numpy(),
             images=int(self.images),
         )
+
+
+def _checked(indices: Tensor, num_classes: int) -> Tensor:
+    least, greatest = map(int, indices.aminmax()) if indices.numel() else (0, 0)
+    if least < 0 or greatest >= num_classes:
+        raise SettingError(
+            "class index", found=f"{least} to {greatest}", expected=f"0 to {num_classes - 1}"
+        )
+    return indices.long()

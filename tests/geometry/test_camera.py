@@ -107,7 +107,7 @@ def test_without_shift_a_ray_stays_a_ray() -> None:
     np.testing.assert_allclose(camera.homography @ old, new, atol=1e-10)
 
 
-@pytest.mark.parametrize("fov_deg", [10.0, 45.0, 90.0, 150.0])
+@pytest.mark.parametrize("fov_deg", [0.5, 10.0, 45.0, 90.0, 150.0])
 @pytest.mark.parametrize("size", [(4, 6), (11, 7)])
 def test_fov_is_between_the_outer_pixel_edges(fov_deg: float, size: tuple[int, int]) -> None:
     matrix = camera_matrix_from_fov(fov_deg, size)
@@ -145,6 +145,13 @@ def test_exact_fit_leaves_no_room_to_shift() -> None:
                                atol=1e-12)  # fmt: skip
 
 
+@pytest.mark.parametrize("shift", [(0.5, 0), (-0.5, 0), (0, 0.5), (0, -0.5)])
+def test_an_exact_fit_cannot_be_shifted_by_half_a_pixel(shift: tuple[float, float]) -> None:
+    matrix = camera_matrix_from_fov(45, (128, 128))
+    with pytest.raises(SettingError, match="shift: found"):
+        normalize_camera(matrix, (128, 128), shift=shift)
+
+
 def test_rounding_never_turns_the_shift_range_round() -> None:
     # A range of nothing must still be one to draw from, for every exact fit.
     for fov_deg in np.linspace(20, 80, 61):
@@ -152,12 +159,22 @@ def test_rounding_never_turns_the_shift_range_round() -> None:
         assert (greatest >= least).all()
 
 
-@pytest.mark.parametrize("size", [(300, 760), (760, 300)])
-def test_image_too_small_either_way_is_refused(size: tuple[int, int]) -> None:
+@pytest.mark.parametrize(
+    ("size", "spans"), [((300, 760), "68.32° × 32.18°"), ((760, 300), "29.99° × 72.32°")]
+)
+def test_image_too_small_either_way_is_refused(size: tuple[int, int], spans: str) -> None:
     matrix = K.copy()
     matrix[:2, 2] = size[1] / 2, size[0] / 2
-    with pytest.raises(SettingError, match="field of view: found 45° × 45° for an image that"):
+    expected = f"field of view: found 45° × 45° for an image that spans {spans};"
+    with pytest.raises(SettingError, match=expected):
         normalize_camera(matrix, size)
+
+
+@pytest.mark.parametrize("size", [(127, 128), (128, 127)])
+def test_an_image_too_small_by_a_pixel_is_refused(size: tuple[int, int]) -> None:
+    matrix = camera_matrix_from_fov(45, (128, 128))
+    with pytest.raises(SettingError, match="field of view: found"):
+        shift_range(matrix, size)
 
 
 @pytest.mark.parametrize("shift", [(1e3, 0), (-1e3, 0), (0, 100), (0, -100)])

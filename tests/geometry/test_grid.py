@@ -170,6 +170,16 @@ def test_impossible_levels_are_refused(base_level: int, level: int) -> None:
         TangentGrid(base_level, level)
 
 
+@pytest.mark.parametrize("size", [31, 10**4000])
+def test_absurd_levels_and_sizes_are_refused_at_once(size: int) -> None:
+    assert TangentGrid(2, 30).dim == 2**28
+    assert TangentGrid(0, 4, 2**30).dim == 2**30
+    with pytest.raises(SettingError, match=r"level: found 1?[03]+1?…?; expected at most 30"):
+        TangentGrid(0, size)
+    with pytest.raises(SettingError, match=r"dim: found 1[0-9]+…?; expected at most 1073741824"):
+        TangentGrid(0, 4, 2**30 + size)
+
+
 @pytest.mark.parametrize(
     "rotation",
     [
@@ -197,6 +207,7 @@ def test_grids_are_values() -> None:
     assert len(set(different)) == len(different)
     assert TangentGrid(0, 5) == TangentGrid(0, 5, 32)
     assert hash(TangentGrid(0, 5)) == hash(TangentGrid(0, 5, 32))
+    assert len({hash(TangentGrid(0, level)) for level in range(5, 10)}) == 5
     assert TangentGrid(0, 5, rotation=TURN) == TangentGrid(0, 5, rotation=TURN.tolist())
     assert TangentGrid(0, 5) != (0, 5, 32, None)
 

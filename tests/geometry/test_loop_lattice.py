@@ -10,7 +10,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from tangent_train.errors import SettingError
-from tangent_train.geometry import icosphere, vertex_resolution
+from tangent_train.geometry import icosphere, loop_lattice, vertex_resolution
 from tangent_train.geometry.loop_lattice import MAX_LATTICE_LEVEL, LoopLattice
 
 
@@ -87,3 +87,10 @@ def test_level_10_is_within_reach() -> None:
 def test_levels_out_of_range_are_refused(level: int) -> None:
     with pytest.raises(SettingError, match=f"found {level}; expected 0 to {MAX_LATTICE_LEVEL}"):
         LoopLattice.at_level(level)
+
+
+def test_the_greatest_level_is_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(loop_lattice, "MAX_LATTICE_LEVEL", 2)  # that of 12 takes 1.6 GB
+    assert len(LoopLattice.at_level(2).points) == 5
+    with pytest.raises(SettingError, match="found 3; expected 0 to 2"):
+        LoopLattice.at_level(3)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -119,3 +121,15 @@ def test_what_is_no_pose(
 def test_worlds_must_be_the_same() -> None:
     with pytest.raises(SettingError, match="same world"):
         posed(1, mirrored=True).relative_to(posed(1, mirrored=False))
+
+
+def test_rounding_mirrors_no_pose() -> None:
+    rng = np.random.default_rng(0)
+    poses = [PanoramaPose(random_rotation(rng), rng.normal(size=3)) for _ in range(20)]
+    for one, other in pairwise(poses):
+        rotation, shift_m = one.relative_to(other)
+        point = rng.normal(size=3)
+        world = other.world_from_panorama @ point + other.location_m
+        np.testing.assert_allclose(
+            rotation @ point + shift_m, one.seen(world)[0] * one.seen(world)[1]
+        )

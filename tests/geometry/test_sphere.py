@@ -10,8 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from tangent_train.errors import SettingError
 from tangent_train.geometry import (
     FLIP_Y,
+    checked_rotation,
     lonlat_to_xyz,
     random_rotation,
     rotation_about,
@@ -106,3 +108,12 @@ def test_flip_y_mirrors_left_and_right_only() -> None:
     np.testing.assert_array_equal(FLIP_Y @ FLIP_Y, np.eye(3))
     with pytest.raises(ValueError, match="read-only"):
         FLIP_Y[0, 0] = 2
+
+
+def test_rotations_written_with_seven_digits_are_taken() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        matrix = random_rotation(rng)
+        np.testing.assert_array_equal(checked_rotation(matrix.round(7)), matrix.round(7))
+        with pytest.raises(SettingError, match="rotation: found"):
+            checked_rotation(matrix.round(4))

@@ -139,6 +139,18 @@ def test_panoramas_too_large_for_opencv(
     np.testing.assert_allclose(found, expected, atol=1 if dtype == np.uint8 else 1e-5)
 
 
+@pytest.mark.parametrize("interpolation", ["bilinear", "nearest"])
+def test_opencv_is_not_asked_at_its_limit(
+    monkeypatch: pytest.MonkeyPatch, interpolation: Any
+) -> None:
+    image, place = np.arange(128, dtype=np.uint8).reshape(4, 32), np.ones((1, 1), np.float32)
+    monkeypatch.setattr(sampling, "_REMAP_LIMIT", 32)
+    monkeypatch.setattr("cv2.remap", None)
+    out = np.empty((1, 1), np.uint8)
+    sampling.EquirectMap(place, place, (4, 32)).sample(image, interpolation, out)
+    assert out.item() == 33
+
+
 def test_a_smaller_dim_is_the_centre_crop() -> None:
     image = _random((64, 128, 3), np.float32)
     whole = equirect_to_tangent(image, TangentGrid(0, 5))
@@ -190,6 +202,8 @@ def test_gradients(shape: tuple[int, int]) -> None:
         (np.zeros((4, 8)), {"interpolation": "cubic"}, "interpolation: found 'cubic'"),
         (np.zeros((4, 8)), {"faces": [20]}, "faces"),
         (torch.zeros(4, 8), {}, "panorama"),
+        (torch.zeros(3, 0, 8), {}, "panorama"),
+        (torch.zeros(3, 4, 0), {}, "panorama"),
         (torch.zeros(1, 4, 8, dtype=torch.uint8), {}, "float"),
     ],
 )

@@ -54,6 +54,27 @@ def test_classes_that_do_not_occur_are_left_out_of_the_mean() -> None:
 def test_nothing_counted_has_no_scores() -> None:
     scores = classification_scores(np.zeros((3, 3), np.int64))
     assert np.isnan([scores.accuracy, scores.class_accuracy, *scores.of_class]).all()
+    assert scores.counts.tolist() == [0, 0, 0]
+
+
+def test_a_class_of_one_counts_like_all_others() -> None:
+    scores = classification_scores(np.array([[1.0, 0, 0], [1, 2, 1], [0, 0, 0]]))
+    assert scores.of_class[:2].tolist() == [1, 0.5]
+    assert scores.class_accuracy == 0.75
+    assert scores.counts.dtype == np.int64
+
+
+def test_counts_are_whole_numbers_summed_over_processes() -> None:
+    metric = ClassCounts(2)
+    metric.confusion += 2**24  # float32 cannot count beyond
+    metric.update(torch.tensor([1]), torch.tensor([0]))
+    expected = 2**24 + np.array([[0, 1], [0, 0]])
+
+    def gather(state: torch.Tensor, group: object = None) -> list[torch.Tensor]:
+        return [state, 2 * state]
+
+    metric.dist_sync_fn, metric.distributed_available_fn = gather, lambda: True
+    np.testing.assert_array_equal(metric.compute(), 3 * expected)
 
 
 def test_matrices_add_up_over_processes_and_reset() -> None:

@@ -71,8 +71,19 @@ def test_nothing_labelled() -> None:
     scores = segmentation_scores(empty)
     assert np.isnan(scores.miou)
     assert np.all(np.isnan(scores.iou))
-    assert np.all(scores.share == 0)
+    assert scores.share.tolist() == [0, 0, 0]
     assert segmentation_scores(empty, "zero").miou == 0
+    assert segmentation_scores(empty.astype(int)).share.dtype == np.float64
+
+
+@pytest.mark.parametrize("scale", [1e-9, 1e-3, 1.0, 1e9])
+def test_scores_are_of_shares_however_little_there_is(scale: float) -> None:
+    # One pixel of class 3; as solid angles, pixels are small fractions of a steradian.
+    confusion = np.array([[0, 5, 0, 0], [1, 8, 1, 0], [0, 2, 6, 0], [0, 0, 0, 1.0]])
+    scores = segmentation_scores(confusion * scale)
+    np.testing.assert_allclose(scores.iou, [8 / 12, 6 / 9, 1], rtol=1e-12)
+    np.testing.assert_allclose(scores.accuracy, [8 / 10, 6 / 8, 1], rtol=1e-12)
+    np.testing.assert_allclose(scores.share, [10 / 19, 8 / 19, 1 / 19], rtol=1e-12)
 
 
 def test_solid_angle_weighs_a_hemisphere_as_half_whatever_its_rows() -> None:
@@ -99,21 +110,59 @@ def test_latitude_bands_go_from_north_to_south() -> None:
 
 def test_matrices_add_up_over_processes_and_reset() -> None:
     pairs = _panoramas()
-    parts = [_counted(pairs[:1]), _counted(pairs[1:])]
-    total = sum(part.compute().pixels for part in parts)
+    one, other = _counted(pairs[:1]).compute(), _counted(pairs[1:]).compute()
     whole = _counted(pairs)
-    np.testing.assert_array_equal(whole.compute().pixels, total)
-    assert whole.compute().images == 3
+    matrices = whole.compute()
+    np.testing.assert_array_equal(matrices.pixels, one.pixels + other.pixels)
+    np.testing.assert_array_equal(matrices.bands, one.bands + other.bands)
+    np.testing.assert_allclose(matrices.solid_angle, one.solid_angle + other.solid_angle)
+    assert matrices.images == 3
     whole.reset()
     assert int(whole.pixels.sum()) == int(whole.images) == 0
+
+
+def test_large_counts_stay_exact() -> None:
+    # Float32 cannot count beyond 2**24: a data set has more pixels of one class than that.
+    metric = ConfusionMatrix(2)
+    metric.pixels += 2**24
+    metric.bands += 2**24
+    metric.images += 2**24
+    metric.update(torch.ones(1, 2, dtype=torch.int64), torch.ones(1, 2, dtype=torch.int64))
+    metric.update(torch.ones(1, 1, 1, dtype=torch.int64), torch.ones(1, 1, 1, dtype=torch.int64))
+    matrices = metric.compute()
+    assert int(matrices.pixels[1, 1]) == 2**24 + 3
+    assert int(matrices.bands[:, 1, 1].sum()) == 6 * 2**24 + 2
+    assert matrices.images == 2**24 + 2
+    assert matrices.solid_angle.dtype == np.float64
+
+
+def test_all_is_summed_over_processes() -> None:
+    metric, own = _counted(_panoramas()), _counted(_panoramas()).compute()
+
+    def gather(state: torch.Tensor, group: object = None) -> list[torch.Tensor]:
+        return [state, 2 * state]
+
+    metric.dist_sync_fn, metric.distributed_available_fn = gather, lambda: True
+    whole = metric.compute()
+    np.testing.assert_array_equal(whole.pixels, 3 * own.pixels)
+    np.testing.assert_array_equal(whole.bands, 3 * own.bands)
+    np.testing.assert_allclose(whole.solid_angle, 3 * own.solid_angle, rtol=1e-12)
+    assert whole.images == 9
 
 
 def test_bad_input_is_refused() -> None:
     metric = ConfusionMatrix(3)
     with pytest.raises(SettingError, match="prediction"):
         metric.update(torch.ones(2, 4, dtype=torch.int64), torch.ones(2, 3, dtype=torch.int64))
-    with pytest.raises(SettingError, match="class index"):
-        metric.update(torch.full((2, 4), 3, dtype=torch.int64), torch.ones(2, 4, dtype=torch.int64))
+    ones = torch.ones(2, 4, dtype=torch.int64)
+    for strange in (3, -1):  # −1 would count as the last class of the row above
+        found = f"class index: found {min(strange, 1)} to {max(strange, 1)}; expected 0 to 2"
+        one_of_them = ones.clone()
+        one_of_them[1, 2] = strange
+        for pair in ((one_of_them, ones), (ones, one_of_them)):
+            with pytest.raises(SettingError, match=found):
+                metric.update(*pair)
+    assert metric.compute().images == 0
 
 
 def test_an_all_unknown_panorama_counts_as_seen_and_adds_nothing() -> None:
@@ -134,3 +183,12 @@ def test_photos_are_counted_like_panoramas_without_latitudes_and_solid_angles() 
     assert not photo.solid_angle.any()
     assert not photo.bands.any()
     assert as_one.solid_angle.any()
+
+
+def test_photos_add_up_whatever_classes_they_show() -> None:
+    first, last = np.full((1, 2, 2), 1), np.full((1, 2, 2), CLASSES - 1)
+    expected = np.zeros((CLASSES, CLASSES), np.int64)
+    expected[1, 1], expected[CLASSES - 1, 1] = 8, 4
+    found = _counted([(first, first), (first, last), (first, first)]).compute()
+    np.testing.assert_array_equal(found.pixels, expected)
+    assert found.images == 3

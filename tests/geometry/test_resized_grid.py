@@ -1,0 +1,44 @@
+"""Images of another size see what the original ones see."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tangent_train.errors import SettingError
+from tangent_train.geometry import CubeGrid, PinholeGrid, ResizedGrid, TangentGrid, rotation_about
+
+TURN, OTHER = rotation_about((1, 2, 3), 0.4), rotation_about((0, 1, 0), 1.1)
+GRIDS: list[PinholeGrid] = [CubeGrid(8, TURN), TangentGrid(1, 5), TangentGrid(0, 4, 20, TURN)]
+
+
+@pytest.mark.parametrize("original", GRIDS)
+@pytest.mark.parametrize("dim", [2, 7, 33])
+def test_only_the_pixels_are_others(original: PinholeGrid, dim: int) -> None:
+    grid = ResizedGrid(original, dim)
+    assert grid.dim == dim
+    assert grid.dim * grid.pitch == pytest.approx(original.dim * original.pitch, rel=1e-15)
+    assert grid.num_images == original.num_images
+    assert grid.overlapping is original.overlapping
+    assert grid.rotation is original.rotation
+    np.testing.assert_array_equal(grid.neighbors, original.neighbors)
+    np.testing.assert_array_equal(grid.world_from_camera, original.world_from_camera)
+    # The outer edges agree: the middle of d pixels is (d − 1)/2.
+    edges = original.project(grid.directions([3])[0, 0, 0], 3)
+    np.testing.assert_allclose((edges + 0.5) * dim / original.dim, 0.5, atol=1e-9)
+
+
+@pytest.mark.parametrize("original", GRIDS)
+def test_another_rotation_replaces_its_own(original: PinholeGrid) -> None:
+    turned = ResizedGrid(original, 9).with_rotation(OTHER)
+    assert type(turned) is ResizedGrid
+    assert turned == ResizedGrid(original.with_rotation(OTHER), 9)
+    assert turned != ResizedGrid(original, 9)
+    np.testing.assert_array_equal(turned.rotation, OTHER)
+    assert turned.with_rotation(None).rotation is None
+
+
+@pytest.mark.parametrize("dim", [1, 0, -8])
+def test_less_than_two_pixels_are_refused(dim: int) -> None:
+    with pytest.raises(SettingError, match=f"dim: found {dim}; expected 2 or more"):
+        ResizedGrid(CubeGrid(8), dim)
