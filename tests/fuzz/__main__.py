@@ -25,9 +25,10 @@ from typing import Any
 
 _GIB = 1 << 30
 _SECONDS_PER_INPUT = 20
+_MEMORY_PER_INPUT = 300 << 20  # what images of `LARGEST_IMAGE` take, with some copies
 _COUNTS = "counts.json"
-_STARTS = 25  # of a target whose process dies
-_KINDS = ("error", "crash", "oom", "timeout")
+_INPUTS_PER_PROCESS = 40_000  # decoders of images lose a few kilobytes with many a broken file
+_KINDS = ("error", "crash", "oom", "timeout", "memory")
 
 
 def main() -> int:
@@ -56,16 +57,13 @@ def main() -> int:
 
 
 def _campaign(name: str, seconds: float, folder: Path) -> int:
-    """Run the process of a target, again where it dies; 1 where something was found."""
+    """Run the process of a target again and again; 1 where something was found."""
     (folder / "corpus").mkdir(parents=True, exist_ok=True)
     before = _findings(folder)
     end = time.monotonic() + seconds
     total: Counter[str] = Counter()
     slowest = 0.0
-    for _ in range(_STARTS):
-        left = end - time.monotonic()
-        if left < 1:
-            break
+    while (left := end - time.monotonic()) > 1:
         (folder / _COUNTS).write_text('{"inputs": 0, "refused": 0, "slowest": 0}')
         command = [sys.executable, "-m", "tests.fuzz", "--child", name]
         command += ["--minutes", str(left / 60), "--out", str(folder)]
@@ -109,11 +107,13 @@ def _fuzz(atheris: Any, name: str, seconds: float, folder: Path) -> None:
     path = Path(temporary.name) / "file.png"
 
     def try_one(content: bytes) -> None:
-        start = time.monotonic()
+        start, used = time.monotonic(), _most_used()
         try:
             counts["refused"] += target.try_on(path, content) == "refused"
         except Exception as error:
             _save(folder, content, error)
+        if _most_used() - used > _MEMORY_PER_INPUT:
+            (folder / f"memory-{_most_used() >> 20}-MiB").write_bytes(content)
         counts["inputs"] += 1
         if time.monotonic() - start > counts["slowest"]:
             counts["slowest"] = time.monotonic() - start
@@ -133,11 +133,17 @@ def _fuzz(atheris: Any, name: str, seconds: float, folder: Path) -> None:
     options += [
         f"-artifact_prefix={folder}/",
         "-rss_limit_mb=3000",
+        f"-runs={_INPUTS_PER_PROCESS}",
         "-max_len=1048576",
         "-len_control=0",
     ]
     atheris.Setup([name, *options, str(folder / "corpus")], try_one, custom_mutator=mutator)
     atheris.Fuzz()
+
+
+def _most_used() -> int:
+    """Bytes of memory this process has had at most."""
+    return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
 def _limit_memory() -> None:
