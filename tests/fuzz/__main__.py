@@ -20,7 +20,6 @@ import traceback
 from collections import Counter
 from pathlib import Path
 from random import Random
-from tempfile import TemporaryDirectory
 from typing import Any
 
 _GIB = 1 << 30
@@ -62,7 +61,7 @@ def _campaign(name: str, seconds: float, folder: Path) -> int:
     before = _findings(folder)
     end = time.monotonic() + seconds
     total: Counter[str] = Counter()
-    slowest = 0.0
+    slowest, ended = 0.0, 0
     while (left := end - time.monotonic()) > 1:
         (folder / _COUNTS).write_text('{"inputs": 0, "refused": 0, "slowest": 0}')
         command = [sys.executable, "-m", "tests.fuzz", "--child", name]
@@ -73,6 +72,7 @@ def _campaign(name: str, seconds: float, folder: Path) -> int:
         slowest = max(slowest, counts.pop("slowest"))
         total.update(counts)
         if code:
+            ended += 1
             _say(f"{name}: the process ended with {code}; see {folder / 'log.txt'}")
     found = sorted(_findings(folder) - before)
     _say(
@@ -81,7 +81,7 @@ def _campaign(name: str, seconds: float, folder: Path) -> int:
     )
     for path in found:
         _say(f"  {path}")
-    return 1 if found else 0
+    return 1 if found or ended else 0
 
 
 def _say(line: str) -> None:
@@ -103,8 +103,8 @@ def _fuzz(atheris: Any, name: str, seconds: float, folder: Path) -> None:
     for number, seed in enumerate(seeds):
         (folder / "corpus" / f"seed-{number}").write_bytes(seed)
     counts = {"inputs": 0, "refused": 0, "slowest": 0.0}
-    temporary = TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None)
-    path = Path(temporary.name) / "file.png"
+    path = folder / "tried" / "file.png"
+    path.parent.mkdir(exist_ok=True)
 
     def try_one(content: bytes) -> None:
         start, used = time.monotonic(), _most_used()
