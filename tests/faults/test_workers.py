@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 from functools import partial
@@ -19,14 +20,25 @@ from tangent_train.errors import DataError, SettingError
 from tests.faults.small_runs import Faulty, run_trainer, small_data, small_task
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
     from datamodules.stanford2d3ds import Stanford2D3DS
 
-pytestmark = pytest.mark.filterwarnings("ignore:You defined a `validation_step`:UserWarning")
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:You defined a `validation_step`:UserWarning"),
+    # torch opens files to see whether any are left, and hears of the death in the middle of that.
+    pytest.mark.filterwarnings("ignore:unclosed file <_io.FileIO name='.*tmp:ResourceWarning"),
+]
 
 INDEX = 2
+
+
+@pytest.fixture(autouse=True)
+def _closed() -> Iterator[None]:
+    """Files that torch left open are closed here, and not in a test that may not leave any."""
+    yield
+    gc.collect()
 
 
 def _die(how: Callable[[], object]) -> object:
