@@ -137,7 +137,7 @@ class PinholeGrid(ABC):
         if faces is None:
             return np.arange(self.num_images)
         indices = np.atleast_1d(np.asarray(faces))
-        whole = indices.size == 0 or np.issubdtype(indices.dtype, np.integer)
+        whole = indices.size == 0 or indices.dtype.kind in "iu"
         if not whole or indices.ndim != 1 or np.any((indices < 0) | (indices >= self.num_images)):
             raise SettingError("faces", found=faces, expected=f"indices 0 to {self.num_images - 1}")
         return indices.astype(np.int64)

@@ -16,7 +16,7 @@ from tangent_train.rendering.checks import (
     check_numpy_image,
     check_torch_image,
 )
-from tangent_train.rendering.sampling import map_dtype
+from tangent_train.rendering.sampling import map_dtype, sample_maps
 from tangent_train.rendering.tables import forward_map, tensors_on
 from tangent_train.rendering.taps import bilinear_equirect_taps, nearest_equirect_index, sample
 
@@ -31,6 +31,8 @@ _CHUNK = 2**20
 
 _TOGETHER = 2**16
 """Pixels of small images that are rendered at once: tables of this size stay in a core's cache."""
+_HELD = 2**22
+"""Pixels whose tables are held at once, kept or not; threads are started once for all of them."""
 
 
 @overload
@@ -61,7 +63,7 @@ def equirect_to_tangent(
     Args:
         image: A tensor ``(..., C, H, W)`` on any device, differentiable; or an array
             ``(H, W[, C])``: uint8, uint16 and float32 go through `cv2.remap` (see
-            `EquirectMap.sample` about its precision), other dtypes are slower.
+            `sample_maps` about its precision), other dtypes are slower.
         grid: The images, a `TangentGrid` or a `CubeGrid`.
         faces: Images asked for, default all; only they are rendered.
         interpolation: ``bilinear``, or ``nearest`` for labels and masks of any dtype.
@@ -85,9 +87,15 @@ def equirect_to_tangent(
     # not, unless their tables are not kept anyway.
     together = faces is None or grid.rotation is not None
     step = max(1, _TOGETHER // max(grid.dim**2, 4 * grid.dim)) if together else 1
-    for start in range(0, len(indices), step):
-        table = forward_map(grid, image.shape[:2], indices[start : start + step], dtype)
-        table.sample(image, interpolation, out[start * grid.dim :][: len(table.u)])
+    many = step * max(1, _HELD // (step * grid.dim**2))
+    for start in range(0, len(indices), many):
+        some = indices[start : start + many]
+        maps = [
+            forward_map(grid, image.shape[:2], some[first : first + step], dtype)
+            for first in range(0, len(some), step)
+        ]
+        part = out[start * grid.dim : (start + len(some)) * grid.dim]
+        sample_maps(maps, image, interpolation, part)
     return out.reshape(len(indices), grid.dim, *out.shape[1:])
 
 

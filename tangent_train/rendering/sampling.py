@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -11,16 +12,23 @@ import torch
 from numpy.typing import NDArray
 
 from tangent_train.rendering.kernels import pinhole_map
+from tangent_train.rendering.sampling_kernels import sample_colors, sample_nearest
 from tangent_train.rendering.taps import bilinear_equirect_taps, nearest_equirect_index
 from tangent_train.rendering.threads import over_rows
 
-__all__ = ["EquirectMap", "map_dtype", "pinhole_equirect_map"]
+__all__ = ["EquirectMap", "map_dtype", "pinhole_equirect_map", "sample_maps"]
 
+_KERNEL_LIMIT = 2**31
+"""Compiled kernels take images of fewer values."""
+_SMALLEST_SHARE = 2**18
+"""Pixels that a kernel samples in about the time that starting a thread takes."""
 _REMAP_LIMIT = 32767
 """cv2.remap takes images whose sides are below SHRT_MAX."""
 _REMAP_BILINEAR = (np.dtype(np.uint8), np.dtype(np.uint16), np.dtype(np.float32))
+_COLORS = (np.dtype(np.uint8), np.dtype(np.float32))
+"""Of three channels, sampled by a compiled kernel."""
 _SAME_SIZE = {1: np.uint8, 2: np.uint16, 4: np.float32, 8: np.float64}
-"""Nearest sampling moves bytes: any dtype goes as one of its size that cv2 knows."""
+"""Nearest sampling moves bytes: any dtype goes as one of its size."""
 _BLOCK = 2**18
 """Positions sampled at once where cv2 cannot be used."""
 
@@ -57,38 +65,26 @@ class EquirectMap:
     def sample(
         self, image: NDArray[np.generic], interpolation: str, out: NDArray[np.generic]
     ) -> None:
-        """Sample a panorama, longitude wrapped and poles reflected.
+        """Sample a panorama at these positions; see `sample_maps`."""
+        sample_maps([self], image, interpolation, out)
 
-        Bilinear sampling of uint8, uint16 and float32 is done by `cv2.remap`. OpenCV 5 computes
-        with exact positions and rounds integers once; OpenCV 4 may round positions to 1/32 pixel,
-        which 8-bit images do not show. All else is exact.
-
-        Args:
-            image: ``(H, W[, C])``.
-            interpolation: ``bilinear`` or ``nearest``.
-            out: ``(h, w[, C])`` contiguous, same dtype, written.
-        """
-        if max(*self.shape, *self.u.shape) >= _REMAP_LIMIT:
-            self._gather(image, interpolation, out, None)
-        elif interpolation == "nearest":
-            plain = _SAME_SIZE[image.dtype.itemsize]
-            rows = self.v.clip(0, self.shape[0] - 1) if len(self.polar) else self.v
-            self._remap(image.view(plain), rows, cv2.INTER_NEAREST, out.view(plain))
-        elif image.dtype in _REMAP_BILINEAR:
-            self._remap(image, self.v, cv2.INTER_LINEAR, out)
-            if len(self.polar):
-                self._gather(image, interpolation, out, self.polar)
-        else:
-            self._gather(image, interpolation, out, None)
-
-    def _remap(
-        self,
-        image: NDArray[np.generic],
-        v: NDArray[np.floating],
-        flag: int,
-        out: NDArray[np.generic],
+    def sample_by_cv2(
+        self, image: NDArray[np.generic], nearest: bool, out: NDArray[np.generic]
     ) -> None:
-        u, v = self.u.astype(np.float32, copy=False), v.astype(np.float32, copy=False)
+        """The same without compiled kernels; nearest of dtypes of `_SAME_SIZE` only."""
+        small = max(*self.shape, *self.u.shape) < _REMAP_LIMIT
+        if not small or not (nearest or image.dtype in _REMAP_BILINEAR):
+            self.gather(image, nearest, out, None)
+            return
+        self._remap(image, nearest, out)
+        if not nearest and len(self.polar):
+            self.gather(image, nearest, out, self.polar)
+
+    def _remap(self, image: NDArray[np.generic], nearest: bool, out: NDArray[np.generic]) -> None:
+        u, v = self.u.astype(np.float32, copy=False), self.v.astype(np.float32, copy=False)
+        if nearest and len(self.polar):
+            v = v.clip(0, self.shape[0] - 1)
+        flag = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
         channels = 1 if image.ndim == 2 else image.shape[2]
         if image.ndim == 2 or channels in (3, 4):
             cv2.remap(image, u, v, flag, dst=out, borderMode=cv2.BORDER_WRAP)
@@ -103,10 +99,10 @@ class EquirectMap:
             sampled = cv2.remap(np.ascontiguousarray(group), u, v, flag, borderMode=cv2.BORDER_WRAP)
             out[..., first : first + several] = sampled[..., :size]
 
-    def _gather(
+    def gather(
         self,
         image: NDArray[np.generic],
-        interpolation: str,
+        nearest: bool,
         out: NDArray[np.generic],
         chosen: NDArray[np.intp] | None,
     ) -> None:
@@ -117,12 +113,92 @@ class EquirectMap:
         for start in range(0, len(positions), _BLOCK):
             part = positions[start : start + _BLOCK]
             u, v = (torch.from_numpy(line.reshape(-1)[part]) for line in (self.u, self.v))
-            if interpolation == "nearest":
+            if nearest:
                 target[part] = source[nearest_equirect_index(u, v, self.shape).numpy()]
                 continue
             index, weight = bilinear_equirect_taps(u.double(), v.double(), self.shape)
             values = np.einsum("tpc,tp->pc", source[index.numpy()], weight.numpy())
             target[part] = np.rint(values) if image.dtype.kind in "ui" else values
+
+
+def sample_maps(
+    maps: Sequence[EquirectMap],
+    image: NDArray[np.generic],
+    interpolation: str,
+    out: NDArray[np.generic],
+) -> None:
+    """Sample a panorama at many positions, longitude wrapped and poles reflected.
+
+    Three channels of uint8 or float32, and the nearest pixel of one channel, are sampled by
+    compiled kernels; other bilinear uint8, uint16 and float32 by `cv2.remap`. OpenCV 5 computes
+    with exact positions and rounds integers once; OpenCV 4 may round positions to 1/32 pixel,
+    which 8-bit images do not show. All else is exact.
+
+    Args:
+        maps: Positions ``(h, w)`` in the panorama; only the last may have other rows.
+        image: ``(H, W[, C])``.
+        interpolation: ``bilinear`` or ``nearest``.
+        out: ``(h₁ + h₂ + …, w[, C])`` contiguous, same dtype, written.
+    """
+    nearest = interpolation == "nearest"
+    if nearest:
+        plain = _SAME_SIZE[image.dtype.itemsize]
+        image, out = image.view(plain), out.view(plain)
+    height = len(maps[0].u)
+    parts = [out[n * height :][: len(table.u)] for n, table in enumerate(maps)]
+    kernel = _kernel_for(image, nearest)
+    if kernel is not None:
+        _over_maps(kernel, maps, image, parts)
+    for table, part in zip(maps, parts, strict=True):
+        if kernel is None:
+            table.sample_by_cv2(image, nearest, part)
+        elif not nearest and len(table.polar):
+            table.gather(image, nearest, part, table.polar)
+
+
+def _kernel_for(image: NDArray[np.generic], nearest: bool) -> Callable[..., None] | None:
+    """A compiled kernel that is faster than cv2, where there is one."""
+    if image.size >= _KERNEL_LIMIT:
+        return None
+    if nearest and image.ndim == 2:
+        return sample_nearest
+    if not nearest and image.dtype in _COLORS and image.shape[2:] == (3,):
+        return sample_colors
+    return None
+
+
+def _over_maps(
+    kernel: Callable[..., None],
+    maps: Sequence[EquirectMap],
+    image: NDArray[np.generic],
+    parts: Sequence[NDArray[np.generic]],
+) -> None:
+    """Run a kernel for all rows of all maps, as if they were one, in parallel."""
+    height, width = maps[0].u.shape
+    source = _read_only(image.reshape(-1))
+    arguments = [
+        (
+            source,
+            *(_read_only(np.ascontiguousarray(line, np.float32)) for line in (table.u, table.v)),
+        )
+        for table in maps
+    ]
+
+    def of_rows(start: int, stop: int) -> None:
+        for n in range(start // height, -(-stop // height)):
+            above = n * height
+            rows = max(start - above, 0), min(stop - above, len(maps[n].u))
+            kernel(*rows, *maps[n].shape, *arguments[n], parts[n].reshape(-1))
+
+    shape = sum(len(table.u) for table in maps), width
+    over_rows(of_rows, shape, smallest_share=_SMALLEST_SHARE)
+
+
+def _read_only(array: NDArray[np.generic]) -> NDArray[np.generic]:
+    """Files can only be read: where all are so, a kernel is compiled once."""
+    view = array.view()
+    view.flags.writeable = False
+    return view
 
 
 def pinhole_equirect_map(

@@ -96,9 +96,10 @@ class TableCache:
             nbytes: Size of the value.
         """
         with self._lock:
-            if key in self._values:
+            entry = self._values.get(key)
+            if entry is not None:
                 self._values.move_to_end(key)
-                held: Value = self._values[key][0]
+                held: Value = entry[0]
                 return held
         value = build()
         size = nbytes(value)

@@ -11,11 +11,13 @@ import torch
 
 __all__ = ["over_rows"]
 
-_SMALLEST_SHARE = 2**15
-"""Pixels for which starting a thread is worth it."""
 
-
-def over_rows(kernel: Callable[..., None], shape: tuple[int, int], *arguments: Any) -> None:
+def over_rows(
+    kernel: Callable[..., None],
+    shape: tuple[int, int],
+    *arguments: Any,
+    smallest_share: int = 2**15,
+) -> None:
     """Run ``kernel(start, stop, *arguments)`` over all rows, in parallel blocks.
 
     As many threads as torch would use (`torch.get_num_threads`: one inside a `DataLoader` worker),
@@ -25,9 +27,10 @@ def over_rows(kernel: Callable[..., None], shape: tuple[int, int], *arguments: A
         kernel: A compiled function that releases the GIL.
         shape: ``(H, W)`` rows and their length.
         *arguments: What the kernel takes besides the rows.
+        smallest_share: Pixels for which starting a thread is worth it.
     """
     height, width = shape
-    threads = min(torch.get_num_threads(), height, height * width // _SMALLEST_SHARE)
+    threads = min(torch.get_num_threads(), height, height * width // smallest_share)
     if threads <= 1:
         kernel(0, height, *arguments)
         return

@@ -99,9 +99,41 @@ def test_nearest_takes_the_nearest_pixel(dtype: Any) -> None:
     np.testing.assert_array_equal(tensor.movedim(1, -1).numpy(), found)
 
 
-@pytest.mark.parametrize("limit", [32767, 0])
-def test_nearest_wraps_at_the_seam(monkeypatch: pytest.MonkeyPatch, limit: int) -> None:
-    monkeypatch.setattr(sampling, "_REMAP_LIMIT", limit)
+@pytest.mark.parametrize("dtype", [np.uint8, np.float32])
+@pytest.mark.parametrize("shape", [(1, 2), (2, 3), (5, 11), (64, 128)])
+def test_colors_equal_exact_values_everywhere(shape: tuple[int, int], dtype: Any) -> None:
+    height, width = shape
+    image = _random((*shape, 3), dtype)
+    image.flags.writeable = False
+    rng = np.random.default_rng(0)
+    u = rng.uniform(-0.5, width - 0.5, (50, 40)).astype(np.float32)
+    v = rng.uniform(-0.5, height - 0.5, (50, 40)).astype(np.float32)
+    u[:2] = np.resize([-0.5, 0, width - 1, width - 0.5], 40)
+    v[:2] = np.resize([-0.5, 0, 0.25, height - 1, height - 0.5], 40)
+    table = sampling.EquirectMap(u, v, shape)
+    found, exact = np.empty((50, 40, 3), dtype), np.empty((50, 40, 3))
+    table.sample(image, "bilinear", found)
+    table.sample(image.astype(np.float64), "bilinear", exact)
+    assert np.abs(found - exact).max() <= (0.5 + 1e-4 if dtype == np.uint8 else 1e-5)
+
+
+def test_infinite_colors_stay_where_they_are() -> None:
+    image = np.zeros((8, 16, 3), np.float32)
+    image[3, 5:7], image[3, 9, 1] = np.inf, np.nan
+    u = np.array([[5.5, 4.5, 8.5, 7.5, 2]], np.float32)
+    out = np.empty((1, 5, 3), np.float32)
+    sampling.EquirectMap(u, np.full_like(u, 3), (8, 16)).sample(image, "bilinear", out)
+    np.testing.assert_array_equal(out[0, :, 0], [np.inf, np.inf, 0, 0, 0])
+    np.testing.assert_array_equal(out[0, :, 1], [np.inf, np.inf, np.nan, 0, 0])
+
+
+@pytest.mark.parametrize("kernels", [2**31, 0])
+@pytest.mark.parametrize("remap", [32767, 0])
+def test_nearest_wraps_at_the_seam(
+    monkeypatch: pytest.MonkeyPatch, kernels: int, remap: int
+) -> None:
+    monkeypatch.setattr(sampling, "_KERNEL_LIMIT", kernels)
+    monkeypatch.setattr(sampling, "_REMAP_LIMIT", remap)
     u = np.array([[-0.6, -0.4, 31.4, 31.6]], np.float32)
     table = sampling.EquirectMap(u, np.array([[-0.5, 0, 3, 3.5]], np.float32), (4, 32))
     out = np.empty((1, 4), np.int16)
