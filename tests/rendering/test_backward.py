@@ -17,12 +17,29 @@ from tangent_train.rendering import (
     tangent_to_equirect,
     tangent_to_labels,
 )
+from tangent_train.rendering.taps import nearest_image_index
 from tests.rendering.reference import ReferenceGrid
 
 BLENDS = ["nearest", "feather"]
 SHAPES = [(64, 128), (63, 125), (50, 70)]
 TURNED = TangentGrid(0, 5, dim=28, rotation=random_rotation(np.random.default_rng(1)))
 GRIDS = [TangentGrid(0, 5), TangentGrid(1, 6, dim=24), TURNED]
+
+
+@pytest.mark.parametrize("value", [np.int32(2**24 + 1), np.uint32(2**32 - 1), np.float64(1 / 3)])
+@pytest.mark.parametrize("blend", BLENDS)
+def test_arrays_that_float32_cannot_hold_are_exact(blend: Any, value: Any) -> None:
+    images = np.full((20, 32, 32), value)
+    panorama = tangent_to_equirect(images, TangentGrid(0, 5), (32, 64), blend)
+    assert panorama.dtype == value.dtype
+    np.testing.assert_allclose(panorama, value, rtol=1e-12)
+
+
+def test_positions_off_the_outermost_centres_are_those_of_the_edge() -> None:
+    places = torch.tensor([-0.7, -0.5, 0.4, 1.5, 2.5, 3.4, 3.7])
+    index = nearest_image_index(torch.full((7,), 2), places, places.flip(0), 4)
+    columns, rows = [0, 0, 0, 2, 2, 3, 3], [3, 3, 2, 2, 0, 0, 0]
+    assert index.tolist() == [(2 * 4 + r) * 4 + c for r, c in zip(rows, columns, strict=True)]
 
 
 @pytest.mark.parametrize("blend", BLENDS)
@@ -80,12 +97,14 @@ def test_labels_are_the_argmax_of_the_rendered_scores(
     torch.testing.assert_close(exact, expected)
 
 
-def test_equal_and_infinite_scores() -> None:
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_equal_and_infinite_scores(dtype: Any) -> None:
     grid = TangentGrid(0, 4)
-    scores = np.zeros((20, 3, 16, 16), np.float32)
-    assert not tangent_to_labels(scores, grid, (16, 32)).any()
+    scores = np.zeros((20, 3, 16, 16), dtype)
+    for blend in BLENDS:
+        assert not tangent_to_labels(scores, grid, (16, 32), blend).any()
     scores[:, 0] = -np.inf
-    for blend in ("nearest", "feather"):
+    for blend in BLENDS:
         labels = tangent_to_labels(scores, grid, (16, 32), blend)
         assert (labels == 1).all()
 

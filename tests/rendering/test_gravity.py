@@ -21,8 +21,9 @@ from tangent_train.geometry import (
     random_rotation,
     rotation_about,
 )
-from tangent_train.rendering import rotate_equirect
+from tangent_train.rendering import gravity, rotate_equirect
 from tangent_train.rendering.gravity import estimate_up, up_from_pose, upright_rotation
+from tangent_train.rendering.manhattan import ManhattanFrame
 from tests.rendering.drawn_room import draw_room
 
 _UP = np.array([0.0, 0.0, 1.0])
@@ -178,6 +179,33 @@ def test_other_arrays_are_refused(panorama: NDArray[Any], found: str) -> None:
 def test_impossible_tilts(tilt_deg: float) -> None:
     with pytest.raises(SettingError, match=r"max_tilt_deg: found .* above 0, at most 180"):
         estimate_up(np.zeros((8, 16, 3), np.uint8), tilt_deg)
+
+
+def test_probabilities_of_frames_that_share_their_vertical(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three frames that are as likely as none; of one no axis is in reach."""
+    turns = [rotation_about((1, 0, 0), 0.8), np.eye(3), rotation_about(_UP, 0.5)]
+    even = gravity._EVEN_CHANCE
+    frames = [ManhattanFrame(turn, np.full(3, 0.2), even) for turn in turns]
+    shares = np.array([1, 1, 5, 1, 1, 1]) * 7.0
+    monkeypatch.setattr(gravity, "up_probabilities", lambda *_: shares)
+
+    def of(frames: list[ManhattanFrame], tilt_deg: float) -> tuple[Any, Any]:
+        nothing: Any = None
+        return gravity._candidates(nothing, nothing, frames, math.cos(math.radians(tilt_deg)))
+
+    directions, chances = of(frames, 20)
+    np.testing.assert_allclose(directions, [_UP])
+    np.testing.assert_allclose(chances, [2 / 4])
+    directions, chances = of(frames[1:], 180)
+    np.testing.assert_allclose(directions[:2], [_UP, -_UP])
+    np.testing.assert_allclose(chances, [2 / 3 / 2, *[2 / 3 / 10], *[1 / 3 / 10] * 8])
+
+
+def test_the_smallest_panorama_and_tilt() -> None:
+    assert len(estimate_up(draw_room((64, 128), np.eye(3)), max_tilt_deg=1).candidates)
+    small = estimate_up(draw_room((63, 126), np.eye(3)))
+    assert small.candidates.shape == (0, 3)
+    assert small.confidence == 0
 
 
 # Turning upright

@@ -181,6 +181,18 @@ def test_owned_pixels_of_overlapping_crops_are_disjoint() -> None:
         seen |= cells
 
 
+@pytest.mark.parametrize("overlap", [0.0, 0.25, 0.6])
+def test_as_few_crops_as_overlap_enough(overlap: float) -> None:
+    crops = PerspectiveRepresentation(8, 30.0, 64).of_camera(K, SIZE).cover(overlap)
+    for axis in (0, 1):
+        starts = np.unique(crops.boxes[:, axis].round(6))
+        side = (crops.boxes[:, axis + 2] - crops.boxes[:, axis]).mean()
+        assert len(starts) > 1
+        assert (np.diff(starts) <= side * (1 - overlap) + 1e-5).all()
+        fewer = (starts[-1] - starts[0]) / (len(starts) - 2) if len(starts) > 2 else np.inf
+        assert fewer > side * (1 - overlap)
+
+
 def test_a_photo_that_just_fits_has_one_crop_and_owns_all_of_it() -> None:
     camera = camera_matrix_from_fov(45, (80, 80))
     crops = PerspectiveRepresentation(7).of_camera(camera, (80, 80)).whole()

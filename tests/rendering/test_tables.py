@@ -115,6 +115,8 @@ def test_the_limit_can_be_set(cache: tables.TableCache) -> None:
     set_table_cache_limit(50_000)
     equirect_to_tangent(np.zeros((32, 64), np.float32), TangentGrid(0, 4))
     assert 0 < cache.nbytes <= 50_000
+    set_table_cache_limit(0)
+    assert cache.nbytes == len(cache) == 0
     with pytest.raises(SettingError, match="cache limit"):
         set_table_cache_limit(-1)
 
