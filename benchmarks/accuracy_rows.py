@@ -40,8 +40,10 @@ PLAIN = Variant("plain")
 
 _NEAREST = Variant("blend nearest", ("representation.blend=nearest",), ("null",))
 _AVERAGED = Variant("4 turned icosahedra", ("representation.average_rotations=4",), ("null", "so3"))
+_EIGHT = Variant("8 turned icosahedra", ("representation.average_rotations=8",), ("null", "so3"))
 _AUTO = Variant("upright=auto", ("data.upright=auto", "data.max_tilt_deg=60"), ("null", "20", "45"))
 _AUTO_ANY = Variant("upright=auto, any tilt", ("data.upright=auto", "data.max_tilt_deg=180"))
+_AUTO_SO3 = _AUTO_ANY._replace(orientations=("null", "so3"))
 _POSE = Variant("upright=pose", ("data.upright=pose",), ("45", "so3"), told_up=True)
 
 
@@ -101,12 +103,15 @@ _ALL = (_CONTEXT, "data.inputs=[rgb,depth,validity,elevation]", "ema=0.999")
 _GRAVITY = (_AUTO, _POSE)
 _ANY_GRAVITY = (_AUTO_ANY, _POSE)
 _BEST = (_AVERAGED, *_GRAVITY)
+_ALL_WAYS = (_AVERAGED, _EIGHT, *_GRAVITY, _AUTO_SO3)
 
 _EQUIRECT = (
     Row("erp", "whole equirectangular images, 2 a step", _ERP),
     Row("erp_aux", "the same with an auxiliary head", (*_ERP, _AUX)),
     Row("erp_crops", "90° wide crops of equirectangular images, 16 a step", _CROPS),
-    Row("erp_crops_aux", "the same with an auxiliary head", (*_CROPS, _AUX), _GRAVITY),
+    Row(
+        "erp_crops_aux", "the same with an auxiliary head", (*_CROPS, _AUX), (*_GRAVITY, _AUTO_SO3)
+    ),
 )
 _PIXELS = (
     Row("tangent", "all 20 tangent images of 2 panoramas, not cropped, not blended", _WHOLE),
@@ -129,7 +134,7 @@ _ADDITIONS = (
         "few_3_elevation",
         "few_3_aux, shown how far up every pixel looks",
         (*_THREE, _AUX, _ELEVATION),
-        _BEST,
+        _ALL_WAYS,
     ),
     Row(
         "wide_aux",
@@ -174,7 +179,7 @@ _TURNED = (
         "few_attention_so3",
         "few_attention, likewise",
         (_CONTEXT, _SO3),
-        (_AVERAGED, *_ANY_GRAVITY),
+        (_AVERAGED, _EIGHT, *_ANY_GRAVITY),
     ),
     Row(
         "few_10_attention_so3", "few_10_attention, likewise", (*_TEN, _CONTEXT, _SO3), (_AVERAGED,)
