@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tangent_train.errors import DataError
+from tangent_train.json_text import parse_json
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -138,7 +139,7 @@ def read_classes(path: Path) -> FolderClasses:
         DataError: It cannot be read, is in another form, names something twice or nothing.
     """
     try:
-        content = json.loads(path.read_bytes(), object_pairs_hook=_Pairs)
+        content = parse_json(path.read_bytes(), object_pairs_hook=_Pairs)
     except FileNotFoundError as error:
         raise DataError(
             path,
@@ -146,7 +147,7 @@ def read_classes(path: Path) -> FolderClasses:
             expected="the classes of one's own panoramas",
             remedy="Give data.root=<folder>; docs/own_data.md says what is in it.",
         ) from error
-    except (OSError, ValueError, RecursionError) as error:
+    except (OSError, ValueError) as error:
         remedy = "docs/own_data.md shows how to bring your own data."
         raise DataError(path, found=error, expected=_EXPECTED, remedy=remedy) from error
     if isinstance(content, _Pairs):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tangent_train.errors import DataError
+from tangent_train.json_text import parse_json
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -67,8 +67,8 @@ class LabelTable:
         expected = f"a JSON list of names that begin with {', '.join(CLASSES)} or <UNK>"
         remedy = "Copy semantic_labels.json of the Stanford2D3DS release."
         try:
-            names = json.loads(Path(path).read_bytes())
-        except (OSError, ValueError, RecursionError) as error:
+            names = parse_json(Path(path).read_bytes())
+        except (OSError, ValueError) as error:
             raise DataError(path, found=error, expected=expected, remedy=remedy) from error
         if not isinstance(names, list) or not names:
             raise DataError(path, found=type(names).__name__, expected=expected, remedy=remedy)

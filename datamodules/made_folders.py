@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from tangent_train.errors import DataError
 from tangent_train.files import write_text
+from tangent_train.json_text import parse_json
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -59,8 +60,8 @@ def claim_folder(
 
 def _read_manifest(manifest: Path, generator: str) -> dict[str, Any]:
     try:
-        found = json.loads(manifest.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError):
+        found = parse_json(manifest.read_text(encoding="utf-8"))
+    except ValueError:
         found = None
     if not isinstance(found, dict):
         raise DataError(

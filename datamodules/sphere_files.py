@@ -20,6 +20,7 @@ from datamodules.mesh_spheres import CHANNELS, clean_mesh, mesh_spheres
 from datamodules.off_files import read_off
 from tangent_train.errors import DataError
 from tangent_train.files import atomic_path
+from tangent_train.json_text import parse_json
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -86,8 +87,8 @@ def is_current(source: Path, target: Path) -> bool:
         with target.open("rb") as file:
             file.seek(-min(_TAIL, os.fstat(file.fileno()).st_size), os.SEEK_END)
             line = file.read().rpartition(b"\n{")[2]
-        return bool(json.loads(b"{" + line) == {"made from": stamp(source)})
-    except (OSError, ValueError, RecursionError):
+        return bool(parse_json(b"{" + line) == {"made from": stamp(source)})
+    except (OSError, ValueError):
         return False
 
 

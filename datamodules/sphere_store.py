@@ -17,6 +17,7 @@ from datamodules.progress import show_progress
 from datamodules.sphere_files import is_current, make_sphere, read_sphere, stamp
 from tangent_train.errors import DataError
 from tangent_train.files import write_text
+from tangent_train.json_text import parse_json
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Sequence
@@ -182,11 +183,11 @@ class SphereFolder:
     def _read_unusable(self) -> dict[str, _Unusable]:
         path = self.folder / _UNUSABLE
         try:
-            content: dict[str, Any] = json.loads(path.read_bytes())
+            content: dict[str, Any] = parse_json(path.read_bytes())
             return {name: _Unusable(**entry) for name, entry in content.items()}
         except (FileNotFoundError, NotADirectoryError):
             return {}
-        except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
+        except (OSError, ValueError, TypeError, AttributeError) as error:
             raise DataError(
                 path,
                 found=f"something else ({error})",

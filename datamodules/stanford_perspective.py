@@ -11,7 +11,6 @@ On disk, as released::
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +30,7 @@ from datamodules.stanford_files import (
 )
 from datamodules.stanford_splits import StanfordSplits
 from tangent_train.errors import DataError
+from tangent_train.json_text import parse_json
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -58,8 +58,8 @@ def read_camera_matrix(path: Path) -> NDArray[np.float64]:
     """
     expected = "a pose file with a camera_k_matrix of 3×3 numbers, without skew"
     try:
-        matrix = np.array(json.loads(path.read_bytes())["camera_k_matrix"], np.float64)
-    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
+        matrix = np.array(parse_json(path.read_bytes())["camera_k_matrix"], np.float64)
+    except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:
         found = f"{type(error).__name__}: {error}"
         raise DataError(
             path, found=found, expected=expected, remedy="Copy or extract the file again."

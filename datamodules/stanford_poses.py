@@ -15,7 +15,6 @@ is right.
 
 from __future__ import annotations
 
-import json
 import math
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +23,7 @@ import numpy as np
 from datamodules.synthrooms.camera import CAMERA_FROM_SPHERE, euler_rotation
 from tangent_train.errors import DataError, SettingError
 from tangent_train.geometry import PanoramaPose
+from tangent_train.json_text import parse_json
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -62,8 +62,8 @@ def read_panorama_pose(path: Path) -> PanoramaPose:
 
 def _read_record(path: Path) -> dict[str, Any]:
     try:
-        record = json.loads(path.read_bytes())
-    except (OSError, ValueError, RecursionError) as error:
+        record = parse_json(path.read_bytes())
+    except (OSError, ValueError) as error:
         raise DataError(path, found=error, expected="a pose as JSON", remedy=_REMEDY) from error
     if not isinstance(record, dict):
         raise DataError(path, found="other JSON", expected="a pose", remedy=_REMEDY)

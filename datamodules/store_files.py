@@ -26,6 +26,7 @@ from datamodules.panoramas import Panorama
 from datamodules.sources import count_labels
 from tangent_train.errors import DataError
 from tangent_train.files import atomic_path
+from tangent_train.json_text import parse_json
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -153,7 +154,7 @@ def open_stored(path: Path) -> StoredPanorama:
         raise broken(path, "a corrupted or truncated header", _MADE_WHOLE)
     content = mapped[start + length + _gap(start + length) :]
     try:
-        header = json.loads(text)
+        header = parse_json(text)
         if content.size == header["bytes"]:
             return _parse(path, header, content)
         expected = f"{header['bytes'] + mapped.size - content.size} bytes"

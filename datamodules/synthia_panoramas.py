@@ -43,6 +43,7 @@ from tangent_train.geometry import (
     perspective_directions,
     rotation_about,
 )
+from tangent_train.json_text import parse_json
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Sequence
@@ -234,8 +235,8 @@ def _claim(folder: Path, frames: int, height: int) -> bool:
             write_text(manifest, json.dumps(wanted, indent=1) + "\n")
         return not ready
     try:
-        found = json.loads(manifest.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError):
+        found = parse_json(manifest.read_text(encoding="utf-8"))
+    except ValueError:
         found = "something else"
     if found != wanted:
         raise DataError(

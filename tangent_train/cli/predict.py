@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from dataclasses import replace
@@ -23,6 +22,7 @@ from tangent_train.cli.prediction.report import (
 )
 from tangent_train.cli.prediction.settings import PredictSettings
 from tangent_train.errors import DataError, SettingError
+from tangent_train.json_text import parse_json
 from tangent_train.tasks.prediction.labellers import (
     DepthFolder,
     Labelled,
@@ -127,11 +127,11 @@ def _earlier(
         SettingError: They were made in another way.
     """
     try:
-        content = json.loads((output.path / "summary.json").read_bytes())
+        content = parse_json((output.path / "summary.json").read_bytes())
         entries = {entry["name"]: entry for entry in content["images"] if "error" not in entry}
         before = {name: content[name] for name in _KEPT}
         before |= {name: content[name] for name in _LATER if name in content}
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+    except (OSError, ValueError, KeyError, TypeError):
         return {}
     now = summary(settings, trained, [])
     for name, value in before.items():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 
 from tangent_train.cli.studies.catalogue import STUDIES
 from tangent_train.errors import SettingError
+from tangent_train.json_text import parse_json
 
 __all__ = ["study"]
 
@@ -121,7 +121,7 @@ def _value(name: str, text: str) -> Any:
     if name in _PATHS:
         return None if text == "null" and name != "output" else text
     try:
-        return json.loads(text)
+        return parse_json(text)
     except ValueError:
         return text
 

@@ -7,7 +7,6 @@ figure it leaves.
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 from pathlib import Path
@@ -21,6 +20,7 @@ from hydra.types import RunMode
 from tangent_train.cli.processes import command_line, run_environment, run_process
 from tangent_train.cli.stored import stored_config_arguments
 from tangent_train.errors import SettingError
+from tangent_train.json_text import parse_json
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -109,7 +109,7 @@ def run_job(
         job = f"job {HydraConfig.get().job.num} in {folder} ended with status {code}"
         raise JobError("\n".join([f"tangent-{command}: {job}", *errors]))
     if objective.is_file():
-        return float(json.loads(objective.read_text())["best"])
+        return float(parse_json(objective.read_text())["best"])
     first_task = os.environ.get("SLURM_PROCID", "0") == "0"  # which writes it, perhaps later
     if needs_figure and first_task:
         raise JobError(

@@ -19,6 +19,7 @@ import numpy as np
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import write_text
 from tangent_train.geometry import FLIP_Y, TangentGrid, xyz_to_lonlat
+from tangent_train.json_text import parse_json
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -142,8 +143,8 @@ def read_cameras(path: Path) -> CameraFile:
             contradict each other.
     """
     try:
-        content = json.loads(path.read_bytes())
-    except (OSError, ValueError, RecursionError) as error:
+        content = parse_json(path.read_bytes())
+    except (OSError, ValueError) as error:
         found = "no such file" if isinstance(error, FileNotFoundError) else error
         raise DataError(
             path,

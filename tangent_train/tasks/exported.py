@@ -20,6 +20,7 @@ from torch import nn
 from datamodules.samples import Input, Normalization
 from models.onnx_network import OnnxNetwork
 from tangent_train.errors import DataError
+from tangent_train.json_text import parse_json
 from tangent_train.tasks.networks import TrainedNetwork, network_from
 from tangent_train.tasks.stored_settings import check_stored
 
@@ -221,8 +222,8 @@ def _content(
             "write it with tangent-export.",
         )
     try:
-        content = json.loads(text)
-    except (ValueError, RecursionError) as error:
+        content = parse_json(text)
+    except ValueError as error:
         raise DataError(
             path, found=f"'{METADATA_KEY}' in its metadata is no JSON ({error})", expected=_EXPECTED
         ) from error

@@ -20,7 +20,7 @@ from tangent_train.rendering import (
 from tangent_train.rendering.taps import nearest_image_index
 from tests.rendering.reference import ReferenceGrid
 
-BLENDS = ["nearest", "feather"]
+BLENDS: list[Any] = ["nearest", "feather"]
 SHAPES = [(64, 128), (63, 125), (50, 70)]
 TURNED = TangentGrid(0, 5, dim=28, rotation=random_rotation(np.random.default_rng(1)))
 GRIDS = [TangentGrid(0, 5), TangentGrid(1, 6, dim=24), TURNED]

@@ -19,6 +19,7 @@ import numpy as np
 from datamodules.image_files import read_image_size
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import atomic_path, write_text
+from tangent_train.json_text import parse_json
 from tangent_train.keypoints.colmap import (
     ColmapImage,
     ColmapPair,
@@ -82,9 +83,9 @@ class ColmapExport:
     def is_complete(self, names: Sequence[str]) -> bool:
         """Whether all pairs are exported already, by name."""
         try:
-            index = json.loads((self.folder / _INDEX).read_bytes())
+            index = parse_json((self.folder / _INDEX).read_bytes())
             return index["kind"] == self.kind and set(names) <= set(index["pairs"])
-        except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        except (OSError, ValueError, KeyError, TypeError):
             return False
 
     def has(self, name: str) -> bool:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from tangent_train.errors import SettingError
 from tangent_train.files import write_text
+from tangent_train.json_text import parse_json
 from tangent_train.tasks.keypoints.entries import PairEntry
 from tangent_train.tasks.keypoints.tables import pairs_csv
 
@@ -115,10 +116,10 @@ class ResultsFolder:
         if not [name for name in names if not name.startswith(".")]:
             return None
         try:
-            content = json.loads((self.path / RESULTS).read_bytes())
+            content = parse_json((self.path / RESULTS).read_bytes())
             if (content["program"], content["version"]) == (_PROGRAM, _VERSION):
                 return content["settings"], [PairEntry.of(plain) for plain in content["pairs"]]
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        except (OSError, ValueError, KeyError, TypeError, AttributeError):
             pass
         raise SettingError(
             "output",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -10,6 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from tangent_train.errors import DataError
+from tangent_train.json_text import parse_json
 from tangent_train.tasks.stored_settings import read_settings
 
 __all__ = [
@@ -202,9 +202,9 @@ def _results(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise DataError(path, found="no such file", expected=expected)
     try:
-        results = json.loads(path.read_text())
+        results = parse_json(path.read_text())
         figures = _figures(results)
-    except (OSError, ValueError, RecursionError) as error:
+    except (OSError, ValueError) as error:
         raise DataError(path, found=_first_line(error), expected=expected) from error
     except KeyError as error:
         raise DataError(path, found=f"no {error}", expected=expected) from error
