@@ -138,7 +138,8 @@ class PinholeGrid(ABC):
             return np.arange(self.num_images)
         indices = np.atleast_1d(np.asarray(faces))
         whole = indices.size == 0 or indices.dtype.kind in "iu"
-        if not whole or indices.ndim != 1 or np.any((indices < 0) | (indices >= self.num_images)):
+        outside = (indices < 0) | (indices >= self.num_images)
+        if not whole or indices.ndim != 1 or outside.any():
             raise SettingError("faces", found=faces, expected=f"indices 0 to {self.num_images - 1}")
         return indices.astype(np.int64)
 
@@ -177,12 +178,13 @@ class PinholeGrid(ABC):
         depth = np.where(z > 0, z, np.nan)
         return np.stack([x / depth, y / depth], axis=-1) / self.pitch + (self.dim - 1) / 2
 
+    @cached_property
     def _whole_key(self) -> tuple[object, ...]:
         rotation = None if self.rotation is None else self.rotation.tobytes()
         return type(self), *self._key(), rotation
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, PinholeGrid) and self._whole_key() == other._whole_key()
+        return isinstance(other, PinholeGrid) and self._whole_key == other._whole_key
 
     def __hash__(self) -> int:
-        return hash(self._whole_key())
+        return hash(self._whole_key)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -15,6 +16,8 @@ from tangent_train.rendering.kernels import pinhole_map
 from tangent_train.rendering.sampling_kernels import sample_colors, sample_nearest
 from tangent_train.rendering.taps import bilinear_equirect_taps, nearest_equirect_index
 from tangent_train.rendering.threads import over_rows
+
+Scalar = TypeVar("Scalar", bound=np.generic)
 
 __all__ = ["EquirectMap", "map_dtype", "pinhole_equirect_map", "sample_maps"]
 
@@ -56,6 +59,12 @@ class EquirectMap:
     def polar(self) -> NDArray[np.intp]:
         """Flat indices of positions between a pole and the row next to it."""
         return np.flatnonzero((self.v < 0) | (self.v > self.shape[0] - 1))
+
+    @cached_property
+    def positions(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """`u` and `v` for compiled kernels."""
+        u, v = (np.ascontiguousarray(line, np.float32) for line in (self.u, self.v))
+        return _read_only(u), _read_only(v)
 
     @property
     def nbytes(self) -> int:
@@ -176,13 +185,7 @@ def _over_maps(
     """Run a kernel for all rows of all maps, as if they were one, in parallel."""
     height, width = maps[0].u.shape
     source = _read_only(image.reshape(-1))
-    arguments = [
-        (
-            source,
-            *(_read_only(np.ascontiguousarray(line, np.float32)) for line in (table.u, table.v)),
-        )
-        for table in maps
-    ]
+    arguments = [(source, *table.positions) for table in maps]
 
     def of_rows(start: int, stop: int) -> None:
         for n in range(start // height, -(-stop // height)):
@@ -194,7 +197,7 @@ def _over_maps(
     over_rows(of_rows, shape, smallest_share=_SMALLEST_SHARE)
 
 
-def _read_only(array: NDArray[np.generic]) -> NDArray[np.generic]:
+def _read_only(array: NDArray[Scalar]) -> NDArray[Scalar]:
     """Files can only be read: where all are so, a kernel is compiled once."""
     view = array.view()
     view.flags.writeable = False

@@ -168,7 +168,7 @@ def forward_map(
         faces: The images.
         dtype: float32 or float64; computed in float64 either way.
     """
-    chosen = tuple(int(face) for face in faces)
+    chosen = tuple(map(int, faces))
 
     def build() -> EquirectMap:
         world_from_pixel = grid.world_from_camera[list(chosen)] @ np.linalg.inv(grid.camera_matrix)
