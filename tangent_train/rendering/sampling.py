@@ -17,9 +17,9 @@ from tangent_train.rendering.sampling_kernels import sample_colors, sample_neare
 from tangent_train.rendering.taps import bilinear_equirect_taps, nearest_equirect_index
 from tangent_train.rendering.threads import over_rows
 
-Scalar = TypeVar("Scalar", bound=np.generic)
-
 __all__ = ["EquirectMap", "map_dtype", "pinhole_equirect_map", "sample_maps"]
+
+Scalar = TypeVar("Scalar", bound=np.generic)
 
 _KERNEL_LIMIT = 2**31
 """Compiled kernels take images of fewer values."""
