@@ -34,6 +34,11 @@ class Variant(NamedTuple):
     orientations: tuple[str, ...] = tuple(ORIENTATIONS)
     told_up: bool = False
 
+    @property
+    def upright(self) -> bool:
+        """Whether panoramas are looked at upright, however the camera was held."""
+        return any(text.startswith("data.upright=") for text in self.settings)
+
 
 PLAIN = Variant("plain")
 """As the network was trained."""

@@ -124,12 +124,23 @@ def rates(line: Line) -> dict[str, float]:
 def goals(lines: Sequence[Line]) -> list[str]:
     """How far tangent images are ahead of equirectangular ones, as sentences.
 
-    The best line counts of either, of those that are not told where up is.
+    The best line counts of either: first of those that take panoramas as they come, then also of
+    those that find out from the image where up is. Those that are told it do not count.
     """
-    told = [line for line in lines if not line.variant.told_up]
+    found = [line for line in lines if not line.variant.told_up]
+    come = [line for line in found if not line.variant.upright]
+    return [
+        f"{how}: {sentence}"
+        for how, group in (("As they come", come), ("Up found in the image", found))
+        if group is come or len(group) > len(come)
+        for sentence in _goals(group)
+    ]
+
+
+def _goals(lines: Sequence[Line]) -> list[str]:
     said = []
     for orientation, goal in ((UPRIGHT, 0.0), (TURNED, _AHEAD)):
-        tangent, equirect = (_best(told, orientation, equirect=kind) for kind in (False, True))
+        tangent, equirect = (_best(lines, orientation, equirect=kind) for kind in (False, True))
         if tangent is None or equirect is None:
             continue
         ahead = (tangent.mean(orientation) or 0) - (equirect.mean(orientation) or 0)
@@ -138,7 +149,7 @@ def goals(lines: Sequence[Line]) -> list[str]:
             f"{equirect.name} {_cell(equirect, orientation)}: {100 * ahead:+.1f} mIoU "
             f"(the goal is {100 * goal:+.0f})."
         )
-    best = _best(told, TURNED, equirect=False)
+    best = _best(lines, TURNED, equirect=False)
     upright = None if best is None else best.mean(UPRIGHT)
     if best is not None and upright:
         kept = (best.mean(TURNED) or 0) / upright
@@ -163,13 +174,12 @@ def _cell(line: Line, orientation: str) -> str:
 
 def _markdown(folder: AccuracyFolder, lines: Sequence[Line]) -> list[str]:
     plan = folder.plan()
-    seeds = max((len(found) for line in lines for found in line.scores.values()), default=0)
     scored = [*ORIENTATIONS.values()]
-    head = ["row", *scored, "panoramas/s", "images/s", "Mpx/s", "epochs", "parameters"]
+    head = ["row", *scored, "seeds", "panoramas/s", "images/s", "Mpx/s", "epochs", "parameters"]
     return [
         f"{plan.seconds:g} s of training each, level {plan.level}, made rooms of "
         f"{plan.rooms_height} rows, {plan.device}. mIoU in percent, mean ± standard deviation "
-        f"of {seeds} seed{'s' if seeds > 1 else ''}. Columns say how test panoramas are turned.",
+        "over seeds. Columns say how test panoramas are turned.",
         "",
         _line(head),
         _line(["---", *["---:"] * (len(head) - 1)]),
@@ -190,6 +200,7 @@ def _markdown(folder: AccuracyFolder, lines: Sequence[Line]) -> list[str]:
 
 def _cells(line: Line) -> list[str]:
     cells = [line.name, *(_cell(line, orientation) for orientation in ORIENTATIONS)]
+    cells.append(str(max(len(found) for found in line.scores.values())))
     if line.variant is not PLAIN:
         return [*cells, *[""] * 5]
     rate = rates(line)

@@ -63,14 +63,17 @@ def folder(tmp_path: Path) -> AccuracyFolder:
         _write_run(folder, ERP, seed, {"plain": [0.61 + more, 0.5, 0.3, 0.2, 0.12]})
         told = [None, None, 0.9, None, 0.9]
         plain = [0.67 + more, 0.5, 0.4, 0.2, 0.11]
-        _write_run(folder, FEW, seed, {"plain": plain, "upright=pose": told})
+        found = [0.69 + more, 0.6, 0.5, None, None]
+        few = {"plain": plain, "upright=auto": found, "upright=pose": told}
+        _write_run(folder, FEW, seed, few)
         _write_run(folder, TURNED, seed, {"plain": [0.53, 0.53, 0.53, 0.52, 0.52 - more]})
     return folder
 
 
 def test_lines_are_mean_and_sample_deviation_of_the_seeds(folder: AccuracyFolder) -> None:
     lines = {line.name: line for line in found_lines(folder, chosen_rows([]), seeds=2)}
-    assert list(lines) == ["erp", "few", "few, upright=pose", "few_aux_so3"]
+    variants = ["few, upright=auto", "few, upright=pose"]
+    assert list(lines) == ["erp", "few", *variants, "few_aux_so3"]
     few = lines["few"]
     assert few.scores["null"] == pytest.approx([0.67, 0.69])
     assert few.mean("null") == pytest.approx(np.mean([0.67, 0.69]))
@@ -82,10 +85,15 @@ def test_lines_are_mean_and_sample_deviation_of_the_seeds(folder: AccuracyFolder
 
 
 def test_goals_compare_the_best_that_are_not_told_where_up_is(folder: AccuracyFolder) -> None:
-    upright, turned, kept = goals(found_lines(folder, chosen_rows([]), seeds=2))
-    assert upright == ("upright: few 68.0 ± 1.4, erp 62.0 ± 1.4: +6.0 mIoU (the goal is +0).")
-    assert turned.startswith("SO(3): few_aux_so3 51.0 ± 1.4, erp 12.0 ± 0.0: +39.0 mIoU")
-    assert kept == "few_aux_so3 keeps 96.2 % of its upright score under SO(3) (the goal is 95 %)."
+    lines = found_lines(folder, chosen_rows([]), seeds=2)
+    upright, turned, kept, upright_found, *_ = goals(lines)
+    assert upright == (
+        "As they come: upright: few 68.0 ± 1.4, erp 62.0 ± 1.4: +6.0 mIoU (the goal is +0)."
+    )
+    assert "SO(3): few_aux_so3 51.0 ± 1.4, erp 12.0 ± 0.0: +39.0 mIoU" in turned
+    assert "few_aux_so3 keeps 96.2 % of its upright score under SO(3) (the goal is 95 %)." in kept
+    assert upright_found.startswith("Up found in the image: upright: few, upright=auto 70.0 ± 1.4")
+    assert len(goals([line for line in lines if not line.variant.upright])) == 3
 
 
 def test_the_table_holds_scores_rates_and_commands(folder: AccuracyFolder) -> None:
@@ -94,11 +102,11 @@ def test_the_table_holds_scores_rates_and_commands(folder: AccuracyFolder) -> No
     text = (folder.path / "accuracy.md").read_text()
     assert (
         "| few | 68.0 ± 1.4 | 50.0 ± 0.0 | 40.0 ± 0.0 | 20.0 ± 0.0 | 11.0 ± 0.0 "
-        "| 66.0 | 330.0 | 0.76 | 50 | 1,564,814 |" in text
+        "| 2 | 66.0 | 330.0 | 0.76 | 50 | 1,564,814 |" in text
     )
-    assert "| few, upright=pose | – | – | 90.0 ± 0.0 | – | 90.0 ± 0.0 |" in text
+    assert "| few, upright=pose | – | – | 90.0 ± 0.0 | – | 90.0 ± 0.0 | 2 |" in text
     widths = {line.count("|") for line in text.splitlines() if line.startswith(("| few", "| erp"))}
-    assert widths == {4, 12}
+    assert widths == {4, 13}
     content = json.loads((folder.path / "accuracy.json").read_text())
     turned = content["lines"][-1]
     assert turned["miou"]["so3"]["seeds"] == [0.52, 0.5]
