@@ -49,6 +49,11 @@ _EIGHT = Variant("8 turned icosahedra", ("representation.average_rotations=8",),
 _AUTO = Variant("upright=auto", ("data.upright=auto", "data.max_tilt_deg=60"), ("null", "20", "45"))
 _AUTO_ANY = Variant("upright=auto, any tilt", ("data.upright=auto", "data.max_tilt_deg=180"))
 _AUTO_SO3 = _AUTO_ANY._replace(orientations=("null", "so3"))
+_AVERAGED_AUTO = Variant(
+    "4 turned icosahedra, upright=auto, any tilt",
+    (*_AVERAGED.settings, *_AUTO_SO3.settings),
+    ("null", "so3"),
+)
 _POSE = Variant("upright=pose", ("data.upright=pose",), ("45", "so3"), told_up=True)
 
 
@@ -108,7 +113,7 @@ _ALL = (_CONTEXT, "data.inputs=[rgb,depth,validity,elevation]", "ema=0.999")
 _GRAVITY = (_AUTO, _POSE)
 _ANY_GRAVITY = (_AUTO_ANY, _POSE)
 _BEST = (_AVERAGED, *_GRAVITY)
-_ALL_WAYS = (_AVERAGED, _EIGHT, *_GRAVITY, _AUTO_SO3)
+_ALL_WAYS = (_AVERAGED, _EIGHT, *_GRAVITY, _AUTO_SO3, _AVERAGED_AUTO)
 
 _EQUIRECT = (
     Row("erp", "whole equirectangular images, 2 a step", _ERP),

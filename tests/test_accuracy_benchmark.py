@@ -139,7 +139,7 @@ def test_only_what_is_lacking_is_evaluated(folder: AccuracyFolder) -> None:
     assert folder.lacking(ERP, 0) == []
     assert len(folder.lacking(ERP, 2)) == len(ORIENTATIONS)
     lacking = [(variant.name, orientation) for variant, orientation in folder.lacking(FEW, 0)]
-    assert ("upright=auto", "45") in lacking
+    assert ("4 turned icosahedra", "so3") in lacking
     assert not {name for name, _ in lacking} & {"plain", "upright=pose"}
     run = folder.run(FEW, 0) or {}
     run["evaluations"]["upright=pose"]["settings"] = ["data.upright=null"]
