@@ -28,7 +28,12 @@ class SphereAttention(nn.Module):
     To a head's logits κ (dᵢ·dⱼ − 1) is added, with the directions d of both tokens and a
     concentration κ that every head learns. Directions enter in no other way: turning all of them
     by one rotation changes nothing, and any images of the sphere may be missing. A mixer of
-    `SphereContext`. The last layer starts at zero, so that nothing is added until it is trained.
+    `SphereContext`.
+
+    What a token learns is what it sees on the sphere less what it would see in its own image: an
+    image alone, as a photo, learns nothing, and nothing is learned from it. So a network trained
+    on photos computes the same with it and without, whatever images are there. The last layer
+    starts at zero, so that nothing is added until it is trained on several images of a sphere.
 
     Args:
         channels: Channels C of the tokens.
@@ -65,18 +70,17 @@ class SphereAttention(nn.Module):
         self.queries_keys_values = nn.Linear(channels, 3 * width)
         low, high = map(math.log, _KAPPAS)
         self.log_kappa = nn.Parameter(torch.linspace(low, high, heads))
-        self.output = nn.Linear(width, channels)
+        self.output = nn.Linear(width, channels, bias=False)
         for layer in (self.elevation, self.output):
             if layer is not None:
                 nn.init.zeros_(layer.weight)
-        nn.init.zeros_(self.output.bias)
 
     def forward(
         self,
         tokens: Float[Tensor, "spheres images channels rows columns"],
         directions: Float[Tensor, "spheres images 3 rows columns"],
     ) -> Float[Tensor, "spheres images channels rows columns"]:
-        """What every token learns from all tokens of its sphere.
+        """What every token learns from the other images of its sphere.
 
         Args:
             tokens: Features of all images there are of each sphere.
@@ -92,8 +96,18 @@ class SphereAttention(nn.Module):
             part.unflatten(-1, (self.heads, -1)).transpose(1, 2)
             for part in self.queries_keys_values(x).chunk(3, dim=-1)
         )
-        seen = angular_attention(queries, keys, values, along, self.log_kappa.exp())
-        learned: Tensor = self.output(seen.transpose(1, 2).flatten(2))
+        kappa = self.log_kappa.exp()
+        seen = angular_attention(queries, keys, values, along, kappa)
+        own = seen
+        if images > 1:
+            queries, keys, values = (
+                part.unflatten(2, (images, -1)).transpose(1, 2).flatten(0, 1)
+                for part in (queries, keys, values)
+            )
+            along = along.reshape(spheres * images, -1, 3)
+            own = angular_attention(queries, keys, values, along, kappa)
+            own = own.reshape(spheres, images, *own.shape[1:]).transpose(1, 2).flatten(2, 3)
+        learned: Tensor = self.output((seen - own).transpose(1, 2).flatten(2))
         return learned.reshape(spheres, images, rows, columns, channels).movedim(-1, 2)
 
 

@@ -40,8 +40,8 @@ class SphereContext(nn.Module):
     at a stage of the network become F + enlarged(mixer(pooled(F))): a few tokens of every image are
     mixed with those of all images of its sphere, by the directions they look along. Mixers start at
     zero, so that before training this computes exactly what the network does, and can be added to
-    a trained one. Any subset of the images of a sphere will do, or a single one, which then has
-    only itself to see.
+    a trained one. Any subset of the images of a sphere will do, or a single one, to which
+    `SphereAttention` adds nothing.
 
     Args:
         network: Any module ``(B, C, h, w) -> scores``, a tensor or a mapping of tensors.
@@ -53,7 +53,8 @@ class SphereContext(nn.Module):
         in_channels: Channels C of the images, to find C' out.
         channels: C', where it cannot be found out.
         tokens: Features are averaged to at most so many rows and columns of tokens.
-        fov_deg: Angle that the width of an image spans if nothing else is said about its camera.
+        fov_deg: Angle that the width of an image spans if nothing else is said about its camera, as
+            of a photo; to `SphereAttention`, which adds nothing there, it does not matter.
 
     Raises:
         SettingError: A setting that cannot work; of stages, it names those there are.

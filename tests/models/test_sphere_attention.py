@@ -62,10 +62,11 @@ def _slow(mixer: SphereAttention, tokens: Tensor, directions: Tensor) -> Tensor:
                     + float(kappa[head]) * (float(d[i] @ d[j]) - 1)
                     for j in range(len(places))
                 ]
-                share = np.exp(logits) / np.exp(logits).sum()
+                odds = np.exp(logits)
+                own = odds * [other[0] == place[0] for other in places]
+                share = odds / odds.sum() - own / own.sum()
                 heads.append(torch.tensor(share) @ v[:, head])
-            learned = weights["output.weight"] @ torch.cat(heads) + weights["output.bias"]
-            out[place[0], :, place[1], place[2]] = learned
+            out[place[0], :, place[1], place[2]] = weights["output.weight"] @ torch.cat(heads)
     assert result.shape[2] == channels
     return result
 
@@ -123,6 +124,15 @@ def test_images_have_no_order_and_spheres_do_not_see_each_other() -> None:
         torch.testing.assert_close(mixer(tokens[part], directions[part]), together[part])
     fewer = mixer(tokens[:, :2], directions[:, :2])
     assert not torch.allclose(fewer, together[:, :2], atol=0.01)
+
+
+def test_an_image_alone_learns_nothing() -> None:
+    mixer, (tokens, directions) = _mixer(elevation=True), _inputs(images=1)
+    learned = mixer(tokens.requires_grad_(), directions)
+    assert not learned.any()
+    leaves = [tokens, *mixer.parameters()]
+    for gradient in torch.autograd.grad((learned * torch.randn_like(learned)).sum(), leaves):
+        assert not gradient.any(), "and nothing is learned from it"
 
 
 def test_a_narrow_head_only_sees_what_looks_the_same_way() -> None:

@@ -92,7 +92,6 @@ def test_statistics_take_every_chunk_in_once(momentum: float | None) -> None:
         if isinstance(module, nn.BatchNorm2d):
             module.momentum = momentum
     nn.init.zeros_(context.mixer.get_parameter("output.weight"))
-    nn.init.zeros_(context.mixer.get_parameter("output.bias"))
     plain = copy.deepcopy(context.network)
     images = torch.randn(8, 3, 16, 16)
     for _ in range(2):
