@@ -64,8 +64,7 @@ def folder(tmp_path: Path) -> AccuracyFolder:
         told = [None, None, 0.9, None, 0.9]
         plain = [0.67 + more, 0.5, 0.4, 0.2, 0.11]
         found = [0.69 + more, 0.6, 0.5, None, None]
-        few = {"plain": plain, "upright=auto": found, "upright=pose": told}
-        _write_run(folder, FEW, seed, few)
+        _write_run(folder, FEW, seed, {"plain": plain, "upright=auto": found, "upright=pose": told})
         _write_run(folder, TURNED, seed, {"plain": [0.53, 0.53, 0.53, 0.52, 0.52 - more]})
     return folder
 

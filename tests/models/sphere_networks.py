@@ -33,7 +33,7 @@ def small_context(network: nn.Module | None = None, **settings: Any) -> SphereCo
     inner = small_unet() if network is None else network
     context = SphereContext(inner, STAGE, ATTENTION, **{"in_channels": 3, "tokens": 2, **settings})
     awake(context.mixer, 2.0)
-    nn.init.zeros_(context.mixer.log_kappa)
+    nn.init.zeros_(context.mixer.get_parameter("log_kappa"))
     return context
 
 
