@@ -124,14 +124,14 @@ def rates(line: Line) -> dict[str, float]:
 def goals(lines: Sequence[Line]) -> list[str]:
     """How far tangent images are ahead of equirectangular ones, as sentences.
 
-    The best line counts of either: first of those that take panoramas as they come, then also of
-    those that find out from the image where up is. Those that are told it do not count.
+    The best line counts of either: first of those that take panoramas as they come, then of those
+    that may find out from the image where up is. Those that are told it do not count.
     """
     found = [line for line in lines if not line.variant.told_up]
     come = [line for line in found if not line.variant.upright]
     return [
         f"{how}: {sentence}"
-        for how, group in (("As they come", come), ("Up found in the image", found))
+        for how, group in (("As they come", come), ("Up may be found in the image", found))
         if group is come or len(group) > len(come)
         for sentence in _goals(group)
     ]

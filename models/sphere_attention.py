@@ -30,10 +30,11 @@ class SphereAttention(nn.Module):
     by one rotation changes nothing, and any images of the sphere may be missing. A mixer of
     `SphereContext`.
 
-    What a token learns is what it sees on the sphere less what it would see in its own image: an
-    image alone, as a photo, learns nothing, and nothing is learned from it. So a network trained
-    on photos computes the same with it and without, whatever images are there. The last layer
-    starts at zero, so that nothing is added until it is trained on several images of a sphere.
+    To a token is added what it sees on the sphere less what it would see in its own image: the
+    share of attention that other images have, times how their mean differs from that of its own.
+    An image alone, as a photo, receives nothing and gives no gradient. The last layer starts at
+    zero and is trained by several images of a sphere only: a network trained on photos computes
+    the same with it and without, whatever images are there.
 
     Args:
         channels: Channels C of the tokens.
@@ -80,7 +81,7 @@ class SphereAttention(nn.Module):
         tokens: Float[Tensor, "spheres images channels rows columns"],
         directions: Float[Tensor, "spheres images 3 rows columns"],
     ) -> Float[Tensor, "spheres images channels rows columns"]:
-        """What every token learns from the other images of its sphere.
+        """What is added to every token.
 
         Args:
             tokens: Features of all images there are of each sphere.
@@ -107,8 +108,9 @@ class SphereAttention(nn.Module):
             along = along.reshape(spheres * images, -1, 3)
             own = angular_attention(queries, keys, values, along, kappa)
             own = own.reshape(spheres, images, *own.shape[1:]).transpose(1, 2).flatten(2, 3)
-        learned: Tensor = self.output((seen - own).transpose(1, 2).flatten(2))
-        return learned.reshape(spheres, images, rows, columns, channels).movedim(-1, 2)
+        others = (seen - own).to(x.dtype).transpose(1, 2).flatten(2)
+        added: Tensor = self.output(others)
+        return added.reshape(spheres, images, rows, columns, channels).movedim(-1, 2)
 
 
 def angular_attention(
@@ -131,7 +133,7 @@ def angular_attention(
         kappa: Concentration of every head.
 
     Returns:
-        For every query, the mean of the values.
+        For every query, the mean of the values, in that precision: differences of means stay exact.
     """
     with _without_autocast(queries.device.type):
         size, exact = queries.shape[-1], torch.promote_types(queries.dtype, torch.float32)
@@ -145,7 +147,7 @@ def angular_attention(
         query, key = (functional.pad(part, (0, further)) for part in (query, key))
         value = functional.pad(values.to(exact), (0, further + 3))
         seen = functional.scaled_dot_product_attention(query, key, value, scale=1.0)
-    return seen[..., :size].to(values.dtype)
+    return seen[..., :size]
 
 
 def _without_autocast(device: str) -> AbstractContextManager[object]:

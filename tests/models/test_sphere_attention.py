@@ -173,12 +173,12 @@ def test_half_precision_does_not_blur_directions() -> None:
         found = mixer(tokens, directions)
     assert found.dtype == torch.bfloat16
     torch.testing.assert_close(found.float(), expected, rtol=0.1, atol=0.1)
-    queries = torch.zeros(1, 1, 2, 4)
-    close = torch.tensor([[[1.0, 0, 0], [math.cos(0.05), math.sin(0.05), 0]]])
-    values = torch.tensor([[[[1.0, 0, 0, 0], [0, 1.0, 0, 0]]]])
+    queries = torch.zeros(1, 1, 2, 4, dtype=torch.bfloat16)
+    close = torch.tensor([[[1.0, 0, 0], [math.cos(0.04), math.sin(0.04), 0]]])
+    values = torch.tensor([[[[1.0, 0, 0, 0], [0, 1.0, 0, 0]]]], dtype=torch.bfloat16)
     with torch.autocast("cpu", torch.bfloat16):
         share = angular_attention(queries, queries, values, close, torch.tensor([1000.0]))
-    expected_share = 1 / (1 + math.exp(1000 * (math.cos(0.05) - 1)))
+    expected_share = 1 / (1 + math.exp(1000 * (math.cos(0.04) - 1)))
     assert float(share[0, 0, 0, 0]) == pytest.approx(expected_share, abs=1e-4)
     whole = mixer.bfloat16()(tokens.bfloat16(), directions)
     torch.testing.assert_close(whole.float(), expected, rtol=0.2, atol=0.2)
