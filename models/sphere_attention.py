@@ -99,7 +99,7 @@ class SphereAttention(nn.Module):
         )
         kappa = self.log_kappa.exp()
         seen = angular_attention(queries, keys, values, along, kappa)
-        own = seen
+        own = seen  # of an image alone: nothing is added, with a gradient (0) for all parameters
         if images > 1:
             queries, keys, values = (
                 part.unflatten(2, (images, -1)).transpose(1, 2).flatten(0, 1)

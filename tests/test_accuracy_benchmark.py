@@ -91,7 +91,9 @@ def test_goals_compare_the_best_that_are_not_told_where_up_is(folder: AccuracyFo
     )
     assert "SO(3): few_aux_so3 51.0 ± 1.4, erp 12.0 ± 0.0: +39.0 mIoU" in turned
     assert "few_aux_so3 keeps 96.2 % of its upright score under SO(3) (the goal is 95 %)." in kept
-    assert upright_found.startswith("Up may be found in the image: upright: few, upright=auto 70")
+    assert upright_found.startswith(
+        "Up may be found in the image: upright: few, upright=auto 70.0 ± 1.4"
+    )
     assert len(goals([line for line in lines if not line.variant.upright])) == 3
 
 
