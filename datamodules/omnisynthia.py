@@ -36,6 +36,7 @@ from datamodules.synthia_pixels import (
 )
 from datamodules.synthia_splits import FRAMES, TEST, TRAIN, SequenceSplits
 from tangent_train.errors import DataError
+from tangent_train.registry import Local, registered
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -132,6 +133,14 @@ class SynthiaPanoramas:
         return resize_nearest(decode_labels(read_first_channel(path), path), self._shape)
 
 
+@registered(
+    root=Local,
+    train_sequences=list[str],
+    test_sequences=list[str],
+    validation_fraction=float,
+    frames=int,
+    panorama_height=int,
+)
 class OmniSynthia(PanoramaDataModule):
     """OmniSYNTHIA, 13 classes, with the training and test sequences of its authors.
 

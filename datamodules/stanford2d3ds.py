@@ -46,6 +46,7 @@ from datamodules.stanford_files import (
 from datamodules.stanford_poses import read_panorama_pose
 from datamodules.stanford_splits import StanfordSplits
 from tangent_train.errors import SettingError
+from tangent_train.registry import Local, registered
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -174,6 +175,9 @@ class StanfordPanoramas:
         return resize_depth(steps, self._shape)
 
 
+@registered(
+    root=Local, label_table=Local, fold=int, areas=list[str], mask=Mask, validation_fraction=float
+)
 class Stanford2D3DS(PanoramaDataModule):
     """Stanford2D3DS, 13 classes, in the three folds of its authors.
 

@@ -35,6 +35,7 @@ from datamodules.synthia_pixels import (
 )
 from datamodules.synthia_splits import FRAMES, TEST, TRAIN, SequenceSplits, choose_frames
 from tangent_train.errors import DataError
+from tangent_train.registry import Local, registered
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -109,6 +110,13 @@ def _read_labels(path: Path) -> NDArray[np.uint8]:
     return decode_labels(read_view_labels(path), path)
 
 
+@registered(
+    root=Local,
+    train_sequences=list[str],
+    test_sequences=list[str],
+    validation_fraction=float,
+    frames=int,
+)
 class SynthiaPerspective(PhotoDataModule):
     """SYNTHIA's views, 13 classes, of the frames and in the splits of OmniSYNTHIA.
 

@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from models.stride import check_sides
+from tangent_train.registry import registered
 
 __all__ = ["HexUNet"]
 
@@ -40,6 +41,7 @@ def _decoder(in_channels: int, neck: int, out_channels: int) -> nn.Sequential:
     )
 
 
+@registered(in_channels=int, num_classes=int)
 class HexUNet(nn.Module):
     """UNet of the OmniSYNTHIA experiments (paper, table "transfer"; after Zhang et al. 2019).
 

@@ -9,6 +9,7 @@ from models.residual import Down
 from models.stride import check_sides
 from models.views import each_view
 from tangent_train.errors import SettingError
+from tangent_train.registry import registered
 
 __all__ = ["ShapeClassifier"]
 
@@ -19,6 +20,7 @@ _HALVINGS = 3
 """After the first convolution, which halves too."""
 
 
+@registered(in_channels=int, num_classes=int, width=int, dropout=float)
 class ShapeClassifier(nn.Module):
     """Classifies a shape by all of its tangent images (paper, supplement, "Shape classification").
 

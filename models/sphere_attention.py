@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from tangent_train.errors import SettingError
+from tangent_train.registry import registered
 
 __all__ = ["SphereAttention", "angular_attention"]
 
@@ -22,6 +23,7 @@ _ALIGNMENT = 8
 """Sizes of heads that fast kernels take are multiples of it."""
 
 
+@registered(channels=int, heads=int, width=int | None, elevation=bool)
 class SphereAttention(nn.Module):
     """Lets all images of a sphere see each other: multi-head attention between their tokens.
 

@@ -12,6 +12,7 @@ from torch.nn import functional
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_directions
+from tangent_train.registry import registered
 from tangent_train.rendering.taps import Taps, bilinear_equirect_taps, sample
 
 __all__ = ["SphereRendering", "equirect_to_tokens", "pad_equirect", "tokens_to_equirect"]
@@ -22,6 +23,7 @@ _NO_NEIGHBORS = 1e-9
 """Keeps the mean over no pairs of neighbours at 0."""
 
 
+@registered(channels=int, width=int, rows=int, dilations=list[int], spread=float)
 class SphereRendering(nn.Module):
     """Lets the images of a sphere see each other through one coarse panorama of features.
 

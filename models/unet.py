@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from models.residual import Down, Residual
 from models.stride import check_sides
 from tangent_train.errors import SettingError
+from tangent_train.registry import registered
 
 __all__ = ["UNet"]
 
@@ -29,6 +30,7 @@ class _Up(nn.Module):
         return merged
 
 
+@registered(in_channels=int, num_classes=int, widths=list[int])
 class UNet(nn.Module):
     """Residual UNet (paper, supplement, "Network training details"; after Jiang et al. 2019).
 

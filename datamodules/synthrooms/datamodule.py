@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 from datamodules.stanford2d3ds import Stanford2D3DS
 from datamodules.stanford_perspective import Stanford2D3DSPerspective
-from datamodules.synthrooms.settings import RoomSettings
+from datamodules.synthrooms.settings import RoomSettings, ViewKind
 from tangent_train.errors import SettingError
+from tangent_train.registry import registered
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 __all__ = ["SynthRooms", "SynthRoomsPerspective"]
 
 
+@registered(rooms=dict[str, int | ViewKind | dict[str, int]])
 class SynthRooms(Stanford2D3DS):
     """Rooms made on the first use, read as Stanford2D3DS: the data set that needs no download.
 
@@ -49,6 +51,7 @@ class SynthRooms(Stanford2D3DS):
         _make_files(self.root, self.rooms)
 
 
+@registered(rooms=dict[str, int | ViewKind | dict[str, int]])
 class SynthRoomsPerspective(Stanford2D3DSPerspective):
     """Photos of the same rooms, read as those of Stanford2D3DS.
 

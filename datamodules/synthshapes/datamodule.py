@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 from datamodules.modelnet40 import ModelNet40
 from datamodules.synthshapes.families import CLASSES
 from datamodules.synthshapes.settings import ShapeSettings
+from tangent_train.registry import registered
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 __all__ = ["SynthShapes"]
 
 
+@registered(shapes=dict[str, int] | None)
 class SynthShapes(ModelNet40):
     """Shapes made on the first use, read as ModelNet40: the data set that needs no download.
 

@@ -6,18 +6,20 @@ import copy
 import os
 import shutil
 import traceback
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
-from hydra.errors import InstantiationException
-from hydra.utils import get_object, instantiate
-from omegaconf import DictConfig, OmegaConf
 
+from tangent_train.checkpoints.trained import completed_settings
 from tangent_train.errors import SettingError
-from tangent_train.tasks.networks import completed_settings, make
+from tangent_train.registry import make, maker_of
 
-__all__ = ["build", "check_numbers"]
+__all__ = ["Settings", "build", "check_numbers"]
+
+Settings = Mapping[str, Any]
+"""All settings of a run, resolved: plain values in nested sections."""
 
 _REMEDIES = {
     "classification": "Choose task=classification with a network for it (experiment=shapes/default "
@@ -43,15 +45,16 @@ _ENDLESS = ("trainer.max_epochs", "trainer.max_steps")
 """Those of them of which −1 means no end."""
 
 
-def build(config: DictConfig) -> tuple[Any, Any]:
-    """The data module and the task of a config.
+def build(settings: Settings, trust: Collection[str] | None = None) -> tuple[Any, Any]:
+    """The data module and the task of a run.
 
     Network settings that are null are taken from the data: ``in_channels``, and ``num_classes`` or
     ``classes``, also of a network inside the network's settings. Where a checkpoint will bring the
     tensors, no others are fetched first.
 
     Args:
-        config: A composed config.
+        settings: Of the run.
+        trust: Of settings that come from a file, see `registry.make`.
 
     Returns:
         Data module and task.
@@ -59,68 +62,61 @@ def build(config: DictConfig) -> tuple[Any, Any]:
     Raises:
         SettingError: A setting cannot work, or two of them not together.
     """
-    check_numbers(config)
-    _check_compiler(config.task.get("compile"))
-    representation = instantiate(config.representation)
-    data = instantiate(config.data, representation=representation)
-    _check_kind(config.task, data)
-    restored = config.get("resume") is not None or config.get("checkpoint") is not None
-    network = OmegaConf.to_container(config.network, resolve=True)
-    classes = len(data.class_names)
-    task = instantiate(
-        config.task,
-        network=_network(completed_settings(network, data.in_channels, classes, restored=restored)),
-        representation=representation,
-        class_names=data.class_names,
-        optimizer=instantiate(config.optimizer),
-        scheduler=instantiate(config.scheduler),
+    check_numbers(settings)
+    _check_compiler(settings["task"].get("compile"))
+    parts = {
+        name: make(settings[name], name, trust)
+        for name in ("representation", "optimizer", "scheduler")
+        if settings.get(name) is not None
+    }
+    representation = parts["representation"]
+    data = make(settings["data"], "data", trust, representation=representation)
+    _check_kind(maker_of(settings["task"], "task", trust), data)
+    restored = settings.get("resume") is not None or settings.get("checkpoint") is not None
+    network = completed_settings(
+        settings["network"], data.in_channels, len(data.class_names), restored=restored
     )
+    parts["network"] = make(network, "network", trust)
+    task = make(settings["task"], "task", trust, class_names=data.class_names, **parts)
     _try_network(task, data.in_channels)
-    _try_optimizer(task, config)
+    _try_optimizer(task, settings)
     return data, task
 
 
-def _network(settings: dict[str, Any]) -> Any:
-    try:
-        return make(settings)
-    except InstantiationException as error:
-        if not str(error).startswith("Error locating target"):
-            raise
-        raise SettingError(
-            "network._target_",
-            found=f"{settings['_target_']}, of which something cannot be imported",
-            expected="the full name of a class or function",
-            remedy="Install its package, or add the folder it is in to PYTHONPATH.",
-        ) from error
-
-
-def check_numbers(config: DictConfig) -> None:
+def check_numbers(settings: Settings) -> None:
     """Refuse numbers that would be found out late, or with many lines about something else.
 
     Args:
-        config: A composed config.
+        settings: Of the run.
 
     Raises:
         SettingError: There is one.
     """
     for name, (least, most) in _WHOLE.items():
-        value = OmegaConf.select(config, name)
+        value = _select(settings, name)
         if value is None or (value == -1 and name in _ENDLESS):
             continue
         if type(value) is not int or not least <= value <= most:
             expected = f"a whole number from {least}" + (f" to {most}" if most < _ANY else "")
             raise SettingError(name, found=value, expected=expected)
-    clipped = OmegaConf.select(config, "trainer.gradient_clip_val")
+    clipped = _select(settings, "trainer.gradient_clip_val")
     if clipped is not None and not (type(clipped) in (int, float) and clipped >= 0):
         raise SettingError(
             "trainer.gradient_clip_val", found=clipped, expected="a number from 0, or null"
         )
 
 
-def _check_kind(settings: DictConfig, data: Any) -> None:
+def _select(settings: Settings, name: str) -> Any:
+    value: Any = settings
+    for part in name.split("."):
+        value = value.get(part) if isinstance(value, Mapping) else None
+    return value
+
+
+def _check_kind(task: Any, data: Any) -> None:
     """Refuse a task that learns something else than the data has labels for."""
     labelled = getattr(data, "kind", "segmentation")
-    kind = getattr(get_object(settings._target_), "kind", labelled)
+    kind = getattr(task, "kind", labelled)
     if kind != labelled:
         raise SettingError(
             "task",
@@ -165,21 +161,21 @@ def _try_network(task: Any, channels: int) -> None:
             ) from error
 
 
-def _try_optimizer(task: Any, config: DictConfig) -> None:
+def _try_optimizer(task: Any, settings: Settings) -> None:
     """Make optimizer and scheduler: nothing is computed, and a wrong number shows."""
-    for name, section in (("optimizer", config.optimizer), ("scheduler", config.scheduler)):
+    for name in ("optimizer", "scheduler"):
         try:
             if name == "optimizer":
                 task.make_optimizer(task.parameters())
             else:
                 task.optimization(lambda: _SOME_STEPS)
         except (AssertionError, TypeError, ValueError) as error:
-            plain = {k: value for k, value in section.items() if not str(k).startswith("_")}
+            plain = {k: v for k, v in settings[name].items() if not str(k).startswith("_")}
             written = ", ".join(f"{name}.{key}={value}" for key, value in plain.items())
             raise SettingError(
                 name,
                 found=f"{written} ({error})",
-                expected=f"settings that {section._target_} takes",
+                expected=f"settings that {settings[name]['_target_']} takes",
             ) from error
 
 

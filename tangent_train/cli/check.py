@@ -3,36 +3,34 @@
 from __future__ import annotations
 
 import sys
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from hydra.utils import instantiate
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 from datamodules.data_check import check_all
+from tangent_train.registry import make
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from omegaconf import DictConfig
+    from collections.abc import Mapping, Sequence
 
     from datamodules.problems import Problem
 
 __all__ = ["check"]
 
 
-def check(config: DictConfig) -> None:
+def check(settings: Mapping[str, Any]) -> None:
     """Read all of the data set of a run; leave with 1 if something is wrong.
 
     On a terminal the problems are a table, elsewhere lines of file, finding and remedy with tabs
     between them; what was looked at goes to the standard error output then.
 
     Args:
-        config: The composed ``check.yaml``.
+        settings: The composed ``check.yaml``.
     """
-    representation = instantiate(config.representation)
-    data = instantiate(config.data, representation=representation)
+    representation = make(settings["representation"], "representation")
+    data = make(settings["data"], "data", representation=representation)
     console = Console(highlight=False)
     problems, count = check_all(data, progress=console.is_terminal)
     listed = problems.listed()

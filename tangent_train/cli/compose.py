@@ -102,18 +102,25 @@ def compose_option(group: str, option: str, search: Sequence[str] = ()) -> dict[
     return section
 
 
-def check_overrides(config_name: str, arguments: list[str]) -> None:
+def check_overrides(
+    config_name: str,
+    arguments: Sequence[str],
+    known: Sequence[str] = (),
+    choosable: Sequence[str] = (),
+) -> None:
     """Refuse overrides of what does not exist, with the near matches.
 
     Args:
         config_name: The config they apply to.
         arguments: The command line; options and additions (``+key=…``) are left to Hydra.
+        known: Names of settings besides those of the config: of a stored one.
+        choosable: Groups of which a stored config takes options.
 
     Raises:
         SettingError: A setting, group or option is unknown, an override cannot be parsed, or an
             experiment belongs to another command.
     """
-    options = get_args_parser().parse_args(arguments)
+    options = get_args_parser().parse_args(list(arguments))
     if options.multirun and config_name == _TRANSFER:
         raise SettingError(
             "-m", found="a sweep", expected="folds=[1,2,3] and seeds=[0,1,2], settings of its own"
@@ -131,20 +138,24 @@ def check_overrides(config_name: str, arguments: list[str]) -> None:
         search = [str(o.input_line) for o in overrides if o.key_or_group == "hydra.searchpath"]
         options_of = {o.key_or_group: _options(loader, o.key_or_group, search) for o in plain}
         groups = [o for o in plain if options_of[o.key_or_group]]
-        if groups and config_name.startswith(STORED):
+        stored = config_name.startswith(STORED)
+        made = [o for o in groups if stored and o.key_or_group not in choosable]
+        if made:
             raise SettingError(
-                groups[0].key_or_group,
-                found=f"'{groups[0].input_line}'",
-                expected="overrides of single settings, as in data.fold=2",
+                made[0].key_or_group,
+                found=f"'{made[0].input_line}'",
+                expected="overrides of single settings, as in data.fold=2"
+                + (f", or options of {', '.join(choosable)}" if choosable else ""),
                 remedy="A stored config has its choices made; start a new run for others.",
             )
         for override in groups:
             _check_option(override, options_of[override.key_or_group])
             _check_pairs(override, config_name)
         chosen = [str(o.input_line) for o in groups if not o.is_sweep_override()]
+        chosen = [f"+{text}" for text in chosen] if stored else chosen
         config = _compose(config_name, search, chosen)
         _check_experiment(config_name, config, chosen)
-    names = list(dict.fromkeys([*_dotted(config), *_group_names(loader)]))
+    names = list(dict.fromkeys([*known, *_dotted(config), *_group_names(loader)]))
     for override in plain:
         if override not in groups and override.key_or_group not in names:
             _refuse("setting", override.key_or_group, names)

@@ -2,37 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from models.held import held_networks
 from models.sphere_context import SphereContext
+from tangent_train.checkpoints.trained import load_trained
 from tangent_train.cli import values
 from tangent_train.errors import SettingError
 from tangent_train.tasks.export import SUFFIXES, Export, Format, export_network
-from tangent_train.tasks.trained import load_trained
 
 __all__ = ["export"]
 
 _EXAMPLE = "For example: tangent-export checkpoint=runs/…/checkpoints/best.ckpt output=model.onnx"
 
 
-def export(config: DictConfig) -> None:
+def export(settings: Mapping[str, Any]) -> None:
     """Write a trained network to a file and say how well it agrees with PyTorch.
 
     Args:
-        config: The composed ``export.yaml``.
+        settings: The composed ``export.yaml``.
 
     Raises:
         DataError: The checkpoint cannot be used.
         SettingError: A setting is missing or impossible, the file is there already, or the network
             cannot be exported.
     """
-    settings: Any = OmegaConf.to_container(config, resolve=True)
     checkpoint = _given(settings, "checkpoint", "a checkpoint written by tangent-train")
     output = _given(settings, "output", f"a file ending in {', '.join(SUFFIXES.values())}")
     form = _format(settings["format"], output)
@@ -57,7 +55,7 @@ def export(config: DictConfig) -> None:
         )
 
 
-def _given(settings: dict[str, Any], name: str, expected: str) -> Path:
+def _given(settings: Mapping[str, Any], name: str, expected: str) -> Path:
     if not settings[name]:
         raise SettingError(name, found="none", expected=expected, remedy=_EXAMPLE)
     return Path(str(settings[name])).expanduser()

@@ -6,8 +6,6 @@ import sys
 import time
 from typing import TYPE_CHECKING, Any
 
-from hydra.utils import get_class, instantiate
-from omegaconf import OmegaConf
 from rich.console import Console
 
 from datamodules.image_pairs import ImagePairs
@@ -22,22 +20,21 @@ from tangent_train.cli.processes import ended_by_sigterm
 from tangent_train.errors import DataError, SettingError
 from tangent_train.keypoints.detectors import Detector
 from tangent_train.keypoints.motion_search import colmap
+from tangent_train.registry import make, maker_of
 from tangent_train.tasks.keypoints.compare import Comparer, Matching
 from tangent_train.tasks.keypoints.entries import PairEntry
 from tangent_train.tasks.keypoints.representations import Representations
 from tangent_train.tasks.keypoints.tables import KeypointReport, overall_tables, shown_name
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from omegaconf import DictConfig
+    from collections.abc import Iterator, Mapping, Sequence
 
 __all__ = ["keypoints"]
 
 _SECONDS_BETWEEN_WRITES = 5.0
 
 
-def keypoints(config: DictConfig) -> None:
+def keypoints(config: Mapping[str, Any]) -> None:
     """Compare keypoints of panoramas and of tangent images on pairs, and write what was found.
 
     Args:
@@ -47,8 +44,7 @@ def keypoints(config: DictConfig) -> None:
         SettingError: A setting is missing or cannot work.
         DataError: There are no pairs.
     """
-    plain: Any = OmegaConf.to_container(config, resolve=True)
-    settings = KeypointSettings.of(plain)
+    settings = KeypointSettings.of(config)
     colmap()  # pycolmap is needed: it is missed now rather than after minutes
     with ended_by_sigterm():  # after it: pycolmap has a handler that prints its stack
         _compare_and_tell(_pairs(config), settings)
@@ -93,12 +89,12 @@ def _compare_and_tell(pairs: PanoramaPairs, settings: KeypointSettings) -> None:
         sys.exit(f"tangent-keypoints: {failed} could not be used, see above")
 
 
-def _pairs(config: DictConfig) -> PanoramaPairs:
-    kind = get_class(config.data._target_)
+def _pairs(config: Mapping[str, Any]) -> PanoramaPairs:
+    kind = maker_of(config["data"], "data")
     if not issubclass(kind, PanoramaPairs):
         raise SettingError(
             "data",
-            found=config.data._target_,
+            found=config["data"]["_target_"],
             expected="pairs: data=synthrooms_pairs, stanford2d3ds_pairs or image_pairs",
         )
     given = [name for name in ("left", "right", "input") if config[name] is not None]
@@ -109,7 +105,7 @@ def _pairs(config: DictConfig) -> PanoramaPairs:
             expected="none with other data than image_pairs",
             remedy="Leave it or data= out.",
         )
-    pairs: PanoramaPairs = instantiate(config.data)
+    pairs: PanoramaPairs = make(config["data"], "data")
     return pairs
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import sys
 from importlib import import_module
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from tangent_train.errors import DataError, SettingError
 
@@ -129,20 +129,27 @@ def _main(command: str) -> None:
 def _compose_and_run(command: str, typed: list[str]) -> None:
     import hydra
     from hydra._internal.utils import get_args_parser
-    from hydra.errors import InstantiationException
+    from hydra.core.hydra_config import HydraConfig
+    from omegaconf import OmegaConf
 
     from tangent_train.cli.compose import check_overrides, config_folder, quote_path
     from tangent_train.cli.keypoint_pairs.arguments import keypoint_arguments
-    from tangent_train.cli.stored import with_stored_config
+    from tangent_train.cli.stored import CHOOSABLE, stored_run
 
     as_module = __name__ == "__main__"
-    settings = typed[1:] if as_module else typed
+    arguments = typed[1:] if as_module else typed
     if command in _OF_FILES:
-        settings = [quote_path(argument) for argument in settings]
+        arguments = [quote_path(argument) for argument in arguments]
     if command == "keypoints":
-        settings = keypoint_arguments(settings)
-    config_name, arguments = with_stored_config(command, settings)
-    check_overrides(config_name, arguments)
+        arguments = keypoint_arguments(arguments)
+    said, config_name = arguments, command
+    stored = stored_run(command, arguments)
+    if stored is None:
+        check_overrides(command, arguments)
+    else:
+        choosable = CHOOSABLE if command == "evaluate" else ()
+        check_overrides(stored.name, stored.arguments, stored.known, choosable)
+        arguments, config_name = stored.additions(), stored.name
     visible_gpus = os.environ.get("CUDA_VISIBLE_DEVICES")
 
     def job(config: DictConfig) -> float | None:
@@ -151,17 +158,19 @@ def _compose_and_run(command: str, typed: list[str]) -> None:
         from tangent_train.cli.sweep import in_sweep, leave_warnings_to_the_sweep, run_job
 
         try:
+            settings: Any = OmegaConf.to_container(config, resolve=True)
             if in_sweep():
-                return run_job(command, settings, visible_gpus, config)
+                return run_job(command, said, visible_gpus, settings)
             leave_warnings_to_the_sweep()
             commands = import_module(f"tangent_train.cli.{_MODULES.get(command, 'run')}")
-            result: float | None = getattr(commands, command)(config)
+            run = getattr(commands, command)
+            if stored is None:  # the stages of a transfer keep the references of its config
+                result: float | None = run(config if command == "transfer" else settings)
+            else:
+                chosen = HydraConfig.get().runtime.choices
+                result = run(*stored.settings(settings, [g for g in CHOOSABLE if g in chosen]))
         except (DataError, SettingError) as error:
             sys.exit(f"tangent-{command}: {error}")
-        except InstantiationException as error:
-            if isinstance(error.__cause__, DataError | SettingError):
-                sys.exit(f"tangent-{command}: {error.__cause__}")
-            raise
         return result
 
     # Lightning prints its own messages: Hydra's handlers would print them again. A sweep has only

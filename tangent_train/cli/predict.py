@@ -7,11 +7,11 @@ import time
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from omegaconf import OmegaConf
 from rich.console import Console
 
 from datamodules.image_files import find_images
 from datamodules.progress import progress_bar
+from tangent_train.checkpoints.trained import load_trained
 from tangent_train.cli.prediction.report import (
     Entry,
     shares_table,
@@ -35,16 +35,13 @@ from tangent_train.tasks.prediction.panoramas import PanoramaPredictor
 from tangent_train.tasks.prediction.photos import PhotoPredictor
 from tangent_train.tasks.prediction.predictor import Runner
 from tangent_train.tasks.prediction.summary import write_summary
-from tangent_train.tasks.trained import load_trained
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from omegaconf import DictConfig
-
+    from tangent_train.checkpoints.trained import TrainedNetwork
     from tangent_train.tasks.html import EncodedImage
-    from tangent_train.tasks.networks import TrainedNetwork
 
 __all__ = ["predict"]
 
@@ -55,7 +52,7 @@ _LATER = ("upright", "max_tilt_deg")
 """Likewise, of results that say it; older ones are of panoramas taken as they were."""
 
 
-def predict(config: DictConfig) -> None:
+def predict(config: Mapping[str, Any]) -> None:
     """Label images and write what was found.
 
     Args:
@@ -65,8 +62,7 @@ def predict(config: DictConfig) -> None:
         SettingError: A setting is missing or cannot work.
         DataError: The checkpoint cannot be read, or there are no images.
     """
-    plain: Any = OmegaConf.to_container(config, resolve=True)
-    settings = PredictSettings.of(plain)
+    settings = PredictSettings.of(config)
     paths = _without_results(find_images(settings.input), settings)
     images = dict(zip(output_names(paths), paths, strict=True))
     if len(images) < len(paths):

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, cast
-
-from omegaconf import OmegaConf
+from typing import TYPE_CHECKING, Any
 
 from tangent_train.cli.rendering.back import render_back
 from tangent_train.cli.rendering.forward import render_forward
@@ -12,22 +10,21 @@ from tangent_train.cli.rendering.settings import BackSettings, ForwardSettings
 from tangent_train.errors import SettingError
 
 if TYPE_CHECKING:
-    from omegaconf import DictConfig
+    from collections.abc import Mapping
 
 __all__ = ["render"]
 
 
-def render(config: DictConfig) -> None:
+def render(settings: Mapping[str, Any]) -> None:
     """Do what ``configs/render.yaml`` says.
 
     Args:
-        config: The composed settings.
+        settings: The composed settings.
 
     Raises:
         DataError: A file cannot be used.
         SettingError: A setting cannot work.
     """
-    settings = cast("dict[str, Any]", OmegaConf.to_container(config, resolve=True))
     if settings["back"] is not None:
         render_back(BackSettings.of(settings))
     elif settings["input"] is not None:

@@ -8,22 +8,10 @@ from typing import Any
 from tangent_train.errors import SettingError
 from tangent_train.tasks.reports.runs import flat_settings
 
-__all__ = ["LATER_SETTINGS", "check_resumed", "differing_settings"]
-
-LATER_SETTINGS: dict[str, tuple[Any, str]] = {
-    "ema": (None, "init_from"),
-    "data.upright": (None, "panoramas_per_step"),
-    "data.max_tilt_deg": (60, "panoramas_per_step"),
-    "data.skip_broken": (False, "in_memory"),
-    "representation.average_rotations": (1, "faces_per_panorama"),
-    "task.auxiliary_weight": (0.4, "class_weights"),
-    "task.auxiliary_target": ("histogram", "class_weights"),
-    "task.region_loss": ("none", "class_weights"),
-    "task.region_weight": (1.0, "class_weights"),
-}
-"""Settings that older runs lack: what those did, and another setting of the same section."""
+__all__ = ["check_resumed", "differing_settings"]
 
 _FREE = (
+    "checkpoint",
     "checkpoint_every_n_steps",
     "data.in_memory",
     "data.label_table",
@@ -31,6 +19,7 @@ _FREE = (
     "data.root",
     "data.store",
     "data.test_rotation",
+    "init_from",
     "name",
     "panels",
     "representation.average_rotations",
@@ -99,7 +88,7 @@ def differing_settings(
 ) -> list[tuple[str, Any, Any]]:
     """Settings that differ, sorted by name, with what they are and what they were.
 
-    A setting that one of the two does not have is None there, or what older runs did without it.
+    A setting that one of the two does not have is None there.
 
     Args:
         config: A resolved config.
@@ -108,9 +97,6 @@ def differing_settings(
         but: Except these.
     """
     now, then = dict(flat_settings(config)), dict(flat_settings(before))
-    for name, (value, _) in LATER_SETTINGS.items():
-        for settings in (now, then):
-            settings.setdefault(name, value)
     return [
         (name, now.get(name), then.get(name))
         for name in sorted(now.keys() | then.keys())

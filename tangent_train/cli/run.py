@@ -6,30 +6,32 @@ import json
 import signal
 import sys
 import warnings
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
 import lightning
 import torch
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import InstantiationException
-from hydra.utils import instantiate
 from lightning.fabric.utilities.exceptions import MisconfigurationException
+from lightning.pytorch.accelerators import CPUAccelerator
 from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import SIGTERMException
-from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from datamodules.samples import channel_names
 from models.initialize import initialize, origins_table
-from tangent_train.cli.build import build, check_numbers
+from tangent_train.checkpoints.content import read_checkpoint, write_settings
+from tangent_train.checkpoints.trained import completed_settings, inputs_in
+from tangent_train.cli.build import Settings, build, check_numbers
 from tangent_train.cli.machine import machine_faults
 from tangent_train.cli.resume import check_resumed
 from tangent_train.cli.sweep import OBJECTIVE_FILE
 from tangent_train.errors import SettingError
 from tangent_train.files import write_text
+from tangent_train.registry import make
 from tangent_train.tasks.averaging import AveragedWeights
 from tangent_train.tasks.callbacks import ProgressBar
 from tangent_train.tasks.checkpoints import (
@@ -39,43 +41,46 @@ from tangent_train.tasks.checkpoints import (
     best_checkpoint,
 )
 from tangent_train.tasks.tensorboard_pictures import TrainingSpeed
-from tangent_train.tasks.trained import inputs_in, read_checkpoint, stored_inputs
 
 __all__ = ["best_on_validation", "build", "evaluate", "prepare", "train"]
+
+_LOCAL = ("data.label_table=", "data.root=", "data.store=", "task.compile", "trust=")
 
 # lightning 2.6 asks torch's tree library in a way torch ≥ 2.13 deprecates: nothing to do about it.
 warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)`", FutureWarning)
 
 
-def train(config: DictConfig) -> float | None:
+def train(settings: Settings, trust: Collection[str] | None = None) -> float | None:
     """Train, then evaluate the best epoch of the validation split (else the last) on the test fold.
 
     Args:
-        config: The composed ``train.yaml``.
+        settings: Of the run: the composed ``train.yaml``, or of a run that goes on.
+        trust: Of settings that come from a file, see `registry.make`.
 
     Returns:
         The best figure on the validation split, what sweeps compare; None without such a split.
     """
     folder = _run_folder()
     checkpoints = folder / "checkpoints"
-    check_numbers(config)
-    lightning.seed_everything(config.seed, workers=True, verbose=False)
-    resumed = None if config.resume is None else checkpoints / "last.ckpt"
+    check_numbers(settings)
+    lightning.seed_everything(settings["seed"], workers=True, verbose=False)
+    resumed = None if settings["resume"] is None else checkpoints / "last.ckpt"
     if resumed is not None:
-        check_resumed(_resolved(config), read_checkpoint(resumed)["resolved_config"])
-    data, task = build(config)
-    if config.init_from is not None and resumed is None:
-        channels = _channels(Path(config.init_from), data)
-        origins = initialize(task.network, config.init_from, channels)
-        rank_zero_only(_console().print)(origins_table(origins, config.init_from))
-    write_text(folder / "config.yaml", OmegaConf.to_yaml(config, resolve=True))
-    last = LastCheckpoint(checkpoints, config.checkpoint_every_n_steps)
+        check_resumed(settings, read_checkpoint(resumed, ("config",))["config"])
+    data, task = build(settings, trust)
+    settings = _completed(settings, data)
+    start = settings["init_from"]
+    if start is not None and resumed is None:
+        origins = initialize(task.network, start, _channels(Path(start), data))
+        rank_zero_only(_console().print)(origins_table(origins, start))
+    write_settings(folder / "config.yaml", settings)
+    last = LastCheckpoint(checkpoints, settings["checkpoint_every_n_steps"], _typed_local())
     callbacks = [last, LearningRateMonitor()]
-    if config.get("ema") is not None:  # configs of older runs do not have it
-        callbacks.append(AveragedWeights(config.ema))
+    if settings["ema"] is not None:
+        callbacks.append(AveragedWeights(settings["ema"]))
     if data.validation_fraction:
         callbacks.append(best_checkpoint(checkpoints, task.monitor))
-    trainer = _trainer(config, folder, data, task, callbacks)
+    trainer = _trainer(settings, folder, data, task, callbacks, trust)
     with warnings.catch_warnings(), machine_faults(folder, data):
         # The checkpoints of a resumed run are meant to be there.
         warnings.filterwarnings("ignore", "Checkpoint directory .* exists and is not empty")
@@ -97,16 +102,17 @@ def train(config: DictConfig) -> float | None:
     return score
 
 
-def evaluate(config: DictConfig) -> None:
+def evaluate(settings: Settings, trust: Collection[str] | None = None) -> None:
     """Evaluate a checkpoint on the test fold of its data.
 
     Args:
-        config: The config inside the checkpoint, with overrides, and ``checkpoint``.
+        settings: Of the run, and ``checkpoint``.
+        trust: Of settings that come from a file, see `registry.make`.
 
     Raises:
         SettingError: No checkpoint is given.
     """
-    if config.checkpoint is None:
+    if settings["checkpoint"] is None:
         raise SettingError(
             "checkpoint",
             found="none",
@@ -114,42 +120,66 @@ def evaluate(config: DictConfig) -> None:
             remedy="For example: tangent-evaluate checkpoint=runs/…/checkpoints/best.ckpt",
         )
     folder = _run_folder()
-    check_numbers(config)
-    lightning.seed_everything(config.seed, workers=True, verbose=False)
-    data, task = build(config)
-    trainer = _trainer(config, folder, data, task, [])
+    check_numbers(settings)
+    lightning.seed_everything(settings["seed"], workers=True, verbose=False)
+    data, task = build(settings, trust)
+    settings = _completed(settings, data)
+    write_settings(folder / "config.yaml", settings)
+    trainer = _trainer(settings, folder, data, task, [], trust)
     with machine_faults(folder, data):
-        _test(trainer, task, data, Path(config.checkpoint), folder)
+        _test(trainer, task, data, Path(settings["checkpoint"]), folder)
 
 
-def prepare(config: DictConfig) -> None:
+def prepare(settings: Settings) -> None:
     """Make or check the data set, and its prepared store if one is set.
 
     Args:
-        config: The composed ``prepare.yaml``.
+        settings: The composed ``prepare.yaml``.
     """
-    representation = instantiate(config.representation)
-    data = instantiate(config.data, representation=representation)
+    representation = make(settings["representation"], "representation")
+    data = make(settings["data"], "data", representation=representation)
     data.prepare_all()
     counts = ", ".join(f"{len(data.open_split(s))} {s}" for s in ("train", "val", "test"))
     _console().print(f"{data.root} is ready. {data.noun.capitalize()}: {counts}.")
 
 
+def _completed(settings: Settings, data: Any) -> dict[str, Any]:
+    """The settings as they are kept: the network's without the data, the options they came from."""
+    classes = len(data.class_names)
+    network = completed_settings(settings["network"], data.in_channels, classes)
+    return {"choices": _choices(), **settings, "network": network}
+
+
+def _choices() -> dict[str, str]:
+    chosen = HydraConfig.get().runtime.choices
+    return {group: chosen[group] for group in ("data", "experiment") if chosen.get(group)}
+
+
+def _typed_local() -> list[str]:
+    """What was typed that no file says: a resumed run has to be told again."""
+    typed = [said.lstrip("+") for said in HydraConfig.get().overrides.task]
+    return [said for said in typed if said.startswith(_LOCAL)]
+
+
 def _trainer(
-    config: DictConfig, folder: Path, data: Any, task: Any, callbacks: list[Any]
+    settings: Settings,
+    folder: Path,
+    data: Any,
+    task: Any,
+    callbacks: list[Any],
+    trust: Collection[str] | None = None,
 ) -> lightning.Trainer:
     contents = {
         "kind": task.kind,
-        # Not resolved: an override of level or seed still reaches everything that refers to it.
-        "config": OmegaConf.to_container(config),
-        "resolved_config": _resolved(config),
+        "config": settings,
         "class_names": list(data.class_names),
         **_shown(data),
     }
-    common = [CheckpointContents(contents), *task.pictures(folder, config)]
+    common = [CheckpointContents(contents), *task.pictures(folder, settings)]
     common += [TrainingSpeed(), ProgressBar()]
-    every, epochs = config.trainer.check_val_every_n_epoch, config.trainer.max_epochs
-    settings = {
+    section = settings["trainer"]
+    every, epochs = section.get("check_val_every_n_epoch"), section.get("max_epochs")
+    given = {
         # A run shorter than that is validated at its end.
         "check_val_every_n_epoch": min(every, epochs) if every and (epochs or -1) > 0 else every,
         "default_root_dir": str(folder),
@@ -159,20 +189,14 @@ def _trainer(
         # The data module's samplers count every image once on any number of processes.
         "use_distributed_sampler": False,
     }
-    try:
-        trainer: lightning.Trainer = instantiate(config.trainer, **settings)
-    except InstantiationException as error:
+    trainer: lightning.Trainer = make(section, "trainer", trust, **given)
+    if section.get("sync_batchnorm") and isinstance(trainer.accelerator, CPUAccelerator):
         raise SettingError(
-            "trainer",
-            found=f"what cannot work: {error.__cause__ or error}",
-            expected="settings that lightning.Trainer takes",
-        ) from error
+            "trainer.sync_batchnorm",
+            found="true, on a CPU",
+            expected="false: torch has batch statistics over several processes on GPUs only",
+        )
     return trainer
-
-
-def _resolved(config: DictConfig) -> dict[str, Any]:
-    plain: Any = OmegaConf.to_container(config, resolve=True)
-    return plain
 
 
 def _test(trainer: lightning.Trainer, task: Any, data: Any, checkpoint: Path, folder: Path) -> None:
@@ -197,8 +221,6 @@ def _test(trainer: lightning.Trainer, task: Any, data: Any, checkpoint: Path, fo
 def _check_fits(content: dict[str, Any], data: Any, checkpoint: Path) -> None:
     """Refuse data whose labels or inputs mean something else to the network."""
     own = {"class_names": list(data.class_names), **_shown(data)}
-    if "inputs" in own:  # which older checkpoints do not say
-        content = content | {"inputs": list(stored_inputs(content))}
     for name, value in own.items():
         if content[name] != value:
             raise SettingError(

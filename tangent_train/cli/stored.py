@@ -1,98 +1,223 @@
-"""Starting from a stored config: of a run to go on with, of a checkpoint to evaluate."""
+"""Starting from the settings inside a checkpoint: to go on with a run, or to evaluate it.
+
+Hydra composes what the user says and nothing else: an option here, a single setting there. What the
+file says is laid under that as plain data, checked, and never reaches Hydra.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hydra import initialize_config_dir
-from hydra._internal.utils import get_args_parser
+from hydra import compose
 from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
+from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
-from tangent_train.cli.compose import STORED, compose_option, config_folder, search_path
-from tangent_train.cli.resume import LATER_SETTINGS
+from tangent_train.cli import values
+from tangent_train.cli.compose import STORED
 from tangent_train.errors import DataError, SettingError
+from tangent_train.registry import Text, accept, check_fields, check_plain, named_targets
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Sequence
+    from collections.abc import Collection, Mapping, Sequence
 
-__all__ = ["checkpoint_config", "stored_config_arguments", "with_stored_config"]
+__all__ = ["CHOOSABLE", "StoredRun", "stored_arguments", "stored_run"]
 
-_CHOOSABLE = ("data", "representation")
+CHOOSABLE = ("data", "representation", "trainer")
 """Sections that an evaluation may take from a group: all else belongs to the network."""
 
-_OF_THE_NETWORK = ("fold", "inputs", "normalization")
-"""Settings of the data that a network was trained for."""
+_SECTIONS = (*CHOOSABLE, "network", "task", "optimizer", "scheduler")
+_RUN = {
+    "choices": dict[str, Text] | None,
+    "name": Text,
+    "seed": int,
+    "level": int,
+    "panels": int,
+    "tensorboard_images": int,
+    "checkpoint_every_n_steps": int | None,
+    "ema": float | None,
+}
+"""Settings outside of the sections."""
+
+_FOLLOWING = {"representation.level": "level", "data.seed": "seed"}
+"""Settings that in every config are what others are."""
+
+_EXPECTED = "the settings of a run"
 
 
-def with_stored_config(command: str, arguments: list[str]) -> tuple[str, list[str]]:
+@dataclass(frozen=True)
+class StoredRun:
+    """The settings inside a checkpoint, on which those of the command line are laid.
+
+    Attributes:
+        path: The checkpoint.
+        config: Its settings, unchecked.
+        name: Of the config to compose; of the user's own words alone.
+        arguments: The command line without what only says which checkpoint it is.
+    """
+
+    path: Path
+    config: Mapping[str, Any]
+    name: str
+    arguments: Sequence[str]
+
+    @property
+    def known(self) -> list[str]:
+        """The names of all settings."""
+        return [*_RUN, *_dotted({name: self.config.get(name) for name in _SECTIONS})]
+
+    def additions(self) -> list[str]:
+        """The command line for Hydra: every override adds to an empty config."""
+        return [_addition(argument) for argument in self.arguments]
+
+    def settings(
+        self, said: Mapping[str, Any], chosen: Collection[str]
+    ) -> tuple[dict[str, Any], tuple[str, ...]]:
+        """All settings of the run that goes on.
+
+        Args:
+            said: The composed config of `additions`, resolved.
+            chosen: Groups of which it holds an option.
+
+        Returns:
+            The settings, and what they may name besides what is registered.
+
+        Raises:
+            DataError: The file gives settings that files must not give.
+            SettingError: A setting of this machine has to be said.
+        """
+        trust = (*values.names(said, "trust"), *named_targets(said))
+        sections: dict[str, Any] = {
+            name: self.config.get(name)
+            for name in _SECTIONS
+            if name not in chosen and self.config.get(name) is not None
+        }
+        file_only = check_fields(self.path, self.config, _RUN, _EXPECTED)
+        said = {name: value for name, value in said.items() if name != "trust"}
+        own = {n for n in _leaves(said) if n not in file_only or said[n] != file_only[n]}
+        for name, other in _FOLLOWING.items():
+            section, _, setting = name.partition(".")
+            inside = sections.get(section)
+            if other in own and name not in own and isinstance(inside, dict) and setting in inside:
+                said = _merged(said, {section: {setting: said[other]}})
+                own.add(name)
+        accepted = accept(self.path, _merged(sections, _only(said, sections)), trust, own)
+        settings = _merged(file_only | accepted.settings, said)
+        if "data" in chosen:
+            settings["data"] |= self._of_the_network(settings["data"], own)
+        self._fill_local(settings, accepted.local, file_only["choices"] or {})
+        return {"init_from": None, "resume": None, "checkpoint": None} | settings, trust
+
+    def _of_the_network(self, data: Mapping[str, Any], own: Collection[str]) -> dict[str, Any]:
+        """What belongs to the network whatever the data: the fold it left out, and its inputs."""
+        from tangent_train.checkpoints.content import INPUTS, NORMALIZATION
+
+        kinds = {"fold": int | None, "inputs": INPUTS | None, "normalization": NORMALIZATION | None}
+        before = check_fields(self.path, self.config.get("data"), kinds, _EXPECTED, "data")
+        typed = {argument.lstrip("+").partition("=")[0] for argument in self.arguments}
+        return {
+            name: value
+            for name, value in before.items()
+            if value is not None
+            and f"data.{name}" not in typed
+            and (name in data or name == "normalization")
+        }
+
+    @staticmethod
+    def _fill_local(
+        settings: dict[str, Any], local: Mapping[str, Any], choices: Mapping[str, str]
+    ) -> None:
+        """Give settings that only concern this machine the values they have here."""
+        here = _composed_here(choices)
+        for place, theirs in local.items():
+            section, _, name = place.partition(".")
+            same = OmegaConf.select(here, f"{section}._target_") == settings[section]["_target_"]
+            value = OmegaConf.select(here, place) if same else None
+            if place == "data.root" and value != theirs:
+                raise SettingError(
+                    place,
+                    found="none: files do not say where data lie on this machine",
+                    expected="the folder of the data set",
+                    remedy=f"The run had data.root={theirs!r}: add that if it is right.",
+                )
+            if value is not None:
+                settings[section][name] = value
+
+
+def stored_run(command: str, arguments: Sequence[str]) -> StoredRun | None:
     """Start from a stored config where the command goes on from one.
 
-    ``tangent-train resume=<run folder>`` takes the config inside the run's last checkpoint,
-    ``tangent-evaluate checkpoint=<file>`` the one inside that, with other sections where
-    ``data=<option>`` or ``representation=<option>`` says so; overrides then apply to it. Code that
-    is not of this package or the libraries of networks has to be named on the command line, by
-    ``trust=<its full name>`` or as an override: a config calls what it names.
+    ``tangent-train resume=<run folder>`` takes the settings inside the run's last checkpoint,
+    ``tangent-evaluate checkpoint=<file>`` those inside that, with other sections where
+    ``data=<option>``, ``representation=<option>`` or ``trainer=<option>`` says so.
 
     Args:
         command: train, evaluate, prepare or transfer.
         arguments: The command line after the program's name.
 
-    Returns:
-        The name of the config to compose, and the arguments with the folder to run in.
-
     Raises:
-        DataError: There is no usable config where the argument points.
-        SettingError: An option is unknown, or a run is to be resumed elsewhere.
+        DataError: There are no usable settings where the argument points.
+        SettingError: A run is to be resumed elsewhere.
     """
     given = dict(argument.partition("=")[::2] for argument in arguments)
     if command == "train" and given.get("resume") not in (None, "", "null"):
-        stored, folder = _of_run(given, arguments)
-    elif command == "evaluate" and _has_checkpoint(arguments):
-        path = Path(given["checkpoint"]).absolute()
-        stored = checkpoint_config(path, *_trusted(arguments))
-        _choose_sections(stored, arguments)
-        stored["checkpoint"] = str(path)
-        folder = "runs/evaluate/${now:%Y-%m-%d_%H-%M-%S}"
+        folder = _resumed_folder(given, arguments)
+        path, base = _last_checkpoint(folder), {"resume": str(folder)}
+        run_dir = str(folder).replace("${", r"\${")
+    elif command == "evaluate" and given.get("checkpoint") not in (None, "", "null"):
+        path = Path(given["checkpoint"].strip("'\"")).absolute()
+        base, run_dir = {"checkpoint": str(path)}, "runs/evaluate/${now:%Y-%m-%d_%H-%M-%S}"
     else:
-        return command, arguments
-    used = stored_config_arguments(command, arguments)
-    stored["hydra"] = {"run": {"dir": folder}, "sweep": {"dir": folder}}
-    ConfigStore.instance().store(STORED + command, stored)
-    return STORED + command, [a for a in arguments if a not in used]
+        return None
+    from tangent_train.checkpoints.content import read_checkpoint
+
+    config = check_plain(path, read_checkpoint(path, ("config",))["config"], "config")
+    # The user's options refer to these two.
+    numbers = check_fields(path, config, {"level": int, "seed": int}, _EXPECTED)
+    base = {name: text.replace("${", r"\${") for name, text in base.items()}
+    hydra = {"run": {"dir": run_dir}, "sweep": {"dir": run_dir}}
+    name = STORED + command
+    ConfigStore.instance().store(name, {**base, **numbers, "trust": [], "hydra": hydra})
+    used = ("checkpoint=", "resume=")
+    left = [a for a in arguments if not a.startswith(used)]
+    return StoredRun(path, config, name, left)
 
 
-def stored_config_arguments(command: str, arguments: Sequence[str]) -> list[str]:
-    """The arguments that say what the stored config is, which are no overrides of it."""
-    names = ["checkpoint=", "resume=", "trust="]
-    if command == "evaluate" and _has_checkpoint(arguments):
-        names += [f"{group}=" for group in _CHOOSABLE]
-    return [a for a in arguments if a.startswith(tuple(names))]
+def _composed_here(choices: Mapping[str, str]) -> Any:
+    """The user's own config of the options a run began with."""
+    loader = GlobalHydra.instance().config_loader()
+    chosen = []
+    for group, option in choices.items():
+        folder, _, name = option.rpartition("/")
+        options = loader.get_group_options(f"{group}/{folder}" if folder else group)
+        if name in options and group in ("data", "experiment"):
+            chosen.append(f"{group}={option}")
+    try:
+        return compose("train", chosen)
+    except HydraException:  # options that are nothing together
+        return OmegaConf.create()
 
 
-def _has_checkpoint(arguments: Sequence[str]) -> bool:
-    return any(a.startswith("checkpoint=") and a != "checkpoint=" for a in arguments)
+def stored_arguments(command: str, arguments: Sequence[str]) -> list[str]:
+    """The arguments that say which stored run it is, for a process that goes on with it."""
+    found = ["checkpoint=", "resume="] if command in ("train", "evaluate") else []
+    return [a for a in arguments if a.startswith(tuple(found))]
 
 
-def _trusted(arguments: Sequence[str]) -> tuple[set[str], set[str]]:
-    """Code that the command line names itself, and settings that it replaces."""
-    plain = [a.lstrip("+").partition("=")[::2] for a in arguments if "=" in a and a[0] not in "-~"]
-    trust = {
-        part.strip(" '\"")
-        for name, value in plain
-        if name == "trust"
-        for part in value.strip("[]").split(",")
-    }
-    # A network that is overridden where it was in the checkpoint is the user's own choice there;
-    # one that the checkpoint names elsewhere as well likewise.
-    trust |= {value for name, value in plain if name.endswith("._target_")}
-    return trust, {name for name, _ in plain}
+def _addition(argument: str) -> str:
+    name, equals, value = argument.lstrip("+").partition("=")
+    if not equals or argument[0] in "-~" or name.startswith("hydra"):
+        return argument
+    if name in CHOOSABLE and value[:1] not in "{[":
+        return f"+{name}={value}"
+    return f"++{name}={value}"
 
 
-def _of_run(given: dict[str, str], arguments: list[str]) -> tuple[dict[str, Any], str]:
-    """The config of the run to go on with, and its folder."""
-    folder = Path(given["resume"]).absolute()
+def _resumed_folder(given: Mapping[str, str], arguments: Sequence[str]) -> Path:
+    folder = Path(given["resume"].strip("'\"")).absolute()
     # Lightning starts further processes with the run's own folder.
     its_own = Path(given.get("hydra.run.dir", str(folder)).strip("'\"")).absolute() == folder
     elsewhere = [a for a in arguments if a in ("-m", "--multirun")]
@@ -103,9 +228,7 @@ def _of_run(given: dict[str, str], arguments: list[str]) -> tuple[dict[str, Any]
             found=f"{elsewhere[0]} beside it",
             expected="neither a sweep nor another folder: a run goes on in its own",
         )
-    stored = checkpoint_config(_last_checkpoint(folder), *_trusted(arguments))
-    stored["resume"] = str(folder)
-    return stored, str(folder)
+    return folder
 
 
 def _last_checkpoint(folder: Path) -> Path:
@@ -120,53 +243,32 @@ def _last_checkpoint(folder: Path) -> Path:
     return path
 
 
-def _choose_sections(stored: dict[str, Any], arguments: list[str]) -> None:
-    """Put the chosen options in place of the stored sections.
-
-    What they refer to elsewhere in the config, as the level, they take from the stored one. What
-    belongs to the network stays: the fold, as it has been trained on the others, and its inputs.
-    """
-    chosen = [a.partition("=")[::2] for a in stored_config_arguments("evaluate", arguments)]
-    chosen = [(group, option) for group, option in chosen if group in _CHOOSABLE]
-    if not chosen:
-        return
-    before = stored.get("data") or {}
-    search = search_path(get_args_parser().parse_args(arguments))
-    with initialize_config_dir(str(config_folder()), version_base="1.3"):
-        for group, option in chosen:
-            stored[group] = compose_option(group, option.strip("'\""), search)
-    for name in _OF_THE_NETWORK:
-        if before.get(name) is not None and (name in stored["data"] or name == "normalization"):
-            stored["data"][name] = before[name]
+def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+    """Nested settings with others laid over them."""
+    merged = dict(below)
+    for name, value in above.items():
+        before = merged.get(name)
+        both = isinstance(before, dict) and isinstance(value, dict)
+        merged[name] = _merged(before, value) if both else value  # type: ignore[arg-type]
+    return merged
 
 
-def checkpoint_config(
-    path: Path, trust: Collection[str] = (), overridden: Collection[str] = ()
-) -> dict[str, Any]:
-    """The config inside a checkpoint, read without unpickling anything but tensors.
+def _only(settings: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
+    return {name: value for name, value in settings.items() if name in names}
 
-    Args:
-        path: The checkpoint.
-        trust: Code it may name, see `check_stored`.
-        overridden: Settings that the command line replaces.
 
-    Raises:
-        DataError: The file is missing, no checkpoint, of another program, or names other code.
-    """
-    from tangent_train.tasks.stored_settings import check_stored, without_resolvers
-    from tangent_train.tasks.trained import read_checkpoint
+def _dotted(settings: Mapping[Any, Any], prefix: str = "") -> list[str]:
+    names = []
+    for key, value in settings.items():
+        names.append(f"{prefix}{key}")
+        if isinstance(value, dict):
+            names += _dotted(value, f"{prefix}{key}.")
+    return names
 
-    content = read_checkpoint(path)
-    written = without_resolvers(path, content["config"], content.get("resolved_config"))
-    check_stored(path, written, trust, overridden)
-    container = OmegaConf.to_container(OmegaConf.create(written), resolve=False)
-    if not isinstance(container, dict):
-        raise DataError("stored config", found=type(container).__name__, expected="a mapping")
-    # A list of defaults would choose sections, and is none of the run's settings.
-    stored = {str(key): value for key, value in container.items() if key != "defaults"}
-    for name, (value, beside) in LATER_SETTINGS.items():
-        section, _, setting = name.rpartition(".")
-        inside = stored.get(section) if section else stored
-        if isinstance(inside, dict) and beside in inside:
-            inside.setdefault(setting, value)
-    return stored
+
+def _leaves(settings: Mapping[str, Any], prefix: str = "") -> list[str]:
+    leaves = []
+    for name, value in settings.items():
+        inside = isinstance(value, dict) and value
+        leaves += _leaves(value, f"{prefix}{name}.") if inside else [f"{prefix}{name}"]
+    return leaves

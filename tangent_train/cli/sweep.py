@@ -18,7 +18,7 @@ from hydra.errors import CompactHydraException
 from hydra.types import RunMode
 
 from tangent_train.cli.processes import command_line, run_environment, run_process
-from tangent_train.cli.stored import stored_config_arguments
+from tangent_train.cli.stored import stored_arguments
 from tangent_train.errors import SettingError
 from tangent_train.json_text import parse_json
 
@@ -128,8 +128,8 @@ def _arguments(command: str, typed: Sequence[str]) -> list[str]:
         "--config-name": options.config_name,
     }
     arguments = [f"{name}={value}" for name, value in named.items() if value]
-    # Where a stored config comes from, and its sections, are no settings: Hydra does not know them.
-    arguments += stored_config_arguments(command, typed)
+    # Where a stored config comes from is no setting: Hydra does not know it.
+    arguments += stored_arguments(command, typed)
     hydra = HydraConfig.get().overrides
     swept = ("hydra.sweep.", "hydra.sweeper.", "hydra.launcher.", "hydra.mode=", "hydra.run.")
     groups = ("hydra/", *(f"{group}=" for group in _GROUPS), "checkpoint=", "resume=")

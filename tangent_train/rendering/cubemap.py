@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from tangent_train.geometry import CubeGrid, equirect_shape
+from tangent_train.registry import registered
 from tangent_train.rendering.representation import PinholeRepresentation, RotationAugmentation
 
 __all__ = ["CubemapRepresentation"]
 
 
+@registered(
+    level=int, dim=int | None, rotation=RotationAugmentation, mirror=bool, erp_height=int | None
+)
 class CubemapRepresentation(PinholeRepresentation):
     """The baseline between panorama and tangent images: the six faces of a cube.
 

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry import normalize_camera, shift_range
+from tangent_train.registry import registered
 from tangent_train.rendering.forward import Interpolation
 from tangent_train.rendering.views import NO_RAYS, UNTURNED
 
@@ -183,6 +184,14 @@ class PhotoSampler:
         return PhotoCrops(np.array(boxes), wanted.image_size, mirrored)
 
 
+@registered(
+    level=int,
+    fov_deg=float,
+    dim=int | list[int] | None,
+    crops_per_photo=int,
+    mirror=bool,
+    evaluation=Crops,
+)
 class PerspectiveRepresentation:
     """Crops of photos, all of one camera.
 

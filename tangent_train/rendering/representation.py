@@ -28,6 +28,7 @@ from tangent_train.geometry import (
     random_rotation,
     rotation_about,
 )
+from tangent_train.registry import registered
 from tangent_train.rendering.backward import Blend, tangent_to_labels
 from tangent_train.rendering.mosaic import ScoreMosaic
 from tangent_train.rendering.rotate import rotate_equirect
@@ -188,6 +189,18 @@ class PinholeRepresentation:
         return labels
 
 
+@registered(
+    base_level=int,
+    level=int,
+    dim=int | None,
+    crop_multiple=int | None,
+    faces_per_panorama=int | None,
+    rotation=RotationAugmentation,
+    mirror=bool,
+    blend=Blend,
+    erp_height=int | None,
+    average_rotations=int,
+)
 class TangentRepresentation(PinholeRepresentation):
     """Tangent images (paper, section 3.2).
 
@@ -272,6 +285,13 @@ class TangentRepresentation(PinholeRepresentation):
         return torch.from_numpy(mosaic.labels().astype(np.int64))
 
 
+@registered(
+    level=int,
+    crop_deg=float | None,
+    rotation=RotationAugmentation,
+    mirror=bool,
+    erp_height=int | None,
+)
 class EquirectRepresentation:
     """The baseline without tangent images: the equirectangular image, or random crops of it.
 

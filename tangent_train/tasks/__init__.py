@@ -12,6 +12,7 @@ if TYPE_CHECKING:
         classification_scores,
     )
     from tangent_train.tasks.metrics import ConfusionMatrix, SegmentationScores, segmentation_scores
+    from tangent_train.tasks.schedules import WarmupCosineLR
     from tangent_train.tasks.segmentation import SegmentationTask
 
 __all__ = [
@@ -20,6 +21,7 @@ __all__ = [
     "ConfusionMatrix",
     "SegmentationScores",
     "SegmentationTask",
+    "WarmupCosineLR",
     "classification_scores",
     "segmentation_scores",
 ]
@@ -27,6 +29,7 @@ __all__ = [
 _MODULES = {
     "ClassificationTask": "classification",
     "SegmentationTask": "segmentation",
+    "WarmupCosineLR": "schedules",
     "ClassificationScores": "classification_metrics",
     "classification_scores": "classification_metrics",
 }

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import shlex
 import signal
 import threading
+from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -115,16 +117,20 @@ class LastCheckpoint(Checkpoint):
     Args:
         folder: Where to; the checkpoints' folder of a run.
         every_n_steps: Optimizer steps between checkpoints within an epoch; None for none.
+        typed: What the command to go on with has to say besides the folder.
 
     Raises:
         SettingError: Fewer than one step.
     """
 
-    def __init__(self, folder: Path | str, every_n_steps: int | None = None) -> None:
+    def __init__(
+        self, folder: Path | str, every_n_steps: int | None = None, typed: Sequence[str] = ()
+    ) -> None:
         if every_n_steps is not None and every_n_steps < 1:
             raise SettingError("checkpoint_every_n_steps", found=every_n_steps, expected="≥ 1")
         self.path = Path(folder) / "last.ckpt"
         self.every_n_steps = every_n_steps
+        self.typed = typed
         self._told_to_end = False
         self._processes: Any = None
 
@@ -192,11 +198,11 @@ class LastCheckpoint(Checkpoint):
         if not interrupted and not _is_of_the_machine(exception):
             return
         if trainer.is_global_zero and self.path.exists():
-            run_folder = self.path.parent.parent
+            command = shlex.join([f"resume={self.path.parent.parent}", *self.typed])
             Console(stderr=True).print(
                 f"{'Interrupted' if interrupted else 'Stopped'}. {self.path} has all up to "
                 f"{'here' if terminated else 'the last checkpoint'}; go on with\n"
-                f"  tangent-train resume={run_folder}",
+                f"  tangent-train {command}",
                 soft_wrap=True,
                 highlight=False,
             )

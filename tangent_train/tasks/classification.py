@@ -17,6 +17,7 @@ from torch.optim.lr_scheduler import LRScheduler
 
 from datamodules.split_module import Kind
 from tangent_train.errors import SettingError
+from tangent_train.registry import registered
 from tangent_train.tasks.base import Part, Task
 from tangent_train.tasks.classification_metrics import ClassCounts, classification_scores
 from tangent_train.tasks.classification_results import (
@@ -30,6 +31,7 @@ from tangent_train.tasks.tensorboard_pictures import ValidationConfusion
 __all__ = ["ClassificationTask"]
 
 
+@registered()
 class ClassificationTask(Task):
     """Trains a network that names a shape by all views of its sphere (paper, section 4.1).
 

@@ -9,16 +9,14 @@ from typing import NamedTuple, get_args
 import torch
 from torch import nn
 
+from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
 from tangent_train.errors import SettingError
 from tangent_train.files import atomic_path
 from tangent_train.tasks.export_formats import WRITE, Format, Plan, random_images
-from tangent_train.tasks.networks import TrainedNetwork
-from tangent_train.tasks.stored_settings import named_targets
-from tangent_train.tasks.trained import load_trained
 
 __all__ = ["SUFFIXES", "TOLERANCE", "Export", "Format", "export_network"]
 
-SUFFIXES: dict[Format, str] = {"onnx": ".onnx", "safetensors": ".safetensors", "torchscript": ".pt"}
+SUFFIXES: dict[Format, str] = {"onnx": ".onnx", "safetensors": ".safetensors"}
 """What the names of the files end with; `load_trained` goes by it."""
 
 TOLERANCE = 1e-4
@@ -66,9 +64,8 @@ def export_network(
         trained: The network; of a checkpoint or of a safetensors file.
         path: The file, with the suffix of the format. It appears when all is well, else not at all.
         form: ``onnx``: the computation, for onnxruntime and others. ``safetensors``: the tensors,
-            and the settings of the network that takes them. ``torchscript``: the computation, for
-            torch without Python.
-        image_size: The only rows and columns to write it for; of ONNX and TorchScript.
+            and the settings of the network that takes them.
+        image_size: The only rows and columns to write it for; of ONNX.
         opset: Version of ONNX's operators; default the exporter's own.
 
     Raises:
@@ -153,7 +150,7 @@ def _check_onnx(network: nn.Module) -> None:
 def _compared(plan: Plan, path: Path) -> Export:
     """Read the file as any user does and compare; raises `_DifferenceError`."""
     trained = plan.trained
-    exported = load_trained(path, named_targets([trained.settings, trained.representation]))
+    exported = load_trained(path, trained.trust)
     difference = share = 0.0
     for size in plan.compared_sizes:
         for count in _BATCHES:

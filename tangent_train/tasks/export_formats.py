@@ -14,13 +14,12 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from tangent_train.checkpoints.trained import METADATA_KEY, TrainedNetwork, metadata_json
 from tangent_train.errors import SettingError
-from tangent_train.tasks.exported import METADATA_KEY, metadata_json, torchscript_without_warnings
-from tangent_train.tasks.networks import TrainedNetwork
 
 __all__ = ["WRITE", "Format", "Plan", "random_images"]
 
-Format = Literal["onnx", "safetensors", "torchscript"]
+Format = Literal["onnx", "safetensors"]
 
 
 @dataclass(frozen=True)
@@ -129,14 +128,6 @@ def _quiet_exporter() -> Iterator[None]:
         logging.disable(disabled)
 
 
-def _write_torchscript(plan: Plan, path: Path) -> None:
-    with torchscript_without_warnings(), torch.no_grad():
-        jit: Any = torch.jit  # partly without types
-        traced = jit.trace(plan.trained.network, plan.traced_images, check_trace=False)
-        extra = {METADATA_KEY: plan.metadata_without_settings}
-        jit.save(traced, str(path), _extra_files=extra)
-
-
 def _write_safetensors(plan: Plan, path: Path) -> None:
     try:
         from safetensors.torch import save_file
@@ -159,6 +150,5 @@ def _write_safetensors(plan: Plan, path: Path) -> None:
 WRITE: dict[Format, Callable[[Plan, Path], None]] = {
     "onnx": _write_onnx,
     "safetensors": _write_safetensors,
-    "torchscript": _write_torchscript,
 }
 """Write a file as planned, by format."""

@@ -9,10 +9,12 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
 from tangent_train.errors import SettingError
+from tangent_train.registry import registered
 
 __all__ = ["WarmupCosineLR"]
 
 
+@registered(warmup=float)
 class WarmupCosineLR(LRScheduler):
     """Rises in a straight line to the learning rate, then falls along half a cosine to zero.
 

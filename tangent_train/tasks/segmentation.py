@@ -19,6 +19,7 @@ from datamodules.class_weights import ClassWeights
 from datamodules.split_module import Kind
 from models.held import held_networks
 from tangent_train.errors import SettingError
+from tangent_train.registry import registered
 from tangent_train.rendering import Assembler, EquirectRepresentation
 from tangent_train.tasks.base import Part, Task, check_at_once
 from tangent_train.tasks.callbacks import PredictionPanels
@@ -32,6 +33,15 @@ from tangent_train.tasks.tensorboard_pictures import ValidationPictures
 __all__ = ["SegmentationTask"]
 
 
+@registered(
+    class_weights=ClassWeights | list[float],
+    auxiliary_weight=float,
+    auxiliary_target=AuxiliaryTarget,
+    region_loss=RegionLoss | Literal["none"],
+    region_weight=float,
+    images_per_forward=int,
+    absent_class=AbsentClass,
+)
 class SegmentationTask(Task):
     """Trains a network on views of panoramas, or on crops of photos, and scores it on the whole.
 

@@ -27,7 +27,7 @@ from tangent_train.geometry import (
 )
 from tangent_train.tasks.export import SUFFIXES, Format, export_network
 from tangent_train.tasks.exported import torchscript_without_warnings
-from tangent_train.tasks.trained import load_trained
+from tangent_train.checkpoints.trained import load_trained
 from tests.rendering.reference import sample_panorama, to_lonlat
 from tests.tasks.odd_networks import assert_same, scores_of, some_images
 from tests.tasks.small_networks import small_trained

@@ -20,7 +20,7 @@ from tangent_train.cli import main
 from tangent_train.cli.keypoint_pairs.export import ColmapExport
 from tangent_train.errors import DataError
 from tangent_train.tasks.reports.runs import load_run
-from tangent_train.tasks.trained import load_trained, read_checkpoint
+from tangent_train.checkpoints.trained import load_trained, read_checkpoint
 from tests.tasks.prediction.trained import write_checkpoint
 
 

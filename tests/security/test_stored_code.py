@@ -30,7 +30,7 @@ from tangent_train.tasks.exported import (
 from tangent_train.tasks.networks import completed_settings
 from tangent_train.tasks.reports.runs import load_run
 from tangent_train.tasks.stored_settings import check_stored, named_targets, read_settings
-from tangent_train.tasks.trained import load_trained
+from tangent_train.checkpoints.trained import load_trained
 from tests.tasks.small_networks import save_checkpoint, small_trained
 
 Edit = Callable[[dict[str, Any], Path], None]

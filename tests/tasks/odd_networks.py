@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from tangent_train.tasks.networks import TrainedNetwork
+from tangent_train.checkpoints.trained import TrainedNetwork
 
 
 class Tied(nn.Module):

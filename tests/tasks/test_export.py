@@ -17,7 +17,7 @@ from models import UNet
 from tangent_train.errors import SettingError
 from tangent_train.tasks import export as export_module
 from tangent_train.tasks.export import SUFFIXES, Format, export_network
-from tangent_train.tasks.trained import load_trained
+from tangent_train.checkpoints.trained import load_trained
 from tests.tasks.odd_networks import assert_same, own, scores_of, some_images
 from tests.tasks.small_networks import small_trained
 

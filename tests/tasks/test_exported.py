@@ -22,8 +22,8 @@ from models import UNet, initialize
 from models.onnx_network import OnnxNetwork
 from tangent_train.errors import DataError, SettingError
 from tangent_train.tasks.export import SUFFIXES, Format, export_network
-from tangent_train.tasks.networks import TrainedNetwork
-from tangent_train.tasks.trained import load_trained
+from tangent_train.checkpoints.trained import TrainedNetwork
+from tangent_train.checkpoints.trained import load_trained
 from tests.tasks.odd_networks import assert_same, scores_of, some_images
 from tests.tasks.small_networks import NAMES, UNET, small_trained
 

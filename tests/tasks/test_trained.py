@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from tangent_train.errors import DataError
 from tangent_train.tasks.networks import PRETRAINED, Scores, completed_settings, size_multiple_of
-from tangent_train.tasks.trained import load_trained, read_checkpoint
+from tangent_train.checkpoints.trained import load_trained, read_checkpoint
 from tests.tasks.small_networks import save_checkpoint, with_statistics
 
 SMALL_UNET = ["network=unet", "network.widths=[4,8,8]"]

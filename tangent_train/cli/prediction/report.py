@@ -13,9 +13,9 @@ from tangent_train.tasks.html import Table, ViewerImage, encode_image, write_rep
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from tangent_train.checkpoints.trained import TrainedNetwork
     from tangent_train.cli.prediction.settings import PredictSettings
     from tangent_train.tasks.html import EncodedImage
-    from tangent_train.tasks.networks import TrainedNetwork
     from tangent_train.tasks.prediction.labellers import Labelled
     from tangent_train.tasks.prediction.outputs import OutputFolder
 

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import InstantiationException
 from omegaconf import DictConfig, OmegaConf, open_dict
 from rich.console import Console
 
@@ -72,7 +71,8 @@ def _try(stages: Sequence[Stage]) -> None:
         parts = stage.config["data"], stage.config["representation"], stage.config["level"]
         if parts not in tried:
             tried.append(parts)
-            config = OmegaConf.create(stage.config | {"checkpoint": "P's: no weights are fetched"})
+            config: Any = OmegaConf.to_container(OmegaConf.create(stage.config), resolve=True)
+            config["checkpoint"] = "P's: no weights are fetched"
             with _named(stage):
                 built.append((stage, build(config)[0]))
                 _check_alike(network, built[-1][1])
@@ -87,12 +87,9 @@ def _named(stage: Stage) -> Iterator[None]:
     """Say which stage an error is about: settings of the photos are below ``photos``."""
     try:
         yield
-    except (DataError, SettingError, InstantiationException) as error:
-        cause = error.__cause__ if isinstance(error, InstantiationException) else error
-        if not isinstance(cause, DataError | SettingError):
-            raise
+    except (DataError, SettingError) as error:
         where = ", in photos" if stage.on == "photos" else ""
-        raise SettingError(f"stage {stage.name}{where}: {cause}") from error
+        raise SettingError(f"stage {stage.name}{where}: {error}") from error
 
 
 def _check_alike(network: dict[str, Any], data: Any) -> None:

@@ -5,12 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hydra.utils import get_class
 from omegaconf import DictConfig, OmegaConf
 
 from tangent_train.cli.resume import differing_settings
-from tangent_train.cli.stored import checkpoint_config
 from tangent_train.errors import SettingError
+from tangent_train.registry import check_fields, check_plain, maker_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -29,30 +28,27 @@ def check_given(config: DictConfig, folds: Sequence[int | None]) -> None:
         DataError: It is no checkpoint of tangent-train.
         SettingError: The transfer cannot start from it.
     """
-    from tangent_train.tasks.stored_settings import check_stored, named_targets
-    from tangent_train.tasks.trained import read_checkpoint
+    from tangent_train.checkpoints.content import read_checkpoint
 
     path = Path(config.checkpoint)
     content = read_checkpoint(path)
-    kind = content.get("kind", "segmentation")
-    if kind != "segmentation":
+    if content["kind"] != "segmentation":
         raise SettingError(
             f"checkpoint={path}",
-            found=f"a network for {kind}",
+            found=f"a network for {content['kind']}",
             expected="one for segmentation: a transfer compares labels of pixels",
         )
     wanted: Any = OmegaConf.to_container(config, resolve=True)
-    stored = checkpoint_config(path, named_targets(content["config"]))  # compared, not called
-    check_stored(path, stored["data"], named_targets(wanted))  # but this is imported
-    given: Any = OmegaConf.to_container(OmegaConf.create(stored), resolve=True)
+    plain = check_plain(path, content["config"], "config")
+    given = check_fields(path, plain, {"network": dict, "data": dict}, "the settings of a run")
     _check_network(path, given, wanted)
-    theirs = _classes(given["data"])
-    for data in (wanted["data"], wanted["photos"]["data"]):
-        if _classes(data) != theirs:
+    for name, data in (("data", wanted["data"]), ("photos.data", wanted["photos"]["data"])):
+        classes = getattr(maker_of(data, name), "class_names", content["class_names"])
+        if list(classes) != content["class_names"]:
             raise SettingError(
                 f"checkpoint={path}",
-                found=f"a network for the classes of {given['data']['_target_']}",
-                expected=f"those of {data['_target_']}",
+                found=f"a network for {', '.join(content['class_names'])}",
+                expected=f"one for {', '.join(classes)}, the classes of {data['_target_']}",
             )
     fold = given["data"].get("fold")
     if fold is not None and set(folds) != {fold}:
@@ -64,14 +60,17 @@ def check_given(config: DictConfig, folds: Sequence[int | None]) -> None:
 
 
 def _check_network(path: Path, given: dict[str, Any], wanted: dict[str, Any]) -> None:
-    from tangent_train.tasks.networks import PRETRAINED
+    from tangent_train.checkpoints.trained import completed_settings
 
+    # What the data says of a network, and where it began, does not matter once it is trained.
     now, then = (
-        {"network": config["network"], "data": {"inputs": config["data"].get("inputs")}}
+        {
+            "network": completed_settings(config["network"], 0, 0, restored=True),
+            "data": {"inputs": config["data"].get("inputs")},
+        }
         for config in (wanted, given)
     )
-    # Where a network began does not matter once it is trained.
-    free = [f"network.{name}" for name in PRETRAINED]
+    free = [f"network.{name}" for name in ("in_channels", "num_classes", "classes")]
     differing = differing_settings(now, then, free)
     if differing:
         name, value, before = differing[0]
@@ -81,8 +80,3 @@ def _check_network(path: Path, given: dict[str, Any], wanted: dict[str, Any]) ->
             expected=f"{value!r}, as here",
             remedy=f"Set {name} as it was, or train P here: leave checkpoint= out.",
         )
-
-
-def _classes(data: dict[str, Any]) -> tuple[str, ...]:
-    names: tuple[str, ...] = tuple(get_class(data["_target_"]).class_names)  # type: ignore[attr-defined]
-    return names

@@ -5,16 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from hydra.utils import instantiate
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from rich.table import Table
 
 from tangent_train.cli.transfer.stages import STUDY, Stage, checked_study
 from tangent_train.files import write_bytes, write_text
 from tangent_train.geometry import camera_matrix_from_fov
+from tangent_train.registry import make
 from tangent_train.tasks.reports.runs import Run, load_run
 from tangent_train.tasks.transfer import chart, levels
 from tangent_train.tasks.transfer import tables as transfer_tables
@@ -107,11 +107,12 @@ def trained_level(config: DictConfig) -> float:
     Returns:
         The photos' own level where their field of view is not set.
     """
-    photos = instantiate(config.photos.representation)
+    settings: Any = OmegaConf.to_container(config, resolve=True)
+    photos = make(settings["photos"]["representation"], "photos.representation")
     if not hasattr(photos, "fov_deg"):
         return float(config.photos.representation.get("level", config.level))
     focal = camera_matrix_from_fov(photos.fov_deg, photos.image_size)[0, 0]
-    panoramas = instantiate(config.representation)
+    panoramas = make(settings["representation"], "representation")
     grid = getattr(panoramas, "grid", None)
     pitch = math.pi / panoramas.erp_height if grid is None else grid.pitch
     return float(config.level + math.log2(focal * pitch))

@@ -1,7 +1,7 @@
 """The stages of a transfer as runs: what is in their folders, starting them and going on.
 
 Beside what a run leaves, a stage's folder holds ``stage.yaml``, its config, and ``stage.json``:
-which stage it is, and a digest of the checkpoint it starts from.
+which stage it is, with which settings, and a digest of the checkpoint it starts from.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from tangent_train.cli.processes import command_line, run_environment, run_proce
 from tangent_train.cli.resume import differing_settings
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import write_text
+from tangent_train.json_text import parse_json
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -93,13 +94,10 @@ def stage_state(stage: Stage) -> State:
                 remedy=_REMEDY,
             )
         return "new"
-    before = _read(stage.folder / _CONFIG)
-    if before is None:
-        return "new"
     finished = (stage.folder / _RESULTS).is_file()
     begun = stage.command == "train" and (stage.folder / _LAST).is_file()
     if finished or begun:
-        _check_settings(stage, before)
+        _check_settings(stage, record.get("settings"))
         _check_weights(stage, record)
         return "finished" if finished else "begun"
     return "new"
@@ -123,13 +121,15 @@ def run_stage(stage: Stage, state: State) -> int:
     record = None
     if state == "begun":
         config["resume"] = str(stage.folder)
-        # Where it has begun: the folder may have been moved since.
-        config["init_from"] = (_read(stage.folder / _CONFIG) or {}).get("init_from")
     else:
         weights = _checkpoint(stage)
         source = "init_from" if stage.command == "train" else "checkpoint"
         config[source] = None if weights is None else str(weights)
-        record = {"stage": stage.name, "weights": weights and _digest(weights)}
+        record = {
+            "stage": stage.name,
+            "weights": weights and _digest(weights),
+            "settings": _resolved(stage),
+        }
     with _alone(stage):
         if record is not None:
             write_text(stage.folder / _RECORD, json.dumps(record, indent=1) + "\n")
@@ -190,8 +190,13 @@ def _checkpoint(stage: Stage) -> Path | None:
     return found
 
 
-def _check_settings(stage: Stage, before: Mapping[str, Any]) -> None:
-    now: Any = OmegaConf.to_container(OmegaConf.create(stage.config), resolve=True)
+def _check_settings(stage: Stage, before: Any) -> None:
+    now = _resolved(stage)
+    if not isinstance(before, dict):
+        raise DataError(
+            stage.folder / _RECORD, found=f"settings={before!r}", expected="those of the stage",
+            remedy=_REMEDY,
+        )  # fmt: skip
     free = _FREE if stage.command == "train" else (*_FREE, *_ONLY_TRAINING)
     differing = differing_settings(now, before, free)
     if not differing:
@@ -231,17 +236,22 @@ def _digest_of(path: Path, _changed: int, _size: int) -> str:
         return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
 
 
+def _resolved(stage: Stage) -> dict[str, Any]:
+    config: Any = OmegaConf.to_container(OmegaConf.create(stage.config), resolve=True)
+    return config
+
+
 def _read(path: Path) -> dict[str, Any] | None:
-    """A file of a stage, resolved; None where there is none."""
+    """The record of a stage; None where there is none."""
     if not path.is_file():
         return None
     try:
-        content = OmegaConf.to_container(OmegaConf.load(path), resolve=True)
-    except Exception as error:
+        content = parse_json(path.read_bytes())
+    except ValueError as error:
         first_line = str(error).partition("\n")[0]
         raise DataError(
             path, found=first_line, expected="as tangent-transfer wrote it", remedy=_REMEDY
         ) from error
     if not isinstance(content, dict):
         raise DataError(path, found=type(content).__name__, expected="settings", remedy=_REMEDY)
-    return {str(name): value for name, value in content.items()}
+    return content

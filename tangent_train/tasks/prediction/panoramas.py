@@ -24,8 +24,8 @@ from tangent_train.tasks.prediction.seen import panorama_representation
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from tangent_train.checkpoints.trained import TrainedNetwork
     from tangent_train.rendering import Blend, EquirectRepresentation
-    from tangent_train.tasks.networks import TrainedNetwork
 
 __all__ = ["PanoramaPredictor"]
 

@@ -21,8 +21,8 @@ from tangent_train.tasks.prediction.predictor import Done, InputImage, Level, Pr
 from tangent_train.tasks.prediction.seen import photo_representation
 
 if TYPE_CHECKING:
+    from tangent_train.checkpoints.trained import TrainedNetwork
     from tangent_train.rendering import Blend, PerspectiveRepresentation
-    from tangent_train.tasks.networks import TrainedNetwork
 
 __all__ = ["PhotoPredictor"]
 

@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from torch import Tensor
 
+    from tangent_train.checkpoints.trained import TrainedNetwork
     from tangent_train.geometry import PinholeGrid
     from tangent_train.rendering.mosaic import ScoreMosaic
     from tangent_train.rendering.views import Views
-    from tangent_train.tasks.networks import TrainedNetwork
 
 __all__ = ["Done", "InputImage", "Level", "Prediction", "Runner"]
 

@@ -6,13 +6,13 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from tangent_train.errors import SettingError
+from tangent_train.registry import make
 from tangent_train.rendering import PerspectiveRepresentation
 from tangent_train.rendering.representation import PinholeRepresentation
-from tangent_train.tasks.networks import make
 
 if TYPE_CHECKING:
+    from tangent_train.checkpoints.trained import TrainedNetwork
     from tangent_train.rendering import EquirectRepresentation
-    from tangent_train.tasks.networks import TrainedNetwork
 
 __all__ = ["panorama_representation", "photo_representation"]
 
@@ -49,7 +49,9 @@ def panorama_representation(
     if level not in (None, trained.level):
         settings |= {"erp_height": None} | ({"dim": None} if "dim" in settings else {})
     settings["level"] = trained.level if level is None else level
-    representation: PinholeRepresentation | EquirectRepresentation = make(settings)
+    representation: PinholeRepresentation | EquirectRepresentation = make(
+        settings, "representation", trained.trust
+    )
     _check_size(trained, representation.image_size)
     return representation
 

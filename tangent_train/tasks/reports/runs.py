@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from tangent_train.checkpoints.content import read_settings
 from tangent_train.errors import DataError
 from tangent_train.json_text import parse_json
-from tangent_train.tasks.stored_settings import read_settings
 
 __all__ = [
     "FIGURES",
@@ -179,21 +179,7 @@ def load_run(folder: Path) -> Run:
         DataError: One of the files is missing or not what ``tangent-train`` writes.
     """
     results = _results(folder / RESULTS_FILE)
-    path = folder / "config.yaml"
-    if not path.is_file():
-        path = folder / ".hydra" / "config.yaml"  # of tangent-evaluate
-    if not path.is_file():
-        raise DataError(
-            folder / "config.yaml",
-            found="no such file",
-            expected="the settings of the run, beside its results",
-        )
-    try:
-        config = read_settings(path)
-    except Exception as error:
-        raise DataError(path, found=_first_line(error), expected="the settings of a run") from error
-    if not isinstance(config, dict):
-        raise DataError(path, found=type(config).__name__, expected="the settings of a run")
+    config = read_settings(folder / "config.yaml")
     return Run(folder, dict(flat_settings(config)), results)
 
 

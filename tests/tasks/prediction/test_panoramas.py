@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from tangent_train.tasks.networks import TrainedNetwork
+    from tangent_train.checkpoints.trained import TrainedNetwork
 
 
 def _predict(

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from tangent_train.rendering import Blend
-    from tangent_train.tasks.networks import TrainedNetwork
+    from tangent_train.checkpoints.trained import TrainedNetwork
 
 
 def _blocks(height: int, width: int) -> NDArray[np.uint8]:

@@ -1,0 +1,107 @@
+"""What is in a checkpoint, and in the settings of a run."""
+
+from __future__ import annotations
+
+import zipfile
+from typing import TYPE_CHECKING, Any, Literal
+
+import yaml  # type: ignore[import-untyped]
+
+from tangent_train.errors import DataError
+from tangent_train.files import write_text
+from tangent_train.registry import Text, check_fields
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Mapping
+    from pathlib import Path
+
+__all__ = ["INPUTS", "NORMALIZATION", "read_checkpoint", "read_settings", "write_settings"]
+
+INPUTS = list[Literal["rgb", "depth", "validity", "elevation"]]
+"""What a network is shown, see `datamodules.samples.Input`."""
+
+NORMALIZATION = dict[str, list[float]]
+"""Its ``mean`` and ``std``."""
+
+_FIELDS = {
+    "config": dict,
+    "class_names": list[Text],
+    "inputs": INPUTS | None,  # None of shapes, whose six channels are all there is
+    "kind": Literal["segmentation", "classification"],
+    "normalization": NORMALIZATION,
+    "state_dict": dict,
+}
+_EXPECTED = "a checkpoint written by tangent-train"
+
+
+def read_checkpoint(path: Path, needed: Collection[str] = tuple(_FIELDS)) -> dict[str, Any]:
+    """The content of a checkpoint; nothing but tensors and plain values is unpickled.
+
+    Args:
+        path: The file. Tensors stay in it until they are used.
+        needed: Which of its fields: ``config`` (the resolved settings of the run, unchecked),
+            ``class_names``, ``inputs``, ``kind``, ``normalization``, ``state_dict``.
+
+    Raises:
+        DataError: The file is missing, no checkpoint, or of another program.
+    """
+    import torch
+
+    if not path.is_file():
+        found = "a folder" if path.is_dir() else "no such file"
+        remedy = "Give its checkpoints/best.ckpt." if path.is_dir() else ""
+        raise DataError(path, found=found, expected=_EXPECTED, remedy=remedy)
+    if not zipfile.is_zipfile(path):
+        raise DataError(path, found="an unreadable file", expected=_EXPECTED)
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+    except Exception as error:
+        first_line = str(error).partition("\n")[0]
+        if "TorchScript" in first_line:
+            raise DataError(
+                path,
+                found="a TorchScript program",
+                expected=f"{_EXPECTED}, or an ONNX or safetensors file of tangent-export",
+                remedy="TorchScript cannot be read safely; export the network to ONNX.",
+            ) from error
+        raise DataError(
+            path, found=f"an unreadable file ({first_line})", expected=_EXPECTED
+        ) from error
+    kinds = {name: kind for name, kind in _FIELDS.items() if name in needed}
+    return check_fields(path, content, kinds, _EXPECTED)
+
+
+def read_settings(path: Path) -> dict[str, Any]:
+    """The settings of a run, from the file that `write_settings` wrote.
+
+    Nothing in them is looked up: ``${oc.env:HOME}`` stays what it is. Nor are aliases followed, by
+    which a few lines can stand for more than fits into memory.
+
+    Raises:
+        DataError: It is missing, or something else.
+    """
+    expected = "the settings of a run"
+    try:
+        text = path.read_text(encoding="utf-8")
+        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, yaml.SafeLoader)):
+            raise DataError(path, found="an alias", expected=f"{expected}, which have none")
+        content = yaml.safe_load(text)
+    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
+        if isinstance(error, DataError):
+            raise
+        first_line = f"{type(error).__name__}: {error}".partition("\n")[0]
+        raise DataError(path, found=first_line, expected=expected) from error
+    if not isinstance(content, dict):
+        raise DataError(path, found=type(content).__name__, expected=expected)
+    return {str(name): value for name, value in content.items()}
+
+
+class _Dumper(yaml.SafeDumper):  # type: ignore[misc]
+    def ignore_aliases(self, data: Any) -> bool:
+        """Write out what appears twice."""
+        return True
+
+
+def write_settings(path: Path, settings: Mapping[str, Any]) -> None:
+    """Write settings as YAML; texts are written so that any reader takes them for what they are."""
+    write_text(path, yaml.dump(dict(settings), Dumper=_Dumper, sort_keys=False, allow_unicode=True))

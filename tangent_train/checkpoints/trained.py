@@ -1,0 +1,345 @@
+"""Trained networks from files: checkpoints, and what `tangent-export` writes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor, nn
+
+from datamodules.samples import Input, Normalization, channel_names
+from models.onnx_network import OnnxNetwork
+from tangent_train.checkpoints.content import INPUTS, NORMALIZATION, read_checkpoint
+from tangent_train.checkpoints.image_sizes import size_multiple_of
+from tangent_train.errors import DataError, SettingError
+from tangent_train.json_text import parse_json
+from tangent_train.registry import Text, accept, check_fields, make
+
+__all__ = [
+    "METADATA_KEY",
+    "Scores",
+    "TrainedNetwork",
+    "completed_settings",
+    "inputs_in",
+    "load_trained",
+    "metadata_json",
+]
+
+METADATA_KEY = "tangent_train"
+"""Names the JSON text: in an ONNX file's ``metadata_props``, in safetensors' ``__metadata__``."""
+
+_PREFIX = "network."
+"""Begins the names of the network's tensors in a checkpoint."""
+
+_PRETRAINED = ("weights", "weights_backbone", "encoder_weights")
+"""Settings that name trained weights, in models, torchvision and segmentation-models-pytorch."""
+
+_EXPORTED = "a network written by tangent-export"
+_TRAINED = "a checkpoint written by tangent-train"
+
+
+@dataclass(frozen=True)
+class TrainedNetwork:
+    """A trained network with all that is needed to use it.
+
+    Attributes:
+        network: In evaluation mode; ``(B, C, h, w)`` float32, normalized, to scores ``(B, K+1, h,
+            w)``, the unknown class first.
+        class_names: K + 1 names, the unknown class first.
+        inputs: What it is shown, see `datamodules.samples.Input`.
+        normalization: Of RGB and depth.
+        level: Level s it was trained at.
+        representation: The section of the config it was trained with.
+        image_size: Rows and columns of the images that representation evaluates on.
+        size_multiple: Height and width of its images must be multiples of this.
+        fixed_size: The only rows and columns it takes; None where it takes others.
+        settings: The section of the config that makes it, complete; None where only the computation
+            is known (ONNX).
+        trust: What its settings may name besides registered classes.
+    """
+
+    network: nn.Module
+    class_names: tuple[str, ...]
+    inputs: tuple[Input, ...]
+    normalization: Normalization
+    level: int
+    representation: Mapping[str, Any]
+    image_size: tuple[int, int]
+    size_multiple: int = 1
+    fixed_size: tuple[int, int] | None = None
+    settings: Mapping[str, Any] | None = None
+    trust: tuple[str, ...] = ()
+
+    @property
+    def in_channels(self) -> int:
+        """Channels of its images."""
+        return len(channel_names(self.inputs))
+
+
+_KINDS = {
+    "class_names": list[Text],
+    "inputs": INPUTS,
+    "normalization": NORMALIZATION,
+    "level": int,
+    "representation": dict,
+    "image_size": list[int],
+    "size_multiple": int,
+    "fixed_size": list[int] | None,
+    "settings": dict | None,
+}
+"""What the metadata of an exported network say."""
+
+
+class Scores(nn.Module):
+    """A network whose result is always a tensor.
+
+    Args:
+        network: Maps images ``(B, C, h, w)`` to scores ``(B, K, h, w)``, or to a dict with those
+            under ``"out"`` (torchvision's).
+    """
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Scores of every pixel."""
+        scores = self.network(images)
+        result: Tensor = scores["out"] if isinstance(scores, dict) else scores
+        return result
+
+
+def completed_settings(
+    settings: Any, in_channels: int, num_classes: int, *, restored: bool = False
+) -> Any:
+    """Settings of a network, and of networks inside them, with what the data says where null.
+
+    Args:
+        settings: Resolved; ``in_channels``, and ``num_classes`` or ``classes`` may be null.
+        in_channels: Channels of the images.
+        num_classes: Classes, the unknown one included where there is one.
+        restored: Whether a checkpoint will bring the tensors: no others are fetched first.
+    """
+    known = dict.fromkeys(("num_classes", "classes"), num_classes) | {"in_channels": in_channels}
+    unwanted = _PRETRAINED if restored else ()
+
+    def complete(value: Any) -> Any:
+        if not isinstance(value, Mapping):
+            return value
+        return {
+            name: known.get(name) if inner is None or name in unwanted else complete(inner)
+            for name, inner in value.items()
+        }
+
+    return complete(settings)
+
+
+def load_trained(path: Path, trust: Collection[str] = ()) -> TrainedNetwork:
+    """A trained network, on the CPU and in evaluation mode, from a file of this package.
+
+    Args:
+        path: A checkpoint; or what `tangent-export` wrote, known by its suffix ``.onnx`` or
+            ``.safetensors``.
+        trust: Full names of classes that the file may name besides those that are registered.
+
+    Raises:
+        DataError: There is no such file, it holds something else, it names other code, its network
+            cannot be made, or a package to read it is missing.
+    """
+    suffix = path.suffix.lower()
+    if suffix == ".onnx":
+        network = OnnxNetwork(path)
+        described = _described(path, network.metadata.get(METADATA_KEY))
+        return _trained(path, described | {"settings": None}, network, trust)
+    if suffix == ".safetensors":
+        with _safetensors(path) as file:
+            described = _described(path, (file.metadata() or {}).get(METADATA_KEY))
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        return _trained(path, described, tensors, trust)
+    return _from_checkpoint(path, trust)
+
+
+def inputs_in(path: Path) -> tuple[Input, ...] | None:
+    """What the network in a checkpoint or safetensors file is shown, where that is said."""
+    try:
+        if path.suffix.lower() == ".safetensors":
+            with _safetensors(path) as file:
+                text = (file.metadata() or {}).get(METADATA_KEY)
+            return tuple(_described(path, text)["inputs"])
+        found = read_checkpoint(path, ("inputs",))["inputs"]
+    except DataError:
+        return None
+    return None if found is None else tuple(found)
+
+
+def metadata_json(trained: TrainedNetwork) -> str:
+    """All that is known of a network besides its numbers, as JSON.
+
+    The fields of `TrainedNetwork`, but ``network`` and ``trust``, under their names;
+    ``normalization`` with ``mean`` and ``std``; ``tangent_train_version``.
+    """
+    content = {f.name: getattr(trained, f.name) for f in fields(trained) if f.name in _KINDS}
+    mean, std = trained.normalization.mean, trained.normalization.std
+    content["normalization"] = {"mean": mean, "std": std}
+    return json.dumps(content | {"tangent_train_version": version("tangent-train")})
+
+
+def _from_checkpoint(path: Path, trust: Collection[str]) -> TrainedNetwork:
+    content = read_checkpoint(path)
+    if content["kind"] != "segmentation":
+        raise DataError(
+            path,
+            found=f"a network for {content['kind']}",
+            expected="one for segmentation, with scores of every pixel",
+            remedy=f"tangent-evaluate checkpoint={path} is for both.",
+        )
+    kinds = {"network": dict, "representation": dict, "level": int}
+    config = check_fields(path, content["config"], kinds, _TRAINED, "its config")
+    content["inputs"] = content["inputs"] or []
+    described = {name: content[name] for name in ("class_names", "inputs", "normalization")} | {
+        "level": config["level"],
+        "representation": config["representation"],
+        "settings": config["network"],
+        "image_size": None,
+        "size_multiple": None,
+        "fixed_size": None,
+    }
+    tensors = {
+        name.removeprefix(_PREFIX): tensor
+        for name, tensor in content["state_dict"].items()
+        if str(name).startswith(_PREFIX)
+    }
+    return _trained(path, described, tensors, trust)
+
+
+def _trained(
+    path: Path,
+    described: dict[str, Any],
+    content: OnnxNetwork | Mapping[str, Tensor],
+    trust: Collection[str],
+) -> TrainedNetwork:
+    """A network as it is described, with the tensors or the computation of a file."""
+    sections = {"network": described["settings"], "representation": described["representation"]}
+    given = {name: settings for name, settings in sections.items() if settings is not None}
+    settings = accept(path, given, trust).settings
+    representation = _made(path, "representation", settings["representation"], trust)
+    channels = len(channel_names(described["inputs"]))
+    if isinstance(content, OnnxNetwork):
+        network: nn.Module = content
+    elif described["settings"] is None:
+        raise DataError(path, found="no settings of the network inside", expected=_EXPORTED)
+    else:
+        classes = len(described["class_names"])
+        complete = completed_settings(settings["network"], channels, classes, restored=True)
+        settings["network"] = complete
+        network = _with_tensors(path, complete, content, trust)
+    if described["image_size"] is None:
+        multiple, size = size_multiple_of(network, channels), representation.image_size
+        described |= {"size_multiple": multiple or 1, "image_size": size}
+        described["fixed_size"] = None if multiple else size
+    fixed = described["fixed_size"]
+    return TrainedNetwork(
+        network=network.eval(),
+        class_names=tuple(described["class_names"]),
+        inputs=tuple(described["inputs"]),
+        normalization=_normalization(path, described["normalization"]),
+        level=described["level"],
+        representation=settings["representation"],
+        image_size=_size(path, described["image_size"]),
+        size_multiple=described["size_multiple"],
+        fixed_size=None if fixed is None else _size(path, fixed),
+        settings=settings.get("network"),
+        trust=tuple(trust),
+    )
+
+
+def _normalization(path: Path, content: Mapping[str, Any]) -> Normalization:
+    try:
+        return Normalization(**content)
+    except (TypeError, SettingError) as error:
+        expected = "its mean and std, three numbers each, or four with depth"
+        raise DataError(path, found=f"normalization={content}", expected=expected) from error
+
+
+def _size(path: Path, sides: Any) -> tuple[int, int]:
+    if len(sides) != 2:
+        raise DataError(path, found=f"{sides} as a size", expected="rows and columns")
+    return sides[0], sides[1]
+
+
+def _with_tensors(
+    path: Path, settings: Mapping[str, Any], tensors: Mapping[str, Tensor], trust: Collection[str]
+) -> nn.Module:
+    network: nn.Module = _made(path, "network", settings, trust)
+    try:
+        network.load_state_dict(dict(tensors))
+    except (RuntimeError, TypeError, AttributeError) as error:
+        raise DataError(
+            path,
+            found=f"other tensors than those of its network ({error})",
+            expected=f"the tensors of {settings['_target_']}",
+            remedy="Is the package of the network of another version than in training?",
+        ) from error
+    return Scores(network).eval()
+
+
+def _made(path: Path, section: str, settings: Mapping[str, Any], trust: Collection[str]) -> Any:
+    try:
+        return make(settings, section, trust)
+    except (DataError, SettingError) as error:
+        raise DataError(
+            path,
+            found=f"a {section} that cannot be made ({error.subject}: {error.found})",
+            expected=f"settings of {settings['_target_']}",
+            remedy=error.remedy,
+        ) from error
+
+
+def _described(path: Path, text: str | bytes | None) -> dict[str, Any]:
+    """The metadata of a file."""
+    if not text:
+        raise DataError(
+            path,
+            found=f"no '{METADATA_KEY}' in its metadata",
+            expected=_EXPORTED,
+            remedy="The file must say which classes and which normalization its network has; "
+            "write it with tangent-export.",
+        )
+    where = f"'{METADATA_KEY}' of its metadata"
+    try:
+        content = parse_json(text)
+    except ValueError as error:
+        raise DataError(path, found=f"no JSON in {where} ({error})", expected=_EXPORTED) from error
+    return check_fields(path, content, _KINDS, _EXPORTED, where)
+
+
+@contextmanager
+def _safetensors(path: Path) -> Iterator[Any]:
+    """An open file.
+
+    Raises:
+        DataError: It is no such file, or the package safetensors is missing.
+    """
+    if not path.is_file():
+        raise DataError(path, found="no such file", expected=_EXPORTED)
+    try:
+        from safetensors import SafetensorError, safe_open
+    except ImportError as error:
+        raise DataError(
+            path,
+            found="a safetensors file",
+            expected="the package safetensors, to read it",
+            remedy="Run: pip install 'tangent-train[export]'",
+        ) from error
+    try:
+        with safe_open(path, framework="pt") as file:
+            yield file
+    except (SafetensorError, OSError) as error:
+        first_line = str(error).strip().partition("\n")[0]
+        found = f"an unreadable file ({first_line})"
+        raise DataError(path, found=found, expected=_EXPORTED) from error
