@@ -110,25 +110,25 @@ def find(module: str, name: str) -> tuple[Any, Mapping[str, Any]] | None:
         name: In the module.
 
     Returns:
-        None where files may not name it, or its package is not installed.
+        None where files may not name it.
+
+    Raises:
+        ModuleNotFoundError: Its package is not installed.
     """
-    try:
-        if name in _BY_SIGNATURE.get(module, "").split():
-            return _by_signature(getattr(import_module(module), name))
-        if module in _TORCHVISION:
-            return _of_torchvision(module, name)
-        if (module, name) == ("timm", "create_model"):
-            return import_module(module).create_model, _OF_TIMM
-        if (module, name) == ("lightning", "Trainer"):
-            return import_module(module).Trainer, _OF_TRAINER
-    except ModuleNotFoundError as error:
-        if error.name != module.partition(".")[0]:
-            raise
+    if name in _BY_SIGNATURE.get(module, "").split():
+        return _by_signature(getattr(import_module(module), name))
+    if module in _TORCHVISION:
+        return _of_torchvision(module, name)
+    if (module, name) == ("timm", "create_model"):
+        return import_module(module).create_model, _OF_TIMM
+    if (module, name) == ("lightning", "Trainer"):
+        return import_module(module).Trainer, _OF_TRAINER
     return None
 
 
 def _by_signature(made: Any) -> tuple[Any, Mapping[str, Any]]:
-    kinds = dict.fromkeys(inspect.signature(made).parameters, SIMPLE)
+    named = inspect.signature(made).parameters.values()
+    kinds = dict.fromkeys((p.name for p in named if p.kind is not p.VAR_KEYWORD), SIMPLE)
     return made, kinds | {name: Weights for name in kinds if name.endswith("weights")}
 
 

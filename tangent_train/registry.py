@@ -51,7 +51,7 @@ class Object:
 
 
 class Text:
-    """Any text up to `_LONGEST_TEXT`: what is only ever shown, as names of classes."""
+    """Any text: what is only ever shown, as names of classes."""
 
 
 class Weights:
@@ -72,7 +72,6 @@ _HOMES = (
 _WORD = re.compile(r"[A-Za-z0-9][\w.+ -]{0,99}", re.ASCII)
 """A text in settings: no path, no address, no name of Hydra's, nothing to interpret."""
 
-_LONGEST_TEXT = 1000
 _DEEPEST = 12
 _EXTRAS = {"segmentation_models_pytorch": "networks", "timm": "networks"}
 """Packages that an extra of this one installs."""
@@ -316,7 +315,15 @@ class _Check:
 
     def _kinds(self, place: str, target: Any) -> Mapping[str, Any] | None:
         """By the name of a setting what it may be; None where the user trusts in whatever it is."""
-        found, kinds = _find(target, self.trust)
+        try:
+            found, kinds = _find(target, self.trust)
+        except SettingError as error:
+            raise DataError(
+                self.path,
+                found=f"{place}={target}, of which something cannot be imported",
+                expected="its package, as in training",
+                remedy=error.remedy,
+            ) from error
         if found is None and not self._is_own(place):
             raise DataError(
                 self.path,
@@ -361,7 +368,15 @@ def _find(target: Any, trust: Collection[str]) -> tuple[Any, Mapping[str, Any] |
             return made, {k: v for base in bases for k, v in _settings.get(base, {}).items()}
     from tangent_train import libraries
 
-    found = libraries.find(module, name)
+    try:
+        found = libraries.find(module, name)
+    except ModuleNotFoundError as error:
+        raise SettingError(
+            target,
+            found=f"no package {error.name}",
+            expected="it, to make what a file names",
+            remedy=_missing_package(error),
+        ) from error
     if found is None and target in trust:
         return _imported(target, "trust"), None
     return found or (None, None)
@@ -396,7 +411,7 @@ def _fits(value: Any, kind: Any) -> bool:
     if kind is str:
         return isinstance(value, str) and _WORD.fullmatch(value) is not None
     if kind is Text:
-        return isinstance(value, str) and len(value) <= _LONGEST_TEXT
+        return isinstance(value, str)
     if kind is float:
         return type(value) in (int, float)
     if kind is dict:

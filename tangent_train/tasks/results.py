@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
 from collections.abc import Sequence
@@ -15,6 +13,7 @@ from numpy.typing import NDArray
 from rich.markup import escape
 from rich.table import Table
 
+from tangent_train.csv_text import csv_text
 from tangent_train.files import write_text
 from tangent_train.tasks.losses import UNKNOWN
 from tangent_train.tasks.metrics import (
@@ -123,11 +122,7 @@ def write_files(
         folder: Where to.
     """
     write_text(folder / "results.json", json.dumps(results, indent=1) + "\n")
-    text = io.StringIO()
-    writer = csv.DictWriter(text, columns, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(results["classes"])
-    write_text(folder / "results.csv", text.getvalue())
+    write_text(folder / "results.csv", csv_text(columns, results["classes"]))
     write_text(folder / "results.md", markdown)
 
 

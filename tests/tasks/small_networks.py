@@ -13,7 +13,9 @@ from torch import nn
 from datamodules.samples import Input, Normalization
 from tangent_train.cli.compose import config_folder
 from tangent_train.cli.run import build
-from tangent_train.tasks.networks import Scores, TrainedNetwork, make, size_multiple_of
+from tangent_train.checkpoints.image_sizes import size_multiple_of
+from tangent_train.checkpoints.trained import Scores, TrainedNetwork, completed_settings
+from tangent_train.registry import make
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -42,7 +44,7 @@ def small_trained(
 ) -> TrainedNetwork:
     """As it comes out of a checkpoint, with random numbers; `network` instead of the settings'."""
     torch.manual_seed(1)
-    scores = Scores(with_statistics(network or make(settings))).eval()
+    scores = Scores(with_statistics(network or make(settings, "network"))).eval()
     multiple = size_multiple_of(scores, channels)
     depth: tuple[Input, ...] = ("rgb", "depth")
     return TrainedNetwork(
@@ -78,13 +80,17 @@ def save_checkpoint(path: Path, *overrides: str, **changes: Any) -> Segmentation
     """
     with initialize_config_dir(str(config_folder()), version_base="1.3"):
         config = compose("train", ["level=4", *overrides])
+    settings: Any = OmegaConf.to_container(config, resolve=True)
     torch.manual_seed(2)
-    data, task = build(config)
+    data, task = build(settings)
+    classes = len(data.class_names)
+    settings["network"] = completed_settings(settings["network"], data.in_channels, classes)
     with_statistics(task.network)
     normalization = data.normalization
     content = {
-        "config": OmegaConf.to_container(config),
-        "resolved_config": OmegaConf.to_container(config, resolve=True),
+        "config": settings,
+        "kind": task.kind,
+        "inputs": list(data.inputs),
         "class_names": list(data.class_names),
         "normalization": {"mean": list(normalization.mean), "std": list(normalization.std)},
         "state_dict": task.state_dict(),

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from tangent_train.csv_text import csv_text
 from tangent_train.tasks.keypoints.entries import AS_GIVEN, TURNED, PairEntry, Scored, with_splits
 from tangent_train.tasks.keypoints.means import (
     PAPER,
@@ -267,15 +266,13 @@ def pairs_csv(entries: Sequence[PairEntry], published: Mapping[str, PublishedPai
         entries: Of all pairs; those that could not be used are left out.
         published: See `KeypointReport`.
     """
-    text = io.StringIO()
-    writer = csv.DictWriter(text, _COLUMNS, lineterminator="\n", extrasaction="ignore")
-    writer.writeheader()
+    rows = []
     for entry in with_splits(entries):
         paper = published.get(entry.name)
         for scored in entry.scored:
             printed = paper.scores.get(scored.representation) if paper else None
             printed = printed if scored.condition == AS_GIVEN else None
-            writer.writerow(
+            rows.append(
                 {
                     **vars(entry),
                     **vars(scored),
@@ -288,4 +285,4 @@ def pairs_csv(entries: Sequence[PairEntry], published: Mapping[str, PublishedPai
                     ),
                 }
             )
-    return text.getvalue()
+    return csv_text(_COLUMNS, rows)

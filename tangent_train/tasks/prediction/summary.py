@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from tangent_train.csv_text import csv_text
 from tangent_train.files import write_text
 from tangent_train.geometry import equirect_solid_angles
 
@@ -79,16 +78,15 @@ def write_summary(folder: Path, content: dict[str, Any], class_names: Sequence[s
         class_names: K + 1 names.
     """
     write_text(folder / "summary.json", json.dumps(_plain(content), indent=1) + "\n")
-    text = io.StringIO()
     columns = ("file", "rows", "columns", "level", "views", "seam_ratio")
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*columns, *class_names[1:], "error"])
+    rows = []
     for entry in content["images"]:
         shares = entry.get("classes", {})
         values = [entry.get(name) for name in columns]
         values += [shares.get(name) for name in class_names[1:]]
-        writer.writerow([*map(_plain, values), entry.get("error")])
-    write_text(folder / "summary.csv", text.getvalue())
+        rows.append([*map(_plain, values), entry.get("error")])
+    table = csv_text([*columns, *class_names[1:], "error"], rows)
+    write_text(folder / "summary.csv", table)
 
 
 def _plain(value: Any) -> Any:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -12,6 +10,7 @@ from typing import Any
 
 from rich.table import Table
 
+from tangent_train.csv_text import csv_text
 from tangent_train.tasks.reports.cells import line, markdown_table, terminal_table, text
 from tangent_train.tasks.reports.classification import classification_sections, rotations
 from tangent_train.tasks.reports.groups import Figure, Group
@@ -123,16 +122,14 @@ def report_csv(groups: Sequence[Group]) -> str:
     Args:
         groups: From `groups.group_runs`.
     """
-    file = io.StringIO()
     columns = ["group", *_facts(groups[0]), "runs", "class", "figure"]
     columns += ["mean", "over_folds", "over_seeds", "folds", "paper"]
-    writer = csv.DictWriter(file, columns, lineterminator="\n")
-    writer.writeheader()
+    rows = []
     for group in groups:
         for class_name, name, figure, paper in _all_figures(group):
             row = {"group": group.label, "runs": len(group.runs), "class": class_name}
-            writer.writerow(row | _facts(group) | {"figure": name, "paper": paper} | asdict(figure))
-    return file.getvalue()
+            rows.append(row | _facts(group) | {"figure": name, "paper": paper} | asdict(figure))
+    return csv_text(columns, rows)
 
 
 def report_json(groups: Sequence[Group], remarks: Sequence[str]) -> str:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -12,6 +10,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure as Canvas
 
+from tangent_train.csv_text import csv_text
 from tangent_train.tasks.reports.cells import Cells, terminal_table, text
 from tangent_train.tasks.reports.chart import png_bytes
 
@@ -71,11 +70,7 @@ class Outcome:
 
     def csv(self) -> str:
         """All columns with all digits; nothing where there is no value."""
-        file = io.StringIO()
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(column.key for column in self.columns)
-        writer.writerows(self.rows)
-        return file.getvalue()
+        return csv_text([column.key for column in self.columns], self.rows)
 
     def cells(self) -> list[Cells]:
         """The table as text, its header first."""

@@ -6,8 +6,6 @@ figures fall the further that of the panoramas is from it.
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from collections import defaultdict
 from collections.abc import Sequence
@@ -16,6 +14,7 @@ from typing import Any
 
 from rich.table import Table
 
+from tangent_train.csv_text import csv_text
 from tangent_train.errors import DataError
 from tangent_train.tasks.reports.cells import (
     Cells,
@@ -186,17 +185,15 @@ def levels_csv(report: LevelReport) -> str:
     Args:
         report: From `gather_levels`.
     """
-    file = io.StringIO()
     columns = ["level", "fold", "figure", "mean", "over_folds", "over_seeds", "folds", "kept"]
-    writer = csv.DictWriter(file, columns, lineterminator="\n")
-    writer.writeheader()
+    rows: list[dict[str, Any]] = []
     for row in report.rows:
         for fold, part in _scopes(row):
             for name in MEANS:
                 figures = {"figure": name} | asdict(part.figure(name))
                 of_trained = {"kept": part.kept(name).mean}
-                writer.writerow({"level": row.level, "fold": fold} | figures | of_trained)
-    return file.getvalue()
+                rows.append({"level": row.level, "fold": fold} | figures | of_trained)
+    return csv_text(columns, rows)
 
 
 def levels_json(report: LevelReport) -> str:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -11,6 +9,7 @@ from typing import Any
 
 from rich.table import Table
 
+from tangent_train.csv_text import csv_text
 from tangent_train.tasks.reports.cells import line, markdown_table, terminal_table, text
 from tangent_train.tasks.reports.groups import Figure
 from tangent_train.tasks.reports.runs import MEANS, PER_BAND, PER_CLASS
@@ -159,12 +158,10 @@ def transfer_csv(report: TransferReport) -> str:
     Args:
         report: From `report.gather`.
     """
-    file = io.StringIO()
     columns = ["stage", "on", "epochs", "representation", "fold", "class", "south", "north"]
     columns += ["figure", "mean", "over_folds", "over_seeds", "folds"]
     columns += ["kept", "kept_over_folds", "kept_over_seeds", "paper"]
-    writer = csv.DictWriter(file, columns, lineterminator="\n")
-    writer.writeheader()
+    rows = []
     for fold, part in _scopes(report):
         for row in part.rows:
             facts = _facts(row) | {"fold": fold}
@@ -178,8 +175,8 @@ def transfer_csv(report: TransferReport) -> str:
                     "paper": entry.paper,
                 }
                 figures = {"figure": entry.name} | asdict(entry.figure)
-                writer.writerow(facts | where | figures | beside)
-    return file.getvalue()
+                rows.append(facts | where | figures | beside)
+    return csv_text(columns, rows)
 
 
 def transfer_json(report: TransferReport) -> str:

@@ -8,7 +8,8 @@ import torch
 from torch import nn
 
 from datamodules.samples import RGB_NORMALIZATION, RGBD_NORMALIZATION
-from tangent_train.tasks.networks import TrainedNetwork, make
+from tangent_train.checkpoints.trained import TrainedNetwork
+from tangent_train.registry import make
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -47,7 +48,7 @@ def trained_network(
         "normalization": RGB_NORMALIZATION if channels == 3 else RGBD_NORMALIZATION,
         "level": representation["level"],
         "representation": representation,
-        "image_size": make(representation).image_size,
+        "image_size": make(representation, "representation").image_size,
     }
     return TrainedNetwork(**(settings | changes))
 
@@ -73,7 +74,8 @@ def write_checkpoint(
     normalization = RGB_NORMALIZATION if channels == 3 else RGBD_NORMALIZATION
     content = {
         "config": config,
-        "resolved_config": config,
+        "kind": "segmentation",
+        "inputs": ["rgb", "depth"][: channels - 2],
         "class_names": list(CLASS_NAMES),
         "normalization": {"mean": list(normalization.mean), "std": list(normalization.std)},
         "state_dict": {f"network.{name}": value for name, value in network.state_dict().items()},
