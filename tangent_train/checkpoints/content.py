@@ -9,7 +9,7 @@ import yaml  # type: ignore[import-untyped]
 
 from tangent_train.errors import DataError
 from tangent_train.files import write_text
-from tangent_train.registry import Text, check_fields
+from tangent_train.registry import Text, check_fields, check_plain
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
@@ -93,7 +93,8 @@ def read_settings(path: Path) -> dict[str, Any]:
         raise DataError(path, found=first_line, expected=expected) from error
     if not isinstance(content, dict):
         raise DataError(path, found=type(content).__name__, expected=expected)
-    return {str(name): value for name, value in content.items()}
+    settings: dict[str, Any] = check_plain(path, content, "settings")
+    return settings
 
 
 class _Dumper(yaml.SafeDumper):  # type: ignore[misc]

@@ -13,6 +13,7 @@ __all__ = ["check_resumed", "differing_settings"]
 _FREE = (
     "checkpoint",
     "checkpoint_every_n_steps",
+    "choices",
     "data.in_memory",
     "data.label_table",
     "data.num_workers",

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 from numpy.typing import ArrayLike, NDArray
 
 __all__ = ["confusion_picture", "row_shares"]
@@ -89,5 +90,7 @@ def confusion_picture(
         color = "white" if shares[row, column] > _DARK else "black"
         text = str(percents[row, column])
         axes.text(column, row, text, ha="center", va="center", color=color, fontsize=_FONT_PT - 1)
+    for name in figure.findobj(Text):
+        name.set_parse_math(False)  # "$" in a name is no formula
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()

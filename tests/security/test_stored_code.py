@@ -1,376 +1,220 @@
-"""Settings in a file name no code that would be run, look nothing up and fetch nothing."""
+"""Files of other people run nothing, look nothing up and fetch nothing."""
 
 from __future__ import annotations
 
-import copy
+import csv
 import json
+import re
+import shutil
 import sys
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import onnx
 import pytest
 import torch
-import torchvision
 import yaml  # type: ignore[import-untyped]
 from hydra import compose, initialize_config_dir
-from safetensors.torch import save_file
-from torch import Tensor, nn
+from omegaconf import OmegaConf
+from safetensors.torch import load_file, save_file
+from torch import nn
 
+from models import initialize
+from tangent_train import registry
+from tangent_train.checkpoints.content import read_checkpoint, read_settings
+from tangent_train.checkpoints.trained import METADATA_KEY, inputs_in, load_trained
 from tangent_train.cli import main
-from tangent_train.cli.compose import config_folder
-from tangent_train.cli.stored import checkpoint_config, with_stored_config
-from tangent_train.errors import DataError
-from tangent_train.tasks.exported import (
-    _TOUCHES_FILES,
-    METADATA_KEY,
-    torchscript_without_warnings,
-)
-from tangent_train.tasks.networks import completed_settings
+from tangent_train.cli import stored as stored_module
+from tangent_train.cli.build import build
+from tangent_train.cli.compose import check_overrides, config_folder
+from tangent_train.cli.keypoint_pairs.folder import RESULTS, ResultsFolder
+from tangent_train.cli.stored import CHOOSABLE, StoredRun, stored_run
+from tangent_train.errors import DataError, SettingError
+from tangent_train.registry import accept, check_plain, make, named_targets
+from tangent_train.rendering.camera_files import read_cameras
 from tangent_train.tasks.reports.runs import load_run
-from tangent_train.tasks.stored_settings import check_stored, named_targets, read_settings
-from tangent_train.checkpoints.trained import load_trained
-from tests.tasks.small_networks import save_checkpoint, small_trained
+from tests.datamodules.folder_format import write_classes, write_data_set
+from tests.security.attacks import attacks, json_attacks, places, replaced, sampled
+from tests.security.watch import CANARY, watched
 
-Edit = Callable[[dict[str, Any], Path], None]
-JIT: Any = torch.jit  # partly without types
+SECRET = "sesame-open"
+SETTINGS = [
+    "experiment=rooms/demo",
+    "level=4",
+    "network.widths=[4,8]",
+    "representation.crop_multiple=null",
+    "data.panoramas_per_step=1",
+    "data.validation_fraction=0.2",
+    "data.inputs=[rgb]",
+    "data.rooms.height=32",
+    "data.rooms.rooms={area_1: 2, area_2: 1, area_5a: 1}",
+    "trainer.accelerator=cpu",
+    "trainer.max_epochs=1",
+    "panels=0",
+    "tensorboard_images=0",
+]
+
+
+def _run(monkeypatch: pytest.MonkeyPatch, command: str, *arguments: str) -> None:
+    monkeypatch.setattr(sys, "argv", [f"tangent-{command}", *arguments])
+    getattr(main, command)()
 
 
 @pytest.fixture(scope="module")
-def harmless(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """What is in a checkpoint."""
-    path = tmp_path_factory.mktemp("harmless") / "best.ckpt"
-    save_checkpoint(path, "network.widths=[4,8,8]", "data.inputs=[rgb]")
-    content: dict[str, Any] = torch.load(path, weights_only=True)
-    return content
-
-
-def _edited(path: Path, content: dict[str, Any], edit: Edit, created: Path) -> Path:
-    changed = copy.deepcopy(content)
-    for name in ("config", "resolved_config"):
-        edit(changed[name], created)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    torch.save(changed, path)
-    return path
-
-
-def _command(created: Path) -> dict[str, Any]:
-    return {"_target_": "os.mkdir", "path": str(created)}
-
-
-def _network(config: dict[str, Any], created: Path) -> None:
-    config["network"] = _command(created)
-
-
-def _inner_network(config: dict[str, Any], created: Path) -> None:
-    config["network"]["norm"] = [{"deep": _command(created)}]
-
-
-def _representation(config: dict[str, Any], created: Path) -> None:
-    config["representation"]["rotation"] = _command(created)
-
-
-def _data(config: dict[str, Any], created: Path) -> None:
-    config["data"]["rooms"] = _command(created)
-
-
-def _optimizer(config: dict[str, Any], created: Path) -> None:
-    config["optimizer"]["lr"] = _command(created)
-
-
-def _trainer(config: dict[str, Any], created: Path) -> None:
-    config["trainer"]["profiler"] = _command(created)
-
-
-def _partial(config: dict[str, Any], created: Path) -> None:
-    config["scheduler"] = _command(created) | {"_partial_": True}
-
-
-def _referred(config: dict[str, Any], created: Path) -> None:
-    config["name"] = "os.mkdir"
-    config["network"] = {"_target_": "${name}", "path": str(created)}
-
-
-def _made_of_text(config: dict[str, Any], created: Path) -> None:
-    config["network"] = f"${{oc.create:{{_target_: os.mkdir, path: {created}}}}}"
-
-
-def _through_a_module(config: dict[str, Any], created: Path) -> None:
-    config["network"] = _command(created) | {"_target_": "torch.nn.functional.warnings.sys.exit"}
-
-
-def _function_of_torch(config: dict[str, Any], created: Path) -> None:
-    config["network"] = {"_target_": "torch.load", "f": str(created), "weights_only": False}
-
-
-def _function_of_ours(config: dict[str, Any], created: Path) -> None:
-    target = "tangent_train.files.write_text"
-    config["network"] = {"_target_": target, "path": str(created), "content": "x"}
-
-
-def _address(config: dict[str, Any], created: Path) -> None:
-    config["network"] = {"_target_": "timm.create_model", "model_name": f"local-dir:{created}"}
-
-
-def _positional_address(config: dict[str, Any], created: Path) -> None:
-    config["network"] = {"_target_": "timm.create_model", "_args_": ["hf-hub:somebody/net"]}
-
-
-def _weights_of_timm(config: dict[str, Any], created: Path) -> None:
-    settings = {"model_name": "resnet18", "checkpoint_path": str(created)}
-    config["network"] = {"_target_": "timm.create_model", **settings}
-
-
-def _compiler(config: dict[str, Any], created: Path) -> None:
-    config["task"]["compile"] = {"options": {"cpp.cxx": str(created)}}
-
-
-NETWORKS: tuple[Edit, ...] = (
-    _network,
-    _inner_network,
-    _representation,
-    _referred,
-    _made_of_text,
-    _through_a_module,
-    _function_of_torch,
-    _function_of_ours,
-    _address,
-    _positional_address,
-    _weights_of_timm,
-)
-EDITS: tuple[Edit, ...] = (*NETWORKS, _data, _optimizer, _trainer, _partial, _compiler)
-
-
-@pytest.mark.parametrize("edit", EDITS)
-def test_a_checkpoint_names_no_other_code(
-    edit: Edit, harmless: dict[str, Any], tmp_path: Path
-) -> None:
-    created = tmp_path / "created"
-    path = _edited(tmp_path / "x.ckpt", harmless, edit, created)
-    with pytest.raises(DataError, match=r"x\.ckpt: found .*; expected settings of networks"):
-        checkpoint_config(path)
-    if edit in NETWORKS:
-        with pytest.raises(DataError, match=r"x\.ckpt: found .*; expected settings of networks"):
-            load_trained(path)
-    assert not created.exists()
-
-
-@pytest.mark.parametrize(
-    ("command", "arguments"),
-    [
-        ("evaluate", ["checkpoint=run/checkpoints/last.ckpt"]),
-        ("train", ["resume=run"]),
-        ("predict", ["checkpoint=run/checkpoints/last.ckpt", "input=image.png", "output=labels"]),
-        ("export", ["checkpoint=run/checkpoints/last.ckpt", "output=net.onnx"]),
-    ],
-)
-def test_no_command_runs_it(
-    command: str,
-    arguments: list[str],
-    harmless: dict[str, Any],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    created = tmp_path / "created"
-    _edited(tmp_path / "run" / "checkpoints" / "last.ckpt", harmless, _network, created)
-    (tmp_path / "image.png").touch()
-    monkeypatch.setattr(sys, "argv", [f"tangent-{command}", *arguments])
-    message = r"last\.ckpt: found network\._target_=os\.mkdir, which would be called.*trust=os\.mk"
-    with pytest.raises(SystemExit, match=message):
-        getattr(main, command)()
-    assert not created.exists()
-
-
-def test_a_transfer_imports_nothing_that_it_names(
-    harmless: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def edit(config: dict[str, Any], _: Path) -> None:
-        config["data"]["_target_"] = "antigravity.fly"
-
-    monkeypatch.chdir(tmp_path)
-    _edited(tmp_path / "x.ckpt", harmless, edit, tmp_path)
-    arguments = ["experiment=rooms/transfer", "checkpoint=x.ckpt"]
-    monkeypatch.setattr(sys, "argv", ["tangent-transfer", *arguments])
-    with pytest.raises(SystemExit, match=r"_target_=antigravity\.fly, which would be called"):
-        main.transfer()
-    assert "antigravity" not in sys.modules
-
-
-class Own(nn.Conv2d):
-    """A network of a user."""
-
-    def __init__(self, in_channels: int, num_classes: int) -> None:
-        super().__init__(in_channels, num_classes, 1)
-
-
-def _own(content: dict[str, Any], path: Path) -> Path:
-    changed = copy.deepcopy(content)
-    for name in ("config", "resolved_config"):
-        null = {"in_channels": None, "num_classes": None}
-        changed[name]["network"] = {"_target_": f"{__name__}.Own", **null}
-    count = len(content["class_names"])
-    changed["state_dict"] = {f"network.{n}": t for n, t in Own(3, count).state_dict().items()}
-    torch.save(changed, path)
-    return path
-
-
-def test_ones_own_network_is_trusted_by_its_name(harmless: dict[str, Any], tmp_path: Path) -> None:
-    path = _own(harmless, tmp_path / "x.ckpt")
-    name = f"{__name__}.Own"
-    with pytest.raises(DataError, match=f"trust={name}"):
-        load_trained(path)
-    assert load_trained(path, [name]).in_channels == 3
-    for said in (f"trust={name}", f"trust=['{name}',my.Other]", f"network._target_={name}"):
-        stored, arguments = with_stored_config("evaluate", [f"checkpoint={path}", said])
-        assert stored == "stored_evaluate"
-        assert not any(argument.startswith("trust=") for argument in arguments)
-    with pytest.raises(DataError, match=f"trust={name}"):
-        with_stored_config("evaluate", [f"checkpoint={path}", "trust=my.Other"])
-
-
-def test_a_command_takes_what_is_trusted(
-    harmless: dict[str, Any],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    _own(harmless, tmp_path / "x.ckpt")
-    monkeypatch.chdir(tmp_path)
-    line = ["tangent-export", "checkpoint=x.ckpt", "output=x.safetensors"]
-    monkeypatch.setattr(sys, "argv", [*line, "trust=3"])
-    with pytest.raises(SystemExit, match="trust: found 3; expected a name, or a list of names"):
-        main.export()
-    monkeypatch.setattr(sys, "argv", [*line, f"trust={__name__}.Own"])
-    main.export()
-    with pytest.raises(DataError, match=f"trust={__name__}.Own"):
-        load_trained(tmp_path / "x.safetensors")
-
-
-def test_all_that_the_configs_name_is_known() -> None:
-    for path in sorted(config_folder().rglob("*.yaml")):
-        settings = yaml.safe_load(path.read_text())
-        targets = named_targets(settings)
-        of_pairs = {name for name in targets if name.endswith("Pairs")}  # of no checkpoint
-        check_stored(path, settings.get("network", {}) if of_pairs else _section(settings))
-
-
-def _section(settings: dict[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in settings.items() if name not in ("hydra", "name")}
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        "models.initialize",
-        "torch.hub.load",
-        "torch.nn.Module.load_state_dict",
-        "torch.nn.modules.conv.Conv2d",
-        "torch.nn._reduction",
-        "torch.optim.os",
-        "torchvision.models.get_model",
-        "torchvision.models.segmentation.resnet18",
-        "segmentation_models_pytorch.from_pretrained",
-        "timm.models.load_checkpoint",
-        "lightning.LightningModule.load_from_checkpoint",
-        "builtins.eval",
-        "eval",
-        "",
-        None,
-        3,
-        ["os.system"],
-    ],
-)
-def test_what_is_near_to_what_is_known_is_not_known(name: Any, tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="which would be called"):
-        check_stored(tmp_path, {"x": [{"_target_": name if name is not None else "None"}]})
-
-
-@pytest.mark.parametrize(
-    "settings",
-    [
-        {"_target_": "torch.nn.Sequential", "_args_": [{"_target_": "torch.nn.Conv2d"}]},
-        {"_target_": "torchvision.models.segmentation.fcn_resnet50"},
-        {"_target_": "torch.optim.SGD", "lr": "${optimizer.lr}"},
-        {"_target_": "segmentation_models_pytorch.FPN", "encoder_name": "tu-convnext_atto"},
-        {"_target_": "timm.create_model", "model_name": "resnet18.a1_in1k", "pretrained": True},
-        {"_target_": "lightning.Trainer", "profiler": "simple"},
-    ],
-)
-def test_networks_of_the_libraries_need_no_trust(settings: Any, tmp_path: Path) -> None:
-    check_stored(tmp_path, {"network": settings})
-
-
-def test_the_environment_is_not_looked_up(
-    harmless: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("SECRET", "sesame")
-    content = copy.deepcopy(harmless)
-    content["config"]["data"] |= {"root": "${oc.env:SECRET}/x", "list": ["${oc.env:SECRET}"]}
-    content["resolved_config"]["data"] |= {"root": "as it was/x", "list": ["then"]}
-    torch.save(content, tmp_path / "x.ckpt")
-    with_stored_config("evaluate", [f"checkpoint={tmp_path / 'x.ckpt'}"])
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a finished run; beside it its data and the network as other files."""
+    folder = tmp_path_factory.mktemp("honest")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        _run(patch, "train", *SETTINGS, "data.root=rooms", "hydra.run.dir=run")
+        checkpoint = "checkpoint=run/checkpoints/last.ckpt"
+        for name in ("net.onnx", "net.safetensors"):
+            _run(patch, "export", checkpoint, f"output={name}")
+    return folder / "run"
+
+
+@pytest.fixture(scope="module")
+def content(run: Path) -> dict[str, Any]:
+    """What is in its checkpoint."""
+    found: dict[str, Any] = torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)
+    return found
+
+
+@pytest.fixture
+def forbidden(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder that only attacks name."""
+    monkeypatch.setenv("SECRET", SECRET)
+    folder = tmp_path / "forbidden"
+    folder.mkdir()
+    return folder
+
+
+def _settled(
+    path: Path, *said: str, root: str | None = "rooms"
+) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """The settings of tangent-evaluate."""
+    stored, typed = _typed(path, *said, *([] if root is None else [f"data.root={root}"]))
     with initialize_config_dir(str(config_folder()), version_base="1.3"):
-        config = compose("stored_evaluate")
-    assert config.data.root == "as it was/x"
-    assert config.data.list == ["then"]
-    for nested in ("${oc.env:SECRET}", "${ oc.env : SECRET}", "${a.${oc.env:SECRET}}"):
-        content["config"]["data"]["root"] = nested
-        content["resolved_config"]["data"]["root"] = nested
-        torch.save(content, tmp_path / "x.ckpt")
-        with pytest.raises(DataError, match="looked up outside of the settings"):
-            checkpoint_config(tmp_path / "x.ckpt")
+        return stored.settings(typed, ())
 
 
-def test_a_report_looks_nothing_up_and_follows_no_aliases(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def _typed(path: Path, *said: str) -> tuple[StoredRun, dict[str, Any]]:
+    stored = stored_run("evaluate", [f"checkpoint={path}", *said])
+    assert stored is not None
+    check_overrides(stored.name, stored.arguments, stored.known, CHOOSABLE)
+    with initialize_config_dir(str(config_folder()), version_base="1.3"):
+        typed: Any = OmegaConf.to_container(compose(stored.name, stored.additions()), resolve=True)
+    return stored, typed
+
+
+def _nothing_happens(use: Callable[[Path], Any], path: Path, forbidden: Path, what: object) -> None:
+    """Use a file: it is taken for what it is, or refused in one line that names it."""
+    with watched(forbidden) as happened, suppress(DataError, SettingError):
+        use(path)
+    assert not happened, (what, happened)
+    assert not list(forbidden.iterdir()), what
+
+
+def _in_checkpoint(
+    content: dict[str, Any], forbidden: Path, each: int | None, only: Sequence[str]
+) -> Iterator[tuple[Path, object]]:
+    path = forbidden.parent / "x.ckpt"
+    lighter = content | {"optimizer_states": [], "loops": {}}
+    all_places = [("config", *place) for place in places(content["config"])]
+    all_places += [(name,) for name in ("config", "class_names", "inputs", "kind", "state_dict")]
+    all_places += [("normalization",), ("normalization", "mean")]
+    all_places = [("config", name) for name in only] or all_places
+    for place, value in sampled(list(attacks(forbidden)), all_places, each):
+        torch.save(replaced(lighter, place, value), path)
+        yield path, (place, value)
+
+
+def _attack_checkpoints(
+    content: dict[str, Any], forbidden: Path, each: int | None, only: Sequence[str] = ()
 ) -> None:
-    monkeypatch.setenv("SECRET", "sesame")
-    path = tmp_path / "config.yaml"
-    path.write_text("level: 5\nrows: ${level}\nroot: ${oc.env:SECRET}/x\nlist: ['${oc.env:A}']\n")
-    found = {"level": 5, "rows": 5, "root": "${oc.env:SECRET}/x", "list": ["${oc.env:A}"]}
-    assert read_settings(path) == found
-    lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x]"]
-    lines += [f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]" for k in range(1, 12)]
-    path.write_text("\n".join(lines))
-    figures = dict.fromkeys(("miou", "macc", "miou_solid_angle", "macc_solid_angle"), 0.5)
-    (tmp_path / "results.json").write_text(json.dumps(figures | {"classes": []}))
-    with pytest.raises(DataError, match=r"config\.yaml: found ValueError: an alias"):
-        load_run(tmp_path)
+    honest = forbidden.parent / "honest.ckpt"
+    torch.save(content, honest)
+    stored, typed = _typed(honest, "data.root=rooms")
+    here = OmegaConf.create()
+
+    def evaluated(path: Path) -> None:
+        config = check_plain(path, read_checkpoint(path, ("config",))["config"], "config")
+        with pytest.MonkeyPatch.context() as patch:  # what the user has is not what is attacked
+            patch.setattr(stored_module, "_composed_here", lambda _: here)
+            settings = replace(stored, path=path, config=config).settings(typed, ())
+        build(*settings)
+
+    for path, what in _in_checkpoint(content, forbidden, each, only):
+        for use in (load_trained, evaluated, inputs_in):
+            _nothing_happens(use, path, forbidden, what)
 
 
-def test_settings_without_end_are_refused(harmless: dict[str, Any], tmp_path: Path) -> None:
-    deep: Any = []
-    for _ in range(5000):
-        deep = [deep]
-    path = tmp_path / "x.ckpt"
-    with pytest.raises(DataError, match="without end"):
-        check_stored(path, deep)
-    (tmp_path / "config.yaml").write_text("x: " + "[" * 5000 + "]" * 5000)
-    (tmp_path / "results.json").write_text("[" * 200_000)
-    with pytest.raises(DataError, match=r"results\.json"):
-        load_run(tmp_path)
+def test_nothing_in_a_checkpoint_is_interpreted(content: dict[str, Any], forbidden: Path) -> None:
+    _attack_checkpoints(content, forbidden, each=2)
 
 
-@pytest.mark.parametrize("name", ["settings", "representation"])
-def test_exported_networks_name_no_other_code(name: str, tmp_path: Path) -> None:
-    """Beside the numbers of a network there is JSON in all three formats."""
-    trained = small_trained()
-    created = tmp_path / "created"
-    described = {
-        "settings": completed_settings(trained.settings, 4, 5),
-        "class_names": trained.class_names,
-        "inputs": trained.inputs,
-        "normalization": {"mean": [0, 0, 0, 0], "std": [1, 1, 1, 1]},
-        "level": 5,
-        "representation": trained.representation,
-        "image_size": (32, 32),
-        "size_multiple": 4,
-        "fixed_size": None,
-    }
-    text = json.dumps(described | {name: _command(created)})
-    tensors = {n: t.contiguous() for n, t in trained.network.network.state_dict().items()}  # type: ignore[union-attr]
-    save_file(tensors, tmp_path / "x.safetensors", {METADATA_KEY: text})
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_no_attack_at_any_place_of_a_checkpoint_is_interpreted(
+    content: dict[str, Any], forbidden: Path
+) -> None:
+    _attack_checkpoints(content, forbidden, each=None)
+
+
+def _without_the_registry(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(registry, "_find", lambda target, _: (registry._imported(target, "x"), None))
+
+
+def _without_kinds(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(registry, "_fits", lambda value, kind: True)
+
+
+def _without_depth(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(registry, "_DEEPEST", 10**9)
+
+
+def _with_hydra(patch: pytest.MonkeyPatch) -> None:
+    from hydra.utils import instantiate
+
+    patch.setattr(registry, "_made", lambda value, *_: instantiate({"x": value})["x"])
+    patch.setattr(registry, "_WORD", re.compile(".*", re.DOTALL))
+
+
+@pytest.mark.parametrize(
+    "taken_out", [_without_the_registry, _without_kinds, _without_depth, _with_hydra]
+)
+def test_the_attacks_are_noticed_when_a_check_is_taken_out(
+    taken_out: Callable[[pytest.MonkeyPatch], None],
+    content: dict[str, Any],
+    forbidden: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("socket.getaddrinfo", _no_network)
+    taken_out(monkeypatch)
+    with pytest.raises(BaseException, match=r"(?s).") as raised:
+        _attack_checkpoints(content, forbidden, each=None, only=("network", "representation"))
+    assert not isinstance(raised.value, DataError | SettingError)
+
+
+def _no_network(*_: object, **__: object) -> None:
+    raise AssertionError("the network was asked for")
+
+
+def _described(run: Path) -> dict[str, Any]:
+    header = (run.parent / "net.safetensors").read_bytes()
+    length = int.from_bytes(header[:8], "little")
+    text = json.loads(header[8 : 8 + length])["__metadata__"][METADATA_KEY]
+    described: dict[str, Any] = json.loads(text)
+    return described
+
+
+def _exported(run: Path, folder: Path) -> Callable[[str], list[Path]]:
+    """Writes the network with other metadata, as ONNX and as safetensors."""
+    tensors = load_file(run.parent / "net.safetensors")
     node = onnx.helper.make_node("Identity", ["images"], ["scores"])
     ends = [
         onnx.helper.make_tensor_value_info(end, onnx.TensorProto.FLOAT, [None] * 4)
@@ -379,67 +223,373 @@ def test_exported_networks_name_no_other_code(name: str, tmp_path: Path) -> None
     graph = onnx.helper.make_graph([node], "x", ends[:1], ends[1:])
     opset = [onnx.helper.make_opsetid("", 17)]
     model = onnx.helper.make_model(graph, opset_imports=opset, ir_version=9)
-    onnx.helper.set_model_props(model, {METADATA_KEY: text})
-    onnx.save(model, tmp_path / "x.onnx")
-    with torchscript_without_warnings():
-        script: Any = JIT.trace(nn.Identity(), torch.zeros(1, 4, 8, 8))
-        torch.jit.save(script, tmp_path / "x.pt", _extra_files={METADATA_KEY: text})
-    for suffix in ("safetensors", "onnx", "pt"):
-        with pytest.raises(DataError, match=f"found {name}._target_=os.mkdir, which would be"):
-            load_trained(tmp_path / f"x.{suffix}")
-        assert not created.exists()
+
+    def write(text: str) -> list[Path]:
+        save_file(tensors, folder / "x.safetensors", {METADATA_KEY: text})
+        onnx.helper.set_model_props(model, {METADATA_KEY: text})
+        onnx.save(model, folder / "x.onnx")
+        return [folder / "x.safetensors", folder / "x.onnx"]
+
+    return write
+
+
+def test_nothing_in_an_exported_network_is_interpreted(run: Path, forbidden: Path) -> None:
+    described, write = _described(run), _exported(run, forbidden.parent)
+    all_places = list(places(described))
+    for place, value in sampled(list(json_attacks(forbidden)), all_places, each=2):
+        for path in write(json.dumps(replaced(described, place, value))):
+            _nothing_happens(load_trained, path, forbidden, (place, value))
+            _nothing_happens(inputs_in, path, forbidden, (place, value))
+
+
+def test_nothing_in_the_settings_of_a_run_is_interpreted(run: Path, forbidden: Path) -> None:
+    folder = forbidden.parent / "theirs"
+    shutil.copytree(run, folder, ignore=shutil.ignore_patterns("tensorboard", "checkpoints"))
+    settings = read_settings(run / "config.yaml")
+    for place, value in sampled(list(json_attacks(forbidden)), list(places(settings)), each=2):
+        (folder / "config.yaml").write_text(yaml.safe_dump(replaced(settings, place, value)))
+        _nothing_happens(load_run, folder, forbidden, (place, value))
+
+
+def test_nothing_in_lists_of_cameras_and_results_of_keypoints_is_interpreted(
+    run: Path, forbidden: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(forbidden.parent)
+    panorama = next((run.parent / "rooms").rglob("*equirectangular_domain_rgb.png"))
+    _run(monkeypatch, "render", f"input={panorama}", "output=tangent", "level=4", "base_level=0")
+    cameras = next(Path("tangent").rglob("cameras.json"))
+    Path("found").mkdir()
+    results = Path("found") / RESULTS
+    pairs = {"program": "tangent-keypoints", "version": 1, "settings": {"level": 5}, "pairs": []}
+    for path, use, honest in (
+        (cameras, read_cameras, json.loads(cameras.read_text())),
+        (results, lambda p: ResultsFolder(p.parent, {"level": 5}).open(overwrite=False), pairs),
+    ):
+        for place, value in sampled(list(json_attacks(forbidden)), list(places(honest)), each=1):
+            path.write_text(json.dumps(replaced(honest, place, value)))
+            _nothing_happens(use, path, forbidden, (path, place, value))
+
+
+def _hostile(content: dict[str, Any], folder: Path, **sections: Any) -> Path:
+    """A run whose settings hold something else."""
+    path = folder / "run" / "checkpoints" / "last.ckpt"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    torch.save(content | {"config": content["config"] | sections}, path)
+    return path
+
+
+_FIRE = f"{CANARY}.fire"
+_UNET = {"_target_": "models.UNet", "in_channels": 3, "num_classes": 14, "widths": [4, 8]}
+_TIMM = {"_target_": "timm.create_model"}
+WAYS: dict[str, tuple[dict[str, Any], str]] = {
+    "code": ({"network": {"_target_": _FIRE}}, rf"network\._target_={_FIRE}.*trust={_FIRE}"),
+    "text for a section": ({"network": f"_target_: {_FIRE}"}, "network="),
+    "resolver": (
+        {"network": f"${{oc.create:{{_target_: {_FIRE}}}}}"},
+        "network=",
+    ),
+    "nested resolver": (
+        {"network": _UNET | {"widths": f"${{oc.${{c}}:{{_target_: {_FIRE}}}}}"}, "c": "create"},
+        r"network\.widths=",
+    ),
+    "reference": (
+        {"network": _TIMM | {"model_name": "${note}"}, "note": "hf-hub:somebody/net"},
+        r"network\.model_name=",
+    ),
+    "positional": (
+        {"network": _TIMM | {"_args_": ["resnet18", True, {"hf_hub_id": "a/b"}]}},
+        r"network\._args_=",
+    ),
+    "weights by position": (
+        {"network": _TIMM | {"_args_": ["resnet18", False, None, None, "x.pth"]}},
+        r"network\._args_=",
+    ),
+}
+COMMANDS = {
+    "evaluate": ["checkpoint=run/checkpoints/last.ckpt", "data.root=rooms"],
+    "train": ["resume=run", "data.root=rooms"],
+    "predict": ["checkpoint=run/checkpoints/last.ckpt", "input=image.png", "output=labels"],
+    "export": ["checkpoint=run/checkpoints/last.ckpt", "output=net.onnx"],
+}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("way", WAYS)
+def test_every_command_refuses_what_once_ran(
+    way: str,
+    command: str,
+    content: dict[str, Any],
+    forbidden: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(forbidden.parent)
+    Path("image.png").touch()
+    sections, message = WAYS[way]
+    _hostile(content, Path(), **sections)
+    with watched(forbidden) as happened, pytest.raises(SystemExit) as raised:
+        _run(monkeypatch, command, *COMMANDS[command])
+    assert re.search(rf"last\.ckpt: found (config\.)?{message}", str(raised.value))
+    assert "Traceback" not in capsys.readouterr().err
+    assert not happened
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_start_from_tensors_reads_tensors_only(
+    way: str, content: dict[str, Any], forbidden: Path
+) -> None:
+    path = _hostile(content, forbidden.parent, **WAYS[way][0])
+    with watched(forbidden) as happened:
+        network = make(_UNET, "network")
+        assert initialize(network, path).share == 1
+        assert inputs_in(path) == ("rgb",)
+    assert not happened
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_transfer_compares_and_makes_nothing(
+    way: str, content: dict[str, Any], forbidden: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(forbidden.parent)
+    _hostile(content, Path(), **WAYS[way][0])
+    given = ["experiment=rooms/transfer", "checkpoint=run/checkpoints/last.ckpt"]
+    with watched(forbidden) as happened, pytest.raises(SystemExit, match=r"last\.ckpt: found"):
+        _run(monkeypatch, "transfer", *given)
+    assert not happened
+
+
+def test_a_checkpoint_whose_config_is_a_text(
+    content: dict[str, Any], forbidden: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(forbidden.parent)
+    Path("image.png").touch()
+    path = _hostile(content, Path())
+    text = f"network: {{_target_: {_FIRE}}}\nlevel: 4\nseed: 0\n"
+    torch.save(content | {"config": text}, path)
+    for command, arguments in COMMANDS.items():
+        with (
+            watched(forbidden) as happened,
+            pytest.raises(SystemExit, match=r"last\.ckpt: found c"),
+        ):
+            _run(monkeypatch, command, *arguments)
+        assert not happened
+
+
+def test_references_evade_no_rule_about_a_place(content: dict[str, Any], forbidden: Path) -> None:
+    """What compiles is this machine's: of a file it is not even looked at."""
+    options = {"options": {"cpp.cxx": f"sh -c 'id > {forbidden}/x'"}}
+    for compiling in (options, "${bag}", "inductor"):
+        task = content["config"]["task"] | {"compile": compiling}
+        path = _hostile(content, forbidden.parent, task=task, bag=options)
+        with watched(forbidden) as happened:
+            settings, _ = _settled(path)
+        assert "compile" not in settings["task"]
+        assert not happened
+    settings, _ = _settled(path, "task.compile={mode: max-autotune}")
+    assert settings["task"]["compile"] == {"mode": "max-autotune"}
+
+
+def test_paths_are_not_taken_from_files(content: dict[str, Any], forbidden: Path) -> None:
+    data = content["config"]["data"]
+    path = _hostile(content, forbidden.parent, data=data | {"root": str(forbidden), "store": "/x"})
+    settings, _ = _settled(path, root="mine")
+    assert settings["data"]["root"] == "mine"
+    assert "store" not in settings["data"]
+    with pytest.raises(SettingError, match=r"data\.root: found .*The run had data\.root="):
+        _settled(path, root=None)
+
+
+def test_paths_of_ones_own_configs_need_not_be_typed_again(
+    content: dict[str, Any], tmp_path: Path
+) -> None:
+    """The experiment of the run says the same here."""
+    data = content["config"]["data"] | {"root": "data/rooms_demo"}
+    path = _hostile(content, tmp_path, data=data)
+    assert _settled(path, root=None)[0]["data"]["root"] == "data/rooms_demo"
+
+
+def test_names_of_classes_are_names(
+    forbidden: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A data set's classes.json, through training and evaluation."""
+    monkeypatch.chdir(forbidden.parent)
+    names = [
+        f"${{oc.create:{{_target_: {_FIRE}, command: 'id > {forbidden}/x'}}}}",
+        "${oc.env:SECRET}",
+        "=HYPERLINK(1)",
+        f"{{_target_: {_FIRE}}}",
+    ]
+    write_data_set(Path("theirs"), height=64)
+    write_classes(Path("theirs"), dict(zip(names, (1, [2, 3], 255, 4), strict=True)))
+    folder = ["data=folder", "data.root=theirs", "data.inputs=[rgb]", "data.num_workers=0"]
+    own = [s for s in SETTINGS if not s.startswith(("experiment", "data", "representation"))]
+    widths = ["network=unet_small", "representation=tangent_economy_16", *own, "level=5"]
+    with watched(forbidden) as happened:
+        _run(monkeypatch, "check", *folder, "level=5")
+        _run(monkeypatch, "train", *widths, *folder, "hydra.run.dir=run")
+        best = "checkpoint=run/checkpoints/last.ckpt"
+        _run(monkeypatch, "evaluate", best, "data.root=theirs", "hydra.run.dir=evaluated")
+        images = next(Path("theirs/images").rglob("*.png"))
+        _run(monkeypatch, "predict", best, f"input={images}", "output=labels", "device=cpu")
+        _run(monkeypatch, "report", "run", "evaluated", "--output", "report")
+    assert not happened
+    for file in (Path("run/results.csv"), Path("evaluated/results.csv")):
+        with file.open() as opened:
+            found = [row["class"] for row in csv.DictReader(opened)]
+        assert found == [f"'{n}" if n.startswith("=") else n for n in names]
+    written = [p for top in ("run", "evaluated", "labels", "report") for p in Path(top).rglob("*")]
+    for path in written:
+        assert not path.is_file() or SECRET.encode() not in path.read_bytes(), path
+    assert SECRET not in capsys.readouterr().out
+
+
+def test_reports_of_other_peoples_runs_look_nothing_up(
+    run: Path, forbidden: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(forbidden.parent)
+    settings = read_settings(run / "config.yaml")
+    settings |= {"c": "env", "name": "${oc.${c}:SECRET}"}
+    settings["data"] |= {"inputs": "${oc.env:SECRET}", "fold": "${oc.${c}:SECRET}"}
+    Path("theirs").mkdir()
+    shutil.copy(run / "results.json", "theirs")
+    Path("theirs/config.yaml").write_text(yaml.safe_dump(settings))
+    with pytest.raises(SystemExit, match=r"config\.yaml: found data\.fold=.* inside; expected"):
+        _run(monkeypatch, "report", "theirs", "--output", "report")
+    settings["data"] |= {"inputs": ["rgb"], "fold": 1}
+    Path("theirs/config.yaml").write_text(yaml.safe_dump(settings))
+    _run(monkeypatch, "report", "theirs", "--output", "report")
+    said = capsys.readouterr()
+    assert SECRET not in said.out + said.err
+    for path in Path("report").iterdir():
+        assert SECRET.encode() not in path.read_bytes(), path
+
+
+def test_aliases_in_settings_are_not_followed(tmp_path: Path) -> None:
+    lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x]"]
+    lines += [f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]" for k in range(1, 12)]
+    (tmp_path / "config.yaml").write_text("\n".join(lines))
+    with pytest.raises(DataError, match=r"config\.yaml: found an alias"):
+        read_settings(tmp_path / "config.yaml")
+    (tmp_path / "config.yaml").write_text("x: " + "[" * 1500 + "]" * 1500)
+    with pytest.raises(DataError, match=r"config\.yaml: found RecursionError"):
+        read_settings(tmp_path / "config.yaml")
 
 
 class Saving(nn.Module):
-    """Writes a file when it is loaded, and when it is used."""
+    """Writes a file when it is used."""
 
     def __init__(self, path: str) -> None:
         super().__init__()
         self.path = path
 
-    def forward(self, images: Tensor) -> Tensor:
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
         torch.save(images, self.path)
         return images
 
 
-class SavingAtOnce(Saving):
-    @torch.jit.export
-    def __getstate__(self) -> tuple[str, bool]:
-        return self.path, self.training
-
-    @torch.jit.export
-    def __setstate__(self, state: tuple[str, bool]) -> None:
-        self.path, self.training = state
-        torch.save(1, self.path)
-
-
-@pytest.mark.parametrize("kind", [Saving, SavingAtOnce])
-def test_torchscript_that_writes_files_is_refused_before_it_runs(
-    kind: type[Saving], tmp_path: Path
+@pytest.mark.parametrize("order", ["program", "program first", "program last"])
+def test_programs_of_torchscript_are_refused(
+    order: str, run: Path, content: dict[str, Any], forbidden: Path
 ) -> None:
-    created, path = tmp_path / "created", tmp_path / "x.pt"
-    with torchscript_without_warnings():
-        script: Any = torch.jit.script(kind(str(created)))
-        torch.jit.save(script, path)
-        created.unlink(missing_ok=True)
-        again: Any = JIT.load(path)
-        again(torch.zeros(1))
-    assert created.exists(), "else this could not fail"
-    created.unlink()
-    with pytest.raises(DataError, match=r"x\.pt: found a program that calls save"):
+    """Also in a file that holds two archives, of which two readers may find two."""
+    path = forbidden.parent / "x.pt"
+    torch_script: Any = torch.jit
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        torch_script.save(torch_script.script(Saving(str(forbidden / "x"))), str(path))
+    program = path.read_bytes()
+    torch.save(content, path)
+    honest = path.read_bytes()
+    parts = {"program": [program], "program first": [program, honest]}
+    path.write_bytes(b"".join(parts.get(order, [honest, program])))
+    refused = pytest.raises(DataError, match=r"a TorchScript program|archive is corrupted")
+    with watched(forbidden) as happened, refused:
         load_trained(path)
-    assert not created.exists()
+    assert not happened
+    assert not list(forbidden.iterdir())
 
 
-def test_torchscript_has_no_other_operations_on_files() -> None:
-    assert torchvision.extension._has_ops(), "whose operations are there once it is imported"
-    schemas: Any = torch._C._jit_get_all_schemas()
-    named = {
-        schema.name.partition("::")[2]
-        for schema in schemas
-        for argument in schema.arguments
-        if any(word in argument.name.lower() for word in ("file", "path", "url", "dir"))
-        and "str" in str(argument.type)
-    }
-    assert {"save", "from_file", "write_file"} <= named
-    assert all(_TOUCHES_FILES.fullmatch(name.encode()) for name in named)
+class Own(nn.Conv2d):
+    """A network of a user."""
+
+    def __init__(self, in_channels: int, num_classes: int, inner: Any = None) -> None:
+        super().__init__(in_channels, num_classes, 1)
+
+
+OWN = f"{__name__}.Own"
+
+
+def _own(content: dict[str, Any], path: Path, **settings: Any) -> Path:
+    network = {"_target_": OWN, "in_channels": 3, "num_classes": 14, **settings}
+    tensors = {f"network.{n}": t for n, t in Own(3, 14).state_dict().items()}
+    changed = content | {"config": content["config"] | {"network": network}}
+    torch.save(changed | {"state_dict": tensors}, path)
+    return path
+
+
+def test_ones_own_network_is_trusted_by_its_name(content: dict[str, Any], tmp_path: Path) -> None:
+    path = _own(content, tmp_path / "x.ckpt")
+    with pytest.raises(DataError, match=f"trust={OWN}"):
+        load_trained(path)
+    assert load_trained(path, [OWN]).in_channels == 3
+    for said in (f"trust={OWN}", f"trust=['{OWN}',my.Other]", f"network._target_={OWN}"):
+        settings, trust = _settled(path, said)
+        assert OWN in trust
+        build(settings, trust)
+    with pytest.raises(DataError, match=f"trust={OWN}"):
+        _settled(path, "trust=my.Other")
+    # What it is given may be any plain value, but objects inside are checked all the same.
+    path = _own(content, tmp_path / "x.ckpt", inner={"a": [{"_target_": _FIRE}]})
+    with pytest.raises(DataError, match=rf"network\.inner\.a\.0\._target_={_FIRE}"):
+        load_trained(path, [OWN])
+
+
+def test_trust_reaches_every_command(
+    content: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    _own(content, Path("x.ckpt"))
+    line = ["checkpoint=x.ckpt", "output=x.safetensors"]
+    with pytest.raises(SystemExit, match="trust: found 3; expected a name, or a list of names"):
+        _run(monkeypatch, "export", *line, "trust=3")
+    _run(monkeypatch, "export", *line, f"trust={OWN}")
+    with pytest.raises(DataError, match=f"trust={OWN}"):
+        load_trained(Path("x.safetensors"))
+    assert load_trained(Path("x.safetensors"), [OWN]).trust == (OWN,)
+
+
+def test_all_that_the_configs_name_is_registered() -> None:
+    for path in sorted(config_folder().rglob("*.yaml")):
+        for target in named_targets(yaml.safe_load(path.read_text())):
+            if target.endswith("Pairs"):  # of tangent-keypoints, which leaves no checkpoint
+                continue
+            assert registry._find(target, ())[0] is not None, (path, target)
+
+
+@pytest.mark.parametrize(
+    "network",
+    [
+        {"_target_": "torch.nn.Conv2d", "in_channels": 3, "out_channels": 14, "kernel_size": 1},
+        {"_target_": "torchvision.models.segmentation.fcn_resnet50", "num_classes": 14},
+        {"_target_": "segmentation_models_pytorch.FPN", "encoder_name": "tu-convnext_atto"},
+        {"_target_": "timm.create_model", "model_name": "resnet18.a1_in1k", "pretrained": True},
+    ],
+)
+def test_networks_of_the_libraries_need_no_trust_and_fetch_nothing(
+    network: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("socket.getaddrinfo", _no_network)
+    settings = accept(tmp_path, {"network": network}).settings["network"]
+    with watched(tmp_path / "forbidden") as happened:
+        make(settings, "network", ())
+    assert not happened
+
+
+def test_tensors_are_tensors(content: dict[str, Any], tmp_path: Path) -> None:
+    path = tmp_path / "x.ckpt"
+    for wrong in ({"network.x": "y"}, {"network.x": [1]}, "text", None):
+        torch.save(content | {"state_dict": wrong}, path)
+        with pytest.raises(DataError, match=r"x\.ckpt: found"):
+            load_trained(path)
+    torch.save(content, path)
+    assert read_checkpoint(path)["kind"] == "segmentation"

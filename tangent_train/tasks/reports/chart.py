@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure as Canvas
+from matplotlib.text import Text
 
 from tangent_train.tasks.reports.classification import rotations
 from tangent_train.tasks.reports.groups import Figure, Group
@@ -101,6 +102,8 @@ def png_bytes(figure: Canvas, software: str) -> bytes:
         figure: With a canvas.
         software: Stands in the file.
     """
+    for text in figure.findobj(Text):
+        text.set_parse_math(False)  # "$" in a name is no formula
     file = io.BytesIO()
     figure.savefig(file, format="png", metadata={"Software": software})
     return file.getvalue()

@@ -37,6 +37,7 @@ _NO_BASE_LEVEL = {"CubemapRepresentation": "cubemap", "PerspectiveRepresentation
 _SAME_RUN = (
     "checkpoint",
     "checkpoint_every_n_steps",
+    "choices",
     "data.fold",
     "data.in_memory",
     "data.label_table",

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tangent_train.checkpoints.content import read_settings
+from tangent_train.checkpoints.content import INPUTS, read_settings
 from tangent_train.errors import DataError
 from tangent_train.json_text import parse_json
+from tangent_train.registry import check_fields
 
 __all__ = [
     "FIGURES",
@@ -59,6 +60,16 @@ FIGURES: Mapping[str, Figures] = {
     "classification": Figures(("accuracy", "class_accuracy"), ("accuracy",), "accuracy"),
 }
 """By the kind of the task."""
+
+
+_SHOWN = {
+    "data.fold": int | None,
+    "data.inputs": INPUTS | None,
+    "level": int | None,
+    "representation.base_level": int | None,
+    "seed": int | None,
+}
+"""What settings in reports have to be."""
 
 
 @dataclass(frozen=True)
@@ -179,8 +190,10 @@ def load_run(folder: Path) -> Run:
         DataError: One of the files is missing or not what ``tangent-train`` writes.
     """
     results = _results(folder / RESULTS_FILE)
-    config = read_settings(folder / "config.yaml")
-    return Run(folder, dict(flat_settings(config)), results)
+    path = folder / "config.yaml"
+    settings = dict(flat_settings(read_settings(path)))
+    check_fields(path, settings, _SHOWN, "the settings of a run")
+    return Run(folder, settings, results)
 
 
 def _results(path: Path) -> dict[str, Any]:

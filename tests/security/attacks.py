@@ -1,0 +1,122 @@
+"""Settings that would run, fetch, read or write something if anything interpreted them."""
+
+from __future__ import annotations
+
+import copy
+import itertools
+from collections import OrderedDict
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from tests.security.watch import CANARY
+
+__all__ = ["attacks", "json_attacks", "places", "replaced"]
+
+_NAMES = (
+    f"{CANARY}.fire",
+    "os.mkdir",
+    "antigravity.fly",
+    "torch.utils.collect_env.run",
+    "torch.load",
+    "builtins.eval",
+    "models.initialize",
+    "models.fcn_resnet.torch.hub.load",
+    "tangent_train.files.write_text",
+    "datamodules.__builtins__",
+    "lightning.LightningModule.load_from_checkpoint",
+    "torchvision.models.get_model",
+    "segmentation_models_pytorch.from_pretrained",
+)
+
+
+def json_attacks(forbidden: Path) -> Iterator[Any]:
+    """Those that JSON and YAML can hold as well.
+
+    Args:
+        forbidden: A folder that exists and nobody else names.
+    """
+    command = {"_target_": f"{CANARY}.fire", "path": str(forbidden / "x")}
+    for name in _NAMES:
+        yield {"_target_": name, "path": str(forbidden / "x")}
+    yield command | {"_partial_": True}
+    yield [command]
+    yield {"inner": command}
+    yield {"_target_": "models.UNet", "in_channels": command, "num_classes": 3}
+    # Positional arguments.
+    yield {"_target_": "timm.create_model", "_args_": ["resnet18", True, {"hf_hub_id": "a/b"}]}
+    yield {"_target_": "torch.nn.Sequential", "_args_": [command]}
+    yield {"_target_": "torch.nn.Conv2d", "_args_": [3, 3, 1], "_convert_": "all"}
+    # Addresses and files.
+    yield {"_target_": "timm.create_model", "model_name": f"local-dir:{forbidden}"}
+    yield {"_target_": "timm.create_model", "model_name": "hf-hub:a/b", "pretrained": True}
+    weights = {"checkpoint_path": str(forbidden / "x")}
+    yield {"_target_": "timm.create_model", "model_name": "resnet18", **weights}
+    yield {"_target_": "models.FCNResNet", "weights": str(forbidden / "x"), "depth": 50}
+    yield {"options": {"cpp.cxx": f"sh -c 'id > {forbidden}/x'"}}
+    yield str(forbidden / "x")
+    yield "https://example.invalid/x"
+    yield "../../x"
+    # Interpolations, plain and nested.
+    for resolver in ("oc.env:SECRET", "oc.create:" + str(command).replace("'", ""), "bag"):
+        yield f"${{{resolver}}}"
+        yield f"x ${{ {resolver} }} y"
+    yield f"${{oc.${{c}}:{{_target_: {CANARY}.fire}}}}"
+    yield {"c": "create", "x": f"${{oc.${{.c}}:{{_target_: {CANARY}.fire}}}}"}
+    # Texts where mappings are expected, wrong types.
+    yield f"_target_: {CANARY}.fire\npath: x\n"
+    yield from ("", 0, -1, 3, True, None, 1e308, 10**30, [], {}, [None], {"": ""}, "nan")
+    deep: Any = command
+    for _ in range(100):
+        deep = [deep]
+    yield deep
+    yield {"_target_": ["os.mkdir"]}
+    yield {"_target_": None}
+    yield {"_target_": "", "_partial_": "yes"}
+
+
+def attacks(forbidden: Path) -> Iterator[Any]:
+    """Those of `json_attacks`, and what only a checkpoint can hold."""
+    yield from json_attacks(forbidden)
+    yield torch.zeros(2)
+    yield OrderedDict(_target_=f"{CANARY}.fire")
+    yield {1: 2, None: 3}
+    yield (1, 2)
+    endless: list[Any] = []
+    endless.append(endless)
+    yield endless
+
+
+def places(settings: Any, place: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """Where something is in nested settings, and one place more in every mapping."""
+    inner = settings.items() if isinstance(settings, Mapping) else ()
+    for name, value in inner:
+        yield (*place, name)
+        yield from places(value, (*place, name))
+    if isinstance(settings, Mapping):
+        yield (*place, "added")
+
+
+def replaced(content: Any, place: tuple[Any, ...], value: Any) -> Any:
+    """A copy with something else at a place."""
+    changed = copy.deepcopy(content)
+    inside = changed
+    for name in place[:-1]:
+        inside = inside[name]
+    inside[place[-1]] = value
+    return changed
+
+
+def sampled(
+    all_attacks: list[Any], all_places: list[tuple[Any, ...]], each: int | None
+) -> Iterator[tuple[tuple[Any, ...], Any]]:
+    """Every attack at some places and every place with some attacks; None for all pairs."""
+    if each is None:
+        yield from itertools.product(all_places, all_attacks)
+        return
+    longest = max(len(all_places), len(all_attacks))
+    for k in range(longest * each):
+        place = all_places[k % len(all_places)]
+        yield place, all_attacks[(k + k // longest * 7) % len(all_attacks)]

@@ -1,0 +1,52 @@
+"""Sees what Python is asked to do: imports, files, processes, the network."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+__all__ = ["CANARY", "watched"]
+
+CANARY = "attack_canary"
+"""A module that only attacks name; it does not exist, and asking for it is seen."""
+
+_MODULES = (CANARY, "antigravity", "collect_env")
+_PROCESSES = ("os.exec", "os.posix_spawn", "os.spawn", "os.system", "subprocess.Popen")
+_NETWORK = ("ftplib.connect", "http.client.connect", "socket.connect", "socket.getaddrinfo")
+_watching: list[tuple[list[str], str]] = []
+
+
+@contextmanager
+def watched(forbidden: Path) -> Iterator[list[str]]:
+    """Note what must not happen while this is on.
+
+    Args:
+        forbidden: A folder that only attacks name; all that is done to it is noted.
+
+    Yields:
+        What happened: empty if all is well.
+    """
+    happened: list[str] = []
+    _watching.append((happened, str(forbidden)))
+    try:
+        yield happened
+    finally:
+        _watching.pop()
+
+
+def _hook(event: str, arguments: tuple[Any, ...]) -> None:
+    for happened, forbidden in _watching:
+        imported = event == "import" and any(m in str(arguments[0]) for m in _MODULES)
+        started = event in (*_PROCESSES, *_NETWORK)
+        touched = event not in ("compile", "exec", "object.__getattr__") and any(
+            isinstance(argument, str | Path) and forbidden in str(argument)
+            for argument in arguments
+        )
+        if imported or started or touched:
+            happened.append(f"{event} {str(arguments)[:200]}")
+
+
+sys.addaudithook(_hook)
