@@ -203,7 +203,8 @@ class TangentResults:
             return
         with atomic_path(path) as temporary:
             mapped = open_memmap(temporary, "w+", arrays[0].dtype, (*shape, *channels))
-            reserve(temporary)
+            with temporary.open("r+b") as file:
+                reserve(file, temporary.stat().st_size)
             self._render(arrays, grid, blend, mapped)
             mapped.flush()
 

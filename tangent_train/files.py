@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import errno
-import fcntl
 import os
 import shutil
 import tempfile
 import time
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import IO, TYPE_CHECKING
 
 from tangent_train.errors import SettingError
 
@@ -22,7 +21,7 @@ __all__ = ["NoRoomError", "atomic_path", "no_room", "reserve", "write_bytes", "w
 _PREFIX = ".partial-"
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _PROBE = bytes(1 << 16)
-_ABANDONED_S = 3600.0
+_ABANDONED_S = 24 * 3600.0
 _tidied: set[Path] = set()
 
 
@@ -57,8 +56,9 @@ def no_room(path: Path, error: BaseException) -> NoRoomError | None:
 def atomic_path(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside `path` that replaces it when the block succeeds.
 
-    A process that is killed leaves the temporary file behind. It is locked while it is written, so
-    the next process that writes to the folder knows what nobody works on any more, and removes it.
+    The new file is on the disk before it takes the place of the old one, so that a power cut leaves
+    one of the two. A process that is killed leaves the temporary file behind; the first one that
+    writes to the folder a day later removes it.
 
     Args:
         path: The file to write; its folder is created. An existing file stays untouched until the
@@ -78,13 +78,15 @@ def atomic_path(path: Path) -> Iterator[Path]:
         if told is None:
             raise
         raise told from error
-    _lock(handle)
+    os.close(handle)
     _remove_abandoned(path.parent)
     temporary = Path(name)
     try:
         temporary.chmod(0o644)
         yield temporary
+        _sync(temporary)
         temporary.replace(path)
+        _sync(path.parent)
     except Exception as error:
         known = isinstance(error, OSError) and error.errno is not None
         told = no_room(path, error if known else _refused(temporary))
@@ -92,23 +94,42 @@ def atomic_path(path: Path) -> Iterator[Path]:
             raise
         raise told from error
     finally:
-        os.close(handle)
         temporary.unlink(missing_ok=True)
 
 
-def reserve(path: Path) -> None:
+def reserve(file: IO[bytes], size: int) -> None:
     """Take the room of a file before its pages are written through memory.
 
-    A mapped file has holes at first; a disk that is full when one is filled ends the process.
+    A mapped file has holes at first; a disk that is full when one is filled ends the process. Where
+    the system has no way to take room (macOS, Windows), it is written, as it is.
 
     Args:
-        path: A file of its final size.
+        file: Open for reading and writing.
+        size: Its final size in bytes.
 
     Raises:
         OSError: There is too little room.
     """
-    with path.open("r+b") as file:
-        os.posix_fallocate(file.fileno(), 0, os.fstat(file.fileno()).st_size)
+    if hasattr(os, "posix_fallocate"):
+        os.posix_fallocate(file.fileno(), 0, size)
+        return
+    for start in range(0, size, len(_PROBE)):
+        file.seek(start)
+        block = file.read(min(len(_PROBE), size - start))
+        file.seek(start)
+        file.write(block or _PROBE[: size - start])
+    file.flush()
+
+
+def _sync(path: Path) -> None:
+    """Have a file, or the names in a folder, written to the disk now."""
+    if path.is_dir() and os.name == "nt":  # where folders cannot be opened
+        return
+    handle = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 def write_bytes(path: Path, content: bytes) -> None:
@@ -134,26 +155,12 @@ def _refused(path: Path) -> OSError:
     return OSError()
 
 
-def _lock(handle: int) -> bool:
-    """Whether nobody else has this file locked; where files cannot be locked, nobody knows."""
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        return False
-    return True
-
-
 def _remove_abandoned(folder: Path) -> None:
-    """Remove temporary files of processes that were killed, once per process and folder.
-
-    Young ones stay: locks of other machines are not seen on every network disk.
-    """
+    """Remove temporary files of processes that were killed, once per process and folder."""
     if folder in _tidied:
         return
     _tidied.add(folder)
     for path in folder.glob(f"{_PREFIX}*"):
         with suppress(OSError):  # gone meanwhile, or not ours to touch
             if path.is_file() and time.time() - path.stat().st_mtime > _ABANDONED_S:
-                with path.open("rb") as file:
-                    if _lock(file.fileno()):
-                        path.unlink()
+                path.unlink()

@@ -8,13 +8,13 @@ only the labels are kept.
 from __future__ import annotations
 
 import math
-import os
 import tempfile
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from tangent_train.errors import SettingError
+from tangent_train.files import reserve
 from tangent_train.rendering import kernels, mosaic_kernels
 from tangent_train.rendering.checks import check_blend
 from tangent_train.rendering.tables import FEATHER_POWER
@@ -152,7 +152,7 @@ def _zeros(shape: tuple[int, ...]) -> NDArray[np.float32]:
     # The file has no name: it is gone with the array, whatever happens.
     with tempfile.TemporaryFile() as file:
         try:  # now: of a full disk the system says nothing later, it ends the process
-            os.posix_fallocate(file.fileno(), 0, nbytes)
+            reserve(file, nbytes)
         except OSError as error:
             raise SettingError(
                 f"temporary folder {tempfile.gettempdir()}",

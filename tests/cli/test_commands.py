@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -14,14 +15,13 @@ import cv2
 import lightning
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from lightning.fabric.utilities.exceptions import MisconfigurationException
-from omegaconf import OmegaConf
 
-from tangent_train.cli import main
-from tangent_train.cli.compose import config_folder
-from tangent_train.cli.stored import stored_config_arguments, with_stored_config
+from tangent_train.checkpoints.content import read_settings
+from tangent_train.cli import main, run
+from tangent_train.cli.stored import stored_arguments
 from tangent_train.tasks.checkpoints import LastCheckpoint
+from tangent_train.tasks.reports.runs import load_run
 
 AREAS = ("1", "2", "3", "4", "5a", "5b", "6")
 SETTINGS = [
@@ -98,24 +98,39 @@ def test_checkpoints_hold_tensors_and_plain_values_only(run_folder: Path) -> Non
 
 
 def test_evaluating_the_checkpoint_repeats_the_numbers_exactly(
+    run_folder: Path, rooms: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    checkpoint = run_folder / "checkpoints" / "best.ckpt"
+    _run(monkeypatch, "evaluate", f"checkpoint={checkpoint}", rooms, "hydra.run.dir=again")
+    assert _results(tmp_path / "again") == _results(run_folder)
+    again, before = (load_run(folder).settings for folder in (tmp_path / "again", run_folder))
+    differing = {n for n in again.keys() | before.keys() if again.get(n) != before.get(n)}
+    assert differing == {"checkpoint"}, "and what was evaluated can be read with its figures"
+
+
+def test_an_evaluation_says_which_data_it_cannot_find(
     run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     checkpoint = run_folder / "checkpoints" / "best.ckpt"
-    _run(monkeypatch, "evaluate", f"checkpoint={checkpoint}", "hydra.run.dir=again")
-    assert _results(tmp_path / "again") == _results(run_folder)
+    with pytest.raises(
+        SystemExit, match=r"data\.root: found none: .* had data\.root='.*made rooms'"
+    ):
+        _run(monkeypatch, "evaluate", f"checkpoint={checkpoint}", "hydra.run.dir=again")
+    assert not (tmp_path / "data").exists()
 
 
 def test_overrides_apply_to_the_checkpoints_config(
-    run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run_folder: Path, rooms: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     checkpoint = run_folder / "checkpoints" / "best.ckpt"
-    arguments = [f"checkpoint={checkpoint}", "data.test_rotation=so3"]
+    arguments = [f"checkpoint={checkpoint}", rooms, "data.test_rotation=so3"]
     _run(monkeypatch, "evaluate", *arguments, "hydra.run.dir=turned")
     assert _results(tmp_path / "turned")["confusion"] != _results(run_folder)["confusion"]
     with pytest.raises(SystemExit, match=r"Did you mean data\.test_rotation"):
-        _run(monkeypatch, "evaluate", arguments[0], "data.test_rotatio=so3")
+        _run(monkeypatch, "evaluate", *arguments[:2], "data.test_rotatio=so3")
 
 
 def test_an_interrupted_run_says_how_to_go_on_and_ends_the_same(
@@ -137,8 +152,9 @@ def test_an_interrupted_run_says_how_to_go_on_and_ends_the_same(
         patch.setattr(LastCheckpoint, "on_train_epoch_end", interrupt)
         with pytest.raises(SystemExit):
             _run(patch, "train", *SETTINGS, rooms, "hydra.run.dir=cut")
-    assert "tangent-train resume=" in capsys.readouterr().err
-    _run(monkeypatch, "train", f"resume={tmp_path / 'cut'}")
+    command = capsys.readouterr().err.strip().splitlines()[-1]
+    assert shlex.split(command) == ["tangent-train", f"resume={tmp_path / 'cut'}", rooms]
+    _run(monkeypatch, "train", *shlex.split(command)[1:])
     assert _results(tmp_path / "cut") == _results(run_folder)
 
 
@@ -190,7 +206,7 @@ def test_further_inputs_start_at_zero_and_stay_in_the_checkpoint(
     best = tmp_path / "begun/checkpoints/best.ckpt"
     content = torch.load(best, weights_only=True)
     assert content["inputs"] == ["rgb", "depth", "validity", "elevation"]
-    again = [f"checkpoint={best}", "hydra.run.dir=again"]
+    again = [f"checkpoint={best}", rooms, "hydra.run.dir=again"]
     _run(monkeypatch, "evaluate", *again)
     figures = [_results(tmp_path / folder)["confusion"] for folder in ("begun", "again")]
     assert figures[0] == figures[1]
@@ -199,13 +215,13 @@ def test_further_inputs_start_at_zero_and_stay_in_the_checkpoint(
 
 
 def test_settings_of_the_checkpoint_reach_what_refers_to_them(
-    run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run_folder: Path, rooms: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     odd = tmp_path / "a=b (1)" / "x.ckpt"
     odd.parent.mkdir()
     odd.write_bytes((run_folder / "checkpoints" / "best.ckpt").read_bytes())
-    arguments = [f"checkpoint={odd}", "data.test_rotation=so3"]
+    arguments = [f"checkpoint={odd}", rooms, "data.test_rotation=so3"]
     for seed in (1, 2):
         _run(monkeypatch, "evaluate", *arguments, f"seed={seed}", f"hydra.run.dir={seed}")
     first, second = (_results(tmp_path / str(seed))["confusion"] for seed in (1, 2))
@@ -217,18 +233,39 @@ def test_settings_of_the_checkpoint_reach_what_refers_to_them(
     [
         ("network=unet", "expected overrides of single settings"),
         ("representation=erb", "unknown representation: .*Did you mean erp"),
-        ("representation=tangent,erp", "unknown representation: found 'tangent,erp'"),
+        ("trainer=dpp", "unknown trainer: .*Did you mean ddp"),
         ("data.inputs=[rgb]", "found inputs .* which the network was trained with"),
         ("data=omnisynthia", r"found class names .*'sky'.*; expected .*'beam'"),
     ],
 )
 def test_what_a_checkpoint_cannot_do_is_refused(
-    run_folder: Path, override: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run_folder: Path,
+    rooms: str,
+    override: str,
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     checkpoint = run_folder / "checkpoints" / "best.ckpt"
     with pytest.raises(SystemExit, match=message):
-        _run(monkeypatch, "evaluate", f"checkpoint={checkpoint}", override)
+        _run(monkeypatch, "evaluate", f"checkpoint={checkpoint}", rooms, override)
+
+
+def test_several_options_of_a_group_are_a_sweep(
+    run_folder: Path,
+    rooms: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    arguments = [f"checkpoint={run_folder / 'checkpoints' / 'best.ckpt'}", rooms]
+    with pytest.raises(SystemExit):
+        _run(monkeypatch, "evaluate", *arguments, "representation=tangent,erp")
+    assert "To sweep over it, add --multirun" in capsys.readouterr().err
+    with pytest.raises(SystemExit, match=r"unknown representation: found 'erb'; .*mean erp"):
+        _run(monkeypatch, "evaluate", *arguments, "-m", "representation=tangent,erb")
 
 
 def test_a_checkpoint_is_evaluated_on_other_data_through_another_representation(
@@ -239,40 +276,47 @@ def test_a_checkpoint_is_evaluated_on_other_data_through_another_representation(
     same_rooms = [text for text in SETTINGS if text.startswith("data.rooms.")]
     chosen = ["data=synthrooms", rooms, *same_rooms, "representation=erp"]
     _run(monkeypatch, "evaluate", checkpoint, *chosen, "hydra.run.dir=other")
-    config: Any = OmegaConf.load(tmp_path / "other" / ".hydra" / "config.yaml")
-    assert config.data.panoramas_per_step == 4, "the option's own, not the run's"
-    assert "base_level" not in config.representation
-    assert OmegaConf.to_container(config, resolve=False)["representation"]["level"] == "${level}"  # type: ignore[index, call-overload]
-    assert config.representation.level == 4
+    config = read_settings(tmp_path / "other" / "config.yaml")
+    assert config["data"]["panoramas_per_step"] == 4, "the option's own, not the run's"
+    assert "base_level" not in config["representation"]
+    assert config["representation"]["level"] == 4
     assert _results(tmp_path / "other")["confusion"] != _results(run_folder)["confusion"]
 
 
-def test_evaluation_on_other_data_keeps_fold_and_inputs(run_folder: Path, tmp_path: Path) -> None:
+def test_evaluation_on_other_data_keeps_fold_and_inputs(
+    run_folder: Path, rooms: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
     path = tmp_path / "fold_2.ckpt"
     content = torch.load(run_folder / "checkpoints" / "best.ckpt", weights_only=True)
     content["config"]["data"] |= {"fold": 2, "inputs": ["rgb"]}
     torch.save(content, path)
-    with_stored_config("evaluate", [f"checkpoint={path}", "data=synthrooms"])
-    with initialize_config_dir(str(config_folder()), version_base="1.3"):
-        config = compose("stored_evaluate")
-    assert config.data.fold == 2, "the network has seen the rooms of the others"
-    assert config.data.inputs == ["rgb"], "it takes no others"
+    chosen = ["data=synthrooms", rooms, "hydra.run.dir=other"]
+    with monkeypatch.context() as patch:
+        found: list[dict[str, Any]] = []
+        patch.setattr(run, "evaluate", lambda settings, trust: found.append(settings))
+        _run(patch, "evaluate", f"checkpoint={path}", *chosen)
+        _run(patch, "evaluate", f"checkpoint={path}", *chosen, "data.fold=3", "data.inputs=[depth]")
+    assert found[0]["data"]["fold"] == 2, "the network has seen the rooms of the others"
+    assert found[0]["data"]["inputs"] == ["rgb"], "it takes no others"
+    assert found[1]["data"]["fold"] == 3, "but what is typed counts"
+    assert found[1]["data"]["inputs"] == ["depth"]
 
 
-def test_jobs_of_a_sweep_get_the_chosen_sections() -> None:
+def test_processes_of_a_run_go_on_with_the_same_stored_run() -> None:
     typed = ["checkpoint=x.ckpt", "representation=erp", "data.test_rotation=0,45"]
-    kept = ["checkpoint=x.ckpt", "representation=erp"]
-    assert stored_config_arguments("evaluate", typed) == kept
-    assert stored_config_arguments("train", typed) == kept[:1]
+    assert stored_arguments("evaluate", typed) == typed[:1]
+    assert stored_arguments("train", ["resume=x", "seed=1"]) == ["resume=x"]
+    assert stored_arguments("prepare", typed) == []
 
 
 def test_a_schedule_cannot_be_resumed_with_another_length(
-    run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run_folder: Path, rooms: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     copy = tmp_path / "copy"
     shutil.copytree(run_folder, copy)
     with pytest.raises(SystemExit, match=r"trainer\.max_epochs, .*: found .* steps of training"):
-        _run(monkeypatch, "train", f"resume={copy}", "trainer.max_epochs=3")
+        _run(monkeypatch, "train", f"resume={copy}", rooms, "trainer.max_epochs=3")
 
 
 @pytest.mark.parametrize(
@@ -327,7 +371,7 @@ def test_help_answers_before_anything_heavy_is_imported(
 
 
 def test_what_lightning_refuses_is_said_in_one_line(
-    run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run_folder: Path, rooms: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As it does when a run of six epochs is resumed for three."""
     again = tmp_path / "again"
@@ -338,4 +382,4 @@ def test_what_lightning_refuses_is_said_in_one_line(
 
     monkeypatch.setattr(lightning.Trainer, "fit", refuse)
     with pytest.raises(SystemExit, match=r"tangent-train: trainer: found .*current_epoch=6"):
-        _run(monkeypatch, "train", f"resume={again}")
+        _run(monkeypatch, "train", f"resume={again}", rooms)

@@ -9,7 +9,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from tangent_train.cli.compose import check_overrides, config_folder
-from tangent_train.cli.stored import checkpoint_config, with_stored_config
+from tangent_train.cli.stored import stored_run
 from tangent_train.errors import DataError, SettingError
 
 
@@ -102,15 +102,26 @@ def test_options_of_a_users_own_config_folder_are_known(tmp_path: Path) -> None:
         check_overrides("train", ["network=mine", "network.sizes=4", *own])
 
 
-def test_a_command_without_a_stored_config_keeps_its_arguments() -> None:
-    assert with_stored_config("train", ["level=6"]) == ("train", ["level=6"])
-    assert with_stored_config("train", ["resume=null"])[0] == "train"
-    assert with_stored_config("evaluate", []) == ("evaluate", [])
+@pytest.mark.parametrize(
+    ("command", "arguments"),
+    [
+        ("train", ["level=6"]),
+        ("train", ["resume=null"]),
+        ("train", ["checkpoint=x.ckpt"]),
+        ("evaluate", []),
+        ("evaluate", ["checkpoint="]),
+        ("prepare", ["checkpoint=x.ckpt"]),
+    ],
+)
+def test_a_command_without_a_stored_run_starts_from_the_users_configs(
+    command: str, arguments: list[str]
+) -> None:
+    assert stored_run(command, arguments) is None
 
 
 def test_resume_needs_a_run_that_has_begun(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="the folder of a run that has begun"):
-        with_stored_config("train", [f"resume={tmp_path}"])
+        stored_run("train", [f"resume={tmp_path}"])
 
 
 def _missing(path: Path) -> None:
@@ -142,4 +153,4 @@ def test_what_is_no_checkpoint_is_refused(tmp_path: Path, make: object, message:
     path = tmp_path / "x.ckpt"
     make(path)  # type: ignore[operator]
     with pytest.raises(DataError, match=message):
-        checkpoint_config(path)
+        stored_run("evaluate", [f"checkpoint={path}"])

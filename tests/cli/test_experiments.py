@@ -9,14 +9,14 @@ import lightning
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
-from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from datamodules.synthshapes.generate import generate_shapes
 from datamodules.synthshapes.settings import ShapeSettings
+from tangent_train.cli.build import build
 from tangent_train.cli.compose import config_folder
-from tangent_train.cli.run import build
 from tangent_train.cli.transfer.stages import folds_and_seeds, plan
+from tangent_train.registry import make
 from tests.datamodules.synthia_format import write_panoramas, write_views
 
 if TYPE_CHECKING:
@@ -85,9 +85,15 @@ def _shrunk(config: DictConfig, stanford_root: Path, rooms_root: Path) -> dict[s
     return {**settings, **rooms, "data.rooms.height": ROWS, "data.root": str(rooms_root)}
 
 
+def _plain(config: DictConfig) -> dict[str, Any]:
+    settings: Any = OmegaConf.to_container(config, resolve=True)
+    return settings
+
+
 def _one_step(config: DictConfig, task: Any, data: Any, folder: Path) -> lightning.Trainer:
-    trainer: lightning.Trainer = instantiate(
-        config.trainer,
+    trainer: lightning.Trainer = make(
+        _plain(config.trainer),
+        "trainer",
         accelerator="cpu",
         default_root_dir=str(folder),
         callbacks=[OneStep()],
@@ -104,7 +110,7 @@ def _one_step(config: DictConfig, task: Any, data: Any, folder: Path) -> lightni
 
 def _takes_a_step(config: DictConfig, folder: Path) -> set[str]:
     """Build what a run is made of and train one step; the names of all tensors."""
-    data, task = build(config)
+    data, task = build(_plain(config))
     before = {name: p.detach().clone() for name, p in task.network.named_parameters()}
     trainer = _one_step(config, task, data, folder)
     assert trainer.global_step == 1
@@ -121,7 +127,7 @@ def _builds_at_full_size(config: DictConfig) -> set[str]:
     if "weights" in config.network:
         config.network.weights = None  # nothing from the internet
     with torch.device("meta"):  # shapes only: build runs the network on an image of full size
-        data, task = build(config)
+        data, task = build(_plain(config))
     assert len(task.class_names) == len(data.class_names) == 14
     return set(task.state_dict())
 
@@ -155,7 +161,7 @@ def test_every_experiment_on_shapes_composes_instantiates_and_takes_a_step(
     config = _composed(experiment)
     assert config.name == experiment
     with torch.device("meta"):
-        data, task = build(config)
+        data, task = build(_plain(config))
     assert (
         len(task.class_names) == len(data.class_names) == (40 if "modelnet" in experiment else 10)
     )

@@ -14,9 +14,9 @@ import pytest
 import torch
 from PIL import Image
 
+from tangent_train.checkpoints.trained import load_trained
 from tangent_train.cli import main
 from tangent_train.tasks import export as export_module
-from tangent_train.checkpoints.trained import load_trained
 from tests.documentation.markdown import commands, shown_files
 from tests.documentation.running import ROOT
 from tests.tasks.small_networks import save_checkpoint
@@ -44,7 +44,7 @@ def _export(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None:
     main.export()
 
 
-@pytest.mark.parametrize("name", ["a, b.onnx", "model.safetensors", "new/folder/model.PT"])
+@pytest.mark.parametrize("name", ["a, b.onnx", "model.safetensors", "new/folder/model.ONNX"])
 def test_the_suffix_says_the_format(
     name: str,
     checkpoint: Path,
@@ -98,8 +98,8 @@ def test_a_size_is_said(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    output = tmp_path / "model.pt"
-    typed = [f"checkpoint={checkpoint}", f"output={output}", "format=torchscript"]
+    output = tmp_path / "model.onnx"
+    typed = [f"checkpoint={checkpoint}", f"output={output}", "format=onnx"]
     _export(monkeypatch, *typed, "image_size=[32,48]")
     assert "4 channels, 32×48; scores" in capsys.readouterr().out
     assert load_trained(output).fixed_size == (32, 48)
@@ -112,12 +112,14 @@ def test_a_size_is_said(
         (["checkpoint={}"], r"output: found none; expected a file ending in \.onnx, \.safetensors"),
         (["checkpoint={}", "output=x.bin"], r"output: found x\.bin; expected a name ending in"),
         (["checkpoint={}", "output=x.pt", "format=onnx"], r"output: found x\.pt; .* \.onnx"),
-        (["checkpoint={}", "output=x.pt", "format=tf"], "format: found tf; expected onnx or"),
-        (["checkpoint={}", "output=x.pt", "image_size=32"], "image_size: found 32; expected"),
-        (["checkpoint={}", "output=x.pt", "image_size=[1,a]"], r"image_size: .*height, width"),
-        (["checkpoint={}", "output=x.pt", "image_size=[15,16]"], "image_size: .* multiples of 2"),
+        (["checkpoint={}", "output=x.pt"], r"output: found x\.pt; .* \.onnx, \.safetensors\.$"),
+        (["checkpoint={}", "output=x.pt", "format=torchscript"], "format: found torchscript; exp"),
+        (["checkpoint={}", "output=x.onnx", "format=tf"], "format: found tf; expected onnx or"),
+        (["checkpoint={}", "output=x.onnx", "image_size=32"], "image_size: found 32; expected"),
+        (["checkpoint={}", "output=x.onnx", "image_size=[1,a]"], r"image_size: .*height, width"),
+        (["checkpoint={}", "output=x.onnx", "image_size=[15,16]"], "image_size: .* multiples of 2"),
         (["checkpoint={}", "output=x.onnx", "opset=new"], "opset: found new; expected a whole"),
-        (["checkpoint=none.ckpt", "output=x.pt"], r"none\.ckpt: found no such file"),
+        (["checkpoint=none.ckpt", "output=x.onnx"], r"none\.ckpt: found no such file"),
         (["checkpoints=x"], "unknown setting: found 'checkpoints'; .*Did you mean checkpoint"),
     ],
 )

@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
-from omegaconf import DictConfig
+from omegaconf import OmegaConf
 
+from tangent_train.cli.build import build
 from tangent_train.cli.compose import config_folder
-from tangent_train.cli.run import build
 from tangent_train.errors import SettingError
 
 NETWORKS = {path.stem for path in (config_folder() / "network").glob("*.yaml")}
@@ -35,9 +35,11 @@ MAKER = {
 DEPTH = {"fcn_resnet": "network.depth=50", "fcn_resnet_context": "network.network.depth=50"}
 
 
-def _composed(*overrides: str) -> DictConfig:
+def _composed(*overrides: str) -> dict[str, Any]:
     with initialize_config_dir(str(config_folder()), version_base="1.3"):
-        return compose("train", ["level=5", "representation.erp_height=32", *overrides])
+        config = compose("train", ["level=5", "representation.erp_height=32", *overrides])
+    settings: Any = OmegaConf.to_container(config, resolve=True)
+    return settings
 
 
 def test_every_network_is_tested() -> None:
@@ -48,8 +50,7 @@ def test_every_network_is_tested() -> None:
 def test_every_network_takes_the_data_s_channels_and_classes(network: str) -> None:
     shallow = [DEPTH[network]] if network in DEPTH else []
     for inputs, channels in (("[rgb]", 3), ("[rgb,depth]", 4)):
-        config = _composed(f"network={network}", f"data.inputs={inputs}", *shallow)
-        _, task = build(config)
+        _, task = build(_composed(f"network={network}", f"data.inputs={inputs}", *shallow))
         made = type(task.network)
         assert f"{made.__module__}.{made.__name__}" == MAKER[network]
         scores = task(torch.randn(2, channels, 32, 32))
@@ -125,22 +126,22 @@ def test_what_does_not_belong_together_is_refused(overrides: list[str], message:
 
 
 def test_networks_for_single_images_are_refused_for_shapes() -> None:
-    config = _composed(*SHAPES)
-    config.network = {"_target_": "torchvision.models.resnet18", "num_classes": None}
+    settings = _composed(*SHAPES)
+    settings["network"] = {"_target_": "torchvision.models.resnet18", "num_classes": None}
     message = (
         r"network: found ResNet, which does not take \(1, 20, 6, 32, 32\) \(resnet\.py, line .*: .*"
         r"expected one that maps views of shapes"
     )
     with pytest.raises(SettingError, match=message):
-        build(config)
+        build(settings)
 
 
 def test_the_place_of_an_error_in_ones_own_network_is_said() -> None:
-    config = _composed()
-    config.network = {"_target_": f"{__name__}.Broken"}
+    settings = _composed()
+    settings["network"] = {"_target_": f"{__name__}.Broken"}
     message = r"network: found Broken, .* \(test_networks\.py, line \d+: .*4096"
     with pytest.raises(SettingError, match=message):
-        build(config)
+        build(settings)
 
 
 class Broken(torch.nn.Linear):
@@ -170,19 +171,19 @@ class Recorder(torch.nn.Conv2d):
 def test_nulls_are_filled_in_and_weights_left_to_the_checkpoint(
     from_checkpoint: str | None,
 ) -> None:
-    config = _composed()
-    config.network = {
+    settings = _composed()
+    settings["network"] = {
         "_target_": f"{__name__}.Recorder",
         "in_channels": None,
         "classes": None,
         "num_classes": 3,
         "weights": "coco",
         "other": None,
-        "inner": {"in_channels": None, "encoder_weights": "imagenet", "level": "${level}"},
+        "inner": {"in_channels": None, "encoder_weights": "imagenet", "level": 5},
     }
     if from_checkpoint is not None:
-        config = DictConfig({**config, from_checkpoint: "x"})
-    _, task = build(config)
+        settings[from_checkpoint] = "x"
+    _, task = build(settings)
     weights, inner = (None, None) if from_checkpoint else ("coco", "imagenet")
     assert task.network.in_channels == 4
     assert task.network.out_channels == 14

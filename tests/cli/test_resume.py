@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,15 @@ from tangent_train.cli import main
 from tangent_train.cli.resume import check_resumed
 from tangent_train.errors import SettingError
 
-# No batch statistics. Dropout draws from torch's generator at every step.
+# Dropout draws from torch's generator at every step.
+DROPPING = """
+from torch import nn
+
+class Dropping(nn.Conv2d):
+    def forward(self, images):
+        return nn.functional.dropout2d(super().forward(images), training=self.training)
+"""
+# No batch statistics.
 NETWORKS = {
     "plain": """
 _target_: torch.nn.Conv2d
@@ -27,10 +37,11 @@ kernel_size: 3
 padding: 1
 """,
     "dropout": """
-_target_: torch.nn.Sequential
-_args_:
-  - {_target_: torch.nn.Conv2d, in_channels: 4, out_channels: 14, kernel_size: 3, padding: 1}
-  - {_target_: torch.nn.Dropout2d}
+_target_: dropping.Dropping
+in_channels: 4
+out_channels: 14
+kernel_size: 3
+padding: 1
 """,
 }
 SETTINGS = [
@@ -82,17 +93,38 @@ def _last(folder: Path) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def settings(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
-    """With the networks above as options, and the rooms made."""
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """With the networks above as options, and the module of one of them, which can be imported."""
     folder = tmp_path_factory.mktemp("settings")
     (folder / "network").mkdir()
     for name, config in NETWORKS.items():
         (folder / "network" / f"{name}.yaml").write_text(config)
-    settings = ["--config-dir", str(folder), *SETTINGS, f"data.root={folder / 'rooms'}"]
+    (folder / "dropping.py").write_text(DROPPING)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(folder)
+        patch.setenv("PYTHONPATH", str(folder), prepend=os.pathsep)
+        yield folder
+
+
+@pytest.fixture(scope="module")
+def settings(folder: Path) -> list[str]:
+    """Of the networks and the rooms, which are made."""
+    settings = ["--config-dir", str(folder), *SETTINGS, _root(folder)]
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         _run(patch, "prepare", *settings, "network=plain")
     return settings
+
+
+def _root(folder: Path) -> str:
+    """What no file says."""
+    return f"data.root={folder / 'rooms'}"
+
+
+@pytest.fixture(scope="module")
+def again(folder: Path) -> list[str]:
+    """What has to be said again of a run with dropout."""
+    return [_root(folder), "trust=dropping.Dropping"]
 
 
 @pytest.fixture(scope="module")
@@ -151,6 +183,7 @@ def test_a_run_cut_short_goes_on_as_if_nothing_had_happened(
     workers: int,
     undisturbed: Path,
     arguments: list[str],
+    again: list[str],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -158,19 +191,22 @@ def test_a_run_cut_short_goes_on_as_if_nothing_had_happened(
     assert _last(undisturbed)["global_step"] == 15, "three epochs of five steps"
     if how == signal.SIGTERM:
         assert cut.returncode == 128 + signal.SIGTERM, cut.stderr
-        assert "tangent-train resume=" in cut.stderr
+        assert f"tangent-train resume={tmp_path / 'cut'} {again[0]}\n" in cut.stderr
         assert "Traceback" not in cut.stderr
         assert _last(tmp_path / "cut")["global_step"] == step, "saved when it was told to end"
     else:
         assert cut.returncode == -signal.SIGKILL, cut.stderr
         assert _last(tmp_path / "cut")["global_step"] == step - 1
-    _run(monkeypatch, "train", f"resume={tmp_path / 'cut'}", f"data.num_workers={workers}")
+    resumed = [f"resume={tmp_path / 'cut'}", *again]
+    _run(monkeypatch, "train", *resumed, f"data.num_workers={workers}")
     _assert_same_end(tmp_path / "cut", undisturbed)
 
 
 def test_checkpoints_say_all_that_later_commands_need(undisturbed: Path) -> None:
     content = _last(undisturbed)
-    assert content["resolved_config"]["representation"]["level"] == 4
+    assert content["config"]["representation"]["level"] == 4
+    assert content["kind"] == "segmentation"
+    assert content["inputs"] == ["rgb", "depth"]
     assert content["class_names"][:2] == ["unknown", "beam"]
     assert len(content["normalization"]["mean"]) == 4
     assert content["tangent_train_version"]
@@ -188,10 +224,33 @@ def test_checkpoints_say_all_that_later_commands_need(undisturbed: Path) -> None
     ],
 )
 def test_a_run_is_not_resumed_as_another(
-    undisturbed: Path, override: str, message: str, monkeypatch: pytest.MonkeyPatch
+    undisturbed: Path,
+    again: list[str],
+    override: str,
+    message: str,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     with pytest.raises(SystemExit, match=message):
-        _run(monkeypatch, "train", f"resume={undisturbed}", override)
+        _run(monkeypatch, "train", f"resume={undisturbed}", *again, override)
+
+
+def test_a_run_is_not_resumed_without_its_root_and_what_is_to_be_trusted(
+    undisturbed: Path, again: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root, trust = again
+    with pytest.raises(
+        SystemExit, match=r"_target_=dropping\.Dropping, .*trust=dropping\.Dropping"
+    ):
+        _run(monkeypatch, "train", f"resume={undisturbed}", root)
+    with pytest.raises(
+        SystemExit, match=rf"data\.root: found none.* had {re.escape(_quoted(root))}"
+    ):
+        _run(monkeypatch, "train", f"resume={undisturbed}", trust)
+
+
+def _quoted(root: str) -> str:
+    name, _, value = root.partition("=")
+    return f"{name}={value!r}"
 
 
 def test_where_and_how_it_is_computed_may_change() -> None:
@@ -215,7 +274,7 @@ def _processes(folder: Path, *arguments: str, command: Path = COMMAND) -> None:
 
 @pytest.mark.slow
 def test_two_processes_make_the_steps_and_figures_of_one(
-    settings: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    settings: list[str], folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     common = [*settings, "network=plain", "trainer.max_steps=3", "optimizer=adam"]
@@ -234,14 +293,15 @@ def test_two_processes_make_the_steps_and_figures_of_one(
     cut = _cut(arguments, tmp_path, signal.SIGTERM, 2)
     assert cut.returncode == 128 + signal.SIGTERM, cut.stderr
     assert _last(tmp_path / "cut")["global_step"] == 2, "all ended after the step"
-    _processes(tmp_path, f"resume={tmp_path / 'cut'}")
+    _processes(tmp_path, f"resume={tmp_path / 'cut'}", _root(folder))
     _assert_same_end(tmp_path / "cut", tmp_path / "two")
     checkpoint = f"checkpoint={tmp_path / 'one' / 'checkpoints' / 'last.ckpt'}"
     _processes(
-        tmp_path, checkpoint, "trainer.devices=2", "+trainer.strategy=ddp",
-        "hydra.run.dir=evaluated", command=COMMAND.with_name("tangent-evaluate"),
+        tmp_path, checkpoint, _root(folder), "trainer=ddp", "trainer.accelerator=cpu",
+        "trainer.devices=2", "hydra.run.dir=evaluated",
+        command=COMMAND.with_name("tangent-evaluate"),
     )  # fmt: skip
-    _run(monkeypatch, "evaluate", checkpoint, "hydra.run.dir=again")
+    _run(monkeypatch, "evaluate", checkpoint, _root(folder), "hydra.run.dir=again")
     figures = [
         json.loads((tmp_path / folder / "results.json").read_text())
         for folder in ("again", "evaluated")

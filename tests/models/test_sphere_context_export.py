@@ -8,9 +8,8 @@ import pytest
 import torch
 
 from models import SphereContext
+from tangent_train.checkpoints.trained import Scores, load_trained
 from tangent_train.tasks.export import SUFFIXES, Format, export_network
-from tangent_train.tasks.networks import Scores
-from tangent_train.checkpoints.trained import load_trained
 from tests.models.sphere_networks import awake
 from tests.tasks.odd_networks import assert_same, scores_of, some_images
 from tests.tasks.small_networks import small_trained
@@ -38,7 +37,7 @@ CONTEXT: dict[str, Any] = {
 }
 
 
-@pytest.mark.parametrize("form", ["onnx", "safetensors", "torchscript"])
+@pytest.mark.parametrize("form", ["onnx", "safetensors"])
 def test_files_compute_the_same_in_any_size(form: Format, tmp_path: Path) -> None:
     trained = small_trained(CONTEXT)
     assert isinstance(trained.network, Scores)

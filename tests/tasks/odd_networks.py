@@ -46,13 +46,23 @@ class TwoSizes(nn.Conv2d):
 
 
 class Counting(nn.Conv2d):
-    """Another computation for two images: a trace knows only one of them."""
+    """Another computation for two images: no exporter leaves their number open."""
 
     def __init__(self) -> None:
         super().__init__(4, 5, 1)
 
     def forward(self, images: Tensor) -> Tensor:
         return super().forward(images) * (2 if images.shape[0] == 2 else 1)
+
+
+class Tracing(nn.Conv2d):
+    """Another computation while it is traced."""
+
+    def __init__(self) -> None:
+        super().__init__(4, 5, 1)
+
+    def forward(self, images: Tensor) -> Tensor:
+        return super().forward(images) * (2 if torch.compiler.is_compiling() else 1)
 
 
 class Looking(nn.Conv2d):

@@ -11,11 +11,11 @@ from omegaconf import OmegaConf
 from torch import nn
 
 from datamodules.samples import Input, Normalization
-from tangent_train.cli.compose import config_folder
-from tangent_train.cli.run import build
 from tangent_train.checkpoints.image_sizes import size_multiple_of
 from tangent_train.checkpoints.trained import Scores, TrainedNetwork, completed_settings
-from tangent_train.registry import make
+from tangent_train.cli.build import build
+from tangent_train.cli.compose import config_folder
+from tangent_train.registry import make, named_targets
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -64,6 +64,7 @@ def small_trained(
         size_multiple=multiple or 1,
         fixed_size=None if multiple else image_size,
         settings=settings,
+        trust=tuple(named_targets(settings)),
     )
 
 

@@ -11,12 +11,15 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from tangent_train.checkpoints.content import read_checkpoint
+from tangent_train.checkpoints.image_sizes import size_multiple_of
+from tangent_train.checkpoints.trained import Scores, completed_settings, load_trained
 from tangent_train.errors import DataError
-from tangent_train.tasks.networks import PRETRAINED, Scores, completed_settings, size_multiple_of
-from tangent_train.checkpoints.trained import load_trained, read_checkpoint
 from tests.tasks.small_networks import save_checkpoint, with_statistics
 
 SMALL_UNET = ["network=unet", "network.widths=[4,8,8]"]
+NO_TARGET = r"network\._target_="
+PRETRAINED = ("weights", "weights_backbone", "encoder_weights")
 
 
 @pytest.mark.parametrize(
@@ -71,9 +74,9 @@ def test_a_network_computes_what_its_task_does(
 
 def test_tensors_of_the_file_are_used_and_no_others_fetched(tmp_path: Path) -> None:
     path = tmp_path / "best.ckpt"
-    save_checkpoint(path, *SMALL_UNET, level="x")
+    save_checkpoint(path, *SMALL_UNET)
     content = torch.load(path, weights_only=True)
-    settings = content["resolved_config"]["network"]
+    settings = content["config"]["network"]
     settings["_target_"] = f"{__name__}.Remembering"
     settings |= dict.fromkeys(PRETRAINED, "published")
     del settings["widths"]
@@ -159,8 +162,8 @@ def test_a_network_of_one_size_is_said_to_be_one(tmp_path: Path) -> None:
         "representation.dim=[32,48]",
     )
     content = torch.load(path, weights_only=True)
-    content["resolved_config"]["network"] = {"_target_": f"{__name__}.OneSize"}
-    content["resolved_config"]["representation"]["dim"] = [24, 40]
+    content["config"]["network"] = {"_target_": f"{__name__}.OneSize"}
+    content["config"]["representation"]["dim"] = [24, 40]
     content["state_dict"] = {f"network.{n}": t for n, t in OneSize().state_dict().items()}
     torch.save(content, path)
     trained = load_trained(path, trust=[f"{__name__}.OneSize"])
@@ -183,7 +186,7 @@ def _edited(path: Path, edit: Any) -> Path:
 
 
 def _other_network(content: Any) -> None:
-    content["resolved_config"]["network"]["widths"] = [4, 8]
+    content["config"]["network"]["widths"] = [4, 8]
 
 
 def _no_tensors(content: Any) -> None:
@@ -191,27 +194,31 @@ def _no_tensors(content: Any) -> None:
 
 
 def _no_package(content: Any) -> None:
-    content["resolved_config"]["network"]["_target_"] = "no_such_package.nets.Net"
+    content["config"]["network"]["_target_"] = "no_such_package.nets.Net"
 
 
 def _no_class(content: Any) -> None:
-    content["resolved_config"]["network"]["_target_"] = "models.NoSuchNet"
+    content["config"]["network"]["_target_"] = "models.NoSuchNet"
 
 
 def _no_module(content: Any) -> None:
-    content["resolved_config"]["network"]["_target_"] = "models.missing.Net"
+    content["config"]["network"]["_target_"] = "models.missing.Net"
 
 
 def _wrong_setting(content: Any) -> None:
-    content["resolved_config"]["network"]["wide"] = 3
+    content["config"]["network"]["wide"] = 3
+
+
+def _wrong_value(content: Any) -> None:
+    content["config"]["network"]["widths"] = []
 
 
 def _wrong_level(content: Any) -> None:
-    content["resolved_config"]["representation"]["dim"] = 2
+    content["config"]["representation"]["dim"] = 2
 
 
 def _no_representation(content: Any) -> None:
-    del content["resolved_config"]["representation"]
+    del content["config"]["representation"]
 
 
 def _no_classes(content: Any) -> None:
@@ -225,11 +232,15 @@ def _no_classes(content: Any) -> None:
         (_no_tensors, r"other tensors than"),
         (
             _no_package,
-            r"a network of the package no_such_package, which is not installed; .*PYTHONPATH",
+            rf"{NO_TARGET}no_such_package\.nets\.Net, .*Install no_such_.*PYTHONPATH",
         ),
-        (_no_class, r"a network that cannot be made .*NoSuchNet.*settings of models\.NoSuchNet"),
-        (_no_module, r"a network that cannot be made .*models\.missing"),
-        (_wrong_setting, r"a network that cannot be made .*'wide'"),
+        (_no_class, rf"{NO_TARGET}models\.NoSuchNet, of which something cannot be imported"),
+        (_no_module, rf"{NO_TARGET}models\.missing\.Net, of which something cannot be imported"),
+        (_wrong_setting, r"network\.wide=3; expected settings of models\.UNet \(.*widths"),
+        (
+            _wrong_value,
+            r"a network that cannot be made .*widths.*; expected settings of models\.U",
+        ),
         (_wrong_level, r"a representation that cannot be made .*dim"),
         (_no_representation, r"no representation in its config"),
         (_no_classes, r"no class_names inside; expected a checkpoint written by tangent-train"),
@@ -246,7 +257,7 @@ def test_the_extra_of_a_missing_package_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def smp(content: Any) -> None:
-        content["resolved_config"]["network"] = {"_target_": "segmentation_models_pytorch.Unet"}
+        content["config"]["network"] = {"_target_": "segmentation_models_pytorch.Unet"}
 
     path = _edited(tmp_path / "best.ckpt", smp)
     monkeypatch.setitem(sys.modules, "segmentation_models_pytorch", None)
@@ -261,7 +272,7 @@ def test_the_extra_of_a_missing_package_is_named(
         (b"", "an unreadable file"),
         (b"not a checkpoint", "an unreadable file"),
         ({"state_dict": {}}, "no config inside"),
-        ([1, 2], "no config inside"),
+        ([1, 2], "list instead of a mapping inside"),
         ({"config": {}, "state_dict": {}, "extra": Path("x")}, "an unreadable file"),
     ],
 )

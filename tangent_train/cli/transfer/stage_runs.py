@@ -6,7 +6,6 @@ which stage it is, with which settings, and a digest of the checkpoint it starts
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
 import shlex
@@ -15,6 +14,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from filelock import FileLock, Timeout
 from omegaconf import OmegaConf
 
 from tangent_train.cli.processes import command_line, run_environment, run_process
@@ -142,23 +142,24 @@ def run_stage(stage: Stage, state: State) -> int:
 def _alone(stage: Stage) -> Iterator[None]:
     """Keep other commands off a stage while this one runs it."""
     stage.folder.mkdir(parents=True, exist_ok=True)
-    with (stage.folder / ".lock").open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise SettingError(
-                stage.folder,
-                found=f"another tangent-transfer that runs stage {stage.name}",
-                expected="none",
-                remedy="Wait for it; other seeds and folds can run beside it.",
-            ) from error
+    try:
+        lock = FileLock(stage.folder / ".lock").acquire(blocking=False)
+    except Timeout as error:
+        raise SettingError(
+            stage.folder,
+            found=f"another tangent-transfer that runs stage {stage.name}",
+            expected="none",
+            remedy="Wait for it; other seeds and folds can run beside it.",
+        ) from error
+    with lock:
         yield
 
 
 def said_as_a_command(stage: Stage, state: State) -> str:
     """What a user would type to run the stage alone."""
     if state == "begun":
-        return f"tangent-train {shlex.quote(f'resume={stage.folder}')}"
+        root = _resolved(stage)["data"]["root"]
+        return f"tangent-train {shlex.join([f'resume={stage.folder}', f'data.root={root}'])}"
     _, _, _, command, *arguments = _line(stage)
     return f"tangent-{command} {shlex.join(arguments)}"
 

@@ -135,7 +135,8 @@ class OutputFolder:
             whole = tuple(map(np.arange, found.labels.shape))
             rows, columns = whole if found.area is None else found.area.places()
             array = np.lib.format.open_memmap(temporary, "w+", np.float16, shape)
-            reserve(temporary)
+            with temporary.open("r+b") as file:
+                reserve(file, temporary.stat().st_size)
             for start in range(0, len(rows), _ROWS_AT_ONCE):
                 part = slice(start, start + _ROWS_AT_ONCE)
                 array[part] = mosaic.probabilities(rows[part])[:, columns]

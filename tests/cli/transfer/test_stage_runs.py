@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import fcntl
 import shlex
 import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 
 from tangent_train.cli.transfer import stage_runs
 from tangent_train.cli.transfer.stage_runs import run_stage, said_as_a_command, stage_state
@@ -136,8 +136,7 @@ def test_evaluations_do_not_depend_on_how_training_goes(stage: Stage, runs: Pret
 
 def test_two_commands_never_run_the_same_stage(stage: Stage, runs: PretendedRuns) -> None:
     stage.folder.mkdir(parents=True, exist_ok=True)
-    with (stage.folder / ".lock").open("w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
+    with FileLock(stage.folder / ".lock"):
         with pytest.raises(SettingError, match="another tangent-transfer that runs stage P"):
             run_stage(stage, "new")
         assert not runs.started

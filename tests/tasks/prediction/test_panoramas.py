@@ -12,11 +12,12 @@ import torch
 
 from datamodules import Stanford2D3DS
 from datamodules.samples import normalize, render_inputs
+from tangent_train.checkpoints.trained import Scores
 from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_directions, rotation_about
+from tangent_train.registry import make
 from tangent_train.rendering import rotate_equirect
 from tangent_train.rendering.representation import turns
-from tangent_train.tasks.networks import Scores, make
 from tangent_train.tasks.prediction.panoramas import PanoramaPredictor
 from tangent_train.tasks.prediction.predictor import InputImage, Prediction, Runner
 from tangent_train.tasks.prediction.seen import panorama_representation
@@ -63,7 +64,7 @@ def test_labels_are_those_of_an_evaluation(
     stanford_root: Path, representation: dict[str, Any], blend: str, channels: int
 ) -> None:
     trained = trained_network(representation, channels)
-    made = make(representation)
+    made = make(representation, "representation")
     data = Stanford2D3DS(
         root=str(stanford_root), representation=made, inputs=trained.inputs, fold=1
     )
@@ -84,7 +85,7 @@ def test_images_of_a_sphere_see_each_other_as_in_an_evaluation(at_once: int) -> 
     torch.manual_seed(0)
     network = small_context().eval()
     awake(network)
-    image, made = InputImage(_sphere(32)), make(TANGENT)
+    image, made = InputImage(_sphere(32)), make(TANGENT, "representation")
     trained = trained_network(TANGENT, network=Scores(network))
     labels = _predict(trained, image, at_once, blend="nearest").mosaic.labels()
     task = SegmentationTask(

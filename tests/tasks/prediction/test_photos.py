@@ -28,8 +28,8 @@ from tests.tasks.prediction.trained import (
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from tangent_train.rendering import Blend
     from tangent_train.checkpoints.trained import TrainedNetwork
+    from tangent_train.rendering import Blend
 
 
 def _blocks(height: int, width: int) -> NDArray[np.uint8]:

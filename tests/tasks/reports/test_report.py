@@ -276,11 +276,14 @@ def test_groups_of_unknown_data_lack_no_folds_and_have_names_of_their_own(tmp_pa
     assert [group.missing_folds for group in groups] == [()] * 4
 
 
-def test_evaluations_are_runs_too(tmp_path: Path) -> None:
+def test_settings_are_what_is_written_and_nothing_is_looked_up(tmp_path: Path) -> None:
     folder = _write(tmp_path / "a", [0.1, 0.2, 0.3])
-    (folder / ".hydra").mkdir()
-    (folder / "config.yaml").rename(folder / ".hydra" / "config.yaml")
-    assert load_run(folder).settings["optimizer.lr"] == 0.01
+    with (folder / "config.yaml").open("a") as file:
+        file.write("lr: ${optimizer.lr}\nhome: ${oc.env:HOME}\nmissing: ${b}\n")
+    settings = load_run(folder).settings
+    assert settings["optimizer.lr"] == 0.01
+    found = [settings[name] for name in ("lr", "home", "missing")]
+    assert found == ["${optimizer.lr}", "${oc.env:HOME}", "${b}"]
 
 
 def test_runs_are_found_once_and_unfinished_ones_named(three_folds: Path) -> None:
@@ -321,7 +324,7 @@ def test_figures_must_be_shares(value: object, tmp_path: Path) -> None:
         load_run(folder)
 
 
-@pytest.mark.parametrize("content", [None, "[1, 2]", "a: ${b}", "a: [", "5"])
+@pytest.mark.parametrize("content", [None, "[1, 2]", "a: &b 1\nc: *b", "a: [", "5"])
 def test_broken_settings_are_named(content: str | None, tmp_path: Path) -> None:
     folder = _write(tmp_path / "a", [0.1, 0.2, 0.3])
     path = folder / "config.yaml"
