@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import struct
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
@@ -26,6 +27,9 @@ MOST_PIXELS = "TANGENT_MOST_PIXELS"
 decoded, at most. A file of a few kilobytes can promise more than fit into memory."""
 
 _MOST = 32768 * 16384
+
+_CHANNELS = {2: 3, 4: 2, 6: 4}  # of PNG's types of colour; all others have one
+_MOST_DEFLATED = 1032  # bytes of one: deflate copies 258 with two bits
 
 # EXIF orientation: are rows and columns exchanged, and which of them run backwards afterwards?
 _ORIENTATIONS = {
@@ -88,6 +92,28 @@ def check_pixels(path: Path, height: int, width: int) -> None:
     most = _most_pixels()
     if height * width > most:
         raise _too_large(path, f"{height}×{width} pixels", most)
+    _check_deflated(path)
+
+
+def _check_deflated(path: Path) -> None:
+    """Refuse a PNG too short for its pixels: decoders take the memory for all of them first."""
+    try:
+        with path.open("rb") as file:
+            start = file.read(26)
+            size = file.seek(0, os.SEEK_END)
+    except OSError:
+        return  # said by who reads it
+    if not start.startswith(b"\x89PNG\r\n\x1a\n") or len(start) < 26:
+        return
+    width, height, bits, color = struct.unpack(">IIBB", start[16:26])
+    least = height * (width * bits * _CHANNELS.get(color, 1) // 8 + 1) / _MOST_DEFLATED
+    if size < least:
+        raise DataError(
+            path,
+            found=f"a header of {height}×{width} pixels, and {size} bytes",
+            expected=f"{least:.0f} bytes at least, with which a PNG can hold so many",
+            remedy="Copy or export the file again.",
+        )
 
 
 def _most_pixels() -> int:

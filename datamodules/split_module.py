@@ -9,6 +9,7 @@ import cv2
 import torch
 from lightning import LightningDataModule
 from lightning.pytorch.trainer.states import TrainerFn
+from lightning.pytorch.utilities import rank_zero_warn
 from torch.utils.data import DataLoader, Dataset
 
 from datamodules.data_check import find_usable
@@ -318,6 +319,13 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Source]):
     ) -> DataLoader[Any]:
         rank, world_size = _process()
         source = self.source(split)
+        left_out = len(source) % world_size
+        if shuffle and left_out:
+            rank_zero_warn(
+                f"{left_out} of {len(source)} training {self.noun}, others every time, are left "
+                f"out of each epoch: {world_size} processes take as many each.",
+                category=UserWarning,
+            )
         watched = WatchedSamples(dataset, source.name, self.num_workers)
         self._watched[split] = watched
         return WatchedLoader(

@@ -127,12 +127,10 @@ def _main(command: str) -> None:
 
 
 def _compose_and_run(command: str, typed: list[str]) -> None:
-    import hydra
-    from hydra._internal.utils import get_args_parser
     from hydra.core.hydra_config import HydraConfig
     from omegaconf import OmegaConf
 
-    from tangent_train.cli.compose import check_overrides, config_folder, quote_path
+    from tangent_train.cli.compose import check_overrides, quote_path
     from tangent_train.cli.keypoint_pairs.arguments import keypoint_arguments
     from tangent_train.cli.stored import CHOOSABLE, stored_run
 
@@ -173,6 +171,27 @@ def _compose_and_run(command: str, typed: list[str]) -> None:
             sys.exit(f"tangent-{command}: {error}")
         return result
 
+    try:
+        _run_hydra(job, config_name, arguments)
+    except (NotADirectoryError, PermissionError) as error:
+        unwritable = SettingError(
+            error.filename or "output",
+            found=(error.strerror or str(error)).lower(),
+            expected="a file or folder that can be read and written",
+            remedy="Change its permissions, or choose another one (of a run: hydra.run.dir=…).",
+        )
+        sys.exit(f"tangent-{command}: {unwritable}")
+
+
+def _run_hydra(
+    job: Callable[[DictConfig], float | None], config_name: str, arguments: list[str]
+) -> None:
+    import hydra
+    from hydra._internal.utils import get_args_parser
+    from hydra.errors import CompactHydraException
+
+    from tangent_train.cli.compose import config_folder
+
     # Lightning prints its own messages: Hydra's handlers would print them again. A sweep has only
     # Hydra's. argparse wants all overrides in one place.
     quiet = ["hydra/job_logging=none"]
@@ -181,7 +200,12 @@ def _compose_and_run(command: str, typed: list[str]) -> None:
     places = (i for i, a in enumerate(arguments) if a[:1] == "~" or ("=" in a and a[0] != "-"))
     place = next(places, len(arguments))
     sys.argv[1:] = [*arguments[:place], *quiet, *arguments[place:]]
-    hydra.main(version_base="1.3", config_path=str(config_folder()), config_name=config_name)(job)()
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # raises what it would print
+    run = hydra.main(version_base="1.3", config_path=str(config_folder()), config_name=config_name)
+    try:
+        run(job)()
+    except CompactHydraException as error:  # of Hydra itself, which says what is wrong
+        sys.exit(str(error))
 
 
 if __name__ == "__main__":

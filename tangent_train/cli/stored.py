@@ -139,9 +139,9 @@ class StoredRun:
             if place == "data.root" and value != theirs:
                 raise SettingError(
                     place,
-                    found="none: files do not say where data lie on this machine",
-                    expected="the folder of the data set",
-                    remedy=f"The run had data.root={theirs!r}: add that if it is right.",
+                    found="no folder, as checkpoints do not say where data lie",
+                    expected="that of the data set on this machine",
+                    remedy=f"The run had data.root={theirs!r}: add that if it is right here.",
                 )
             if value is not None:
                 settings[section][name] = value

@@ -132,9 +132,29 @@ def test_more_can_be_allowed_than_is_by_default(
 ) -> None:
     path = _png(tmp_path / "a.png", 32770, 16384, 1)
     monkeypatch.setenv(MOST_PIXELS, str(2**30))
+    with path.open("ab") as file:
+        file.write(bytes(100_000))
     # Past the limit, and then found to be broken.
     with pytest.raises(DataError, match=r"a\.png: found (a broken PNG|no image that can be)"):
         read_rgb(path)
+
+
+@pytest.mark.usefixtures("no_decoder")
+@pytest.mark.parametrize("read", [read_color_png, read_depth_png, _pixels, _depth, read_rgb])
+def test_a_png_is_not_decoded_that_is_too_short_for_its_pixels(read: Read, tmp_path: Path) -> None:
+    """Decoders take the memory for what the header says, here a gigabyte, before they look."""
+    path = _png(tmp_path / "a.png", 30000, 15000)
+    with pytest.raises(DataError, match=r"header of 15000×30000 pixels, and \d+ bytes; expected 8"):
+        read(path)
+
+
+def test_the_shortest_png_is_read(tmp_path: Path) -> None:
+    """Of one colour, one bit a pixel: no image is packed closer."""
+    path = tmp_path / "a.png"
+    Image.new("1", (16384, 8192)).save(path, optimize=True)
+    assert read_rgb(path).shape == (8192, 16384, 3)
+    Image.new("RGB", (4096, 2048)).save(path, optimize=True)
+    assert read_color_png(path).shape == (2048, 4096, 3)
 
 
 def test_only_png_files_reach_the_decoder_of_png_files(
