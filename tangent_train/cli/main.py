@@ -189,6 +189,7 @@ def _run_hydra(
     import hydra
     from hydra._internal.utils import get_args_parser
     from hydra.errors import CompactHydraException
+    from omegaconf.errors import OmegaConfBaseException
 
     from tangent_train.cli.compose import config_folder
 
@@ -204,7 +205,7 @@ def _run_hydra(
     run = hydra.main(version_base="1.3", config_path=str(config_folder()), config_name=config_name)
     try:
         run(job)()
-    except CompactHydraException as error:  # of Hydra itself, which says what is wrong
+    except (CompactHydraException, OmegaConfBaseException) as error:  # which say what is wrong
         sys.exit(str(error))
 
 

@@ -94,11 +94,11 @@ def test_the_checkpoint_holds_classes_and_normalization(run_folder: Path) -> Non
 
 
 def test_the_checkpoint_is_evaluated_again_and_on_other_files(
-    run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    root: Path, run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     checkpoint = f"checkpoint={run_folder / 'checkpoints' / 'best.ckpt'}"
-    _run(monkeypatch, "evaluate", checkpoint, "hydra.run.dir=again")
+    _run(monkeypatch, "evaluate", checkpoint, f"data.root='{root}'", "hydra.run.dir=again")
     assert _results(tmp_path / "again") == _results(run_folder)
     # Another folder of the same classes, with all panoramas for test but one of each other split.
     own = write_data_set(tmp_path / "more", scenes=4, each=1, height=_ROWS, depth=True)

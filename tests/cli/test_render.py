@@ -37,7 +37,8 @@ def _render(**settings: Any) -> None:
     }
     unknown = texts.keys() - set(config)
     assert not unknown
-    render(OmegaConf.merge(config, texts))  # type: ignore[arg-type]
+    plain: Any = OmegaConf.to_container(OmegaConf.merge(config, texts), resolve=True)
+    render(plain)
 
 
 def _smooth(height: int = HEIGHT) -> NDArray[np.uint8]:

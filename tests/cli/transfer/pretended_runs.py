@@ -12,6 +12,7 @@ import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
+from tangent_train.checkpoints.content import write_settings
 from tangent_train.cli import main
 from tangent_train.tasks.metrics import ConfusionMatrices
 from tangent_train.tasks.results import evaluation_results, write_results
@@ -64,9 +65,8 @@ class PretendedRuns:
         config: Any = OmegaConf.load(folder / "stage.yaml")
         self.started.append((command, folder.name))
         self.configs.append(config)
-        settings = folder / ("config.yaml" if command == "train" else ".hydra/config.yaml")
-        settings.parent.mkdir(exist_ok=True)
-        OmegaConf.save(config, settings, resolve=True)
+        settings: Any = OmegaConf.to_container(config, resolve=True)
+        write_settings(folder / "config.yaml", settings)
         if command == "train":
             (folder / "checkpoints").mkdir(exist_ok=True)
             (folder / "checkpoints" / "last.ckpt").write_text(f"{config.name} {config.seed}")

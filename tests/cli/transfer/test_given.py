@@ -10,6 +10,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
+from datamodules import SynthRooms
 from tangent_train.cli.compose import config_folder
 from tangent_train.cli.transfer.given import check_given
 from tangent_train.errors import SettingError
@@ -32,10 +33,18 @@ def _checkpoint(path: Path, **changes: Any) -> Path:
             "fold": 1,
         },
     }
+    content: dict[str, Any] = {
+        "kind": "segmentation",
+        "class_names": list(SynthRooms.class_names),
+        "inputs": config["data"]["inputs"],
+        "normalization": {"mean": [0.0] * 4, "std": [1.0] * 4},
+        "state_dict": {},
+        "config": config,
+    }
     for name, value in changes.items():
         section, _, setting = name.partition("__")
-        config[section][setting] = value
-    torch.save({"config": config, "state_dict": {}}, path)
+        (config[section] if setting else content)[setting or section] = value
+    torch.save(content, path)
     return path
 
 
@@ -60,7 +69,13 @@ def test_a_given_network_is_not_trained(
         ({"data__inputs": ["rgb"]}, [1], r"data\.inputs=\['rgb'\]; expected \['rgb', 'depth'\]"),
         ({"data__fold": 2}, [1], r"testing on fold 2.*; expected folds=\[2\]"),
         ({}, [1, 2], r"testing on fold 1.*; expected folds=\[1\]"),
-        ({"data___target_": "datamodules.OmniSynthia"}, [1], "a network for the classes of"),
+        (
+            {"class_names": ["unknown", "sky", "road"]},
+            [1],
+            "a network for unknown, sky, road; expected one for unknown, beam, .*, the classes of "
+            r"datamodules\.SynthRooms",
+        ),
+        ({"kind": "classification"}, [1], "a network for classification; .* for segmentation"),
     ],
 )
 def test_a_network_that_does_not_fit_is_refused(

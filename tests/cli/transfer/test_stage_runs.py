@@ -74,6 +74,7 @@ def stage(tmp_path: Path) -> Stage:
     config = {
         "name": "a",
         "seed": 0,
+        "data": {"root": "my rooms"},
         "trainer": {"max_epochs": 2, "devices": 1},
         "representation": {},
     }
@@ -95,7 +96,8 @@ def test_any_folder_can_be_named(stage: Stage, runs: PretendedRuns) -> None:
     assert stage_state(stage) == "finished"
     words = shlex.split(said_as_a_command(stage, "new"))
     assert words[:3] == ["tangent-train", f"--config-dir={stage.folder}", "--config-name=stage"]
-    assert shlex.split(said_as_a_command(stage, "begun"))[1] == f"resume={stage.folder}"
+    again = shlex.split(said_as_a_command(stage, "begun"))
+    assert again == ["tangent-train", f"resume={stage.folder}", "data.root=my rooms"]
 
 
 def test_an_interrupted_start_is_none(stage: Stage) -> None:
@@ -106,12 +108,18 @@ def test_an_interrupted_start_is_none(stage: Stage) -> None:
     assert stage_state(stage) == "new"
 
 
-@pytest.mark.parametrize("text", ["a: [", "- 1", "x: ${nowhere}"])
+@pytest.mark.parametrize("text", ["a: [", "[1]", '{"stage": "P", "weights": null, "settings": 1}'])
 def test_a_broken_file_is_named(text: str, stage: Stage, runs: PretendedRuns) -> None:
     run_stage(stage, "new")
-    (stage.folder / "stage.yaml").write_text(text)
-    with pytest.raises(DataError, match=r"stage\.yaml: found .*delete the folder"):
+    (stage.folder / "stage.json").write_text(text)
+    with pytest.raises(DataError, match=r"stage\.json: found .*delete the folder"):
         stage_state(stage)
+
+
+def test_its_config_is_written_and_never_read(stage: Stage, runs: PretendedRuns) -> None:
+    run_stage(stage, "new")
+    (stage.folder / "stage.yaml").write_text("a: [")
+    assert stage_state(stage) == "finished"
 
 
 def test_a_killed_process_has_the_status_of_a_shell(
