@@ -37,7 +37,7 @@ from datamodules.panoramas import (
 from datamodules.samples import Input, Normalization
 from datamodules.sources import count_labels, in_threads
 from tangent_train.errors import SettingError
-from tangent_train.registry import Local, registered
+from tangent_train.registry import registered
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -151,13 +151,7 @@ class FolderSource:
         return self._classes.decode(resize_nearest(codes, self._shape))
 
 
-@registered(
-    root=Local,
-    test_fraction=float,
-    validation_fraction=float,
-    split_seed=int,
-    depth_units_per_m=float,
-)
+@registered
 class FolderPanoramas(PanoramaDataModule):
     """One's own panoramas, with the classes of ``classes.json``.
 

@@ -28,7 +28,7 @@ from datamodules.sphere_files import mesh_problem
 from datamodules.sphere_store import Shapes, SphereFolder
 from datamodules.split_module import Kind, Split, SplitDataModule
 from tangent_train.errors import DataError, SettingError
-from tangent_train.registry import Local, registered
+from tangent_train.registry import registered
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -42,14 +42,7 @@ __all__ = ["ModelNet40"]
 _PER_PROCESS = 100
 
 
-@registered(
-    root=Local,
-    store=Local,
-    shapes_per_step=int,
-    validation_fraction=float,
-    test_rotation=TestRotation,
-    normalization=dict[str, list[float]] | None,
-)
+@registered
 class ModelNet40(SplitDataModule[Shapes]):
     """Shapes as spheres, to be classified.
 

@@ -15,6 +15,7 @@ from datamodules.panorama_module import PanoramaDataModule, Split
 from datamodules.panoramas import Panorama, resize_area, resize_depth, resize_nearest
 from datamodules.png import check_panorama_size, read_color_png
 from datamodules.problems import Problems
+from datamodules.samples import Input, Normalization
 from datamodules.sources import count_labels
 from datamodules.synthia_files import (
     GET_IT,
@@ -36,7 +37,7 @@ from datamodules.synthia_pixels import (
 )
 from datamodules.synthia_splits import FRAMES, TEST, TRAIN, SequenceSplits
 from tangent_train.errors import DataError
-from tangent_train.registry import Local, registered
+from tangent_train.registry import registered
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -44,7 +45,6 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from datamodules.samples import Input, Normalization
     from tangent_train.rendering.representation import Representation
 
 __all__ = ["OmniSynthia", "SynthiaPanoramas"]
@@ -133,14 +133,7 @@ class SynthiaPanoramas:
         return resize_nearest(decode_labels(read_first_channel(path), path), self._shape)
 
 
-@registered(
-    root=Local,
-    train_sequences=list[str],
-    test_sequences=list[str],
-    validation_fraction=float,
-    frames=int,
-    panorama_height=int,
-)
+@registered
 class OmniSynthia(PanoramaDataModule):
     """OmniSYNTHIA, 13 classes, with the training and test sequences of its authors.
 

@@ -14,7 +14,6 @@ from datamodules.sources import read_strictly
 from datamodules.store import PreparedPanoramas, prepare_store
 from datamodules.turned_panoramas import PosedPanoramas, TurnedPanoramas, UprightPanoramas
 from tangent_train.errors import DataError, SettingError
-from tangent_train.registry import Local, registered
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -30,13 +29,6 @@ Upright = Literal["pose", "auto"] | None
 """Where it is known from which way is up in a panorama."""
 
 
-@registered(
-    panoramas_per_step=int,
-    store=Local,
-    test_rotation=float | Literal["so3"] | None,
-    upright=Upright,
-    max_tilt_deg=float,
-)
 class PanoramaDataModule(SegmentationDataModule[Panorama]):
     """Panoramas of one data set.
 

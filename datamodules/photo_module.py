@@ -10,7 +10,6 @@ from datamodules.photos import Photo
 from datamodules.segmentation_module import SegmentationDataModule, Split
 from tangent_train.errors import DataError, SettingError
 from tangent_train.geometry import shift_range
-from tangent_train.registry import registered
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -22,7 +21,6 @@ if TYPE_CHECKING:
 __all__ = ["PhotoDataModule", "Split"]
 
 
-@registered(photos_per_step=int)
 class PhotoDataModule(SegmentationDataModule[Photo]):
     """Photos of one data set.
 

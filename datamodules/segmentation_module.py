@@ -31,7 +31,6 @@ from datamodules.sources import (
 )
 from datamodules.split_module import SPLITS, Kind, Split, SplitDataModule
 from tangent_train.errors import SettingError
-from tangent_train.registry import registered
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -43,7 +42,6 @@ __all__ = ["SPLITS", "SegmentationDataModule", "Split"]
 _Image = TypeVar("_Image", bound=LabelledImage)
 
 
-@registered(inputs=list[Input], color_jitter=float, normalization=dict[str, list[float]] | None)
 class SegmentationDataModule(SplitDataModule[ImageSource[_Image]], Generic[_Image]):
     """Labelled images of one data set, split for training, validation and test.
 

@@ -18,7 +18,6 @@ from datamodules.samples import Normalization
 from datamodules.sampling import EpochSampler
 from datamodules.watched_samples import WatchedLoader, WatchedSamples, explained
 from tangent_train.errors import SettingError
-from tangent_train.registry import registered
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -54,7 +53,6 @@ class Source(Protocol):
 _Source = TypeVar("_Source", bound=Source)
 
 
-@registered(num_workers=int, seed=int, stream=int, in_memory=bool, skip_broken=bool)
 class SplitDataModule(LightningDataModule, ABC, Generic[_Source]):
     """A data set split for training, validation and test.
 

@@ -46,7 +46,7 @@ from datamodules.stanford_files import (
 from datamodules.stanford_poses import read_panorama_pose
 from datamodules.stanford_splits import StanfordSplits
 from tangent_train.errors import SettingError
-from tangent_train.registry import Local, registered
+from tangent_train.registry import registered
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -175,9 +175,7 @@ class StanfordPanoramas:
         return resize_depth(steps, self._shape)
 
 
-@registered(
-    root=Local, label_table=Local, fold=int, areas=list[str], mask=Mask, validation_fraction=float
-)
+@registered
 class Stanford2D3DS(PanoramaDataModule):
     """Stanford2D3DS, 13 classes, in the three folds of its authors.
 

@@ -31,7 +31,7 @@ from datamodules.stanford_files import (
 from datamodules.stanford_splits import StanfordSplits
 from tangent_train.errors import DataError
 from tangent_train.json_text import parse_json
-from tangent_train.registry import Local, registered
+from tangent_train.registry import registered
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -135,7 +135,7 @@ class StanfordPhotos:
         return count_labels(self._table.decode(read_color_png(self._files[index].semantic)))
 
 
-@registered(root=Local, label_table=Local, fold=int, areas=list[str], validation_fraction=float)
+@registered
 class Stanford2D3DSPerspective(PhotoDataModule):
     """The photos of Stanford2D3DS, 13 classes, in the three folds of its authors.
 

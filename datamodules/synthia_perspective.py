@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from datamodules.photo_module import PhotoDataModule, Split
 from datamodules.photos import Photo, distance_from_z_depth
 from datamodules.png import read_color_png
+from datamodules.samples import Input, Normalization
 from datamodules.sources import count_labels, in_threads
 from datamodules.synthia_files import (
     GET_IT,
@@ -35,7 +36,7 @@ from datamodules.synthia_pixels import (
 )
 from datamodules.synthia_splits import FRAMES, TEST, TRAIN, SequenceSplits, choose_frames
 from tangent_train.errors import DataError
-from tangent_train.registry import Local, registered
+from tangent_train.registry import registered
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -43,7 +44,6 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from datamodules.samples import Input, Normalization
     from tangent_train.rendering.perspective import PerspectiveRepresentation
 
 __all__ = ["SynthiaPerspective", "SynthiaPhotos"]
@@ -110,13 +110,7 @@ def _read_labels(path: Path) -> NDArray[np.uint8]:
     return decode_labels(read_view_labels(path), path)
 
 
-@registered(
-    root=Local,
-    train_sequences=list[str],
-    test_sequences=list[str],
-    validation_fraction=float,
-    frames=int,
-)
+@registered
 class SynthiaPerspective(PhotoDataModule):
     """SYNTHIA's views, 13 classes, of the frames and in the splits of OmniSYNTHIA.
 

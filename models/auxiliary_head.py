@@ -10,14 +10,12 @@ from torch import Tensor, nn
 
 from models.stages import stage_channels
 from tangent_train.errors import SettingError
-from tangent_train.registry import Object, registered
+from tangent_train.registry import registered
 
 __all__ = ["AuxiliaryHead"]
 
 
-@registered(
-    network=Object, stage=str, in_channels=int | None, num_classes=int | None, channels=int | None
-)
+@registered
 class AuxiliaryHead(nn.Module):
     """Scores at an encoder stage beside those of the network, in training only.
 

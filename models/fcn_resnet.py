@@ -19,7 +19,7 @@ from torchvision.models.segmentation import (
 from models.pretrained import fetch_tensors, load_tensors, read_tensors
 from models.stem import widen_stem, with_channels
 from tangent_train.errors import SettingError
-from tangent_train.registry import Weights, registered
+from tangent_train.registry import registered
 
 __all__ = ["FCNResNet"]
 
@@ -71,7 +71,7 @@ def _freeze_statistics(network: nn.Module) -> None:
                 child.p = 0.0
 
 
-@registered(in_channels=int, num_classes=int, depth=int, weights=Weights, frozen_statistics=bool)
+@registered
 class FCNResNet(nn.Module):
     """torchvision's FCN on a dilated ResNet, without its auxiliary classifier.
 

@@ -41,7 +41,7 @@ def _decoder(in_channels: int, neck: int, out_channels: int) -> nn.Sequential:
     )
 
 
-@registered(in_channels=int, num_classes=int)
+@registered
 class HexUNet(nn.Module):
     """UNet of the OmniSYNTHIA experiments (paper, table "transfer"; after Zhang et al. 2019).
 

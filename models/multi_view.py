@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from models.stem import widen_stem
 from models.views import each_view
 from tangent_train.errors import SettingError
-from tangent_train.registry import Object, registered
+from tangent_train.registry import registered
 
 __all__ = ["MultiView"]
 
@@ -16,7 +16,7 @@ _DIMENSIONS = 3
 """Of scores: shapes, views, classes."""
 
 
-@registered(network=Object, in_channels=int, num_classes=int)
+@registered
 class MultiView(nn.Module):
     """Shows a classifier every view of a shape by itself and averages the scores.
 

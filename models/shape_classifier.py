@@ -20,7 +20,7 @@ _HALVINGS = 3
 """After the first convolution, which halves too."""
 
 
-@registered(in_channels=int, num_classes=int, width=int, dropout=float)
+@registered
 class ShapeClassifier(nn.Module):
     """Classifies a shape by all of its tangent images (paper, supplement, "Shape classification").
 

@@ -23,7 +23,7 @@ _ALIGNMENT = 8
 """Sizes of heads that fast kernels take are multiples of it."""
 
 
-@registered(channels=int, heads=int, width=int | None, elevation=bool)
+@registered
 class SphereAttention(nn.Module):
     """Lets all images of a sphere see each other: multi-head attention between their tokens.
 

@@ -15,7 +15,7 @@ from models.chunks import KeptStatistics, joined, recomputed, same_draws, seeds
 from models.sphere_tokens import add_tokens, lone_rays, to_tokens, token_directions
 from models.stages import stage_channels
 from tangent_train.errors import SettingError
-from tangent_train.registry import Object, registered
+from tangent_train.registry import registered
 
 __all__ = ["SphereContext"]
 
@@ -34,15 +34,7 @@ class _ReachedError(Exception):
         self.tokens = tokens
 
 
-@registered(
-    network=Object,
-    stage=str,
-    mixer=Object,
-    in_channels=int | None,
-    channels=int | None,
-    tokens=int,
-    fov_deg=float,
-)
+@registered
 class SphereContext(nn.Module):
     """A network for single images whose images of one sphere see each other.
 

@@ -23,7 +23,7 @@ _NO_NEIGHBORS = 1e-9
 """Keeps the mean over no pairs of neighbours at 0."""
 
 
-@registered(channels=int, width=int, rows=int, dilations=list[int], spread=float)
+@registered
 class SphereRendering(nn.Module):
     """Lets the images of a sphere see each other through one coarse panorama of features.
 

@@ -8,14 +8,14 @@ import torch
 from torch import Tensor, nn
 
 from tangent_train.errors import SettingError
-from tangent_train.registry import Object, registered
+from tangent_train.registry import registered
 
 __all__ = ["of_channels", "widen_stem", "with_channels"]
 
 _RGB = 3
 
 
-@registered(network=Object, in_channels=int)
+@registered
 def widen_stem(network: nn.Module, in_channels: int) -> nn.Module:
     """Let a network for RGB images take further channels, depth for example.
 

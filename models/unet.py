@@ -30,7 +30,7 @@ class _Up(nn.Module):
         return merged
 
 
-@registered(in_channels=int, num_classes=int, widths=list[int])
+@registered
 class UNet(nn.Module):
     """Residual UNet (paper, supplement, "Network training details"; after Jiang et al. 2019).
 

@@ -2,31 +2,31 @@
 
 A section of a config says by ``_target_`` what is made of it. In a config folder or on the command
 line its owner wrote that, and any class or function may be named. Settings inside a file may be
-anybody's. They are plain data: `accept` compares them with what classes say a file may set
-(`registered`, at the class itself), and nothing in them is ever interpreted: no interpolations,
-no positional arguments, no paths and no addresses. `make` is the only code that turns settings into
-objects; for settings from files it finds registered objects and what the user trusts, by name.
+anybody's. They are plain data: `accept` compares them with the registered classes that they name
+and with the types of those classes' own arguments, and nothing in them is ever interpreted: no
+interpolations, no positional arguments, no paths and no addresses. `make` is the only code that
+turns settings into objects.
 
 This module imports nothing heavy: networks and data sets import it.
 """
 
 from __future__ import annotations
 
+import builtins
 import inspect
 import re
 import traceback
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from importlib import import_module
 from pathlib import Path
 from pkgutil import resolve_name
 from types import NoneType, UnionType
-from typing import Any, Literal, NamedTuple, TypeVar, get_args, get_origin
+from typing import Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from tangent_train.errors import DataError, SettingError
 
 __all__ = [
-    "SIMPLE",
     "Accepted",
     "Local",
     "Object",
@@ -41,59 +41,47 @@ __all__ = [
     "registered",
 ]
 
-
-class Local:
-    """A setting that only concerns a machine, never taken from a file: paths, compilers."""
-
-
-class Object:
-    """Another registered object."""
-
-
-class Text:
-    """Any text: what is only ever shown, as names of classes."""
-
-
-class Weights:
-    """Names trained weights: null in a file, whose own tensors are used."""
-
-
-SIMPLE: Any = int | float | bool | str | None | list[int | float | bool | str | None]
-"""A number, a word, or a list of these."""
-
-_HOMES = (
-    "datamodules",
-    "models",
-    "tangent_train.rendering",
-    "tangent_train.tasks",
-)
+_HOMES = ("datamodules", "models", "tangent_train.rendering", "tangent_train.tasks")
 """Packages whose public names files may give, where they are registered."""
 
 _WORD = re.compile(r"[A-Za-z0-9][\w.+ -]{0,99}", re.ASCII)
 """A text in settings: no path, no address, no name of Hydra's, nothing to interpret."""
 
 _DEEPEST = 12
+_PLAIN = (bool, int, float, str, NoneType, dict)
 _EXTRAS = {"segmentation_models_pytorch": "networks", "timm": "networks"}
 """Packages that an extra of this one installs."""
 
-_settings: dict[Any, Mapping[str, Any]] = {}
+
+class Local:
+    """A kind of setting: of this machine, never taken from a file, as paths and compilers are."""
+
+
+class Object:
+    """A kind of setting: another registered object."""
+
+
+class Text:
+    """A kind of setting: any text that is only ever shown, as names of classes."""
+
+
+class Weights:
+    """A kind of setting: names trained weights. Null in a file, whose own tensors are used."""
+
+
+_registered: set[Any] = set()
 _Registered = TypeVar("_Registered", bound=Callable[..., Any])
 
 
-def registered(**kinds: Any) -> Callable[[_Registered], _Registered]:
-    """Let settings in files name a class or function, with these settings and no others.
+def registered(made: _Registered) -> _Registered:
+    """Let settings in files name a class or function.
 
-    Args:
-        **kinds: By the name of a setting what it may be: ``int``, ``float``, ``bool``, ``str`` (a
-            word), ``None``, `Literal`, ``list[…]``, ``dict[str, …]``, a union of these, or one of
-            the kinds of this module. A subclass takes the settings of its bases as well.
+    They may give its arguments by name, as the annotations say: numbers, words (`Literal` or
+    ``str``), sequences and mappings of these, other registered objects. An argument that may be a
+    `Path` or `Any` is not taken from files.
     """
-
-    def register(made: _Registered) -> _Registered:
-        _settings[made] = kinds
-        return made
-
-    return register
+    _registered.add(made)
+    return made
 
 
 class Accepted(NamedTuple):
@@ -130,6 +118,62 @@ def accept(
     plain = {name: check_plain(path, section, name) for name, section in sections.items()}
     settings = {name: check.object(section, name) for name, section in plain.items()}
     return Accepted(settings, check.local)
+
+
+class _Check:
+    """The settings of one file."""
+
+    def __init__(self, path: Path, trust: Collection[str], own: Collection[str]) -> None:
+        self.local: dict[str, Any] = {}
+        self._path = path
+        self._trust = trust
+        self._own = own
+
+    def object(self, settings: Any, place: str) -> dict[str, Any]:
+        if not isinstance(settings, Mapping) or "_target_" not in settings:
+            raise self._refused(place, settings, "a section with a _target_")
+        target = settings["_target_"]
+        trust = (*self._trust, target) if self._is_own(f"{place}._target_") else self._trust
+        _, kinds = _find(target, trust, self._path)
+        if kinds is None:
+            raise DataError(
+                self._path,
+                found=f"{place}._target_={target}, which would be called",
+                expected="networks, data and tasks that are registered here",
+                remedy=f"If you know it, and trust who made the file: trust={target}",
+            )
+        made: dict[str, Any] = {n: None for n, kind in kinds.items() if kind is Weights}
+        made["_target_"] = target
+        for name, value in settings.items():
+            here = f"{place}.{name}"
+            kind = bool if name == "_partial_" else kinds.get(name, kinds.get("**"))
+            if self._is_own(here):
+                made[name] = value
+            elif kind is None and name != "_target_":
+                raise self._refused(here, value, f"a setting of {target} ({', '.join(kinds)})")
+            elif kind is Local:
+                self.local[here] = value
+            elif name not in made:
+                made[name] = self._value(value, kind, here)
+        return made
+
+    def _value(self, value: Any, kind: Any, place: str) -> Any:
+        if kind is Any and isinstance(value, Mapping) and "_target_" not in value:
+            return {name: self._value(v, Any, f"{place}.{name}") for name, v in value.items()}
+        if kind is Any and isinstance(value, list):
+            return [self._value(v, Any, f"{place}.{k}") for k, v in enumerate(value)]
+        if isinstance(value, Mapping) and kind in (Any, Object):
+            return self.object(value, place)
+        if kind is not Any and not _fits(value, NoneType if kind is Object else kind):
+            raise self._refused(place, value, f"{inspect.formatannotation(kind)} in a file")
+        return value
+
+    def _is_own(self, place: str) -> bool:
+        return any(place == own or place.startswith(f"{own}.") for own in self._own)
+
+    def _refused(self, place: str, value: Any, expected: str) -> DataError:
+        remedy = f"On the command line {place}=… may be anything."
+        return DataError(self._path, found=f"{place}={value!r}", expected=expected, remedy=remedy)
 
 
 def check_fields(
@@ -177,25 +221,17 @@ def check_plain(path: Path, value: Any, place: str, depth: int = 0) -> Any:
     expected = f"plain values, at most {_DEEPEST} inside each other"
     if depth > _DEEPEST:
         raise DataError(path, found=f"more of them in {place[:80]}…", expected=expected)
-    if isinstance(value, Mapping):
-        inside = {
-            name: check_plain(path, inner, f"{place}.{name}", depth + 1)
-            for name, inner in value.items()
-        }
-        if all(type(name) is str for name in inside):
-            return inside
-    elif isinstance(value, list | tuple):
+    if isinstance(value, Mapping) and all(type(name) is str for name in value):
+        return {n: check_plain(path, v, f"{place}.{n}", depth + 1) for n, v in value.items()}
+    if isinstance(value, list | tuple):
         return [check_plain(path, v, f"{place}.{k}", depth + 1) for k, v in enumerate(value)]
-    elif value is None or type(value) in (bool, int, float, str):
+    if value is None or type(value) in (bool, int, float, str):
         return value
     raise DataError(path, found=f"{place}={value!r}", expected=expected)
 
 
 def make(
-    settings: Mapping[str, Any],
-    place: str,
-    trust: Collection[str] | None = None,
-    **given: Any,
+    settings: Mapping[str, Any], place: str, trust: Collection[str] | None = None, **given: Any
 ) -> Any:
     """What a section of a config describes.
 
@@ -212,11 +248,8 @@ def make(
         DataError: What is made says that a file cannot be used.
     """
     maker = maker_of(settings, place, trust)
-    arguments = {
-        name: _made(value, f"{place}.{name}", trust)
-        for name, value in settings.items()
-        if name not in ("_target_", "_partial_")
-    } | given
+    own = {name: value for name, value in settings.items() if name not in ("_target_", "_partial_")}
+    arguments = {n: _made(v, f"{place}.{n}", trust) for n, v in own.items()} | given
     if settings.get("_partial_"):
         return partial(maker, **arguments)
     try:
@@ -235,7 +268,7 @@ def make(
 def maker_of(settings: Mapping[str, Any], place: str, trust: Collection[str] | None = None) -> Any:
     """The class or function that a section names; see `make`."""
     target = settings.get("_target_")
-    found = _imported(target, place) if trust is None else _find(target, trust)[0]
+    found = _imported(target, place) if trust is None else _find(target, trust, place)[0]
     if found is None:
         raise SettingError(f"{place}._target_", found=target, expected="a registered name")
     return found
@@ -243,18 +276,10 @@ def maker_of(settings: Mapping[str, Any], place: str, trust: Collection[str] | N
 
 def named_targets(settings: Any) -> set[str]:
     """All that settings name as ``_target_``."""
-    return {str(value) for place, value in _leaves(settings, ()) if place[-1:] == ("_target_",)}
-
-
-def _leaves(value: Any, place: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], Any]]:
-    if isinstance(value, Mapping):
-        for name, inner in value.items():
-            yield from _leaves(inner, (*place, str(name)))
-    elif isinstance(value, list | tuple):
-        for inner in value:
-            yield from _leaves(inner, place)
-    else:
-        yield place, value
+    inner = settings.values() if isinstance(settings, Mapping) else settings
+    listed = isinstance(settings, Mapping | list)
+    named = {str(settings["_target_"])} if listed and "_target_" in settings else set()
+    return named.union(*map(named_targets, inner)) if listed else named
 
 
 def _made(value: Any, place: str, trust: Collection[str] | None) -> Any:
@@ -262,124 +287,99 @@ def _made(value: Any, place: str, trust: Collection[str] | None) -> Any:
         if "_target_" in value:
             return make(value, place, trust)
         return {name: _made(inner, f"{place}.{name}", trust) for name, inner in value.items()}
-    if isinstance(value, list | tuple):
+    if isinstance(value, list):
         return [_made(inner, f"{place}.{k}", trust) for k, inner in enumerate(value)]
     return value
 
 
-class _Check:
-    """The settings of one file."""
-
-    def __init__(self, path: Path, trust: Collection[str], own: Collection[str]) -> None:
-        self.path = path
-        self.trust = trust
-        self.own = own
-        self.local: dict[str, Any] = {}
-
-    def object(self, settings: Any, place: str) -> dict[str, Any]:
-        if not isinstance(settings, Mapping):
-            raise self._refused(place, repr(settings), "a section with a _target_")
-        target = settings.get("_target_")
-        kinds = self._kinds(f"{place}._target_", target)
-        checked: dict[str, Any] = {"_target_": target}
-        for name, value in settings.items():
-            here = f"{place}.{name}"
-            if name == "_target_":
-                continue
-            if self._is_own(here):
-                checked[name] = value
-            elif kinds is None:
-                checked[name] = self._objects(value, here)
-            elif name == "_partial_" and isinstance(value, bool):
-                checked[name] = value
-            else:
-                kind = kinds.get(name) if isinstance(name, str) else None
-                if kind is None:
-                    known = ", ".join(kinds) or "none"
-                    raise self._refused(here, repr(value), f"settings of {target} ({known})")
-                self._add(checked, name, value, kind, here)
-        no_weights = [name for name, kind in (kinds or {}).items() if kind is Weights]
-        return checked | dict.fromkeys(no_weights)
-
-    def _add(self, checked: dict[str, Any], name: str, value: Any, kind: Any, place: str) -> None:
-        if kind is Weights:
-            return
-        if kind is Local:
-            self.local[place] = value
-        elif kind is Object:
-            checked[name] = self.object(value, place)
-        elif _fits(value, kind):
-            checked[name] = value
-        else:
-            raise self._refused(place, repr(value), f"{shown(kind)} in a file")
-
-    def _kinds(self, place: str, target: Any) -> Mapping[str, Any] | None:
-        """By the name of a setting what it may be; None where the user trusts in whatever it is."""
-        try:
-            found, kinds = _find(target, self.trust)
-        except SettingError as error:
-            raise DataError(
-                self.path,
-                found=f"{place}={target}, of which something cannot be imported",
-                expected="its package, as in training",
-                remedy=error.remedy,
-            ) from error
-        if found is None and not self._is_own(place):
-            raise DataError(
-                self.path,
-                found=f"{place}={target}, which would be called",
-                expected="networks, data and tasks that are registered here",
-                remedy=f"If you know it, and trust who made the file: trust={target}",
-            )
-        return kinds
-
-    def _objects(self, value: Any, place: str) -> Any:
-        """A plain value for what the user trusts, objects inside it checked."""
-        if isinstance(value, Mapping):
-            if "_target_" in value:
-                return self.object(value, place)
-            return {name: self._objects(inner, f"{place}.{name}") for name, inner in value.items()}
-        if isinstance(value, list):
-            return [self._objects(inner, f"{place}.{k}") for k, inner in enumerate(value)]
-        return value
-
-    def _is_own(self, place: str) -> bool:
-        return any(place == own or place.startswith(f"{own}.") for own in self.own)
-
-    def _refused(self, place: str, found: str, expected: str) -> DataError:
-        return DataError(
-            self.path,
-            found=f"{place}={found}",
-            expected=expected,
-            remedy=f"On the command line {place}=… may be anything.",
-        )
-
-
-def _find(target: Any, trust: Collection[str]) -> tuple[Any, Mapping[str, Any] | None]:
-    """A registered object with the kinds of its settings, or a trusted one; else None."""
+def _find(
+    target: Any, trust: Collection[str], subject: object
+) -> tuple[Any, Mapping[str, Any] | None]:
+    """What a file may name, with the kinds of its settings; of a trusted one all are `Any`."""
     if not isinstance(target, str):
         return None, None
     module, _, name = target.rpartition(".")
     if module in _HOMES:
         home = import_module(module)
         made = getattr(home, name) if name in home.__all__ else None
-        if made in _settings:
-            bases = made.__mro__[::-1] if inspect.isclass(made) else (made,)
-            return made, {k: v for base in bases for k, v in _settings.get(base, {}).items()}
+        if made in _registered:
+            return made, _kinds(made)
     from tangent_train import libraries
 
     try:
         found = libraries.find(module, name)
     except ModuleNotFoundError as error:
-        raise SettingError(
-            target,
-            found=f"no package {error.name}",
-            expected="it, to make what a file names",
+        raise DataError(
+            subject,
+            found=f"{target}, and no package {error.name}",
+            expected="the package, as in training",
             remedy=_missing_package(error),
         ) from error
     if found is None and target in trust:
-        return _imported(target, "trust"), None
+        return _imported(target, str(subject)), {"**": Any}
     return found or (None, None)
+
+
+class _Names(dict[str, Any]):
+    """Names in the annotations of a function; those only type checkers know are of objects."""
+
+    def __init__(self, function: Any) -> None:
+        known = {"Callable": Callable, "Mapping": Mapping, "Path": Path, "Sequence": Sequence}
+        super().__init__(known | inspect.unwrap(function).__globals__)
+
+    def __missing__(self, name: str) -> Any:
+        return getattr(builtins, name, Object)
+
+
+def _kinds(made: Any) -> dict[str, Any]:
+    """By the name of an argument what a file may give for it; also those handed on to bases."""
+    kinds: dict[str, Any] = {}
+    for base in inspect.getmro(made) if inspect.isclass(made) else (made,):
+        function = vars(base).get("__init__") if inspect.isclass(base) else base
+        if function is None:
+            continue
+        hints = get_type_hints(function, localns=_Names(function))
+        arguments = inspect.signature(function).parameters.values()
+        of_base = {a.name: _kind(hints[a.name]) for a in arguments if a.name in hints}
+        kinds = {**{n: k for n, k in of_base.items() if n != "settings"}, **kinds}
+        if not any(a.kind is a.VAR_KEYWORD for a in arguments):
+            break
+    return kinds
+
+
+def _kind(hint: Any) -> Any:
+    members = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+    if any(m in (Any, Path, object) or Any in get_args(m) for m in members):
+        return Local
+    plain = [member for member in members if _is_plain(member)]
+    return Union[tuple(plain)] if set(plain) - {NoneType} else Object  # noqa: UP007 - of a list
+
+
+def _is_plain(hint: Any) -> bool:
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin in (Union, UnionType, Sequence, Mapping, list, dict):
+        return all(map(_is_plain, arguments))
+    return hint in _PLAIN or origin is Literal
+
+
+def _fits(value: Any, kind: Any) -> bool:
+    """Whether a value is of a kind: a plain type, or one of the kinds of this module."""
+    origin, arguments = get_origin(kind), get_args(kind)
+    if origin in (Union, UnionType):
+        return any(_fits(value, one) for one in arguments)
+    if origin is Literal:
+        return any(type(value) is type(one) and value == one for one in arguments)
+    if origin in (Sequence, list):
+        return isinstance(value, list | tuple) and all(_fits(v, arguments[0]) for v in value)
+    if origin in (Mapping, dict):
+        return isinstance(value, Mapping) and all(
+            _fits(name, str) and _fits(inner, arguments[1]) for name, inner in value.items()
+        )
+    if kind is str:
+        return isinstance(value, str) and _WORD.fullmatch(value) is not None
+    if kind in (Text, dict):
+        return isinstance(value, str if kind is Text else Mapping)
+    return type(value) in (int, float) if kind is float else type(value) is kind
 
 
 def _imported(target: Any, place: str) -> Any:
@@ -395,54 +395,8 @@ def _imported(target: Any, place: str) -> Any:
         ) from error
 
 
-def _fits(value: Any, kind: Any) -> bool:
-    """Whether a value is of a kind, see `registered`."""
-    origin, arguments = get_origin(kind), get_args(kind)
-    if origin is UnionType or (origin is not None and origin.__name__ == "Union"):
-        return any(_fits(value, one) for one in arguments)
-    if origin is Literal:
-        return any(type(value) is type(one) and value == one for one in arguments)
-    if origin is list:
-        return isinstance(value, list | tuple) and all(_fits(v, arguments[0]) for v in value)
-    if origin is dict:
-        return isinstance(value, Mapping) and all(
-            _fits(name, str) and _fits(inner, arguments[1]) for name, inner in value.items()
-        )
-    if kind is str:
-        return isinstance(value, str) and _WORD.fullmatch(value) is not None
-    if kind is Text:
-        return isinstance(value, str)
-    if kind is float:
-        return type(value) in (int, float)
-    if kind is dict:
-        return isinstance(value, Mapping)
-    return type(value) is (NoneType if kind is None else kind)
-
-
-def shown(kind: Any) -> str:
-    """A kind of setting in words.
-
-    >>> shown(int | None), shown(list[float]), shown(Literal["yaw", "so3"]), shown(dict[str, int])
-    ('int or null', 'a list of float', 'yaw or so3', 'a mapping of int')
-    """
-    origin, arguments = get_origin(kind), get_args(kind)
-    if origin is Literal:
-        return " or ".join(map(str, arguments))
-    if origin is list:
-        return f"a list of {shown(arguments[0])}"
-    if origin is dict:
-        return f"a mapping of {shown(arguments[1])}"
-    if arguments:
-        return " or ".join(map(shown, arguments))
-    names = {str: "a word", None: "null", NoneType: "null", Text: "a text", dict: "a mapping"}
-    return names.get(kind) or str(kind.__name__)
-
-
 def _said(error: BaseException) -> str:
-    """What an error says and where: its first line, and the last line of code that is no library's.
-
-    Own networks fail in their own words; a traceback would be of this module.
-    """
+    """The first line of an error, and where it was raised: own networks fail in their own words."""
     frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename != __file__]
     first_line = str(error).strip().partition("\n")[0]
     place = f", {Path(frames[-1].filename).name} line {frames[-1].lineno}" if frames else ""
@@ -451,11 +405,11 @@ def _said(error: BaseException) -> str:
 
 def _missing_package(error: BaseException | None) -> str:
     """How to install the package that is missing; empty if none is."""
-    while error is not None:
-        if isinstance(error, ModuleNotFoundError) and error.name:
-            package = error.name.partition(".")[0]
-            if package in _EXTRAS:
-                return f"Run: pip install 'tangent-train[{_EXTRAS[package]}]'"
-            return f"Install {package}, or add the folder it is in to PYTHONPATH."
+    while error is not None and not (isinstance(error, ModuleNotFoundError) and error.name):
         error = error.__cause__ or error.__context__
-    return ""
+    if error is None:
+        return ""
+    package = str(error.name).partition(".")[0]
+    if package in _EXTRAS:
+        return f"Run: pip install 'tangent-train[{_EXTRAS[package]}]'"
+    return f"Install {package}, or add the folder it is in to PYTHONPATH."

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 __all__ = ["SynthRooms", "SynthRoomsPerspective"]
 
 
-@registered(rooms=dict[str, int | ViewKind | dict[str, int]])
+@registered
 class SynthRooms(Stanford2D3DS):
     """Rooms made on the first use, read as Stanford2D3DS: the data set that needs no download.
 
@@ -40,7 +40,7 @@ class SynthRooms(Stanford2D3DS):
         self,
         root: str | Path,
         representation: Representation,
-        rooms: RoomSettings | Mapping[str, Any],
+        rooms: RoomSettings | Mapping[str, int | ViewKind | Mapping[str, int]],
         **settings: Any,
     ) -> None:
         self.rooms = _room_settings(rooms)
@@ -51,7 +51,7 @@ class SynthRooms(Stanford2D3DS):
         _make_files(self.root, self.rooms)
 
 
-@registered(rooms=dict[str, int | ViewKind | dict[str, int]])
+@registered
 class SynthRoomsPerspective(Stanford2D3DSPerspective):
     """Photos of the same rooms, read as those of Stanford2D3DS.
 
@@ -71,7 +71,7 @@ class SynthRoomsPerspective(Stanford2D3DSPerspective):
         self,
         root: str | Path,
         representation: PerspectiveRepresentation,
-        rooms: RoomSettings | Mapping[str, Any],
+        rooms: RoomSettings | Mapping[str, int | ViewKind | Mapping[str, int]],
         **settings: Any,
     ) -> None:
         self.rooms = _room_settings(rooms)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 __all__ = ["SynthShapes"]
 
 
-@registered(shapes=dict[str, int] | None)
+@registered
 class SynthShapes(ModelNet40):
     """Shapes made on the first use, read as ModelNet40: the data set that needs no download.
 
@@ -38,7 +38,7 @@ class SynthShapes(ModelNet40):
         self,
         root: str | Path,
         representation: Representation,
-        shapes: ShapeSettings | Mapping[str, Any] | None = None,
+        shapes: ShapeSettings | Mapping[str, int] | None = None,
         **settings: Any,
     ) -> None:
         given = shapes or {}

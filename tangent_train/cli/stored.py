@@ -16,10 +16,12 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
+from tangent_train.checkpoints.content import INPUTS, NORMALIZATION, read_checkpoint
 from tangent_train.cli import values
 from tangent_train.cli.compose import STORED
 from tangent_train.errors import DataError, SettingError
 from tangent_train.registry import Text, accept, check_fields, check_plain, named_targets
+from tangent_train.tasks.reports.runs import flat_settings
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
@@ -41,9 +43,6 @@ _RUN = {
     "ema": float | None,
 }
 """Settings outside of the sections."""
-
-_FOLLOWING = {"representation.level": "level", "data.seed": "seed"}
-"""Settings that in every config are what others are."""
 
 _EXPECTED = "the settings of a run"
 
@@ -67,7 +66,10 @@ class StoredRun:
     @property
     def known(self) -> list[str]:
         """The names of all settings."""
-        return [*_RUN, *_dotted({name: self.config.get(name) for name in _SECTIONS})]
+        sections = _only(self.config, _SECTIONS)
+        inside = [name.split(".") for name, _ in flat_settings(sections)]
+        dotted = {".".join(parts[: k + 1]) for parts in inside for k in range(len(parts))}
+        return [*_RUN, *sorted(dotted)]
 
     def additions(self) -> list[str]:
         """The command line for Hydra: every override adds to an empty config."""
@@ -90,61 +92,49 @@ class StoredRun:
             SettingError: A setting of this machine has to be said.
         """
         trust = (*values.names(said, "trust"), *named_targets(said))
-        sections: dict[str, Any] = {
-            name: self.config.get(name)
-            for name in _SECTIONS
-            if name not in chosen and self.config.get(name) is not None
-        }
-        file_only = check_fields(self.path, self.config, _RUN, _EXPECTED)
+        of_run = check_fields(self.path, self.config, _RUN, _EXPECTED)
         said = {name: value for name, value in said.items() if name != "trust"}
-        own = {n for n in _leaves(said) if n not in file_only or said[n] != file_only[n]}
-        for name, other in _FOLLOWING.items():
-            section, _, setting = name.partition(".")
-            inside = sections.get(section)
-            if other in own and name not in own and isinstance(inside, dict) and setting in inside:
-                said = _merged(said, {section: {setting: said[other]}})
-                own.add(name)
+        own = {n for n, value in flat_settings(said) if n not in of_run or value != of_run[n]}
+        sections = _only(self.config, set(_SECTIONS) - set(chosen))
+        sections = {name: section for name, section in sections.items() if section is not None}
+        representation = said.setdefault("representation", {})
+        if "level" in own and "representation" not in chosen:  # in every config it is the same
+            representation.setdefault("level", said["level"])
+            own.add("representation.level")
         accepted = accept(self.path, _merged(sections, _only(said, sections)), trust, own)
-        settings = _merged(file_only | accepted.settings, said)
+        settings = _merged(of_run | accepted.settings, said)
         if "data" in chosen:
-            settings["data"] |= self._of_the_network(settings["data"], own)
-        self._fill_local(settings, accepted.local, file_only["choices"] or {})
+            settings["data"] |= self._of_the_network(settings["data"])
+        _fill_local(settings, accepted.local, of_run["choices"] or {})
         return {"init_from": None, "resume": None, "checkpoint": None} | settings, trust
 
-    def _of_the_network(self, data: Mapping[str, Any], own: Collection[str]) -> dict[str, Any]:
+    def _of_the_network(self, data: Mapping[str, Any]) -> dict[str, Any]:
         """What belongs to the network whatever the data: the fold it left out, and its inputs."""
-        from tangent_train.checkpoints.content import INPUTS, NORMALIZATION
-
         kinds = {"fold": int | None, "inputs": INPUTS | None, "normalization": NORMALIZATION | None}
         before = check_fields(self.path, self.config.get("data"), kinds, _EXPECTED, "data")
         typed = {argument.lstrip("+").partition("=")[0] for argument in self.arguments}
-        return {
-            name: value
-            for name, value in before.items()
-            if value is not None
-            and f"data.{name}" not in typed
-            and (name in data or name == "normalization")
-        }
+        known = {*data, "normalization"} - {name for name in kinds if f"data.{name}" in typed}
+        return {n: value for n, value in before.items() if value is not None and n in known}
 
-    @staticmethod
-    def _fill_local(
-        settings: dict[str, Any], local: Mapping[str, Any], choices: Mapping[str, str]
-    ) -> None:
-        """Give settings that only concern this machine the values they have here."""
-        here = _composed_here(choices)
-        for place, theirs in local.items():
-            section, _, name = place.partition(".")
-            same = OmegaConf.select(here, f"{section}._target_") == settings[section]["_target_"]
-            value = OmegaConf.select(here, place) if same else None
-            if place == "data.root" and value != theirs:
-                raise SettingError(
-                    place,
-                    found="no folder, as checkpoints do not say where data lie",
-                    expected="that of the data set on this machine",
-                    remedy=f"The run had data.root={theirs!r}: add that if it is right here.",
-                )
-            if value is not None:
-                settings[section][name] = value
+
+def _fill_local(
+    settings: dict[str, Any], local: Mapping[str, Any], choices: Mapping[str, str]
+) -> None:
+    """Give settings that only concern this machine the values they have here."""
+    here = _composed_here(choices)
+    for place, theirs in local.items():
+        section, _, name = place.partition(".")
+        same = OmegaConf.select(here, f"{section}._target_") == settings[section]["_target_"]
+        value = OmegaConf.select(here, place) if same else None
+        if place == "data.root" and value != theirs:
+            raise SettingError(
+                place,
+                found="no folder, as checkpoints do not say where data lie",
+                expected="that of the data set on this machine",
+                remedy=f"The run had data.root={theirs!r}: add that if it is right here.",
+            )
+        if value is not None:
+            settings[section][name] = value
 
 
 def stored_run(command: str, arguments: Sequence[str]) -> StoredRun | None:
@@ -172,8 +162,6 @@ def stored_run(command: str, arguments: Sequence[str]) -> StoredRun | None:
         base, run_dir = {"checkpoint": str(path)}, "runs/evaluate/${now:%Y-%m-%d_%H-%M-%S}"
     else:
         return None
-    from tangent_train.checkpoints.content import read_checkpoint
-
     config = check_plain(path, read_checkpoint(path, ("config",))["config"], "config")
     # The user's options refer to these two.
     numbers = check_fields(path, config, {"level": int, "seed": int}, _EXPECTED)
@@ -255,20 +243,3 @@ def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any
 
 def _only(settings: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
     return {name: value for name, value in settings.items() if name in names}
-
-
-def _dotted(settings: Mapping[Any, Any], prefix: str = "") -> list[str]:
-    names = []
-    for key, value in settings.items():
-        names.append(f"{prefix}{key}")
-        if isinstance(value, dict):
-            names += _dotted(value, f"{prefix}{key}.")
-    return names
-
-
-def _leaves(settings: Mapping[str, Any], prefix: str = "") -> list[str]:
-    leaves = []
-    for name, value in settings.items():
-        inside = isinstance(value, dict) and value
-        leaves += _leaves(value, f"{prefix}{name}.") if inside else [f"{prefix}{name}"]
-    return leaves

@@ -9,9 +9,7 @@ from tangent_train.rendering.representation import PinholeRepresentation, Rotati
 __all__ = ["CubemapRepresentation"]
 
 
-@registered(
-    level=int, dim=int | None, rotation=RotationAugmentation, mirror=bool, erp_height=int | None
-)
+@registered
 class CubemapRepresentation(PinholeRepresentation):
     """The baseline between panorama and tangent images: the six faces of a cube.
 

@@ -184,14 +184,7 @@ class PhotoSampler:
         return PhotoCrops(np.array(boxes), wanted.image_size, mirrored)
 
 
-@registered(
-    level=int,
-    fov_deg=float,
-    dim=int | list[int] | None,
-    crops_per_photo=int,
-    mirror=bool,
-    evaluation=Crops,
-)
+@registered
 class PerspectiveRepresentation:
     """Crops of photos, all of one camera.
 

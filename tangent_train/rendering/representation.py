@@ -189,18 +189,7 @@ class PinholeRepresentation:
         return labels
 
 
-@registered(
-    base_level=int,
-    level=int,
-    dim=int | None,
-    crop_multiple=int | None,
-    faces_per_panorama=int | None,
-    rotation=RotationAugmentation,
-    mirror=bool,
-    blend=Blend,
-    erp_height=int | None,
-    average_rotations=int,
-)
+@registered
 class TangentRepresentation(PinholeRepresentation):
     """Tangent images (paper, section 3.2).
 
@@ -285,13 +274,7 @@ class TangentRepresentation(PinholeRepresentation):
         return torch.from_numpy(mosaic.labels().astype(np.int64))
 
 
-@registered(
-    level=int,
-    crop_deg=float | None,
-    rotation=RotationAugmentation,
-    mirror=bool,
-    erp_height=int | None,
-)
+@registered
 class EquirectRepresentation:
     """The baseline without tangent images: the equirectangular image, or random crops of it.
 

@@ -19,7 +19,6 @@ from torch.optim.lr_scheduler import LRScheduler
 
 from datamodules.split_module import Kind
 from tangent_train.errors import SettingError
-from tangent_train.registry import Local, registered
 from tangent_train.tasks.divergence import LossWatch, check_weights, stop
 
 __all__ = ["Part", "Task", "check_at_once"]
@@ -28,7 +27,6 @@ Part = tuple[tuple[Tensor, ...], Tensor]
 """Inputs of the network and their labels."""
 
 
-@registered(label_smoothing=float, images_per_chunk=int | None, channels_last=bool, compile=Local)
 class Task(lightning.LightningModule, ABC):
     """Trains a network on batches of spheres and says what runs need to know about it.
 

@@ -31,7 +31,7 @@ from tangent_train.tasks.tensorboard_pictures import ValidationConfusion
 __all__ = ["ClassificationTask"]
 
 
-@registered()
+@registered
 class ClassificationTask(Task):
     """Trains a network that names a shape by all views of its sphere (paper, section 4.1).
 

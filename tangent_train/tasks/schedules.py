@@ -14,7 +14,7 @@ from tangent_train.registry import registered
 __all__ = ["WarmupCosineLR"]
 
 
-@registered(warmup=float)
+@registered
 class WarmupCosineLR(LRScheduler):
     """Rises in a straight line to the learning rate, then falls along half a cosine to zero.
 

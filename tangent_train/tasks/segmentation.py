@@ -33,15 +33,7 @@ from tangent_train.tasks.tensorboard_pictures import ValidationPictures
 __all__ = ["SegmentationTask"]
 
 
-@registered(
-    class_weights=ClassWeights | list[float],
-    auxiliary_weight=float,
-    auxiliary_target=AuxiliaryTarget,
-    region_loss=RegionLoss | Literal["none"],
-    region_weight=float,
-    images_per_forward=int,
-    absent_class=AbsentClass,
-)
+@registered
 class SegmentationTask(Task):
     """Trains a network on views of panoramas, or on crops of photos, and scores it on the whole.
 

@@ -18,32 +18,16 @@ import torch
 from tangent_train.cli import main
 from tangent_train.cli.resume import check_resumed
 from tangent_train.errors import SettingError
+from tests.dropping import TRUST, write_dropout
 
-# Dropout draws from torch's generator at every step.
-DROPPING = """
-from torch import nn
-
-class Dropping(nn.Conv2d):
-    def forward(self, images):
-        return nn.functional.dropout2d(super().forward(images), training=self.training)
-"""
 # No batch statistics.
-NETWORKS = {
-    "plain": """
+PLAIN = """
 _target_: torch.nn.Conv2d
 in_channels: 4
 out_channels: 14
 kernel_size: 3
 padding: 1
-""",
-    "dropout": """
-_target_: dropping.Dropping
-in_channels: 4
-out_channels: 14
-kernel_size: 3
-padding: 1
-""",
-}
+"""
 SETTINGS = [
     "experiment=rooms/demo",
     "level=4",
@@ -94,12 +78,10 @@ def _last(folder: Path) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """With the networks above as options, and the module of one of them, which can be imported."""
+    """With two networks as options: the one above, and one that has to be trusted."""
     folder = tmp_path_factory.mktemp("settings")
-    (folder / "network").mkdir()
-    for name, config in NETWORKS.items():
-        (folder / "network" / f"{name}.yaml").write_text(config)
-    (folder / "dropping.py").write_text(DROPPING)
+    write_dropout(folder)
+    (folder / "network" / "plain.yaml").write_text(PLAIN)
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(folder)
         patch.setenv("PYTHONPATH", str(folder), prepend=os.pathsep)
@@ -124,7 +106,7 @@ def _root(folder: Path) -> str:
 @pytest.fixture(scope="module")
 def again(folder: Path) -> list[str]:
     """What has to be said again of a run with dropout."""
-    return [_root(folder), "trust=dropping.Dropping"]
+    return [_root(folder), TRUST]
 
 
 @pytest.fixture(scope="module")

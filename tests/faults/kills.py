@@ -25,6 +25,8 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import torch
 
+from tests.dropping import TRUST, write_dropout
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from multiprocessing.process import BaseProcess
@@ -32,12 +34,6 @@ if TYPE_CHECKING:
 __all__ = ["Outcome", "campaign", "killed_while_writing"]
 
 _PATIENCE_S = 300.0
-_NETWORK = """
-_target_: torch.nn.Sequential
-_args_:
-  - {_target_: torch.nn.Conv2d, in_channels: 4, out_channels: 14, kernel_size: 3, padding: 1}
-  - {_target_: torch.nn.Dropout2d}
-"""
 
 
 @dataclass(frozen=True)
@@ -73,8 +69,7 @@ def campaign(root: Path, folder: Path, moments: int, seed: int) -> Iterator[Outc
     Yields:
         What became of each.
     """
-    (folder / "network").mkdir(parents=True)
-    (folder / "network" / "dropout.yaml").write_text(_NETWORK)
+    write_dropout(folder)
     undisturbed = folder / "undisturbed"
     process = _started(undisturbed, folder, _settings(root, folder))
     _await_checkpoint(process, undisturbed)
@@ -85,7 +80,7 @@ def campaign(root: Path, folder: Path, moments: int, seed: int) -> Iterator[Outc
     for number in range(moments):
         run = folder / f"run_{number}"
         kills = 1 + number % 2
-        yield _disturbed(run, undisturbed, _settings(root, folder), kills, duration_s, draw)
+        yield _disturbed(run, undisturbed, root, kills, duration_s, draw)
 
 
 def killed_while_writing(root: Path, folder: Path) -> Outcome:
@@ -103,7 +98,7 @@ def killed_while_writing(root: Path, folder: Path) -> Outcome:
     steps = _loaded(run / "checkpoints" / "last.ckpt")["global_step"]
     left = len(list(run.rglob(".partial-*")))
     broken = [f"{path.name}: {error}" for path, error in _broken(run)]
-    _await_end(_started(run, folder, [f"resume={run}"]), run)
+    _await_end(_started(run, folder, _again(root, run)), run)
     broken += [f"{path.name}: {error}" for path, error in _broken(run)]
     different = tuple(_different(run, folder / "undisturbed"))
     return Outcome((), (steps,), (False,), left, tuple(broken), different)
@@ -133,10 +128,14 @@ def _settings(root: Path, folder: Path) -> list[str]:
     ]  # fmt: skip
 
 
+def _again(root: Path, run: Path) -> list[str]:
+    return [f"resume={run}", f"data.root={root}", TRUST]
+
+
 def _disturbed(
     run: Path,
     undisturbed: Path,
-    settings: list[str],
+    root: Path,
     kills: int,
     duration_s: float,
     draw: random.Random,
@@ -145,7 +144,7 @@ def _disturbed(
     steps: list[int] = []
     evaluated: list[bool] = []
     broken: list[str] = []
-    arguments = settings
+    arguments = _settings(root, run.parent)
     while len(after) < kills:
         process = _started(run, run.parent, arguments)
         _await_checkpoint(process, run)
@@ -161,7 +160,7 @@ def _disturbed(
         steps.append(_loaded(run / "checkpoints" / "last.ckpt")["global_step"])
         evaluated.append((run / "results.json").exists())
         broken += [f"{path.name}: {error}" for path, error in _broken(run)]
-        arguments = [f"resume={run}"]
+        arguments = _again(root, run)
     left = len(list(run.rglob(".partial-*")))
     _await_end(_started(run, run.parent, arguments), run)
     broken += [f"{path.name}: {error}" for path, error in _broken(run)]
@@ -187,6 +186,7 @@ def _train(
     arguments: list[str], folder: Path, log: Path, before: Callable[[], None] | None
 ) -> None:
     os.chdir(folder)
+    sys.path.insert(0, str(folder))  # its network
     with log.open("a") as file:
         for stream in (1, 2):
             os.dup2(file.fileno(), stream)

@@ -230,10 +230,11 @@ def test_what_tensorboard_cannot_write_stops_with_a_checkpoint_to_go_on_from(
 
 
 NETWORK = """
-_target_: torch.nn.Sequential
-_args_:
-  - {_target_: torch.nn.Conv2d, in_channels: 4, out_channels: 400, kernel_size: 9, padding: 4}
-  - {_target_: torch.nn.Conv2d, in_channels: 400, out_channels: 14, kernel_size: 1}
+_target_: torch.nn.Conv2d
+in_channels: 4
+out_channels: 14
+kernel_size: 49
+padding: 24
 """
 
 
@@ -255,7 +256,7 @@ def test_a_run_whose_disk_is_full_goes_on_when_there_is_room(
     {COMMAND} {shlex.join(arguments)}; echo "status $?"
     find disk -name '.partial*' -o -name last.ckpt -size +100k
     mount -o remount,size=100m disk
-    {COMMAND} resume=disk/run; echo "status $?"
+    {COMMAND} resume=disk/run data.root={stanford_root}; echo "status $?"
     cp disk/run/results.json .
     """
     done = _on_a_small_disk(script, tmp_path, "4m")

@@ -26,7 +26,12 @@ from torch import nn
 from models import initialize
 from tangent_train import registry
 from tangent_train.checkpoints.content import read_checkpoint, read_settings
-from tangent_train.checkpoints.trained import METADATA_KEY, inputs_in, load_trained
+from tangent_train.checkpoints.trained import (
+    METADATA_KEY,
+    completed_settings,
+    inputs_in,
+    load_trained,
+)
 from tangent_train.cli import main
 from tangent_train.cli import stored as stored_module
 from tangent_train.cli.build import build
@@ -166,7 +171,9 @@ def test_no_attack_at_any_place_of_a_checkpoint_is_interpreted(
 
 
 def _without_the_registry(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(registry, "_find", lambda target, _: (registry._imported(target, "x"), None))
+    patch.setattr(
+        registry, "_find", lambda target, *_: (registry._imported(target, "x"), {"**": Any})
+    )
 
 
 def _without_kinds(patch: pytest.MonkeyPatch) -> None:
@@ -563,7 +570,39 @@ def test_all_that_the_configs_name_is_registered() -> None:
         for target in named_targets(yaml.safe_load(path.read_text())):
             if target.endswith("Pairs"):  # of tangent-keypoints, which leaves no checkpoint
                 continue
-            assert registry._find(target, ())[0] is not None, (path, target)
+            assert registry._find(target, (), path)[0] is not None, (path, target)
+
+
+EXPERIMENTS = sorted(
+    p.relative_to(config_folder() / "experiment").with_suffix("").as_posix()
+    for p in (config_folder() / "experiment").rglob("*.yaml")
+)
+OPTIONS = [
+    f"{group}={path.stem}"
+    for group in ("data", "network", "representation", "optimizer", "scheduler", "trainer")
+    for path in sorted((config_folder() / group).glob("*.yaml"))
+    if not path.stem.endswith("pairs")
+]
+
+
+@pytest.mark.parametrize("option", [f"experiment={name}" for name in EXPERIMENTS] + OPTIONS)
+def test_settings_of_every_experiment_and_option_are_accepted(option: str, tmp_path: Path) -> None:
+    """As a checkpoint has them, but for what is of this machine."""
+    command = "transfer" if "transfer" in option else "train"
+    with initialize_config_dir(str(config_folder()), version_base="1.3"):
+        config: Any = OmegaConf.to_container(compose(command, [option]), resolve=True)
+    network = completed_settings(config["network"], 3, 14)
+    sections = {name: config[name] for name in ("data", "representation", "optimizer", "trainer")}
+    sections |= {"network": network, "task": config["task"], "scheduler": config["scheduler"]}
+    for photos in (config.get("photos", {}),):
+        sections |= {f"photos.{name}": section for name, section in photos.items()}
+    accepted = accept(tmp_path, sections)
+    weights = {"weights", "weights_backbone", "encoder_weights"}
+    for name, section in sections.items():
+        left_out = {key for key in section if key not in accepted.settings[name]} - weights
+        assert left_out <= {"root", "store", "label_table", "compile"}
+        for key, value in accepted.settings[name].items():
+            assert isinstance(value, dict) or key in weights or value == section[key]
 
 
 @pytest.mark.parametrize(

@@ -80,8 +80,8 @@ def test_a_failing_stage_leaves_the_others_and_the_command_goes_on(
     assert [stage for _, stage in runs.started] == ["P-FT-1", "S-FT-1"]
     resumed = runs.configs[-2]
     assert resumed.resume == str(folder), "it had begun"
-    assert resumed.init_from.endswith("P/checkpoints/last.ckpt"), "as when it began"
-    assert f"tangent-train resume={folder}" in capsys.readouterr().out
+    assert resumed.init_from is None, "its own checkpoint has the tensors"
+    assert f"tangent-train resume={folder} data.root=data/" in capsys.readouterr().out
     assert (HERE / "transfer.md").is_file()
 
 
@@ -246,7 +246,7 @@ def test_real_runs_from_photos_to_panoramas(
     run_transfer(monkeypatch, *network)
     out = capsys.readouterr().out
     assert out.count("finished before") == 2
-    assert f"tangent-train resume={(OF_SEED_0 / 'S-FT-1').absolute()}" in out
+    assert f"tangent-train resume={(OF_SEED_0 / 'S-FT-1').absolute()} data.root=" in out
     assert (HERE / "transfer.csv").read_text() == before, "the same figures again"
     left = {path.name for path in tmp_path.iterdir() if path.name[0] != "."}  # those are coverage's
     assert left == {"data", "models", "my", "runs"}

@@ -66,7 +66,7 @@ def test_a_moved_transfer_goes_on(runs: PretendedRuns, monkeypatch: pytest.Monke
     run_transfer(monkeypatch, "compare=[]", "hydra.run.dir=elsewhere/transfer/mine")
     assert runs.started == [("train", "S-FT-1")]
     assert "/elsewhere/" in runs.configs[-1].resume
-    assert "/runs/" in runs.configs[-1].init_from, "as its checkpoint says"
+    assert runs.configs[-1].init_from is None, "its own checkpoint has the tensors"
 
 
 @pytest.fixture
