@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors.torch import load_file
 from torch import Tensor, nn
 from torchvision.models import WeightsEnum
 
@@ -39,13 +40,6 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
         raise DataError(path, found="no such file", expected=expected)
     try:
         content = _read(path)
-    except ImportError as error:
-        raise DataError(
-            path,
-            found="a safetensors file",
-            expected="the package safetensors, to read it",
-            remedy="pip install safetensors",
-        ) from error
     except Exception as error:
         first_line = str(error).partition("\n")[0]
         raise DataError(
@@ -66,8 +60,6 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
 
 def _read(path: Path) -> Any:
     if path.suffix == ".safetensors":
-        from safetensors.torch import load_file
-
         return load_file(path)
     return torch.load(path, map_location="cpu", weights_only=True)
 

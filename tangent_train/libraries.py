@@ -10,7 +10,7 @@ import inspect
 from importlib import import_module
 from typing import Any
 
-from tangent_train.registry import Weights
+from tangent_train.registry import Weights, import_named
 
 __all__ = ["find"]
 
@@ -48,15 +48,15 @@ def find(module: str, name: str) -> tuple[Any, dict[str, Any]] | None:
         None where files may not name it.
 
     Raises:
-        ModuleNotFoundError: Its package is not installed.
+        SettingError: Its package is not installed.
     """
     if name in _BY_SIGNATURE.get(module, "").split():
-        made = getattr(import_module(module), name)
+        made = import_named(f"{module}.{name}", "_target_")
         arguments = inspect.signature(made).parameters.values()
         named = [a.name for a in arguments if a.kind is not a.VAR_KEYWORD]
         kinds = dict.fromkeys((n for n in named if n not in _OF_THE_MACHINE), _SIMPLE)
     elif (module, name) == ("timm", "create_model") or _is_of_torchvision(module, name):
-        made = getattr(import_module(module), name)
+        made = import_named(f"{module}.{name}", "_target_")
         named = list(inspect.signature(made).parameters)
         kinds = dict.fromkeys(_NETWORKS.split(), _SIMPLE)
     else:

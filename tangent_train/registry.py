@@ -35,6 +35,7 @@ __all__ = [
     "accept",
     "check_fields",
     "check_plain",
+    "import_named",
     "make",
     "maker_of",
     "named_targets",
@@ -134,7 +135,7 @@ class _Check:
             raise self._refused(place, settings, "a section with a _target_")
         target = settings["_target_"]
         trust = (*self._trust, target) if self._is_own(f"{place}._target_") else self._trust
-        _, kinds = _find(target, trust, self._path)
+        _, kinds = _find(target, trust)
         if kinds is None:
             raise DataError(
                 self._path,
@@ -268,7 +269,7 @@ def make(
 def maker_of(settings: Mapping[str, Any], place: str, trust: Collection[str] | None = None) -> Any:
     """The class or function that a section names; see `make`."""
     target = settings.get("_target_")
-    found = _imported(target, place) if trust is None else _find(target, trust, place)[0]
+    found = import_named(target, f"{place}._target_") if trust is None else _find(target, trust)[0]
     if found is None:
         raise SettingError(f"{place}._target_", found=target, expected="a registered name")
     return found
@@ -292,9 +293,7 @@ def _made(value: Any, place: str, trust: Collection[str] | None) -> Any:
     return value
 
 
-def _find(
-    target: Any, trust: Collection[str], subject: object
-) -> tuple[Any, Mapping[str, Any] | None]:
+def _find(target: Any, trust: Collection[str]) -> tuple[Any, Mapping[str, Any] | None]:
     """What a file may name, with the kinds of its settings; of a trusted one all are `Any`."""
     if not isinstance(target, str):
         return None, None
@@ -306,17 +305,9 @@ def _find(
             return made, _kinds(made)
     from tangent_train import libraries
 
-    try:
-        found = libraries.find(module, name)
-    except ModuleNotFoundError as error:
-        raise DataError(
-            subject,
-            found=f"{target}, and no package {error.name}",
-            expected="the package, as in training",
-            remedy=_missing_package(error),
-        ) from error
+    found = libraries.find(module, name)
     if found is None and target in trust:
-        return _imported(target, str(subject)), {"**": Any}
+        return import_named(target, "_target_"), {"**": Any}
     return found or (None, None)
 
 
@@ -369,6 +360,9 @@ def _fits(value: Any, kind: Any) -> bool:
         return any(_fits(value, one) for one in arguments)
     if origin is Literal:
         return any(type(value) is type(one) and value == one for one in arguments)
+    if origin is tuple:
+        fits = isinstance(value, list | tuple) and len(value) == len(arguments)
+        return fits and all(map(_fits, value, arguments))
     if origin in (Sequence, list):
         return isinstance(value, list | tuple) and all(_fits(v, arguments[0]) for v in value)
     if origin in (Mapping, dict):
@@ -382,12 +376,17 @@ def _fits(value: Any, kind: Any) -> bool:
     return type(value) in (int, float) if kind is float else type(value) is kind
 
 
-def _imported(target: Any, place: str) -> Any:
+def import_named(target: Any, place: str) -> Any:
+    """What a full name names.
+
+    Raises:
+        SettingError: It cannot be imported.
+    """
     try:
         return resolve_name(str(target))
     except (ImportError, AttributeError, ValueError) as error:
         raise SettingError(
-            f"{place}._target_",
+            place,
             found=f"{target}, of which something cannot be imported ({_said(error)})",
             expected="the full name of a class or function",
             remedy=_missing_package(error)

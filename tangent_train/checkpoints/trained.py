@@ -10,6 +10,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
 from datamodules.samples import Input, Normalization, channel_names
@@ -87,9 +88,9 @@ _KINDS = {
     "normalization": NORMALIZATION,
     "level": int,
     "representation": dict,
-    "image_size": list[int],
+    "image_size": tuple[int, int],
     "size_multiple": int,
-    "fixed_size": list[int] | None,
+    "fixed_size": tuple[int, int] | None,
     "settings": dict | None,
 }
 """What the metadata of an exported network say."""
@@ -152,16 +153,20 @@ def load_trained(path: Path, trust: Collection[str] = ()) -> TrainedNetwork:
             cannot be made, or a package to read it is missing.
     """
     suffix = path.suffix.lower()
-    if suffix == ".onnx":
-        network = OnnxNetwork(path)
-        described = _described(path, network.metadata.get(METADATA_KEY))
-        return _trained(path, described | {"settings": None}, network, trust)
-    if suffix == ".safetensors":
-        with _safetensors(path) as file:
-            described = _described(path, (file.metadata() or {}).get(METADATA_KEY))
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        return _trained(path, described, tensors, trust)
-    return _from_checkpoint(path, trust)
+    try:
+        if suffix == ".onnx":
+            network = OnnxNetwork(path)
+            described = _described(path, network.metadata.get(METADATA_KEY))
+            return _trained(path, described | {"settings": None}, network, trust)
+        if suffix == ".safetensors":
+            with _safetensors(path) as file:
+                described = _described(path, (file.metadata() or {}).get(METADATA_KEY))
+                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            return _trained(path, described, tensors, trust)
+        return _from_checkpoint(path, trust)
+    except SettingError as error:
+        found = f"{error.subject}: {error.found}"
+        raise DataError(path, found=found, expected=error.expected, remedy=error.remedy) from error
 
 
 def inputs_in(path: Path) -> tuple[Input, ...] | None:
@@ -227,7 +232,7 @@ def _trained(
     sections = {"network": described["settings"], "representation": described["representation"]}
     given = {name: settings for name, settings in sections.items() if settings is not None}
     settings = accept(path, given, trust).settings
-    representation = _made(path, "representation", settings["representation"], trust)
+    representation = make(settings["representation"], "representation", trust)
     channels = len(channel_names(described["inputs"]))
     if isinstance(content, OnnxNetwork):
         network: nn.Module = content
@@ -242,40 +247,26 @@ def _trained(
         multiple, size = size_multiple_of(network, channels), representation.image_size
         described |= {"size_multiple": multiple or 1, "image_size": size}
         described["fixed_size"] = None if multiple else size
-    fixed = described["fixed_size"]
+    normalization, fixed = described["normalization"], described["fixed_size"]
     return TrainedNetwork(
         network=network.eval(),
         class_names=tuple(described["class_names"]),
         inputs=tuple(described["inputs"]),
-        normalization=_normalization(path, described["normalization"]),
+        normalization=Normalization(normalization.get("mean", ()), normalization.get("std", ())),
         level=described["level"],
         representation=settings["representation"],
-        image_size=_size(path, described["image_size"]),
+        image_size=tuple(described["image_size"]),
         size_multiple=described["size_multiple"],
-        fixed_size=None if fixed is None else _size(path, fixed),
+        fixed_size=None if fixed is None else tuple(fixed),
         settings=settings.get("network"),
         trust=tuple(trust),
     )
 
 
-def _normalization(path: Path, content: Mapping[str, Any]) -> Normalization:
-    try:
-        return Normalization(**content)
-    except (TypeError, SettingError) as error:
-        expected = "its mean and std, three numbers each, or four with depth"
-        raise DataError(path, found=f"normalization={content}", expected=expected) from error
-
-
-def _size(path: Path, sides: Any) -> tuple[int, int]:
-    if len(sides) != 2:
-        raise DataError(path, found=f"{sides} as a size", expected="rows and columns")
-    return sides[0], sides[1]
-
-
 def _with_tensors(
     path: Path, settings: Mapping[str, Any], tensors: Mapping[str, Tensor], trust: Collection[str]
 ) -> nn.Module:
-    network: nn.Module = _made(path, "network", settings, trust)
+    network: nn.Module = make(settings, "network", trust)
     try:
         network.load_state_dict(dict(tensors))
     except (RuntimeError, TypeError, AttributeError) as error:
@@ -286,18 +277,6 @@ def _with_tensors(
             remedy="Is the package of the network of another version than in training?",
         ) from error
     return Scores(network).eval()
-
-
-def _made(path: Path, section: str, settings: Mapping[str, Any], trust: Collection[str]) -> Any:
-    try:
-        return make(settings, section, trust)
-    except (DataError, SettingError) as error:
-        raise DataError(
-            path,
-            found=f"a {section} that cannot be made ({error.subject}: {error.found})",
-            expected=f"settings of {settings['_target_']}",
-            remedy=error.remedy,
-        ) from error
 
 
 def _described(path: Path, text: str | bytes | None) -> dict[str, Any]:
@@ -323,19 +302,10 @@ def _safetensors(path: Path) -> Iterator[Any]:
     """An open file.
 
     Raises:
-        DataError: It is no such file, or the package safetensors is missing.
+        DataError: It is no such file.
     """
     if not path.is_file():
         raise DataError(path, found="no such file", expected=_EXPORTED)
-    try:
-        from safetensors import SafetensorError, safe_open
-    except ImportError as error:
-        raise DataError(
-            path,
-            found="a safetensors file",
-            expected="the package safetensors, to read it",
-            remedy="Run: pip install 'tangent-train[export]'",
-        ) from error
     try:
         with safe_open(path, framework="pt") as file:
             yield file

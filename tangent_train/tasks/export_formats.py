@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
+from safetensors.torch import save_file
 from torch import Tensor
 
 from tangent_train.checkpoints.trained import METADATA_KEY, TrainedNetwork, metadata_json
@@ -129,15 +130,6 @@ def _quiet_exporter() -> Iterator[None]:
 
 
 def _write_safetensors(plan: Plan, path: Path) -> None:
-    try:
-        from safetensors.torch import save_file
-    except ImportError as error:
-        raise SettingError(
-            "format=safetensors",
-            found="no package safetensors",
-            expected="it, to write them",
-            remedy="Run: pip install 'tangent-train[export]'",
-        ) from error
     network: Any = plan.trained.network
     # Copies: the format knows neither tensors that share memory nor other memory formats.
     tensors = {

@@ -172,7 +172,7 @@ def test_no_attack_at_any_place_of_a_checkpoint_is_interpreted(
 
 def _without_the_registry(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(
-        registry, "_find", lambda target, *_: (registry._imported(target, "x"), {"**": Any})
+        registry, "_find", lambda target, *_: (registry.import_named(target, "x"), {"**": Any})
     )
 
 
@@ -570,7 +570,7 @@ def test_all_that_the_configs_name_is_registered() -> None:
         for target in named_targets(yaml.safe_load(path.read_text())):
             if target.endswith("Pairs"):  # of tangent-keypoints, which leaves no checkpoint
                 continue
-            assert registry._find(target, (), path)[0] is not None, (path, target)
+            assert registry._find(target, ())[0] is not None, (path, target)
 
 
 EXPERIMENTS = sorted(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -195,20 +194,6 @@ def test_a_computation_alone_cannot_be_exported_again(
 ) -> None:
     with pytest.raises(SettingError, match="checkpoint: found an exported network"):
         export_network(load_trained(files["onnx"]), tmp_path / "x.onnx", "onnx")
-
-
-def test_the_package_for_safetensors_is_named(
-    trained: TrainedNetwork,
-    files: dict[Format, Path],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setitem(sys.modules, "safetensors.torch", None)
-    monkeypatch.setitem(sys.modules, "safetensors", None)
-    with pytest.raises(SettingError, match=r"pip install 'tangent-train\[export\]'"):
-        export_network(trained, tmp_path / "other.safetensors", "safetensors")
-    with pytest.raises(DataError, match=r"pip install 'tangent-train\[export\]'"):
-        load_trained(files["safetensors"])
 
 
 def test_onnx_files_of_others_are_told_apart(files: dict[Format, Path], tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from tangent_train.errors import DataError
 from tests.tasks.small_networks import save_checkpoint, with_statistics
 
 SMALL_UNET = ["network=unet", "network.widths=[4,8,8]"]
-NO_TARGET = r"network\._target_="
+NO_TARGET = r"_target_: "
 PRETRAINED = ("weights", "weights_backbone", "encoder_weights")
 
 
@@ -236,12 +236,9 @@ def _no_classes(content: Any) -> None:
         ),
         (_no_class, rf"{NO_TARGET}models\.NoSuchNet, of which something cannot be imported"),
         (_no_module, rf"{NO_TARGET}models\.missing\.Net, of which something cannot be imported"),
-        (_wrong_setting, r"network\.wide=3; expected settings of models\.UNet \(.*widths"),
-        (
-            _wrong_value,
-            r"a network that cannot be made .*widths.*; expected settings of models\.U",
-        ),
-        (_wrong_level, r"a representation that cannot be made .*dim"),
+        (_wrong_setting, r"network\.wide=3; expected a setting of models\.UNet \(.*widths"),
+        (_wrong_value, r"UNet widths: \[\]; expected two or more"),
+        (_wrong_level, r"dim: 2; expected at least 13"),
         (_no_representation, r"no representation in its config"),
         (_no_classes, r"no class_names inside; expected a checkpoint written by tangent-train"),
     ],
