@@ -5,8 +5,7 @@ python -m benchmarks images labels          some of it
 python -m benchmarks compare                measure, then compare with the baseline
 python -m benchmarks compare results.json   compare what was measured
 python -m benchmarks baseline results.json  make it the baseline, better of several runs
-python -m benchmarks accuracy --help        these take longer, and have settings of their own:
-                                            accuracy, costs, keypoints, precision
+python -m benchmarks keypoints --help       these have settings of their own: keypoints, precision
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ __all__ = ["MEASURED", "main"]
 MEASURED = ("images", "labels", "loader", "step", "start", "evaluation", "growth")
 """What is measured without a name."""
 
-OTHERS = ("accuracy", "costs", "keypoints", "precision")
+OTHERS = ("keypoints", "precision")
 """What has settings of its own."""
 
 _OUTPUT = Path("runs/bench")

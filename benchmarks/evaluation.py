@@ -18,8 +18,7 @@ import lightning
 from lightning.pytorch.callbacks import Callback
 from torch import Tensor, nn
 
-from benchmarks.accuracy_run import composed
-from benchmarks.measuring import Options, Row, Table, at_most
+from benchmarks.measuring import Options, Row, Table, at_most, composed
 from benchmarks.quiet import quiet_lightning
 from benchmarks.rooms import AREAS, made_rooms
 from tangent_train.cli import run
@@ -122,7 +121,7 @@ def tables(options: Options) -> Iterator[Table]:
         quiet_lightning(),
         redirect_stdout(io.StringIO()),
     ):
-        lightning.seed_everything(config.seed, verbose=False)
+        lightning.seed_everything(config["seed"], verbose=False)
         data, task = build(config)
         network = task.network = EveryNth(task.network, _EVERY)
         clock = PanoramaClock(network)

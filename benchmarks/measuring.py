@@ -18,6 +18,11 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from tangent_train.cli.compose import config_folder
+
 __all__ = [
     "Goal",
     "Interval",
@@ -27,6 +32,7 @@ __all__ = [
     "Way",
     "at_least",
     "at_most",
+    "composed",
     "in_process",
     "measure",
     "median_interval",
@@ -247,3 +253,10 @@ def memory_kib(name: str, pid: int | str = "self") -> int:
     if found is None:
         raise LookupError(f"/proc/{pid} says nothing about {name}")
     return int(found[1])
+
+
+def composed(overrides: Sequence[str]) -> dict[str, Any]:
+    """The settings of ``tangent-train`` with these overrides."""
+    with initialize_config_dir(str(config_folder()), version_base="1.3"):
+        settings: Any = OmegaConf.to_container(compose("train", list(overrides)), resolve=True)
+    return settings

@@ -22,8 +22,7 @@ import torch
 from lightning.pytorch.callbacks import Callback, LearningRateMonitor
 from torch.nn import functional
 
-from benchmarks.accuracy_run import composed
-from benchmarks.measuring import Options, Row, Table, at_most
+from benchmarks.measuring import Options, Row, Table, at_most, composed
 from benchmarks.quiet import quiet_lightning
 from benchmarks.rooms import few_rooms
 from tangent_train.cli import run
@@ -64,11 +63,11 @@ def tables(options: Options) -> Iterator[Table]:
         rooms = few_rooms(Path(folder) / "rooms", 64 if options.quick else 256)
         config = composed((*_SETTINGS, f"trainer.max_steps={steps}", *small, *rooms))
         with quiet_lightning(), redirect_stdout(io.StringIO()):
-            lightning.seed_everything(config.seed, verbose=False)
+            lightning.seed_everything(config["seed"], verbose=False)
             data, task = build(config)
-            bare = BareLoop(data, task, config.optimizer.lr)
+            bare = BareLoop(data, task, config["optimizer"]["lr"])
             clock = StepClock(bare)
-            last = LastCheckpoint(Path(folder) / "checkpoints", config.checkpoint_every_n_steps)
+            last = LastCheckpoint(Path(folder) / "checkpoints", config["checkpoint_every_n_steps"])
             callbacks = [clock, last, LearningRateMonitor()]
             trainer = run._trainer(config, Path(folder), data, task, callbacks)
             trainer.fit(task, datamodule=data)

@@ -44,11 +44,10 @@ __all__ = [
     "world_rays",
 ]
 
-Input = Literal["rgb", "depth", "validity", "elevation"]
+Input = Literal["rgb", "depth", "elevation"]
 """What a network may be shown of an image, in the order of its channels, see `channel_names`.
 
 * `rgb` and `depth` are normalized.
-* `validity`: 1 where depth is known and 0 where it is missing.
 * `elevation`: the sine of the angle between a pixel's ray and the horizon, −1 (down) to 1 (up).
 """
 
@@ -56,9 +55,6 @@ INPUTS: tuple[Input, ...] = get_args(Input)
 """All of them."""
 
 _COLORS = ("red", "green", "blue")
-
-_RENDERED: tuple[Input, ...] = ("rgb", "depth", "elevation")
-"""What is rendered; the validity is where there is depth."""
 
 MAX_DEPTH_M = 4.0
 """Depth is clipped to this (released code of the paper)."""
@@ -145,7 +141,7 @@ def normalize(
     Raises:
         SettingError: The normalization is one of other channels.
     """
-    parts = dict(zip([name for name in _RENDERED if name in inputs], rendered, strict=True))
+    parts = dict(zip([name for name in INPUTS if name in inputs], rendered, strict=True))
     measured = 3 + ("depth" in parts)
     if normalization.channels != measured:
         raise SettingError(
@@ -166,8 +162,6 @@ def normalize(
     values = images.new_tensor([(1 / (step * std), mean / std) for step, mean, std in scale])
     factor, offset = values.T[..., None, None]
     images[..., :measured, :, :].mul_(factor).sub_(offset)
-    if "validity" in inputs:
-        images[..., measured, :, :] = parts["depth"] > 0
     if "elevation" in inputs:
         images[..., -1, :, :] = parts["elevation"]
     return images

@@ -179,14 +179,14 @@ def checked_inputs(inputs: Sequence[Input]) -> tuple[Input, ...]:
     """Names of inputs in the order of their channels.
 
     Raises:
-        SettingError: One is unknown or there twice, RGB is missing, or validity is without depth.
+        SettingError: One is unknown or there twice, or RGB is missing.
     """
     ordered = tuple(name for name in INPUTS if name in inputs)
     known = not isinstance(inputs, str) and sorted(ordered) == sorted(inputs)
-    if not known or "rgb" not in inputs or ("validity" in inputs and "depth" not in inputs):
+    if not known or "rgb" not in inputs:
         raise SettingError(
             "data.inputs",
             found=inputs if isinstance(inputs, str) else list(inputs),
-            expected="a list: rgb, perhaps depth, elevation and, with depth, validity",
+            expected="a list: rgb, perhaps depth and elevation",
         )
     return ordered

@@ -8,7 +8,6 @@ from models.multi_view import MultiView
 from models.shape_classifier import ShapeClassifier
 from models.sphere_attention import SphereAttention
 from models.sphere_context import SphereContext
-from models.sphere_rendering import SphereRendering
 from models.stem import widen_stem
 from models.unet import UNet
 
@@ -20,7 +19,6 @@ __all__ = [
     "ShapeClassifier",
     "SphereAttention",
     "SphereContext",
-    "SphereRendering",
     "UNet",
     "initialize",
     "widen_stem",

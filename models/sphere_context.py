@@ -51,7 +51,7 @@ class SphereContext(nn.Module):
             ``downs.3`` of a UNet, ``backbone.layer4`` of an FCN-ResNet.
         mixer: Makes the mixer from ``channels=C'``: a module that maps tokens ``(S, n, C', t, t)``
             and their directions ``(S, n, 3, t, t)``, n images of each of S spheres, to what is
-            added to the tokens. `SphereAttention`, `SphereRendering` or another.
+            added to the tokens. `SphereAttention` or another.
         in_channels: Channels C of the images, to find C' out.
         channels: C', where it cannot be found out.
         tokens: Features are averaged to at most so many rows and columns of tokens.

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy import stats
 from torch import nn
 
-from benchmarks import compare, costs, evaluation, growth, keypoints, precision, rivals, step
+from benchmarks import compare, evaluation, growth, keypoints, precision, rivals, step
 from benchmarks.command import MEASURED, OTHERS, main
 from benchmarks.measuring import (
     Interval,
@@ -338,28 +338,6 @@ def test_the_keypoint_benchmark_finds_keypoints_in_all_ways(
     counts = re.findall(r"(\d+) keypoints +[\d.]+ m?s", capsys.readouterr().out)
     assert len(counts) == 8
     assert min(map(int, counts)) > 100
-
-
-@pytest.mark.slow
-def test_the_costs_are_those_of_what_was_added(capsys: pytest.CaptureFixture[str]) -> None:
-    costs.main(["--quick"])
-    found = re.findall(
-        r"^  (.+?) +([\d,]+) parameters +([\d.]+) ms +([\d.]+)× +(\d+) MiB$",
-        capsys.readouterr().out,
-        re.MULTILINE,
-    )
-    assert [name for name, *_ in found] == list(costs.ADDITIONS)
-    parameters = {name: int(count.replace(",", "")) for name, count, *_ in found}
-    plain, head, attention = (
-        parameters[name] for name in ("plain", "auxiliary head", "auxiliary head, attention")
-    )
-    assert plain < head < attention
-    assert parameters["elevation"] == plain + 3 * 3 * 16, "one more plane of the first convolution"
-    assert parameters["Lovász"] == parameters["average of the weights"] == plain
-    assert float(found[0][3]) == 1
-    assert min(float(milliseconds) for _, _, milliseconds, *_ in found) > 0
-    mebibytes = {name: int(memory) for name, *_, memory in found}
-    assert mebibytes["10 images at once"] <= 1.1 * mebibytes["plain"]
 
 
 def test_one_benchmark_is_run_by_its_name(monkeypatch: pytest.MonkeyPatch) -> None:

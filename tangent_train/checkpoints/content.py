@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import yaml  # type: ignore[import-untyped]
 
+from datamodules.samples import Input
 from tangent_train.errors import DataError
 from tangent_train.files import write_text
 from tangent_train.registry import Text, check_fields, check_plain
@@ -17,8 +18,8 @@ if TYPE_CHECKING:
 
 __all__ = ["INPUTS", "NORMALIZATION", "read_checkpoint", "read_settings", "write_settings"]
 
-INPUTS = list[Literal["rgb", "depth", "validity", "elevation"]]
-"""What a network is shown, see `datamodules.samples.Input`."""
+INPUTS = list[Input]
+"""What a network is shown."""
 
 NORMALIZATION = dict[str, list[float]]
 """Its ``mean`` and ``std``."""

@@ -100,26 +100,20 @@ class Task(lightning.LightningModule, ABC):
         """A batch in parts that are trained one after the other, a bound on memory."""
 
     @abstractmethod
-    def loss_sums(self, inputs: tuple[Tensor, ...], labels: Tensor) -> Tensor:
-        """The terms of the loss of one part, each a sum.
+    def loss_sum(self, inputs: tuple[Tensor, ...], labels: Tensor) -> Tensor:
+        """The loss of one part, a sum.
 
         Args:
             inputs: Of the network.
             labels: Of the inputs.
-
-        Returns:
-            ``(terms,)``.
         """
 
     @abstractmethod
-    def loss_norms(self, labels: Tensor) -> Tensor:
-        """What the terms of the loss of all are divided by: known before any network has run.
+    def loss_norm(self, labels: Tensor) -> Tensor:
+        """What the loss of all is divided by: known before any network has run.
 
         Args:
             labels: Of all inputs.
-
-        Returns:
-            ``(terms,)``.
         """
 
     @abstractmethod
@@ -197,17 +191,17 @@ class Task(lightning.LightningModule, ABC):
         processes this is still inside `DistributedDataParallel.forward`, which exchanges gradients
         only in a backward pass that follows it: once, after the last part.
         """
-        norms = self._whole_norms(self.training_labels(batch))
+        norm = self._whole_norm(self.training_labels(batch))
         batches = self.trainer.accumulate_grad_batches
         if batch_idx % batches == 0:
             self.trainer.optimizers[0].zero_grad()
         *parts, last = self.training_parts(batch)
-        value = norms.new_zeros(())
+        value = norm.new_zeros(())
         for part in parts:
-            loss = self._loss(part, norms)
+            loss = self._loss(part, norm)
             self.trainer.strategy.backward(loss / batches, None)
             value += loss.detach()
-        loss = self._loss(last, norms)
+        loss = self._loss(last, norm)
         # The mean over processes, each divided by the mean norm, is the loss of the whole batch.
         whole: Any = self.trainer.strategy.reduce(value + loss.detach(), reduce_op="mean")
         self.log("train/loss", whole, prog_bar=True)
@@ -234,14 +228,14 @@ class Task(lightning.LightningModule, ABC):
     def optimizer_zero_grad(self, *_: Any) -> None:
         """Nothing: `training_step` clears the gradients before its first part."""
 
-    def _whole_norms(self, labels: Tensor) -> Tensor:
-        """Norms of the loss over all processes; as their gradients are averaged, their mean."""
-        norms = self.loss_norms(labels)
-        mean: Tensor = self.trainer.strategy.reduce(norms, reduce_op="mean")
-        return mean.clamp(min=torch.finfo(norms.dtype).tiny)
+    def _whole_norm(self, labels: Tensor) -> Tensor:
+        """The norm of the loss over all processes; as their gradients are averaged, the mean."""
+        norm = self.loss_norm(labels)
+        mean: Tensor = self.trainer.strategy.reduce(norm, reduce_op="mean")
+        return mean.clamp(min=torch.finfo(norm.dtype).tiny)
 
-    def _loss(self, part: Part, norms: Tensor) -> Tensor:
-        return (self.loss_sums(*part) / norms).sum()
+    def _loss(self, part: Part, norm: Tensor) -> Tensor:
+        return self.loss_sum(*part) / norm
 
     def validation_step(self, batch: Any, batch_idx: int) -> Tensor:
         """Count a batch of the validation split."""

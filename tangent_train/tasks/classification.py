@@ -126,17 +126,17 @@ class ClassificationTask(Task):
         parts = zip(torch.split(views, size), torch.split(batch.label, size), strict=True)
         return [((inputs,), labels) for inputs, labels in parts]
 
-    def loss_sums(self, inputs: tuple[Tensor, ...], labels: Tensor) -> Tensor:
+    def loss_sum(self, inputs: tuple[Tensor, ...], labels: Tensor) -> Tensor:
         """Cross-entropy, summed over the shapes."""
         scores = self(*inputs)
         exact = torch.promote_types(scores.dtype, torch.float32)
         return functional.cross_entropy(
             scores.to(exact), labels, reduction="sum", label_smoothing=self.label_smoothing
-        )[None]
+        )
 
-    def loss_norms(self, labels: Tensor) -> Tensor:
+    def loss_norm(self, labels: Tensor) -> Tensor:
         """The number of shapes."""
-        return torch.tensor([float(len(labels))], device=labels.device)
+        return torch.tensor(float(len(labels)), device=labels.device)
 
     def evaluate(self, batch: Any) -> Tensor:
         """Count a batch of shapes; returns the predictions ``(B,)``."""

@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from jaxtyping import Float, Int64, UInt8
 from torch import Tensor
 from torch.nn import functional
 
-from tangent_train.errors import SettingError
-
 __all__ = [
     "UNKNOWN",
     "AuxiliaryTarget",
-    "RegionLoss",
     "auxiliary_sum",
-    "check_region_loss",
     "cross_entropy_norm",
     "cross_entropy_sum",
-    "region_norm",
-    "region_sum",
 ]
 
 UNKNOWN = 0
@@ -28,9 +22,6 @@ UNKNOWN = 0
 
 AuxiliaryTarget = Literal["histogram", "labels"]
 """What the cells of a coarser stage are compared with; see `auxiliary_sum`."""
-
-RegionLoss = Literal["lovasz", "dice"]
-"""Losses of an image as a whole; see `region_sum`."""
 
 
 def cross_entropy_sum(
@@ -107,67 +98,9 @@ def auxiliary_sum(
     )
 
 
-def check_region_loss(name: str) -> None:
-    """Refuse a loss that `region_sum` cannot compute here.
-
-    Args:
-        name: The setting; ``none`` needs nothing.
-
-    Raises:
-        SettingError: An unknown one, or the package it comes from is not installed.
-    """
-    if name not in ("none", "lovasz", "dice"):
-        raise SettingError("task.region_loss", found=repr(name), expected="none, lovasz or dice")
-    if name != "none":
-        _implementations()
-
-
-def region_sum(
-    scores: Float[Tensor, "images classes height width"],
-    labels: UInt8[Tensor, "images height width"],
-    loss: RegionLoss,
-) -> Tensor:
-    """A loss that looks at every image as a whole, summed over those with a labelled pixel.
-
-    `lovasz` is the Lovász-Softmax loss, whose minimum is that of 1 − IoU (Berman et al., CVPR
-    2018), `dice` is 1 − 2·|A∩B| / (|A|+|B|) of probabilities; each the mean over the classes that
-    an image has. Unknown pixels count for nothing.
-
-    Args:
-        scores: Logits.
-        labels: Class indices; 0 is unknown.
-        loss: Which.
-
-    Raises:
-        SettingError: The package it comes from is not installed.
-    """
-    labelled = _labelled(labels)
-    exact, truth = scores[labelled].float(), labels[labelled].long()
-    implementation = getattr(_implementations(), f"{loss.capitalize()}Loss")
-    losses = [exact.sum() * 0]  # should there be none
-    # One by one: of several images the package's Dice makes one, and its Lovász fails when one of
-    # them has no labelled pixel.
-    for image_scores, image_labels in zip(exact, truth, strict=True):
-        chosen = {}  # Lovász takes the classes of the image by itself
-        if loss == "dice":
-            chosen["classes"] = image_labels[image_labels != UNKNOWN].unique().tolist()
-        compute = implementation("multiclass", ignore_index=UNKNOWN, **chosen)
-        losses.append(compute(image_scores[None], image_labels[None]))
-    return torch.stack(losses).sum()
-
-
-def region_norm(labels: UInt8[Tensor, "images height width"]) -> Tensor:
-    """The number of images with a labelled pixel, which `region_sum` is divided by."""
-    return _labelled(labels).sum().float()
-
-
 def _exact(values: Tensor) -> Tensor:
     """Sums of millions of pixels: never in half precision."""
     return values.to(torch.promote_types(values.dtype, torch.float32))
-
-
-def _labelled(labels: Tensor) -> Tensor:
-    return (labels != UNKNOWN).flatten(1).any(dim=1)
 
 
 def _centers(count: int, size: int, device: torch.device) -> Int64[Tensor, " count"]:
@@ -193,16 +126,3 @@ def _histograms(
     bins = cells * classes + labels
     counts = torch.bincount(bins.flatten(), minlength=len(labels) * size[0] * size[1] * classes)
     return counts.view(len(labels), *size, classes).permute(0, 3, 1, 2)
-
-
-def _implementations() -> Any:
-    try:
-        from segmentation_models_pytorch import losses  # type: ignore[import-untyped]
-    except ImportError as error:
-        raise SettingError(
-            "task.region_loss",
-            found="no segmentation-models-pytorch",
-            expected="the package that brings the loss, or task.region_loss=none",
-            remedy="Run: pip install 'tangent-train[networks]'",
-        ) from error
-    return losses

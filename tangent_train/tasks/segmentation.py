@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, Literal, get_args
+from typing import Any, ClassVar, get_args
 
 import torch
 from jaxtyping import Float, Integer
@@ -24,10 +24,14 @@ from tangent_train.rendering import Assembler, EquirectRepresentation
 from tangent_train.tasks.base import Part, Task, check_at_once
 from tangent_train.tasks.callbacks import PredictionPanels
 from tangent_train.tasks.html.evaluation import write_evaluation_report
-from tangent_train.tasks.losses import AuxiliaryTarget, RegionLoss
+from tangent_train.tasks.losses import (
+    AuxiliaryTarget,
+    auxiliary_sum,
+    cross_entropy_norm,
+    cross_entropy_sum,
+)
 from tangent_train.tasks.metrics import AbsentClass, ConfusionMatrix, segmentation_scores
 from tangent_train.tasks.results import evaluation_results, results_table, write_results
-from tangent_train.tasks.segmentation_loss import SegmentationLoss
 from tangent_train.tasks.tensorboard_pictures import ValidationPictures
 
 __all__ = ["SegmentationTask"]
@@ -57,10 +61,8 @@ class SegmentationTask(Task):
         class_weights: Weights of the loss: a name that the data module knows (``none``, ``log``,
             ``sqrt``, ``effective``) or K + 1 numbers.
         label_smoothing: Share of the target spread over all classes.
-        auxiliary_weight: See `SegmentationLoss`.
-        auxiliary_target: See `SegmentationLoss`.
-        region_loss: See `SegmentationLoss`.
-        region_weight: See `SegmentationLoss`.
+        auxiliary_weight: Of the loss of the scores under ``"aux"``.
+        auxiliary_target: What those are compared with, see `losses.auxiliary_sum`.
         images_per_chunk: Images trained at once, a bound on memory; None for the whole batch.
         images_per_forward: Images evaluated at once, a bound on memory; training is not affected.
         absent_class: What classes absent from the truth do to the means.
@@ -85,8 +87,6 @@ class SegmentationTask(Task):
         label_smoothing: float = 0.0,
         auxiliary_weight: float = 0.4,
         auxiliary_target: AuxiliaryTarget = "histogram",
-        region_loss: RegionLoss | Literal["none"] = "none",
-        region_weight: float = 1.0,
         images_per_chunk: int | None = None,
         images_per_forward: int = 32,
         absent_class: AbsentClass = "skip",
@@ -109,9 +109,15 @@ class SegmentationTask(Task):
             raise SettingError("task.absent_class", found=absent_class, expected="skip or zero")
         _check_weighting(class_weights, self.class_names)
         self.weighting = class_weights
-        self.loss = SegmentationLoss(
-            label_smoothing, auxiliary_weight, auxiliary_target, region_loss, region_weight
-        )
+        if not auxiliary_weight >= 0:
+            raise SettingError(
+                "task.auxiliary_weight", found=auxiliary_weight, expected="0 or more"
+            )
+        if auxiliary_target not in get_args(AuxiliaryTarget):
+            expected = " or ".join(get_args(AuxiliaryTarget))
+            raise SettingError("task.auxiliary_target", found=auxiliary_target, expected=expected)
+        self.auxiliary_weight = auxiliary_weight
+        self.auxiliary_target: AuxiliaryTarget = auxiliary_target
         self.takes_rays = any(
             "rays" in inspect.signature(held.forward).parameters for held in held_networks(network)
         )
@@ -195,13 +201,18 @@ class SegmentationTask(Task):
         parts = zip(torch.split(images, size), torch.split(labels, size), strict=True)
         return [((part,), of_part) for part, of_part in parts]
 
-    def loss_sums(self, inputs: tuple[Tensor, ...], labels: Tensor) -> Tensor:
-        """See `SegmentationLoss.sums`."""
-        return self.loss.sums(self.outputs(*inputs), labels, self.class_weights)
+    def loss_sum(self, inputs: tuple[Tensor, ...], labels: Tensor) -> Tensor:
+        """Weighted cross-entropy, with that of an auxiliary head, summed over the pixels."""
+        outputs, weights = self.outputs(*inputs), self.class_weights
+        loss = cross_entropy_sum(outputs["out"], labels, weights, self.label_smoothing)
+        if "aux" not in outputs:
+            return loss
+        auxiliary = auxiliary_sum(outputs["aux"], labels, weights, self.auxiliary_target)
+        return loss + self.auxiliary_weight * auxiliary
 
-    def loss_norms(self, labels: Tensor) -> Tensor:
-        """See `SegmentationLoss.norms`."""
-        return self.loss.norms(labels, self.class_weights)
+    def loss_norm(self, labels: Tensor) -> Tensor:
+        """The class weights of the labelled pixels, added up."""
+        return cross_entropy_norm(labels, self.class_weights)
 
     @torch.no_grad()
     def predict_labels(

@@ -30,7 +30,6 @@ MAKER = {
     "unet_small": "models.unet.UNet",
     "unet_small_aux": "models.auxiliary_head.AuxiliaryHead",
     "unet_small_context": "models.sphere_context.SphereContext",
-    "unet_small_sphere_rendering": "models.sphere_context.SphereContext",
 }
 DEPTH = {"fcn_resnet": "network.depth=50", "fcn_resnet_context": "network.network.depth=50"}
 

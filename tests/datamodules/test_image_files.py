@@ -287,7 +287,7 @@ def test_not_images(tmp_path: Path, read: Any) -> None:
             read(tmp_path / name)
 
 
-def _png_header(width: int, height: int) -> bytes:
+def _png_header(width: int, height: int, compressed: bytes = zlib.compress(bytes(1000))) -> bytes:
     def chunk(kind: bytes, data: bytes) -> bytes:
         end = struct.pack(">I", zlib.crc32(kind + data))
         return struct.pack(">I", len(data)) + kind + data + end
@@ -296,7 +296,7 @@ def _png_header(width: int, height: int) -> bytes:
     return (
         b"\x89PNG\r\n\x1a\n"
         + chunk(b"IHDR", header)
-        + chunk(b"IDAT", zlib.compress(bytes(1000)))
+        + chunk(b"IDAT", compressed)
         + chunk(b"IEND", b"")
     )
 
@@ -313,8 +313,11 @@ def test_files_that_would_fill_the_memory_are_refused(
 
 def test_the_largest_panoramas_are_allowed(tmp_path: Path) -> None:
     path = tmp_path / "large.png"
-    path.write_bytes(_png_header(32768, 16384))
+    path.write_bytes(_png_header(32768, 16384, bytes(1_600_000)))
     assert read_image_size(path) == (16384, 32768)
+    path.write_bytes(_png_header(32768, 16384, bytes(1_500_000)))
+    with pytest.raises(DataError, match=r"16384×32768 pixels, and 15\d{5} bytes; expected 156"):
+        read_image_size(path)
 
 
 def test_floats_are_no_colors(tmp_path: Path) -> None:

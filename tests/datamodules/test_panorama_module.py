@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import hashlib
 import multiprocessing
+import warnings
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -199,9 +200,9 @@ def test_impossible_settings_of_upright(make_module: MakeModule, settings: dict[
         make_module(**settings)
 
 
-@pytest.mark.parametrize("world_size", [2, 3])
+@pytest.mark.parametrize(("world_size", "left_out"), [(2, []), (3, ["2 of 8 training panoramas"])])
 def test_processes_share_the_test_panoramas(
-    make_module: MakeModule, monkeypatch: pytest.MonkeyPatch, world_size: int
+    make_module: MakeModule, monkeypatch: pytest.MonkeyPatch, world_size: int, left_out: list[str]
 ) -> None:
     monkeypatch.setattr("torch.distributed.is_initialized", lambda: True)
     monkeypatch.setattr("torch.distributed.get_world_size", lambda: world_size)
@@ -211,7 +212,10 @@ def test_processes_share_the_test_panoramas(
         monkeypatch.setattr("torch.distributed.get_rank", lambda rank=rank: rank)
         module = make_module()
         seen += [int(batch.index) for batch in module.test_dataloader()]
-        steps.add(len(module.train_dataloader()))
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            steps.add(len(module.train_dataloader()))
+        assert [str(w.message).partition(",")[0] for w in said] == left_out
     assert sorted(seen) == list(range(5))
     assert len(steps) == 1
 

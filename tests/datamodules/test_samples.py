@@ -145,18 +145,17 @@ def test_the_elevation_of_tangent_images_is_that_of_their_rays() -> None:
     np.testing.assert_allclose(elevation, representation.grid.directions()[..., 2], atol=4e-4)
 
 
-def test_validity_and_elevation_follow_the_measured_channels() -> None:
+def test_the_elevation_follows_the_measured_channels() -> None:
     rgb = torch.full((2, 3, 3, 3), 255, dtype=torch.uint8)
     depth = torch.tensor([[0, 1, 2048]] * 3, dtype=torch.int16).expand(2, 3, 3)
     elevation = torch.linspace(-1, 1, 18).reshape(2, 3, 3)
-    every: tuple[Input, ...] = ("rgb", "depth", "validity", "elevation")
+    every: tuple[Input, ...] = ("rgb", "depth", "elevation")
     images = normalize([rgb, depth, elevation], IDENTITY, every)
-    assert images.shape == (2, 6, 3, 3)
+    assert images.shape == (2, 5, 3, 3)
     assert images[0, 3, 0].tolist() == [0, 1 / 512, 4]
-    assert images[:, 4].tolist() == [[[0, 1, 1]] * 3] * 2
-    torch.testing.assert_close(images[:, 5], elevation)
-    without = normalize([rgb, depth], IDENTITY, every[:3])
-    torch.testing.assert_close(without, images[:, :5])
+    torch.testing.assert_close(images[:, 4], elevation)
+    without = normalize([rgb, depth], IDENTITY, every[:2])
+    torch.testing.assert_close(without, images[:, :4])
     flat = normalize([rgb, elevation], RGB_NORMALIZATION, ("rgb", "elevation"))
     torch.testing.assert_close(flat[:, 3], elevation)
 
@@ -166,7 +165,6 @@ def test_validity_and_elevation_follow_the_measured_channels() -> None:
     [
         (),
         ("depth",),
-        ("rgb", "validity"),
         ("rgb", "rgb"),
         ("rgb", "heat"),
         ("rgb", "elevation") * 2,

@@ -12,7 +12,7 @@ from tangent_train.errors import DataError, SettingError
 if TYPE_CHECKING:
     from pathlib import Path
 
-ROOMS = {"rooms": {"1": 2, "3": 0, "5a": 1}, "height": 16, "supersample": 1}
+ROOMS: dict[str, Any] = {"rooms": {"1": 2, "3": 0, "5a": 1}, "height": 16, "supersample": 1}
 
 
 @pytest.mark.slow

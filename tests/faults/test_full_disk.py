@@ -56,7 +56,8 @@ def _numpy(path: Path) -> None:
 def _mapped(path: Path) -> None:
     with atomic_path(path) as temporary:
         array = np.lib.format.open_memmap(temporary, "w+", np.float32, (LARGE,))
-        reserve(temporary)
+        with temporary.open("r+b") as file:
+            reserve(file, temporary.stat().st_size)
         array[:] = 1
 
 

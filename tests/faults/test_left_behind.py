@@ -62,10 +62,10 @@ def test_what_a_killed_process_left_is_removed_by_the_next(
     process.wait()
     assert temporary.read_text() == "half"
     assert list(tmp_path.iterdir()) == [temporary], "no file that could be taken for a whole one"
-    _age(temporary, hours=2)
+    _age(temporary, hours=25)
     (tmp_path / "kept").mkdir()
     (tmp_path / "kept" / ".partial-x").touch()
-    _age(tmp_path / "kept" / ".partial-x", hours=2)
+    _age(tmp_path / "kept" / ".partial-x", hours=25)
     write_text(tmp_path / "file.txt", "whole")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file.txt", "kept"]
     assert (tmp_path / "kept" / ".partial-x").exists(), "only in the folder that is written to"
@@ -75,16 +75,16 @@ def test_what_is_being_written_is_left_alone(
     tmp_path: Path, writer: tuple[subprocess.Popen[str], Path]
 ) -> None:
     _, temporary = writer
-    _age(temporary, hours=100)  # a process that was stopped for days
+    _age(temporary, hours=23)  # a process that was stopped for a night
     write_text(tmp_path / "file.txt", "of another process")
     assert temporary.read_text() == "half"
 
 
 def test_what_is_young_may_be_of_another_machine(tmp_path: Path) -> None:
     (tmp_path / ".partial-young").touch()
-    _age(tmp_path / ".partial-young", hours=0.5)
+    _age(tmp_path / ".partial-young", hours=23)
     (tmp_path / ".partial-folder").mkdir()
-    _age(tmp_path / ".partial-folder", hours=5)
+    _age(tmp_path / ".partial-folder", hours=25)
     write_text(tmp_path / "a", "x")
     assert {path.name for path in tmp_path.iterdir()} == {
         "a",
@@ -96,7 +96,7 @@ def test_what_is_young_may_be_of_another_machine(tmp_path: Path) -> None:
 def test_a_folder_is_looked_at_once(tmp_path: Path) -> None:
     write_text(tmp_path / "a", "x")
     (tmp_path / ".partial-old").touch()
-    _age(tmp_path / ".partial-old", hours=5)
+    _age(tmp_path / ".partial-old", hours=25)
     with atomic_path(tmp_path / "b") as temporary:
         temporary.write_text("x")
     assert (tmp_path / ".partial-old").exists(), "thousands of files are not listed for each"

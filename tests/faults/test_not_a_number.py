@@ -210,14 +210,14 @@ import torch
 from tangent_train.cli.main import train
 from tangent_train.tasks import SegmentationTask
 
-original = SegmentationTask.loss_sums
+original = SegmentationTask.loss_sum
 
-def loss_sums(self, inputs, labels):
+def loss_sum(self, inputs, labels):
     sums = original(self, inputs, labels)
     wrong = self.trainer.global_step == 2 and os.environ.get("LOCAL_RANK") == "1"
     return sums * torch.nan if wrong else sums
 
-SegmentationTask.loss_sums = loss_sums
+SegmentationTask.loss_sum = loss_sum
 if __name__ == "__main__":
     train()
 """

@@ -353,7 +353,7 @@ def test_a_training_refuses_then_goes_on_without(
     left_out = "2 of 12 panoramas are broken and left out (data.skip_broken=true)"
     assert left_out in capsys.readouterr().out
     checkpoint = f"checkpoint={tmp_path / 'run/checkpoints/last.ckpt'}"
-    _run(monkeypatch, "evaluate", checkpoint, "hydra.run.dir=again")
+    _run(monkeypatch, "evaluate", checkpoint, f"data.root='{root}'", "hydra.run.dir=again")
     assert left_out in capsys.readouterr().out
     for folder in ("run", "again"):
         assert '"images": 1' in (tmp_path / folder / "results.json").read_text()

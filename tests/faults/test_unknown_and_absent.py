@@ -68,7 +68,7 @@ class Steps(lightning.Callback):
 @WITHOUT_VALIDATION
 @pytest.mark.parametrize(
     "settings",
-    [{}, {"images_per_chunk": 7}, {"region_loss": "dice"}, {"region_loss": "lovasz"}],
+    [{}, {"images_per_chunk": 7}],
     ids=str,
 )
 @pytest.mark.parametrize("half", [False, True], ids=["float32", "float16"])

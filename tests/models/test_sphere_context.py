@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from models import FCNResNet, SphereContext, SphereRendering, UNet
+from models import FCNResNet, SphereContext, UNet
 from models.sphere_tokens import lone_rays, token_directions
 from tangent_train.errors import SettingError
 from tangent_train.geometry import random_rotation
@@ -209,8 +209,20 @@ def test_fcn_resnet() -> None:
     assert not torch.allclose(scores, expected, atol=1e-3)
 
 
+class Averaging(nn.Module):
+    """A mixer that adds the mean of all images' tokens, whatever they see."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.scale = nn.Parameter(torch.zeros(channels))
+
+    def forward(self, tokens: Tensor, directions: Tensor) -> Tensor:
+        mean = tokens.mean(dim=(1, 3, 4), keepdim=True).expand_as(tokens)
+        return mean * self.scale[:, None, None]
+
+
 def test_any_mixer_can_be_chosen() -> None:
-    context = SphereContext(small_unet(), STAGE, SphereRendering, in_channels=3)
+    context = SphereContext(small_unet(), STAGE, Averaging, in_channels=3)
     awake(context.mixer)
     context.eval()
     images, rays = torch.randn(4, 3, 16, 16), sphere_rays(4)

@@ -1,27 +1,18 @@
 from __future__ import annotations
 
-import itertools
 import math
-import sys
 from fractions import Fraction
 
-import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from tangent_train.errors import SettingError
 from tangent_train.tasks.losses import (
     AuxiliaryTarget,
-    RegionLoss,
     auxiliary_sum,
-    check_region_loss,
     cross_entropy_norm,
     cross_entropy_sum,
-    region_norm,
-    region_sum,
 )
 
 
@@ -151,97 +142,3 @@ def test_auxiliary_losses_are_not_computed_in_half_precision(target: AuxiliaryTa
     with torch.autocast("cpu", torch.bfloat16):
         found = auxiliary_sum(scores, labels, weights, target)
     assert float(found) == pytest.approx(labels.numel() * math.log(3), rel=1e-5)
-
-
-# --- regions -----------------------------------------------------------------------------------
-
-
-def _lovasz(probabilities: NDArray[np.float64], truth: NDArray[np.uint8]) -> float:
-    """Of one image: the Lovász extension as an integral of 1 - IoU over thresholds of the error."""
-    known = truth > 0
-    losses = []
-    for c in np.unique(truth[known]):
-        inside = truth[known] == c
-        errors = np.abs(inside - probabilities[c][known])
-        levels = np.concatenate([[0], np.sort(errors)])
-        loss = 0.0
-        for low, high in itertools.pairwise(levels):
-            wrong = errors > low
-            loss += (high - low) * wrong.sum() / (inside | wrong).sum()
-        losses.append(loss)
-    return float(np.mean(losses))
-
-
-def _dice(probabilities: NDArray[np.float64], truth: NDArray[np.uint8]) -> float:
-    known = truth > 0
-    losses = []
-    for c in np.unique(truth[known]):
-        inside, share = truth[known] == c, probabilities[c][known]
-        losses.append(1 - 2 * share[inside].sum() / (share.sum() + inside.sum()))
-    return float(np.mean(losses))
-
-
-@pytest.mark.parametrize(("loss", "reference"), [("lovasz", _lovasz), ("dice", _dice)])
-def test_region_losses_by_their_definition(loss: RegionLoss, reference: object) -> None:
-    scores, labels = _scores(5, 5, 6, 7), _labels(5, 6, 7)
-    labels[1] = 0  # an image of which nothing is known
-    labels[2, :, 1:] = 0
-    labels[3] = 3
-    labels[4, labels[4] == 2] = 1  # a class is absent
-    probabilities = scores.detach().softmax(1).numpy()
-    assert callable(reference)
-    expected = [reference(probabilities[k], labels[k].numpy()) for k in (0, 2, 3, 4)]
-    found = region_sum(scores.detach(), labels, loss)
-    assert float(found) == pytest.approx(sum(expected), rel=1e-5)
-    assert float(region_norm(labels)) == 4
-
-
-@pytest.mark.parametrize("loss", ["lovasz", "dice"])
-def test_region_parts_add_up_and_unknown_counts_for_nothing(loss: RegionLoss) -> None:
-    scores, labels = _scores(5, 5, 6, 7), _labels(5, 6, 7)
-    labels[0] = 0
-    labels[3, 2:] = 0
-    (expected,) = torch.autograd.grad(region_sum(scores, labels, loss), scores)
-    parts = [region_sum(scores[k : k + 2], labels[k : k + 2], loss) for k in (0, 2, 4)]
-    (found,) = torch.autograd.grad(torch.stack(parts).sum(), scores)
-    torch.testing.assert_close(found, expected)
-    assert float(found[0].abs().max()) == 0
-    assert float(found[3, :, 2:].abs().max()) == 0
-    assert float(found[3, :, :2].abs().max()) > 0
-
-
-@pytest.mark.parametrize("loss", ["lovasz", "dice"])
-def test_region_losses_of_right_and_of_no_labels(loss: RegionLoss) -> None:
-    labels = _labels(3, 8, 8).clamp(min=1)
-    right = 100 * functional.one_hot(labels.long(), 5).movedim(-1, 1).double()
-    assert float(region_sum(right, labels, loss)) == pytest.approx(0, abs=1e-6)
-    assert float(region_sum(-right, labels, loss)) == pytest.approx(3, abs=1e-6)
-    scores = _scores(3, 5, 8, 8)
-    nothing = region_sum(scores, torch.zeros_like(labels), loss)
-    (gradient,) = torch.autograd.grad(nothing, scores)
-    assert nothing.item() == gradient.abs().max().item() == 0
-    assert float(region_norm(torch.zeros_like(labels))) == 0
-
-
-@pytest.mark.parametrize("loss", ["lovasz", "dice"])
-def test_region_losses_are_not_computed_in_half_precision(loss: RegionLoss) -> None:
-    scores, labels = _scores(2, 3, 100, 100), _labels(2, 100, 100, classes=3)
-    half = scores.detach().half()
-    with torch.autocast("cpu", torch.bfloat16):
-        found = region_sum(half, labels, loss)
-    assert found.dtype == torch.float32
-    expected = float(region_sum(half.double(), labels, loss))
-    assert float(found) == pytest.approx(expected, rel=1e-4)
-
-
-def test_unknown_region_losses_and_a_missing_package_are_refused(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    for name in ("none", "lovasz", "dice"):
-        check_region_loss(name)
-    with pytest.raises(SettingError, match="'jaccard'; expected none, lovasz or dice"):
-        check_region_loss("jaccard")
-    monkeypatch.setitem(sys.modules, "segmentation_models_pytorch", None)
-    check_region_loss("none")
-    with pytest.raises(SettingError, match=r"pip install 'tangent-train\[networks\]'"):
-        check_region_loss("dice")

@@ -65,11 +65,11 @@ def test_the_mean_of_two_processes_gradients_is_that_of_their_batches_together(
     task.images_per_chunk = chunk
     task.class_weights.copy_(torch.arange(1.0, 15.0))
     full, sparse = _batch(0.9, 1), _batch(0.1, 2)
-    norms = [task.loss_norms(task.training_labels(batch)) for batch in (full, sparse)]
+    norms = [task.loss_norm(task.training_labels(batch)) for batch in (full, sparse)]
     of_each = [_gradient(task, batch, norms) for batch in (full, sparse)]
     pairs: Any = [torch.cat(pair) for pair in zip(full, sparse, strict=True)]
     both: Any = TrainingSample(*pairs)
-    alone = _gradient(task, both, [task.loss_norms(task.training_labels(both))])
+    alone = _gradient(task, both, [task.loss_norm(task.training_labels(both))])
     torch.testing.assert_close(sum(of_each) / 2, alone, rtol=1e-4, atol=1e-6)
 
 

@@ -14,7 +14,6 @@ from torch.utils.data import DataLoader
 from tangent_train.errors import SettingError
 from tangent_train.rendering import TangentRepresentation
 from tangent_train.tasks import SegmentationTask
-from tangent_train.tasks.segmentation_loss import SegmentationLoss
 from tests.tasks.quiet_trainer import quiet_trainer
 
 NAMES = ("unknown", "a", "b")
@@ -48,38 +47,24 @@ def _batch(seed: int = 0) -> tuple[Tensor, Tensor]:
 @pytest.mark.parametrize("weight", [0.0, 0.4])
 def test_the_auxiliary_head_adds_the_loss_of_its_cells(weight: float) -> None:
     images, labels = _batch()
-    outputs = TwoHeads()(images)
-    loss = SegmentationLoss(auxiliary_weight=weight)
-    found = loss.sums(outputs, labels, WEIGHTS) / loss.norms(labels, WEIGHTS)
+    torch.manual_seed(0)
+    optimizer = partial(torch.optim.SGD, lr=0.1)
+    task = SegmentationTask(TwoHeads(), TANGENT, NAMES, optimizer, auxiliary_weight=weight)
+    task.class_weights.copy_(WEIGHTS)
+    found = task.loss_sum((images,), labels) / task.loss_norm(labels)
+    outputs = task.network(images)
     mean = partial(functional.cross_entropy, weight=WEIGHTS, ignore_index=0)
     enlarged = outputs["aux"].repeat_interleave(4, 2).repeat_interleave(4, 3)
     expected = mean(outputs["out"], labels.long()) + weight * mean(enlarged, labels.long())
-    torch.testing.assert_close(found.sum(), expected)
-
-
-@pytest.mark.parametrize("region", ["lovasz", "dice"])
-def test_a_region_loss_is_the_mean_over_the_images(region: Any) -> None:
-    images, labels = _batch()
-    outputs = {"out": TwoHeads().eval()(images)}
-    plain = SegmentationLoss()
-    both = SegmentationLoss(region_loss=region, region_weight=0.5)
-    norms = both.norms(labels, WEIGHTS)
-    assert norms[1] == 5, "an image without a label does not count"
-    extra = (both.sums(outputs, labels, WEIGHTS) - plain.sums(outputs, labels, WEIGHTS)) / norms
-    assert extra[0] == 0
-    assert 0 < extra[1] < 0.5, "half of something between 0 and 1"
-    each = zip(outputs["out"], labels, strict=True)
-    parts = sum(both.sums({"out": score[None]}, of[None], WEIGHTS) for score, of in each)
-    torch.testing.assert_close(parts, both.sums(outputs, labels, WEIGHTS), rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(found, expected)
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
         ({"auxiliary_weight": -1}, r"task\.auxiliary_weight: found -1"),
-        ({"region_weight": float("nan")}, r"task\.region_weight: found nan"),
+        ({"auxiliary_weight": float("nan")}, r"task\.auxiliary_weight: found nan"),
         ({"auxiliary_target": "mean"}, r"task\.auxiliary_target: found mean.*histogram or labels"),
-        ({"region_loss": "iou"}, r"task\.region_loss: found 'iou'"),
     ],
 )
 def test_impossible_terms(settings: dict[str, Any], message: str) -> None:
