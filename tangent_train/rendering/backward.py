@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any, Literal, TypeVar, overload
 
 import numpy as np
@@ -170,30 +170,12 @@ def _render_labels(
     check_scores(logits, grid)
     small = torch.uint8 if logits.shape[-3] <= 256 else torch.uint16
     stacks = logits.reshape(-1, *logits.shape[-4:])
-    render = _label_renderer(logits, grid, blend)
+    compiled = logits.device.type == "cpu" and logits.dtype == torch.float32
+    render = _compiled_labels if compiled and grid.dim >= label_kernels.LANES else _torch_labels
     result = torch.empty((len(stacks), *shape), dtype=small, device=logits.device)
     for stack, labels in zip(stacks, result, strict=True):
         render(stack, grid, blend, labels)
     return result.reshape(*logits.shape[:-4], *shape)
-
-
-def _label_renderer(
-    logits: Tensor, grid: PinholeGrid, blend: Blend
-) -> Callable[[Tensor, PinholeGrid, Blend, Tensor], None]:
-    """The fastest that there is for these scores."""
-    if logits.device.type == "cpu":
-        compiled = logits.dtype == torch.float32 and grid.dim >= label_kernels.LANES
-        return _compiled_labels if compiled else _torch_labels
-    fused = logits.is_cuda and blend == "nearest" and logits.dtype != torch.float64
-    return _gpu_labels if fused and grid.dim > 1 and _has_triton(logits.device) else _torch_labels
-
-
-def _has_triton(device: torch.device) -> bool:
-    try:
-        from tangent_train.rendering import gpu_labels
-    except ImportError:  # not part of every torch
-        return False
-    return gpu_labels.usable(device)
 
 
 def _tensor(array: NDArray[Any]) -> Tensor:
@@ -253,18 +235,6 @@ def _compiled_labels(scores: Tensor, grid: PinholeGrid, blend: Blend, labels: Te
         )
     else:
         over_rows(label_kernels.owner_labels, shape, array, *owner_arguments(grid, shape), out)
-
-
-def _gpu_labels(scores: Tensor, grid: PinholeGrid, _blend: Blend, labels: Tensor) -> None:
-    """Labels ``(H, W)`` of ``(N, K, d, d)`` scores on a GPU, each from its owner."""
-    from tangent_train.rendering import gpu_labels
-
-    shape, single = check_shape(labels.shape), np.dtype(np.float32)
-    key = ("owner", shape, single)
-    face, u, v = tensors_on(
-        scores.device, grid, key, lambda: owner_table(grid, shape, single).arrays
-    )
-    gpu_labels.owner_labels(scores.contiguous(), face, u, v, labels)
 
 
 def _torch_labels(scores: Tensor, grid: PinholeGrid, blend: Blend, labels: Tensor) -> None:

@@ -34,7 +34,7 @@ def test_rooms_are_made_then_read_like_the_real_set(tmp_path: Path, strips: Any)
 
 def test_settings_as_a_mapping_or_ready_made(tmp_path: Path, strips: Any) -> None:
     mapping = SynthRooms(tmp_path, strips, rooms=ROOMS, fold=1)
-    ready = SynthRooms(tmp_path, strips, rooms=RoomSettings(**ROOMS))  # type: ignore[arg-type]
+    ready = SynthRooms(tmp_path, strips, rooms=RoomSettings(**ROOMS))
     assert mapping.rooms == ready.rooms
 
 

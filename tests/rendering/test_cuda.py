@@ -14,7 +14,6 @@ from tangent_train.rendering import (
     tangent_to_equirect,
     tangent_to_labels,
 )
-from tangent_train.rendering.gpu_labels import usable
 from tangent_train.tasks import ConfusionMatrix
 
 pytestmark = [
@@ -61,8 +60,7 @@ def test_labels(blend: Blend) -> None:
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.float16])
 @pytest.mark.parametrize("classes", [1, 13, 300])
-def test_labels_of_one_kernel_are_those_of_torch(classes: int, dtype: torch.dtype) -> None:
-    assert usable(torch.device("cuda")), "Triton does not work here"
+def test_labels_of_any_precision(classes: int, dtype: torch.dtype) -> None:
     scores = _random(GRID.num_images, classes, GRID.dim, GRID.dim).to(dtype)
     scores[0], scores[1], scores[2, 0] = torch.nan, -torch.inf, torch.nan
     expected = tangent_to_labels(scores.double(), GRID, SHAPE)

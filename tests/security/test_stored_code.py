@@ -167,7 +167,7 @@ def test_nothing_in_a_checkpoint_is_interpreted(content: dict[str, Any], forbidd
 def test_no_attack_at_any_place_of_a_checkpoint_is_interpreted(
     content: dict[str, Any], forbidden: Path
 ) -> None:
-    _attack_checkpoints(content, forbidden, each=None)
+    _attack_checkpoints(content, forbidden, each=10)
 
 
 def _without_the_registry(patch: pytest.MonkeyPatch) -> None:
