@@ -7,19 +7,25 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import yaml  # type: ignore[import-untyped]
 
-from datamodules.samples import Input
 from tangent_train.errors import DataError
 from tangent_train.files import write_text
 from tangent_train.registry import Text, check_fields, check_plain
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping
+    from collections.abc import Collection, Iterator, Mapping
     from pathlib import Path
 
-__all__ = ["INPUTS", "NORMALIZATION", "read_checkpoint", "read_settings", "write_settings"]
+__all__ = [
+    "INPUTS",
+    "NORMALIZATION",
+    "flat_settings",
+    "read_checkpoint",
+    "read_settings",
+    "write_settings",
+]
 
-INPUTS = list[Input]
-"""What a network is shown."""
+INPUTS = list[Literal["rgb", "depth", "elevation"]]
+"""What a network is shown, see `datamodules.samples.Input`, which is slow to import."""
 
 NORMALIZATION = dict[str, list[float]]
 """Its ``mean`` and ``std``."""
@@ -107,3 +113,13 @@ class _Dumper(yaml.SafeDumper):  # type: ignore[misc]
 def write_settings(path: Path, settings: Mapping[str, Any]) -> None:
     """Write settings as YAML; texts are written so that any reader takes them for what they are."""
     write_text(path, yaml.dump(dict(settings), Dumper=_Dumper, sort_keys=False, allow_unicode=True))
+
+
+def flat_settings(config: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Settings of nested sections as ``section.setting``, with their values."""
+    for key, value in config.items():
+        name = f"{prefix}{key}"
+        if isinstance(value, Mapping):
+            yield from flat_settings(value, f"{name}.")
+        else:
+            yield name, value

@@ -205,8 +205,13 @@ def _run_hydra(
     run = hydra.main(version_base="1.3", config_path=str(config_folder()), config_name=config_name)
     try:
         run(job)()
-    except (CompactHydraException, OmegaConfBaseException) as error:  # which say what is wrong
+    except CompactHydraException as error:  # of Hydra itself, which says what is wrong
         sys.exit(str(error))
+    except OmegaConfBaseException as error:
+        found = str(error.msg or error).partition("\n")[0]
+        raise SettingError(
+            error.full_key or "config", found=found, expected="settings that can be resolved"
+        ) from error
 
 
 if __name__ == "__main__":

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from typing import Any
 
+from tangent_train.checkpoints.content import flat_settings
 from tangent_train.errors import SettingError
-from tangent_train.tasks.reports.runs import flat_settings
 
 __all__ = ["check_resumed", "differing_settings"]
 

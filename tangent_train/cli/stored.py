@@ -16,12 +16,11 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
-from tangent_train.checkpoints.content import INPUTS, NORMALIZATION, read_checkpoint
+from tangent_train.checkpoints.content import INPUTS, NORMALIZATION, flat_settings, read_checkpoint
 from tangent_train.cli import values
 from tangent_train.cli.compose import STORED
 from tangent_train.errors import DataError, SettingError
 from tangent_train.registry import Text, accept, check_fields, check_plain, named_targets
-from tangent_train.tasks.reports.runs import flat_settings
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence

@@ -200,7 +200,7 @@ def test_checkpoints_say_all_that_later_commands_need(undisturbed: Path) -> None
     [
         ("optimizer.lr=1", r"optimizer\.lr: found 1 .*learning rate come from the checkpoint"),
         ("data.fold=2", r"data\.fold: found 2 for a run that began with 1"),
-        ("seed=3", r"data\.seed: found 3 for a run that began with 0"),
+        ("seed=3", r": seed: found 3 for a run that began with 0"),
         ("trainer.accumulate_grad_batches=2", "it would take other steps"),
         ("hydra.run.dir=elsewhere", r"found hydra\.run\.dir=elsewhere beside it"),
     ],
@@ -225,7 +225,7 @@ def test_a_run_is_not_resumed_without_its_root_and_what_is_to_be_trusted(
     ):
         _run(monkeypatch, "train", f"resume={undisturbed}", root)
     with pytest.raises(
-        SystemExit, match=rf"data\.root: found none.* had {re.escape(_quoted(root))}"
+        SystemExit, match=rf"data\.root: found no folder.* had {re.escape(_quoted(root))}"
     ):
         _run(monkeypatch, "train", f"resume={undisturbed}", trust)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import select
 import signal
 import subprocess
 import sys
@@ -100,3 +101,88 @@ def test_a_folder_is_looked_at_once(tmp_path: Path) -> None:
     with atomic_path(tmp_path / "b") as temporary:
         temporary.write_text("x")
     assert (tmp_path / ".partial-old").exists(), "thousands of files are not listed for each"
+
+
+MAKER = """
+import sys
+from pathlib import Path
+from datamodules.synthrooms.generate import generate_rooms
+from datamodules.synthrooms.settings import RoomSettings
+print("begun", flush=True)
+generate_rooms(Path(sys.argv[1]), RoomSettings(height=256), workers=2, progress=False)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM])
+@pytest.mark.parametrize("after_s", [0.5, 4])
+def test_workers_end_with_their_parent(tmp_path: Path, how: signal.Signals, after_s: float) -> None:
+    """While they start and while they work: none keeps the terminal's pipe open."""
+    with subprocess.Popen(
+        [sys.executable, "-c", MAKER, str(tmp_path / "rooms")],
+        env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"begun\n"
+        time.sleep(after_s)
+        process.send_signal(how)
+        process.wait(10)
+        ready, _, _ = select.select([process.stdout], [], [], 30)
+        assert ready, "nothing ends"
+        process.stdout.read()  # to the end: all who could write have ended
+
+
+def test_files_are_on_the_disk_before_they_replace_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done: list[str] = []
+    fsync, replace = os.fsync, Path.replace
+    sizes: list[int] = []
+
+    def noted_fsync(handle: int) -> None:
+        done.append("fsync")
+        sizes.append(os.fstat(handle).st_size)
+        fsync(handle)
+
+    def noted_replace(self: Path, target: Path) -> Path:
+        done.append("replace")
+        return replace(self, target)
+
+    monkeypatch.setattr(os, "fsync", noted_fsync)
+    monkeypatch.setattr(Path, "replace", noted_replace)
+    write_text(tmp_path / "a", "four")
+    assert done == ["fsync", "replace", "fsync"], "the file, then the names in its folder"
+    assert sizes[0] == 4
+
+
+ELSEWHERE = """
+import os, sys
+sys.modules["fcntl"] = None
+del os.posix_fallocate
+import numpy as np
+from pathlib import Path
+from tangent_train.cli.transfer import stage_runs
+from tangent_train.files import reserve, write_text
+write_text(Path("a.txt"), "x")
+array = np.lib.format.open_memmap("a.npy", "w+", np.float32, (100_000,))
+array[:3] = 1, 2, 3
+array.flush()
+with open("a.npy", "r+b") as file:
+    reserve(file, os.path.getsize("a.npy"))
+assert os.stat("a.npy").st_blocks * 512 >= 400_000, "taken"
+assert np.load("a.npy")[:4].tolist() == [1, 2, 3, 0]
+"""
+
+
+def test_no_module_of_one_system_is_needed(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", ELSEWHERE],
+        check=False,
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr

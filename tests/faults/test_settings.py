@@ -89,7 +89,14 @@ PREDICT = ("predict", "checkpoint=x.ckpt", "input=image.png", "output=labels")
         ((*ROOMS, "checkpoint_every_n_steps=0"), r"checkpoint_every_n_steps: found 0; expected"),
         ((*ROOMS, "seed=-1"), r"seed: found -1; expected a whole number from 0"),
         ((*ROOMS, "seed=x"), r"seed: found x; expected a whole number"),
+        (
+            (*ROOMS, "trainer=ddp", "trainer.accelerator=cpu", "trainer.sync_batchnorm=true"),
+            r"trainer\.sync_batchnorm: found true, on a CPU; expected false",
+        ),
         # Files.
+        ((*ROOMS, "hydra.run.dir=image.png/run"), r"image\.png/run: found not a directory; expec"),
+        ((*ROOMS, "hydra.run.dir=/sys/run"), r"/sys/run: found operation not permitted; expected"),
+        ((*ROOMS, "data.rooms=${nothing}"), r"Interpolation key 'nothing' not found"),
         (("evaluate", "checkpoint=nowhere.ckpt"), r"nowhere\.ckpt: found no such file; expected"),
         (("evaluate",), r"checkpoint: found none; expected a checkpoint"),
         (("evaluate", "checkpoint=."), r"found a folder; .*checkpoints/best\.ckpt"),

@@ -23,9 +23,10 @@ from omegaconf import OmegaConf
 from safetensors.torch import load_file, save_file
 from torch import nn
 
+from datamodules.samples import Input
 from models import initialize
 from tangent_train import registry
-from tangent_train.checkpoints.content import read_checkpoint, read_settings
+from tangent_train.checkpoints.content import INPUTS, read_checkpoint, read_settings
 from tangent_train.checkpoints.trained import (
     METADATA_KEY,
     completed_settings,
@@ -622,6 +623,10 @@ def test_networks_of_the_libraries_need_no_trust_and_fetch_nothing(
     with watched(tmp_path / "forbidden") as happened:
         make(settings, "network", ())
     assert not happened
+
+
+def test_what_networks_are_shown_is_said_alike_in_both_places() -> None:
+    assert list[Input] == INPUTS
 
 
 def test_tensors_are_tensors(content: dict[str, Any], tmp_path: Path) -> None:

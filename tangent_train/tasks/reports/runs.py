@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tangent_train.checkpoints.content import INPUTS, read_settings
+from tangent_train.checkpoints.content import INPUTS, flat_settings, read_settings
 from tangent_train.errors import DataError
 from tangent_train.json_text import parse_json
 from tangent_train.registry import check_fields
@@ -22,7 +22,6 @@ __all__ = [
     "Figures",
     "Run",
     "find_runs",
-    "flat_settings",
     "load_run",
     "unfinished_runs",
 ]
@@ -233,13 +232,3 @@ def _figures(results: Mapping[str, Any]) -> list[Any]:
 
 def _first_line(error: Exception) -> str:
     return f"{type(error).__name__}: {error}".partition("\n")[0]
-
-
-def flat_settings(config: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Settings of nested sections as ``section.setting``, with their values."""
-    for key, value in config.items():
-        name = f"{prefix}{key}"
-        if isinstance(value, Mapping):
-            yield from flat_settings(value, f"{name}.")
-        else:
-            yield name, value
