@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 from rich.table import Table
+from rich.text import Text
 from torch import Tensor, nn
 
 from models.held import HELD
 from models.pretrained import read_tensors
 from models.stem import of_channels, with_channels
-from tangent_train.errors import DataError
+from tangent_train.errors import DataError, printable
 
 __all__ = ["Origins", "initialize", "origins_table"]
 
@@ -121,7 +122,7 @@ def origins_table(origins: Origins, path: Path | str) -> Table:
         origins: From `initialize`.
         path: The file, for the title.
     """
-    table = Table(title=f"Tensors from {path}", title_justify="left")
+    table = Table(title=Text(f"Tensors from {path}"), title_justify="left")
     for heading in ("", "tensors", "which"):
         table.add_column(heading, justify="right" if heading == "tensors" else "left")
     share = f"{origins.share:.0%} of the network's numbers, with the adapted ones"
@@ -187,6 +188,7 @@ def _differ_in_channels_only(given: Tensor, wanted: Tensor) -> bool:
     return given.shape[:1] + given.shape[2:] == wanted.shape[:1] + wanted.shape[2:]
 
 
-def _listed(lines: list[str]) -> str:
+def _listed(lines: list[str]) -> Text:
+    """Some lines; names of tensors may be anybody's."""
     more = [f"and {len(lines) - _LISTED} more"] if len(lines) > _LISTED else []
-    return "\n".join(lines[:_LISTED] + more)
+    return Text(printable("\n".join(lines[:_LISTED] + more)))

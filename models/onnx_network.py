@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,7 @@ class OnnxNetwork(nn.Module):
         self._path = path
         if not path.is_file():
             raise DataError(path, found="no such file", expected="an ONNX file")
+        _check_alone(path)
         self._sessions = {"CPU": self._open("CPU")}
         session = self._sessions["CPU"]
         inputs, outputs = session.get_inputs(), session.get_outputs()
@@ -85,12 +87,7 @@ class OnnxNetwork(nn.Module):
         try:
             import onnxruntime
         except ImportError as error:
-            raise DataError(
-                self._path,
-                found="an ONNX file",
-                expected="the package onnxruntime, to run it",
-                remedy="Run: pip install 'tangent-train[export]'",
-            ) from error
+            raise _missing(self._path) from error
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = torch.get_num_threads()
         options.log_severity_level = _ERRORS_ONLY
@@ -102,3 +99,46 @@ class OnnxNetwork(nn.Module):
             raise DataError(
                 self._path, found=f"an unreadable file ({first_line})", expected="an ONNX file"
             ) from error
+
+
+def _check_alone(path: Path) -> None:
+    """Refuse a network whose tensors are in other files, which its own would name.
+
+    Raises:
+        DataError: It is such a network, or no ONNX file.
+    """
+    try:
+        import onnx
+    except ImportError as error:
+        raise _missing(path) from error
+    try:
+        graph = onnx.load(path, load_external_data=False)
+    except Exception as error:  # whatever the parser of protocol buffers raises
+        raise DataError(path, found="an unreadable file", expected="an ONNX file") from error
+    if any(tensor.data_location for tensor in _tensors(graph)):
+        raise DataError(
+            path,
+            found="tensors in other files",
+            expected="a network with all that belongs to it inside",
+            remedy="Save it with its weights in the file.",
+        )
+
+
+def _tensors(message: Any) -> Iterator[Any]:
+    """All tensors in a message and in those inside it."""
+    for field, value in message.ListFields():
+        if field.message_type is not None:
+            for inner in value if hasattr(value, "__len__") else [value]:
+                if field.message_type.name == "TensorProto":
+                    yield inner
+                else:
+                    yield from _tensors(inner)
+
+
+def _missing(path: Path) -> DataError:
+    return DataError(
+        path,
+        found="an ONNX file",
+        expected="the packages onnx and onnxruntime, to run it",
+        remedy="Run: pip install 'tangent-train[export]'",
+    )

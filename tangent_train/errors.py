@@ -2,10 +2,23 @@
 
 from __future__ import annotations
 
-__all__ = ["DataError", "SettingError"]
+import re
+
+__all__ = ["DataError", "SettingError", "printable"]
 
 
 _LONGEST = 400  # characters of what was found: a file may hold anything
+_CONTROL = re.compile(r"[^\n\t -~\xa0-\U0010ffff]")
+"""Characters that terminals take for commands."""
+
+
+def printable(text: str) -> str:
+    r"""Lines of text whose commands for terminals are written out.
+
+    >>> print(printable("sofa\x1b[2J"))
+    sofa\x1b[2J
+    """
+    return _CONTROL.sub(lambda match: repr(match[0])[1:-1], text)
 
 
 class _ExplainedError(ValueError):
@@ -27,7 +40,7 @@ class _ExplainedError(ValueError):
             shown = str(found)
             shown = shown if len(shown) <= _LONGEST else shown[:_LONGEST] + "…"
             message = f"{subject}: found {shown}; expected {expected}. {remedy}".rstrip()
-        super().__init__(message)
+        super().__init__(printable(message))
         self.subject = subject
         self.found = found
         self.expected = expected

@@ -24,7 +24,7 @@ from pkgutil import resolve_name
 from types import NoneType, UnionType
 from typing import Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError, SettingError, printable
 
 __all__ = [
     "Accepted",
@@ -45,11 +45,17 @@ __all__ = [
 _HOMES = ("datamodules", "models", "tangent_train.rendering", "tangent_train.tasks")
 """Packages whose public names files may give, where they are registered."""
 
-_WORD = re.compile(r"[A-Za-z0-9][\w.+ -]{0,99}", re.ASCII)
+_WORD = re.compile(r"([A-Za-z0-9][\w.+ -]{0,99})?", re.ASCII)
 """A text in settings: no path, no address, no name of Hydra's, nothing to interpret."""
+
+_LINE = re.compile(r"[^\x00-\x1f\x7f-\x9f]*")
+"""A text without commands for terminals."""
 
 _DEEPEST = 12
 _PLAIN = (bool, int, float, str, NoneType, dict)
+_CALLED_LATER = ("mixer", "optimizer", "scheduler")
+"""Settings that are functions which still take something."""
+
 _EXTRAS = {"segmentation_models_pytorch": "networks", "timm": "networks"}
 """Packages that an extra of this one installs."""
 
@@ -63,7 +69,7 @@ class Object:
 
 
 class Text:
-    """A kind of setting: any text that is only ever shown, as names of classes."""
+    """A kind of setting: any line that is only ever shown, as names of classes."""
 
 
 class Weights:
@@ -147,7 +153,9 @@ class _Check:
         made["_target_"] = target
         for name, value in settings.items():
             here = f"{place}.{name}"
-            kind = bool if name == "_partial_" else kinds.get(name, kinds.get("**"))
+            kind = kinds.get(name, kinds.get("**"))
+            if name == "_partial_" and place.rpartition(".")[2] in _CALLED_LATER:
+                kind = bool
             if self._is_own(here):
                 made[name] = value
             elif kind is None and name != "_target_":
@@ -226,7 +234,8 @@ def check_plain(path: Path, value: Any, place: str, depth: int = 0) -> Any:
         return {n: check_plain(path, v, f"{place}.{n}", depth + 1) for n, v in value.items()}
     if isinstance(value, list | tuple):
         return [check_plain(path, v, f"{place}.{k}", depth + 1) for k, v in enumerate(value)]
-    if value is None or type(value) in (bool, int, float, str):
+    plain = value is None or type(value) in (bool, int, float)
+    if plain or (type(value) is str and printable(value) == value):
         return value
     raise DataError(path, found=f"{place}={value!r}", expected=expected)
 
@@ -371,8 +380,10 @@ def _fits(value: Any, kind: Any) -> bool:
         )
     if kind is str:
         return isinstance(value, str) and _WORD.fullmatch(value) is not None
-    if kind in (Text, dict):
-        return isinstance(value, str if kind is Text else Mapping)
+    if kind is Text:
+        return isinstance(value, str) and _LINE.fullmatch(value) is not None
+    if kind is dict:
+        return isinstance(value, Mapping)
     return type(value) in (int, float) if kind is float else type(value) is kind
 
 

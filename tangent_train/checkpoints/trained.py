@@ -164,9 +164,13 @@ def load_trained(path: Path, trust: Collection[str] = ()) -> TrainedNetwork:
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
             return _trained(path, described, tensors, trust)
         return _from_checkpoint(path, trust)
+    except DataError:
+        raise
     except SettingError as error:
         found = f"{error.subject}: {error.found}"
         raise DataError(path, found=found, expected=error.expected, remedy=error.remedy) from error
+    except (AttributeError, TypeError, ValueError) as error:  # of sections that do not fit
+        raise DataError(path, found=f"{error}", expected=_TRAINED) from error
 
 
 def inputs_in(path: Path) -> tuple[Input, ...] | None:

@@ -31,6 +31,7 @@ __all__ = [
     "check_overrides",
     "compose_option",
     "config_folder",
+    "options_of",
     "quote_path",
     "search_path",
 ]
@@ -94,7 +95,7 @@ def compose_option(group: str, option: str, search: Sequence[str] = ()) -> dict[
     Raises:
         SettingError: There is no such option.
     """
-    options = _options(GlobalHydra.instance().config_loader(), group, list(search))
+    options = options_of(GlobalHydra.instance().config_loader(), group, list(search))
     if option not in options:
         _refuse(group, option, options)
     config = OmegaConf.to_container(compose(f"{group}/{option}", list(search)), resolve=False)
@@ -136,8 +137,8 @@ def check_overrides(
             ) from error
         plain = [o for o in overrides if not (o.is_add() or o.is_delete() or o.is_hydra_override())]
         search = [str(o.input_line) for o in overrides if o.key_or_group == "hydra.searchpath"]
-        options_of = {o.key_or_group: _options(loader, o.key_or_group, search) for o in plain}
-        groups = [o for o in plain if options_of[o.key_or_group]]
+        known_options = {o.key_or_group: options_of(loader, o.key_or_group, search) for o in plain}
+        groups = [o for o in plain if known_options[o.key_or_group]]
         stored = config_name.startswith(STORED)
         made = [o for o in groups if stored and o.key_or_group not in choosable]
         if made:
@@ -149,7 +150,7 @@ def check_overrides(
                 remedy="A stored config has its choices made; start a new run for others.",
             )
         for override in groups:
-            _check_option(override, options_of[override.key_or_group])
+            _check_option(override, known_options[override.key_or_group])
             _check_pairs(override, config_name)
         chosen = [str(o.input_line) for o in groups if not o.is_sweep_override()]
         chosen = [f"+{text}" for text in chosen] if stored else chosen
@@ -237,12 +238,12 @@ def _refuse(kind: str, found: str, known: list[str]) -> None:
     raise SettingError(f"unknown {kind}", found=f"'{found}'", expected=listed, remedy=remedy)
 
 
-def _options(loader: ConfigLoader, group: str, search: list[str]) -> list[str]:
+def options_of(loader: ConfigLoader, group: str, search: list[str]) -> list[str]:
     """Options of a config group, those of its sub-folders as ``folder/option``."""
     options = list(loader.get_group_options(group, overrides=search))
     for folder in loader.list_groups(group):
         options += [
-            f"{folder}/{option}" for option in _options(loader, f"{group}/{folder}", search)
+            f"{folder}/{option}" for option in options_of(loader, f"{group}/{folder}", search)
         ]
     return options
 

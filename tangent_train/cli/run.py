@@ -29,7 +29,7 @@ from tangent_train.cli.build import Settings, build, check_numbers
 from tangent_train.cli.machine import machine_faults
 from tangent_train.cli.resume import check_resumed
 from tangent_train.cli.sweep import OBJECTIVE_FILE
-from tangent_train.errors import SettingError
+from tangent_train.errors import DataError, SettingError
 from tangent_train.files import write_text
 from tangent_train.registry import make
 from tangent_train.tasks.averaging import AveragedWeights
@@ -44,7 +44,19 @@ from tangent_train.tasks.tensorboard_pictures import TrainingSpeed
 
 __all__ = ["best_on_validation", "build", "evaluate", "prepare", "train"]
 
-_LOCAL = ("data.label_table=", "data.root=", "data.store=", "task.compile", "trust=")
+_LOCAL = (
+    "data.label_table=",
+    "data.root=",
+    "data.store=",
+    "task.compile",
+    "trainer.accelerator=",
+    "trainer.devices=",
+    "trainer.num_nodes=",
+    "trainer.strategy=",
+    "trust=",
+)
+"""Begins what no file says and a resumed run has to be told again."""
+
 
 # lightning 2.6 asks torch's tree library in a way torch ≥ 2.13 deprecates: nothing to do about it.
 warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)`", FutureWarning)
@@ -95,6 +107,14 @@ def train(settings: Settings, trust: Collection[str] | None = None) -> float | N
             _test(trainer, task, data, best, folder)
         except SIGTERMException:
             sys.exit(128 + signal.SIGTERM)
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            if resumed is None or last.has_begun or isinstance(error, DataError | SettingError):
+                raise
+            raise DataError(
+                resumed,
+                found=f"what cannot be gone on with ({type(error).__name__}: {error})",
+                expected="the last checkpoint of this run",
+            ) from error
         except MisconfigurationException as error:  # as fewer epochs than a resumed run has done
             raise SettingError(
                 "trainer", found=f"what cannot work: {error}", expected="settings that can"
@@ -152,11 +172,13 @@ def _completed(settings: Settings, data: Any) -> dict[str, Any]:
 
 def _choices() -> dict[str, str]:
     chosen = HydraConfig.get().runtime.choices
-    return {group: chosen[group] for group in ("data", "experiment") if chosen.get(group)}
+    return {
+        group: chosen[group] for group in ("data", "experiment", "trainer") if chosen.get(group)
+    }
 
 
 def _typed_local() -> list[str]:
-    """What was typed that no file says: a resumed run has to be told again."""
+    """What was typed of it."""
     typed = [said.lstrip("+") for said in HydraConfig.get().overrides.task]
     return [said for said in typed if said.startswith(_LOCAL)]
 

@@ -11,14 +11,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hydra import compose
+from hydra._internal.utils import get_args_parser
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from tangent_train.checkpoints.content import INPUTS, NORMALIZATION, flat_settings, read_checkpoint
 from tangent_train.cli import values
-from tangent_train.cli.compose import STORED
+from tangent_train.cli.compose import STORED, options_of, search_path
 from tangent_train.errors import DataError, SettingError
 from tangent_train.registry import Text, accept, check_fields, check_plain, named_targets
 
@@ -30,6 +32,7 @@ __all__ = ["CHOOSABLE", "StoredRun", "stored_arguments", "stored_run"]
 CHOOSABLE = ("data", "representation", "trainer")
 """Sections that an evaluation may take from a group: all else belongs to the network."""
 
+_CHOSEN = ("data", "experiment", "trainer")
 _SECTIONS = (*CHOOSABLE, "network", "task", "optimizer", "scheduler")
 _RUN = {
     "choices": dict[str, Text] | None,
@@ -55,12 +58,14 @@ class StoredRun:
         config: Its settings, unchecked.
         name: Of the config to compose; of the user's own words alone.
         arguments: The command line without what only says which checkpoint it is.
+        search: Where Hydra looks for options besides.
     """
 
     path: Path
     config: Mapping[str, Any]
     name: str
     arguments: Sequence[str]
+    search: Sequence[str]
 
     @property
     def known(self) -> list[str]:
@@ -92,6 +97,8 @@ class StoredRun:
         """
         trust = (*values.names(said, "trust"), *named_targets(said))
         of_run = check_fields(self.path, self.config, _RUN, _EXPECTED)
+        needed = {name: dict for name in _SECTIONS if name != "scheduler" and name not in chosen}
+        check_fields(self.path, self.config, needed, _EXPECTED)
         said = {name: value for name, value in said.items() if name != "trust"}
         own = {n for n, value in flat_settings(said) if n not in of_run or value != of_run[n]}
         sections = _only(self.config, set(_SECTIONS) - set(chosen))
@@ -104,7 +111,10 @@ class StoredRun:
         settings = _merged(of_run | accepted.settings, said)
         if "data" in chosen:
             settings["data"] |= self._of_the_network(settings["data"])
-        _fill_local(settings, accepted.local, of_run["choices"] or {})
+        choices = of_run["choices"] or {}
+        if "resume" not in said:  # how many processes evaluate is said anew
+            choices = _only(choices, ("data", "experiment"))
+        _fill_local(settings, accepted.local, _composed_here(choices, self.search))
         return {"init_from": None, "resume": None, "checkpoint": None} | settings, trust
 
     def _of_the_network(self, data: Mapping[str, Any]) -> dict[str, Any]:
@@ -117,14 +127,14 @@ class StoredRun:
 
 
 def _fill_local(
-    settings: dict[str, Any], local: Mapping[str, Any], choices: Mapping[str, str]
+    settings: dict[str, Any], local: Mapping[str, Any], here: Mapping[str, Any]
 ) -> None:
     """Give settings that only concern this machine the values they have here."""
-    here = _composed_here(choices)
     for place, theirs in local.items():
         section, _, name = place.partition(".")
-        same = OmegaConf.select(here, f"{section}._target_") == settings[section]["_target_"]
-        value = OmegaConf.select(here, place) if same else None
+        own = here.get(section) or {}
+        same = own.get("_target_") == settings[section]["_target_"]
+        value = own.get(name) if same else None
         if place == "data.root" and value != theirs:
             raise SettingError(
                 place,
@@ -170,22 +180,22 @@ def stored_run(command: str, arguments: Sequence[str]) -> StoredRun | None:
     ConfigStore.instance().store(name, {**base, **numbers, "trust": [], "hydra": hydra})
     used = ("checkpoint=", "resume=")
     left = [a for a in arguments if not a.startswith(used)]
-    return StoredRun(path, config, name, left)
+    search = search_path(get_args_parser().parse_args(left))
+    return StoredRun(path, config, name, left, search)
 
 
-def _composed_here(choices: Mapping[str, str]) -> Any:
-    """The user's own config of the options a run began with."""
+def _composed_here(choices: Mapping[str, str], search: Sequence[str]) -> Any:
+    """The user's own settings of the options a run began with, those that there are here."""
     loader = GlobalHydra.instance().config_loader()
-    chosen = []
-    for group, option in choices.items():
-        folder, _, name = option.rpartition("/")
-        options = loader.get_group_options(f"{group}/{folder}" if folder else group)
-        if name in options and group in ("data", "experiment"):
-            chosen.append(f"{group}={option}")
+    own = [
+        f"{group}={choices[group]}"
+        for group in _CHOSEN
+        if choices.get(group) in options_of(loader, group, list(search))
+    ]
     try:
-        return compose("train", chosen)
-    except HydraException:  # options that are nothing together
-        return OmegaConf.create()
+        return OmegaConf.to_container(compose("train", [*search, *own]), resolve=True)
+    except (HydraException, OmegaConfBaseException):  # options that are nothing together
+        return {}
 
 
 def stored_arguments(command: str, arguments: Sequence[str]) -> list[str]:

@@ -49,6 +49,10 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         with atomic_path(Path(path)) as temporary:
             torch.save(checkpoint, temporary)
 
+    def remove_checkpoint(self, path: str | Path) -> None:
+        """Remove a file. Lightning's own would remove a folder with all that is in it."""
+        Path(path).unlink(missing_ok=True)
+
 
 class CheckpointContents(Callback):
     """Puts all that later commands need into every checkpoint, and the state of the randomness.
@@ -119,6 +123,9 @@ class LastCheckpoint(Checkpoint):
         every_n_steps: Optimizer steps between checkpoints within an epoch; None for none.
         typed: What the command to go on with has to say besides the folder.
 
+    Attributes:
+        has_begun: Whether the training has: all that is restored is.
+
     Raises:
         SettingError: Fewer than one step.
     """
@@ -131,6 +138,7 @@ class LastCheckpoint(Checkpoint):
         self.path = Path(folder) / "last.ckpt"
         self.every_n_steps = every_n_steps
         self.typed = typed
+        self.has_begun = False
         self._told_to_end = False
         self._processes: Any = None
 
@@ -148,6 +156,7 @@ class LastCheckpoint(Checkpoint):
                 trainer.strategy.launcher.kill(number)
             self._told_to_end = True
 
+        self.has_begun = True
         self._told_to_end = False
         if trainer.world_size > 1:  # a group of its own on the CPU: no waiting for a GPU
             self._processes = torch.distributed.new_group(backend="gloo")
@@ -228,19 +237,15 @@ class BestCheckpoint(ModelCheckpoint):
     """Keeps the best epoch so far when the run's folder was moved before it is resumed."""
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Take the state, with its files in this folder."""
-        folder = Path(self.dirpath or state_dict["dirpath"])
-
-        def here(path: str) -> str:
-            return path and str(folder / Path(path).name)
-
-        paths = ("best_model_path", "kth_best_model_path", "last_model_path")
-        super().load_state_dict(
-            state_dict
-            | {"dirpath": str(folder)}
-            | {name: here(state_dict[name]) for name in paths}
-            | {"best_k_models": {here(p): s for p, s in state_dict["best_k_models"].items()}}
-        )
+        """Take how good the best epoch was; where its file is does not come out of a file."""
+        score = state_dict["best_model_score"]
+        if score is None:
+            return
+        path = str(Path(self.dirpath or "") / "best.ckpt")
+        score = torch.as_tensor(score)
+        self.best_model_score = self.kth_value = self.current_score = score
+        self.best_model_path = self.kth_best_model_path = path
+        self.best_k_models = {path: score}
 
 
 def best_checkpoint(folder: Path | str, monitor: str = "val/miou") -> ModelCheckpoint:

@@ -173,7 +173,8 @@ def test_a_run_cut_short_goes_on_as_if_nothing_had_happened(
     assert _last(undisturbed)["global_step"] == 15, "three epochs of five steps"
     if how == signal.SIGTERM:
         assert cut.returncode == 128 + signal.SIGTERM, cut.stderr
-        assert f"tangent-train resume={tmp_path / 'cut'} {again[0]}\n" in cut.stderr
+        assert f"tangent-train resume={tmp_path / 'cut'} " in cut.stderr
+        assert again[0] in cut.stderr
         assert "Traceback" not in cut.stderr
         assert _last(tmp_path / "cut")["global_step"] == step, "saved when it was told to end"
     else:
@@ -275,7 +276,10 @@ def test_two_processes_make_the_steps_and_figures_of_one(
     cut = _cut(arguments, tmp_path, signal.SIGTERM, 2)
     assert cut.returncode == 128 + signal.SIGTERM, cut.stderr
     assert _last(tmp_path / "cut")["global_step"] == 2, "all ended after the step"
-    _processes(tmp_path, f"resume={tmp_path / 'cut'}", _root(folder))
+    _processes(
+        tmp_path, f"resume={tmp_path / 'cut'}", _root(folder), "trainer.accelerator=cpu",
+        "trainer.devices=2",
+    )  # fmt: skip
     _assert_same_end(tmp_path / "cut", tmp_path / "two")
     checkpoint = f"checkpoint={tmp_path / 'one' / 'checkpoints' / 'last.ckpt'}"
     _processes(

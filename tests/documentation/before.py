@@ -10,7 +10,7 @@ from tests.documentation.world import RGB_CHECKPOINT
 
 MADE_FIRST = {
     name: ("tangent-export", f"checkpoint={RGB_CHECKPOINT}", f"output={name}")
-    for name in ("model.onnx", "model.safetensors", "model.pt")
+    for name in ("model.onnx", "model.safetensors")
 }
 """Files that take a while to make, and how: only for commands that read them."""
 

@@ -24,7 +24,15 @@ if TYPE_CHECKING:
 
 ROWS = 32
 TIME = "2026-01-31_12-00-00"
-RUNS = ("demo", "make_demo", "run", "standard", "rooms/accuracy", "paper/semseg_s7_b0_rgbd")
+RUNS = (
+    "demo",
+    "make_demo",
+    "run",
+    "standard",
+    "accuracy/few_aux",
+    "rooms/accuracy",
+    "paper/semseg_s7_b0_rgbd",
+)
 """Names of the runs that documents name: all of them copies of one."""
 
 PLACES = {

@@ -20,11 +20,13 @@ import torch
 import yaml  # type: ignore[import-untyped]
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
+from rich.console import Console
 from safetensors.torch import load_file, save_file
 from torch import nn
 
 from datamodules.samples import Input
 from models import initialize
+from models.initialize import origins_table
 from tangent_train import registry
 from tangent_train.checkpoints.content import INPUTS, read_checkpoint, read_settings
 from tangent_train.checkpoints.trained import (
@@ -42,6 +44,7 @@ from tangent_train.cli.stored import CHOOSABLE, StoredRun, stored_run
 from tangent_train.errors import DataError, SettingError
 from tangent_train.registry import accept, check_plain, make, named_targets
 from tangent_train.rendering.camera_files import read_cameras
+from tangent_train.tasks.checkpoints import AtomicCheckpointIO, best_checkpoint
 from tangent_train.tasks.reports.runs import load_run
 from tests.datamodules.folder_format import write_classes, write_data_set
 from tests.security.attacks import attacks, json_attacks, places, replaced, sampled
@@ -96,6 +99,7 @@ def forbidden(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("SECRET", SECRET)
     folder = tmp_path / "forbidden"
     folder.mkdir()
+    (folder / "config.json").write_text("{}")  # whoever opens it is seen
     return folder
 
 
@@ -122,7 +126,7 @@ def _nothing_happens(use: Callable[[Path], Any], path: Path, forbidden: Path, wh
     with watched(forbidden) as happened, suppress(DataError, SettingError):
         use(path)
     assert not happened, (what, happened)
-    assert not list(forbidden.iterdir()), what
+    assert [path.name for path in forbidden.iterdir()] == ["config.json"], what
 
 
 def _in_checkpoint(
@@ -145,12 +149,11 @@ def _attack_checkpoints(
     honest = forbidden.parent / "honest.ckpt"
     torch.save(content, honest)
     stored, typed = _typed(honest, "data.root=rooms")
-    here = OmegaConf.create()
 
     def evaluated(path: Path) -> None:
         config = check_plain(path, read_checkpoint(path, ("config",))["config"], "config")
         with pytest.MonkeyPatch.context() as patch:  # what the user has is not what is attacked
-            patch.setattr(stored_module, "_composed_here", lambda _: here)
+            patch.setattr(stored_module, "_composed_here", lambda *_: {})
             settings = replace(stored, path=path, config=config).settings(typed, ())
         build(*settings)
 
@@ -185,15 +188,12 @@ def _without_depth(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(registry, "_DEEPEST", 10**9)
 
 
-def _with_hydra(patch: pytest.MonkeyPatch) -> None:
-    from hydra.utils import instantiate
-
-    patch.setattr(registry, "_made", lambda value, *_: instantiate({"x": value})["x"])
+def _without_words(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(registry, "_WORD", re.compile(".*", re.DOTALL))
 
 
 @pytest.mark.parametrize(
-    "taken_out", [_without_the_registry, _without_kinds, _without_depth, _with_hydra]
+    "taken_out", [_without_the_registry, _without_kinds, _without_depth, _without_words]
 )
 def test_the_attacks_are_noticed_when_a_check_is_taken_out(
     taken_out: Callable[[pytest.MonkeyPatch], None],
@@ -416,6 +416,122 @@ def test_paths_of_ones_own_configs_need_not_be_typed_again(
     assert _settled(path, root=None)[0]["data"]["root"] == "data/rooms_demo"
 
 
+def test_options_of_the_run_are_looked_up_among_ones_own(
+    content: dict[str, Any], forbidden: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A name of an option is no path to somebody's config."""
+    monkeypatch.chdir(forbidden.parent)
+    (forbidden / "data").mkdir()
+    target = content["config"]["data"]["_target_"]
+    theirs = f"# @package data\n_target_: {target}\nroot: rooms\nstore: x_${{oc.env:SECRET}}\n"
+    (forbidden / "data" / "z.yaml").write_text(theirs)
+    up = "/".join([".."] * 30)
+    for option in (f"{up}{forbidden}/data/z", "../data/folder", "a\0b/c", "z"):
+        for group in ("data", "experiment", "trainer"):
+            path = _hostile(content, Path(), choices={group: option})
+            with watched(forbidden) as happened:
+                try:
+                    settings, _ = _settled(path)
+                except DataError as error:
+                    assert "choices" in str(error)  # noqa: PT017 - either is right
+                else:
+                    assert "store" not in settings["data"]
+            assert not [event for event in happened if "z.yaml" in event]
+
+
+def test_files_decide_no_processes_and_no_sockets(content: dict[str, Any], tmp_path: Path) -> None:
+    many = {"devices": 3, "strategy": "ddp", "num_nodes": 2, "accelerator": "gpu"}
+    trainer = content["config"]["trainer"] | many | {"model_registry": "x", "max_time": "00:01:00"}
+    settings, _ = _settled(_hostile(content, tmp_path, trainer=trainer))
+    assert not {*many, "model_registry", "max_time"} & settings["trainer"].keys() - {
+        "accelerator", "devices"}  # fmt: skip
+    assert settings["trainer"].get("devices") != 3
+    assert settings["trainer"].get("accelerator") != "gpu"
+
+
+@pytest.mark.parametrize("name", ["..", "../..", "/", ".", "notes.txt", "/etc/passwd"])
+def test_where_the_best_epoch_is_does_not_come_out_of_a_file(name: str, tmp_path: Path) -> None:
+    """Lightning removes the one that was the best before: once the whole folder, by its state."""
+    best = best_checkpoint(tmp_path)
+    low = torch.tensor(-1.0)
+    state = dict.fromkeys(("best_model_path", "kth_best_model_path", "last_model_path"), name)
+    scores = dict.fromkeys(("best_model_score", "current_score", "kth_value"), low)
+    best.load_state_dict({**state, **scores, "best_k_models": {name: low}, "dirpath": "/"})
+    mine = str(tmp_path / "best.ckpt")
+    assert best.dirpath == str(tmp_path)
+    assert {best.best_model_path, best.kth_best_model_path, *best.best_k_models} == {mine}
+    assert best.last_model_path == ""
+    assert best.best_model_score == -1
+
+
+def test_checkpoints_are_files_when_they_are_removed(tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(OSError, match="folder"):
+        AtomicCheckpointIO().remove_checkpoint(tmp_path / "folder")
+    (tmp_path / "x.ckpt").touch()
+    AtomicCheckpointIO().remove_checkpoint(tmp_path / "x.ckpt")
+    assert [path.name for path in tmp_path.iterdir()] == ["folder"]
+
+
+@pytest.mark.parametrize(
+    ("entry", "value"),
+    [
+        ("callbacks", "x"),
+        ("optimizer_states", "x"),
+        ("optimizer_states", [{"state": {}, "param_groups": "x"}]),
+    ],
+)
+def test_what_cannot_be_gone_on_with_is_said_in_a_line(
+    entry: str,
+    value: Any,
+    run: Path,
+    content: dict[str, Any],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(run.parent)
+    theirs = tmp_path / "theirs"
+    (theirs / "checkpoints").mkdir(parents=True)
+    torch.save(content | {entry: value}, theirs / "checkpoints" / "last.ckpt")
+    with pytest.raises(
+        SystemExit, match=r"^tangent-train: .*last\.ckpt: found what cannot be gone"
+    ):
+        _run(monkeypatch, "train", f"resume={theirs}", "data.root=rooms")
+
+
+def test_terminals_get_no_commands(content: dict[str, Any], run: Path, tmp_path: Path) -> None:
+    evil = "a.b\x1b]0;owned\x07\n\x1b[31mtrust me"
+    path = _hostile(content, tmp_path, network={"_target_": evil})
+    with pytest.raises(DataError) as refused:
+        load_trained(path)
+    assert "\x1b" not in str(refused.value)
+    torch.save(content | {"class_names": [evil] * 14}, path)
+    with pytest.raises(DataError, match="class_names="):
+        load_trained(path)
+    settings = read_settings(run / "config.yaml") | {"name": evil}
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(settings))
+    with pytest.raises(DataError, match=r"settings\.name="):
+        read_settings(tmp_path / "config.yaml")
+    network = make(_UNET, "network")
+    names = {"[/nope][link=x]" + evil: torch.zeros(1), **network.state_dict()}
+    torch.save(names, path)
+    console = Console(record=True, width=200, force_terminal=True)
+    console.print(origins_table(initialize(network, path), path))
+    shown = console.export_text()
+    assert "[/nope][link=x]a.b" in shown
+    assert "\x07" not in shown
+
+
+def test_networks_are_one_file(run: Path, tmp_path: Path) -> None:
+    model = onnx.load(run.parent / "net.onnx")
+    tensor = model.graph.initializer[0]
+    onnx.external_data_helper.set_external_data(tensor, "/etc/hostname")
+    tensor.ClearField("raw_data")
+    (tmp_path / "x.onnx").write_bytes(model.SerializeToString())
+    with pytest.raises(DataError, match=r"x\.onnx: found tensors in other files"):
+        load_trained(tmp_path / "x.onnx")
+
+
 def test_names_of_classes_are_names(
     forbidden: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -514,7 +630,7 @@ def test_programs_of_torchscript_are_refused(
     with watched(forbidden) as happened, refused:
         load_trained(path)
     assert not happened
-    assert not list(forbidden.iterdir())
+    assert not (forbidden / "x").exists()
 
 
 class Own(nn.Conv2d):
@@ -574,6 +690,8 @@ def test_all_that_the_configs_name_is_registered() -> None:
             assert registry._find(target, ())[0] is not None, (path, target)
 
 
+MACHINE = {"root", "store", "label_table", "compile"}
+MACHINE |= {"accelerator", "devices", "num_nodes", "strategy"}
 EXPERIMENTS = sorted(
     p.relative_to(config_folder() / "experiment").with_suffix("").as_posix()
     for p in (config_folder() / "experiment").rglob("*.yaml")
@@ -601,7 +719,7 @@ def test_settings_of_every_experiment_and_option_are_accepted(option: str, tmp_p
     weights = {"weights", "weights_backbone", "encoder_weights"}
     for name, section in sections.items():
         left_out = {key for key in section if key not in accepted.settings[name]} - weights
-        assert left_out <= {"root", "store", "label_table", "compile"}
+        assert left_out <= MACHINE
         for key, value in accepted.settings[name].items():
             assert isinstance(value, dict) or key in weights or value == section[key]
 

@@ -102,11 +102,9 @@ class Run:
         return tuple(entry["class"] for entry in self.results["classes"])
 
     @property
-    def images(self) -> int | None:
+    def images(self) -> int:
         """How many panoramas or photos were scored."""
-        results = self.results
-        images = results.get("images", results.get("panoramas"))  # the latter up to 0.1.0
-        return None if images is None else int(images)
+        return int(self.results["images"])
 
     @property
     def bands(self) -> tuple[tuple[float, float], ...]:
@@ -220,6 +218,8 @@ def _figures(results: Mapping[str, Any]) -> list[Any]:
     if _kind(results) not in FIGURES:
         raise ValueError(f"results of {_kind(results)}")
     names = FIGURES[_kind(results)]
+    if type(results["images"]) is not int:
+        raise TypeError
     figures = [results[name] for name in names.means]
     for entry in results["classes"]:
         str(entry["class"])
