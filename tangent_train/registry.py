@@ -173,7 +173,7 @@ class _Check:
             return [self._value(v, Any, f"{place}.{k}") for k, v in enumerate(value)]
         if isinstance(value, Mapping) and kind in (Any, Object):
             return self.object(value, place)
-        if kind is not Any and not _fits(value, NoneType if kind is Object else kind):
+        if value is not None and kind is not Any and (kind is Object or not _fits(value, kind)):
             raise self._refused(place, value, f"{inspect.formatannotation(kind)} in a file")
         return value
 

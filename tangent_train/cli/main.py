@@ -195,9 +195,8 @@ def _run_hydra(
 
     # Lightning prints its own messages: Hydra's handlers would print them again. A sweep has only
     # Hydra's. argparse wants all overrides in one place.
-    quiet = ["hydra/job_logging=none"]
-    if not get_args_parser().parse_args(arguments).multirun:
-        quiet.append("hydra/hydra_logging=none")
+    several = get_args_parser().parse_args(arguments).multirun
+    quiet = ["hydra/job_logging=none"] + ["hydra/hydra_logging=none"] * (not several)
     places = (i for i, a in enumerate(arguments) if a[:1] == "~" or ("=" in a and a[0] != "-"))
     place = next(places, len(arguments))
     sys.argv[1:] = [*arguments[:place], *quiet, *arguments[place:]]
@@ -212,6 +211,10 @@ def _run_hydra(
         raise SettingError(
             error.full_key or "config", found=found, expected="settings that can be resolved"
         ) from error
+    except RuntimeError as error:
+        if not several:
+            raise
+        sys.exit(str(error))  # of a launcher: jobs have said what was wrong with them
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ from rich.console import Console
 from datamodules.samples import channel_names
 from models.initialize import initialize, origins_table
 from tangent_train.checkpoints.content import read_checkpoint, write_settings
-from tangent_train.checkpoints.trained import completed_settings, inputs_in
+from tangent_train.checkpoints.trained import inputs_in
 from tangent_train.cli.build import Settings, build, check_numbers
 from tangent_train.cli.machine import machine_faults
 from tangent_train.cli.resume import check_resumed
@@ -80,7 +80,7 @@ def train(settings: Settings, trust: Collection[str] | None = None) -> float | N
     if resumed is not None:
         check_resumed(settings, read_checkpoint(resumed, ("config",))["config"])
     data, task = build(settings, trust)
-    settings = _completed(settings, data)
+    settings = {"choices": _choices(), **settings}
     start = settings["init_from"]
     if start is not None and resumed is None:
         origins = initialize(task.network, start, _channels(Path(start), data))
@@ -143,7 +143,7 @@ def evaluate(settings: Settings, trust: Collection[str] | None = None) -> None:
     check_numbers(settings)
     lightning.seed_everything(settings["seed"], workers=True, verbose=False)
     data, task = build(settings, trust)
-    settings = _completed(settings, data)
+    settings = {"choices": _choices(), **settings}
     write_settings(folder / "config.yaml", settings)
     trainer = _trainer(settings, folder, data, task, [], trust)
     with machine_faults(folder, data):
@@ -163,14 +163,8 @@ def prepare(settings: Settings) -> None:
     _console().print(f"{data.root} is ready. {data.noun.capitalize()}: {counts}.")
 
 
-def _completed(settings: Settings, data: Any) -> dict[str, Any]:
-    """The settings as they are kept: the network's without the data, the options they came from."""
-    classes = len(data.class_names)
-    network = completed_settings(settings["network"], data.in_channels, classes)
-    return {"choices": _choices(), **settings, "network": network}
-
-
 def _choices() -> dict[str, str]:
+    """The options that the settings came from, by group."""
     chosen = HydraConfig.get().runtime.choices
     return {
         group: chosen[group] for group in ("data", "experiment", "trainer") if chosen.get(group)

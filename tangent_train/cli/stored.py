@@ -103,10 +103,10 @@ class StoredRun:
         own = {n for n, value in flat_settings(said) if n not in of_run or value != of_run[n]}
         sections = _only(self.config, set(_SECTIONS) - set(chosen))
         sections = {name: section for name, section in sections.items() if section is not None}
-        representation = said.setdefault("representation", {})
-        if "level" in own and "representation" not in chosen:  # in every config it is the same
-            representation.setdefault("level", said["level"])
-            own.add("representation.level")
+        for name, section in (("level", "representation"), ("seed", "data")):
+            if name in own and section not in chosen:  # in every config it is the same
+                said[section] = {name: said[name]} | said.get(section, {})
+                own.add(f"{section}.{name}")
         accepted = accept(self.path, _merged(sections, _only(said, sections)), trust, own)
         settings = _merged(of_run | accepted.settings, said)
         if "data" in chosen:

@@ -13,6 +13,7 @@ from typing import Any, NoReturn
 import pytest
 from hydra.core.config_store import ConfigStore
 from hydra.core.plugins import Plugins
+from submitit.core.utils import FailedJobError
 
 from tangent_train.cli import main, processes, sweep
 
@@ -126,25 +127,21 @@ def test_failing_jobs_are_shown_and_do_not_stop_the_others(
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as stopped:
         _run(monkeypatch, "train", "-m", "data.fold=4,5", "hydra.sweep.dir=sweep", *SETTINGS)
-    assert stopped.value.code == 1
-    error = capfd.readouterr().err
-    assert error.count("tangent-train: data.fold: found 4") == 2, "when it happens and at the end"
+    error, last = capfd.readouterr().err, str(stopped.value.code)
+    assert error.count("tangent-train: data.fold: found 4") == 1, "when it happens"
     assert error.count("tangent-train: data.fold: found 5") == 1
-    assert f"job 0 in {tmp_path / 'sweep' / '0'} ended with status 1" in error
+    assert last.count("tangent-train: data.fold: found 4") == 1, "and at the end"
+    assert f"job 0 in {tmp_path / 'sweep' / '0'} ended with status 1" in last
 
 
 @OLD_SQLALCHEMY
 def test_a_search_without_a_validation_split_is_refused(
-    settings: tuple[str, ...],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    settings: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit):
+    message = r"^tangent-train: data\.validation_fraction: found no validation split"
+    with pytest.raises(SystemExit, match=message):
         _run(monkeypatch, "train", "-m", "sweep=optuna", *settings, "data.validation_fraction=0")
-    message = capsys.readouterr().err
-    assert "data.validation_fraction: found no validation split" in message
     assert not list(tmp_path.rglob("checkpoints"))
 
 
@@ -191,7 +188,7 @@ def test_slurm_gets_the_resources_of_the_config(
         (tmp_path / "bin" / name).chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}:{os.environ['PATH']}")
     asked = ("hydra.launcher.partition=gpu", "hydra.launcher.gpus_per_node=4")
-    with pytest.raises(SystemExit):
+    with pytest.raises((SystemExit, FailedJobError)):
         _run(monkeypatch, "train", "-m", "launcher=slurm", "seed=1,2", "name=try", *asked)
     job = (tmp_path / "job").read_text()
     for option in (

@@ -300,7 +300,9 @@ def test_runs_are_found_once_and_unfinished_ones_named(three_folds: Path) -> Non
     [
         ("{", "JSONDecodeError"),
         ("[]", "other lists and mappings"),
-        ('{"miou": 0.5}', "no 'macc'"),
+        ('{"miou": 0.5}', "no 'images'"),
+        ('{"images": "5", "miou": 0.5}', "other lists and mappings"),
+        ('{"images": 5, "miou": 0.5}', "no 'macc'"),
         (None, "no such file"),
     ],
 )
@@ -414,17 +416,10 @@ def test_photos_and_cubemaps_are_named_and_have_folds(tmp_path: Path) -> None:
 
 
 def test_reports_say_how_many_images_were_scored(tmp_path: Path) -> None:
-    """Also of results that were written before photos were scored, with another name for it."""
     folder = _write(tmp_path / "a", [0.1, 0.2, 0.3])
+    assert load_run(folder).images == 5
     written = json.loads(report_json(_groups(folder), []))["groups"][0]["runs"][0]
     assert written["images"] == 5
-    results = json.loads((folder / "results.json").read_text())
-    results["panoramas"] = results.pop("images")
-    (folder / "results.json").write_text(json.dumps(results))
-    assert load_run(folder).images == 5
-    del results["panoramas"]
-    (folder / "results.json").write_text(json.dumps(results))
-    assert load_run(folder).images is None
 
 
 def test_the_class_that_takes_most_from_the_mean_is_named(
