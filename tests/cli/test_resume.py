@@ -201,7 +201,7 @@ def test_checkpoints_say_all_that_later_commands_need(undisturbed: Path) -> None
     [
         ("optimizer.lr=1", r"optimizer\.lr: found 1 .*learning rate come from the checkpoint"),
         ("data.fold=2", r"data\.fold: found 2 for a run that began with 1"),
-        ("seed=3", r": seed: found 3 for a run that began with 0"),
+        ("seed=3", r"seed: found 3 for a run that began with 0"),
         ("trainer.accumulate_grad_batches=2", "it would take other steps"),
         ("hydra.run.dir=elsewhere", r"found hydra\.run\.dir=elsewhere beside it"),
     ],
