@@ -13,9 +13,9 @@ import cv2
 
 from benchmarks.measuring import Options, Row, Table, Way, at_least, measure, memory_kib
 from benchmarks.rooms import AREAS, made_rooms
-from datamodules.samples import TrainingImages
-from datamodules.stanford2d3ds import Stanford2D3DS
-from tangent_train.rendering.representation import TangentRepresentation
+from datamodules.core.samples import TrainingImages
+from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
+from tangent_train.rendering.representations.pinhole import TangentRepresentation
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

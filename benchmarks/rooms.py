@@ -8,8 +8,8 @@ from atexit import register
 from functools import cache
 from pathlib import Path
 
-from datamodules.stanford2d3ds import FileName
-from datamodules.stanford_files import AREAS as ALL_AREAS
+from datamodules.stanford2d3ds.files import AREAS as ALL_AREAS
+from datamodules.stanford2d3ds.panoramas import FileName
 from datamodules.synthrooms.generate import generate_rooms
 from datamodules.synthrooms.settings import RoomSettings
 

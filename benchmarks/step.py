@@ -25,9 +25,9 @@ from torch.nn import functional
 from benchmarks.measuring import Options, Row, Table, at_most, composed
 from benchmarks.quiet import quiet_lightning
 from benchmarks.rooms import few_rooms
+from tangent_train.callbacks.checkpoints import LastCheckpoint
 from tangent_train.cli import run
 from tangent_train.cli.build import build
-from tangent_train.tasks.checkpoints import LastCheckpoint
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

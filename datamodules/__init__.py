@@ -1,10 +1,7 @@
-"""Data sets as Lightning data modules.
+"""Data sets as Lightning data modules, a folder each.
 
-`segmentation_module`, `sources`, `samples` and `sampling` serve any labelled images, `panoramas`
-and `panorama_module` panoramas, `photos` and `photo_module` photos. A data set adds modules that
-find and read its files, like `stanford2d3ds` and `stanford_perspective`. Shapes as spheres are
-`modelnet40`, with `shape_files`, `off_files`, `mesh_spheres`, `sphere_store` and `shape_samples`;
-`split_module` is what all data modules share.
+`core` is what they share (the data modules of panoramas and of photos, samples, transforms, the
+prepared store, checks), `images` reads and writes image files.
 """
 
 from __future__ import annotations
@@ -13,19 +10,19 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from datamodules.folder_panoramas import FolderPanoramas
-    from datamodules.image_pairs import ImagePairs
-    from datamodules.modelnet40 import ModelNet40
-    from datamodules.omnisynthia import OmniSynthia
-    from datamodules.panoramas import Panorama
-    from datamodules.photos import Photo
-    from datamodules.samples import EvaluationSample, Normalization, TrainingSample, normalize
-    from datamodules.sampling import EpochSampler, sample_rng
-    from datamodules.shape_samples import ShapeSample
-    from datamodules.stanford2d3ds import Stanford2D3DS
-    from datamodules.stanford_pairs import StanfordPairs
-    from datamodules.stanford_perspective import Stanford2D3DSPerspective
-    from datamodules.synthia_perspective import SynthiaPerspective
+    from datamodules.core.image_pairs import ImagePairs
+    from datamodules.core.panoramas import Panorama
+    from datamodules.core.photos import Photo
+    from datamodules.core.samples import EvaluationSample, Normalization, TrainingSample, normalize
+    from datamodules.core.sampling import EpochSampler, sample_rng
+    from datamodules.folder.panoramas import FolderPanoramas
+    from datamodules.modelnet40.datamodule import ModelNet40
+    from datamodules.modelnet40.shape_samples import ShapeSample
+    from datamodules.stanford2d3ds.pairs import StanfordPairs
+    from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
+    from datamodules.stanford2d3ds.perspective import Stanford2D3DSPerspective
+    from datamodules.synthia.omnisynthia import OmniSynthia
+    from datamodules.synthia.perspective import SynthiaPerspective
     from datamodules.synthrooms.datamodule import SynthRooms, SynthRoomsPerspective
     from datamodules.synthrooms.pairs import SynthRoomsPairs
     from datamodules.synthshapes.datamodule import SynthShapes
@@ -54,30 +51,33 @@ __all__ = [
     "sample_rng",
 ]
 
-_MODULES = (
-    "folder_panoramas",
-    "image_pairs",
-    "modelnet40",
-    "omnisynthia",
-    "panoramas",
-    "photos",
-    "samples",
-    "sampling",
-    "shape_samples",
-    "stanford2d3ds",
-    "stanford_pairs",
-    "stanford_perspective",
-    "synthia_perspective",
-    "synthrooms.datamodule",
-    "synthrooms.pairs",
-    "synthshapes.datamodule",
-)
+_MODULES = {
+    "EpochSampler": "datamodules.core.sampling",
+    "EvaluationSample": "datamodules.core.samples",
+    "FolderPanoramas": "datamodules.folder.panoramas",
+    "ImagePairs": "datamodules.core.image_pairs",
+    "ModelNet40": "datamodules.modelnet40.datamodule",
+    "Normalization": "datamodules.core.samples",
+    "OmniSynthia": "datamodules.synthia.omnisynthia",
+    "Panorama": "datamodules.core.panoramas",
+    "Photo": "datamodules.core.photos",
+    "ShapeSample": "datamodules.modelnet40.shape_samples",
+    "Stanford2D3DS": "datamodules.stanford2d3ds.panoramas",
+    "Stanford2D3DSPerspective": "datamodules.stanford2d3ds.perspective",
+    "StanfordPairs": "datamodules.stanford2d3ds.pairs",
+    "SynthRooms": "datamodules.synthrooms.datamodule",
+    "SynthRoomsPairs": "datamodules.synthrooms.pairs",
+    "SynthRoomsPerspective": "datamodules.synthrooms.datamodule",
+    "SynthShapes": "datamodules.synthshapes.datamodule",
+    "SynthiaPerspective": "datamodules.synthia.perspective",
+    "TrainingSample": "datamodules.core.samples",
+    "normalize": "datamodules.core.samples",
+    "sample_rng": "datamodules.core.sampling",
+}
 
 
 def __getattr__(name: str) -> Any:
     # On demand: the processes that make rooms need neither torch nor lightning.
-    if name in __all__:
-        for module in map(import_module, (f"datamodules.{module}" for module in _MODULES)):
-            if name in module.__dict__.get("__all__", ()):
-                return getattr(module, name)
+    if name in _MODULES:
+        return getattr(import_module(_MODULES[name]), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

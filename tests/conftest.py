@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from datamodules.label_table import CLASSES
+from datamodules.core.label_table import CLASSES
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -47,7 +47,7 @@ def test_the_wheel_holds_the_packages_and_the_configs(wheel: Path) -> None:
         "tangent_train/configs/train.yaml",
         "tangent_train/configs/experiment/rooms/demo.yaml",
         "tangent_train/py.typed",
-        "datamodules/stanford2d3ds.py",
+        "datamodules/stanford2d3ds/panoramas.py",
         "datamodules/stanford_pairs.csv",
         "datamodules/synthrooms/generate.py",
         "models/unet.py",

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from datamodules.stanford2d3ds import Stanford2D3DS
-from datamodules.stanford_perspective import Stanford2D3DSPerspective
+from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
+from datamodules.stanford2d3ds.perspective import Stanford2D3DSPerspective
 from datamodules.synthrooms.settings import RoomSettings, ViewKind
 from tangent_train.errors import SettingError
 from tangent_train.registry import registered
@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
-    from tangent_train.rendering.perspective import PerspectiveRepresentation
-    from tangent_train.rendering.representation import Representation
+    from tangent_train.rendering.representations.perspective import PerspectiveRepresentation
+    from tangent_train.rendering.representations.pinhole import Representation
 
 __all__ = ["SynthRooms", "SynthRoomsPerspective"]
 

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from datamodules.made_folders import claim_folder
-from datamodules.processes import in_processes, number_of_processes
-from datamodules.progress import show_progress
-from datamodules.stanford_files import AREAS
+from datamodules.core.made_folders import claim_folder
+from datamodules.core.processes import in_processes, number_of_processes
+from datamodules.core.progress import show_progress
+from datamodules.stanford2d3ds.files import AREAS
 from datamodules.synthrooms.camera import PanoramaView, PerspectiveView, Pose, draw_view
 from datamodules.synthrooms.raycast import RayScene
 from datamodules.synthrooms.render import draw_camera, draw_holes, render

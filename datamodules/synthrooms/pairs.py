@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from datamodules.stanford_pairs import StanfordPairs
+from datamodules.stanford2d3ds.pairs import StanfordPairs
 from datamodules.synthrooms.settings import RoomSettings
 from tangent_train.errors import SettingError
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
-from datamodules.stanford_files import AREAS
+from datamodules.stanford2d3ds.files import AREAS
 from tangent_train.errors import SettingError
 
 if TYPE_CHECKING:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from datamodules.modelnet40 import ModelNet40
+from datamodules.modelnet40.datamodule import ModelNet40
 from datamodules.synthshapes.families import CLASSES
 from datamodules.synthshapes.settings import ShapeSettings
 from tangent_train.registry import registered
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
-    from tangent_train.rendering.representation import Representation
+    from tangent_train.rendering.representations.pinhole import Representation
 
 __all__ = ["SynthShapes"]
 

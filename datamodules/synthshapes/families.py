@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from datamodules.off_files import Mesh
+from datamodules.modelnet40.off_files import Mesh
 from datamodules.synthshapes import furniture, vessels
 from datamodules.synthshapes.parts import Parts
 from tangent_train.geometry import rotation_about

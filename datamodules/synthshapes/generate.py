@@ -6,10 +6,10 @@ import os
 from contextlib import closing
 from typing import TYPE_CHECKING, NamedTuple
 
-from datamodules.made_folders import claim_folder
-from datamodules.off_files import write_off
-from datamodules.processes import in_processes, number_of_processes
-from datamodules.progress import show_progress
+from datamodules.core.made_folders import claim_folder
+from datamodules.core.processes import in_processes, number_of_processes
+from datamodules.core.progress import show_progress
+from datamodules.modelnet40.off_files import write_off
 from datamodules.synthshapes.families import CLASSES, make_shape
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from trimesh import creation, transformations
 
-from datamodules.off_files import Mesh
+from datamodules.modelnet40.off_files import Mesh
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

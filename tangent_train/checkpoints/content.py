@@ -26,7 +26,7 @@ __all__ = [
 ]
 
 INPUTS = list[Literal["rgb", "depth", "elevation"]]
-"""What a network is shown, see `datamodules.samples.Input`, which is slow to import."""
+"""What a network is shown, see `datamodules.core.samples.Input`, which is slow to import."""
 
 NORMALIZATION = dict[str, list[float]]
 """Its ``mean`` and ``std``."""

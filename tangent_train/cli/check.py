@@ -9,13 +9,13 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from datamodules.data_check import check_all
+from datamodules.core.data_check import check_all
 from tangent_train.registry import make
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from datamodules.problems import Problem
+    from datamodules.core.problems import Problem
 
 __all__ = ["check"]
 

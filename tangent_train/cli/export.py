@@ -13,7 +13,7 @@ from models.sphere_context import SphereContext
 from tangent_train.checkpoints.trained import load_trained
 from tangent_train.cli import values
 from tangent_train.errors import SettingError
-from tangent_train.tasks.export import SUFFIXES, Export, Format, export_network
+from tangent_train.inference.export import SUFFIXES, Export, Format, export_network
 
 __all__ = ["export"]
 

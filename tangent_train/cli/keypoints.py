@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
-from datamodules.image_pairs import ImagePairs
-from datamodules.panorama_pairs import PanoramaPairs
-from datamodules.progress import progress_bar
-from datamodules.stanford_pairs import StanfordPairs, published_pairs
+from datamodules.core.image_pairs import ImagePairs
+from datamodules.core.panorama_pairs import PanoramaPairs
+from datamodules.core.progress import progress_bar
+from datamodules.stanford2d3ds.pairs import StanfordPairs, published_pairs
 from tangent_train.cli.keypoint_pairs.export import ColmapExport
 from tangent_train.cli.keypoint_pairs.folder import EXPORT, ResultsFolder
 from tangent_train.cli.keypoint_pairs.outputs import PairOutputs
@@ -21,10 +21,10 @@ from tangent_train.errors import DataError, SettingError
 from tangent_train.keypoints.detectors import Detector
 from tangent_train.keypoints.motion_search import colmap
 from tangent_train.registry import make, maker_of
-from tangent_train.tasks.keypoints.compare import Comparer, Matching
-from tangent_train.tasks.keypoints.entries import PairEntry
-from tangent_train.tasks.keypoints.representations import Representations
-from tangent_train.tasks.keypoints.tables import KeypointReport, overall_tables, shown_name
+from tangent_train.results.keypoints.compare import Comparer, Matching
+from tangent_train.results.keypoints.entries import PairEntry
+from tangent_train.results.keypoints.representations import Representations
+from tangent_train.results.keypoints.tables import KeypointReport, overall_tables, shown_name
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence

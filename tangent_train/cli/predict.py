@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
-from datamodules.image_files import find_images
-from datamodules.progress import progress_bar
+from datamodules.core.progress import progress_bar
+from datamodules.images.image_files import find_images
 from tangent_train.checkpoints.trained import load_trained
 from tangent_train.cli.prediction.report import (
     Entry,
@@ -22,26 +22,26 @@ from tangent_train.cli.prediction.report import (
 )
 from tangent_train.cli.prediction.settings import PredictSettings
 from tangent_train.errors import DataError, SettingError
-from tangent_train.json_text import parse_json
-from tangent_train.tasks.prediction.labellers import (
+from tangent_train.inference.labellers import (
     DepthFolder,
     Labelled,
     Labeller,
     PanoramaLabeller,
     PhotoLabeller,
 )
-from tangent_train.tasks.prediction.outputs import OutputFolder, output_names
-from tangent_train.tasks.prediction.panoramas import PanoramaPredictor
-from tangent_train.tasks.prediction.photos import PhotoPredictor
-from tangent_train.tasks.prediction.predictor import Runner
-from tangent_train.tasks.prediction.summary import write_summary
+from tangent_train.inference.outputs import OutputFolder, output_names
+from tangent_train.inference.panoramas import PanoramaPredictor
+from tangent_train.inference.photos import PhotoPredictor
+from tangent_train.inference.predictor import Runner
+from tangent_train.inference.summary import write_summary
+from tangent_train.json_text import parse_json
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
     from tangent_train.checkpoints.trained import TrainedNetwork
-    from tangent_train.tasks.html import EncodedImage
+    from tangent_train.results.html import EncodedImage
 
 __all__ = ["predict"]
 

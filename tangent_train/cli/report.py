@@ -34,10 +34,10 @@ def report(arguments: Sequence[str]) -> None:
     from rich.console import Console
 
     from tangent_train.files import write_bytes, write_text
-    from tangent_train.tasks.reports import tables
-    from tangent_train.tasks.reports.chart import report_png
-    from tangent_train.tasks.reports.groups import group_runs
-    from tangent_train.tasks.reports.runs import find_runs, load_run, unfinished_runs
+    from tangent_train.results.reports import tables
+    from tangent_train.results.reports.chart import report_png
+    from tangent_train.results.reports.groups import group_runs
+    from tangent_train.results.reports.runs import find_runs, load_run, unfinished_runs
 
     groups = group_runs([load_run(folder) for folder in find_runs(options.folders)])
     remarks = tables.notes(groups)
@@ -93,7 +93,7 @@ def _check_output(folder: Path) -> None:
 
 
 def _is_report(path: Path) -> bool:
-    from tangent_train.tasks.reports.tables import MADE_BY
+    from tangent_train.results.reports.tables import MADE_BY
 
     try:
         content = parse_json(path.read_text())

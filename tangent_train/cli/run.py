@@ -21,8 +21,16 @@ from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 from rich.console import Console
 
-from datamodules.samples import channel_names
+from datamodules.core.samples import channel_names
 from models.initialize import initialize, origins_table
+from tangent_train.callbacks.checkpoints import (
+    AtomicCheckpointIO,
+    CheckpointContents,
+    LastCheckpoint,
+    best_checkpoint,
+)
+from tangent_train.callbacks.panels import ProgressBar
+from tangent_train.callbacks.tensorboard import TrainingSpeed
 from tangent_train.checkpoints.content import read_checkpoint, write_settings
 from tangent_train.checkpoints.trained import inputs_in
 from tangent_train.cli.build import Settings, build, check_numbers
@@ -33,14 +41,6 @@ from tangent_train.errors import DataError, SettingError
 from tangent_train.files import write_text
 from tangent_train.registry import make
 from tangent_train.tasks.averaging import AveragedWeights
-from tangent_train.tasks.callbacks import ProgressBar
-from tangent_train.tasks.checkpoints import (
-    AtomicCheckpointIO,
-    CheckpointContents,
-    LastCheckpoint,
-    best_checkpoint,
-)
-from tangent_train.tasks.tensorboard_pictures import TrainingSpeed
 
 __all__ = ["best_on_validation", "build", "evaluate", "prepare", "train"]
 

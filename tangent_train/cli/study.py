@@ -163,7 +163,7 @@ def _is_study(picture: Path) -> bool:
     """Whether a picture bears the mark."""
     from PIL import Image
 
-    from tangent_train.tasks.studies.outcome import MADE_BY
+    from studies.outcome import MADE_BY
 
     try:
         with Image.open(picture) as image:

@@ -11,10 +11,10 @@ from tangent_train.rendering.camera_files import (
     write_cameras,
     write_colmap,
 )
-from tangent_train.rendering.cubemap import CubemapRepresentation
 from tangent_train.rendering.forward import Interpolation, equirect_to_tangent
-from tangent_train.rendering.perspective import PerspectiveRepresentation
-from tangent_train.rendering.representation import (
+from tangent_train.rendering.representations.cubemap import CubemapRepresentation
+from tangent_train.rendering.representations.perspective import PerspectiveRepresentation
+from tangent_train.rendering.representations.pinhole import (
     Assembler,
     EquirectRepresentation,
     Representation,

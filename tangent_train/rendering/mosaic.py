@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from tangent_train.geometry import PinholeGrid
     from tangent_train.rendering.backward import Blend
-    from tangent_train.rendering.perspective import PhotoCrops
+    from tangent_train.rendering.representations.perspective import PhotoCrops
 
 __all__ = ["ScoreMosaic", "window"]
 

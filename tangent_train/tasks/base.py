@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
-from datamodules.split_module import Kind
+from datamodules.core.split_module import Kind
 from tangent_train.errors import SettingError
 from tangent_train.tasks.divergence import LossWatch, check_weights, stop
 

@@ -15,18 +15,18 @@ from torch.nn import functional
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
-from datamodules.split_module import Kind
+from datamodules.core.split_module import Kind
+from tangent_train.callbacks.tensorboard import ValidationConfusion
 from tangent_train.errors import SettingError
+from tangent_train.metrics.classification import ClassCounts, classification_scores
 from tangent_train.registry import registered
-from tangent_train.tasks.base import Part, Task
-from tangent_train.tasks.classification_metrics import ClassCounts, classification_scores
-from tangent_train.tasks.classification_results import (
+from tangent_train.results.classification import (
     classification_results,
     classification_table,
     write_classification_results,
 )
-from tangent_train.tasks.html.classification import write_classification_report
-from tangent_train.tasks.tensorboard_pictures import ValidationConfusion
+from tangent_train.results.html.classification import write_classification_report
+from tangent_train.tasks.base import Part, Task
 
 __all__ = ["ClassificationTask"]
 

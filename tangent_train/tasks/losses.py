@@ -9,16 +9,14 @@ from jaxtyping import Float, Int64, UInt8
 from torch import Tensor
 from torch.nn import functional
 
+from tangent_train.metrics.segmentation import UNKNOWN
+
 __all__ = [
-    "UNKNOWN",
     "AuxiliaryTarget",
     "auxiliary_sum",
     "cross_entropy_norm",
     "cross_entropy_sum",
 ]
-
-UNKNOWN = 0
-"""Class index of unlabelled pixels, everywhere."""
 
 AuxiliaryTarget = Literal["histogram", "labels"]
 """What the cells of a coarser stage are compared with; see `auxiliary_sum`."""

@@ -15,24 +15,24 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
-from datamodules.class_weights import ClassWeights
-from datamodules.split_module import Kind
+from datamodules.core.class_weights import ClassWeights
+from datamodules.core.split_module import Kind
 from models.held import held_networks
+from tangent_train.callbacks.panels import PredictionPanels
+from tangent_train.callbacks.tensorboard import ValidationPictures
 from tangent_train.errors import SettingError
+from tangent_train.metrics.segmentation import AbsentClass, ConfusionMatrix, segmentation_scores
 from tangent_train.registry import registered
 from tangent_train.rendering import Assembler, EquirectRepresentation
+from tangent_train.results.html.evaluation import write_evaluation_report
+from tangent_train.results.segmentation import evaluation_results, results_table, write_results
 from tangent_train.tasks.base import Part, Task, check_at_once
-from tangent_train.tasks.callbacks import PredictionPanels
-from tangent_train.tasks.html.evaluation import write_evaluation_report
 from tangent_train.tasks.losses import (
     AuxiliaryTarget,
     auxiliary_sum,
     cross_entropy_norm,
     cross_entropy_sum,
 )
-from tangent_train.tasks.metrics import AbsentClass, ConfusionMatrix, segmentation_scores
-from tangent_train.tasks.results import evaluation_results, results_table, write_results
-from tangent_train.tasks.tensorboard_pictures import ValidationPictures
 
 __all__ = ["SegmentationTask"]
 

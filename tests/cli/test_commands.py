@@ -17,11 +17,11 @@ import pytest
 import torch
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 
+from tangent_train.callbacks.checkpoints import LastCheckpoint
 from tangent_train.checkpoints.content import read_settings
 from tangent_train.cli import main, run
 from tangent_train.cli.stored import stored_arguments
-from tangent_train.tasks.checkpoints import LastCheckpoint
-from tangent_train.tasks.reports.runs import load_run
+from tangent_train.results.reports.runs import load_run
 
 AREAS = ("1", "2", "3", "4", "5a", "5b", "6")
 SETTINGS = [

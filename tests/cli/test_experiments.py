@@ -17,7 +17,7 @@ from tangent_train.cli.build import build
 from tangent_train.cli.compose import config_folder
 from tangent_train.cli.transfer.stages import folds_and_seeds, plan
 from tangent_train.registry import make
-from tests.datamodules.synthia_format import write_panoramas, write_views
+from tests.datamodules.synthia.synthia_format import write_panoramas, write_views
 
 if TYPE_CHECKING:
     from tests.conftest import FabricateStanford

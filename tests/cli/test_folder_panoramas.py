@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from tangent_train.cli import main
-from tests.datamodules.folder_format import (
+from tests.datamodules.folder.folder_format import (
     CLASS_OF_STORED,
     NAMES,
     write_classes,

@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from datamodules.image_pairs import ImagePairs
-from datamodules.stanford_pairs import StanfordPairs, published_pairs
+from datamodules.core.image_pairs import ImagePairs
+from datamodules.stanford2d3ds.pairs import StanfordPairs, published_pairs
 from tangent_train.cli import main
 from tangent_train.cli.compose import check_overrides, config_folder
 from tangent_train.cli.keypoint_pairs.arguments import keypoint_arguments
@@ -26,8 +26,8 @@ from tangent_train.cli.keypoint_pairs.settings import EXPORTS, KeypointSettings
 from tangent_train.cli.keypoints import keypoints
 from tangent_train.errors import SettingError
 from tangent_train.keypoints import motion_search
-from tangent_train.tasks.keypoints.compare import Comparer, Comparison
-from tests.tasks.keypoints.ball_room import ball_pair
+from tangent_train.results.keypoints.compare import Comparer, Comparison
+from tests.results.keypoints.ball_room import ball_pair
 
 pytest.importorskip("pycolmap")
 

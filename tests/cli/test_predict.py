@@ -14,7 +14,7 @@ from PIL import Image
 
 from tangent_train.cli import main
 from tangent_train.geometry import equirect_directions, equirect_solid_angles
-from tests.tasks.prediction.trained import CLASS_NAMES, PERSPECTIVE, TANGENT, write_checkpoint
+from tests.inference.trained import CLASS_NAMES, PERSPECTIVE, TANGENT, write_checkpoint
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -266,7 +266,7 @@ def test_an_interruption_keeps_what_is_done(
 ) -> None:
     for name in ("a", "b", "c"):
         _write(tmp_path / "panoramas" / f"{name}.png", _sphere(16))
-    from tangent_train.tasks.prediction.labellers import PanoramaLabeller
+    from tangent_train.inference.labellers import PanoramaLabeller
 
     whole = PanoramaLabeller.label
 

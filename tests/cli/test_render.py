@@ -14,8 +14,8 @@ import pytest
 from numpy.typing import NDArray
 from omegaconf import OmegaConf
 
-from datamodules import tangent_folders
-from datamodules.pixel_files import write_pixels
+from datamodules.images import tangent_folders
+from datamodules.images.pixel_files import write_pixels
 from tangent_train.cli import main
 from tangent_train.cli.compose import config_folder
 from tangent_train.cli.render import render
@@ -300,7 +300,7 @@ def test_features_of_another_resolution(
     room: Path, tmp_path: Path, dim: int, blend: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Features that are the directions of their pixels, written by hand, come back in place."""
-    monkeypatch.setattr("datamodules.tangent_results._GROUP_BYTES", 200_000)
+    monkeypatch.setattr("datamodules.images.tangent_results._GROUP_BYTES", 200_000)
     _render(input=room, output=tmp_path / "tan", base_level=0)
     content = json.loads((tmp_path / "tan" / "room" / "cameras.json").read_text())
     (tmp_path / "features").mkdir()

@@ -12,8 +12,8 @@ import pytest
 from omegaconf import OmegaConf
 
 from tangent_train.cli import main
-from tangent_train.tasks.metrics import ConfusionMatrices
-from tangent_train.tasks.results import evaluation_results, write_results
+from tangent_train.metrics.segmentation import ConfusionMatrices
+from tangent_train.results.segmentation import evaluation_results, write_results
 
 FILES = {"report.json", "report.md", "report.csv", "report.png"}
 

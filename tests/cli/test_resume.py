@@ -47,7 +47,7 @@ COMMAND = Path(sys.executable).parent / "tangent-train"
 CUT_SHORT = """
 import os, signal, sys
 from tangent_train.cli.main import train
-from tangent_train.tasks.checkpoints import LastCheckpoint
+from tangent_train.callbacks.checkpoints import LastCheckpoint
 
 original = LastCheckpoint.on_train_batch_end
 

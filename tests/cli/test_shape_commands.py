@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 import torch
 
+from tangent_train.callbacks.checkpoints import LastCheckpoint
 from tangent_train.cli import main
-from tangent_train.tasks.checkpoints import LastCheckpoint
 
 SETTINGS = [
     "experiment=shapes/default",

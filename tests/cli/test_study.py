@@ -12,7 +12,7 @@ from PIL import Image
 
 from tangent_train.cli import main
 from tangent_train.cli.studies.catalogue import STUDIES
-from tests.tasks.studies.mnist_format import write_mnist
+from tests.studies.mnist_format import write_mnist
 
 
 def study(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:

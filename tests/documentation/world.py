@@ -12,12 +12,12 @@ from PIL import ExifTags, Image
 
 from datamodules.synthshapes.generate import generate_shapes
 from datamodules.synthshapes.settings import ShapeSettings
-from tests.datamodules.folder_format import write_data_set
-from tests.datamodules.stanford_pairs_format import write_paper_pairs
-from tests.datamodules.synthia_format import write_panoramas, write_views
+from tests.datamodules.folder.folder_format import write_data_set
+from tests.datamodules.stanford2d3ds.stanford_pairs_format import write_paper_pairs
+from tests.datamodules.synthia.synthia_format import write_panoramas, write_views
 from tests.documentation.cluster import write_cluster
 from tests.documentation.running import run
-from tests.tasks.studies.mnist_format import write_mnist
+from tests.studies.mnist_format import write_mnist
 
 if TYPE_CHECKING:
     from tests.conftest import FabricateStanford

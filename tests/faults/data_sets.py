@@ -17,15 +17,15 @@ from datamodules import (
     SynthiaPerspective,
 )
 from tangent_train.rendering import EquirectRepresentation, PerspectiveRepresentation
-from tests.datamodules.folder_format import write_data_set
-from tests.datamodules.shapes_format import write_tree
-from tests.datamodules.synthia_format import write_panoramas, write_views
+from tests.datamodules.folder.folder_format import write_data_set
+from tests.datamodules.modelnet40.shapes_format import write_tree
+from tests.datamodules.synthia.synthia_format import write_panoramas, write_views
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from datamodules.split_module import SplitDataModule
+    from datamodules.core.split_module import SplitDataModule
     from tests.conftest import FabricateStanford
 
 NAME = "Küche 1 [b] 部屋 ∕ a,b=c"

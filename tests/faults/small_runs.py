@@ -9,10 +9,10 @@ import lightning
 import torch
 from torch import Tensor, nn
 
-from datamodules.stanford2d3ds import Stanford2D3DS
+from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
+from tangent_train.callbacks.checkpoints import AtomicCheckpointIO, LastCheckpoint
 from tangent_train.rendering import TangentRepresentation
 from tangent_train.tasks import SegmentationTask
-from tangent_train.tasks.checkpoints import AtomicCheckpointIO, LastCheckpoint
 
 if TYPE_CHECKING:
     from collections.abc import Callable

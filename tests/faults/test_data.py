@@ -16,9 +16,9 @@ import pytest
 from PIL import Image
 
 from datamodules import SynthRooms
-from datamodules.data_check import check_all
+from datamodules.core.data_check import check_all
 from tangent_train.errors import DataError
-from tests.datamodules.folder_format import write_classes
+from tests.datamodules.folder.folder_format import write_classes
 from tests.faults import data_sets as sets
 from tests.faults.data_sets import colors, module, partner, write
 

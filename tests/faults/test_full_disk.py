@@ -23,13 +23,13 @@ import pytest
 import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 
-from datamodules.stanford2d3ds import Stanford2D3DS
+from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
+from tangent_train.callbacks.checkpoints import AtomicCheckpointIO
 from tangent_train.cli.machine import machine_faults
 from tangent_train.files import NoRoomError, atomic_path, reserve, write_text
+from tangent_train.metrics.segmentation import ConfusionMatrices
 from tangent_train.rendering import TangentRepresentation
-from tangent_train.tasks.checkpoints import AtomicCheckpointIO
-from tangent_train.tasks.metrics import ConfusionMatrices
-from tangent_train.tasks.results import evaluation_results, write_results
+from tangent_train.results.segmentation import evaluation_results, write_results
 from tests.faults.small_runs import Faulty, run_trainer, small_data, small_task
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ import torch
 from lightning.pytorch.plugins import MixedPrecision
 from torch import Tensor
 
-from datamodules.stanford2d3ds import Stanford2D3DS
+from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 from tangent_train.errors import SettingError
 from tangent_train.tasks.divergence import BATCH_FILE
 from tests.faults.small_runs import Faulty, run_trainer, small_data, small_task

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from tangent_train.cli import main
-from tests.tasks.prediction.trained import write_checkpoint
+from tests.inference.trained import write_checkpoint
 
 ROOMS = ("train", "experiment=rooms/demo")
 PREDICT = ("predict", "checkpoint=x.ckpt", "input=image.png", "output=labels")

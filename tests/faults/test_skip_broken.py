@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 from lightning.pytorch.trainer.states import TrainerFn
 
-from datamodules import data_check
+from datamodules.core import data_check
 from tangent_train.cli import main
 from tangent_train.errors import DataError, SettingError
-from tests.datamodules.folder_format import write_classes
+from tests.datamodules.folder.folder_format import write_classes
 from tests.faults import data_sets as sets
 from tests.faults.data_sets import colors, module, names, partner, write
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from datamodules.split_module import SplitDataModule
+    from datamodules.core.split_module import SplitDataModule
     from tests.conftest import FabricateStanford
 
 PANORAMAS = ("folder", "stanford", "omnisynthia")
@@ -201,7 +201,7 @@ def test_a_store_that_is_made_is_not_read_again_for_what_is_broken(
     def refuse(*_: Any) -> None:
         raise AssertionError("all of it is in the store")
 
-    monkeypatch.setattr("datamodules.stanford2d3ds.read_color_png", refuse)
+    monkeypatch.setattr("datamodules.stanford2d3ds.panoramas.read_color_png", refuse)
     data = module("stanford", root, **settings)
     data.prepare_all()
     assert len(data.source("train")) > 0

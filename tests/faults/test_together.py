@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 import pytest
 import torch
 
-from datamodules.made_folders import claim_folder
-from datamodules.stanford2d3ds import Stanford2D3DS
-from datamodules.store_files import write_stored
+from datamodules.core.made_folders import claim_folder
+from datamodules.core.store_files import write_stored
+from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 from datamodules.synthrooms.generate import generate_rooms
 from datamodules.synthrooms.settings import RoomSettings
 from tangent_train.errors import DataError
@@ -33,7 +33,11 @@ PANORAMAS = 14
 def processes() -> ForkServerContext:
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(
-        ["datamodules.stanford2d3ds", "datamodules.synthrooms.generate", "tangent_train.rendering"]
+        [
+            "datamodules.stanford2d3ds.panoramas",
+            "datamodules.synthrooms.generate",
+            "tangent_train.rendering",
+        ]
     )
     return context
 
@@ -91,7 +95,7 @@ def _prepare_and_die(root: Path, store: Path, barrier: Any) -> None:
         write(path, *content)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("datamodules.store.write_stored", fall)
+        patch.setattr("datamodules.core.store.write_stored", fall)
         _data(root, store).prepare_data()
 
 

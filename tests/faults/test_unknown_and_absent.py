@@ -15,11 +15,11 @@ import pytest
 import torch
 from lightning.pytorch.plugins import MixedPrecision
 
-from datamodules.stanford2d3ds import Stanford2D3DS
+from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
+from tangent_train.callbacks.checkpoints import best_checkpoint
+from tangent_train.callbacks.panels import PredictionPanels
 from tangent_train.cli.run import best_on_validation
-from tangent_train.tasks.callbacks import PredictionPanels
-from tangent_train.tasks.checkpoints import best_checkpoint
-from tangent_train.tasks.results import evaluation_results
+from tangent_train.results.segmentation import evaluation_results
 from tests.faults.small_runs import Faulty, run_trainer, small_data, small_task
 
 if TYPE_CHECKING:

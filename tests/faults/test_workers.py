@@ -14,7 +14,7 @@ import pytest
 import torch
 from torch.utils.data import get_worker_info
 
-from datamodules.watched_samples import explained
+from datamodules.core.watched_samples import explained
 from tangent_train.cli.machine import machine_faults
 from tangent_train.errors import DataError, SettingError
 from tests.faults.small_runs import Faulty, run_trainer, small_data, small_task
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
-    from datamodules.stanford2d3ds import Stanford2D3DS
+    from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:You defined a `validation_step`:UserWarning"),

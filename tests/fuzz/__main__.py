@@ -96,7 +96,7 @@ def _findings(folder: Path) -> set[Path]:
 def _fuzz(atheris: Any, name: str, seconds: float, folder: Path) -> None:
     """Try inputs until the time is over; ends the process."""
     with atheris.instrument_imports(include=["datamodules", "tangent_train"]):
-        from datamodules.image_opening import MOST_PIXELS
+        from datamodules.images.image_opening import MOST_PIXELS
         from tests.fuzz.targets import LARGEST_IMAGE, TARGETS
     target = TARGETS[name]
     seeds = target.seeds()

@@ -15,12 +15,12 @@ import numpy as np
 import OpenEXR
 from PIL import Image
 
-from datamodules.gpano import NAMESPACE, area_of
-from datamodules.gpano_pose import up_of
-from datamodules.image_files import read_depth_m
-from datamodules.label_table import CLASSES, LabelTable
-from datamodules.pixel_files import read_pixels
-from datamodules.png import check_png, read_color_png, read_depth_png
+from datamodules.core.label_table import CLASSES, LabelTable
+from datamodules.images.gpano import NAMESPACE, area_of
+from datamodules.images.gpano_pose import up_of
+from datamodules.images.image_files import read_depth_m
+from datamodules.images.pixel_files import read_pixels
+from datamodules.images.png import check_png, read_color_png, read_depth_png
 from tangent_train.errors import DataError
 from tests.fuzz.mutation import png_chunk
 from tests.fuzz.pixels import DEPTH, RGB, npy, png

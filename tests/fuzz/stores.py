@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from datamodules.panoramas import Panorama
-from datamodules.shape_files import ShapeFile
-from datamodules.sphere_files import is_current, read_sphere
-from datamodules.sphere_store import SphereFolder
-from datamodules.store_files import open_stored, write_stored
+from datamodules.core.panoramas import Panorama
+from datamodules.core.store_files import open_stored, write_stored
+from datamodules.modelnet40.shape_files import ShapeFile
+from datamodules.modelnet40.sphere_files import is_current, read_sphere
+from datamodules.modelnet40.sphere_store import SphereFolder
 from tests.fuzz.pixels import DEPTH, RGB, SHAPE, npy
 
 if TYPE_CHECKING:

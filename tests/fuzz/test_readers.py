@@ -14,10 +14,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from datamodules.gpano import NAMESPACE
-from datamodules.image_opening import MOST_PIXELS
-from datamodules.pixel_files import read_pixels
-from datamodules.png import read_color_png
+from datamodules.images.gpano import NAMESPACE
+from datamodules.images.image_opening import MOST_PIXELS
+from datamodules.images.pixel_files import read_pixels
+from datamodules.images.png import read_color_png
 from tangent_train.errors import DataError
 from tests.fuzz.mutation import png_chunk
 from tests.fuzz.targets import LARGEST_IMAGE, LONGEST_MESSAGE, TARGETS, Target

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from datamodules.folder_classes import read_classes
-from datamodules.label_table import CLASSES, LabelTable
-from datamodules.off_files import read_off
-from datamodules.stanford_perspective import read_camera_matrix
-from datamodules.stanford_poses import read_panorama_pose
+from datamodules.core.label_table import CLASSES, LabelTable
+from datamodules.folder.classes import read_classes
+from datamodules.modelnet40.off_files import read_off
+from datamodules.stanford2d3ds.perspective import read_camera_matrix
+from datamodules.stanford2d3ds.poses import read_panorama_pose
 from tangent_train.geometry import TangentGrid, rotation_about
 from tangent_train.rendering.camera_files import CameraFile, read_cameras, write_cameras
 from tests.fuzz.pixels import DEPTH, RGB, SHAPE

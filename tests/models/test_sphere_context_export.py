@@ -9,7 +9,7 @@ import torch
 
 from models import SphereContext
 from tangent_train.checkpoints.trained import Scores, load_trained
-from tangent_train.tasks.export import SUFFIXES, Format, export_network
+from tangent_train.inference.export import SUFFIXES, Format, export_network
 from tests.models.sphere_networks import awake
 from tests.tasks.odd_networks import assert_same, scores_of, some_images
 from tests.tasks.small_networks import small_trained

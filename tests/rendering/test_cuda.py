@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from tangent_train.geometry import TangentGrid, equirect_shape
+from tangent_train.metrics import ConfusionMatrix
 from tangent_train.rendering import (
     Blend,
     Interpolation,
@@ -14,7 +15,6 @@ from tangent_train.rendering import (
     tangent_to_equirect,
     tangent_to_labels,
 )
-from tangent_train.tasks import ConfusionMatrix
 
 pytestmark = [
     pytest.mark.gpu,

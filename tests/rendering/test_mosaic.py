@@ -25,7 +25,7 @@ from tangent_train.rendering import (
     tangent_to_labels,
 )
 from tangent_train.rendering.mosaic import ScoreMosaic
-from tangent_train.rendering.perspective import PhotoCrops
+from tangent_train.rendering.representations.perspective import PhotoCrops
 
 if TYPE_CHECKING:
     from tangent_train.geometry import PinholeGrid

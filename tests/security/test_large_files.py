@@ -15,18 +15,18 @@ import numpy as np
 import pytest
 from PIL import Image, ImageFile
 
-from datamodules import pixel_files, png
-from datamodules.folder_classes import read_classes
-from datamodules.gpano import NAMESPACE
-from datamodules.image_files import read_array, read_depth_m, read_rgb
-from datamodules.image_opening import MOST_PIXELS
-from datamodules.label_table import LabelTable
-from datamodules.pixel_files import read_pixels, write_pixels
-from datamodules.png import read_color_png, read_depth_png
-from datamodules.xmp import read_xmp_tags
+from datamodules.core.label_table import LabelTable
+from datamodules.folder.classes import read_classes
+from datamodules.images import pixel_files, png
+from datamodules.images.gpano import NAMESPACE
+from datamodules.images.image_files import read_array, read_depth_m, read_rgb
+from datamodules.images.image_opening import MOST_PIXELS
+from datamodules.images.pixel_files import read_pixels, write_pixels
+from datamodules.images.png import read_color_png, read_depth_png
+from datamodules.images.xmp import read_xmp_tags
+from studies.digits import read_idx
 from tangent_train.errors import DataError, SettingError
 from tangent_train.rendering.camera_files import read_cameras
-from tangent_train.tasks.studies.digits import read_idx
 
 Read = Callable[[Path], Any]
 

@@ -13,11 +13,11 @@ import torch
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from datamodules.pixel_files import write_pixels
+from datamodules.images.pixel_files import write_pixels
 from tangent_train.cli import main
 from tangent_train.cli.keypoint_pairs.folder import PICTURES, ResultsFolder
-from tangent_train.tasks.prediction.outputs import OutputFolder, output_names
-from tests.tasks.prediction.trained import write_checkpoint
+from tangent_train.inference.outputs import OutputFolder, output_names
+from tests.inference.trained import write_checkpoint
 
 SCRIPT = '<img src=x onerror="alert(1)"><script>alert(1)<\\script>'
 _PARTS = st.text(st.characters(exclude_characters="/\0", codec="utf-8"), min_size=1, max_size=12)

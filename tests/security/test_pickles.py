@@ -12,17 +12,17 @@ import numpy as np
 import pytest
 import torch
 
-from datamodules.image_files import read_array
-from datamodules.sphere_files import read_sphere
-from datamodules.store_files import open_stored
+from datamodules.core.store_files import open_stored
+from datamodules.images.image_files import read_array
+from datamodules.modelnet40.sphere_files import read_sphere
 from models.pretrained import read_tensors
 from tangent_train.checkpoints.content import read_checkpoint
 from tangent_train.checkpoints.trained import load_trained
 from tangent_train.cli import main
 from tangent_train.cli.keypoint_pairs.export import ColmapExport
 from tangent_train.errors import DataError
-from tangent_train.tasks.reports.runs import load_run
-from tests.tasks.prediction.trained import write_checkpoint
+from tangent_train.results.reports.runs import load_run
+from tests.inference.trained import write_checkpoint
 
 
 class Creating:

@@ -24,10 +24,11 @@ from rich.console import Console
 from safetensors.torch import load_file, save_file
 from torch import nn
 
-from datamodules.samples import Input
+from datamodules.core.samples import Input
 from models import initialize
 from models.initialize import origins_table
 from tangent_train import registry
+from tangent_train.callbacks.checkpoints import AtomicCheckpointIO, best_checkpoint
 from tangent_train.checkpoints.content import INPUTS, read_checkpoint, read_settings
 from tangent_train.checkpoints.trained import (
     METADATA_KEY,
@@ -44,9 +45,8 @@ from tangent_train.cli.stored import CHOOSABLE, StoredRun, stored_run
 from tangent_train.errors import DataError, SettingError
 from tangent_train.registry import accept, check_plain, make, named_targets
 from tangent_train.rendering.camera_files import read_cameras
-from tangent_train.tasks.checkpoints import AtomicCheckpointIO, best_checkpoint
-from tangent_train.tasks.reports.runs import load_run
-from tests.datamodules.folder_format import write_classes, write_data_set
+from tangent_train.results.reports.runs import load_run
+from tests.datamodules.folder.folder_format import write_classes, write_data_set
 from tests.security.attacks import attacks, json_attacks, places, replaced, sampled
 from tests.security.watch import CANARY, watched
 

@@ -15,14 +15,14 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.utils.data import DataLoader
 
-from tangent_train.errors import SettingError
-from tangent_train.tasks.averaging import AveragedWeights
-from tangent_train.tasks.checkpoints import (
+from tangent_train.callbacks.checkpoints import (
     AtomicCheckpointIO,
     CheckpointContents,
     LastCheckpoint,
     best_checkpoint,
 )
+from tangent_train.errors import SettingError
+from tangent_train.tasks.averaging import AveragedWeights
 
 DECAY = 0.3  # from the fourth step on: (1 + t) / (10 + t) is less before
 STEPS = 4

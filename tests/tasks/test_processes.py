@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from datamodules.samples import TrainingSample
+from datamodules.core.samples import TrainingSample
 from tests.conftest import ROOMS
 from tests.faults.small_runs import run_trainer, small_data, small_task
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from datamodules.image_files import read_image_size
+from datamodules.images.image_files import read_image_size
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import atomic_path, write_text
 from tangent_train.json_text import parse_json
@@ -28,13 +28,13 @@ from tangent_train.keypoints.colmap import (
 )
 from tangent_train.keypoints.spherical import SphericalKeypoints
 from tangent_train.keypoints.two_view import TwoView
-from tangent_train.tasks.keypoints.entries import AS_GIVEN
+from tangent_train.results.keypoints.entries import AS_GIVEN
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from datamodules.panorama_pairs import PairedPanorama, PanoramaPair
-    from tangent_train.tasks.keypoints.compare import Comparison
+    from datamodules.core.panorama_pairs import PairedPanorama, PanoramaPair
+    from tangent_train.results.keypoints.compare import Comparison
 
 __all__ = ["ColmapExport"]
 

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Any
 from tangent_train.errors import SettingError
 from tangent_train.files import write_text
 from tangent_train.json_text import parse_json
-from tangent_train.tasks.keypoints.entries import PairEntry
-from tangent_train.tasks.keypoints.tables import pairs_csv
+from tangent_train.results.keypoints.entries import PairEntry
+from tangent_train.results.keypoints.tables import pairs_csv
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from tangent_train.tasks.keypoints.tables import KeypointReport
+    from tangent_train.results.keypoints.tables import KeypointReport
 
 __all__ = ["EXPORT", "PICTURES", "ResultsFolder"]
 

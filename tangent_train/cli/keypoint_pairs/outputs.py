@@ -9,19 +9,19 @@ import cv2
 
 from tangent_train.errors import SettingError
 from tangent_train.files import write_bytes
-from tangent_train.tasks.keypoints.entries import AS_GIVEN, TURNED
-from tangent_train.tasks.keypoints.pictures import DrawnMatches, matches_picture
-from tangent_train.tasks.keypoints.tables import shown_name
+from tangent_train.results.keypoints.entries import AS_GIVEN, TURNED
+from tangent_train.results.keypoints.pictures import DrawnMatches, matches_picture
+from tangent_train.results.keypoints.tables import shown_name
 
 if TYPE_CHECKING:
     from collections.abc import Container, Sequence
     from pathlib import Path
 
-    from datamodules.panorama_pairs import PanoramaPair
+    from datamodules.core.panorama_pairs import PanoramaPair
     from tangent_train.cli.keypoint_pairs.export import ColmapExport
     from tangent_train.cli.keypoint_pairs.folder import ResultsFolder
-    from tangent_train.tasks.keypoints.compare import Comparison
-    from tangent_train.tasks.keypoints.found import Found
+    from tangent_train.results.keypoints.compare import Comparison
+    from tangent_train.results.keypoints.found import Found
 
 __all__ = ["PairOutputs"]
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from tangent_train.cli import values
 from tangent_train.errors import SettingError
-from tangent_train.tasks.keypoints.representations import LEAST_STEPS
+from tangent_train.results.keypoints.representations import LEAST_STEPS
 
 __all__ = ["EXPORTS", "KeypointSettings"]
 

@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING, Any
 from rich.markup import escape
 from rich.table import Table as TerminalTable
 
-from tangent_train.tasks.html import Table, ViewerImage, encode_image, write_report
+from tangent_train.results.html import Table, ViewerImage, encode_image, write_report
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from tangent_train.checkpoints.trained import TrainedNetwork
     from tangent_train.cli.prediction.settings import PredictSettings
-    from tangent_train.tasks.html import EncodedImage
-    from tangent_train.tasks.prediction.labellers import Labelled
-    from tangent_train.tasks.prediction.outputs import OutputFolder
+    from tangent_train.inference.labellers import Labelled
+    from tangent_train.inference.outputs import OutputFolder
+    from tangent_train.results.html import EncodedImage
 
 __all__ = ["shares_table", "shown_image", "summary", "what_happens", "write_prediction_report"]
 

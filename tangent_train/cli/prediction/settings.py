@@ -12,9 +12,9 @@ from tangent_train.cli import values
 from tangent_train.errors import SettingError
 
 if TYPE_CHECKING:
-    from datamodules.panorama_module import Upright
+    from datamodules.core.panorama_module import Upright
+    from tangent_train.inference.predictor import Level
     from tangent_train.rendering import Blend
-    from tangent_train.tasks.prediction.predictor import Level
 
 __all__ = ["PredictSettings"]
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from datamodules.pixel_files import PIXEL_SUFFIXES
-from datamodules.tangent_results import TangentResults, result_files
+from datamodules.images.pixel_files import PIXEL_SUFFIXES
+from datamodules.images.tangent_results import TangentResults, result_files
 from tangent_train.cli.rendering.reports import Failures, refuse_existing, say
 from tangent_train.errors import DataError, SettingError
 from tangent_train.rendering.camera_files import CAMERAS_FILE, read_cameras
@@ -52,7 +52,7 @@ def render_back(settings: BackSettings) -> None:
         with failures.kept(tasks[0].folder):
             say(f"Panorama: {_render(tasks[0], settings)}")
     else:
-        from datamodules.progress import show_progress
+        from datamodules.core.progress import show_progress
 
         show_progress(_render_all(tasks, settings, failures), "Panoramas", "panoramas", len(tasks))
         say(f"{len(tasks) - len(failures)} panoramas: {settings.output}")

@@ -7,8 +7,8 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from datamodules.image_files import find_images
-from datamodules.tangent_folders import TangentFolder, read_panorama, shrink_to_level
+from datamodules.images.image_files import find_images
+from datamodules.images.tangent_folders import TangentFolder, read_panorama, shrink_to_level
 from tangent_train.cli.rendering.reports import Failures, refuse_existing, say
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import write_bytes
@@ -87,7 +87,7 @@ def _folders(paths: Sequence[Path], root: Path, output: Path) -> dict[Path, Path
 def _write_folders(
     folders: Mapping[Path, Path], settings: ForwardSettings, failures: Failures
 ) -> None:
-    from datamodules.progress import show_progress
+    from datamodules.core.progress import show_progress
 
     each = 20 * 4**settings.base_level if settings.faces is None else len(settings.faces)
 

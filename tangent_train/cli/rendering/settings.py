@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from datamodules.pixel_files import LOSSY_SUFFIXES, PIXEL_SUFFIXES
-from datamodules.tangent_results import KINDS
+from datamodules.images.pixel_files import LOSSY_SUFFIXES, PIXEL_SUFFIXES
+from datamodules.images.tangent_results import KINDS
 from tangent_train.cli import values
 from tangent_train.errors import SettingError
 from tangent_train.geometry import random_rotation, rotation_about
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from datamodules.tangent_results import Kind
+    from datamodules.images.tangent_results import Kind
     from tangent_train.rendering import Blend, Interpolation
 
 __all__ = ["BackSettings", "ForwardSettings"]

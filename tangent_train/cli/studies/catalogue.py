@@ -10,7 +10,7 @@ from tangent_train.cli import values
 from tangent_train.errors import SettingError
 
 if TYPE_CHECKING:
-    from tangent_train.tasks.studies.outcome import Outcome
+    from studies.outcome import Outcome
 
 __all__ = ["STUDIES", "Settings", "Study"]
 
@@ -36,31 +36,31 @@ class Study:
 
 
 def _surface_area(settings: Settings, _say: Say) -> Outcome:
-    from tangent_train.tasks.studies.surface_area import surface_area
+    from studies.surface_area import surface_area
 
     return surface_area(settings["levels"])
 
 
 def _angular_resolution(settings: Settings, _say: Say) -> Outcome:
-    from tangent_train.tasks.studies.angular_resolution import angular_resolution
+    from studies.angular_resolution import angular_resolution
 
     return angular_resolution(settings["levels"])
 
 
 def _fov(settings: Settings, _say: Say) -> Outcome:
-    from tangent_train.tasks.studies.fov import fov
+    from studies.fov import fov
 
     return fov(settings["level"])
 
 
 def _distorted_digits(settings: Settings, say: Say) -> Outcome:
-    from tangent_train.tasks.studies.distorted_digits import distorted_digits
+    from studies.distorted_digits import distorted_digits
 
     return distorted_digits(**settings, say=say)
 
 
 def _representation_distortion(settings: Settings, _say: Say) -> Outcome:
-    from tangent_train.tasks.studies.representation_distortion import representation_distortion
+    from studies.representation_distortion import representation_distortion
 
     return representation_distortion(settings["side"])
 
@@ -78,7 +78,7 @@ def _check_digits(settings: Settings) -> Settings:
 
     mnist = values.path(settings, "mnist")
     if mnist is not None:
-        from tangent_train.tasks.studies.digits import find_mnist
+        from studies.digits import find_mnist
 
         find_mnist(mnist)
     elif find_spec("sklearn") is None:

@@ -15,10 +15,10 @@ from tangent_train.cli.transfer.stages import STUDY, Stage, checked_study
 from tangent_train.files import write_bytes, write_text
 from tangent_train.geometry import camera_matrix_from_fov
 from tangent_train.registry import make
-from tangent_train.tasks.reports.runs import Run, load_run
-from tangent_train.tasks.transfer import chart, levels
-from tangent_train.tasks.transfer import tables as transfer_tables
-from tangent_train.tasks.transfer.report import StageResult, gather
+from tangent_train.results.reports.runs import Run, load_run
+from tangent_train.results.transfer import chart, levels
+from tangent_train.results.transfer import tables as transfer_tables
+from tangent_train.results.transfer.report import StageResult, gather
 
 __all__ = ["trained_level", "write_report"]
 

@@ -8,7 +8,7 @@ import pytest
 
 from tangent_train.cli import compose
 from tangent_train.cli.transfer import command, stage_runs
-from tangent_train.tasks.transfer import chart
+from tangent_train.results.transfer import chart
 from tests.cli.transfer.pretended_runs import PretendedRuns
 
 

@@ -14,8 +14,8 @@ from omegaconf import OmegaConf
 
 from tangent_train.checkpoints.content import write_settings
 from tangent_train.cli import main
-from tangent_train.tasks.metrics import ConfusionMatrices
-from tangent_train.tasks.results import evaluation_results, write_results
+from tangent_train.metrics.segmentation import ConfusionMatrices
+from tangent_train.results.segmentation import evaluation_results, write_results
 
 SETTINGS = (
     "experiment=rooms/transfer",

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from datamodules.mesh_spheres import clean_mesh, mesh_spheres
+from datamodules.modelnet40.mesh_spheres import clean_mesh, mesh_spheres
 from datamodules.synthshapes.families import CLASSES, make_shape
 from datamodules.synthshapes.parts import Parts
 from tangent_train.geometry import rotation_about

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from datamodules import SynthShapes
-from datamodules.off_files import write_off
-from datamodules.shape_files import find_shapes
+from datamodules.modelnet40.off_files import write_off
+from datamodules.modelnet40.shape_files import find_shapes
 from datamodules.synthshapes import generate
 from datamodules.synthshapes.families import CLASSES
 from datamodules.synthshapes.generate import MANIFEST, generate_shapes, plan_shapes
@@ -17,7 +17,7 @@ from tangent_train.errors import DataError, SettingError
 from tangent_train.rendering import TangentRepresentation
 
 if TYPE_CHECKING:
-    from datamodules.split_module import Split
+    from datamodules.core.split_module import Split
 
 TINY = ShapeSettings(seed=3, train=2, test=1)
 

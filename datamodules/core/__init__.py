@@ -1,0 +1,1 @@
+"""What all data sets share: data modules, samples, transforms, the prepared store, checks."""

@@ -1,0 +1,225 @@
+"""Panoramas in memory, whatever data set they come from: sizes, masks, sources.
+
+Everything about one panorama (RGB, depth, labels) is brought to the size a run reads with **one**
+pixel grid: the outer edges of source and target agree, so target row i covers source rows
+``i · H / h`` to ``(i + 1) · H / h``. RGB is averaged over that area; labels and depth are taken
+from the source pixel at its centre.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol, TypeVar
+
+import cv2
+import numpy as np
+
+from datamodules.core.sources import ImageSource, ReadableImages
+from tangent_train.rendering.upright.gravity import upright_rotation
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from tangent_train.rendering.representations.pinhole import Representation, Sampler
+
+__all__ = [
+    "STEPS_PER_M",
+    "FileSource",
+    "Mask",
+    "Panorama",
+    "ReadablePanoramas",
+    "Turn",
+    "mask_black",
+    "meters_to_steps",
+    "resize_area",
+    "resize_depth",
+    "resize_nearest",
+    "steps_to_meters",
+]
+
+_Pixel = TypeVar("_Pixel", bound=np.generic)
+
+Mask = Literal["labels", "any_black", "all_black"]
+"""Which pixels count as unknown besides those without a label; see `mask_black`."""
+
+Turn = float | Literal["so3"] | None
+"""How test panoramas are turned: tilted by degrees, any way, or not."""
+
+STEPS_PER_M = 512
+"""Depth is in steps of 1/512 m, as in the files of Stanford2D3DS."""
+
+
+class Panorama(NamedTuple):
+    """One panorama.
+
+    Attributes:
+        rgb: ``(H, W, 3)`` uint8.
+        depth: ``(H, W)`` uint16 distance from the centre in steps of 1/512 m, 0 where missing; or
+            None. See `steps_to_meters`.
+        labels: ``(H, W)`` uint8, 0 where unknown.
+        up: ``(3,)`` direction of the zenith, a unit vector; None where it is z, as it should be.
+
+    The arrays may be shared or read-only: not to be written to.
+    """
+
+    rgb: NDArray[np.uint8]
+    depth: NDArray[np.uint16] | None
+    labels: NDArray[np.uint8]
+    up: NDArray[np.float64] | None = None
+
+    def sampler(self, representation: Representation) -> Sampler:
+        """What draws its views: the representation, brought upright."""
+        if self.up is None:
+            return representation
+        return representation.turned(upright_rotation(self.up))
+
+    def target(self, representation: Representation) -> NDArray[np.uint8]:
+        """All labels: predictions are rendered back to the panorama."""
+        del representation
+        return self.labels
+
+
+class FileSource(ImageSource["Panorama"], Protocol):
+    """Panoramas of one size decoded from files: what a prepared store is made of."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the panoramas."""
+        ...
+
+    @property
+    def variant(self) -> str:
+        """A name for the settings that runs of the same data differ in, such as the size.
+
+        Each has its own folder in a store.
+        """
+        ...
+
+    @property
+    def settings(self) -> Mapping[str, str]:
+        """What decides the pixels besides the files, by name."""
+        ...
+
+    def files(self, index: int) -> Mapping[str, Path]:
+        """The file of every part of one panorama: `rgb`, `labels` and, where read, `depth`."""
+        ...
+
+
+class ReadablePanoramas(ReadableImages[Panorama]):
+    """Some of the panoramas of another source, see `ReadableImages`.
+
+    Args:
+        source: Where they come from.
+        indices: Which, by their numbers there.
+    """
+
+    def __init__(self, source: FileSource, indices: Sequence[int]) -> None:
+        super().__init__(source, indices)
+        self._files = source
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """See `FileSource`, as all others."""
+        return self._files.shape
+
+    @property
+    def variant(self) -> str:
+        """As of the source."""
+        return self._files.variant
+
+    @property
+    def settings(self) -> Mapping[str, str]:
+        """As of the source."""
+        return self._files.settings
+
+    def files(self, index: int) -> Mapping[str, Path]:
+        """As of the source."""
+        return self._files.files(self._indices[index])
+
+
+def resize_area(image: NDArray[np.uint8], shape: tuple[int, int]) -> NDArray[np.uint8]:
+    """Shrink ``(H, W, 3)`` to ``shape`` by averaging areas: no aliasing."""
+    if image.shape[:2] == shape:
+        return image
+    return cv2.resize(image, (shape[1], shape[0]), interpolation=cv2.INTER_AREA)
+
+
+def resize_nearest(image: NDArray[_Pixel], shape: tuple[int, int]) -> NDArray[_Pixel]:
+    """Shrink ``(H, W[, C])`` to ``shape``, taking the pixel at the centre of each target pixel.
+
+    Where that is a corner of four pixels (even ratios) it is the lower right one.
+    """
+    if image.shape[:2] == shape:
+        return image
+    rows, columns = (
+        (2 * np.arange(target) + 1) * source // (2 * target)
+        for source, target in zip(image.shape, shape, strict=False)
+    )
+    return image[rows][:, columns]
+
+
+def resize_depth(depth: NDArray[np.uint16], shape: tuple[int, int]) -> NDArray[np.uint16]:
+    """Shrink raw depth ``(H, W)``, 0 where missing, without ever mixing two values.
+
+    As `resize_nearest`, but where that pixel is missing, the valid pixel nearest to the centre,
+    of those in the area of the target pixel, is taken instead.
+    """
+    small = resize_nearest(depth, shape)
+    holes = np.nonzero(small == 0)
+    scale = [source / target for source, target in zip(depth.shape, shape, strict=True)]
+    centers = [(i + 0.5) * s for i, s in zip(holes, scale, strict=True)]
+    # The first source pixel whose centre lies in the area of the target pixel.
+    first = [np.ceil(i * s - 0.5).astype(np.intp) for i, s in zip(holes, scale, strict=True)]
+    nearest = np.full(len(holes[0]), np.inf)
+    for step in np.ndindex(math.ceil(scale[0]), math.ceil(scale[1])):
+        pixel = [np.minimum(f + d, n - 1) for f, d, n in zip(first, step, depth.shape, strict=True)]
+        away = [np.abs(p + 0.5 - c) for p, c in zip(pixel, centers, strict=True)]
+        inside = (away[0] <= scale[0] / 2) & (away[1] <= scale[1] / 2)
+        distance = np.hypot(*away)
+        value = depth[pixel[0], pixel[1]]
+        better = inside & (value > 0) & (distance < nearest)
+        small[holes[0][better], holes[1][better]] = value[better]
+        nearest[better] = distance[better]
+    return small
+
+
+def mask_black(labels: NDArray[np.uint8], rgb: NDArray[np.uint8], mask: Mask) -> NDArray[np.uint8]:
+    """Make black pixels unknown.
+
+    The released code of the paper does `any_black`, in training and in evaluation alike, on the
+    pixels of the file before they are resized; so do we, at the pixels the labels are taken from.
+
+    Args:
+        labels: ``(H, W)``.
+        rgb: ``(H, W, 3)`` at the same pixels.
+        mask: `labels` changes nothing; `any_black` makes pixels unknown where any channel is 0,
+            `all_black` where all are.
+
+    Returns:
+        ``(H, W)`` labels.
+    """
+    if mask == "labels":
+        return labels
+    black = rgb == 0
+    return np.where(black.any(-1) if mask == "any_black" else black.all(-1), np.uint8(0), labels)
+
+
+def steps_to_meters(steps: NDArray[np.uint16]) -> NDArray[np.float32]:
+    """Depth in metres, float32, of depth in steps of 1/512 m."""
+    return steps.astype(np.float32) / np.float32(STEPS_PER_M)
+
+
+def meters_to_steps(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
+    """Depth in steps of 1/512 m, rounded, at most 65535 (128 m), of depth in metres.
+
+    What is there but nearer than half a step is one step away: 0 would mean that it is missing.
+
+    >>> meters_to_steps(np.array([0, 1e-4, 1, 1000], np.float32)).tolist()
+    [0, 1, 512, 65535]
+    """
+    most = np.iinfo(np.uint16).max
+    steps = np.minimum(depth_m * np.float32(STEPS_PER_M) + np.float32(0.5), most)
+    return np.maximum(steps.astype(np.uint16), depth_m > 0)

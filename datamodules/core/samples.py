@@ -1,0 +1,340 @@
+"""From labelled images to what a network is trained and evaluated on."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, TypeVar, get_args
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset, default_collate
+
+from datamodules.core.panoramas import STEPS_PER_M
+from datamodules.core.sampling import Seed, sample_rng
+from datamodules.images.colors import jitter_colors
+from tangent_train.errors import SettingError
+from tangent_train.geometry import equirect_elevations
+from tangent_train.rendering.upright.gravity import upright_rotation
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from datamodules.core.sources import ImageSource, LabelledImage, ShownImage
+    from tangent_train.rendering.representations.pinhole import Views
+
+__all__ = [
+    "INPUTS",
+    "RGBD_NORMALIZATION",
+    "RGB_NORMALIZATION",
+    "EvaluationImages",
+    "EvaluationSample",
+    "Input",
+    "Inputs",
+    "Normalization",
+    "TrainingImages",
+    "TrainingSample",
+    "channel_names",
+    "collate",
+    "normalize",
+    "render_inputs",
+    "world_rays",
+]
+
+Input = Literal["rgb", "depth", "elevation"]
+"""What a network may be shown of an image, in the order of its channels, see `channel_names`.
+
+* `rgb` and `depth` are normalized.
+* `elevation`: the sine of the angle between a pixel's ray and the horizon, −1 (down) to 1 (up).
+"""
+
+INPUTS: tuple[Input, ...] = get_args(Input)
+"""All of them."""
+
+_COLORS = ("red", "green", "blue")
+
+MAX_DEPTH_M = 4.0
+"""Depth is clipped to this (released code of the paper)."""
+
+Inputs = Sequence[Tensor]
+"""RGB, perhaps depth and elevation as they were rendered, see `TrainingSample`."""
+
+_Images = TypeVar("_Images", Inputs, Tensor)
+_Sample = TypeVar("_Sample", "TrainingSample[Inputs]", "EvaluationSample[Inputs]")
+
+
+@dataclass(frozen=True)
+class Normalization:
+    """Mean and standard deviation of the channels R, G, B (of 0 to 1) and perhaps depth (metres).
+
+    Depth counts clipped to `MAX_DEPTH_M` and 0 where missing. Spheres of shapes have six channels,
+    see `mesh_spheres`.
+
+    Attributes:
+        mean: 3, 4 or 6 numbers.
+        std: As many, greater than 0.
+
+    Raises:
+        SettingError: Other numbers.
+    """
+
+    mean: Sequence[float]
+    std: Sequence[float]
+
+    def __post_init__(self) -> None:
+        # Plain tuples, whatever list a config brought: comparable and safe in checkpoints.
+        object.__setattr__(self, "mean", tuple(float(value) for value in self.mean))
+        object.__setattr__(self, "std", tuple(float(value) for value in self.std))
+        right = len(self.mean) == len(self.std) and len(self.mean) in (3, 4, 6)
+        if not (right and all(map(math.isfinite, [*self.mean, *self.std])) and min(self.std) > 0):
+            raise SettingError(
+                "normalization",
+                found=f"mean {self.mean}, std {self.std}",
+                expected="3 numbers each, 4 with depth, 6 of shapes, std greater than 0",
+            )
+
+    @property
+    def channels(self) -> int:
+        """3, 4 with depth, or 6 of shapes."""
+        return len(self.mean)
+
+
+RGB_NORMALIZATION = Normalization(
+    mean=(0.5490, 0.5306, 0.4779),
+    std=(0.1992, 0.2005, 0.2129),
+)
+"""Stanford2D3DS without depth (released code of the paper)."""
+
+RGBD_NORMALIZATION = Normalization(
+    mean=(0.4974898, 0.47918808, 0.42809588, 1.0961773),
+    std=(0.23762763, 0.23354423, 0.23272438, 0.75536704),
+)
+"""Stanford2D3DS with depth (ugscnn, used by the released code of the paper)."""
+
+
+def channel_names(inputs: Sequence[Input]) -> tuple[str, ...]:
+    """The channels of an image of these inputs by name, colours apart.
+
+    >>> channel_names(["rgb", "depth"])
+    ('red', 'green', 'blue', 'depth')
+    """
+    return tuple(name for each in inputs for name in (_COLORS if each == "rgb" else (each,)))
+
+
+def normalize(
+    rendered: Sequence[Tensor], normalization: Normalization, inputs: Sequence[Input]
+) -> Tensor:
+    """What a network takes, channels first.
+
+    Args:
+        rendered: RGB ``(..., h, w, 3)`` uint8; with depth ``(..., h, w)`` in steps of 1/512 m, 0
+            where missing, at most `MAX_DEPTH_M`; with elevation ``(..., h, w)`` float32.
+        normalization: Of RGB and depth.
+        inputs: What the network takes, in the order of `INPUTS`.
+
+    Returns:
+        ``(..., C, h, w)`` float32, on the same device.
+
+    Raises:
+        SettingError: The normalization is one of other channels.
+    """
+    parts = dict(zip([name for name in INPUTS if name in inputs], rendered, strict=True))
+    measured = 3 + ("depth" in parts)
+    if normalization.channels != measured:
+        raise SettingError(
+            "normalization",
+            found=f"{normalization.channels} channels",
+            expected=f"{measured}, as the inputs have",
+        )
+    rgb = parts["rgb"]
+    *batch, height, width, _ = rgb.shape
+    channels = len(channel_names(inputs))
+    images = rgb.new_empty((*batch, channels, height, width), dtype=torch.float32)
+    images[..., :3, :, :] = rgb.movedim(-1, -3)
+    if "depth" in parts:
+        images[..., 3, :, :] = parts["depth"]
+    # One multiplication and one addition per value: (v / unit − mean) / std.
+    unit = [255] * 3 + [STEPS_PER_M] * (measured - 3)
+    scale = zip(unit, normalization.mean, normalization.std, strict=True)
+    values = images.new_tensor([(1 / (step * std), mean / std) for step, mean, std in scale])
+    factor, offset = values.T[..., None, None]
+    images[..., :measured, :, :].mul_(factor).sub_(offset)
+    if "elevation" in inputs:
+        images[..., -1, :, :] = parts["elevation"]
+    return images
+
+
+class TrainingSample(NamedTuple, Generic[_Images]):
+    """One panorama or photo seen through P images; collated, each has a leading batch dimension.
+
+    Attributes:
+        images: From the loader what was rendered, RGB ``(P, h, w, 3)`` uint8, perhaps depth
+            ``(P, h, w)`` int16 and elevation ``(P, h, w)`` float32: fewer bytes. On the device
+            `normalize` makes them ``(P, C, h, w)`` float32.
+        labels: ``(P, h, w)`` uint8, 0 where unknown.
+        rays: ``(P, 3, 3)`` float32 where the images look, see `world_rays`; or ``(0, 3, 3)``.
+        index: Place in its split.
+    """
+
+    images: _Images
+    labels: Tensor
+    rays: Tensor
+    index: int  # type: ignore[assignment]  # nobody needs tuple.index
+
+
+class EvaluationSample(NamedTuple, Generic[_Images]):
+    """One whole panorama or photo; collated, each has a leading batch dimension.
+
+    Attributes:
+        images: N images of all of it, as in `TrainingSample`.
+        target: uint8 labels, 0 where unknown: ``(H, W)`` of the panorama itself; ``(N, h, w)`` of
+            the crops of a photo.
+        rays: As in `TrainingSample`.
+        rotations: ``(K, 3, 3)`` float32, see `Views.rotations`.
+        index: Place in its split.
+    """
+
+    images: _Images
+    target: Tensor
+    rays: Tensor
+    rotations: Tensor
+    index: int  # type: ignore[assignment]  # nobody needs tuple.index
+
+
+class TrainingImages(Dataset[TrainingSample[Inputs]]):
+    """Random views of images, by (epoch, index).
+
+    Args:
+        source: The images.
+        representation: What the network sees of them.
+        seed: Seed of the run, 0 or more.
+        inputs: What the network is shown, see `Input`.
+        color_jitter: Strength of the colour augmentation, 0 to 1, see `jitter_colors`.
+    """
+
+    def __init__(
+        self,
+        source: ImageSource[LabelledImage],
+        representation: Any,
+        seed: Seed,
+        inputs: Sequence[Input],
+        color_jitter: float = 0.0,
+    ) -> None:
+        self._source = source
+        self._representation = representation
+        self._seed = seed
+        self._inputs = inputs
+        self._color_jitter = color_jitter
+
+    def __len__(self) -> int:
+        return len(self._source)
+
+    def __getitem__(self, key: tuple[int, int]) -> TrainingSample[Inputs]:
+        epoch, index = key
+        image = self._source.read(index)
+        rng = sample_rng(self._seed, epoch, index)
+        views = image.sampler(self._representation).sample(rng)
+        rgb, *others = render_inputs(image, views, self._inputs)
+        if self._color_jitter:
+            rgb = jitter_colors(rgb, self._color_jitter, rng)
+        return TrainingSample(
+            (rgb, *others),
+            _tensor(views.render(image.labels, "nearest")),
+            torch.from_numpy(world_rays(views, image.up)),
+            index,
+        )
+
+
+class EvaluationImages(Dataset[EvaluationSample[Inputs]]):
+    """Whole images, by (epoch, index); the epoch changes nothing.
+
+    Args:
+        source: The images.
+        representation: What the network sees of them.
+        inputs: What it is shown, see `Input`.
+    """
+
+    def __init__(
+        self, source: ImageSource[LabelledImage], representation: Any, inputs: Sequence[Input]
+    ) -> None:
+        self._source = source
+        self._representation = representation
+        self._inputs = inputs
+
+    def __len__(self) -> int:
+        return len(self._source)
+
+    def __getitem__(self, key: tuple[int, int]) -> EvaluationSample[Inputs]:
+        _, index = key
+        image = self._source.read(index)
+        views = image.sampler(self._representation).whole()
+        return EvaluationSample(
+            render_inputs(image, views, self._inputs),
+            torch.tensor(image.target(self._representation)),
+            torch.from_numpy(world_rays(views, image.up)),
+            torch.from_numpy(views.rotations().astype(np.float32)),
+            index,
+        )
+
+
+def collate(samples: list[_Sample]) -> _Sample:
+    """A batch of `TrainingSample` or `EvaluationSample`, with a leading dimension.
+
+    As torch's own function, but one sample alone is not copied.
+    """
+    if len(samples) > 1:
+        return default_collate(samples)
+    images, *tensors, index = samples[0]
+    kind: Any = type(samples[0])
+    batched = [tensor[None] for tensor in tensors]
+    return kind([image[None] for image in images], *batched, torch.tensor([index]))
+
+
+def render_inputs(image: ShownImage, views: Views, inputs: Sequence[Input]) -> tuple[Tensor, ...]:
+    """What a network is shown of an image, before `normalize`.
+
+    Args:
+        image: It, with depth where that is an input.
+        views: Where it looks.
+        inputs: See `Input`.
+
+    Returns:
+        RGB ``(n, h, w, 3)`` uint8; with depth, ``(n, h, w)`` int16 steps up to `MAX_DEPTH_M`; with
+        elevation, ``(n, h, w)`` float32.
+    """
+    rendered = [_tensor(views.render(image.rgb, "bilinear"))]
+    if "depth" in inputs and image.depth is not None:
+        steps = np.minimum(views.render(image.depth, "nearest"), int(MAX_DEPTH_M * STEPS_PER_M))
+        rendered.append(torch.from_numpy(steps.view(np.int16)))  # torch hardly knows uint16
+    if "elevation" in inputs:
+        shape = (image.rgb.shape[0], image.rgb.shape[1])
+        up = image.up
+        elevations = _upright_elevations(shape) if up is None else equirect_elevations(shape, up)
+        rendered.append(_tensor(views.render(elevations, "bilinear")))
+    return tuple(rendered)
+
+
+def world_rays(views: Views, up: NDArray[np.float64] | None) -> NDArray[np.float32]:
+    """Where images look in a world whose zenith is z, see `Views.rays`.
+
+    Args:
+        views: Of a panorama.
+        up: Its zenith; None where that is z.
+    """
+    rays = views.rays()
+    return rays if up is None else upright_rotation(up).T.astype(np.float32) @ rays
+
+
+@lru_cache(maxsize=2)
+def _upright_elevations(shape: tuple[int, int]) -> NDArray[np.float32]:
+    elevations = equirect_elevations(shape)
+    elevations.setflags(write=False)
+    return elevations
+
+
+def _tensor(array: NDArray[Any]) -> Tensor:
+    # What is rendered may be the panorama itself, shared or a read-only file: that is copied.
+    return torch.from_numpy(array) if array.flags.owndata else torch.tensor(array)

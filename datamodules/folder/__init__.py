@@ -1,0 +1,1 @@
+"""Data sets of your own: a folder of panoramas with labels."""

@@ -1,0 +1,168 @@
+"""Which panoramas of one's own data set are for training, validation and test."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from datamodules.core.group_drawing import draw_groups
+from datamodules.core.problems import Noted, raised
+from datamodules.core.segmentation_module import SPLITS, Split
+from tangent_train.errors import DataError, SettingError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from datamodules.folder.files import PanoramaFiles
+
+__all__ = ["FolderSplits"]
+
+
+@dataclass(frozen=True)
+class FolderSplits:
+    """The splits that ``train.txt``, ``val.txt`` and ``test.txt`` name, or that are drawn.
+
+    Scenes, the first folders inside ``images/``, are drawn as a whole: images of one room or street
+    resemble each other. Images that are in no folder are drawn one by one.
+
+    Attributes:
+        root: Folder of the data set, where the lists are, or not. Without ``test.txt``, the test
+            panoramas are those in no other list if there is a ``train.txt``, else drawn; without
+            ``train.txt`` all others are for training; without ``val.txt`` some of those for
+            training are drawn for validation.
+        test_fraction: Share of the scenes for test, if drawn: at least one, never all.
+        validation_fraction: Share of the training scenes for validation, if drawn: at least one,
+            never all; 0 for no validation, whether there is a list or not.
+        seed: Of the drawing.
+
+    Raises:
+        SettingError: A setting that cannot work.
+    """
+
+    root: Path
+    test_fraction: float = 0.2
+    validation_fraction: float = 0.1
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.test_fraction < 1:
+            raise SettingError(
+                "data.test_fraction", found=self.test_fraction, expected="above 0 to below 1"
+            )
+        if not 0 <= self.validation_fraction < 1:
+            raise SettingError(
+                "data.validation_fraction", found=self.validation_fraction, expected="0 to below 1"
+            )
+        if self.seed < 0:
+            raise SettingError("data.split_seed", found=self.seed, expected="0 or more")
+
+    def divide(
+        self, panoramas: Sequence[PanoramaFiles], noted: Noted = raised
+    ) -> dict[Split, list[PanoramaFiles]]:
+        """The panoramas of every split, each in the order given.
+
+        Args:
+            panoramas: All of the data set.
+            noted: Where wrong lines of lists go, to go on after them.
+
+        Raises:
+            DataError: A list cannot be used, or there are too few scenes to draw from.
+        """
+        listed = self._read_lists(panoramas, noted)
+        named = {name for names in listed.values() for name in names}
+        rest = [files for files in panoramas if files.name not in named]
+        if "test" in listed:
+            test = self._some("test", listed["test"])
+        elif "train" in listed:
+            test = self._some("test", {files.name for files in rest})
+        else:
+            test = self._draw("test", rest, self.test_fraction)
+        rest = [files for files in rest if files.name not in test]
+        train = self._some("train", listed.get("train", {files.name for files in rest}))
+        held: set[str] = set()
+        if self.validation_fraction and "val" in listed:
+            held = self._some("val", listed["val"])
+        elif self.validation_fraction:
+            training = [files for files in panoramas if files.name in train]
+            held = self._draw("val", training, self.validation_fraction)
+        chosen: dict[Split, set[str]] = {"train": train - held, "val": held, "test": test}
+        return {
+            split: [files for files in panoramas if files.name in chosen[split]] for split in SPLITS
+        }
+
+    def _read_lists(
+        self, panoramas: Sequence[PanoramaFiles], noted: Noted
+    ) -> dict[Split, set[str]]:
+        """The names in each list that is there."""
+        names = {files.name: files.name for files in panoramas}
+        # With the ending of the image is right as well.
+        names |= {files.name + files.rgb.suffix: files.name for files in panoramas}
+        listed: dict[Split, set[str]] = {}
+        owners: dict[str, Path] = {}
+        for split in SPLITS:
+            path = self.root / f"{split}.txt"
+            if not path.is_file():
+                continue
+            listed[split] = set()
+            for line in _lines(path):
+                with noted((split, line)):
+                    listed[split].add(_listed_name(path, line, names, owners))
+        return listed
+
+    def _draw(self, split: Split, panoramas: Sequence[PanoramaFiles], fraction: float) -> set[str]:
+        """The names in some scenes, the same for the same seed."""
+        scenes = {files.scene for files in panoramas}
+        drawn = draw_groups(scenes, fraction, [self.seed, SPLITS.index(split)])
+        if not drawn:
+            raise DataError(
+                self.root / "images",
+                found=f"{len(scenes)} scenes to draw those of {split} from",
+                expected="two or more: first folders, or images that are in none",
+                remedy=f"Have more of them, or {_named_in(split)}.",
+            )
+        return {files.name for files in panoramas if files.scene in drawn}
+
+    def _some(self, split: Split, names: set[str]) -> set[str]:
+        """The names, if there are any."""
+        if not names:
+            raise DataError(
+                self.root,
+                found=f"no panoramas for {split}",
+                expected="one or more",
+                remedy=f"{_named_in(split).capitalize()}.",
+            )
+        return names
+
+
+def _listed_name(path: Path, line: str, names: dict[str, str], owners: dict[str, Path]) -> str:
+    """The panorama that a line of a list names, which is then that list's own."""
+    if line not in names:
+        raise DataError(
+            path,
+            found=f"{line!r}, of which there is no image",
+            expected="names of files in images/, as scene/name",
+        )
+    name = names[line]
+    if name in owners:
+        raise DataError(
+            path,
+            found=f"{line!r}, also in {owners[name]}",
+            expected="every panorama once, in one of the lists",
+        )
+    owners[name] = path
+    return name
+
+
+def _named_in(split: Split) -> str:
+    also = ", or set data.validation_fraction=0" if split == "val" else ""
+    return f"name some in {split}.txt{also}"
+
+
+def _lines(path: Path) -> list[str]:
+    """The names in a list, without empty lines and those that begin with #."""
+    try:
+        lines = [line.strip() for line in path.read_text("utf-8-sig").splitlines()]
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(path, found=error, expected="names, one per line, in UTF-8") from error
+    return [line for line in lines if line and not line.startswith("#")]

@@ -1,0 +1,1 @@
+"""ModelNet40: shapes as spheres."""

@@ -1,0 +1,146 @@
+"""From spheres of shapes to what a network is trained and evaluated on."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from datamodules.core.samples import Normalization
+from datamodules.core.sampling import Seed, sample_rng
+from datamodules.modelnet40.sphere_files import STEPS
+from tangent_train.geometry import random_rotation, rotation_about
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from datamodules.modelnet40.sphere_store import Shapes
+    from tangent_train.rendering.representations.views import Views
+
+__all__ = [
+    "SPHERE_NORMALIZATION",
+    "EvaluationShapes",
+    "ShapeSample",
+    "TestRotation",
+    "TrainingShapes",
+    "normalize_spheres",
+]
+
+SPHERE_NORMALIZATION = Normalization(
+    mean=(0.7139, 0.6936, 0.5851, 0.5336, 0.7626, 0.5651),
+    std=(0.2797, 0.2606, 0.2737, 0.2144, 0.1987, 0.2440),
+)
+"""The six channels of `mesh_spheres` over ModelNet40 (the released code of the paper)."""
+
+TestRotation = Literal["yaw", "so3"] | None
+"""How test shapes are turned: about the vertical, any way, or not."""
+
+
+class ShapeSample(NamedTuple):
+    """One shape seen through N images; collated, each has a leading batch dimension.
+
+    Attributes:
+        images: From the loader ``(N, h, w, 6)`` int16 in steps of `STEPS`: half the bytes. On the
+            device `normalize_spheres` makes them ``(N, 6, h, w)`` float32.
+        label: Class, int64.
+        index: Place in its split, int64.
+    """
+
+    images: Tensor
+    label: Tensor
+    index: Tensor  # type: ignore[assignment]  # nobody needs tuple.index
+
+
+class TrainingShapes(Dataset[ShapeSample]):
+    """Random views of shapes, by (epoch, index).
+
+    Args:
+        source: The shapes.
+        representation: What the network sees of them.
+        seed: Seed of the run, 0 or more.
+    """
+
+    def __init__(self, source: Shapes, representation: Any, seed: Seed) -> None:
+        self._source = source
+        self._representation = representation
+        self._seed = seed
+
+    def __len__(self) -> int:
+        return len(self._source)
+
+    def __getitem__(self, key: tuple[int, int]) -> ShapeSample:
+        epoch, index = key
+        views = self._representation.sample(sample_rng(self._seed, epoch, index))
+        return _sample(self._source, index, views)
+
+
+class EvaluationShapes(Dataset[ShapeSample]):
+    """All views of shapes, by (epoch, index); the epoch changes nothing.
+
+    Args:
+        source: The shapes.
+        representation: What the network sees of them.
+        rotation: How they are turned, each its own way.
+        seed: Seed of the turns.
+    """
+
+    def __init__(
+        self, source: Shapes, representation: Any, rotation: TestRotation = None, seed: int = 0
+    ) -> None:
+        self._source = source
+        self._representation = representation
+        self._rotation = rotation
+        self._seed = seed
+
+    def __len__(self) -> int:
+        return len(self._source)
+
+    def __getitem__(self, key: tuple[int, int]) -> ShapeSample:
+        _, index = key
+        representation = self._representation
+        if self._rotation is not None:  # turned back, it sees of the sphere what a turned one shows
+            representation = representation.turned(self.rotation(index).T)
+        views = representation.whole()
+        return _sample(self._source, index, views)
+
+    def rotation(self, index: int) -> NDArray[np.float64]:
+        """The turn of one shape, ``(3, 3)``: its point x is now at R x."""
+        rng = sample_rng(self._seed, 0, index)
+        if self._rotation == "so3":
+            return random_rotation(rng)
+        return rotation_about((0, 0, 1), rng.uniform(0, 2 * math.pi))
+
+
+def _sample(source: Shapes, index: int, views: Views) -> ShapeSample:
+    spheres = source.read(index)
+    images = views.render(spheres, "bilinear")
+    # Torch hardly knows uint16; all values are below 2 · STEPS = 2¹⁵.
+    return ShapeSample(
+        torch.from_numpy(images.view(np.int16)),
+        torch.tensor(source.labels[index]),
+        torch.tensor(index),
+    )
+
+
+def normalize_spheres(images: Tensor, normalization: Normalization) -> Tensor:
+    """What a network takes, channels first.
+
+    Args:
+        images: ``(..., h, w, 6)`` int16 in steps of `STEPS`.
+        normalization: Of six channels.
+
+    Returns:
+        ``(..., 6, h, w)`` float32, on the same device.
+    """
+    *batch, height, width, channels = images.shape
+    values = images.new_empty((*batch, channels, height, width), dtype=torch.float32)
+    values.copy_(images.movedim(-1, -3))
+    # One multiplication and one addition per value: (v / STEPS − mean) / std.
+    scale = zip(normalization.mean, normalization.std, strict=True)
+    factors = values.new_tensor([(1 / (STEPS * std), mean / std) for mean, std in scale])
+    factor, offset = factors.T[..., None, None]
+    return values.mul_(factor).sub_(offset)

@@ -1,0 +1,1 @@
+"""Stanford2D3DS: panoramas, photos and pairs of panoramas."""

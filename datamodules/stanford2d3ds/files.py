@@ -1,0 +1,245 @@
+"""The files of Stanford2D3DS: their names, their partners, and what is expected of them."""
+
+from __future__ import annotations
+
+import os
+import re
+from typing import TYPE_CHECKING, Literal, NamedTuple
+
+from datamodules.core.problems import Noted, raised
+from datamodules.images.png import check_panorama_size, check_png
+from tangent_train.errors import DataError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from pathlib import Path
+
+
+__all__ = [
+    "AREAS",
+    "FOLDS",
+    "GET_IT",
+    "MISSING_DEPTH",
+    "FileName",
+    "PictureFiles",
+    "check_cameras",
+    "check_panorama",
+    "check_picture",
+    "list_pictures",
+]
+
+AREAS: tuple[str, ...] = ("1", "2", "3", "4", "5a", "5b", "6")
+"""All areas; 5a and 5b are parts of one floor and share rooms."""
+
+FOLDS: dict[int, tuple[str, ...]] = {1: ("5a", "5b"), 2: ("2", "4"), 3: ("1", "3", "6")}
+"""Test areas of each fold; the other areas are for training."""
+
+GET_IT = (
+    "Get Stanford2D3DS from http://buildingparser.stanford.edu/dataset.html and point data.root at "
+    "the folder with area_1 … area_6, or train on data=synthrooms, which needs no download."
+)
+"""What to do when the data set is not there."""
+
+MISSING_DEPTH = 65535
+"""Marks pixels without depth in depth files."""
+
+_NAME = re.compile(
+    r"camera_([0-9a-f]{32})_([A-Za-z]+)_(\d+)_frame_(equirectangular|\d+)"
+    r"_domain_([a-z]+(?:_[a-z]+)*)(\.\w+)"
+)
+_FORMATS = {"rgb": (8, ("RGB", "RGBA")), "semantic": (8, ("RGB", "RGBA")), "depth": (16, ("grey",))}
+
+
+class FileName(NamedTuple):
+    """The parts of a file's name; panoramas have the frame `equirectangular`."""
+
+    camera: str
+    room: str
+    room_number: int
+    frame: str
+    domain: str
+    suffix: str
+
+    @classmethod
+    def parse(cls, name: str) -> FileName:
+        """Take a file's name apart.
+
+        Args:
+            name: The name without folders.
+
+        Raises:
+            DataError: It is no name of the data set.
+
+        >>> FileName.parse(f"camera_{'0f' * 16}_office_7_frame_3_domain_rgb.png")[1:]
+        ('office', 7, '3', 'rgb', '.png')
+        """
+        match = _NAME.fullmatch(name)
+        if match is None:
+            raise DataError(
+                name,
+                found="an unknown file name",
+                expected="camera_<32 hex>_<room>_<n>_frame_<equirectangular or number>"
+                "_domain_<kind>.<ending>",
+                remedy="Move files that are not of the data set elsewhere.",
+            )
+        camera, room, number, frame, domain, suffix = match.groups()
+        return cls(camera, room, int(number), frame, domain, suffix)
+
+    def __str__(self) -> str:
+        return (
+            f"camera_{self.camera}_{self.room}_{self.room_number}"
+            f"_frame_{self.frame}_domain_{self.domain}{self.suffix}"
+        )
+
+
+class PictureFiles(NamedTuple):
+    """The files of one panorama (`pano`) or photo (`data`)."""
+
+    area: str
+    name: FileName
+    rgb: Path
+    semantic: Path
+    depth: Path | None
+
+    @property
+    def room(self) -> tuple[str, str, int]:
+        """Building, kind and number of the room: 5a and 5b are one building."""
+        return self.area.rstrip("ab"), self.name.room, self.name.room_number
+
+    @property
+    def short_name(self) -> str:
+        """Area, room and camera, as ``area_3/office_2/<32 hex>``."""
+        room = f"{self.name.room}_{self.name.room_number}"
+        return f"area_{self.area}/{room}/{self.name.camera}"
+
+    @property
+    def pose(self) -> Path:
+        """Camera and pose."""
+        name = self.name._replace(domain="pose", suffix=".json")
+        return self.rgb.parents[1] / "pose" / str(name)
+
+
+def list_pictures(
+    root: Path,
+    area: str,
+    group: Literal["pano", "data"],
+    with_depth: bool,
+    noted: Noted = raised,
+) -> list[PictureFiles]:
+    """The panoramas or photos of one area, in the order of their names.
+
+    Args:
+        root: Folder of the data set.
+        area: One of `AREAS`.
+        group: Panoramas or photos.
+        with_depth: Whether depth is wanted.
+        noted: Where errors go, to go on after them.
+
+    Raises:
+        DataError: There are none, or other files.
+    """
+    folder = root / f"area_{area}" / group
+    found = []
+    images: list[Path] = []
+    with noted():
+        images = _list_images(folder / "rgb", "panoramas" if group == "pano" else "photos")
+    for rgb in images:
+        with noted(rgb, rgb):
+            name = FileName.parse(rgb.name)
+            depth = folder / "depth" / str(name._replace(domain="depth"))
+            semantic = folder / "semantic" / str(name._replace(domain="semantic"))
+            found.append(PictureFiles(area, name, rgb, semantic, depth if with_depth else None))
+    return found
+
+
+def _list_images(folder: Path, kind: str) -> list[Path]:
+    """The images in a folder, in the order of their names."""
+    why = f"no {kind}"
+    try:
+        # Hidden files are leftovers of archives made on a Mac.
+        paths = [p for p in folder.iterdir() if p.suffix == ".png" and not p.name.startswith(".")]
+    except FileNotFoundError:
+        paths = []
+    except OSError as error:
+        paths, why = [], os.strerror(error.errno or 0)
+    if not paths:
+        raise DataError(folder, found=why, expected="camera_….png files", remedy=GET_IT)
+    return sorted(paths)
+
+
+def check_cameras(pictures: Iterable[PictureFiles], noted: Noted = raised) -> None:
+    """Check that no picture is there twice, as a copy in another room or area.
+
+    The two parts of area 5 share rooms, and are always in the same split: a camera may be in both.
+
+    Args:
+        pictures: Of all areas.
+        noted: Where errors go, to go on after them.
+
+    Raises:
+        DataError: One is.
+    """
+    seen: dict[tuple[str, str], list[PictureFiles]] = {}
+    for picture in pictures:
+        before = seen.setdefault((picture.name.camera, picture.name.frame), [])
+        for other in before:
+            with noted(picture):
+                if other.area == picture.area or other.room[0] != picture.room[0]:
+                    raise DataError(
+                        picture.rgb,
+                        found=f"the camera of {other.rgb}",
+                        expected="every camera in one room of one area",
+                        remedy="Remove the copy, with its depth, labels and pose.",
+                    )
+        before.append(picture)
+
+
+def check_panorama(files: PictureFiles, erp_height: int, noted: Noted = raised) -> None:
+    """Check that all files are there, of one size and readable at `erp_height`; nothing is decoded.
+
+    Args:
+        files: Of the panorama.
+        erp_height: Rows that are wanted.
+        noted: Where errors go, to go on after them.
+
+    Raises:
+        DataError: A file is missing, cut off, or of another size or pixel format.
+        SettingError: The panorama has fewer rows than wanted.
+    """
+    size = check_picture(files, noted)
+    with noted(files, files.rgb):
+        if size is not None:
+            check_panorama_size(files.rgb, size, erp_height)
+
+
+def check_picture(files: PictureFiles, noted: Noted = raised) -> tuple[int, int] | None:
+    """Check that all images are there and of one size; nothing is decoded.
+
+    Args:
+        files: Of the panorama or photo.
+        noted: Where errors go, to go on after them.
+
+    Returns:
+        Rows and columns; None after an error in the colours' file.
+
+    Raises:
+        DataError: A file is missing, cut off, or of another size or pixel format.
+    """
+    size = None
+    partners = [(files.rgb, "rgb"), (files.semantic, "semantic")]
+    if files.depth is not None:
+        partners.append((files.depth, "depth"))
+    for path, domain in partners:
+        with noted(files):
+            header = check_png(path, *_FORMATS[domain])
+            height, width = header.height, header.width
+            if domain == "rgb":
+                size = height, width
+            if size is not None and (height, width) != size:
+                raise DataError(
+                    path,
+                    found=f"{height}×{width} pixels",
+                    expected=f"{size[0]}×{size[1]}, as {files.rgb.name}",
+                    remedy="Copy or extract both files again.",
+                )
+    return size

@@ -1,0 +1,1 @@
+"""SYNTHIA and OmniSYNTHIA."""

@@ -1,0 +1,1 @@
+"""What happens around training: checkpoints, pictures and curves, progress."""

@@ -1,0 +1,214 @@
+"""What TensorBoard shows of a training beside its curves: pictures, per-class figures, speed."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import cv2
+import lightning
+import numpy as np
+import torch
+from lightning.pytorch.callbacks import Callback
+from lightning.pytorch.loggers import TensorBoardLogger
+from numpy.typing import NDArray
+
+from tangent_train.errors import SettingError
+from tangent_train.metrics.classification import classification_scores
+from tangent_train.metrics.segmentation import segmentation_scores
+from tangent_train.results.confusion_picture import confusion_picture
+from tangent_train.results.pictures import prediction_panel, shown_image, side_by_side
+
+__all__ = ["TrainingSpeed", "ValidationConfusion", "ValidationPictures"]
+
+_MOST_ROWS = 256
+"""Larger images are shown smaller: an event file holds the pictures of all validations."""
+
+_PANORAMA_DIMENSIONS = 2
+
+_Labels = NDArray[np.integer]
+
+
+class ValidationPictures(Callback):
+    """Shows in TensorBoard, after every validation, what became of a few images and of each class.
+
+    * ``val_images/<name>``: input, truth, prediction and error; always the same images, spread over
+      those that the first process sees.
+    * ``val_iou/<class>``: IoU of the classes that occur.
+    * ``val/confusion``: the confusion matrix, in percent of the true class.
+
+    They stand at the same steps as ``val/miou``. Only the first process draws; nothing is drawn
+    without a logger for TensorBoard.
+
+    Args:
+        count: How many images.
+
+    Raises:
+        SettingError: Less than 0.
+    """
+
+    def __init__(self, count: int = 4) -> None:
+        if count < 0:
+            raise SettingError("tensorboard_images", found=count, expected="0 or more")
+        self.count = count
+        self._shown: dict[int, tuple[NDArray[np.uint8], _Labels]] = {}
+
+    def on_validation_batch_end(  # noqa: D102 - a hook of Lightning
+        self,
+        trainer: lightning.Trainer,
+        pl_module: lightning.LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+        dataloader_idx: int = 0,
+    ) -> None:
+        writer = _writer(trainer)
+        batches = int(trainer.num_val_batches[dataloader_idx])
+        chosen = np.linspace(0, batches - 1, min(self.count, batches)).round()
+        if writer is None or batch_idx not in chosen:
+            return
+        target, index = batch.target[0], int(batch.index[0])
+        task: Any = pl_module
+        prediction = outputs[0]
+        data: Any = trainer.datamodule  # type: ignore[attr-defined]
+        source = data.source("val")
+        if index not in self._shown:
+            rgb = shown_image(source.read(index), target, task.representation)
+            self._shown[index] = _smaller(rgb), _smaller(side_by_side(target.cpu().numpy()))
+        shown = _smaller(side_by_side(prediction.cpu().numpy()))
+        panel = prediction_panel(*self._shown[index], shown, task.class_names)
+        tag = f"val_images/{source.name(index).replace('/', '_')}"
+        writer.add_image(tag, panel, _step(trainer), dataformats="HWC")
+
+    def on_validation_end(  # noqa: D102 - a hook of Lightning; the scores are there now
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
+    ) -> None:
+        writer = _writer(trainer)
+        if writer is None:
+            return
+        task: Any = pl_module
+        step, matrix = _step(trainer), task.matrices.pixels
+        scores = segmentation_scores(matrix, task.absent_class)
+        for name, iou in zip(task.class_names[1:], scores.iou, strict=True):
+            if not np.isnan(iou):
+                writer.add_scalar(f"val_iou/{name}", iou, step)
+        picture = confusion_picture(matrix, task.class_names)
+        writer.add_image("val/confusion", picture, step, dataformats="HWC")
+
+
+class ValidationConfusion(Callback):
+    """Shows in TensorBoard, after every validation of a classification, what became of each class.
+
+    * ``val_accuracy/<class>``: share of the classes that occur that was classified rightly.
+    * ``val/confusion``: the confusion matrix, in percent of the true class.
+
+    They stand at the same steps as ``val/accuracy``. Only the first process draws; nothing is drawn
+    without a logger for TensorBoard.
+    """
+
+    def on_validation_end(  # noqa: D102 - a hook of Lightning; the scores are there now
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
+    ) -> None:
+        writer = _writer(trainer)
+        if writer is None:
+            return
+        task: Any = pl_module
+        step = _step(trainer)
+        scores = classification_scores(task.matrix)
+        for name, accuracy in zip(task.class_names, scores.of_class, strict=True):
+            if not np.isnan(accuracy):
+                writer.add_scalar(f"val_accuracy/{name}", accuracy, step)
+        picture = confusion_picture(task.matrix, task.class_names, unknown=False)
+        writer.add_image("val/confusion", picture, step, dataformats="HWC")
+
+
+class TrainingSpeed(Callback):
+    """Logs how fast training is, once an epoch.
+
+    * ``speed/images_per_s``: images (tangent images, crops, whatever the network sees) trained per
+      second by all processes, over the whole epoch without its validation.
+    * ``speed/epoch_s``: seconds of the epoch without its validation; not for the rest of an epoch
+      that a resumed run begins with.
+    * ``speed/validation_s``: seconds of its validation, where it had one.
+    """
+
+    def __init__(self) -> None:
+        self._begin(0.0, whole=False)
+
+    def _begin(self, now: float, *, whole: bool) -> None:
+        self._began, self._whole = now, whole
+        self._images, self._validation = 0, 0.0
+
+    def on_train_start(  # noqa: D102 - a hook of Lightning; within an epoch if resumed there
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
+    ) -> None:
+        self._begin(_now(pl_module), whole=False)
+
+    def on_train_epoch_start(  # noqa: D102 - a hook of Lightning
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
+    ) -> None:
+        self._begin(_now(pl_module), whole=True)
+
+    def on_train_batch_end(  # noqa: D102 - a hook of Lightning
+        self,
+        trainer: lightning.Trainer,
+        pl_module: lightning.LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+    ) -> None:
+        self._images += batch.images.shape[0] * batch.images.shape[1]
+
+    def on_validation_start(  # noqa: D102 - a hook of Lightning
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
+    ) -> None:
+        self._validation -= _now(pl_module)
+
+    def on_validation_end(  # noqa: D102 - a hook of Lightning
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
+    ) -> None:
+        self._validation += _now(pl_module)
+
+    def on_train_epoch_end(  # noqa: D102 - a hook of Lightning
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
+    ) -> None:
+        if not trainer.is_global_zero or not self._images:
+            return
+        seconds = _now(pl_module) - self._began - self._validation
+        # Every process has as many images.
+        figures = {"images_per_s": self._images * trainer.world_size / seconds}
+        figures |= {"epoch_s": seconds} if self._whole else {}
+        figures |= {"validation_s": self._validation} if self._validation else {}
+        for name, value in figures.items():
+            pl_module.log(f"speed/{name}", value, rank_zero_only=True)
+
+
+def _smaller(image: NDArray[Any]) -> NDArray[Any]:
+    """At most `_MOST_ROWS` rows: every so many labels, the mean of so many colours."""
+    step = -(-image.shape[0] // _MOST_ROWS)
+    labels = image[step // 2 :: step, step // 2 :: step]
+    if image.ndim == _PANORAMA_DIMENSIONS or step == 1:
+        return labels
+    rows, columns = labels.shape[:2]
+    colors: NDArray[Any] = cv2.resize(image, (columns, rows), interpolation=cv2.INTER_AREA)
+    return colors
+
+
+def _writer(trainer: lightning.Trainer) -> Any:
+    """TensorBoard's writer, in the first process; None where nothing is to be written."""
+    if trainer.sanity_checking or not trainer.is_global_zero:
+        return None
+    found = (x.experiment for x in trainer.loggers if isinstance(x, TensorBoardLogger))
+    return next(found, None)
+
+
+def _step(trainer: lightning.Trainer) -> int:
+    """Where Lightning puts the figures of a validation (one less than `global_step` then)."""
+    return trainer.fit_loop.epoch_loop._batches_that_stepped
+
+
+def _now(module: lightning.LightningModule) -> float:
+    """Seconds, once the device has done what it was given."""
+    if module.device.type == "cuda":
+        torch.cuda.synchronize(module.device)
+    return time.perf_counter()

@@ -1,0 +1,1 @@
+"""From images to predictions: image → views → scores → panorama, and export to other programs."""

@@ -1,0 +1,171 @@
+"""Which way is up in a panorama: by its picture, or by how the camera says it was held."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tangent_train.errors import SettingError
+from tangent_train.geometry import rotation_about
+from tangent_train.rendering.checks import check_numpy_image
+from tangent_train.rendering.upright.cues import up_probabilities
+from tangent_train.rendering.upright.line_segments import LineSegments, find_line_segments
+from tangent_train.rendering.upright.manhattan import ManhattanFrame, find_manhattan_frames
+
+__all__ = ["Gravity", "estimate_up", "up_from_pose", "upright_rotation"]
+
+_UP = np.array([0.0, 0.0, 1.0])
+_EVEN_CHANCE = 3.1  # significance of frames of which half are right
+_STEEPNESS = 3.0
+_ACCEPTED = 0.5
+_LEAST_ROWS = 64
+"""With fewer, noise looks like a room."""
+_DISTINCT = np.cos(np.radians(6))
+
+
+class Gravity(NamedTuple):
+    """An estimate of the direction of up.
+
+    Attributes:
+        up: ``(3,)`` unit vector in the panorama's frame (`tangent_train.geometry`): where the
+            zenith is seen. ``(0, 0, 1)``, as if it were upright, where nothing was found.
+        confidence: Estimated probability, from 0 to 1, that it is right; 0 where nothing was found.
+        candidates: ``(n, 3)`` all directions considered, the most probable first, accepted or not.
+    """
+
+    up: NDArray[np.float64]
+    confidence: float
+    candidates: NDArray[np.float64]
+
+    @property
+    def found(self) -> NDArray[np.float64] | None:
+        """`up`, where one was found."""
+        return self.up if self.confidence else None
+
+
+def estimate_up(rgb: NDArray[np.uint8], max_tilt_deg: float = 60.0) -> Gravity:
+    """Estimate the direction of up from the straight edges of rooms and buildings.
+
+    Most of them follow three directions at right angles, one of which is the vertical: the frame
+    that most edges follow (Coughlan and Yuille, "Manhattan World", ICCV 1999) gives its axes, to a
+    fraction of a degree. Where only one of them is within `max_tilt_deg` of the panorama's own
+    vertical, it is up. Of several, one is chosen by what rooms look like (see `up_probabilities`):
+    of SynthRooms held at any angle, one in six gets another axis of the room.
+
+    An estimate that is less probable than not is no estimate: pictures of nature, noise and
+    pictures without edges leave the panorama as it is.
+
+    Args:
+        rgb: ``(H, W, 3)`` uint8 whole panorama. 128 rows or more give good results, less than 64
+            none. Black (0, 0, 0) areas count as missing.
+        max_tilt_deg: The farthest that up may be from ``(0, 0, 1)``, above 0; 180 is any
+            orientation. Allow some degrees more than the camera was tilted: of a panorama beyond
+            it, another axis of the room may be within.
+
+    Raises:
+        SettingError: The panorama or the tilt cannot be used.
+    """
+    check_numpy_image(rgb, "bilinear")
+    if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8:
+        found = f"shape {rgb.shape}, dtype {rgb.dtype}"
+        raise SettingError("panorama", found=found, expected="(H, W, 3) of dtype uint8")
+    if not 0 < max_tilt_deg <= 180:
+        raise SettingError("max_tilt_deg", found=max_tilt_deg, expected="above 0, at most 180")
+    if rgb.shape[0] < _LEAST_ROWS:
+        return Gravity(_UP.copy(), 0.0, np.zeros((0, 3)))
+    segments = find_line_segments(rgb)
+    frames = find_manhattan_frames(segments)
+    lowest = math.cos(math.radians(max_tilt_deg)) - 1e-9
+    directions, chances = _candidates(rgb, segments, frames, lowest)
+    if not len(chances) or chances[0] < _ACCEPTED:
+        return Gravity(_UP.copy(), 0.0, directions)
+    return Gravity(directions[0].copy(), float(chances[0]), directions)
+
+
+def _candidates(
+    rgb: NDArray[np.uint8], segments: LineSegments, frames: list[ManhattanFrame], lowest: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Directions of up in reach ``(n, 3)`` and their probabilities ``(n,)``, best first."""
+    # A logit model of all frames and of none of them; frames with the same vertical add up.
+    odds = [math.exp(_STEEPNESS * (frame.significance - _EVEN_CHANCE)) for frame in frames]
+    directions = np.zeros((0, 3))
+    chances = np.zeros(0)
+    for frame, odd in zip(frames, odds, strict=True):
+        axes = np.concatenate([frame.axes_xyz.T, -frame.axes_xyz.T])
+        inside = axes[:, 2] >= lowest
+        if not inside.any():
+            continue
+        shares = np.ones(1)
+        if inside.sum() > 1:
+            shares = up_probabilities(rgb, segments, frame.axes_xyz)[inside]
+        for axis, share in zip(axes[inside], odd * shares / shares.sum(), strict=True):
+            known = np.flatnonzero(directions @ axis > _DISTINCT)
+            if len(known):
+                chances[known[0]] += share
+            else:
+                directions = np.concatenate([directions, axis[None]])
+                chances = np.append(chances, share)
+    order = np.argsort(-chances, kind="stable")
+    return directions[order], chances[order] / (1 + sum(odds))
+
+
+def upright_rotation(up: ArrayLike) -> NDArray[np.float64]:
+    """The smallest rotation R with ``R @ (0, 0, 1) = up``.
+
+    A grid turned by it (``grid.with_rotation(R)``) has its z axis point up, and
+    ``rotate_equirect(panorama, R.T)`` is the panorama upright.
+
+    Args:
+        up: ``(3,)`` direction of up in the panorama's frame, of any length.
+
+    Returns:
+        ``(3, 3)`` rotation; half a turn about the y axis for ``(0, 0, -1)``.
+
+    Raises:
+        SettingError: It is no direction.
+
+    >>> upright_rotation([0, 1, 0]).round(6).tolist()
+    [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]
+    """
+    direction = np.asarray(up, np.float64)
+    length = np.linalg.norm(direction)
+    if direction.shape != (3,) or not 0 < length < math.inf:
+        raise SettingError("up", found=up, expected="three numbers, not all 0")
+    x, y, z = direction / length
+    sine = math.hypot(x, y)
+    axis = (-y / sine, x / sine, 0) if sine > 0 else (0, 1, 0)
+    return rotation_about(axis, math.atan2(sine, z))
+
+
+def up_from_pose(pitch_deg: float, roll_deg: float) -> NDArray[np.float64]:
+    """The direction of up by `PosePitchDegrees` and `PoseRollDegrees` of a panorama.
+
+    In Google's Photo Sphere XMP metadata
+    (https://developers.google.com/streetview/spherical-metadata) the pitch is that of the middle of
+    the image, in degrees above the horizon; as the roll increases, the horizon rotates
+    counterclockwise in the image: the camera's right side goes down. The camera is turned by the
+    heading, then by the pitch about its own right, then by the roll about its own forward axis; the
+    heading leaves up where it is. Some programs have written, or shown, the roll with the other
+    sign.
+
+    Args:
+        pitch_deg: −90 to 90.
+        roll_deg: −180 to 180.
+
+    Returns:
+        ``(3,)`` unit vector in the panorama's frame: forward, right, up.
+
+    Raises:
+        SettingError: An angle that is no number.
+
+    >>> up_from_pose(0, -90).round(6).tolist()
+    [0.0, 1.0, 0.0]
+    """
+    if not (math.isfinite(pitch_deg) and math.isfinite(roll_deg)):
+        raise SettingError("pose", found=(pitch_deg, roll_deg), expected="angles in degrees")
+    pitch, roll = math.radians(pitch_deg), math.radians(roll_deg)
+    level = math.cos(pitch)
+    return np.array([math.sin(pitch), -level * math.sin(roll), level * math.cos(roll)])

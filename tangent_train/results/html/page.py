@@ -1,0 +1,149 @@
+"""Writes the report: one HTML file that needs nothing else."""
+
+from __future__ import annotations
+
+import html
+import itertools
+import json
+import re
+from base64 import b64encode
+from collections.abc import Iterable, Iterator, Sequence
+from importlib.resources import files
+from typing import TYPE_CHECKING, Any
+
+from tangent_train.files import atomic_path
+from tangent_train.results.html.curves import curve_html
+from tangent_train.results.html.images import EncodedImage, ViewerImage, encode_image
+from tangent_train.results.html.parts import Curve, Table, paragraphs, table_html
+from tangent_train.results.pictures import class_colors
+
+if TYPE_CHECKING:
+    from pathlib import Path
+    from typing import TextIO
+
+__all__ = ["write_report"]
+
+_SCRIPTS = ("view.js", "surfaces.js", "gestures.js", "viewer.js")
+_IMAGES = "<!--images-->\n"
+_PLACEHOLDER = re.compile(r"\{\{(\w+)\}\}")
+
+
+def write_report(
+    path: Path,
+    title: str,
+    *,
+    tables: Sequence[Table] = (),
+    curves: Sequence[Curve] = (),
+    images: Iterable[ViewerImage | EncodedImage] = (),
+    class_names: Sequence[str] = (),
+    notes: Sequence[str] = (),
+) -> None:
+    """Write a report as one HTML file, atomically.
+
+    Args:
+        path: The file.
+        title: Of the page.
+        tables: Shown below the viewer.
+        curves: Likewise; those without a finite value are left out.
+        images: For the viewer, taken one at a time: only one of them is in memory.
+        class_names: K + 1 names of the classes in the label maps, the unknown class first.
+        notes: Lines below the title, the most important first.
+
+    Raises:
+        DataError: An image has arrays of other shapes or types, or unknown class indices.
+        SettingError: A line of a curve has another number of points than its axis.
+    """
+    encoded = _encoded(images, len(class_names))
+    first = next(encoded, None)
+    has_images = first is not None
+    parts: dict[str, str] = {
+        "title": html.escape(title),
+        "notes": paragraphs(notes),
+        "style": _resource("viewer.css"),
+        "viewer": _viewer(class_names) if has_images else "",
+        "script": _script() if has_images else "",
+        "curves": _group("curves", map(curve_html, curves)),
+        "tables": _group("tables", map(table_html, tables)),
+    }
+    page = _filled(_resource("page.html"), parts)
+    before, _, after = page.partition(_IMAGES)
+    with (
+        atomic_path(path) as temporary,
+        temporary.open("w", encoding="utf-8", errors="backslashreplace") as file,
+    ):
+        file.write(before)
+        for image in itertools.chain(filter(None, [first]), encoded):
+            _write_image(file, image)
+        file.write(after)
+
+
+def _encoded(
+    images: Iterable[ViewerImage | EncodedImage], class_count: int
+) -> Iterator[EncodedImage]:
+    for image in images:
+        encoded = image if isinstance(image, EncodedImage) else encode_image(image, class_count)
+        del image  # before the next one is made
+        yield encoded
+
+
+def _group(name: str, cards: Iterable[str]) -> str:
+    content = "\n".join(filter(None, cards))
+    return f'<div class="{name}">\n{content}\n</div>' if content else ""
+
+
+def _viewer(class_names: Sequence[str]) -> str:
+    colors = class_colors(len(class_names)).tolist()[
+        : len(class_names)
+    ]  # a picture may have no classes
+    classes = [{"name": name, "rgb": rgb} for name, rgb in zip(class_names, colors, strict=True)]
+    parts = {"images": _IMAGES, "classes": _json(classes), "shader": _resource("viewer.frag")}
+    return _filled(_resource("viewer.html"), parts)
+
+
+def _script() -> str:
+    # A block of its own: no names in the page's global scope.
+    body = "\n".join(map(_resource, _SCRIPTS))
+    return f'<script>\n"use strict";\n{{\n{body}}}\n</script>'
+
+
+def _write_image(file: TextIO, image: EncodedImage) -> None:
+    note = f'<span class="note">{html.escape(image.note)}</span>' if image.note else ""
+    file.write(
+        f'<li><button type="button"><img alt="" src="data:image/jpeg;base64,'
+        f'{_base64(image.thumbnail)}"><span class="name">{html.escape(image.name)}</span>{note}'
+        '</button>\n<script type="application/json">'
+    )
+    file.write(
+        _json(
+            {
+                "name": image.name,
+                "note": image.note,
+                "sphere": image.sphere,
+                "width": image.width,
+                "height": image.height,
+                "shares": image.shares,
+                "input": _base64(image.jpeg),
+                "truth": image.truth and _base64(image.truth),
+                "prediction": image.prediction and _base64(image.prediction),
+            }
+        )
+    )
+    file.write("</script></li>\n")
+
+
+def _json(content: Any) -> str:
+    """JSON that cannot end, or be mistaken for a comment in, the script element around it."""
+    return json.dumps(content, separators=(",", ":")).replace("<", "\\u003c")
+
+
+def _base64(content: bytes) -> str:
+    return b64encode(content).decode("ascii")
+
+
+def _filled(template: str, parts: dict[str, str]) -> str:
+    """The template with its ``{{names}}`` replaced; what is put in is not looked at again."""
+    return _PLACEHOLDER.sub(lambda match: parts[match[1]], template)
+
+
+def _resource(name: str) -> str:
+    return files("tangent_train.results.html").joinpath(name).read_text(encoding="utf-8")

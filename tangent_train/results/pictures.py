@@ -1,0 +1,165 @@
+"""Pictures of predictions: input, truth, prediction and error, with a legend."""
+
+from __future__ import annotations
+
+import colorsys
+from collections.abc import Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tangent_train.metrics.segmentation import UNKNOWN
+
+__all__ = [
+    "class_colors",
+    "colorize",
+    "overlay_picture",
+    "prediction_panel",
+    "shown_image",
+    "side_by_side",
+]
+
+_Image = NDArray[np.uint8]
+_MARGIN = 8
+_LEAST_ROWS = 256
+_PANORAMA_DIMENSIONS = 2
+_LEGEND_WIDTH = 1200
+"""Pixels of width per step of a legend's size."""
+
+
+def class_colors(num_classes: int) -> _Image:
+    """Distinct colours, black for the unknown class 0.
+
+    Args:
+        num_classes: K + 1.
+
+    Returns:
+        ``(K+1, 3)`` RGB: hues a golden ratio apart, in three brightnesses.
+    """
+    colors = [
+        colorsys.hsv_to_rgb(k * 0.618034 % 1, 0.45 + 0.4 * (k % 2), 0.95 - 0.15 * (k % 3))
+        for k in range(1, num_classes)
+    ]
+    return (np.array([(0, 0, 0), *colors]) * 255).round().astype(np.uint8)
+
+
+def colorize(labels: NDArray[np.integer], num_classes: int) -> _Image:
+    """Class indices ``(H, W)`` as RGB ``(H, W, 3)``.
+
+    Args:
+        labels: Class indices.
+        num_classes: K + 1.
+    """
+    return class_colors(num_classes)[labels]
+
+
+def prediction_panel(
+    rgb: _Image,
+    truth: NDArray[np.integer],
+    prediction: NDArray[np.integer],
+    class_names: Sequence[str],
+) -> _Image:
+    """Input, truth, prediction and error in a 2×2 grid, over a legend of the classes seen.
+
+    Args:
+        rgb: ``(H, W, 3)`` the panorama, or the crops of a photo side by side.
+        truth: ``(H, W)`` class indices, 0 unknown.
+        prediction: ``(H, W)`` class indices.
+        class_names: K + 1 names.
+
+    Returns:
+        RGB image, about 2W × 2H; panoramas of less than 256 rows are shown in whole multiples of
+        their size. Errors are red, unknown truth is grey.
+    """
+    count = len(class_names)
+    error = np.full((*truth.shape, 3), 255, np.uint8)
+    error[prediction != truth] = (214, 39, 40)
+    error[truth == UNKNOWN] = (160, 160, 160)
+    tiles = {
+        "input": rgb,
+        "truth": colorize(truth, count),
+        "prediction": colorize(prediction, count),
+        "error": error,
+    }
+    scale = max(1, _LEAST_ROWS // truth.shape[0])
+    titled = [
+        _titled(image.repeat(scale, axis=0).repeat(scale, axis=1), title)
+        for title, image in tiles.items()
+    ]
+    gap = np.full((titled[0].shape[0], _MARGIN, 3), 255, np.uint8)
+    grid = np.concatenate([np.concatenate([titled[k], gap, titled[k + 1]], axis=1) for k in (0, 2)])
+    seen = np.union1d(np.unique(truth), np.unique(prediction))
+    return np.concatenate([grid, _legend(grid.shape[1], seen, class_names)])
+
+
+def shown_image(image: Any, target: Any, representation: Any) -> NDArray[np.uint8]:
+    """What is shown beside labels: the panorama itself, or the crops of a photo side by side.
+
+    Args:
+        image: Of an `ImageSource`.
+        target: Its labels as they are evaluated: ``(H, W)``, or ``(n, h, w)`` of crops.
+        representation: What makes the crops.
+
+    Returns:
+        RGB ``(H, W, 3)``, or ``(h, n·w, 3)``.
+    """
+    if target.ndim == _PANORAMA_DIMENSIONS:
+        return np.asarray(image.rgb)
+    crops = image.sampler(representation).whole().render(image.rgb, "bilinear")
+    return np.hstack(crops)
+
+
+def side_by_side(labels: NDArray[np.integer]) -> NDArray[np.integer]:
+    """``(H, W)`` labels as they are, ``(n, h, w)`` of crops in one row."""
+    return labels if labels.ndim == _PANORAMA_DIMENSIONS else np.hstack([*labels])
+
+
+def _titled(image: _Image, title: str) -> _Image:
+    strip = np.full((22, image.shape[1], 3), 255, np.uint8)
+    return np.concatenate([_text(strip, title, (2, 16)), image])
+
+
+def overlay_picture(
+    rgb: _Image, labels: NDArray[np.integer], class_names: Sequence[str], opacity: float = 0.5
+) -> _Image:
+    """A picture with its labels laid over it, over a legend of the classes in it.
+
+    Args:
+        rgb: ``(H, W, 3)``.
+        labels: ``(H, W)`` class indices; what is unknown (0) shows the picture.
+        class_names: K + 1 names.
+        opacity: Of the labels.
+
+    Returns:
+        RGB image of the same width, a little higher; the legend grows with the width.
+    """
+    colors = colorize(labels, len(class_names))
+    mixed = cv2.addWeighted(rgb, 1 - opacity, colors, opacity, 0)
+    mixed[labels == UNKNOWN] = rgb[labels == UNKNOWN]
+    scale = max(1, round(rgb.shape[1] / _LEGEND_WIDTH))
+    seen = np.setdiff1d(np.unique(labels), [UNKNOWN])
+    return np.concatenate([mixed, _legend(rgb.shape[1], seen, class_names, scale)])
+
+
+def _legend(
+    width: int, classes: NDArray[np.integer], class_names: Sequence[str], scale: int = 1
+) -> _Image:
+    longest = max((len(class_names[index]) for index in classes), default=0)
+    cell, line = max(104, 30 + 9 * longest) * scale, 22 * scale
+    per_row = max(1, width // cell)
+    rows = -(-len(classes) // per_row)
+    legend = np.full((rows * line + _MARGIN * scale, width, 3), 255, np.uint8)
+    colors = class_colors(len(class_names))
+    for k, index in enumerate(classes):
+        x, y = k % per_row * cell + 2 * scale, k // per_row * line + _MARGIN * scale
+        legend[y : y + 14 * scale, x : x + 14 * scale] = colors[index]
+        _text(legend, class_names[index], (x + 19 * scale, y + 12 * scale), scale)
+    return legend
+
+
+def _text(image: _Image, text: str, origin: tuple[int, int], scale: int = 1) -> _Image:
+    font, black = cv2.FONT_HERSHEY_SIMPLEX, (0, 0, 0)
+    cv2.putText(image, text, origin, font, 0.45 * scale, black, scale, cv2.LINE_AA)
+    return image

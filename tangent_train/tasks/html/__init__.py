@@ -1,7 +1,0 @@
-"""One self-contained HTML file with tables, curves and a viewer of panoramas; no network needed."""
-
-from tangent_train.tasks.html.images import EncodedImage, ViewerImage, encode_image
-from tangent_train.tasks.html.page import write_report
-from tangent_train.tasks.html.parts import Curve, Table
-
-__all__ = ["Curve", "EncodedImage", "Table", "ViewerImage", "encode_image", "write_report"]

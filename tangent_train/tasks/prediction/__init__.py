@@ -1,1 +1,0 @@
-"""Labels of one's own panoramas and photos, from a trained network."""

@@ -1,0 +1,255 @@
+"""What a small real training leaves in TensorBoard's files, read back with its own reader."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import lightning
+import numpy as np
+import pytest
+import torch
+from lightning.pytorch.loggers import TensorBoardLogger
+from numpy.typing import NDArray
+from tensorboard.backend.event_processing.event_accumulator import (  # type: ignore[import-untyped]
+    EventAccumulator,
+)
+from torch import nn
+
+from datamodules import Stanford2D3DS, Stanford2D3DSPerspective
+from datamodules.core.samples import EvaluationImages
+from tangent_train.callbacks.tensorboard import TrainingSpeed, ValidationPictures
+from tangent_train.errors import SettingError
+from tangent_train.rendering import PerspectiveRepresentation, TangentRepresentation
+from tangent_train.results.confusion_picture import confusion_picture
+from tangent_train.results.pictures import colorize, prediction_panel
+from tangent_train.tasks import SegmentationTask
+
+if TYPE_CHECKING:
+    from tests.conftest import FabricateStanford
+
+TANGENT = TangentRepresentation(base_level=0, level=4, faces_per_panorama=5)
+PHOTOS = PerspectiveRepresentation(level=5, evaluation="grid", crops_per_photo=2)
+STEPS = 3  # of an epoch: 6 panoramas, 2 at a time
+
+
+def _task(representation: Any, class_names: tuple[str, ...]) -> SegmentationTask:
+    torch.manual_seed(0)
+    optimizer = partial(torch.optim.SGD, lr=0.1)
+    return SegmentationTask(nn.Conv2d(4, 14, 1), representation, class_names, optimizer)
+
+
+def _panoramas(root: Path) -> Stanford2D3DS:
+    # Validation: 3 panoramas of 2 rooms.
+    return Stanford2D3DS(root, TANGENT, panoramas_per_step=2, validation_fraction=0.35, seed=3)
+
+
+def _fit(
+    folder: Path, data: Any, task: SegmentationTask, *, count: int = 2, **settings: Any
+) -> lightning.Trainer:
+    resumed = settings.pop("ckpt_path", None)
+    trainer = lightning.Trainer(
+        **{"max_epochs": 2} | settings,
+        accelerator="cpu",
+        logger=TensorBoardLogger(folder, name="", version="tensorboard"),
+        callbacks=[ValidationPictures(count), TrainingSpeed()],
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        num_sanity_val_steps=1,
+        use_distributed_sampler=False,
+        log_every_n_steps=1,
+        default_root_dir=folder,
+    )
+    trainer.fit(task, datamodule=data, ckpt_path=resumed, weights_only=True)
+    return trainer
+
+
+def _events(folder: Path) -> EventAccumulator:
+    events = EventAccumulator(str(folder / "tensorboard"), size_guidance={"images": 0})
+    events.Reload()
+    return events
+
+
+def _steps(events: EventAccumulator, tag: str) -> list[int]:
+    kind = events.Images if tag in events.Tags()["images"] else events.Scalars
+    return [event.step for event in kind(tag)]
+
+
+def _picture(event: Any) -> NDArray[np.uint8]:
+    bgr = cv2.imdecode(np.frombuffer(event.encoded_image_string, np.uint8), cv2.IMREAD_COLOR)
+    assert bgr is not None
+    return np.asarray(bgr[..., ::-1], np.uint8)
+
+
+def _tags(events: EventAccumulator, kind: str, group: str) -> list[str]:
+    return sorted(tag for tag in events.Tags()[kind] if tag.startswith(group))
+
+
+@pytest.fixture(scope="module")
+def trained(
+    stanford_root: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, SegmentationTask, Stanford2D3DS]:
+    """Two epochs of panoramas."""
+    folder = tmp_path_factory.mktemp("trained")
+    data = _panoramas(stanford_root)
+    task = _task(TANGENT, data.class_names)
+    _fit(folder, data, task)
+    return folder, task, data
+
+
+def test_the_same_images_are_shown_after_every_validation(
+    trained: tuple[Path, SegmentationTask, Stanford2D3DS],
+) -> None:
+    folder, task, data = trained
+    events, source = _events(folder), data.source("val")
+    assert len(source) == 3
+    chosen = {f"val_images/{source.name(k).replace('/', '_')}": k for k in (0, 2)}
+    assert _tags(events, "images", "val_images/") == sorted(chosen), "first and last of 3"
+    for tag, index in chosen.items():
+        assert _steps(events, tag) == _steps(events, "val/miou") == [STEPS - 1, 2 * STEPS - 1]
+        panorama = source.read(index)
+        views = TANGENT.whole()
+        rgb = torch.from_numpy(views.render(panorama.rgb, "bilinear")).movedim(-1, 1) / 255
+        assert panorama.depth is not None
+        steps = views.render(panorama.depth, "nearest").astype(np.float32) / 512
+        depth = torch.from_numpy(steps).clamp(max=4)
+        values = torch.cat([rgb, depth[:, None]], dim=1)
+        mean, std = (torch.tensor(v) for v in (data.normalization.mean, data.normalization.std))
+        with torch.no_grad():
+            scores = task.network((values - mean[:, None, None]) / std[:, None, None])
+        labels = TANGENT.to_labels(scores[:, 1:], (32, 64)).numpy() + 1
+        expected = prediction_panel(panorama.rgb, panorama.labels, labels, data.class_names)
+        np.testing.assert_array_equal(_picture(events.Images(tag)[-1]), expected)
+
+
+def test_figures_of_every_class_are_those_of_numpy(
+    trained: tuple[Path, SegmentationTask, Stanford2D3DS],
+) -> None:
+    folder, task, data = trained
+    events = _events(folder)
+    matrix = task.matrices.pixels
+    present = [k for k in range(1, 14) if matrix[k].sum()]
+    named = {f"val_iou/{data.class_names[k]}": k for k in present}
+    assert _tags(events, "scalars", "val_iou/") == sorted(named)
+    assert named, "no class to compare"
+    for tag, k in named.items():
+        union = matrix[k].sum() + matrix[1:, k].sum() - matrix[k, k]
+        assert _steps(events, tag) == [STEPS - 1, 2 * STEPS - 1]
+        assert events.Scalars(tag)[-1].value == pytest.approx(matrix[k, k] / union, rel=1e-6)
+    mean = np.mean([events.Scalars(tag)[-1].value for tag in named])
+    assert mean == pytest.approx(events.Scalars("val/miou")[-1].value, rel=1e-6)
+    picture = _picture(events.Images("val/confusion")[-1])
+    np.testing.assert_array_equal(picture, confusion_picture(matrix, data.class_names))
+
+
+def test_the_speed_is_that_of_training_alone(stanford_root: Path, tmp_path: Path) -> None:
+    """Every step takes a second of a clock that only steps and validations move."""
+    data = _panoramas(stanford_root)
+    task = _task(TANGENT, data.class_names)
+    clock = SimpleNamespace(now=100.0)
+
+    class Watch(TrainingSpeed):
+        def on_train_batch_end(self, *hooked: Any) -> None:
+            clock.now += 1.0
+            super().on_train_batch_end(*hooked)
+
+        def on_validation_batch_end(self, *_: Any) -> None:
+            clock.now += 7.0
+
+    with pytest.MonkeyPatch.context() as patch:
+        module = "tests.callbacks.test_tensorboard"
+        patch.setattr(f"{module}.TrainingSpeed", Watch)
+        patch.setattr("time.perf_counter", lambda: clock.now)
+        _fit(tmp_path, data, task)
+    events = _events(tmp_path)
+    images = [event.value for event in events.Scalars("speed/images_per_s")]
+    assert images == [2 * 5, 2 * 5], "two panoramas of 5 images each second"
+    assert [event.value for event in events.Scalars("speed/epoch_s")] == [STEPS, STEPS]
+    assert [event.value for event in events.Scalars("speed/validation_s")] == [21.0, 21.0]
+    assert _steps(events, "speed/epoch_s") == [STEPS - 1, 2 * STEPS - 1]
+
+
+def test_a_resumed_run_goes_on_at_the_same_steps(
+    stanford_root: Path,
+    tmp_path: Path,
+    trained: tuple[Path, SegmentationTask, Stanford2D3DS],
+) -> None:
+    data = _panoramas(stanford_root)
+    trainer = _fit(tmp_path, data, _task(TANGENT, data.class_names), max_epochs=1)
+    trainer.save_checkpoint(tmp_path / "x.ckpt")
+    data = _panoramas(stanford_root)
+    task = _task(TANGENT, data.class_names)
+    _fit(tmp_path, data, task, ckpt_path=tmp_path / "x.ckpt")
+    resumed, whole = _events(tmp_path), _events(trained[0])
+    for tag in (*whole.Tags()["images"], "val_iou/wall", "speed/epoch_s"):
+        assert _steps(resumed, tag) == _steps(whole, tag)
+    for tag in whole.Tags()["images"]:
+        for event, other in zip(resumed.Images(tag), whole.Images(tag), strict=True):
+            assert event.encoded_image_string == other.encoded_image_string
+
+
+def test_crops_of_a_photo_stand_side_by_side(
+    fabricate_stanford: FabricateStanford, tmp_path: Path
+) -> None:
+    root = fabricate_stanford(tmp_path / "data", photos=2)
+    data = Stanford2D3DSPerspective(root, PHOTOS, photos_per_step=3, validation_fraction=0.35)
+    task = _task(PHOTOS, data.class_names)
+    _fit(tmp_path, data, task, count=1, max_epochs=1)
+    events, source = _events(tmp_path), data.source("val")
+    sample: Any = EvaluationImages(source, PHOTOS, data.inputs)[0, 0]
+    rgb, truth = sample.images[0].numpy(), sample.target.numpy()
+    assert len(rgb) > 1, "several crops"
+    (tag,) = _tags(events, "images", "val_images/")
+    picture = _picture(events.Images(tag)[-1])
+    side = rgb.shape[1]
+    scale = 256 // side
+    assert picture.shape[1] == 2 * scale * len(rgb) * side + 8
+    shown = picture[22 : 22 + scale * side : scale, : scale * len(rgb) * side : scale]
+    np.testing.assert_array_equal(shown, np.hstack(rgb))
+    truths = picture[22 : 22 + scale * side : scale, 8 + scale * len(rgb) * side :: scale]
+    np.testing.assert_array_equal(truths, colorize(np.hstack(truth), 14))
+    assert events.Scalars("speed/images_per_s")[0].value > 0
+
+
+@pytest.mark.parametrize("rows", [512, 513, 2048])
+def test_large_panoramas_are_shown_smaller(rows: int) -> None:
+    from tangent_train.callbacks.tensorboard import _smaller
+
+    step = -(-rows // 256)
+    rng = np.random.default_rng(0)
+    labels = rng.integers(0, 14, (rows, 2 * rows)).astype(np.uint8)
+    small = _smaller(labels)
+    assert small.shape[0] <= 256
+    np.testing.assert_array_equal(small[3, 5], labels[3 * step + step // 2, 5 * step + step // 2])
+    colors = _smaller(np.full((rows, 2 * rows, 3), 77, np.uint8))
+    assert colors.shape == (*small.shape, 3)
+    assert np.all(colors == 77)
+
+
+def test_nothing_is_drawn_by_other_processes_or_without_tensorboard(tmp_path: Path) -> None:
+    class Unused:
+        def __getattr__(self, name: str) -> Any:
+            raise AssertionError(name)
+
+    logger = TensorBoardLogger(tmp_path, name="", version="tensorboard")
+    for rank_0, loggers in ((False, [logger]), (True, [])):
+        trainer: Any = SimpleNamespace(
+            sanity_checking=False,
+            is_global_zero=rank_0,
+            loggers=loggers,
+            num_val_batches=[3],
+        )
+        pictures = ValidationPictures(3)
+        unused: Any = Unused()
+        pictures.on_validation_batch_end(trainer, unused, None, unused, 0)
+        pictures.on_validation_end(trainer, unused)
+    assert not list(tmp_path.rglob("events*"))
+
+
+def test_a_negative_number_of_images_is_refused() -> None:
+    with pytest.raises(SettingError, match="tensorboard_images: found -1"):
+        ValidationPictures(-1)

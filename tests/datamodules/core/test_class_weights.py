@@ -1,0 +1,54 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from datamodules.core.class_weights import class_weights
+from tangent_train.errors import SettingError
+
+COUNTS = np.array([999, 4_000_000, 1_000_000, 900_000, 50_000, 0, 300])
+
+
+def test_effective_weights_are_those_of_cui_for_the_mean_count() -> None:
+    seen = COUNTS[1:] > 0
+    counts = COUNTS[1:][seen].astype(np.float64)
+    beta = 1 - 1 / counts.mean()
+    expected = (1 - beta) / (1 - beta**counts)
+    weights = class_weights(COUNTS, "effective")
+    found = weights[1:][torch.from_numpy(seen)].numpy()
+    np.testing.assert_allclose(found, expected / expected.mean(), rtol=1e-5)
+    assert weights[0] == weights[5] == 0
+    assert weights.dtype == torch.float32
+
+
+def test_effective_weights_follow_the_share_of_rare_classes_only() -> None:
+    rare, frequent = (float(w) for w in class_weights(COUNTS, "effective")[[6, 4]])
+    assert rare / frequent == pytest.approx(50_000 / 300, rel=0.03)
+    most, second = (float(w) for w in class_weights(COUNTS, "effective")[[1, 2]])
+    assert second / most == pytest.approx(1.7, abs=0.01)  # of a fourth of the pixels
+
+
+@pytest.mark.parametrize("kind", ["log", "sqrt", "effective", "none"])
+def test_only_the_shares_count(kind: str) -> None:
+    once = class_weights(COUNTS, kind)  # type: ignore[arg-type]
+    torch.testing.assert_close(once, class_weights(COUNTS * 1000, kind))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("kind", ["log", "sqrt", "effective"])
+def test_extreme_counts_give_finite_weights(kind: str) -> None:
+    for counts in ([5, 0, 0], [0, 7, 0], [0, 1, 1], [3, 1, 10**13]):
+        weights = class_weights(np.array(counts), kind)  # type: ignore[arg-type]
+        assert torch.isfinite(weights).all()
+        assert (weights > 0).tolist() == [False, counts[1] > 0, counts[2] > 0]
+
+
+def test_the_seen_classes_weigh_one_in_the_mean() -> None:
+    for kind in ("sqrt", "effective"):
+        weights = class_weights(COUNTS, kind)
+        assert float(weights[weights > 0].mean()) == pytest.approx(1)
+
+
+def test_another_kind_is_refused() -> None:
+    with pytest.raises(SettingError, match="log, sqrt, effective or none"):
+        class_weights(COUNTS, "cbrt")  # type: ignore[arg-type]

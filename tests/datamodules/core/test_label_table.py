@@ -1,0 +1,72 @@
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from datamodules.stanford2d3ds.panoramas import CLASSES, LabelTable
+from tangent_train.errors import DataError
+
+REAL_DATA = os.environ.get("TANGENT_REAL_DATA")
+
+
+def _colors(indices: list[int]) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
+    return np.array([[[i >> 16, i >> 8 & 255, i & 255] for i in indices]], np.uint8)
+
+
+def test_classes_are_numbered_in_alphabetical_order(tmp_path: Path) -> None:
+    names = [f"{name}_1_office_1_1" for name in reversed(CLASSES)]
+    path = tmp_path / "labels.json"
+    path.write_text(json.dumps(["<UNK>_0_<UNK>_0_0", *names]))
+    table = LabelTable.from_json(path)
+    assert list(CLASSES) == sorted(CLASSES)
+    assert table.class_ids.dtype == np.uint8
+    assert table.class_ids.tolist() == [0, *range(13, 0, -1)]
+
+
+def test_decode_uses_all_three_bytes() -> None:
+    ids = np.zeros(70_000, np.uint8)
+    ids[[0x0A, 0x0A0B, 0x010A0B]] = 1, 2, 3
+    decoded = LabelTable(ids).decode(_colors([0x0A, 0x0A0B, 0x010A0B, 0]))
+    assert decoded.dtype == np.uint8
+    assert decoded.tolist() == [[1, 2, 3, 0]]
+
+
+def test_past_the_end_of_the_table_is_unknown() -> None:
+    # #0D0D0D without its red byte would be entry 3341 of the table.
+    table = LabelTable(np.full(9816, 6, np.uint8))
+    assert table.decode(_colors([0x0D0D0D, 9815, 9816, 0xFFFFFF])).tolist() == [[0, 6, 0, 0]]
+
+
+@pytest.mark.parametrize(
+    ("content", "found"),
+    [
+        ("{not json", "Expecting"),
+        ('{"beam": 1}', "dict"),
+        ("[]", "list"),
+        ('["beam_1_office_1_1", "sky_1_office_1_1"]', "'sky'"),
+        (None, "No such file"),
+    ],
+)
+def test_no_class_table(tmp_path: Path, content: str | None, found: str) -> None:
+    path = tmp_path / "labels.json"
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(DataError, match=found) as error:
+        LabelTable.from_json(path)
+    assert str(path) in str(error.value)
+
+
+@pytest.mark.real_data
+@pytest.mark.skipif(REAL_DATA is None, reason="TANGENT_REAL_DATA is not set")
+def test_agrees_with_an_independent_decode_of_the_real_table() -> None:
+    folder = Path(str(REAL_DATA)) / "stanford2d3ds"
+    # One class per entry, then that of everything past the end, which it calls 14, <INV>.
+    *classes, invalid = map(int, (folder / "independent_label_maps.txt").read_text().split())
+    table = LabelTable.from_json(folder / "semantic_labels.json")
+    assert invalid == 14
+    assert len(classes) == 9816
+    assert table.decode(_colors(list(range(9816)))).ravel().tolist() == classes

@@ -1,0 +1,377 @@
+from __future__ import annotations
+
+import hashlib
+import multiprocessing
+import warnings
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from lightning import LightningModule, Trainer
+
+from datamodules.core.panorama_module import Split
+from datamodules.core.panoramas import Panorama
+from datamodules.core.samples import (
+    RGB_NORMALIZATION,
+    RGBD_NORMALIZATION,
+    EvaluationSample,
+    normalize,
+)
+from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
+from tangent_train.errors import SettingError
+from tangent_train.rendering import TangentRepresentation
+from tangent_train.rendering.upright.gravity import Gravity
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from datamodules.core.samples import TrainingSample
+
+    MakeModule = Callable[..., Stanford2D3DS]
+
+
+SPLITS: tuple[Split, ...] = ("train", "val", "test")
+
+
+@pytest.fixture
+def make_module(stanford_root: Path, strips: Any) -> MakeModule:
+    def make(**settings: Any) -> Stanford2D3DS:
+        return Stanford2D3DS(stanford_root, strips, **settings)
+
+    return make
+
+
+def _digest(batch: TrainingSample[Any]) -> str:
+    images = [batch.images] if isinstance(batch.images, torch.Tensor) else batch.images
+    arrays = [tensor.numpy() for tensor in (*images, batch.labels)]
+    content = hashlib.sha256(b"".join(array.tobytes() for array in arrays))
+    return f"{torch.as_tensor(batch.index).tolist()} {content.hexdigest()[:8]}"
+
+
+# --- loaders -----------------------------------------------------------------------------------
+
+
+def test_what_tasks_ask_for(make_module: MakeModule) -> None:
+    module = make_module()
+    assert module.class_names[:2] == ("unknown", "beam")
+    assert len(module.class_names) == 14
+    assert (module.in_channels, module.normalization, module.erp_height) == (
+        4,
+        RGBD_NORMALIZATION,
+        16,
+    )
+    rgb = make_module(inputs=["rgb"])
+    assert (rgb.in_channels, rgb.normalization) == (3, RGB_NORMALIZATION)
+    assert module.sample_name("test", 0).startswith("area_5a/")
+
+
+def test_training_batches(make_module: MakeModule) -> None:
+    module = make_module(panoramas_per_step=4, validation_fraction=0)
+    batches = list(module.train_dataloader())
+    assert [len(batch.labels) for batch in batches] == [4, 4, 1]
+    assert [image.shape for image in batches[0].images] == [(4, 2, 16, 8, 3), (4, 2, 16, 8)]
+    images = module.on_after_batch_transfer(batches[0], 0).images
+    torch.testing.assert_close(
+        images, normalize(batches[0].images, module.normalization, module.inputs)
+    )
+    assert batches[0].labels.shape == (4, 2, 16, 8)
+    assert batches[0].labels.dtype == torch.uint8
+
+
+def test_evaluation_batches_are_whole_panoramas_in_order(make_module: MakeModule) -> None:
+    module = make_module(inputs=("rgb",))
+    loaders = {"val": module.val_dataloader(), "test": module.test_dataloader()}
+    for split in SPLITS[1:]:
+        batches = list(loaders[split])
+        assert all(isinstance(batch, EvaluationSample) for batch in batches)
+        assert [int(batch.index) for batch in batches] == list(range(len(module.source(split))))
+        images = module.on_after_batch_transfer(batches[0], 0).images
+        assert images.shape == (1, 4, 3, 16, 8)
+        expected = module.source(split).read(0).labels[None]
+        np.testing.assert_array_equal(batches[0].target.numpy(), expected)
+
+
+@pytest.mark.parametrize("in_memory", [False, True])
+def test_the_same_samples_for_any_number_of_workers(
+    make_module: MakeModule, in_memory: bool
+) -> None:
+    def two_epochs(num_workers: int) -> list[list[str]]:
+        loader = make_module(num_workers=num_workers, in_memory=in_memory).train_dataloader()
+        epochs = []
+        for epoch in (0, 1):
+            loader.sampler.set_epoch(epoch)  # type: ignore[attr-defined]
+            epochs.append([_digest(batch) for batch in loader])
+        return epochs
+
+    alone = two_epochs(0)
+    assert two_epochs(2) == alone  # persistent workers learn about the new epoch, too
+    assert alone[0] != alone[1]
+
+
+@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="needs fork")
+def test_workers_start_after_opencv_has_used_threads(make_module: MakeModule) -> None:
+    # cv2.setNumThreads(1) in a forked worker never returned.
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(2)
+    cv2.resize(np.zeros((2048, 4096, 3), np.uint8), (1000, 500), interpolation=cv2.INTER_AREA)
+    prepare = make_module().train_dataloader().worker_init_fn
+    worker = multiprocessing.get_context("fork").Process(target=prepare, args=(0,))
+    worker.start()
+    worker.join(20)
+    stuck = worker.is_alive()
+    worker.kill()
+    worker.join()
+    cv2.setNumThreads(before)
+    assert not stuck
+
+
+def test_in_memory_gives_the_same_samples(make_module: MakeModule) -> None:
+    on_disk, in_memory = (
+        [_digest(batch) for batch in make_module(in_memory=keep).train_dataloader()]
+        for keep in (False, True)
+    )
+    assert on_disk == in_memory
+
+
+def test_in_memory_reads_no_file_twice(
+    make_module: MakeModule, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module = make_module(in_memory=True)
+    list(module.train_dataloader())
+    monkeypatch.setattr("datamodules.stanford2d3ds.panoramas.read_color_png", None)
+    assert len(list(module.train_dataloader())) > 0
+    assert module.class_weights("log").shape == (14,)
+
+
+def test_only_test_panoramas_turn(make_module: MakeModule) -> None:
+    plain, turned = make_module(), make_module(test_rotation=30)
+    for split in SPLITS:
+        before, after = plain.source(split).read(0), turned.source(split).read(0)
+        for i, name in enumerate(Panorama._fields):
+            if name == "up":
+                continue
+            same = np.array_equal(np.asarray(before[i]), np.asarray(after[i]))
+            assert same is (split != "test")
+    assert turned.sample_name("test", 1) == plain.sample_name("test", 1)
+
+
+def test_turned_panoramas_are_looked_at_upright_where_up_is_known(make_module: MakeModule) -> None:
+    turned, known = make_module(test_rotation=30), make_module(test_rotation=30, upright="pose")
+    panorama, aware = turned.source("test").read(0), known.source("test").read(0)
+    np.testing.assert_array_equal(panorama.rgb, aware.rgb)
+    np.testing.assert_array_equal(panorama.labels, aware.labels)
+    assert panorama.up is None
+    assert aware.up is not None
+    assert np.degrees(np.arccos(aware.up[2])) == pytest.approx(30)
+    representation = TangentRepresentation(0, 3)
+    rotation = aware.sampler(representation).whole().rotations()[0]
+    np.testing.assert_allclose(rotation @ [0, 0, 1], aware.up, atol=1e-12)
+    for split in ("train", "val"):
+        assert known.source(split).read(0).up is None
+
+
+def test_up_is_estimated_from_every_image(
+    make_module: MakeModule, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[float] = []
+
+    def estimate(rgb: NDArray[np.uint8], max_tilt_deg: float) -> Gravity:
+        asked.append(max_tilt_deg)
+        up = np.array([0.6, 0.0, 0.8])
+        return Gravity(up, 0.9, up[None])
+
+    monkeypatch.setattr("datamodules.core.turned_panoramas.estimate_up", estimate)
+    module = make_module(upright="auto", max_tilt_deg=60, in_memory=True)
+    for split in SPLITS:
+        source = module.source(split)
+        before = len(asked)
+        for _ in range(3):
+            np.testing.assert_array_equal(source.read(0).up, [0.6, 0.0, 0.8])
+        assert len(asked) == before, "once, when it was read into memory"
+        assert source.name(0)
+    assert set(asked) == {60}
+    counts = module.source("train").label_counts(0)
+    np.testing.assert_array_equal(counts, make_module().source("train").label_counts(0))
+
+
+@pytest.mark.parametrize("settings", [{"upright": "maybe"}, {"max_tilt_deg": 0}])
+def test_impossible_settings_of_upright(make_module: MakeModule, settings: dict[str, Any]) -> None:
+    with pytest.raises(SettingError, match=r"data\.(upright|max_tilt_deg): found"):
+        make_module(**settings)
+
+
+@pytest.mark.parametrize(("world_size", "left_out"), [(2, []), (3, ["2 of 8 training panoramas"])])
+def test_processes_share_the_test_panoramas(
+    make_module: MakeModule, monkeypatch: pytest.MonkeyPatch, world_size: int, left_out: list[str]
+) -> None:
+    monkeypatch.setattr("torch.distributed.is_initialized", lambda: True)
+    monkeypatch.setattr("torch.distributed.get_world_size", lambda: world_size)
+    seen = []
+    steps = set()
+    for rank in range(world_size):
+        monkeypatch.setattr("torch.distributed.get_rank", lambda rank=rank: rank)
+        module = make_module()
+        seen += [int(batch.index) for batch in module.test_dataloader()]
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            steps.add(len(module.train_dataloader()))
+        assert [str(w.message).partition(",")[0] for w in said] == left_out
+    assert sorted(seen) == list(range(5))
+    assert len(steps) == 1
+
+
+# --- with a trainer ----------------------------------------------------------------------------
+
+
+class Recorder(LightningModule):
+    """Trains one number and writes down what it is shown."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.zeros(()))
+        self.seen: dict[int, list[str]] = {}
+        self.tested: list[int] = []
+
+    def training_step(self, batch: TrainingSample[torch.Tensor], batch_idx: int) -> torch.Tensor:
+        assert batch.images.shape[2:] == (4, 16, 8)
+        self.seen.setdefault(self.current_epoch, []).append(_digest(batch))
+        return self.weight * batch.images.mean()
+
+    def validation_step(self, batch: EvaluationSample[torch.Tensor], batch_idx: int) -> None:
+        pass
+
+    def test_step(self, batch: EvaluationSample[torch.Tensor], batch_idx: int) -> None:
+        self.tested.append(int(batch.index))
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        return torch.optim.SGD(self.parameters(), lr=0.1)
+
+
+def _trainer(folder: Path, epochs: int, precision: Any = None) -> Trainer:
+    return Trainer(
+        precision=precision,
+        default_root_dir=folder,
+        accelerator="cpu",
+        max_epochs=epochs,
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        use_distributed_sampler=False,
+        log_every_n_steps=1,
+    )
+
+
+@pytest.mark.filterwarnings("ignore:.*does not have many workers")
+@pytest.mark.filterwarnings("ignore:GPU available but not used")
+# No validation split: the trainer makes sure it is meant.
+@pytest.mark.filterwarnings("ignore:Total length of `list` across ranks is zero")
+# Lightning 2.6 with torch 2.15.
+@pytest.mark.filterwarnings("ignore:.*LeafSpec:FutureWarning")
+@pytest.mark.parametrize("validation_fraction", [0, 0.3])
+def test_a_resumed_run_sees_what_the_whole_run_sees(
+    make_module: MakeModule, tmp_path: Path, validation_fraction: float
+) -> None:
+    def module() -> Stanford2D3DS:
+        return make_module(validation_fraction=validation_fraction)
+
+    whole, first, second = Recorder(), Recorder(), Recorder()
+    _trainer(tmp_path / "whole", 3).fit(whole, datamodule=module())
+    trainer = _trainer(tmp_path / "parts", 1)
+    trainer.fit(first, datamodule=module())
+    trainer.save_checkpoint(tmp_path / "last.ckpt")
+    resumed = _trainer(tmp_path / "parts", 3)
+    resumed.fit(second, datamodule=module(), ckpt_path=tmp_path / "last.ckpt", weights_only=True)
+    assert list(whole.seen) == [0, 1, 2]
+    assert len({tuple(epoch) for epoch in whole.seen.values()}) == 3
+    assert first.seen | second.seen == whole.seen
+    resumed.test(second, datamodule=module(), verbose=False)
+    assert second.tested == [0, 1, 2, 3, 4]
+
+
+@pytest.mark.filterwarnings("ignore:.*LeafSpec:FutureWarning")
+@pytest.mark.parametrize(
+    ("precision", "dtype"), [("32-true", "float32"), ("bf16-true", "bfloat16")]
+)
+def test_images_have_the_precision_of_the_run(
+    make_module: MakeModule, tmp_path: Path, precision: Any, dtype: str
+) -> None:
+    seen = []
+
+    class Watcher(Recorder):
+        def test_step(self, batch: EvaluationSample[torch.Tensor], batch_idx: int) -> None:
+            seen.append(batch.images.dtype)
+
+    trainer = _trainer(tmp_path, 1, precision=precision)
+    trainer.test(Watcher(), datamodule=make_module(), verbose=False)
+    assert set(seen) == {getattr(torch, dtype)}
+
+
+# --- class weights -----------------------------------------------------------------------------
+
+
+def _shares(module: Stanford2D3DS) -> np.ndarray[Any, Any]:
+    source = module.source("train")
+    labels = np.concatenate([source.read(i).labels.ravel() for i in range(len(source))])
+    known = labels[labels > 0]
+    return np.array([(known == c).mean() for c in range(1, 14)])
+
+
+def test_class_weights_against_their_formulas(make_module: MakeModule) -> None:
+    module = make_module()
+    shares = _shares(module)
+    log, sqrt, none = (module.class_weights(kind) for kind in ("log", "sqrt", "none"))
+    np.testing.assert_allclose(log[1:], 1 / np.log(1.02 + shares), rtol=1e-5)
+    np.testing.assert_allclose(sqrt[1:], shares**-0.5 / np.mean(shares**-0.5), rtol=1e-5)
+    assert none.tolist() == [0] + [1] * 13
+    assert log.dtype == torch.float32
+    assert log[0] == sqrt[0] == 0
+
+
+def test_classes_never_seen_weigh_nothing(
+    make_module: MakeModule, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module = make_module()
+    source = module.source("train")
+    read = source.label_counts
+    monkeypatch.setattr(
+        source, "label_counts", lambda i: np.where(np.arange(256) == 13, read(i), 0)
+    )
+    for kind in ("log", "sqrt"):
+        weights = module.class_weights(kind)
+        assert weights.nonzero().ravel().tolist() == [13]
+        assert torch.isfinite(weights).all()
+
+
+def test_class_weights_of_another_kind(make_module: MakeModule) -> None:
+    with pytest.raises(SettingError, match="log, sqrt, effective or none"):
+        make_module().class_weights("cbrt")  # type: ignore[arg-type]
+
+
+# --- settings ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("inputs", ("depth",)),
+        ("inputs", ("rgb", "hha")),
+        ("panoramas_per_step", 0),
+        ("num_workers", -1),
+        ("seed", -1),
+        ("normalization", RGB_NORMALIZATION),
+        ("color_jitter", -0.1),
+        ("color_jitter", 1.1),
+        ("test_rotation", "yaw"),
+        ("test_rotation", 200),
+        ("test_rotation", -1),
+    ],
+)
+def test_impossible_settings(make_module: MakeModule, name: str, value: Any) -> None:
+    with pytest.raises(SettingError, match=rf"data\.{name}"):
+        make_module(**{name: value})

@@ -1,0 +1,184 @@
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+import pytest
+
+from datamodules.core.panoramas import (
+    Panorama,
+    mask_black,
+    resize_area,
+    resize_depth,
+    resize_nearest,
+    steps_to_meters,
+)
+from datamodules.core.sources import RememberedImages, count_labels, in_threads
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+class Memory:
+    """A source that counts how often it is read."""
+
+    def __init__(self, panoramas: list[Panorama]) -> None:
+        self.panoramas = panoramas
+        self.reads = [0] * len(panoramas)
+
+    def __len__(self) -> int:
+        return len(self.panoramas)
+
+    def name(self, index: int) -> str:
+        return f"panorama {index}"
+
+    def read(self, index: int) -> Panorama:
+        self.reads[index] += 1
+        return self.panoramas[index]
+
+    def label_counts(self, index: int) -> NDArray[np.int64]:
+        return count_labels(self.read(index).labels)
+
+
+def _panorama(rng: np.random.Generator, *, depth: bool = True) -> Panorama:
+    return Panorama(
+        rng.integers(0, 256, (8, 16, 3), np.uint8),
+        rng.integers(0, 65535, (8, 16), np.uint16) if depth else None,
+        rng.integers(0, 14, (8, 16), np.uint8),
+    )
+
+
+# --- sizes -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("column", [16, 52, 100])
+@pytest.mark.parametrize("ratio", [2, 4])
+def test_an_edge_falls_on_the_same_column_in_rgb_depth_and_labels(column: int, ratio: int) -> None:
+    # Released code: RGB and labels 1.5 source pixels apart after shrinking by 4.
+    shape = (64 // ratio, 128 // ratio)
+    labels = np.zeros((64, 128), np.uint8)
+    labels[:, column:] = 1
+    depth = np.where(labels == 1, 512, 1024).astype(np.uint16)
+    rgb = np.repeat(labels[..., None] * np.uint8(255), 3, axis=2)
+    expected = np.zeros(shape, np.uint8)
+    expected[:, column // ratio :] = 1
+    np.testing.assert_array_equal(resize_nearest(labels, shape), expected)
+    np.testing.assert_array_equal(resize_depth(depth, shape) == 512, expected)
+    np.testing.assert_array_equal(resize_area(rgb, shape)[..., 0], expected * 255)
+
+
+def test_a_ramp_keeps_its_place_at_an_uneven_ratio() -> None:
+    # Centre of target column j lies at (j + ½) · 3/2 source columns; the ramp says where it is.
+    ramp = np.tile(np.arange(96, dtype=np.uint8) * 2, (48, 1))
+    expected = 2 * ((np.arange(64) + 0.5) * 1.5 - 0.5)
+    area = resize_area(np.repeat(ramp[..., None], 3, axis=2), (32, 64))[0, :, 0]
+    np.testing.assert_allclose(area, expected, atol=1)
+    np.testing.assert_allclose(resize_nearest(ramp, (32, 64))[0], expected, atol=1)
+
+
+def test_rgb_is_averaged() -> None:
+    stripes = np.zeros((8, 16, 3), np.uint8)
+    stripes[:, ::2] = 200
+    assert np.unique(resize_area(stripes, (4, 8))).tolist() == [100]
+
+
+@pytest.mark.parametrize("resize", [resize_area, resize_nearest])
+def test_the_same_size_changes_nothing(resize: Any) -> None:
+    image = np.random.default_rng(0).integers(0, 256, (4, 8, 3), np.uint8)
+    np.testing.assert_array_equal(resize(image, (4, 8)), image)
+
+
+def _nearest_valid(depth: NDArray[np.uint16], shape: tuple[int, int]) -> NDArray[np.uint16]:
+    """Slow and independent: look at every source pixel of every footprint."""
+    out = resize_nearest(depth, shape).copy()
+    (H, W), (h, w) = depth.shape, shape
+    for i, j in np.ndindex(h, w):
+        top, bottom, left, right = i * H / h, (i + 1) * H / h, j * W / w, (j + 1) * W / w
+        inside = [
+            (np.hypot(y + 0.5 - (top + bottom) / 2, x + 0.5 - (left + right) / 2), depth[y, x])
+            for y in range(H)
+            for x in range(W)
+            if top <= y + 0.5 <= bottom and left <= x + 0.5 <= right and depth[y, x]
+        ]
+        if out[i, j] == 0 and inside:
+            out[i, j] = min(inside, key=lambda pair: pair[0])[1]
+    return out
+
+
+@pytest.mark.parametrize("shape", [(12, 24), (6, 12), (4, 8), (3, 6), (8, 16), (5, 10)])
+@pytest.mark.parametrize("missing", [0.3, 0.9])
+def test_depth_is_that_of_a_near_valid_pixel(shape: tuple[int, int], missing: float) -> None:
+    rng = np.random.default_rng(3)
+    depth = rng.integers(1, 2000, (12, 24), np.uint16)
+    depth[rng.random(depth.shape) < missing] = 0
+    small, reference = resize_depth(depth, shape), _nearest_valid(depth, shape)
+    assert small.dtype == np.uint16
+    np.testing.assert_array_equal(small == 0, reference == 0)
+    valid = resize_nearest(depth, shape) > 0
+    np.testing.assert_array_equal(small[valid], reference[valid])
+    assert set(small.ravel().tolist()) <= set(depth.ravel().tolist())
+
+
+def test_depth_takes_the_nearest_of_the_valid_ones() -> None:
+    depth = np.zeros((5, 10), np.uint16)
+    depth[0, 0], depth[2, 1], depth[4, 4] = 10, 20, 30
+    depth[4, 9] = 40
+    assert resize_depth(depth, (1, 2)).tolist() == [[20, 40]]
+
+
+# --- masks -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("mask", "expected"),
+    [("labels", [5, 5, 5]), ("any_black", [0, 0, 5]), ("all_black", [0, 5, 5])],
+)
+def test_masks(mask: Literal["labels", "any_black", "all_black"], expected: list[int]) -> None:
+    rgb = np.array([[[0, 0, 0], [9, 0, 9], [1, 2, 3]]], np.uint8)
+    masked = mask_black(np.full((1, 3), 5, np.uint8), rgb, mask)
+    assert masked.dtype == np.uint8
+    assert masked.tolist() == [expected]
+
+
+# --- sources -----------------------------------------------------------------------------------
+
+
+def test_threads_keep_the_order() -> None:
+    rng = np.random.default_rng(0)
+    panoramas = [_panorama(rng) for _ in range(100)]
+    read = list(in_threads(Memory(panoramas).read, 100))
+    assert all(a is b for a, b in zip(read, panoramas, strict=True))
+
+
+@pytest.mark.parametrize("depth", [True, False])
+def test_remembered_panoramas_are_the_same_and_read_once(depth: bool) -> None:
+    rng = np.random.default_rng(0)
+    source = Memory([_panorama(rng, depth=depth) for _ in range(3)])
+    remembered = RememberedImages(source)
+    for _ in range(2):
+        for index in range(len(remembered)):
+            for kept, original in zip(remembered.read(index), source.panoramas[index], strict=True):
+                if original is None:
+                    assert kept is None
+                    continue
+                assert kept is not None
+                assert kept.dtype == original.dtype
+                np.testing.assert_array_equal(kept, original)
+            np.testing.assert_array_equal(
+                remembered.label_counts(index), count_labels(source.panoramas[index].labels)
+            )
+    assert source.reads == [1, 1, 1]
+    assert remembered.name(1) == "panorama 1"
+
+
+def test_labels_are_counted() -> None:
+    labels = np.array([[0, 3, 3], [13, 3, 255]], np.uint8)
+    counts = count_labels(labels)
+    assert counts.shape == (256,)
+    assert {label: counts[label] for label in np.flatnonzero(counts)} == {0: 1, 3: 3, 13: 1, 255: 1}
+
+
+def test_depth_in_meters() -> None:
+    depth_m = steps_to_meters(np.array([0, 1, 512, 65535], np.uint16))
+    assert depth_m.dtype == np.float32
+    assert depth_m.tolist() == [0, 1 / 512, 1, 65535 / 512]

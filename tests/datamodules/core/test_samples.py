@@ -1,0 +1,319 @@
+from __future__ import annotations
+
+import colorsys
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+import torch
+from torch.utils.data import default_collate
+
+from datamodules.core.panoramas import Panorama
+from datamodules.core.samples import (
+    RGB_NORMALIZATION,
+    RGBD_NORMALIZATION,
+    EvaluationImages,
+    EvaluationSample,
+    Input,
+    Normalization,
+    TrainingImages,
+    TrainingSample,
+    collate,
+    normalize,
+    render_inputs,
+)
+from datamodules.core.segmentation_module import checked_inputs
+from datamodules.images.colors import jitter_colors
+from tangent_train.errors import SettingError
+from tangent_train.geometry import equirect_directions
+from tangent_train.rendering.representations.pinhole import (
+    EquirectRepresentation,
+    TangentRepresentation,
+)
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from datamodules.core.sources import ImageSource
+    from tangent_train.rendering.representations.pinhole import Representation
+
+DEPTH: tuple[Input, ...] = ("rgb", "depth")
+IDENTITY = Normalization((0, 0, 0, 0), (1 / 255, 1 / 255, 1 / 255, 1))
+
+
+class Positions:
+    """Panoramas whose every pixel has its own red, depth and label."""
+
+    def __len__(self) -> int:
+        return 3
+
+    def name(self, index: int) -> str:
+        return str(index)
+
+    def read(self, index: int) -> Panorama:
+        place = np.arange(16 * 32).reshape(16, 32) % 251
+        labels = (place + index).astype(np.uint8)
+        rgb = np.stack([labels, labels, labels], axis=-1)
+        return Panorama(rgb, labels.astype(np.uint16) * 4, labels)
+
+    def label_counts(self, index: int) -> NDArray[np.int64]:
+        raise NotImplementedError
+
+
+# --- normalization -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("depth", [True, False])
+def test_normalize_against_the_formula(depth: bool) -> None:
+    rng = np.random.default_rng(0)
+    rgb = rng.integers(0, 256, (3, 2, 4, 5, 3), np.uint8)
+    steps = rng.integers(0, 2049, (3, 2, 4, 5)).astype(np.int16)
+    inputs = [torch.from_numpy(array) for array in ((rgb, steps) if depth else (rgb,))]
+    normalization = RGBD_NORMALIZATION if depth else RGB_NORMALIZATION
+    images = normalize(inputs, normalization, DEPTH if depth else ("rgb",))
+    assert images.shape == (3, 2, 4 if depth else 3, 4, 5)
+    assert images.dtype == torch.float32
+    assert images.is_contiguous()
+    for channel, (mean, std) in enumerate(zip(normalization.mean, normalization.std, strict=True)):
+        value = rgb[..., channel] / 255 if channel < 3 else steps / 512
+        np.testing.assert_allclose(images[:, :, channel], (value - mean) / std, atol=1e-5)
+
+
+def test_a_config_brings_lists() -> None:
+    from_list = Normalization([0.5490, 0.5306, 0.4779], [0.1992, 0.2005, 0.2129])
+    assert from_list == RGB_NORMALIZATION
+    assert (from_list.channels, RGBD_NORMALIZATION.channels) == (3, 4)
+
+
+@pytest.mark.parametrize(
+    ("mean", "std"),
+    [
+        ((0, 0, 0), (1, 1, 0)),
+        ((0, 0, 0), (1, 1, 1, 1)),
+        ((0, 0), (1, 1)),
+        ((), ()),
+        ((0, 0, float("nan")), (1, 1, 1)),
+        ((0, 0, 0), (1, 1, float("nan"))),
+    ],
+)
+def test_impossible_normalization(mean: Any, std: Any) -> None:
+    with pytest.raises(SettingError, match="normalization"):
+        Normalization(mean, std)
+
+
+@pytest.mark.parametrize(("depth", "normalization"), [(True, RGB_NORMALIZATION), (False, IDENTITY)])
+def test_normalization_of_other_channels(depth: bool, normalization: Normalization) -> None:
+    inputs = [torch.zeros((1, 2, 2, 3), dtype=torch.uint8)]
+    inputs += [torch.zeros((1, 2, 2), dtype=torch.int16)] * depth
+    with pytest.raises(SettingError, match="channels"):
+        normalize(inputs, normalization, DEPTH if depth else ("rgb",))
+
+
+# --- other inputs -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("up", [None, (0.6, 0.0, 0.8), (0.0, 0.0, -1.0)])
+@pytest.mark.parametrize(
+    "representation",
+    [
+        TangentRepresentation(0, 5, rotation="so3", faces_per_panorama=4, mirror=True),
+        EquirectRepresentation(5, rotation="so3", mirror=True),
+        EquirectRepresentation(5, crop_deg=90, rotation="yaw", mirror=True),
+    ],
+)
+def test_elevation_is_how_far_a_pixel_looks_up(
+    representation: Representation, up: tuple[float, float, float] | None
+) -> None:
+    """Against directions rendered as three pictures: the same pixels, another way to the angle."""
+    shape = (64, 128)
+    zenith = None if up is None else np.array(up)
+    image = Panorama(np.zeros((*shape, 3), np.uint8), None, np.zeros(shape, np.uint8), zenith)
+    for seed in range(4):
+        views = representation.sample(np.random.default_rng(seed))
+        elevation = render_inputs(image, views, ("rgb", "elevation"))[1].numpy()
+        directions = views.render(equirect_directions(shape).astype(np.float32), "bilinear")
+        expected = directions @ np.array((0, 0, 1) if up is None else up)
+        np.testing.assert_allclose(elevation, expected, atol=1e-5)
+        assert elevation.dtype == np.float32
+    whole = representation.turned(np.eye(3)).whole()
+    elevation = render_inputs(image, whole, ("rgb", "elevation"))[1].numpy()
+    assert -1 <= elevation.min() < -0.99
+    assert 0.99 < elevation.max() <= 1
+
+
+def test_the_elevation_of_tangent_images_is_that_of_their_rays() -> None:
+    shape, representation = (128, 256), TangentRepresentation(0, 6)
+    image = Panorama(np.zeros((*shape, 3), np.uint8), None, np.zeros(shape, np.uint8))
+    elevation = render_inputs(image, representation.whole(), ("rgb", "elevation"))[1].numpy()
+    np.testing.assert_allclose(elevation, representation.grid.directions()[..., 2], atol=4e-4)
+
+
+def test_the_elevation_follows_the_measured_channels() -> None:
+    rgb = torch.full((2, 3, 3, 3), 255, dtype=torch.uint8)
+    depth = torch.tensor([[0, 1, 2048]] * 3, dtype=torch.int16).expand(2, 3, 3)
+    elevation = torch.linspace(-1, 1, 18).reshape(2, 3, 3)
+    every: tuple[Input, ...] = ("rgb", "depth", "elevation")
+    images = normalize([rgb, depth, elevation], IDENTITY, every)
+    assert images.shape == (2, 5, 3, 3)
+    assert images[0, 3, 0].tolist() == [0, 1 / 512, 4]
+    torch.testing.assert_close(images[:, 4], elevation)
+    without = normalize([rgb, depth], IDENTITY, every[:2])
+    torch.testing.assert_close(without, images[:, :4])
+    flat = normalize([rgb, elevation], RGB_NORMALIZATION, ("rgb", "elevation"))
+    torch.testing.assert_close(flat[:, 3], elevation)
+
+
+@pytest.mark.parametrize(
+    "inputs",
+    [
+        (),
+        ("depth",),
+        ("rgb", "rgb"),
+        ("rgb", "heat"),
+        ("rgb", "elevation") * 2,
+        "rgb",
+    ],
+)
+def test_impossible_inputs(inputs: Any) -> None:
+    with pytest.raises(SettingError, match=r"data\.inputs: found .* expected a list: rgb"):
+        checked_inputs(inputs)
+
+
+def test_inputs_come_in_the_order_of_the_channels() -> None:
+    assert checked_inputs(["elevation", "depth", "rgb"]) == ("rgb", "depth", "elevation")
+
+
+# --- samples -----------------------------------------------------------------------------------
+
+
+def _training(strips: Representation, seed: int = 0) -> TrainingImages:
+    source: ImageSource[Panorama] = Positions()
+    return TrainingImages(source, strips, seed, DEPTH)
+
+
+def test_training_sample(strips: Representation) -> None:
+    sample = _training(strips)[4, 1]
+    rgb, depth = sample.images
+    assert (rgb.shape, rgb.dtype) == ((2, 16, 8, 3), torch.uint8)
+    assert (depth.shape, depth.dtype) == ((2, 16, 8), torch.int16)
+    assert (sample.labels.shape, sample.labels.dtype) == ((2, 16, 8), torch.uint8)
+    assert sample.index == 1
+    # The same pixels in all channels.
+    for channel in range(3):
+        torch.testing.assert_close(rgb[..., channel], sample.labels)
+    torch.testing.assert_close(depth, sample.labels.short() * 4)
+
+
+def test_depth_is_clipped_and_missing_is_zero(
+    strips: Representation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steps = np.tile(np.array([0, 1, 2047, 2048, 2049, 32768, 65535, 0], np.uint16), (16, 4))
+    panorama = Positions().read(0)._replace(depth=steps)
+    monkeypatch.setattr(Positions, "read", lambda *_: panorama)
+    images = EvaluationImages(Positions(), strips, DEPTH)[0, 0].images
+    assert images[1][0, 0].tolist() == [0, 1, 2047, 2048, 2048, 2048, 2048, 0]
+    assert normalize(images, IDENTITY, DEPTH)[0, 3, 0, 3] == 4  # metres
+
+
+def test_views_are_those_of_seed_epoch_and_index(strips: Representation) -> None:
+    first = _training(strips)[4, 1].labels
+    assert torch.equal(first, _training(strips)[4, 1].labels)
+    assert not torch.equal(first, _training(strips)[5, 1].labels)
+    assert not torch.equal(first, _training(strips, seed=1)[4, 1].labels)
+
+
+def test_evaluation_sample(strips: Representation) -> None:
+    dataset = EvaluationImages(Positions(), strips, DEPTH)
+    sample = dataset[0, 2]
+    assert len(dataset) == len(_training(strips)) == 3
+    images = normalize(sample.images, IDENTITY, DEPTH)
+    assert images.shape == (4, 4, 16, 8)
+    assert sample.index == 2
+    np.testing.assert_array_equal(sample.target.numpy(), Positions().read(2).labels)
+    joined = torch.cat(list(images[:, 0]), dim=1)
+    torch.testing.assert_close(joined, sample.target.float())
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_batches_are_those_of_torch(strips: Representation, count: int) -> None:
+    training: Any = _training(strips)
+    evaluation: Any = EvaluationImages(Positions(), strips, DEPTH)
+    for samples in ([d[0, i] for i in range(count)] for d in (training, evaluation)):
+        found, expected = collate(samples), default_collate(samples)
+        assert type(found) is type(expected)
+        assert torch.equal(found[1], expected[1])
+        assert torch.equal(torch.as_tensor(found.index), torch.as_tensor(expected.index))
+        for image, wanted in zip(found.images, expected.images, strict=True):
+            assert torch.equal(image, wanted)
+
+
+def test_samples_share_no_memory_with_panoramas(
+    strips: Representation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    panorama = Positions().read(0)
+    monkeypatch.setattr(Positions, "read", lambda *_: panorama)
+    whole = EquirectRepresentation(level=3)
+    for dataset in (
+        TrainingImages(Positions(), whole, 0, DEPTH),
+        EvaluationImages(Positions(), whole, DEPTH),
+    ):
+        for tensor in (*(sample := dataset[0, 0]).images, sample[1]):
+            assert not any(np.shares_memory(tensor.numpy(), part) for part in panorama)
+
+
+def test_samples_collate(strips: Representation) -> None:
+    training = _training(strips)
+    batch = default_collate([training[0, 0], training[0, 2]])
+    assert isinstance(batch, TrainingSample)
+    assert [image.shape for image in batch.images] == [(2, 2, 16, 8, 3), (2, 2, 16, 8)]
+    assert batch.labels.dtype == torch.uint8
+    assert torch.as_tensor(batch.index).tolist() == [0, 2]
+    whole = default_collate([EvaluationImages(Positions(), strips, DEPTH)[0, 1]])
+    assert isinstance(whole, EvaluationSample)
+    assert whole.target.shape == (1, 16, 32)
+
+
+# --- colours -----------------------------------------------------------------------------------
+
+
+def test_jitter_changes_the_colours_and_nothing_else(strips: Representation) -> None:
+    plain, jittered = (
+        TrainingImages(Positions(), strips, 0, DEPTH),
+        TrainingImages(Positions(), strips, 0, DEPTH, 0.5),
+    )
+    for epoch in range(3):
+        before, after = plain[epoch, 1], jittered[epoch, 1]
+        assert not torch.equal(before.images[0], after.images[0])
+        assert torch.equal(before.images[1], after.images[1])
+        assert torch.equal(before.labels, after.labels)
+        assert torch.equal(after.images[0], jittered[epoch, 1].images[0])
+
+
+@pytest.mark.parametrize("strength", [0.1, 0.4])
+def test_jitter_against_slow_formulas(strength: float) -> None:
+    rgb = np.random.default_rng(1).integers(40, 160, (2, 3, 5, 3), np.uint8)
+    found = jitter_colors(torch.from_numpy(rgb), strength, np.random.default_rng(7)).numpy()
+    rng = np.random.default_rng(7)
+    brightness, contrast, saturation = (rng.uniform(1 - strength, 1 + strength) for _ in range(3))
+    hue = rng.uniform(-1, 1) * strength / 10
+
+    def grey(colors: NDArray[np.floating]) -> NDArray[np.floating]:
+        return colors @ [0.2989, 0.587, 0.114]
+
+    colors = np.minimum(rgb / 255 * brightness, 1)
+    colors = np.clip(contrast * colors + (1 - contrast) * grey(colors).mean(), 0, 1)
+    colors = np.clip(saturation * colors + (1 - saturation) * grey(colors)[..., None], 0, 1)
+    for place in np.ndindex(rgb.shape[:3]):
+        h, s, v = colorsys.rgb_to_hsv(*colors[place])
+        expected = colorsys.hsv_to_rgb((h + hue) % 1, s, v)
+        np.testing.assert_allclose(found[place] / 255, expected, atol=4 / 255)
+
+
+def test_jitter_of_neighbouring_images_agrees() -> None:
+    # The same colour in a dark and in a bright image stays the same colour.
+    rgb = torch.zeros((2, 4, 4, 3), dtype=torch.uint8)
+    rgb[1] = 200
+    rgb[:, 0] = torch.tensor([90, 120, 60], dtype=torch.uint8)
+    found = jitter_colors(rgb, 0.5, np.random.default_rng(3))
+    assert torch.equal(found[0, 0], found[1, 0])
+    assert not torch.equal(found[0, 0], rgb[0, 0])

@@ -1,0 +1,83 @@
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from datamodules.folder.classes import read_classes
+from tangent_train.errors import DataError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+def _write_json(path: Path, text: str) -> Path:
+    (path / "classes.json").write_text(text)
+    return path / "classes.json"
+
+
+def test_forms_of_classes(tmp_path: Path) -> None:
+    listed = read_classes(_write_json(tmp_path, '["wall", null, "floor"]'))
+    assert listed.names == ("wall", "floor")
+    assert listed.decode(np.arange(4)).tolist() == [1, 0, 2, 0]
+    named = read_classes(_write_json(tmp_path, '{"b": [5, 3], "a": 4}'))
+    assert named.names == ("b", "a")
+    assert named.decode(np.arange(7, dtype=np.uint8)).tolist() == [0, 0, 0, 1, 2, 1, 0]
+    colors = read_classes(_write_json(tmp_path, '{"b": ["#0A0000", "#00000a"], "a": "#000a00"}'))
+    stored = np.array([[10, 0, 0], [0, 10, 0], [0, 0, 10], [10, 10, 0]], np.uint8)
+    assert colors.decode(stored[None]).tolist() == [[1, 2, 1, 0]]
+
+
+def test_colors_are_compared_exactly_with_a_slow_reading(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    table = rng.choice(1 << 24, 255, replace=False)
+    content = {f"c{place}": f"#{code:06x}" for place, code in enumerate(table)}
+    classes = read_classes(_write_json(tmp_path, json.dumps(content)))
+    codes = np.concatenate([table, table + 1, table - 1, rng.integers(0, 1 << 24, 1000)])
+    codes = codes.clip(0, (1 << 24) - 1)
+    stored = np.stack([codes >> 16, codes >> 8 & 255, codes & 255], -1).astype(np.uint8)[None]
+    places = {int(code): place + 1 for place, code in enumerate(table)}
+    assert classes.decode(stored)[0].tolist() == [places.get(int(code), 0) for code in codes]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "Expecting value"),
+        ('["wall",]', "expected a list of class names"),
+        ("3", "found 3; expected a list of class names"),
+        ("[]", "found 0 classes; expected 1 to 255"),
+        ("{}", "found 0 classes"),
+        ("[null]", "found 0 classes"),
+        (json.dumps([str(n) for n in range(256)]), "found 256 classes"),
+        ('["a", 3]', "class name 3"),
+        ('["a", ""]', "class name ''"),
+        ('["a", ["b"]]', "class name ['b']"),
+        ('["a", "b", "a"]', "class 'a' twice"),
+        ('{"a": 1, "a": 2}', "class 'a' twice"),
+        ('["unknown", "a"]', "Leave it out; in a list, write null in its place."),
+        ('{"a": 1, "b": 1}', "found 1 for 'a' and 'b'; expected every value or colour once"),
+        ('{"a": [1, 1]}', "found 1 for 'a' and 'a'"),
+        ('{"a": "#00ff00", "b": "#00FF00"}', "found #00FF00 for 'a' and 'b'"),
+        ('{"a": 1, "b": "#00ff00"}', "found values and colours; expected either"),
+        ('{"a": 0, "b": "#000000"}', "found values and colours; expected either"),
+        ('{"a": []}', "found nothing for 'a'"),
+        ('{"a": -1}', "found -1 for 'a'; expected a value of 0 to 65535"),
+        ('{"a": 65536}', "found 65536 for 'a'"),
+        ('{"a": 1.5}', "found 1.5 for 'a'"),
+        ('{"a": true}', "found true for 'a'"),
+        ('{"a": null}', "found null for 'a'"),
+        ('{"a": "red"}', "found \"red\" for 'a'"),
+        ('{"a": "#fff"}', 'found "#fff" for'),
+        ('{"a": {"b": 1}}', "for 'a'; expected a value"),
+        ("[" * 100_000, "expected a list of class names"),
+    ],
+)
+def test_class_lists_that_cannot_be_used(tmp_path: Path, text: str, message: str) -> None:
+    path = _write_json(tmp_path, text)
+    with pytest.raises(DataError, match=r"classes\.json: found") as info:
+        read_classes(path)
+    assert message in str(info.value)
+    assert len(str(info.value)) < 600

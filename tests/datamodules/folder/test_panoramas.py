@@ -1,0 +1,411 @@
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from datamodules.core.samples import RGB_NORMALIZATION, RGBD_NORMALIZATION, Normalization
+from datamodules.folder.panoramas import FolderPanoramas
+from tangent_train.errors import DataError, SettingError
+from tests.datamodules.folder.folder_format import (
+    CLASS_OF_STORED,
+    NAMES,
+    blocks,
+    save,
+    save_depth,
+    write_classes,
+    write_data_set,
+    write_panorama,
+)
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from datamodules.core.panorama_module import Split
+
+_SPLITS: tuple[Split, ...] = ("train", "val", "test")
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Six scenes of two panoramas, 32×64; not to be changed."""
+    return write_data_set(tmp_path_factory.mktemp("folder") / "data", depth=True)
+
+
+@pytest.fixture
+def own_root(root: Path, tmp_path: Path) -> Path:
+    """A copy of it, to be changed."""
+    return Path(shutil.copytree(root, tmp_path / "data"))
+
+
+def _names(module: FolderPanoramas, split: Split) -> list[str]:
+    source = module.open_split(split)
+    return [source.name(index) for index in range(len(source))]
+
+
+# Pixels
+
+
+def test_what_tasks_ask_for(root: Path, strips: Any) -> None:
+    module = FolderPanoramas(root, strips)
+    assert module.class_names == ("unknown", *NAMES)
+    assert (module.inputs, module.in_channels) == (("rgb",), 3)
+    assert module.normalization == RGB_NORMALIZATION
+    both = FolderPanoramas(root, strips, inputs=["rgb", "depth"])
+    assert both.normalization == RGBD_NORMALIZATION
+    own = FolderPanoramas(root, strips, normalization={"mean": [0, 0.5, 1], "std": [1, 1, 2]})
+    assert own.normalization == Normalization((0, 0.5, 1), (1, 1, 2))
+    with pytest.raises(SettingError, match=r"data\.normalization: found .* expected mean and std"):
+        FolderPanoramas(root, strips, normalization={"mean": [0]})
+
+
+@pytest.mark.parametrize("split", _SPLITS)
+def test_pixels_are_those_of_the_files(root: Path, strips: Any, split: Split) -> None:
+    module = FolderPanoramas(root, strips, inputs=["rgb", "depth"], depth_units_per_m=2000)
+    source = module.open_split(split)
+    classes = np.zeros(256, np.uint8)
+    classes[list(CLASS_OF_STORED)] = list(CLASS_OF_STORED.values())
+    assert len(source) >= 1
+    for index in range(len(source)):
+        name = source.name(index)
+        panorama = source.read(index)
+        (path,) = (root / "images").glob(f"{name}.*")
+        with Image.open(path) as image:
+            rgb = np.asarray(image.convert("RGB"))
+        mean = rgb.reshape(16, 2, 32, 2, 3).mean(axis=(1, 3))
+        assert np.abs(panorama.rgb - mean).max() <= 0.5
+        # Of 2×2 pixels the lower right one is nearest to the centre, as for all data sets.
+        stored = cv2.imread(str(root / "labels" / f"{name}.png"), cv2.IMREAD_UNCHANGED)
+        assert stored is not None
+        np.testing.assert_array_equal(panorama.labels, classes[stored[1::2, 1::2]])
+        units = cv2.imread(str(root / "depth" / f"{name}.png"), cv2.IMREAD_UNCHANGED)
+        assert units is not None
+        assert panorama.depth is not None
+        meters = units[1::2, 1::2] / 2000
+        assert np.abs(panorama.depth / 512 - meters).max() <= 0.5 / 512
+        counts = np.bincount(panorama.labels.ravel(), minlength=256)
+        np.testing.assert_array_equal(source.label_counts(index), counts)
+
+
+def test_depth_files_of_all_kinds(own_root: Path, strips: Any) -> None:
+    folder = own_root / "depth" / "scene_0"
+    meters = np.full((32, 64), 2.5, np.float32)
+    meters[:16] = np.nan
+    meters[16:, :2] = 1e-4
+    meters[16:, 2:4] = 200
+    (folder / "view.0.png").unlink()
+    np.save(folder / "view.0.npy", meters)
+    (folder / "view.1.png").unlink()
+    Image.fromarray(meters).save(folder / "view.1.tif")
+    (own_root / "test.txt").write_text("scene_0/view.0\nscene_0/view.1\n")
+    source = FolderPanoramas(own_root, strips, inputs=["rgb", "depth"]).open_split("test")
+    for index in range(2):
+        depth = source.read(index).depth
+        assert depth is not None
+        assert depth.dtype == np.uint16
+        assert not depth[:8].any()
+        assert (depth[8:, 0] == 1).all(), "near is not missing"
+        assert (depth[8:, 1] == 65535).all()
+        assert (depth[8:, 2:] == 1280).all()
+
+
+def _one_panorama(root: Path, stored: Image.Image, classes: Any, **settings: Any) -> None:
+    """A data set whose only test panorama has these labels, the others having class 1."""
+    write_classes(root, classes)
+    for number in range(3):
+        write_panorama(root, f"{number}", number, 16)
+    stored.save(root / "labels" / "0.png", **settings)
+    (root / "test.txt").write_text("0")
+
+
+def _test_labels(root: Path, strips: Any) -> NDArray[np.uint8]:
+    return FolderPanoramas(root, strips).open_split("test").read(0).labels
+
+
+def test_16_bit_values(tmp_path: Path, strips: Any) -> None:
+    values = np.array([0, 1, 255, 256, 1000, 65535], np.uint16)
+    stored = np.resize(values, (16, 32))
+    _one_panorama(tmp_path, Image.new("L", (32, 16)), {"high": 65535, "mid": [256, 1000], "x": 0})
+    save_depth(tmp_path / "labels" / "0.png", stored)
+    expected = np.array([3, 0, 0, 2, 2, 1], np.uint8)
+    np.testing.assert_array_equal(_test_labels(tmp_path, strips), np.resize(expected, (16, 32)))
+
+
+@pytest.mark.parametrize("colors", [4, 16, 256])
+@pytest.mark.parametrize("transparent", [False, True])
+def test_palettes_are_entries_or_colors(
+    tmp_path: Path, strips: Any, colors: int, transparent: bool
+) -> None:
+    rng = np.random.default_rng(colors)
+    stored = rng.integers(0, colors, (16, 32), np.uint8)
+    palette = np.stack((*np.divmod(np.arange(colors), 16), np.full(colors, 200)), -1)
+    image = Image.fromarray(stored, "P")
+    image.putpalette(palette.astype(np.uint8).tobytes())
+    settings: dict[str, Any] = {"bits": {4: 2, 16: 4, 256: 8}[colors]}
+    if transparent:
+        settings["transparency"] = bytes(range(colors))
+    _one_panorama(tmp_path, image, [None, "one", "two", "three"], **settings)
+    expected = np.where(stored < 4, stored, 0)
+    np.testing.assert_array_equal(_test_labels(tmp_path, strips), expected)
+    write_classes(tmp_path, {"two": "#0002c8", "three": "#0003C8"})
+    expected = np.select([stored == 2, stored == 3], [1, 2])
+    np.testing.assert_array_equal(_test_labels(tmp_path, strips), expected)
+
+
+@pytest.mark.parametrize("mode", ["RGB", "RGBA", "L", "LA"])
+def test_colors(tmp_path: Path, strips: Any, mode: str) -> None:
+    rng = np.random.default_rng(0)
+    grey = rng.choice(np.array([0, 17, 34, 255], np.uint8), (16, 32))
+    rgb = np.repeat(grey[..., None], 3, axis=-1)
+    if mode.startswith("RGB"):
+        rgb[..., 1] = rng.choice(np.array([0, 17], np.uint8), (16, 32))
+    image = Image.fromarray(rgb).convert(mode)
+    if mode.endswith("A"):
+        image.putalpha(Image.fromarray(rng.integers(0, 256, (16, 32), np.uint8)))
+    _one_panorama(tmp_path, image, {"a": ["#000000", "#110011"], "b": "#111111", "c": "#ff11FF"})
+    expected = np.zeros((16, 32), np.uint8)
+    for color, label in {(0, 0, 0): 1, (17, 0, 17): 1, (17, 17, 17): 2, (255, 17, 255): 3}.items():
+        expected[(rgb == color).all(-1)] = label
+    np.testing.assert_array_equal(_test_labels(tmp_path, strips), expected)
+
+
+def test_values_beside_transparency(tmp_path: Path, strips: Any) -> None:
+    stored = np.resize(np.arange(5, dtype=np.uint8), (16, 32))
+    image = Image.fromarray(stored)
+    image.putalpha(100)
+    _one_panorama(tmp_path, image, ["a", "b", "c"])
+    expected = np.where(stored < 3, stored + 1, 0)
+    np.testing.assert_array_equal(_test_labels(tmp_path, strips), expected)
+
+
+def test_as_many_classes_as_there_can_be(tmp_path: Path, strips: Any) -> None:
+    stored = np.resize(np.arange(256, dtype=np.uint8), (16, 32))
+    _one_panorama(tmp_path, Image.fromarray(stored), [f"class {n}" for n in range(255)])
+    labels = _test_labels(tmp_path, strips)
+    np.testing.assert_array_equal(labels, np.where(stored < 255, stored.astype(int) + 1, 0))
+    weights = FolderPanoramas(tmp_path, strips, validation_fraction=0).class_weights("none")
+    assert len(weights) == 256
+
+
+def test_odd_sizes_are_shrunk_on_one_grid(tmp_path: Path, strips: Any) -> None:
+    write_classes(tmp_path)
+    for number in range(3):
+        write_panorama(tmp_path, f"{number}", number, 37)
+    source = FolderPanoramas(tmp_path, strips).open_split("test")
+    panorama = source.read(0)
+    values = blocks(int(source.name(0)), 37)
+    rows = [int((i + 0.5) * 37 / 16) for i in range(16)]
+    columns = [int((j + 0.5) * 74 / 32) for j in range(32)]
+    expected = [[CLASS_OF_STORED[int(values[i, j])] for j in columns] for i in rows]
+    np.testing.assert_array_equal(panorama.labels, expected)
+    assert panorama.rgb.shape == (16, 32, 3)
+
+
+# The store, memory, turned panoramas
+
+
+def test_the_prepared_store_gives_the_same(root: Path, tmp_path: Path, strips: Any) -> None:
+    plain = FolderPanoramas(root, strips, inputs=["rgb", "depth"])
+    stored = FolderPanoramas(root, strips, inputs=["rgb", "depth"], store=tmp_path / "store")
+    with pytest.raises(DataError, match="tangent-prepare"):
+        stored.source("test").read(0)
+    stored.prepare_all()
+    remembered = FolderPanoramas(root, strips, inputs=["rgb", "depth"], in_memory=True)
+    for split in _SPLITS:
+        for index in range(len(plain.source(split))):
+            expected = plain.source(split).read(index)
+            for module in (stored, remembered):
+                for part, other in zip(expected, module.source(split).read(index), strict=True):
+                    np.testing.assert_array_equal(part, other)
+
+
+def test_a_store_of_other_classes_is_made_anew(own_root: Path, tmp_path: Path, strips: Any) -> None:
+    store = tmp_path / "store"
+    FolderPanoramas(own_root, strips, store=store).prepare_all()
+    write_classes(own_root, {"wall": 2, "floor": 1, "window": 255})
+    changed = FolderPanoramas(own_root, strips, store=store)
+    with pytest.raises(DataError, match="made from classes"):
+        changed.source("test").read(0)
+    changed.prepare_all()
+    expected = FolderPanoramas(own_root, strips).source("test").read(0).labels
+    np.testing.assert_array_equal(changed.source("test").read(0).labels, expected)
+
+
+def test_a_store_of_other_depth_units_is_made_anew(root: Path, tmp_path: Path, strips: Any) -> None:
+    both: dict[str, Any] = {"inputs": ["rgb", "depth"], "store": tmp_path}
+    FolderPanoramas(root, strips, **both).prepare_all()
+    FolderPanoramas(root, strips, store=tmp_path).source("test").read(0)
+    other = FolderPanoramas(root, strips, depth_units_per_m=1, **both)
+    with pytest.raises(DataError, match="depth units per metre 1000"):
+        other.source("test").read(0)
+
+
+def test_turned_test_panoramas(root: Path, strips: Any) -> None:
+    plain = FolderPanoramas(root, strips).source("test").read(0)
+    turned = FolderPanoramas(root, strips, test_rotation="so3").source("test").read(0)
+    assert (plain.labels != turned.labels).mean() > 0.2
+    assert set(np.unique(turned.labels)) <= set(np.unique(plain.labels))
+
+
+def test_loaders(root: Path, strips: Any) -> None:
+    module = FolderPanoramas(root, strips, inputs=["rgb", "depth"], panoramas_per_step=2)
+    batch = next(iter(module.train_dataloader()))
+    images = module.on_after_batch_transfer(batch, 0).images
+    assert images.shape[-3:] == (4, 16, 8)
+    assert set(np.unique(batch.labels.numpy())) <= {0, 1, 2, 3}
+    source = module.source("train")
+    counts = np.sum([source.label_counts(index) for index in range(len(source))], axis=0)
+    assert counts.sum() == len(source) * 16 * 32
+    shares = counts[1:4] / counts[1:4].sum()
+    expected = [0, *(1 / np.log(1.02 + shares))]
+    np.testing.assert_allclose(module.class_weights("log").numpy(), expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"test_fraction": 0}, r"data\.test_fraction: found 0"),
+        ({"test_fraction": 1}, r"data\.test_fraction: found 1"),
+        ({"validation_fraction": 1}, r"data\.validation_fraction: found 1"),
+        ({"split_seed": -1}, r"data\.split_seed: found -1"),
+        ({"depth_units_per_m": 0}, r"data\.depth_units_per_m: found 0"),
+    ],
+)
+def test_impossible_settings(root: Path, strips: Any, settings: Any, message: str) -> None:
+    with pytest.raises(SettingError, match=message):
+        FolderPanoramas(root, strips, **settings)
+
+
+# What is wrong with files
+
+
+def _remove_label(root: Path) -> None:
+    (root / "labels" / "scene_1" / "view.1.png").unlink()
+
+
+def _cut_label(root: Path) -> None:
+    path = root / "labels" / "scene_1" / "view.1.png"
+    path.write_bytes(path.read_bytes()[:-20])
+
+
+def _small_label(root: Path) -> None:
+    save(root / "labels" / "scene_1" / "view.1.png", blocks(0, 16))
+
+
+def _color_label(root: Path) -> None:
+    save(root / "labels" / "scene_1" / "view.1.png", np.zeros((32, 64, 3), np.uint8))
+
+
+def _bits_label(root: Path) -> None:
+    Image.new("1", (64, 32)).save(root / "labels" / "scene_1" / "view.1.png")
+
+
+def _narrow_image(root: Path) -> None:
+    save(root / "images" / "scene_1" / "view.1.jpg", np.zeros((32, 60, 3), np.uint8))
+
+
+def _small_image(root: Path) -> None:
+    write_panorama(root, "scene_1/view.1", 0, 8, ".jpg", depth=True)
+
+
+def _broken_image(root: Path) -> None:
+    (root / "images" / "scene_1" / "view.1.jpg").write_text("no image")
+
+
+def _two_images(root: Path) -> None:
+    write_panorama(root, "scene_1/view.1", 0, suffix=".png")
+
+
+def _no_images(root: Path) -> None:
+    shutil.rmtree(root / "images")
+    (root / "images").mkdir()
+
+
+def _no_labels(root: Path) -> None:
+    shutil.rmtree(root / "labels")
+
+
+def _no_depth(root: Path) -> None:
+    (root / "depth" / "scene_1" / "view.1.png").unlink()
+
+
+def _two_depths(root: Path) -> None:
+    np.save(root / "depth" / "scene_1" / "view.1.npy", np.ones((32, 64)))
+
+
+def _small_depth(root: Path) -> None:
+    save_depth(root / "depth" / "scene_1" / "view.1.png", np.ones((16, 32), np.uint16))
+
+
+def _small_depth_array(root: Path) -> None:
+    _no_depth(root)
+    np.save(root / "depth" / "scene_1" / "view.1.npy", np.ones((16, 32)))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (_remove_label, r"labels/scene_1/view\.1\.png: found .*No such file"),
+        (_cut_label, r"labels/scene_1/view\.1\.png: found .*parts missing"),
+        (_small_label, r"view\.1\.png: found 16×32 pixels; expected 32×64, as .*view\.1\.jpg"),
+        (_color_label, r"view\.1\.png: found 8-bit RGB; expected .*names values"),
+        (_bits_label, r"view\.1\.png: found 1-bit grey; expected 8-bit grey.*Convert"),
+        (_narrow_image, r"view\.1\.jpg: found 32×60 pixels; expected twice as wide"),
+        (_broken_image, r"view\.1\.jpg: found no image that can be decoded"),
+        (_two_images, r"view\.1\.png: found view\.1\.jpg beside it|view\.1\.jpg: found view"),
+        (_no_images, r"images: found nothing; expected"),
+        (_no_labels, r"labels: found no such folder; .*docs/own_data\.md"),
+        (_no_depth, r"depth/scene_1/view\.1: found no such file; .*data\.inputs=\[rgb\]"),
+        (_two_depths, r"found view\.1\.png, view\.1\.npy; expected one file"),
+        (_small_depth, r"depth/scene_1/view\.1\.png: found 16×32 pixels; expected 32×64"),
+        (_small_depth_array, r"depth/scene_1/view\.1\.npy: found 16×32 pixels"),
+    ],
+)
+def test_files_that_cannot_be_used(own_root: Path, strips: Any, spoil: Any, message: str) -> None:
+    spoil(own_root)
+    with pytest.raises(DataError, match=message):
+        FolderPanoramas(own_root, strips, inputs=["rgb", "depth"]).setup()
+
+
+def test_images_of_fewer_rows_than_wanted(own_root: Path, strips: Any) -> None:
+    _small_image(own_root)
+    with pytest.raises(SettingError, match=r"erp_height: found 16; expected at most the 8 rows"):
+        FolderPanoramas(own_root, strips).setup()
+
+
+def test_missing_folders_and_classes(tmp_path: Path, strips: Any) -> None:
+    with pytest.raises(DataError, match=r"nowhere/classes\.json: found no folder .*data\.root="):
+        FolderPanoramas(tmp_path / "nowhere", strips)
+    write_classes(tmp_path)
+    with pytest.raises(DataError, match="images: found no such folder"):
+        FolderPanoramas(tmp_path, strips).setup()
+
+
+@pytest.mark.parametrize(
+    ("classes", "message"),
+    [
+        ({"sky": 77, "sea": [78, 100]}, r"found values 0, 1, 2, 3, 4, 255, .* values 77, 78, 100"),
+        ([None] * 90 + ["a"] * 1, r"expected values 90, as classes\.json says"),
+    ],
+)
+def test_class_lists_of_other_labels(
+    own_root: Path, strips: Any, classes: Any, message: str
+) -> None:
+    write_classes(own_root, classes)
+    with pytest.raises(DataError, match=message):
+        FolderPanoramas(own_root, strips).setup()
+
+
+def test_some_files_without_any_class_are_fine(own_root: Path, strips: Any) -> None:
+    save(own_root / "labels" / "scene_0" / "view.0.png", np.zeros((32, 64), np.uint8))
+    module = FolderPanoramas(own_root, strips, validation_fraction=0)
+    source = module.open_split("train")
+    names = _names(module, "train")
+    index = names.index("scene_0/view.0") if "scene_0/view.0" in names else None
+    assert index is not None
+    assert source.label_counts(index)[0] == 16 * 32

@@ -1,0 +1,146 @@
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from datamodules.folder.panoramas import FolderPanoramas
+from tangent_train.errors import DataError
+from tests.datamodules.folder.folder_format import write_classes, write_data_set, write_panorama
+
+if TYPE_CHECKING:
+    from datamodules.core.panorama_module import Split
+
+_SPLITS: tuple[Split, ...] = ("train", "val", "test")
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Six scenes of two panoramas, 32×64; not to be changed."""
+    return write_data_set(tmp_path_factory.mktemp("folder") / "data", depth=True)
+
+
+@pytest.fixture
+def own_root(root: Path, tmp_path: Path) -> Path:
+    """A copy of it, to be changed."""
+    return Path(shutil.copytree(root, tmp_path / "data"))
+
+
+def _names(module: FolderPanoramas, split: Split) -> list[str]:
+    source = module.open_split(split)
+    return [source.name(index) for index in range(len(source))]
+
+
+def _all_names(module: FolderPanoramas) -> dict[str, list[str]]:
+    return {split: _names(module, split) for split in _SPLITS}
+
+
+def _together(names: dict[str, list[str]]) -> list[str]:
+    """The names in all splits, none of them twice."""
+    found = [name for split in names.values() for name in split]
+    assert len(set(found)) == len(found)
+    return sorted(found)
+
+
+def test_whole_scenes_are_drawn(root: Path, strips: Any) -> None:
+    chosen: dict[str, str] = {}
+    for split, names in _all_names(FolderPanoramas(root, strips)).items():
+        for name in names:
+            assert chosen.setdefault(name.partition("/")[0], split) == split
+    splits = list(chosen.values())
+    assert len(chosen) == 6
+    assert (splits.count("test"), splits.count("val"), splits.count("train")) == (1, 1, 4)
+
+
+def test_shares_and_seeds_of_the_drawing(tmp_path: Path, strips: Any) -> None:
+    root = write_data_set(tmp_path, scenes=20, each=1, height=16)
+    names = _all_names(FolderPanoramas(root, strips, seed=5))
+    assert [len(names[split]) for split in _SPLITS] == [14, 2, 4]
+    assert len(_together(names)) == 20
+    assert _all_names(FolderPanoramas(root, strips, seed=6)) == names, "not the run's seed"
+    other = _all_names(FolderPanoramas(root, strips, split_seed=1))
+    assert other["test"] != names["test"]
+    assert other["val"] != names["val"]
+    settings: dict[str, Any] = {"test_fraction": 0.5, "validation_fraction": 0}
+    half = _all_names(FolderPanoramas(root, strips, **settings))
+    assert [len(half[split]) for split in _SPLITS] == [10, 0, 10]
+    assert FolderPanoramas(root, strips, **settings).val_dataloader() == []
+
+
+def test_single_images_are_drawn_where_there_are_no_folders(tmp_path: Path, strips: Any) -> None:
+    write_classes(tmp_path)
+    for number in range(10):
+        write_panorama(tmp_path, f"{number}", number, 16)
+    names = _all_names(FolderPanoramas(tmp_path, strips))
+    assert [len(names[split]) for split in _SPLITS] == [7, 1, 2]
+
+
+def test_lists_of_all_splits(own_root: Path, strips: Any) -> None:
+    lists = {
+        "train": "\ufeffscene_5/view.1\n\n# the kitchen\nscene_0/view.0.png\r\n",
+        "val": "scene_1/view.1",
+        "test": "scene_0/view.1\nscene_3/view.0\n",
+    }
+    for split, text in lists.items():
+        (own_root / f"{split}.txt").write_text(text, "utf-8")
+    module = FolderPanoramas(own_root, strips)
+    assert _all_names(module) == {
+        "train": ["scene_0/view.0", "scene_5/view.1"],
+        "val": ["scene_1/view.1"],
+        "test": ["scene_0/view.1", "scene_3/view.0"],
+    }
+    assert _names(FolderPanoramas(own_root, strips, validation_fraction=0), "val") == []
+
+
+def test_lists_of_some_splits(own_root: Path, strips: Any) -> None:
+    all_names = sorted(f"scene_{scene}/view.{view}" for scene in range(6) for view in range(2))
+    (own_root / "test.txt").write_text("scene_2/view.0\n")
+    names = _all_names(FolderPanoramas(own_root, strips))
+    assert names["test"] == ["scene_2/view.0"]
+    assert _together(names) == all_names
+    assert len({name.partition("/")[0] for name in names["val"]}) == 1
+
+    (own_root / "test.txt").unlink()
+    (own_root / "train.txt").write_text("\n".join(all_names[:8]))
+    names = _all_names(FolderPanoramas(own_root, strips))
+    assert names["test"] == all_names[8:], "all that are in no list"
+    assert sorted(names["train"] + names["val"]) == all_names[:8]
+
+    (own_root / "train.txt").unlink()
+    (own_root / "val.txt").write_text("\n".join(all_names[:3]))
+    names = _all_names(FolderPanoramas(own_root, strips))
+    assert names["val"] == all_names[:3]
+    assert len({name.partition("/")[0] for name in names["test"]}) == 1
+    assert _together(names) == all_names
+
+
+@pytest.mark.parametrize(
+    ("lists", "message"),
+    [
+        ({"test": "scene_9/view.0"}, r"test\.txt: found 'scene_9/view\.0', of which there is no"),
+        ({"test": "scene_0/view.0\nscene_0/view.0"}, r"test\.txt: found .* also in .*test\.txt"),
+        ({"test": "scene_0/view.0", "train": "scene_0/view.0"}, r"also in .*train\.txt"),
+        ({"test": ""}, r"found no panoramas for test; .* Name some in test\.txt"),
+        ({"train": ""}, "no panoramas for train"),
+        ({"val": "# none"}, r"no panoramas for val; .*data\.validation_fraction=0"),
+        ({"test": "scene_0/view.0", "train": "scene_0/view.1", "val": ""}, "panoramas for val"),
+        ({"train": "scene_0/view.0"}, r"found 1 scenes to draw those of val .*fraction=0"),
+        ({"test": b"\xff\xfe"}, r"test\.txt: found .*UTF-8"),
+    ],
+)
+def test_lists_that_cannot_be_used(
+    own_root: Path, strips: Any, lists: dict[str, str | bytes], message: str
+) -> None:
+    for split, text in lists.items():
+        content = text if isinstance(text, bytes) else text.encode()
+        (own_root / f"{split}.txt").write_bytes(content)
+    with pytest.raises(DataError, match=message):
+        FolderPanoramas(own_root, strips).setup()
+
+
+def test_one_scene_cannot_be_split(tmp_path: Path, strips: Any) -> None:
+    root = write_data_set(tmp_path, scenes=1, each=3)
+    with pytest.raises(DataError, match=r"found 1 scenes .* name some in test\.txt"):
+        FolderPanoramas(root, strips).setup()

@@ -1,0 +1,338 @@
+from __future__ import annotations
+
+import struct
+import zlib
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from datamodules.images.gpano import PanoramaArea, area_of, area_of_crop, whole_area
+from tangent_train.errors import DataError, SettingError
+from tangent_train.geometry import equirect_to_lonlat
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+_TAGS = {
+    "ProjectionType": "equirectangular",
+    "FullPanoWidthPixels": "360",
+    "FullPanoHeightPixels": "180",
+    "CroppedAreaImageWidthPixels": "60",
+    "CroppedAreaImageHeightPixels": "40",
+    "CroppedAreaLeftPixels": "100",
+    "CroppedAreaTopPixels": "30",
+}
+_HEAD = (
+    '<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>'
+    '<x:xmpmeta xmlns:x="adobe:ns:meta/" x:xmptk="x">'
+    '<rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+)
+_TAIL = '</rdf:RDF></x:xmpmeta>\n   \n<?xpacket end="w"?>'
+_NAMESPACE = 'xmlns:GPano="http://ns.google.com/photos/1.0/panorama/"'
+
+
+def _attributes(tags: Mapping[str, str]) -> str:
+    listed = " ".join(f'GPano:{name}="{value}"' for name, value in tags.items())
+    return f'{_HEAD}<rdf:Description rdf:about="" {_NAMESPACE} {listed}/>{_TAIL}'
+
+
+def _elements(tags: Mapping[str, str]) -> str:
+    listed = "\n".join(f"<GPano:{name}>\n {v}\n</GPano:{name}>" for name, v in tags.items())
+    other = "<rdf:Description rdf:about='' xmlns:o='x:y'><o:CroppedAreaTopPixels>7"
+    other += "</o:CroppedAreaTopPixels></rdf:Description>"
+    mine = f"<rdf:Description rdf:about='' {_NAMESPACE}>{listed}</rdf:Description>"
+    return f"{_HEAD}{other}{mine}{_TAIL}"
+
+
+def _save(path: Path, xmp: str | bytes, shape: tuple[int, int] = (40, 60)) -> Path:
+    image = Image.new("RGB", (shape[1], shape[0]))
+    content = xmp.encode() if isinstance(xmp, str) else xmp
+    if path.suffix == ".png":
+        image.save(path)
+        _add_text(path, content, before_pixels=True)
+    elif path.suffix == ".tif":
+        image.save(path, tiffinfo={700: content})
+    else:
+        image.save(path, xmp=content)
+    return path
+
+
+def _add_text(path: Path, text: bytes, *, before_pixels: bool, packed: bool = False) -> None:
+    data = b"XML:com.adobe.xmp\0" + (b"\1" if packed else b"\0") + b"\0\0\0"
+    data = b"iTXt" + data + (zlib.compress(text) if packed else text)
+    chunk = struct.pack(">I", len(data) - 4) + data + struct.pack(">I", zlib.crc32(data))
+    content = path.read_bytes()
+    place = content.index(b"IDAT" if before_pixels else b"IEND") - 4
+    path.write_bytes(content[:place] + chunk + content[place:])
+
+
+_AREA = PanoramaArea((180, 360), (30, 70), (100, 160), (40, 60))
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif", ".webp"])
+@pytest.mark.parametrize("written", [_attributes, _elements])
+def test_tags_of_all_formats(tmp_path: Path, suffix: str, written: Any) -> None:
+    path = _save(tmp_path / f"image{suffix}", written(_TAGS))
+    assert area_of(path, (40, 60)) == _AREA
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_tags_behind_the_pixels_of_a_png(tmp_path: Path, packed: bool) -> None:
+    path = tmp_path / "image.png"
+    Image.new("RGB", (60, 40)).save(path)
+    _add_text(path, _attributes(_TAGS).encode(), before_pixels=False, packed=packed)
+    assert area_of(path, (40, 60)) == _AREA
+
+
+def test_padding_and_other_encodings(tmp_path: Path) -> None:
+    padded = b"\xef\xbb\xbf" + _attributes(_TAGS).replace("\ufeff", "").encode() + b"  \0\0"
+    wide = _attributes(_TAGS).replace("\ufeff", "").encode("utf-16")
+    for number, xmp in enumerate((padded, wide)):
+        path = _save(tmp_path / f"{number}.jpg", xmp)
+        assert area_of(path, (40, 60)) == _AREA, number
+
+
+def test_images_that_say_nothing(tmp_path: Path) -> None:
+    Image.new("RGB", (60, 40)).save(tmp_path / "none.jpg")
+    incomplete = {k: v for k, v in _TAGS.items() if k != "CroppedAreaTopPixels"}
+    other = _attributes(_TAGS).replace("photos/1.0/panorama", "photos/1.0/image")
+    paths = [
+        tmp_path / "none.jpg",
+        _save(tmp_path / "incomplete.jpg", _attributes(incomplete)),
+        _save(tmp_path / "other.jpg", other),
+        _save(tmp_path / "broken.jpg", _attributes(_TAGS)[:-40]),
+    ]
+    for path in paths:
+        assert area_of(path, (40, 60)) is None, path.name
+
+
+def test_entities_are_refused(tmp_path: Path) -> None:
+    bomb = '<!DOCTYPE x [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;">]>' + _elements(_TAGS)
+    outside = '<!DOCTYPE x SYSTEM "http://127.0.0.1:1/x.dtd">' + _elements(_TAGS)
+    for text in (bomb, outside):
+        for number, encoding in enumerate(("utf-8", "utf-16")):
+            path = _save(tmp_path / f"{number}.jpg", text.replace("\ufeff", "").encode(encoding))
+            with pytest.raises(DataError, match="found XMP data with a document type declaration"):
+                area_of(path, (40, 60))
+
+
+@pytest.mark.parametrize("size", [(20, 30), (80, 120), (27, 40), (33, 50)])
+def test_resized_images_show_the_same(tmp_path: Path, size: tuple[int, int]) -> None:
+    path = _save(tmp_path / "image.jpg", _attributes(_TAGS), size)
+    area = area_of(path, size)
+    assert area is not None
+    assert area.image_shape == size
+    west, north = _angles_deg(area, (area.columns[0], area.rows[0]))
+    east, south = _angles_deg(area, (area.columns[1], area.rows[1]))
+    pixel_deg = 180 / area.full_shape[0]
+    assert np.allclose([west, east, south, north], [-80, -20, 20, 60], atol=1.01 * pixel_deg)
+    known = area.known
+    assert known.shape == area.full_shape
+    assert abs(known.sum() - size[0] * size[1]) <= max(size)
+
+
+def _angles_deg(area: PanoramaArea, corner_xy: tuple[int, int]) -> NDArray[np.float64]:
+    """Longitude and latitude of the upper left corner of a pixel."""
+    return np.degrees(equirect_to_lonlat(np.subtract(corner_xy, 0.5), area.full_shape))
+
+
+@pytest.mark.parametrize(
+    ("changes", "size", "found"),
+    [
+        ({"ProjectionType": "cylindrical"}, (40, 60), "GPano:ProjectionType cylindrical"),
+        ({"FullPanoWidthPixels": "many"}, (40, 60), "GPano:FullPanoWidthPixels 'many'"),
+        ({"FullPanoWidthPixels": "inf"}, (40, 60), "GPano:FullPanoWidthPixels 'inf'"),
+        ({"FullPanoHeightPixels": "100"}, (40, 60), r"of 100×360; expected a part"),
+        ({"CroppedAreaTopPixels": "150"}, (40, 60), r"at \(150, 100\) of 180×360; expected a part"),
+        ({"CroppedAreaImageWidthPixels": "0"}, (40, 60), "40×0 pixels"),
+        ({}, (40, 50), r"in an image of 40×50; expected those of this image\. It was cut"),
+    ],
+)
+def test_tags_that_cannot_be_are_refused(
+    tmp_path: Path, changes: dict[str, str], size: tuple[int, int], found: str
+) -> None:
+    path = _save(tmp_path / "image.jpg", _attributes(_TAGS | changes))
+    with pytest.raises(DataError, match=rf"image\.jpg: found .*{found}"):
+        area_of(path, size)
+
+
+def test_tags_of_a_whole_panorama(tmp_path: Path) -> None:
+    whole = {
+        "CroppedAreaImageWidthPixels": "360",
+        "CroppedAreaImageHeightPixels": "180",
+        "CroppedAreaLeftPixels": "0",
+        "CroppedAreaTopPixels": "0",
+    }
+    path = _save(tmp_path / "image.jpg", _attributes(_TAGS | whole))
+    for size in [(180, 360), (90, 180), (77, 155)]:
+        area = area_of(path, size)
+        assert area == whole_area(path, size)
+        assert area is not None
+        assert area.is_whole
+        assert area.known.all()
+
+
+@pytest.mark.parametrize("left", [300, 330, 359])
+def test_tags_across_the_seam(tmp_path: Path, left: int) -> None:
+    path = _save(tmp_path / "image.jpg", _attributes(_TAGS | {"CroppedAreaLeftPixels": f"{left}"}))
+    area = area_of(path, (40, 60))
+    assert area == PanoramaArea((180, 360), (30, 70), (left, left + 60), (40, 60))
+
+
+# Placing and cutting
+
+
+def _reference_place(image: NDArray[Any], area: PanoramaArea, fill: float) -> NDArray[Any]:
+    """Pixel by pixel."""
+    height, width = area.full_shape
+    whole = np.full((height, width, *image.shape[2:]), fill, image.dtype)
+    for row in range(image.shape[0]):
+        for column in range(image.shape[1]):
+            whole[area.rows[0] + row, (area.columns[0] + column) % width] = image[row, column]
+    return whole
+
+
+@pytest.mark.parametrize(
+    "area",
+    [
+        PanoramaArea((8, 16), (2, 5), (3, 8), (3, 5)),
+        PanoramaArea((8, 16), (0, 8), (12, 20), (8, 8)),
+        PanoramaArea((8, 16), (5, 8), (15, 31), (3, 16)),
+        PanoramaArea((8, 16), (0, 1), (11, 16), (1, 5)),
+        PanoramaArea((8, 16), (0, 8), (0, 16), (8, 16)),
+        PanoramaArea((8, 16), (0, 8), (5, 21), (8, 16)),
+    ],
+)
+@pytest.mark.parametrize(
+    ("channels", "dtype"), [((), np.uint8), ((3,), np.uint8), ((1,), np.uint16), ((), np.float32)]
+)
+def test_place_and_cut(area: PanoramaArea, channels: tuple[int, ...], dtype: Any) -> None:
+    shape = (*area.image_shape, *channels)
+    image = np.random.default_rng(0).integers(1, 250, shape).astype(dtype)
+    placed = area.place(image, fill=7)
+    assert placed.dtype == image.dtype
+    np.testing.assert_array_equal(placed, _reference_place(image, area, 7))
+    np.testing.assert_array_equal(area.cut(placed), image)
+    expected = _reference_place(np.ones(area.image_shape, bool), area, 0)
+    np.testing.assert_array_equal(area.known, expected)
+
+
+def test_place_can_leave_nothing_known_behind() -> None:
+    area = PanoramaArea((4, 8), (1, 2), (7, 9), (1, 2))
+    image = np.array([[1.5, 2.5]], np.float32)
+    placed = area.place(image, fill=np.nan)
+    assert np.isnan(placed).sum() == 30
+    assert placed[1, 7] == 1.5
+    assert placed[1, 0] == 2.5
+
+
+def test_images_of_another_size_are_refused() -> None:
+    area = PanoramaArea((8, 16), (2, 5), (3, 8), (3, 5))
+    with pytest.raises(ValueError, match=r"\(3, 6\) pixels; expected \(3, 5\)"):
+        area.place(np.zeros((3, 6)))
+    with pytest.raises(ValueError, match=r"\(3, 5\) pixels; expected \(8, 16\)"):
+        area.cut(np.zeros((3, 5)))
+
+
+@pytest.mark.parametrize("width", [19, 20, 21])
+def test_whole_panoramas_may_lack_a_column_or_have_one_more(tmp_path: Path, width: int) -> None:
+    area = whole_area(tmp_path / "image.jpg", (10, width))
+    assert area.full_shape == (10, 20)
+    assert area.is_whole
+    image = np.arange(10 * width).reshape(10, width)
+    placed = area.place(image)
+    assert placed.shape == (10, 20)
+    assert set(np.diff(placed[0])) <= {0, 1, 2}
+    cut = area.cut(placed)
+    assert cut.shape == image.shape
+    assert np.abs(cut - image).max() <= (width != 20)
+
+
+@pytest.mark.parametrize("size", [(10, 18), (10, 22), (20, 10), (100, 100), (1, 1)])
+def test_other_shapes_are_refused(tmp_path: Path, size: tuple[int, int]) -> None:
+    message = rf"a\.jpg: found {size[0]}×{size[1]} pixels.*crop=.*GPano.*projection=perspective"
+    with pytest.raises(DataError, match=message):
+        whole_area(tmp_path / "a.jpg", size)
+
+
+# The setting
+
+
+@pytest.mark.parametrize(
+    ("size", "crop", "full_shape", "rows", "columns"),
+    [
+        ((180, 360), (-180, 180, -90, 90), (180, 360), (0, 180), (0, 360)),
+        ((60, 100), (-50, 50, -30, 30), (180, 360), (60, 120), (130, 230)),
+        ((50, 90), (150, -120, -90, -40), (180, 360), (130, 180), (330, 420)),
+        ((30, 360), (-180, 180, -15, 15), (180, 360), (75, 105), (0, 360)),
+        ((20, 20), (180, -170, 80, 90), (360, 720), (0, 20), (0, 20)),
+        ((450, 900), (-45, 45, -22.5, 22.5), (1800, 3600), (675, 1125), (1350, 2250)),
+    ],
+)
+def test_crop(
+    size: tuple[int, int],
+    crop: tuple[float, ...],
+    full_shape: tuple[int, int],
+    rows: tuple[int, int],
+    columns: tuple[int, int],
+) -> None:
+    assert area_of_crop(size, crop) == PanoramaArea(full_shape, rows, columns, size)
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_edges_are_where_the_crop_says(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    across, down = rng.uniform(20, 350), rng.uniform(10, 170)
+    west = rng.uniform(-180, 180)
+    east = (west + across + 180) % 360 - 180
+    south = rng.uniform(-90, 90 - down)
+    width = int(rng.integers(300, 900))
+    size = (round(width * down / across), width)
+    area = area_of_crop(size, (west, east, south, south + down))
+    pixel_deg = 180 / area.full_shape[0]
+    left, top = _angles_deg(area, (area.columns[0], area.rows[0]))
+    assert abs((left - west + 180) % 360 - 180) <= pixel_deg
+    assert abs(top - (south + down)) <= pixel_deg
+    assert abs((area.columns[1] - area.columns[0]) * pixel_deg - across) <= 2 * pixel_deg
+    assert abs((area.rows[1] - area.rows[0]) * pixel_deg - down) <= 2 * pixel_deg
+    assert 0 <= area.columns[0] < area.full_shape[1]
+    assert 0 <= area.rows[0] < area.rows[1] <= area.full_shape[0]
+    image = rng.integers(0, 255, size, np.uint8)
+    cut = area.cut(area.place(image))
+    assert (cut == image).mean() > 0.98
+
+
+@pytest.mark.parametrize(
+    ("crop", "message"),
+    [
+        ((-180, 180, -90), r"found \[-180, 180, -90\]; expected \[west,east,south,north\]"),
+        ((-190, 0, -90, 90), "expected .*−180 to 180"),
+        ((0, 181, -90, 90), "expected .*−180 to 180"),
+        ((0, 90, 20, 20), "south below north"),
+        ((0, 90, 20, 10), "south below north"),
+        ((0, 90, -91, 10), "−90 to 90"),
+        ((30, 30, 0, 10), "east other than west"),
+        ((180, -180, 0, 10), "east other than west"),
+        ((0, float("nan"), 0, 10), "−180 to 180"),
+        ((0, 40, 0, 10), r"pixels of 0\.4°×0\.1° in an image of 100×100; .* square"),
+    ],
+)
+def test_impossible_crops(crop: tuple[float, ...], message: str) -> None:
+    with pytest.raises(SettingError, match=f"crop: found .*{message}|{message}"):
+        area_of_crop((100, 100), crop)
+
+
+@pytest.mark.parametrize("crop", [(-180, 180, -45, 45), (135, -135, -45, 45), (-180, 180, -90, 90)])
+def test_places_are_the_rows_and_columns_that_are_cut(crop: tuple[float, ...]) -> None:
+    west, east, south, north = crop
+    width = (east - west) % 360 or 360
+    area = area_of_crop((round((north - south) / 3), round(width / 3)), crop)
+    height, columns_in_all = area.full_shape
+    whole = np.arange(height * columns_in_all).reshape(area.full_shape)
+    rows, columns = area.places()
+    np.testing.assert_array_equal(whole[rows][:, columns], area.cut(whole))

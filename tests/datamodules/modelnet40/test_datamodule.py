@@ -1,0 +1,481 @@
+from __future__ import annotations
+
+import hashlib
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from lightning import LightningModule, Trainer
+
+from datamodules.core.split_module import Split
+from datamodules.modelnet40.datamodule import ModelNet40
+from datamodules.modelnet40.mesh_spheres import CHANNELS, clean_mesh, mesh_spheres
+from datamodules.modelnet40.off_files import Mesh, read_off, write_off
+from datamodules.modelnet40.shape_files import MODELNET40
+from datamodules.modelnet40.shape_samples import (
+    SPHERE_NORMALIZATION,
+    EvaluationShapes,
+    ShapeSample,
+    normalize_spheres,
+)
+from datamodules.modelnet40.sphere_files import STEPS
+from tangent_train.errors import DataError, SettingError
+from tangent_train.rendering import (
+    EquirectRepresentation,
+    TangentRepresentation,
+    equirect_to_tangent,
+)
+from tangent_train.rendering.representations.cubemap import CubemapRepresentation
+from tangent_train.rendering.representations.perspective import PerspectiveRepresentation
+from tests.datamodules.modelnet40.shapes_format import COUNTS, write_tree
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    MakeModule = Callable[..., ModelNet40]
+
+SPLITS: tuple[Split, ...] = ("train", "val", "test")
+LEVEL = 3
+TRAINING = sum(train for train, _ in COUNTS.values())
+TEST = sum(test for _, test in COUNTS.values())
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small data set with its spheres; not to be changed."""
+    root = write_tree(tmp_path_factory.mktemp("shapes"))
+    ModelNet40(root, TangentRepresentation(0, LEVEL)).prepare_data()
+    return root
+
+
+@pytest.fixture
+def make_module(root: Path) -> MakeModule:
+    def make(rotation: Any = "none", **settings: Any) -> ModelNet40:
+        return ModelNet40(root, TangentRepresentation(0, LEVEL, rotation=rotation), **settings)
+
+    return make
+
+
+def _digest(batch: ShapeSample) -> str:
+    content = hashlib.sha256(batch.images.numpy().tobytes()).hexdigest()[:8]
+    return f"{batch.index.tolist()} {batch.label.tolist()} {content}"
+
+
+# --- splits ------------------------------------------------------------------------------------
+
+
+def test_what_tasks_ask_for(make_module: MakeModule, root: Path) -> None:
+    module = make_module()
+    assert module.class_names == ("chair", "cup", "night_stand")
+    assert (module.noun, module.kind, module.in_channels) == ("shapes", "classification", 6)
+    assert module.normalization == SPHERE_NORMALIZATION
+    assert (module.root, module.validation_fraction) == (root, 0.1)
+    assert module.erp_height == 16
+    assert module.sample_name("test", 0) == "chair/test/chair_0007"
+
+
+def test_every_shape_is_in_one_split_with_the_class_of_its_folder(make_module: MakeModule) -> None:
+    module = make_module(validation_fraction=0.34)
+    names: list[str] = []
+    for split in SPLITS:
+        source = module.source(split)
+        for index, label in enumerate(source.labels):
+            name = source.name(index)
+            assert name.startswith(f"{module.class_names[label]}/")
+            assert ("/test/" in name) is (split == "test")
+            names.append(name)
+    assert len(set(names)) == len(names) == TRAINING + TEST
+
+
+def test_validation_is_drawn_from_every_class_alike(make_module: MakeModule) -> None:
+    drawn = set()
+    for seed in range(4):
+        module = make_module(validation_fraction=0.34, seed=seed)
+        labels = module.source("val").labels
+        # A third of 6, 4 and 5.
+        assert [labels.count(k) for k in range(3)] == [2, 1, 2]
+        drawn.add(tuple(module.source("val").name(i) for i in range(5)))
+        again = make_module(validation_fraction=0.34, seed=seed)
+        assert again.source("val").name(3) == module.source("val").name(3)
+    assert len(drawn) > 1
+    assert len(make_module(validation_fraction=0).source("val")) == 0
+    assert make_module(validation_fraction=0).val_dataloader() == []
+
+
+def test_validation_does_not_depend_on_what_can_be_used(tmp_path: Path) -> None:
+    root = write_tree(tmp_path)
+
+    def validation() -> set[str]:
+        module = ModelNet40(
+            root, TangentRepresentation(0, LEVEL), validation_fraction=0.34, skip_broken=True
+        )
+        module.prepare_data()
+        source = module.source("val")
+        return {source.name(index) for index in range(len(source))}
+
+    before = validation()
+    chosen = sorted(before)[0]
+    (root / f"{chosen}.off").write_text("broken")
+    assert validation() == before - {chosen}
+
+
+def test_both_layouts_give_the_same_samples(make_module: MakeModule, tmp_path: Path) -> None:
+    other = ModelNet40(write_tree(tmp_path, "by split"), TangentRepresentation(0, LEVEL))
+    other.prepare_all()
+    for mine, theirs in zip(make_module().test_dataloader(), other.test_dataloader(), strict=True):
+        assert _digest(mine) == _digest(theirs)
+    assert other.class_names == make_module().class_names
+
+
+def test_classes_before_there_are_files(tmp_path: Path) -> None:
+    module = ModelNet40(tmp_path / "ModelNet40", TangentRepresentation(0, LEVEL))
+    assert module.class_names == MODELNET40
+    for use in (module.setup, module.prepare_data, module.prepare_all):
+        with pytest.raises(DataError, match=r"no such folder.*princeton"):
+            use()
+
+
+@pytest.mark.parametrize("part", ["train", "test"])
+def test_a_split_without_a_usable_shape(tmp_path: Path, part: str) -> None:
+    root = write_tree(tmp_path, counts={"cup": (2, 2)})
+    for path in (root / "cup" / part).iterdir():
+        path.write_text("OFF")
+    module = ModelNet40(root, TangentRepresentation(0, LEVEL), validation_fraction=0)
+    module.prepare_data()
+    with pytest.raises(DataError, match=f"no usable {part} shape"):
+        module.setup()
+
+
+def test_spheres_elsewhere(root: Path, tmp_path: Path) -> None:
+    for level, size in ((2, "8x16"), (4, "32x64")):  # two sizes in one store
+        module = ModelNet40(root, TangentRepresentation(0, level), store=tmp_path / "store")
+        module.prepare_data()
+        made = (tmp_path / "store" / f"spheres_{size}/cup/train").glob("*.npy")
+        assert len(list(made)) == COUNTS["cup"][0]
+        assert not (root / f"spheres_{size}").exists()
+        assert module.source("train").read(0).shape == (2 ** (level + 1), 2 ** (level + 2), 6)
+
+
+def test_spheres_of_every_size_have_a_folder(root: Path) -> None:
+    assert (root / "spheres_16x32/cup/train/cup_0001.npy").exists()
+
+
+# --- samples -----------------------------------------------------------------------------------
+
+
+def test_batches(make_module: MakeModule) -> None:
+    module = make_module(shapes_per_step=4, validation_fraction=0)
+    batches = list(module.train_dataloader())
+    assert [len(batch.label) for batch in batches] == [4, 4, 4, 3]
+    assert batches[0].images.shape == (4, 20, 8, 8, CHANNELS)
+    assert batches[0].images.dtype == torch.int16
+    batch = module.on_after_batch_transfer(batches[0], 0)
+    assert isinstance(batch, ShapeSample)
+    assert (batch.images.shape, batch.images.dtype) == ((4, 20, 6, 8, 8), torch.float32)
+    assert (batch.label.dtype, batch.index.dtype) == (torch.int64, torch.int64)
+    seen = sorted(int(index) for batch in batches for index in batch.index)
+    assert seen == list(range(TRAINING))
+    labels = {int(i): int(c) for batch in batches for i, c in zip(batch.index, batch.label)}  # noqa: B905
+    assert [labels[i] for i in range(TRAINING)] == list(module.source("train").labels)
+
+
+def test_evaluation_takes_all_in_order_several_at_once(make_module: MakeModule) -> None:
+    module = make_module(shapes_per_step=4)
+    batches = list(module.test_dataloader())
+    assert [batch.index.tolist() for batch in batches] == [[0, 1, 2, 3], [4, 5]]
+    assert torch.cat([batch.label for batch in batches]).tolist() == [0, 0, 1, 1, 1, 2]
+
+
+def test_normalization_against_the_formula() -> None:
+    rng = np.random.default_rng(0)
+    steps = rng.integers(0, 2**15, (2, 3, 4, 5, 6)).astype(np.int16)
+    images = normalize_spheres(torch.from_numpy(steps), SPHERE_NORMALIZATION).numpy()
+    mean, std = np.array(SPHERE_NORMALIZATION.mean), np.array(SPHERE_NORMALIZATION.std)
+    expected = np.moveaxis((steps / STEPS - mean) / std, -1, 2)
+    np.testing.assert_allclose(images, expected, atol=1e-5)
+
+
+def test_views_are_those_of_the_float_spheres(make_module: MakeModule, root: Path) -> None:
+    """All six channels, against a rendering in float64 by the torch renderer."""
+    module = make_module()
+    batch = module.on_after_batch_transfer(next(iter(module.test_dataloader())), 0)
+    mesh = read_off(root / f"{module.sample_name('test', 3)}.off")
+    spheres = torch.from_numpy(mesh_spheres(clean_mesh(mesh), (16, 32))).movedim(-1, 0)
+    views = equirect_to_tangent(spheres, module.representation.grid)
+    mean, std = (torch.tensor(line)[:, None, None] for line in _numbers(module))
+    torch.testing.assert_close(
+        batch.images[3], ((views - mean) / std).float(), atol=4 / STEPS / 0.19, rtol=0
+    )
+
+
+def _numbers(module: ModelNet40) -> tuple[list[float], list[float]]:
+    return list(module.normalization.mean), list(module.normalization.std)
+
+
+@pytest.mark.parametrize("in_memory", [False, True])
+def test_the_same_samples_for_any_number_of_workers(
+    make_module: MakeModule, in_memory: bool
+) -> None:
+    def two_epochs(num_workers: int) -> list[list[str]]:
+        module = make_module("so3", num_workers=num_workers, in_memory=in_memory, seed=3)
+        loader = module.train_dataloader()
+        epochs = []
+        for epoch in (0, 1):
+            loader.sampler.set_epoch(epoch)  # type: ignore[attr-defined]
+            epochs.append([_digest(batch) for batch in loader])
+        return epochs
+
+    alone = two_epochs(0)
+    assert two_epochs(2) == alone
+    assert alone[0] != alone[1]
+
+
+def test_training_is_turned_anew_every_time_and_evaluation_is_not(make_module: MakeModule) -> None:
+    plain, turned = make_module(), make_module("so3")
+    first = plain.training_samples()
+    assert torch.equal(first[0, 4].images, first[1, 4].images)
+    again = turned.training_samples()
+    assert not torch.equal(again[0, 4].images, again[1, 4].images)
+    assert torch.equal(again[0, 4].images, again[0, 4].images)
+    for split in SPLITS[1:]:
+        one, other = plain.evaluation_samples(split)[0, 0], turned.evaluation_samples(split)[0, 0]
+        assert torch.equal(one.images, other.images)
+
+
+def test_another_stream_draws_others(make_module: MakeModule) -> None:
+    first, second = (
+        [_digest(batch) for batch in make_module("yaw", stream=stream).train_dataloader()]
+        for stream in (0, 1)
+    )
+    assert set(first).isdisjoint(second)
+
+
+@pytest.mark.parametrize(
+    "representation",
+    [
+        EquirectRepresentation(LEVEL),
+        EquirectRepresentation(LEVEL, rotation="yaw"),
+        EquirectRepresentation(LEVEL, crop_deg=90, rotation="so3"),
+        CubemapRepresentation(LEVEL),
+        TangentRepresentation(0, LEVEL, faces_per_panorama=7, rotation="yaw", mirror=True),
+        TangentRepresentation(1, LEVEL),
+    ],
+    ids=lambda representation: type(representation).__name__,
+)
+def test_other_representations(root: Path, representation: Any) -> None:
+    module = ModelNet40(root, representation, test_rotation="so3")
+    batch = next(iter(module.train_dataloader()))
+    images = module.on_after_batch_transfer(batch, 0).images
+    assert (images.shape[0], images.shape[2]) == (min(16, len(module.source("train"))), 6)
+    whole = next(iter(module.test_dataloader()))
+    height, width = representation.image_size
+    assert whole.images.shape[2:] == (height, width, 6)
+    if isinstance(representation, EquirectRepresentation):
+        assert images.shape[1] == whole.images.shape[1] == 1
+
+
+# --- turned test shapes ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rotation", ["yaw", "so3"])
+def test_the_same_shape_is_turned_the_same_way(make_module: MakeModule, rotation: Any) -> None:
+    upright = list(make_module().test_dataloader())
+    first = list(make_module(test_rotation=rotation, shapes_per_step=2).test_dataloader())
+    again = list(make_module(test_rotation=rotation, num_workers=1).test_dataloader())
+    other = list(make_module(test_rotation=rotation, seed=1).test_dataloader())
+    images = [torch.cat([b.images for b in batches]) for batches in (first, again, upright, other)]
+    assert torch.equal(images[0], images[1])
+    for different in images[2:]:
+        assert not any(torch.equal(a, b) for a, b in zip(images[0], different, strict=True))
+
+
+def test_only_test_shapes_are_turned(make_module: MakeModule) -> None:
+    plain, turned = make_module(), make_module(test_rotation="so3")
+    for split in ("train", "val"):
+        before, after = (
+            module.training_samples()[0, 0]
+            if split == "train"
+            else module.evaluation_samples("val")[0, 0]
+            for module in (plain, turned)
+        )
+        assert torch.equal(before.images, after.images)
+
+
+@pytest.mark.parametrize("rotation", ["yaw", "so3"])
+@pytest.mark.parametrize(
+    "representation",
+    [TangentRepresentation(0, 5), EquirectRepresentation(5)],
+    ids=["tangent", "erp"],
+)
+def test_views_of_a_turned_shape_are_views_of_its_turned_mesh(
+    tmp_path: Path, rotation: Any, representation: Any
+) -> None:
+    """Independent of the renderers: the mesh itself is turned, and rays are cast again."""
+    ball = trimesh.creation.icosphere(4)
+    x, y = ball.vertices[:, :1], ball.vertices[:, 1:2]
+    egg = ball.vertices * (0.4, 0.7, 1) * (1 + 0.3 * x + 0.2 * y)
+    root = write_tree(tmp_path, counts={"bottle": (1, 2)})
+    for path in (root / "bottle/test").iterdir():
+        write_off(path, Mesh(np.array(egg), np.array(ball.faces, np.int64)))
+    module = ModelNet40(root, representation, test_rotation=rotation, validation_fraction=0)
+    module.prepare_data()
+    samples = module.evaluation_samples("test")
+    assert isinstance(samples, EvaluationShapes)
+    for index in range(2):
+        turn = samples.rotation(index)
+        assert bool(turn[2, 2] > 1 - 1e-12) is (rotation == "yaw")
+        mesh = clean_mesh(read_off(root / f"{module.sample_name('test', index)}.off"))
+        turned = mesh._replace(vertices=mesh.vertices @ turn.T)
+        steps = np.rint(mesh_spheres(turned, (64, 128)) * STEPS).astype(np.uint16)
+        views = representation.whole()
+        expected = np.concatenate(
+            [views.render(steps[..., k : k + 3], "bilinear") for k in (0, 3)], axis=-1
+        )
+        found = samples[0, index].images.numpy() / STEPS
+        assert np.abs(found - expected / STEPS).mean() < 0.01  # facets have edges
+        upright = module.source("test").read(index)
+        before = views.render(np.ascontiguousarray(upright[..., :3]), "bilinear") / STEPS
+        assert np.abs(before - expected[..., :3] / STEPS).mean() > 0.05
+
+
+def test_yaw_and_so3_are_spread_over_all_turns(make_module: MakeModule) -> None:
+    module = make_module()
+    for rotation in ("yaw", "so3"):
+        samples = EvaluationShapes(module.source("test"), module.representation, rotation, 0)
+        up = np.array([samples.rotation(index)[:, 2] for index in range(400)])
+        ahead = np.array([samples.rotation(index)[:, 0] for index in range(400)])
+        assert np.abs(ahead.mean(axis=0)).max() < 0.12
+        if rotation == "yaw":
+            np.testing.assert_allclose(up, np.broadcast_to([0, 0, 1.0], up.shape), atol=1e-12)
+        else:
+            assert np.abs(up.mean(axis=0)).max() < 0.12
+            np.testing.assert_allclose((up**2).mean(axis=0), 1 / 3, atol=0.06)
+
+
+# --- with a trainer, and on several processes --------------------------------------------------
+
+
+@pytest.mark.parametrize("world_size", [2, 3])
+def test_processes_share_the_test_shapes(
+    make_module: MakeModule, monkeypatch: pytest.MonkeyPatch, world_size: int
+) -> None:
+    monkeypatch.setattr("torch.distributed.is_initialized", lambda: True)
+    monkeypatch.setattr("torch.distributed.get_world_size", lambda: world_size)
+    seen: list[int] = []
+    steps = set()
+    for rank in range(world_size):
+        monkeypatch.setattr("torch.distributed.get_rank", lambda rank=rank: rank)
+        module = make_module(shapes_per_step=2)
+        for batch in module.test_dataloader():
+            seen += batch.index.tolist()
+        steps.add(len(module.train_dataloader()))
+    assert sorted(seen) == list(range(TEST))
+    assert len(steps) == 1
+
+
+class Recorder(LightningModule):
+    """Trains one number and writes down what it is shown."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.zeros(()))
+        self.seen: dict[int, list[str]] = {}
+        self.dtypes: set[torch.dtype] = set()
+        self.tested: list[int] = []
+
+    def training_step(self, batch: ShapeSample, batch_idx: int) -> torch.Tensor:
+        self.seen.setdefault(self.current_epoch, []).append(_digest(batch))
+        return self.weight * batch.images.mean()
+
+    def validation_step(self, batch: ShapeSample, batch_idx: int) -> None:
+        pass
+
+    def test_step(self, batch: ShapeSample, batch_idx: int) -> None:
+        self.tested += batch.index.tolist()
+        self.dtypes.add(batch.images.dtype)
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        return torch.optim.SGD(self.parameters(), lr=0.1)
+
+
+def _trainer(folder: Path, epochs: int = 1, precision: Any = None) -> Trainer:
+    return Trainer(
+        precision=precision,
+        default_root_dir=folder,
+        accelerator="cpu",
+        max_epochs=epochs,
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        use_distributed_sampler=False,
+        log_every_n_steps=1,
+    )
+
+
+# Lightning 2.6 with torch 2.15.
+@pytest.mark.filterwarnings("ignore:.*LeafSpec:FutureWarning")
+def test_a_resumed_run_sees_what_the_whole_run_sees(
+    make_module: MakeModule, tmp_path: Path
+) -> None:
+    def module() -> ModelNet40:
+        return make_module("so3", shapes_per_step=4)
+
+    whole, first, second = Recorder(), Recorder(), Recorder()
+    _trainer(tmp_path / "whole", 3).fit(whole, datamodule=module())
+    trainer = _trainer(tmp_path / "parts", 1)
+    trainer.fit(first, datamodule=module())
+    trainer.save_checkpoint(tmp_path / "last.ckpt")
+    resumed = _trainer(tmp_path / "parts", 3)
+    resumed.fit(second, datamodule=module(), ckpt_path=tmp_path / "last.ckpt", weights_only=True)
+    assert list(whole.seen) == [0, 1, 2]
+    assert len({tuple(epoch) for epoch in whole.seen.values()}) == 3
+    assert first.seen | second.seen == whole.seen
+
+
+@pytest.mark.filterwarnings("ignore:.*LeafSpec:FutureWarning")
+def test_an_evaluation_prepares_the_test_shapes_only(tmp_path: Path) -> None:
+    root = write_tree(tmp_path / "shapes", counts={"cup": (2, 3)})
+    module, recorder = ModelNet40(root, TangentRepresentation(0, LEVEL)), Recorder()
+    _trainer(tmp_path, precision="bf16-true").test(recorder, datamodule=module, verbose=False)
+    assert recorder.tested == [0, 1, 2]
+    assert recorder.dtypes == {torch.bfloat16}
+    assert {path.parent.name for path in root.rglob("*.npy")} == {"test"}
+
+
+# --- settings ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("shapes_per_step", 0),
+        ("num_workers", -1),
+        ("seed", -1),
+        ("stream", -1),
+        ("validation_fraction", 1),
+        ("validation_fraction", -0.1),
+        ("test_rotation", 30),
+        ("test_rotation", "z"),
+        ("normalization", {"mean": [0, 0, 0], "std": [1, 1, 1]}),
+    ],
+)
+def test_impossible_settings(make_module: MakeModule, name: str, value: Any) -> None:
+    with pytest.raises(SettingError, match=rf"data\.{name}"):
+        make_module(**{name: value})
+
+
+def test_own_normalization(make_module: MakeModule) -> None:
+    own = make_module(normalization={"mean": [0] * 6, "std": [1] * 6})
+    assert list(own.normalization.std) == [1.0] * 6
+    with pytest.raises(SettingError, match="normalization"):
+        make_module(normalization={"mean": [0] * 6, "std": [1] * 5})
+
+
+def test_photos_are_no_way_to_see_a_sphere(root: Path) -> None:
+    photos: Any = PerspectiveRepresentation(level=5)
+    with pytest.raises(SettingError, match="representation=tangent"):
+        ModelNet40(root, photos)

@@ -1,0 +1,255 @@
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+import trimesh
+
+from datamodules.modelnet40.mesh_spheres import RADIUS, clean_mesh, mesh_spheres
+from datamodules.modelnet40.off_files import Mesh
+from datamodules.synthshapes.families import make_shape
+from tangent_train.errors import DataError
+from tangent_train.geometry import equirect_directions, random_rotation
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+SHAPE = (64, 128)
+RAYS = equirect_directions(SHAPE)
+
+
+def _mesh(made: Any) -> Mesh:
+    return Mesh(np.array(made.vertices, np.float64), np.array(made.faces, np.int64))
+
+
+def _box(center: tuple[float, float, float], size: tuple[float, float, float]) -> Mesh:
+    made = _mesh(trimesh.creation.box(size))
+    return made._replace(vertices=made.vertices + center)
+
+
+def _joined(*meshes: Mesh) -> Mesh:
+    counts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+    triangles = [mesh.triangles + n for mesh, n in zip(meshes, counts[:-1], strict=True)]
+    return Mesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(triangles))
+
+
+def _ball(subdivisions: int, radii: tuple[float, float, float] = (1, 1, 1)) -> Mesh:
+    made = _mesh(trimesh.creation.icosphere(subdivisions))
+    return made._replace(vertices=made.vertices * radii)
+
+
+# --- closed forms ------------------------------------------------------------------------------
+
+
+def test_a_cube() -> None:
+    spheres = mesh_spheres(clean_mesh(_box((7, -3, 20), (5, 5, 5))), SHAPE)
+    half = RADIUS / math.sqrt(3)
+    along = np.abs(RAYS).max(axis=-1)  # the share of the ray along the normal of the face it hits
+    two, one = np.sort(np.abs(RAYS), axis=-1)[..., 1:].transpose(2, 0, 1)
+    clear = one - two > 1e-6  # at the edges either face may be hit
+    assert clear.mean() > 0.98
+    expected = np.stack([1 - half / along, along, np.sqrt(1 - along**2)], axis=-1)
+    for channels in (spheres[..., :3], spheres[..., 3:]):
+        np.testing.assert_allclose(channels[clear], expected[clear], atol=2e-6)
+        np.testing.assert_allclose(channels[..., 0], expected[..., 0], atol=2e-6)
+
+
+def test_a_sphere() -> None:
+    ball = _ball(4)
+    spheres = mesh_spheres(clean_mesh(ball), SHAPE)
+    corners = ball.vertices[ball.triangles]
+    centers = corners.mean(axis=1)
+    reach = np.arccos(
+        (centers / np.linalg.norm(centers, axis=1, keepdims=True) * corners[:, 0]).sum(axis=1)
+    ).max()
+    sagitta = RADIUS * (1 - math.cos(reach))  # facets lie below the sphere
+    for first in (0, 3):
+        assert spheres[..., first].min() > 1 - RADIUS - 1e-6
+        assert spheres[..., first].max() < 1 - RADIUS + sagitta + 1e-6
+        assert spheres[..., first + 1].min() > math.cos(reach) - 1e-6
+        assert spheres[..., first + 2].max() < math.sin(reach) + 1e-6
+
+
+def test_an_ellipsoid() -> None:
+    radii = np.array([0.5, 0.8, RADIUS])
+    spheres = mesh_spheres(clean_mesh(_ball(6, (0.5, 0.8, RADIUS))), SHAPE)
+    # The ray meets the ellipsoid at ρ r; its normal there is the gradient of Σ x²/a².
+    rho = 1 / np.sqrt(np.sum((RAYS / radii) ** 2, axis=-1))
+    normal = RAYS / radii**2
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    cosine = np.sum(normal * RAYS, axis=-1)
+    for first in (0, 3):
+        np.testing.assert_allclose(spheres[..., first], 1 - rho, atol=3e-4)
+        np.testing.assert_allclose(spheres[..., first + 1], cosine, atol=0.02)
+        np.testing.assert_allclose(spheres[..., first + 2], np.sqrt(1 - cosine**2), atol=0.03)
+        error = spheres[..., first + 1] - cosine
+        assert abs(error.mean()) < 1e-3
+
+
+def _slow(mesh: Mesh, rays: NDArray[np.float64]) -> tuple[Any, Any]:
+    """Distance and triangle of first hits in float64 (Möller and Trumbore), infinite where none."""
+    a, b, c = mesh.vertices[mesh.triangles].transpose(1, 0, 2)
+    best, which = np.full(len(rays), np.inf), np.full(len(rays), -1)
+    for place, ray in enumerate(rays):
+        across = np.cross(-ray, c - a)
+        determinant = np.einsum("ij,ij->i", across, b - a)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u = np.einsum("ij,ij->i", across, ray - a) / determinant
+            q = np.cross(ray - a, b - a)
+            v = -(q @ ray) / determinant
+            t = np.einsum("ij,ij->i", q, c - a) / determinant
+        hit = np.flatnonzero((u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0))
+        if len(hit):
+            which[place] = hit[np.argmin(t[hit])]
+            best[place] = t[which[place]]
+    return best, which
+
+
+@pytest.mark.parametrize("label", ["chair", "cup", "airplane"])
+def test_open_and_overlapping_meshes_against_a_slow_reference(label: str) -> None:
+    mesh = clean_mesh(make_shape(5, label, 3))
+    rays = RAYS.reshape(-1, 3)[::7]
+    distance, triangle = _slow(mesh, rays)
+    found = mesh_spheres(mesh, SHAPE).reshape(-1, 6)[::7]
+    hit = triangle >= 0
+    expected = np.where(hit, distance, 1)
+    # Rays that pass an edge by a hair may be seen either way in float32.
+    same = np.abs(found[:, 0] - expected) < 1e-4
+    assert same.mean() > 0.998
+    a, b, c = mesh.vertices[mesh.triangles].transpose(1, 0, 2)
+    normals = np.cross(b - a, c - a)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    cosine = np.where(hit, np.abs(np.sum(normals[triangle] * rays, axis=1)), 0)
+    right = np.abs(found[:, 1] - cosine) < 1e-6
+    assert right.mean() > 0.97  # where two faces meet, either normal
+    np.testing.assert_allclose(np.hypot(found[:, 1], found[:, 2]), hit | (found[:, 1] > 0))
+    assert found.min() >= 0
+    assert found[:, 0].max() < 2
+
+
+# --- conventions -------------------------------------------------------------------------------
+
+
+def test_y_is_on_the_right_and_z_is_up() -> None:
+    body, knob = _box((0, 0, 0), (2, 2, 2)), (0.2, 0.2, 0.2)
+    height, width = SHAPE
+    for place, (row, column) in {
+        (0.0, 2.5, 0.0): (height // 2, width * 3 // 4),  # +y: longitude 90°, to the right
+        (0.0, -2.5, 0.0): (height // 2, width // 4),
+        (2.5, 0.0, 0.0): (height // 2, width // 2),
+        (0.0, 0.0, 2.5): (0, 0),
+        (0.0, 0.0, -2.5): (height - 1, 0),
+    }.items():
+        distance = mesh_spheres(clean_mesh(_joined(body, _box(place, knob))), SHAPE)[..., 0]
+        nearest = np.unravel_index(distance.argmin(), SHAPE)
+        assert abs(int(nearest[0]) - row) <= 2
+        if 0 < row < height - 1:
+            assert abs(int(nearest[1]) - column) <= 2
+
+
+def test_where_nothing_is_hit() -> None:
+    plates = _joined(_box((0, 0, 1), (1, 1, 0.1)), _box((0, 0, -1), (1, 1, 0.1)))
+    spheres = mesh_spheres(clean_mesh(plates), SHAPE)
+    assert spheres[32, :, :3].tolist() == [[1, 0, 0]] * 128
+    assert (spheres[..., 4] > 0).all()  # the hull is closed
+    assert spheres[0, 0, 0] < 0.2
+
+
+def test_a_surface_that_is_only_behind_the_middle() -> None:
+    mesh = Mesh(
+        np.array([[-1, -1, -1], [-1, 1, -1], [-1, 0, 1.0], [2, 0, 0], [2, 0.1, 0], [2, 0, 0.1]]),
+        np.array([[0, 1, 2], [3, 4, 5]]),
+    )
+    cleaned = clean_mesh(mesh)
+    distance = mesh_spheres(cleaned, SHAPE)[..., 0]
+    # From above the small triangle the large one is seen, beyond the middle.
+    x = cleaned.vertices[0, 0]
+    row, column = 28, 64
+    expected = 1 - x / RAYS[row, column, 0]
+    assert expected > 1
+    assert distance[row, column] == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize("shape", [(33, 65), (1, 1), (7, 31), (2, 4)])
+def test_no_ray_slips_through_a_closed_mesh(shape: tuple[int, int]) -> None:
+    octahedron = trimesh.Trimesh(
+        [[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]],
+        [[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]],
+    )
+    for made in (_mesh(octahedron), _ball(3), _box((0, 0, 0), (1, 2, 3))):
+        spheres = mesh_spheres(clean_mesh(made), shape)
+        assert spheres.shape == (*shape, 6)
+        assert spheres[..., [1, 4]].min() > 0.1
+        assert spheres[..., [0, 3]].max() < 1
+
+
+def test_a_flat_mesh_is_its_own_hull() -> None:
+    flat = Mesh(np.array([[0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0.0]]), np.array([[0, 1, 2]]))
+    spheres = mesh_spheres(clean_mesh(flat), SHAPE)
+    np.testing.assert_array_equal(spheres[..., :3], spheres[..., 3:])
+    np.testing.assert_allclose(spheres[0, :, 0], 1, atol=1e-6)  # through the middle
+    assert np.isfinite(spheres).all()
+
+
+# --- cleaning ----------------------------------------------------------------------------------
+
+
+def test_in_the_middle_and_within_the_radius() -> None:
+    # Two boxes: the centroid of their surface by hand.
+    mesh = _joined(_box((0, 0, 0), (2, 2, 2)), _box((5, 0, 0), (1, 1, 1)))
+    cleaned = clean_mesh(mesh)
+    centroid = np.array([(24 * 0 + 6 * 5) / 30, 0, 0])
+    moved = mesh.vertices - centroid
+    moved *= RADIUS / np.linalg.norm(moved, axis=1).max()
+    order = np.lexsort(cleaned.vertices.round(9).T)
+    np.testing.assert_allclose(
+        cleaned.vertices[order], moved[np.lexsort(moved.round(9).T)], atol=1e-9
+    )
+    assert len(cleaned.triangles) == 24
+
+
+def test_what_counts_twice_or_not_at_all_changes_nothing() -> None:
+    mesh = make_shape(0, "chair", 1)
+    rng = np.random.default_rng(0)
+    count = len(mesh.vertices)
+    copies = mesh.triangles[rng.choice(len(mesh.triangles), 40)]
+    other = copies[:20] + count  # the same places under other numbers
+    points = np.concatenate([mesh.vertices, mesh.vertices, [[1e9, 0, 0], [0, -1e12, 5]]])
+    degenerate = np.array([[0, 0, 1], [2, 2, 2], [3, 4, 4], [5, 5 + count, 6]])
+    triangles = np.concatenate([mesh.triangles, copies[:, ::-1], other[:, [1, 2, 0]], degenerate])
+    first, second = clean_mesh(mesh), clean_mesh(Mesh(points, triangles))
+    np.testing.assert_allclose(first.vertices, second.vertices, atol=1e-12)
+    np.testing.assert_array_equal(first.triangles, second.triangles)
+
+
+@pytest.mark.parametrize("scale", [1e-9, 1, 1e9])
+def test_size_place_and_attitude_of_the_original_do_not_matter(scale: float) -> None:
+    mesh = make_shape(0, "table", 2)
+    moved = mesh._replace(vertices=(mesh.vertices + 1.5) * scale)
+    np.testing.assert_allclose(clean_mesh(mesh).vertices, clean_mesh(moved).vertices, atol=1e-6)
+    turn = random_rotation(np.random.default_rng(0))
+    turned = clean_mesh(mesh._replace(vertices=mesh.vertices @ turn.T))
+    np.testing.assert_allclose(turned.vertices, clean_mesh(mesh).vertices @ turn.T, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("vertices", "found"),
+    [
+        ([[1, 2, 3]] * 3, "extent of 0"),
+        ([[0, 0, 0], [1, 1, 1], [2, 2, 2]], "no triangle with an area"),
+        ([[0, 0, 0], [1, 0, 0], [0.5, 1e-12, 0]], "no triangle with an area"),
+        ([[1e308, 0, 0], [-1e308, 0, 0], [0, 1, 0]], "extent of inf"),
+    ],
+)
+def test_no_surface(vertices: Any, found: str) -> None:
+    with pytest.raises(DataError, match=found):
+        clean_mesh(Mesh(np.array(vertices, np.float64), np.array([[0, 1, 2]])))
+
+
+def test_channels_have_the_means_of_such_data() -> None:
+    # Of the order of those of ModelNet40, which tests cannot have.
+    images = [mesh_spheres(clean_mesh(make_shape(0, "chair", k)), SHAPE) for k in range(10)]
+    mean = np.mean(images, axis=(0, 1, 2))
+    np.testing.assert_allclose(mean, [0.7139, 0.6936, 0.5851, 0.5336, 0.7626, 0.5651], atol=0.25)

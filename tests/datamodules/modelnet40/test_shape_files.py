@@ -1,0 +1,81 @@
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+import pytest
+
+from datamodules.modelnet40.shape_files import MODELNET40, find_shapes
+from tangent_train.errors import DataError
+from tests.datamodules.modelnet40.shapes_format import COUNTS, write_tree
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+PARTS = ("train", "test")
+
+
+def _touch(path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("")
+
+
+def test_the_forty_classes() -> None:
+    assert len(set(MODELNET40)) == 40
+    assert list(MODELNET40) == sorted(MODELNET40)
+
+
+@pytest.mark.parametrize("layout", ["by class", "by split"])
+def test_both_layouts(tmp_path: Path, layout: Literal["by class", "by split"]) -> None:
+    root = write_tree(tmp_path, layout)
+    _touch(root / "README.txt")
+    _touch(root / "spheres_64x128/chair/train/chair_0001.npy")
+    _touch(root / "modelnet40_train/._chair_0001.off" if layout == "by split" else root / ".x.off")
+    _touch(root / ("modelnet40_test/list.txt" if layout == "by split" else "chair/train/a.txt"))
+    found = find_shapes(root)
+    counted = {
+        label: tuple(sum(s.label == label and s.part == p for s in found) for p in PARTS)
+        for label in COUNTS
+    }
+    assert counted == COUNTS
+    assert len(found) == sum(map(sum, COUNTS.values()))
+    assert len({shape.name for shape in found}) == len(found)
+    for shape in found:
+        assert shape.path == root / f"{shape.name}.off"
+    assert found == sorted(found, key=lambda shape: (shape.part, shape.name))
+
+
+def test_a_missing_folder_says_where_to_get_it(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"no such folder.*modelnet.cs.princeton.edu.*synthshapes"):
+        find_shapes(tmp_path / "ModelNet40")
+
+
+def test_no_meshes(tmp_path: Path) -> None:
+    _touch(tmp_path / "chair/train/chair_0001.obj")
+    with pytest.raises(DataError, match="no meshes"):
+        find_shapes(tmp_path)
+
+
+@pytest.mark.parametrize("layout", ["by class", "by split"])
+def test_one_folder_too_high(tmp_path: Path, layout: Literal["by class", "by split"]) -> None:
+    root = write_tree(tmp_path / "ModelNet40", layout, {"cup": (1, 1)})
+    with pytest.raises(DataError, match=f"Set data.root={root}"):
+        find_shapes(tmp_path)
+
+
+def test_both_layouts_at_once(tmp_path: Path) -> None:
+    write_tree(tmp_path, "by class", {"cup": (1, 1)})
+    write_tree(tmp_path, "by split", {"cup": (1, 1)})
+    with pytest.raises(DataError, match=r"both cup/.* and modelnet40_"):
+        find_shapes(tmp_path)
+
+
+def test_a_name_without_a_class(tmp_path: Path) -> None:
+    _touch(tmp_path / "modelnet40_train/0001.off")
+    with pytest.raises(DataError, match=r"0001\.off: found a name without class"):
+        find_shapes(tmp_path)
+
+
+def test_a_class_that_is_only_tested(tmp_path: Path) -> None:
+    write_tree(tmp_path, counts={"cup": (1, 1), "chair": (0, 1)})
+    with pytest.raises(DataError, match="only test shapes of chair"):
+        find_shapes(tmp_path)

@@ -1,0 +1,321 @@
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+import pytest
+
+from datamodules.core.panoramas import steps_to_meters
+from datamodules.stanford2d3ds.panoramas import AREAS, CLASSES, FOLDS, FileName, Stanford2D3DS
+from tangent_train.errors import DataError, SettingError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from tests.conftest import FabricateStanford
+
+REAL_DATA = os.environ.get("TANGENT_REAL_DATA")
+
+
+@pytest.fixture
+def broken_root(fabricate_stanford: FabricateStanford, tmp_path: Path) -> Path:
+    """A data set to be damaged, one panorama per area."""
+    rooms = {"1": ("office_1", "office_2")} | dict.fromkeys(AREAS[1:], ("office_1",))
+    return fabricate_stanford(tmp_path / "data", rooms, height=16)
+
+
+def _file(root: Path, area: str, domain: str) -> Path:
+    return sorted((root / f"area_{area}" / "pano" / domain).glob("*.png"))[0]
+
+
+# --- names -------------------------------------------------------------------------------------
+
+
+def test_names_come_apart_and_together() -> None:
+    text = f"camera_{'0f' * 16}_conferenceRoom_12_frame_equirectangular_domain_semantic_pretty.png"
+    name = FileName.parse(text)
+    assert name == ("0f" * 16, "conferenceRoom", 12, "equirectangular", "semantic_pretty", ".png")
+    assert str(name) == text
+    partner = FileName.parse(str(name._replace(domain="pose", suffix=".json")))
+    assert partner[:4] == name[:4]
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "image.png",
+        "camera_0f_office_1_frame_equirectangular_domain_rgb.png",
+        f"camera_{'0f' * 16}_office_frame_equirectangular_domain_rgb.png",
+        f"camera_{'0f' * 16}_office_1_frame_left_domain_rgb.png",
+        f"camera_{'0f' * 16}_office_1_frame_3_domain_rgb",
+    ],
+)
+def test_other_names(name: str) -> None:
+    with pytest.raises(DataError, match="unknown file name"):
+        FileName.parse(name)
+
+
+@pytest.mark.real_data
+@pytest.mark.skipif(REAL_DATA is None, reason="TANGENT_REAL_DATA is not set")
+def test_all_real_names_come_apart() -> None:
+    lines = (Path(str(REAL_DATA)) / "stanford2d3ds" / "pano_fold1_test_paths.txt").read_text()
+    paths = [Path(path) for line in lines.splitlines() for path in line.split()]
+    assert len(paths) == 4 * 373
+    for path in paths:
+        name = FileName.parse(path.name)
+        assert str(name) == path.name
+        assert name.frame == "equirectangular"
+
+
+# --- splits ------------------------------------------------------------------------------------
+
+
+def _names(module: Stanford2D3DS, split: Any) -> list[str]:
+    source = module.source(split)
+    return [source.name(i) for i in range(len(source))]
+
+
+@pytest.mark.parametrize("fold", [1, 2, 3])
+def test_folds_are_disjoint_and_rooms_stay_whole(
+    stanford_root: Path, strips: Any, fold: int
+) -> None:
+    module = Stanford2D3DS(stanford_root, strips, fold=fold, validation_fraction=0.3)
+    module.setup("fit")
+    splits = {split: _names(module, split) for split in ("train", "val", "test")}
+    names = [name for split in splits.values() for name in split]
+    assert len(names) == len(set(names)) == len(list(stanford_root.glob("area_*/pano/rgb/*.png")))
+    assert {n.split("/")[0] for n in splits["test"]} == {f"area_{area}" for area in FOLDS[fold]}
+    rooms = {
+        split: {n.rpartition("/")[0].replace("5b", "5a") for n in split_names}
+        for split, split_names in splits.items()
+    }
+    assert rooms["val"]
+    assert not rooms["train"] & rooms["val"]
+
+
+def test_areas_of_the_folds() -> None:
+    assert sorted(area for areas in FOLDS.values() for area in areas) == sorted(AREAS)
+
+
+def test_rooms_of_5a_and_5b_are_the_same_rooms(stanford_root: Path, strips: Any) -> None:
+    # hallway_2 is in both: it must never be half in training, half in validation.
+    for seed in range(20):
+        module = Stanford2D3DS(stanford_root, strips, fold=3, seed=seed, validation_fraction=0.4)
+        halves = [n for n in _names(module, "val") if "/hallway_2/" in n]
+        assert len(halves) in (0, 2)
+
+
+def test_validation_rooms_are_those_of_the_seed(stanford_root: Path, strips: Any) -> None:
+    def rooms(seed: int) -> tuple[str, ...]:
+        return tuple(_names(Stanford2D3DS(stanford_root, strips, seed=seed), "val"))
+
+    assert rooms(0) == rooms(0)
+    assert len({rooms(seed) for seed in range(10)}) > 1
+
+
+@pytest.mark.parametrize(("fraction", "rooms"), [(0.0, 0), (0.001, 1), (0.5, 4), (0.999, 7)])
+def test_at_least_one_room_never_all(
+    stanford_root: Path, strips: Any, fraction: float, rooms: int
+) -> None:
+    module = Stanford2D3DS(stanford_root, strips, validation_fraction=fraction)
+    assert len({n.rpartition("/")[0] for n in _names(module, "val")}) == rooms
+    assert len(_names(module, "train")) > 0
+
+
+def test_one_training_room(
+    fabricate_stanford: FabricateStanford, tmp_path: Path, strips: Any
+) -> None:
+    root = fabricate_stanford(tmp_path, {"1": ("office_1",) * 3, "5a": ("office_1",)})
+    with pytest.raises(DataError, match="one training room"):
+        Stanford2D3DS(root, strips, areas=("1", "5a")).setup()
+    module = Stanford2D3DS(root, strips, areas=("1", "5a"), validation_fraction=0)
+    assert [len(_names(module, split)) for split in ("train", "val", "test")] == [3, 0, 1]
+
+
+# --- reading -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("erp_height", [32, 16, 8])
+def test_reads_what_was_written(stanford_root: Path, strips: Any, erp_height: int) -> None:
+    module = Stanford2D3DS(stanford_root, type(strips)(erp_height))
+    source = module.source("test")
+    area, room, camera = source.name(1).split("/")
+    folder = stanford_root / area / "pano"
+    panorama = source.read(1)
+    assert panorama.rgb.shape == (erp_height, 2 * erp_height, 3)
+    assert panorama.depth is not None
+    dtypes = [a.dtype.name for a in (panorama.rgb, panorama.depth, panorama.labels)]
+    assert dtypes == ["uint8", "uint16", "uint8"]
+    # Blocks of 4×4 pixels: at these sizes every pixel is one block's.
+    step = 32 // erp_height
+    stem = f"camera_{camera}_{room}_frame_equirectangular_domain"
+    semantic = cv2.imread(str(folder / "semantic" / f"{stem}_semantic.png"))
+    assert semantic is not None
+    blue, green, red = np.moveaxis(semantic[::step, ::step].astype(int), -1, 0)
+    table = json.loads((stanford_root / "semantic_labels.json").read_text())
+    ids = {i: CLASSES.index(name.split("_")[0]) + 1 for i, name in enumerate(table) if i}
+    classes = np.vectorize(lambda i: ids.get(i, 0))(red * 65536 + green * 256 + blue)
+    assert classes.max() > 1
+    np.testing.assert_array_equal(panorama.labels, classes)
+    known = classes > 0
+    np.testing.assert_array_equal(
+        steps_to_meters(panorama.depth), np.where(known, 1 + (classes - 1) / 4, 0)
+    )
+    np.testing.assert_array_equal(panorama.rgb[..., 0], np.where(known, 5 + 15 * classes, 0))
+    np.testing.assert_array_equal(panorama.rgb[..., 1], np.where(known, 245 - 15 * classes, 0))
+    assert known.mean() == 7 / 8
+
+
+def test_masks_are_applied_on_reading(stanford_root: Path, strips: Any) -> None:
+    unknown = {}
+    for mask in ("labels", "any_black", "all_black"):
+        module = Stanford2D3DS(stanford_root, strips, mask=mask)
+        source = module.source("train")
+        unknown[mask] = source.read(0).labels == 0
+        counts = source.label_counts(0)
+        assert counts.shape == (256,)
+        values, expected = np.unique(source.read(0).labels, return_counts=True)
+        assert {v: counts[v] for v in np.flatnonzero(counts)} == dict(
+            zip(values, expected, strict=True)
+        )
+    # The fabricated black region has no labels; one more patch has no blue.
+    np.testing.assert_array_equal(unknown["labels"], unknown["all_black"])
+    assert unknown["any_black"][-2:, :4].all()
+    assert not unknown["labels"][-2:, :4].any()
+
+
+def test_without_depth_its_files_are_not_needed(broken_root: Path, strips: Any) -> None:
+    for path in broken_root.glob("area_*/pano/depth/*.png"):
+        path.unlink()
+    module = Stanford2D3DS(broken_root, strips, inputs=("rgb",))
+    assert module.source("test").read(0).depth is None
+    with pytest.raises(DataError, match=r"depth\.png"):
+        Stanford2D3DS(broken_root, strips).setup()
+
+
+@pytest.mark.parametrize("place", ["assets/semantic_labels.json", "elsewhere.json"])
+def test_other_places_of_the_class_table(broken_root: Path, strips: Any, place: str) -> None:
+    target = broken_root / place
+    target.parent.mkdir(exist_ok=True)
+    (broken_root / "semantic_labels.json").rename(target)
+    named = target if place == "elsewhere.json" else None
+    module = Stanford2D3DS(broken_root, strips, label_table=named)
+    assert module.source("test").read(0).labels.any()
+
+
+def test_leftovers_of_archives_are_passed_over(broken_root: Path, strips: Any) -> None:
+    rgb = _file(broken_root, "1", "rgb")
+    rgb.with_name(f"._{rgb.name}").write_bytes(b"leftover")
+    assert len(_names(Stanford2D3DS(broken_root, strips), "test")) == 2
+
+
+# --- what cannot be used -----------------------------------------------------------------------
+
+
+def _rewrite(path: Path, image: np.ndarray[Any, Any]) -> None:
+    assert cv2.imwrite(str(path), image)
+
+
+def _cut_off(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-30])
+
+
+DAMAGES: dict[str, tuple[str, Callable[[Path], object], str]] = {
+    "no depth": ("depth", Path.unlink, r"depth\.png: found .*No such file"),
+    "no semantic": ("semantic", Path.unlink, r"semantic\.png: found .*No such file"),
+    "cut off": ("rgb", _cut_off, r"rgb\.png: found .* parts missing"),
+    "no png": ("semantic", lambda p: p.write_bytes(b"P6 1 1 255 ..."), "no PNG header"),
+    "8-bit depth": (
+        "depth",
+        lambda p: _rewrite(p, np.zeros((16, 32), np.uint8)),
+        "found 8-bit grey; expected 16-bit grey",
+    ),
+    "grey rgb": (
+        "rgb",
+        lambda p: _rewrite(p, np.zeros((16, 32), np.uint8)),
+        "found 8-bit grey; expected 8-bit RGB or RGBA",
+    ),
+    "16-bit semantic": (
+        "semantic",
+        lambda p: _rewrite(p, np.zeros((16, 32, 3), np.uint16)),
+        "found 16-bit RGB",
+    ),
+    "no panorama": (
+        "rgb",
+        lambda p: _rewrite(p, np.zeros((16, 16, 3), np.uint8)),
+        "found 16×16 pixels; expected twice as wide as high",
+    ),
+    "other size": (
+        "depth",
+        lambda p: _rewrite(p, np.zeros((32, 64), np.uint16)),
+        "found 32×64 pixels; expected 16×32",
+    ),
+    "strange name": ("rgb", lambda p: p.rename(p.with_name("a.png")), "unknown file name"),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_damage_is_found_before_training(broken_root: Path, strips: Any, damage: str) -> None:
+    domain, inflict, message = DAMAGES[damage]
+    inflict(_file(broken_root, "5b", domain))  # a test area: training would never notice
+    with pytest.raises(DataError, match=message):
+        Stanford2D3DS(broken_root, strips).setup("fit")
+
+
+def test_damage_inside_a_file_is_found_on_reading(broken_root: Path, strips: Any) -> None:
+    path = _file(broken_root, "5a", "rgb")
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 255
+    path.write_bytes(content)
+    source = Stanford2D3DS(broken_root, strips).source("test")
+    with pytest.raises(DataError, match=r"rgb\.png: found a broken PNG"):
+        source.read(0)
+
+
+def test_missing_root(tmp_path: Path, strips: Any) -> None:
+    module = Stanford2D3DS(tmp_path / "nowhere", strips)
+    with pytest.raises(DataError, match=r"nowhere: found no such folder.*buildingparser"):
+        module.setup()
+
+
+def test_wrong_layout(broken_root: Path, strips: Any) -> None:
+    with pytest.raises(DataError, match="no area_1, area_2"):
+        Stanford2D3DS(broken_root / "area_1", strips).setup()
+    (broken_root / "area_5b").rename(broken_root / "spare")
+    with pytest.raises(DataError, match=r"found no area_5b; expected all of area_1"):
+        Stanford2D3DS(broken_root, strips).setup()
+    (broken_root / "area_5b" / "data").mkdir(parents=True)
+    with pytest.raises(DataError, match=r"area_5b/pano/rgb: found no panoramas"):
+        Stanford2D3DS(broken_root, strips).setup()
+
+
+def test_missing_class_table(broken_root: Path, strips: Any) -> None:
+    (broken_root / "semantic_labels.json").unlink()
+    with pytest.raises(DataError, match=r"no class table.*assets.*data\.label_table"):
+        Stanford2D3DS(broken_root, strips).setup()
+
+
+def test_more_rows_than_the_files_have(broken_root: Path, strips: Any) -> None:
+    with pytest.raises(SettingError, match="found 32; expected at most the 16 rows"):
+        Stanford2D3DS(broken_root, type(strips)(32)).setup()
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("fold", 4),
+        ("mask", "black"),
+        ("validation_fraction", 1.0),
+        ("validation_fraction", -0.1),
+        ("areas", ("1", "7")),
+        ("areas", ("1", "2")),
+        ("areas", ("5a", "5b")),
+    ],
+)
+def test_impossible_settings(tmp_path: Path, strips: Any, name: str, value: Any) -> None:
+    with pytest.raises(SettingError, match=rf"data\.{name}"):
+        Stanford2D3DS(tmp_path, strips, **{name: value})

@@ -1,0 +1,237 @@
+from __future__ import annotations
+
+import json
+import math
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+import pytest
+
+from datamodules import Stanford2D3DS, Stanford2D3DSPerspective, SynthRooms, SynthRoomsPerspective
+from datamodules.core.photos import distance_from_z_depth
+from datamodules.stanford2d3ds.perspective import read_camera_matrix
+from tangent_train.errors import DataError, SettingError
+from tangent_train.geometry import (
+    FLIP_Y,
+    camera_matrix_from_fov,
+    lonlat_to_equirect,
+    perspective_directions,
+    xyz_to_lonlat,
+)
+from tangent_train.rendering import PerspectiveRepresentation, TangentRepresentation
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from tests.conftest import FabricateStanford
+
+CROPS = PerspectiveRepresentation(level=5, evaluation="grid", crops_per_photo=2)
+
+
+@pytest.fixture(scope="module")
+def photo_root(
+    tmp_path_factory: pytest.TempPathFactory, fabricate_stanford: FabricateStanford
+) -> Path:
+    return fabricate_stanford(tmp_path_factory.mktemp("photos"), photos=2)
+
+
+@pytest.fixture
+def broken_root(tmp_path: Path, fabricate_stanford: FabricateStanford) -> Path:
+    return fabricate_stanford(tmp_path / "data", photos=1)
+
+
+def _file(root: Path, area: str, domain: str) -> Path:
+    return sorted((root / f"area_{area}" / "data" / domain).iterdir())[0]
+
+
+# --- reading -----------------------------------------------------------------------------------
+
+
+def test_a_photo_is_what_the_files_hold(photo_root: Path) -> None:
+    source = Stanford2D3DSPerspective(photo_root, CROPS).source("test")
+    photo, name = source.read(1), source.name(1)
+    area, room, camera, frame = name.split("/")
+    stem = f"camera_{camera}_{room}_frame_{frame}_domain"
+    data = photo_root / area / "data"
+    bgr: Any = cv2.imread(str(data / "rgb" / f"{stem}_rgb.png"))
+    np.testing.assert_array_equal(photo.rgb, bgr[..., ::-1])
+    z: Any = cv2.imread(str(data / "depth" / f"{stem}_depth.png"), cv2.IMREAD_UNCHANGED)
+    assert photo.depth is not None
+    assert (photo.depth[z == 65535] == 0).all(), "missing"
+    assert (photo.labels[z == 65535] == 0).all(), "#0D0D0D is unknown, not clutter"
+    # Distance of a pixel at (x, y) from the middle of a picture of 32 pixels that sees 62°.
+    focal = 16 / math.tan(math.radians(31))
+    for row, column in ((10, 3), (20, 30), (31, 0)):
+        x, y = column + 0.5 - 16, row + 0.5 - 16
+        expected = z[row, column] * math.sqrt(1 + (x * x + y * y) / focal**2)
+        assert photo.depth[row, column] == pytest.approx(expected, abs=0.51)
+    np.testing.assert_allclose(
+        photo.camera_matrix, camera_matrix_from_fov(62, (32, 32)), err_msg="counted from centres"
+    )
+
+
+def test_distances_saturate_and_holes_stay_holes() -> None:
+    z = np.array([[0, 65535], [60000, 512]], np.uint16)
+    camera = camera_matrix_from_fov(90, (2, 2))
+    # Pixels at (±½, ±½) with f = 1: √1.5 times the z-depth.
+    np.testing.assert_array_equal(distance_from_z_depth(z, camera), [[0, 65535], [65535, 627]])
+
+
+def test_depth_means_the_same_in_photos_and_panoramas_of_a_room(tmp_path: Path) -> None:
+    rooms = {"rooms": {"1": 1, "5a": 1}, "height": 256, "views_per_camera": 3, "view_size": 64}
+    settings: Any = {"rooms": {**rooms, "views": "uniform"}, "validation_fraction": 0}
+    photos = SynthRoomsPerspective(tmp_path / "rooms", CROPS, **settings)
+    photos.prepare_data()
+    panoramas = SynthRooms(tmp_path / "rooms", TangentRepresentation(0, 7), **settings)
+    panorama, of = panoramas.source("test").read(0), panoramas.sample_name("test", 0)
+    found = []
+    for index in range(len(photos.source("test"))):
+        name = photos.sample_name("test", index)
+        if not name.startswith(of):
+            continue
+        photo = photos.source("test").read(index)
+        rows = _panorama_pixels(tmp_path / "rooms", name, photo.camera_matrix)
+        same = panorama.labels[rows] == photo.labels
+        assert panorama.depth is not None
+        assert photo.depth is not None
+        both = same & (panorama.depth[rows] > 0) & (photo.depth > 0)
+        found += [(photo.depth[both] / panorama.depth[rows][both]).ravel()]
+        assert same.mean() > 0.9
+    ratios = np.concatenate(found)
+    assert len(found) == 3
+    assert abs(np.median(ratios) - 1) < 0.002
+    assert (abs(ratios - 1) < 0.03).mean() > 0.95, "z-depth would be up to 30 % less"
+
+
+def _panorama_pixels(root: Path, name: str, camera_matrix: Any) -> Any:
+    """Where the panorama shows what a photo shows, from the pose files alone."""
+    area, room, camera, frame = name.split("/")
+    rotations = []
+    for group, of in (("data", frame), ("pano", "equirectangular")):
+        path = root / area / group / "pose" / f"camera_{camera}_{room}_frame_{of}_domain_pose.json"
+        rotations.append(np.array(json.loads(path.read_text())["camera_rt_matrix"])[:, :3])
+    rays = perspective_directions(camera_matrix, (64, 64)) @ rotations[0]  # in the room
+    x, y, z = np.moveaxis(rays @ rotations[1].T, -1, 0)  # in the upright camera of the panorama
+    sphere = np.stack([z, x, -y], axis=-1)
+    pixels = lonlat_to_equirect(xyz_to_lonlat(sphere), (256, 512))
+    column, row = np.moveaxis(np.rint(pixels).astype(int), -1, 0)
+    return row.clip(0, 255), column % 512
+
+
+# --- splits ------------------------------------------------------------------------------------
+
+
+def test_photos_are_split_as_the_panoramas(photo_root: Path) -> None:
+    photos = Stanford2D3DSPerspective(photo_root, CROPS, fold=2, seed=3, validation_fraction=0.3)
+    panoramas = Stanford2D3DS(
+        photo_root, TangentRepresentation(0, 4), fold=2, seed=3, validation_fraction=0.3
+    )
+    for split in ("train", "val", "test"):
+        shown = [photos.sample_name(split, i) for i in range(len(photos.source(split)))]
+        whole = [panoramas.sample_name(split, i) for i in range(len(panoramas.source(split)))]
+        assert len(shown) == 2 * len(whole) > 0
+        assert {name.rpartition("/")[0] for name in shown} == set(whole)
+
+
+# --- samples -----------------------------------------------------------------------------------
+
+
+def test_samples(photo_root: Path) -> None:
+    module = Stanford2D3DSPerspective(
+        photo_root, CROPS, photos_per_step=3, validation_fraction=0, in_memory=True
+    )
+    batch = next(iter(module.train_dataloader()))
+    assert [part.shape for part in batch.images] == [(3, 2, 16, 16, 3), (3, 2, 16, 16)]
+    assert batch.labels.shape == (3, 2, 16, 16)
+    normalized = module.on_after_batch_transfer(batch, 0).images
+    assert normalized.shape == (3, 2, 4, 16, 16)
+    (first, *rest) = module.test_dataloader()
+    assert len(rest) + 1 == len(module.source("test"))
+    # 60° in crops of 45°: two across, two down.
+    assert first.images[0].shape == (1, 4, 16, 16, 3)
+    assert first.target.shape == (1, 4, 16, 16)
+    quarter = (first.target[0] > 0).float().mean(dim=(1, 2))
+    assert (quarter < 0.75).all(), "what another crop owns does not count"
+
+
+def test_training_draws_other_crops_each_epoch_and_the_same_again(photo_root: Path) -> None:
+    def labels(epoch: int, workers: int, stream: int = 0) -> Any:
+        settings: Any = {"num_workers": workers, "stream": stream, "photos_per_step": 2}
+        module = Stanford2D3DSPerspective(photo_root, CROPS, validation_fraction=0, **settings)
+        loader = module.train_dataloader()
+        loader.sampler.set_epoch(epoch)  # type: ignore[attr-defined]
+        return next(iter(loader)).labels.numpy()
+
+    np.testing.assert_array_equal(labels(1, 0), labels(1, 2))
+    assert (labels(0, 0) != labels(1, 0)).any()
+    assert (labels(0, 0) != labels(0, 0, stream=1)).any(), "fine-tuning sees others"
+
+
+def test_rgb_alone_needs_no_depth_files(broken_root: Path) -> None:
+    _file(broken_root, "5a", "depth").unlink()
+    module = Stanford2D3DSPerspective(broken_root, CROPS, inputs=["rgb"])
+    assert module.source("test").read(0).depth is None
+    with pytest.raises(DataError, match=r"data/depth/camera.*No such file"):
+        Stanford2D3DSPerspective(broken_root, CROPS).setup()
+
+
+# --- what cannot work --------------------------------------------------------------------------
+
+
+def test_a_photo_that_sees_less_than_a_crop_is_named(broken_root: Path) -> None:
+    module = Stanford2D3DSPerspective(broken_root, PerspectiveRepresentation(5, fov_deg=70))
+    message = r"rgb\.png: found 70° × 70° for an image that spans 60° × 60°; expected all of a crop"
+    with pytest.raises(DataError, match=message):
+        module.setup()
+
+
+POSES = {
+    "no JSON": ("{", "JSONDecodeError"),
+    "no matrix": ("{}", "KeyError: 'camera_k_matrix'"),
+    "no numbers": ('{"camera_k_matrix": "f"}', "ValueError"),
+    "a list": ("[]", "TypeError"),
+    "skew": ('{"camera_k_matrix": [[9, 1, 4], [0, 9, 4], [0, 0, 1]]}', "9.0, 1.0"),
+    "no focal length": ('{"camera_k_matrix": [[0, 0, 4], [0, 9, 4], [0, 0, 1]]}', "0.0"),
+    "not finite": ('{"camera_k_matrix": [[NaN, 0, 4], [0, 9, 4], [0, 0, 1]]}', "nan"),
+    "of 2×3": ('{"camera_k_matrix": [[9, 0, 4], [0, 9, 4]]}', "9.0"),
+}
+
+
+@pytest.mark.parametrize("damage", POSES)
+def test_broken_poses_are_found_before_training(broken_root: Path, damage: str) -> None:
+    content, found = POSES[damage]
+    path = _file(broken_root, "5b", "pose")
+    path.write_text(content)
+    with pytest.raises(DataError, match=rf"pose\.json: found .*{found}.*camera_k_matrix"):
+        Stanford2D3DSPerspective(broken_root, CROPS).setup()
+
+
+def test_missing_pose(broken_root: Path) -> None:
+    path = _file(broken_root, "5b", "pose")
+    path.unlink()
+    with pytest.raises(DataError, match=rf"{path.name}: found FileNotFoundError"):
+        read_camera_matrix(path)
+    with pytest.raises(DataError, match=path.name):
+        Stanford2D3DSPerspective(broken_root, CROPS).setup()
+
+
+def test_no_photos(stanford_root: Path) -> None:
+    with pytest.raises(DataError, match=r"area_1/data/rgb: found no photos"):
+        Stanford2D3DSPerspective(stanford_root, CROPS).setup()
+    with pytest.raises(SettingError, match=r"views_per_camera: found 0"):
+        SynthRoomsPerspective(stanford_root, CROPS, rooms={})
+
+
+def test_representations_of_the_other_kind(photo_root: Path) -> None:
+    tangent: Any = TangentRepresentation(0, 5)
+    with pytest.raises(SettingError, match="found TangentRepresentation; expected one for photos"):
+        Stanford2D3DSPerspective(photo_root, tangent)
+    crops: Any = CROPS
+    with pytest.raises(SettingError, match="PerspectiveRepresentation; expected one for panoramas"):
+        Stanford2D3DS(photo_root, crops)
+
+
+def test_flip_y_is_a_mirror() -> None:
+    # The pose test above relies on it: the sphere's frame is the camera's, axes renamed.
+    assert np.linalg.det(FLIP_Y) == pytest.approx(-1)

@@ -1,0 +1,255 @@
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from datamodules.core.samples import Normalization
+from datamodules.synthia.omnisynthia import OmniSynthia
+from tangent_train.errors import DataError, SettingError
+from tests.datamodules.synthia import synthia_format as synthia
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+FRAMES = {"01": 5, "02": 3, "04": 2, "05": 2, "06": 4}
+SPLITS: tuple[Any, ...] = ("train", "val", "test")
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Panoramas as published; not to be changed."""
+    return synthia.write_panoramas(tmp_path_factory.mktemp("omnisynthia"), FRAMES)
+
+
+@pytest.fixture
+def broken_root(tmp_path: Path) -> Path:
+    """Panoramas of two sequences, to be damaged."""
+    return synthia.write_panoramas(tmp_path / "data", {"01": 2, "04": 2})
+
+
+def two(root: Path, strips: Any, **settings: Any) -> OmniSynthia:
+    return OmniSynthia(
+        root, strips, **{"train_sequences": ["01"], "test_sequences": ["04"], **settings}
+    )
+
+
+def names(module: OmniSynthia, split: Any) -> list[str]:
+    source = module.source(split)
+    return [source.name(i) for i in range(len(source))]
+
+
+# --- splits --------------------------------------------------------------------------------------
+
+
+def test_splits(root: Path, strips: Any) -> None:
+    module = OmniSynthia(root, strips)
+    module.prepare_data()  # nothing to make
+    module.setup("fit")
+    splits = {split: names(module, split) for split in SPLITS}
+    assert splits["val"] == [
+        "sequence_01/000004",
+        "sequence_02/000002",
+        "sequence_05/000001",
+        "sequence_06/000003",
+    ]
+    assert splits["test"] == ["sequence_04/000000", "sequence_04/000001"]
+    assert len(splits["train"]) == 14 - 4
+    assert len({name for split in splits.values() for name in split}) == sum(FRAMES.values())
+    assert not list(root.rglob("*.json"))
+
+
+def test_without_validation(root: Path, strips: Any) -> None:
+    module = two(root, strips, validation_fraction=0)
+    assert [len(names(module, split)) for split in SPLITS] == [5, 0, 2]
+    assert module.val_dataloader() == []
+
+
+def test_classes(root: Path, strips: Any) -> None:
+    module = two(root, strips)
+    assert len(module.class_names) == 14
+    assert module.class_names[0] == "unknown"
+    assert (module.class_names[8], module.class_names[13]) == ("car", "traffic light")
+    weights = module.class_weights("log")
+    assert weights.shape == (14,)
+    assert weights[0] == 0
+    assert (weights > 0).sum() > 8
+
+
+# --- reading -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("erp_height", [32, 16, 8])
+def test_reads_what_was_written(root: Path, strips: Any, erp_height: int) -> None:
+    module = OmniSynthia(root, type(strips)(erp_height), inputs=("rgb", "depth"))
+    source = module.source("test")
+    panorama = source.read(1)
+    pano = synthia.sequence(root, "04") / "pano"
+    # Blocks of 4×4 pixels: at these sizes every pixel is one block's.
+    step = 32 // erp_height
+    labels = synthia.read_png(pano / "GT" / "LABELS_Correct" / "000001.png")
+    ids = labels[::step, ::step].astype(int)
+    assert {15, 255} <= set(np.unique(ids).tolist())
+    expected = np.where(ids == 15, 13, np.where(ids == 255, 0, ids))
+    np.testing.assert_array_equal(panorama.labels, expected)
+    rgb = np.stack([10 * (ids % 16) + 5, 200 - ids % 16, 0 * ids + 50], axis=-1)
+    rgb[ids == 255] = 0
+    np.testing.assert_array_equal(panorama.rgb, rgb)
+    assert panorama.depth is not None
+    meters = np.where(ids == 255, 0, 1 + ids / 10)
+    near = ids != 8  # which are 600 m away
+    assert np.abs(panorama.depth / 512 - meters)[near].max() <= 0.5 / 512
+    assert (panorama.depth[~near] == 65535).all()
+    dtypes = [a.dtype.name for a in (panorama.rgb, panorama.depth, panorama.labels)]
+    assert dtypes == ["uint8", "uint16", "uint8"]
+    counts = np.bincount(expected.ravel(), minlength=256)
+    np.testing.assert_array_equal(source.label_counts(1), counts)
+
+
+def test_reserved_labels_are_unknown(broken_root: Path, strips: Any) -> None:
+    pano = synthia.sequence(broken_root, "04") / "pano"
+    labels = np.full((32, 64), 14, np.uint8)
+    labels[:16] = 13
+    synthia.write_png(pano / "GT" / "LABELS_Correct" / "000000.png", labels)
+    assert not two(broken_root, strips).source("test").read(0).labels.any()
+    labels[20, 30] = 16
+    synthia.write_png(pano / "GT" / "LABELS_Correct" / "000000.png", labels)
+    source = two(broken_root, strips).source("test")
+    for read in (source.read, source.label_counts):
+        with pytest.raises(DataError, match=r"04-SUMMER.*000000\.png: found labels 16"):
+            read(0)
+
+
+def test_without_depth_its_files_are_not_needed(broken_root: Path, strips: Any) -> None:
+    for path in broken_root.glob("*/pano/Depth/*.png"):
+        path.unlink()
+    module = two(broken_root, strips)
+    assert module.in_channels == 3
+    assert module.source("test").read(0).depth is None
+    with pytest.raises(DataError, match=r"Depth/000000\.png"):
+        two(broken_root, strips, inputs=("rgb", "depth")).setup()
+
+
+def test_a_store_gives_the_same(root: Path, strips: Any, tmp_path: Path) -> None:
+    settings = {"inputs": ("rgb", "depth")}
+    plain = two(root, strips, **settings).source("test")
+    module = two(root, strips, store=tmp_path / "store", **settings)
+    module.prepare_data()
+    stored = module.source("test")
+    for index in range(len(plain)):
+        for one, other in zip(plain.read(index), stored.read(index), strict=True):
+            np.testing.assert_array_equal(one, other)
+    (prepared,) = (tmp_path / "store").glob("*/sequence_04/000001.panorama")
+    assert prepared.parts[-3].startswith("16x32")
+
+
+def test_batches(root: Path, strips: Any) -> None:
+    module = two(root, strips, inputs=("rgb", "depth"), panoramas_per_step=2)
+    batch = next(iter(module.train_dataloader()))
+    images = module.on_after_batch_transfer(batch, 0).images
+    assert images.shape == (2, 2, 4, 16, 8)
+    rgb = batch.images[0].double() / 255
+    np.testing.assert_allclose(
+        images[:, :, 0].numpy(), (rgb[..., 0].numpy() - 0.4512) / 0.2601, atol=1e-5
+    )
+
+
+def test_normalization(root: Path, strips: Any) -> None:
+    assert two(root, strips).normalization.mean == (0.4512, 0.4257, 0.3920)
+    assert two(root, strips, inputs=["rgb", "depth"]).normalization.mean[3] == 1.0961773
+    own = Normalization((0, 0, 0), (1, 1, 1))
+    assert two(root, strips, normalization=own).normalization == own
+
+
+# --- making --------------------------------------------------------------------------------------
+
+
+def test_panoramas_are_made_from_views(tmp_path: Path, strips: Any) -> None:
+    root = synthia.write_views(tmp_path, {"01": 3})
+    synthia.write_panoramas(root, {"04": 1})
+    # Numbers, as YAML reads them.
+    sequences = {"train_sequences": [1], "test_sequences": [4]}
+    module = two(root, strips, panorama_height=64, frames=2, **sequences)
+    with pytest.raises(DataError, match=r"pano/RGB: found no panoramas.*tangent-prepare"):
+        module.setup()
+    module.prepare_data()
+    module.setup("fit")
+    assert names(module, "train") == ["sequence_01/000000"]
+    assert names(module, "val") == ["sequence_01/000002"]
+    labels = module.source("train").read(0).labels
+    assert labels.shape == (16, 32)
+    assert set(np.unique(labels).tolist()) == set(range(14))
+    two(root, strips, panorama_height=64, frames=2).make_files()
+    with pytest.raises(DataError, match="'height': 64"):
+        two(root, strips, frames=2).make_files()
+
+
+def test_missing_root(tmp_path: Path, strips: Any) -> None:
+    module = OmniSynthia(tmp_path / "nowhere", strips)
+    for step in (module.make_files, module.setup):
+        with pytest.raises(DataError, match=r"nowhere: found no such folder.*synthia-dataset"):
+            step()
+
+
+def test_neither_views_nor_panoramas(broken_root: Path, strips: Any) -> None:
+    with pytest.raises(DataError, match=r"SEQS-02-SUMMER: found neither .*synthia-dataset"):
+        OmniSynthia(broken_root, strips).make_files()
+
+
+# --- what cannot be used -------------------------------------------------------------------------
+
+
+def _cut_off(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-30])
+
+
+def _rewrite(shape: tuple[int, ...], dtype: Any) -> Callable[[Path], None]:
+    return lambda path: synthia.write_png(path, np.zeros(shape, dtype))
+
+
+DAMAGES: dict[str, tuple[str, Callable[[Path], object], str]] = {
+    "no labels": ("GT/LABELS_Correct", lambda p: p.unlink(), "No such file"),
+    "cut off": ("RGB", _cut_off, "parts missing"),
+    "labels of 16 bits": ("GT/LABELS_Correct", _rewrite((32, 64), np.uint16), "16-bit grey"),
+    "coloured labels": ("GT/LABELS_Correct", _rewrite((32, 64, 3), np.uint8), "8-bit RGB"),
+    "8-bit depth": ("Depth", _rewrite((32, 64), np.uint8), "8-bit grey; expected 16-bit grey"),
+    "other size": ("Depth", _rewrite((16, 32), np.uint16), "found 16×32 pixels; expected 32×64"),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_damage_is_found_before_training(broken_root: Path, strips: Any, damage: str) -> None:
+    part, inflict, message = DAMAGES[damage]
+    place = f"pano/{part}/000001.png"
+    inflict(synthia.sequence(broken_root, "04") / place)  # training would never notice
+    with pytest.raises(DataError, match=f"{place}: .*{message}"):
+        two(broken_root, strips, inputs=("rgb", "depth")).setup("fit")
+
+
+def test_no_panorama(broken_root: Path, strips: Any) -> None:
+    pano = synthia.sequence(broken_root, "01") / "pano"
+    _rewrite((32, 32, 3), np.uint8)(pano / "RGB" / "000000.png")
+    _rewrite((32, 32), np.uint8)(pano / "GT" / "LABELS_Correct" / "000000.png")
+    with pytest.raises(DataError, match="found 32×32 pixels; expected twice as wide"):
+        two(broken_root, strips).setup()
+
+
+def test_more_rows_than_the_files_have(root: Path, strips: Any) -> None:
+    with pytest.raises(SettingError, match="found 64; expected at most the 32 rows"):
+        two(root, type(strips)(64)).setup()
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("train_sequences", ["03"]),
+        ("test_sequences", ["01"]),
+        ("validation_fraction", 1.0),
+        ("inputs", ["depth"]),
+    ],
+)
+def test_impossible_settings(tmp_path: Path, strips: Any, name: str, value: Any) -> None:
+    with pytest.raises(SettingError, match=rf"data\.{name}"):
+        OmniSynthia(tmp_path, strips, **{name: value})

@@ -1,0 +1,509 @@
+"""Panoramas of SYNTHIA's views, against closed forms and against panoramas rendered directly."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import cv2
+import numpy as np
+import pytest
+
+from datamodules.core.photos import distance_from_z_depth
+from datamodules.synthia import panoramas as synthia_panoramas
+from datamodules.synthia.files import VIEWS
+from datamodules.synthia.panoramas import MANIFEST, ViewStitcher, make_panoramas
+from datamodules.synthrooms.camera import PanoramaView, Pose
+from datamodules.synthrooms.raycast import RayScene
+from datamodules.synthrooms.render import Camera, Holes, Picture, render
+from datamodules.synthrooms.scene import furnish
+from tangent_train.errors import DataError, SettingError
+from tangent_train.files import write_bytes
+from tangent_train.geometry import equirect_directions, perspective_directions
+from tests.datamodules.synthia import synthia_format as synthia
+from tests.datamodules.synthia.synthia_format import HEIGHT, SIZE
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+DIRECTIONS = equirect_directions((HEIGHT, 2 * HEIGHT))
+PARTS = {"rgb": "RGB", "labels": "GT/LABELS_Correct", "depth": "Depth"}
+
+
+def make(root: Path, *sequences: str, **settings: Any) -> int:
+    return make_panoramas(root, sequences, **{"height": HEIGHT, "progress": False, **settings})
+
+
+def panorama(root: Path, part: str, sequence: str = "01", frame: int = 0) -> NDArray[Any]:
+    folder = synthia.sequence(root, sequence) / "pano" / PARTS[part]
+    return synthia.read_png(folder / f"{frame:06d}.png")
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+
+class Seen(NamedTuple):
+    """Where the pixels of the panorama are in the views, pixel by pixel in float64."""
+
+    view: NDArray[np.int64]
+    place: NDArray[np.float64]
+    inside: NDArray[np.bool_]
+
+    def nearest(self, views: NDArray[Any], elsewhere: int) -> NDArray[Any]:
+        """The pixel of the views ``(4, h, w)`` nearest to each pixel of the panorama."""
+        column, row = np.moveaxis(np.rint(self.place).astype(int), -1, 0)
+        row, column = np.clip(row, 0, SIZE[0] - 1), np.clip(column, 0, SIZE[1] - 1)
+        return np.where(self.inside, views[self.view, row, column], elsewhere)
+
+    @property
+    def certain(self) -> NDArray[np.bool_]:
+        """Where no rounding decides which pixel is the nearest."""
+        near: NDArray[np.bool_] = np.abs(self.place % 1 - 0.5).min(axis=-1) > 1e-3
+        return near
+
+
+@pytest.fixture(scope="module")
+def seen() -> Seen:
+    places = np.stack([synthia.project(DIRECTIONS, view) for view in VIEWS])
+    view = places[..., 2].argmax(axis=0)
+    place = np.take_along_axis(places, view[None, ..., None], axis=0)[0, ..., :2]
+    edge = np.array([SIZE[1], SIZE[0]]) - 0.5
+    inside = ((place >= -0.5) & (place <= edge)).all(axis=-1)
+    seen = Seen(view, place, np.array(inside))
+    assert 0.3 < seen.inside.mean() < 0.4
+    assert seen.certain.mean() > 0.98
+    return seen
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three frames of two sequences and their panoramas; not to be changed."""
+    root = synthia.write_views(tmp_path_factory.mktemp("synthia"), {"01": 3, "04": 1})
+    assert make(root, "01", "04") == 4
+    return root
+
+
+@pytest.fixture
+def views(tmp_path: Path) -> Path:
+    """Two frames without panoramas."""
+    return synthia.write_views(tmp_path / "synthia", {"01": 2})
+
+
+# --- geometry ------------------------------------------------------------------------------------
+
+
+def test_labels_are_those_of_the_nearest_pixel_of_one_view(made: Path, seen: Seen) -> None:
+    for frame in (0, 1):
+        ids = np.stack([synthia.labels_of(synthia.view_rays(v), frame) for v in VIEWS])
+        labels = panorama(made, "labels", frame=frame)
+        assert labels.dtype == np.uint8
+        expected = seen.nearest(ids, 255)
+        np.testing.assert_array_equal(labels[seen.certain], expected[seen.certain])
+
+
+def test_colours_are_those_of_the_world(made: Path, seen: Seen) -> None:
+    rgb = panorama(made, "rgb")[..., ::-1]
+    error = np.abs(rgb - synthia.rgb_of(DIRECTIONS))
+    inner = (seen.place >= 0) & (seen.place <= np.array([SIZE[1] - 1, SIZE[0] - 1]))
+    assert error[inner.all(axis=-1)].max() < 1.5
+    assert error[seen.inside].max() < 4  # the outer half of the outermost pixels
+    assert not rgb[~seen.inside].any()
+
+
+def test_depth_is_the_distance_from_the_centre(made: Path, seen: Seen) -> None:
+    rays = np.stack([synthia.view_rays(view) for view in VIEWS])
+    distance = np.rint(500 + 10 * rays[..., 2]) * np.linalg.norm(rays, axis=-1)
+    distance[:, :2, :3] = 0  # as fabricated
+    for frame in (0, 1):  # in one channel and in three
+        depth = panorama(made, "depth", frame=frame)
+        assert depth.dtype == np.uint16
+        expected = seen.nearest(distance, 0)
+        assert np.abs(depth - expected)[seen.certain].max() <= 0.5
+        np.testing.assert_array_equal((depth == 0)[seen.certain], (expected == 0)[seen.certain])
+
+
+def test_distances_are_those_of_photos() -> None:
+    rng = np.random.default_rng(0)
+    views = [rng.integers(0, 65536, SIZE, np.uint16) for _ in VIEWS]
+    camera = np.array([[20, 0, 30], [0, 25, 19], [0, 0, 1.0]])
+    depth = ViewStitcher(camera, SIZE, HEIGHT).depth(views)
+    values = np.concatenate([distance_from_z_depth(view, camera).ravel() for view in views])
+    assert set(depth.ravel().tolist()) <= {0, *values.tolist()}
+    assert depth.max() == 65535
+
+
+def test_the_right_view_is_to_the_right_of_the_front() -> None:
+    stitcher = ViewStitcher(_camera(), SIZE, HEIGHT)
+    marks = [np.full(SIZE, value, np.uint8) for value in (1, 2, 3, 4)]
+    horizon = stitcher.labels(marks)[HEIGHT // 2]
+    eighth = HEIGHT // 4
+    np.testing.assert_array_equal(
+        horizon, np.repeat([3, 4, 1, 2, 3], [eighth, 2 * eighth, 2 * eighth, 2 * eighth, eighth])
+    )
+    # Within a view the right stays right and up stays up.
+    halves = np.where(np.arange(SIZE[1]) < SIZE[1] // 2, 1, 2) + np.zeros((SIZE[0], 1))
+    front = stitcher.labels([halves.astype(np.uint8)] * 4)[HEIGHT // 2, 3 * eighth : 5 * eighth]
+    np.testing.assert_array_equal(front, np.repeat([1, 2], eighth))
+    halves = np.where(np.arange(SIZE[0])[:, None] < SIZE[0] // 2, 1, 2) + np.zeros(SIZE[1])
+    column = stitcher.labels([halves.astype(np.uint8)] * 4)[:, HEIGHT]
+    assert column[HEIGHT // 2 - 1 : HEIGHT // 2 + 1].tolist() == [1, 2]
+
+
+def _camera() -> NDArray[np.float64]:
+    x, y = synthia.CENTER_X - 0.5, synthia.CENTER_Y - 0.5
+    return np.array([[synthia.FOCAL, 0, x], [0, synthia.FOCAL, y], [0, 0, 1]])
+
+
+@pytest.mark.parametrize("height", [HEIGHT, 63, 100])
+def test_views_never_mix(height: int) -> None:
+    stitcher = ViewStitcher(_camera(), SIZE, height)
+    grey = [10, 60, 110, 160]
+    rgb = stitcher.rgb([np.full((*SIZE, 3), value, np.uint8) for value in grey])
+    assert np.unique(rgb).tolist() == [0, *grey]
+    labels = stitcher.labels([np.full(SIZE, value, np.uint8) for value in (3, 12, 9, 15)])
+    assert np.unique(labels).tolist() == [3, 9, 12, 15, 255]
+    depth = stitcher.depth([np.full(SIZE, 65535, np.uint16)] * 4)
+    assert np.unique(depth).tolist() == [0, 65535]
+    for image, elsewhere in ((rgb[..., 0], 0), (labels, 255), (depth, 0)):
+        np.testing.assert_array_equal(image == elsewhere, labels == 255)
+
+
+@pytest.mark.parametrize("height", [HEIGHT, 63])
+def test_a_band_without_gaps_between_blind_poles(height: int) -> None:
+    stitcher = ViewStitcher(_camera(), SIZE, height)
+    valid = stitcher.labels([np.zeros(SIZE, np.uint8)] * 4) == 0
+    # By its half height a view sees atan(19 / f) ahead, less to the sides.
+    ahead, corner = np.arctan2(19, [synthia.FOCAL, synthia.FOCAL * np.sqrt(2)])
+    latitude = np.abs(np.pi / 2 - (np.arange(height) + 0.5) / height * np.pi)
+    assert valid[latitude < corner].all()  # all around, ±180° included
+    assert not valid[latitude > ahead].any()
+    np.testing.assert_array_equal(valid, valid[:, ::-1])
+    np.testing.assert_array_equal(valid, valid[::-1])
+
+
+# --- a furnished room ----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class StreetView:
+    """A pinhole picture of any camera; its depth is the z-depth."""
+
+    pose: Pose
+    camera_matrix: NDArray[np.float64]
+    size: tuple[int, int]
+
+    def rays(self, dx: float = 0.0, dy: float = 0.0) -> NDArray[np.float32]:
+        moved = self.camera_matrix.copy()
+        moved[:2, 2] -= (dx, dy)
+        directions = perspective_directions(moved, self.size)
+        return (directions @ self.pose.world_from_camera.T).astype(np.float32)
+
+    def depth_m(
+        self, distance_m: NDArray[np.float32], rays: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        return distance_m * (rays @ self.pose.world_from_camera[:, 2].astype(np.float32))
+
+
+ROOM_SIZE, ROOM_FOCAL, ROOM_HEIGHT = (190, 320), 133.185, 400
+
+
+class Room(NamedTuple):
+    """A panorama put together from views, and the same rendered directly."""
+
+    rgb: NDArray[Any]
+    depth: NDArray[Any]
+    labels: NDArray[Any]
+    direct: Picture
+    direct_labels: NDArray[np.int64]
+    calm: NDArray[np.bool_]
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Room:
+    rng = np.random.default_rng(5)
+    furnished = furnish(rng, "office")
+    scene = RayScene(furnished)
+    area = furnished.plan.floors[0]
+    location = np.array([(area.x0 + area.x1) / 2, (area.y0 + area.y1) / 2, 1.5])
+    camera = Camera(location, 0.7, (0.0, 0.0), np.full(3, 0.8, np.float32), 0.0)
+    holes = Holes(np.zeros((0, 3)), np.zeros(0))
+    ids = np.append(synthia.IDS[np.arange(len(furnished.items)) % 13], 0)  # missing is −1
+    pose = Pose.looking(location, camera.heading)
+    direct = render(scene, PanoramaView(pose, ROOM_HEIGHT), camera, holes, 2, rng)
+    root = tmp_path_factory.mktemp("room")
+    folder = synthia.sequence(root, "02")
+    for turns, view in enumerate("FRBL"):  # to the right: clockwise from above
+        looking = Pose.looking(location, camera.heading - turns * np.pi / 2)
+        K = np.array([[ROOM_FOCAL, 0, 159.5], [0, ROOM_FOCAL, 94.5], [0, 0, 1]])
+        picture = render(scene, StreetView(looking, K, ROOM_SIZE), camera, holes, 2, rng)
+        place = f"Stereo_Left/Omni_{view}/000000.png"
+        synthia.write_png(folder / "RGB" / place, picture.rgb[..., ::-1])
+        centimeters = np.nan_to_num(100 * picture.depth_m + 0.5).astype(np.uint16)
+        synthia.write_png(folder / "Depth" / place, centimeters)
+        classes = ids[picture.items].astype(np.uint16)
+        labels = np.stack([classes * 0 + 7, classes * 0 + 300, classes], axis=-1)
+        synthia.write_png(folder / "GT" / "LABELS" / place, labels)
+    (folder / "CameraParams").mkdir()
+    matrix = f"{ROOM_FOCAL} 0 160\n0 {ROOM_FOCAL} 95\n0 0 1\n"
+    (folder / "CameraParams" / "intrinsics.txt").write_text(matrix)
+    make(root, "02", height=ROOM_HEIGHT)
+    direct_labels = ids[direct.items]
+    return Room(
+        panorama(root, "rgb", "02")[..., ::-1],
+        panorama(root, "depth", "02"),
+        panorama(root, "labels", "02"),
+        direct,
+        direct_labels,
+        _calm(direct_labels),
+    )
+
+
+def _calm(labels: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Pixels whose neighbours have the same label, all around."""
+    wrapped = np.pad(labels.astype(np.float32), ((0, 0), (2, 2)), mode="wrap")
+    kernel = np.ones((3, 3), np.uint8)
+    same: NDArray[np.bool_] = cv2.dilate(wrapped, kernel) == cv2.erode(wrapped, kernel)
+    return same[:, 2:-2]
+
+
+def test_a_room_has_the_labels_of_its_panorama(room: Room) -> None:
+    valid = room.labels != 255
+    same = room.labels == room.direct_labels
+    assert same[valid].mean() > 0.98
+    assert same[valid & room.calm].mean() > 0.999
+    assert (valid & room.calm).sum() > 0.3 * valid.size
+    assert len(np.unique(room.labels)) > 8
+    assert set(np.unique(room.labels).tolist()) <= {255, *np.unique(room.direct_labels).tolist()}
+    # Where two views meet, and at ±180°, nothing is different.
+    seams = np.zeros(2 * ROOM_HEIGHT, np.bool_)
+    for column in (0, *(ROOM_HEIGHT // 4 * np.array([1, 3, 5, 7]))):
+        seams[np.arange(column - 2, column + 2)] = True
+    assert same[valid & room.calm & seams].mean() > 0.995
+
+
+def test_a_room_has_the_colours_of_its_panorama(room: Room) -> None:
+    error = (room.rgb.astype(float) - room.direct.rgb) ** 2
+    assert 10 * np.log10(255**2 / error[(room.labels != 255) & room.calm].mean()) > 36
+
+
+def test_a_room_has_the_depth_of_its_panorama(room: Room) -> None:
+    kernel = np.ones((3, 3), np.uint8)
+    depth_m = np.pad(room.direct.depth_m, ((0, 0), (2, 2)), mode="wrap")
+    nearby = (cv2.dilate(depth_m, kernel) - cv2.erode(depth_m, kernel))[:, 2:-2]
+    smooth = (room.depth > 0) & room.calm & (nearby < 0.1)  # not where it is missing
+    error = np.abs(room.depth / 100 - room.direct.depth_m)[smooth]
+    # Files have whole centimetres, twice, and nearest is up to a pixel away.
+    assert np.mean(error <= nearby[smooth] + 0.012) > 0.999
+    assert np.median(error) < 0.006
+    assert smooth.sum() > 0.25 * smooth.size
+
+
+# --- files ---------------------------------------------------------------------------------------
+
+
+def test_the_format_is_that_of_the_published_panoramas(made: Path) -> None:
+    pano = synthia.sequence(made, "01") / "pano"
+    names = {name for name in contents(pano) if name != MANIFEST}
+    assert names == {f"{folder}/{n:06d}.png" for folder in PARTS.values() for n in range(3)}
+    shapes = {part: panorama(made, part).shape for part in PARTS}
+    size = (HEIGHT, 2 * HEIGHT)
+    assert shapes == {"rgb": (*size, 3), "labels": size, "depth": size}
+    assert set(np.unique(panorama(made, "labels")).tolist()) == {*synthia.IDS.tolist(), 255}
+
+
+@pytest.mark.parametrize("workers", [0, 3])
+def test_the_same_files_for_any_number_of_workers(made: Path, views: Path, workers: int) -> None:
+    assert make(views, "01", workers=workers) == 2
+    again = contents(synthia.sequence(views, "01") / "pano")
+    before = contents(synthia.sequence(made, "01") / "pano")
+    assert again == {name: before[name] for name in again}
+
+
+def test_some_frames_of_many(views: Path) -> None:
+    folder = synthia.sequence(views, "01")
+    for number in range(2, 9):
+        synthia.write_frame(folder, number)
+    assert make(views, "01", frames=4) == 5
+    found = [path.stem for path in sorted((folder / "pano" / "RGB").glob("*.png"))]
+    assert found == ["000000", "000002", "000004", "000006", "000008"]
+
+
+def test_an_interrupt_leaves_whole_files_and_work_goes_on(
+    made: Path, views: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pano = synthia.sequence(views, "01") / "pano"
+    count = 0
+
+    def interrupted(path: Path, content: bytes) -> None:
+        nonlocal count
+        count += 1
+        if count == 5:
+            raise KeyboardInterrupt
+        write_bytes(path, content)
+
+    monkeypatch.setattr(synthia_panoramas, "write_bytes", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        make(views, "01", workers=1)
+    monkeypatch.undo()
+    before = contents(synthia.sequence(made, "01") / "pano")
+    left = contents(pano)
+    assert len(left) == 1 + 4
+    assert all(content == before[name] for name, content in left.items())
+    kept = pano / "RGB" / "000000.png"
+    written = kept.stat().st_mtime_ns
+    assert make(views, "01") == 1
+    finished = contents(pano)
+    assert finished == {name: before[name] for name in finished}
+    assert len(finished) == 1 + 6
+    assert kept.stat().st_mtime_ns == written
+    assert make(views, "01") == 0
+
+
+def test_broken_panoramas_are_made_again(views: Path) -> None:
+    make(views, "01")
+    pano = synthia.sequence(views, "01") / "pano"
+    before = contents(pano)
+    (pano / "Depth" / "000000.png").unlink()
+    labels = pano / "GT" / "LABELS_Correct" / "000001.png"
+    labels.write_bytes(labels.read_bytes()[:-20])
+    assert make(views, "01") == 2
+    assert contents(pano) == before
+
+
+def test_ready_panoramas_stay_as_they_are(views: Path) -> None:
+    # Some, of another size, one of them without depth: nothing is mixed with them.
+    synthia.write_panoramas(views, {"01": 1})
+    pano = synthia.sequence(views, "01") / "pano"
+    (pano / "Depth" / "000000.png").unlink()
+
+    def state() -> dict[str, tuple[int, int]]:
+        return {p.name: (p.stat().st_mtime_ns, p.stat().st_size) for p in pano.rglob("*")}
+
+    before = state()
+    assert make(views, "01") == 0
+    assert state() == before
+
+
+def test_panoramas_without_views_are_enough(tmp_path: Path, made: Path) -> None:
+    synthia.write_panoramas(tmp_path, {"04": 1})
+    own = synthia.sequence(tmp_path, "01")
+    own.mkdir()
+    (own / "pano").symlink_to(synthia.sequence(made, "01") / "pano")
+    assert make(tmp_path, "01", "04", height=16) == 0
+
+
+def test_other_settings_are_refused(views: Path) -> None:
+    make(views, "01")
+    before = contents(views)
+    for other in ({"height": 52}, {"frames": 1}):
+        with pytest.raises(DataError, match=rf"{MANIFEST}: found .*{HEIGHT}.*before"):
+            make(views, "01", **other)
+    (synthia.sequence(views, "01") / "pano" / MANIFEST).write_text("not JSON")
+    with pytest.raises(DataError, match="found something else"):
+        make(views, "01")
+    (synthia.sequence(views, "01") / "pano" / MANIFEST).write_text("[]")
+    with pytest.raises(DataError, match=r"found \[\]"):
+        make(views, "01")
+    assert {name for name in contents(views) if name not in before} == set()
+
+
+def test_the_manifest_says_how(made: Path) -> None:
+    manifest = synthia.sequence(made, "01") / "pano" / MANIFEST
+    assert json.loads(manifest.read_text()) == {
+        "front view at longitude": 0,
+        "frames": 500,
+        "height": HEIGHT,
+    }
+
+
+def test_nothing_to_make_them_from(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"SEQS-05-SUMMER: found neither.*synthia-dataset\.net"):
+        make(tmp_path, "05")
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"height": 0}, r"data\.panorama_height: found 0"),
+        ({"frames": 0}, r"data\.frames: found 0"),
+        ({"workers": -1}, "workers: found -1"),
+    ],
+)
+def test_impossible_settings(views: Path, settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(SettingError, match=message):
+        make(views, "01", **settings)
+
+
+def _cut_off(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-30])
+
+
+def _rewrite(shape: tuple[int, ...], dtype: Any) -> Callable[[Path], None]:
+    return lambda path: synthia.write_png(path, np.zeros(shape, dtype))
+
+
+DAMAGES: dict[str, tuple[str, Callable[[Path], object], str]] = {
+    "no depth": ("Depth", lambda p: p.unlink(), "No such file"),
+    "cut off": ("RGB", _cut_off, "parts missing"),
+    "labels of 8 bits": ("GT/LABELS", _rewrite((*SIZE, 3), np.uint8), "8-bit RGB; expected 16-bit"),
+    "grey labels": ("GT/LABELS", _rewrite(SIZE, np.uint16), "16-bit grey; expected 16-bit RGB"),
+    "depth of 8 bits": ("Depth", _rewrite(SIZE, np.uint8), "8-bit grey; expected 16-bit grey or"),
+    "a smaller part": (
+        "Depth",
+        _rewrite((19, 32), np.uint16),
+        "found 19×32 pixels; expected 38×64",
+    ),
+}
+
+
+@pytest.mark.parametrize("view", ["F", "L"])
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_broken_view_is_named_before_anything_is_made(
+    views: Path, damage: str, view: str
+) -> None:
+    part, inflict, message = DAMAGES[damage]
+    place = f"{part}/Stereo_Left/Omni_{view}/000001.png"
+    inflict(synthia.sequence(views, "01") / place)
+    with pytest.raises(DataError, match=f"{place}: .*{message}"):
+        make(views, "01")
+    assert not list(views.glob("*/pano/RGB"))
+
+
+def test_views_of_several_sizes(views: Path) -> None:
+    folder = synthia.sequence(views, "01")
+    for part, shape, dtype in (
+        ("RGB", (20, 40, 3), np.uint8),
+        ("GT/LABELS", (20, 40, 3), np.uint16),
+        ("Depth", (20, 40), np.uint16),
+    ):
+        synthia.write_png(folder / part / "Stereo_Left/Omni_B/000001.png", np.zeros(shape, dtype))
+    with pytest.raises(DataError, match=r"Omni_B/000001\.png: found 20×40 .*the sequence"):
+        make(views, "01")
+
+
+def test_a_missing_view(views: Path) -> None:
+    for path in (synthia.sequence(views, "01") / "RGB" / "Stereo_Left" / "Omni_R").iterdir():
+        path.unlink()
+    with pytest.raises(DataError, match=r"Omni_R/000000\.png: found .*No such file"):
+        make(views, "01")
+
+
+def test_labels_that_are_none(views: Path) -> None:
+    place = "GT/LABELS/Stereo_Left/Omni_B/000001.png"
+    labels = np.zeros((*SIZE, 3), np.uint16)
+    labels[3, 4, 2] = 16
+    synthia.write_png(synthia.sequence(views, "01") / place, labels)
+    with pytest.raises(DataError, match=f"{place}: found labels 16; expected 0 to 15"):
+        make(views, "01")
+    assert len(list(views.glob("*/pano/RGB/*.png"))) <= 1  # the whole one may have been made
+
+
+def test_progress_is_shown(views: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    make(views, "01", progress=True)
+    assert "Making panoramas" in capsys.readouterr().out

@@ -1,0 +1,85 @@
+"""Small trained networks, and their checkpoints."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import nn
+
+from datamodules.core.samples import RGB_NORMALIZATION, RGBD_NORMALIZATION
+from tangent_train.checkpoints.trained import TrainedNetwork
+from tangent_train.registry import make
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+CLASS_NAMES = ("unknown", "dark", "green", "bright")
+
+_RENDERING = "tangent_train.rendering."
+TANGENT = {"_target_": _RENDERING + "TangentRepresentation", "base_level": 0, "level": 4}
+ERP = {"_target_": _RENDERING + "EquirectRepresentation", "level": 4}
+CUBE = {"_target_": _RENDERING + "CubemapRepresentation", "level": 4}
+PERSPECTIVE = {"_target_": _RENDERING + "PerspectiveRepresentation", "level": 6, "dim": 24}
+
+
+def color_network(channels: int = 3, kernel: int = 3) -> nn.Conv2d:
+    """Scores that tell dark, green and bright apart; the unknown class would win everywhere."""
+    generator = torch.Generator().manual_seed(0)
+    network = nn.Conv2d(channels, 4, kernel, padding=kernel // 2, padding_mode="replicate")
+    with torch.no_grad():
+        network.weight.copy_(0.2 * torch.randn(network.weight.shape, generator=generator))
+        middle = network.weight[:, :, kernel // 2, kernel // 2]
+        middle[1, :3] -= 1
+        middle[2, :3] += torch.tensor([-1.0, 2, -1])
+        middle[3, :3] += 1
+        network.load_state_dict({"bias": torch.tensor([50.0, 0, 0, 0])}, strict=False)
+    return network.eval()
+
+
+def trained_network(
+    representation: dict[str, Any], channels: int = 3, **changes: Any
+) -> TrainedNetwork:
+    """A network that has been trained with this representation."""
+    settings = {
+        "network": color_network(channels),
+        "class_names": CLASS_NAMES,
+        "inputs": ("rgb", "depth")[: channels - 2],
+        "normalization": RGB_NORMALIZATION if channels == 3 else RGBD_NORMALIZATION,
+        "level": representation["level"],
+        "representation": representation,
+        "image_size": make(representation, "representation").image_size,
+    }
+    return TrainedNetwork(**(settings | changes))
+
+
+def write_checkpoint(
+    path: Path, representation: dict[str, Any] = TANGENT, channels: int = 3
+) -> Path:
+    """The checkpoint of such a network, as `tangent-train` writes it."""
+    network = color_network(channels)
+    settings = {
+        "_target_": "torch.nn.Conv2d",
+        "in_channels": None,
+        "out_channels": 4,
+        "kernel_size": 3,
+        "padding": 1,
+        "padding_mode": "replicate",
+    }
+    config = {
+        "network": settings,
+        "representation": representation,
+        "level": representation["level"],
+    }
+    normalization = RGB_NORMALIZATION if channels == 3 else RGBD_NORMALIZATION
+    content = {
+        "config": config,
+        "kind": "segmentation",
+        "inputs": ["rgb", "depth"][: channels - 2],
+        "class_names": list(CLASS_NAMES),
+        "normalization": {"mean": list(normalization.mean), "std": list(normalization.std)},
+        "state_dict": {f"network.{name}": value for name, value in network.state_dict().items()},
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    torch.save(content, path)
+    return path

@@ -1,0 +1,194 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from torchmetrics import JaccardIndex
+
+from tangent_train.errors import SettingError
+from tangent_train.metrics.segmentation import ConfusionMatrix, segmentation_scores
+
+CLASSES = 5
+
+
+def _panoramas() -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    """Prediction and truth of panoramas of uneven sizes; truth has unknown pixels."""
+    rng = np.random.default_rng(3)
+    shapes = [(12, 24), (30, 60), (7, 15)]
+    return [(rng.integers(1, CLASSES, shape), rng.integers(0, CLASSES, shape)) for shape in shapes]
+
+
+def _counted(pairs: list[tuple[NDArray[np.int64], NDArray[np.int64]]]) -> ConfusionMatrix:
+    metric = ConfusionMatrix(CLASSES)
+    for prediction, truth in pairs:
+        metric.update(torch.from_numpy(prediction), torch.from_numpy(truth))
+    return metric
+
+
+def test_scores_equal_plain_numpy_over_the_whole_data_set() -> None:
+    pairs = _panoramas()
+    prediction = np.concatenate([p.ravel() for p, _ in pairs])
+    truth = np.concatenate([t.ravel() for _, t in pairs])
+    prediction, truth = prediction[truth > 0], truth[truth > 0]
+    scores = segmentation_scores(_counted(pairs).compute().pixels)
+    for k in range(1, CLASSES):
+        hits = np.sum((prediction == k) & (truth == k))
+        union = np.sum((prediction == k) | (truth == k))
+        assert scores.iou[k - 1] == pytest.approx(hits / union)
+        assert scores.accuracy[k - 1] == pytest.approx(hits / np.sum(truth == k))
+        assert scores.share[k - 1] == pytest.approx(np.mean(truth == k))
+    assert scores.miou == pytest.approx(scores.iou.mean())
+    assert scores.macc == pytest.approx(scores.accuracy.mean())
+
+
+def test_iou_equals_torchmetrics() -> None:
+    reference = JaccardIndex("multiclass", num_classes=CLASSES, ignore_index=0, average="none")
+    for prediction, truth in _panoramas():
+        reference.update(torch.from_numpy(prediction), torch.from_numpy(truth))
+    scores = segmentation_scores(_counted(_panoramas()).compute().pixels)
+    np.testing.assert_allclose(scores.iou, reference.compute()[1:].numpy(), rtol=1e-6)
+
+
+def test_the_mean_is_over_the_data_set_not_over_panoramas() -> None:
+    pairs = _panoramas()
+    single = [segmentation_scores(_counted([pair]).compute().pixels).miou for pair in pairs]
+    whole = segmentation_scores(_counted(pairs).compute().pixels).miou
+    assert abs(whole - np.mean(single)) > 1e-3
+
+
+@pytest.mark.parametrize(("absent", "mean"), [("skip", (1 + 0.5) / 2), ("zero", (1 + 0.5 + 0) / 3)])
+def test_absent_classes(absent: str, mean: float) -> None:
+    confusion = np.zeros((4, 4))
+    confusion[1, 1] = 10
+    confusion[2, 2], confusion[2, 3] = 5, 5
+    confusion[0, 3] = 100  # unknown truth counts for nothing
+    assert segmentation_scores(confusion, absent).miou == pytest.approx(mean)  # type: ignore[arg-type]
+
+
+def test_nothing_labelled() -> None:
+    empty = np.zeros((4, 4))
+    scores = segmentation_scores(empty)
+    assert np.isnan(scores.miou)
+    assert np.all(np.isnan(scores.iou))
+    assert scores.share.tolist() == [0, 0, 0]
+    assert segmentation_scores(empty, "zero").miou == 0
+    assert segmentation_scores(empty.astype(int)).share.dtype == np.float64
+
+
+@pytest.mark.parametrize("scale", [1e-9, 1e-3, 1.0, 1e9])
+def test_scores_are_of_shares_however_little_there_is(scale: float) -> None:
+    # One pixel of class 3; as solid angles, pixels are small fractions of a steradian.
+    confusion = np.array([[0, 5, 0, 0], [1, 8, 1, 0], [0, 2, 6, 0], [0, 0, 0, 1.0]])
+    scores = segmentation_scores(confusion * scale)
+    np.testing.assert_allclose(scores.iou, [8 / 12, 6 / 9, 1], rtol=1e-12)
+    np.testing.assert_allclose(scores.accuracy, [8 / 10, 6 / 8, 1], rtol=1e-12)
+    np.testing.assert_allclose(scores.share, [10 / 19, 8 / 19, 1 / 19], rtol=1e-12)
+
+
+def test_solid_angle_weighs_a_hemisphere_as_half_whatever_its_rows() -> None:
+    height, width = 64, 128
+    truth = torch.ones(height, width, dtype=torch.int64)
+    truth[: height // 4] = 2  # above 45°: (1 − sin 45°)/2 of the sphere, a quarter of the rows
+    metric = ConfusionMatrix(3)
+    metric.update(truth, truth)
+    matrices = metric.compute()
+    share = matrices.solid_angle.diagonal()[1:] / (4 * np.pi)
+    np.testing.assert_allclose(share, [(1 + np.sqrt(0.5)) / 2, (1 - np.sqrt(0.5)) / 2], rtol=1e-12)
+    np.testing.assert_array_equal(matrices.pixels.diagonal()[1:], [3 * 64 * 32, 64 * 32])
+
+
+def test_latitude_bands_go_from_north_to_south() -> None:
+    truth = torch.arange(1, 7).repeat_interleave(5)[:, None].expand(30, 60)
+    metric = ConfusionMatrix(7)
+    metric.update(truth, truth)
+    bands = metric.compute().bands
+    for k, band in enumerate(bands):
+        assert band[k + 1, k + 1] == 5 * 60
+        assert band.sum() == 5 * 60
+
+
+def test_matrices_add_up_over_processes_and_reset() -> None:
+    pairs = _panoramas()
+    one, other = _counted(pairs[:1]).compute(), _counted(pairs[1:]).compute()
+    whole = _counted(pairs)
+    matrices = whole.compute()
+    np.testing.assert_array_equal(matrices.pixels, one.pixels + other.pixels)
+    np.testing.assert_array_equal(matrices.bands, one.bands + other.bands)
+    np.testing.assert_allclose(matrices.solid_angle, one.solid_angle + other.solid_angle)
+    assert matrices.images == 3
+    whole.reset()
+    assert int(whole.pixels.sum()) == int(whole.images) == 0
+
+
+def test_large_counts_stay_exact() -> None:
+    # Float32 cannot count beyond 2**24: a data set has more pixels of one class than that.
+    metric = ConfusionMatrix(2)
+    metric.pixels += 2**24
+    metric.bands += 2**24
+    metric.images += 2**24
+    metric.update(torch.ones(1, 2, dtype=torch.int64), torch.ones(1, 2, dtype=torch.int64))
+    metric.update(torch.ones(1, 1, 1, dtype=torch.int64), torch.ones(1, 1, 1, dtype=torch.int64))
+    matrices = metric.compute()
+    assert int(matrices.pixels[1, 1]) == 2**24 + 3
+    assert int(matrices.bands[:, 1, 1].sum()) == 6 * 2**24 + 2
+    assert matrices.images == 2**24 + 2
+    assert matrices.solid_angle.dtype == np.float64
+
+
+def test_all_is_summed_over_processes() -> None:
+    metric, own = _counted(_panoramas()), _counted(_panoramas()).compute()
+
+    def gather(state: torch.Tensor, group: object = None) -> list[torch.Tensor]:
+        return [state, 2 * state]
+
+    metric.dist_sync_fn, metric.distributed_available_fn = gather, lambda: True
+    whole = metric.compute()
+    np.testing.assert_array_equal(whole.pixels, 3 * own.pixels)
+    np.testing.assert_array_equal(whole.bands, 3 * own.bands)
+    np.testing.assert_allclose(whole.solid_angle, 3 * own.solid_angle, rtol=1e-12)
+    assert whole.images == 9
+
+
+def test_bad_input_is_refused() -> None:
+    metric = ConfusionMatrix(3)
+    with pytest.raises(SettingError, match="prediction"):
+        metric.update(torch.ones(2, 4, dtype=torch.int64), torch.ones(2, 3, dtype=torch.int64))
+    ones = torch.ones(2, 4, dtype=torch.int64)
+    for strange in (3, -1):  # −1 would count as the last class of the row above
+        found = f"class index: found {min(strange, 1)} to {max(strange, 1)}; expected 0 to 2"
+        one_of_them = ones.clone()
+        one_of_them[1, 2] = strange
+        for pair in ((one_of_them, ones), (ones, one_of_them)):
+            with pytest.raises(SettingError, match=found):
+                metric.update(*pair)
+    assert metric.compute().images == 0
+
+
+def test_an_all_unknown_panorama_counts_as_seen_and_adds_nothing() -> None:
+    metric = ConfusionMatrix(3)
+    unknown = torch.zeros(4, 8, dtype=torch.int64)
+    metric.update(unknown + 1, unknown)
+    assert metric.compute().pixels.sum() == 0
+    assert metric.compute().images == 1
+
+
+def test_photos_are_counted_like_panoramas_without_latitudes_and_solid_angles() -> None:
+    rng = np.random.default_rng(5)
+    prediction, truth = rng.integers(1, CLASSES, (3, 8, 8)), rng.integers(0, CLASSES, (3, 8, 8))
+    photo = _counted([(prediction, truth)]).compute()
+    as_one = _counted([(np.hstack(list(prediction)), np.hstack(list(truth)))]).compute()
+    np.testing.assert_array_equal(photo.pixels, as_one.pixels)
+    assert photo.images == 1, "three crops of one photo"
+    assert not photo.solid_angle.any()
+    assert not photo.bands.any()
+    assert as_one.solid_angle.any()
+
+
+def test_photos_add_up_whatever_classes_they_show() -> None:
+    first, last = np.full((1, 2, 2), 1), np.full((1, 2, 2), CLASSES - 1)
+    expected = np.zeros((CLASSES, CLASSES), np.int64)
+    expected[1, 1], expected[CLASSES - 1, 1] = 8, 4
+    found = _counted([(first, first), (first, last), (first, first)]).compute()
+    np.testing.assert_array_equal(found.pixels, expected)
+    assert found.images == 3

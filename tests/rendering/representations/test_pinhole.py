@@ -1,0 +1,285 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from tangent_train.errors import SettingError
+from tangent_train.geometry import TangentGrid, equirect_directions, rotation_about
+from tangent_train.rendering import (
+    Blend,
+    CubemapRepresentation,
+    EquirectRepresentation,
+    Representation,
+    TangentRepresentation,
+    rotate_equirect,
+    tangent_to_equirect,
+)
+from tangent_train.rendering.representations.views import PinholeViews
+
+SHAPE = (64, 128)
+
+
+def _labels() -> NDArray[np.uint8]:
+    """Eight octants of the sphere, 1 to 8."""
+    positive = equirect_directions(SHAPE) @ [[1, 2, 0], [2, -1, 0], [0, 0.5, 1]] > 0
+    return (positive @ [1, 2, 4] + 1).astype(np.uint8)
+
+
+def _scores(labels: NDArray[np.uint8]) -> torch.Tensor:
+    return torch.nn.functional.one_hot(torch.from_numpy(labels).long(), 9).movedim(-1, 1).float()
+
+
+def _rng(seed: int = 0) -> np.random.Generator:
+    return np.random.default_rng(seed)
+
+
+REPRESENTATIONS: list[Representation] = [
+    TangentRepresentation(0, 5),
+    TangentRepresentation(1, 5, blend="feather"),
+    TangentRepresentation(0, 5, crop_multiple=8, rotation="so3", mirror=True),
+    CubemapRepresentation(5),
+    CubemapRepresentation(5, dim=41, rotation="so3", mirror=True),
+    EquirectRepresentation(5),
+    EquirectRepresentation(5, crop_deg=90, rotation="yaw", mirror=True),
+]
+
+
+@pytest.mark.parametrize("representation", REPRESENTATIONS)
+def test_labels_come_back_from_the_views_of_the_whole_sphere(
+    representation: Representation,
+) -> None:
+    labels = _labels()
+    views = representation.whole().render(labels, "nearest")
+    back = representation.to_labels(_scores(views), SHAPE).numpy()
+    assert back.shape == SHAPE
+    assert np.mean(back == labels) > 0.96, "all but the borders between classes"
+
+
+@pytest.mark.parametrize("representation", REPRESENTATIONS)
+def test_whole_views_are_not_augmented(representation: Representation) -> None:
+    image = _rng().integers(0, 256, (*SHAPE, 3), np.uint8)
+    first, second = (representation.whole().render(image, "bilinear") for _ in range(2))
+    np.testing.assert_array_equal(first, second)
+
+
+@pytest.mark.parametrize("representation", REPRESENTATIONS)
+def test_image_size_is_that_of_the_whole_views(representation: Representation) -> None:
+    height = representation.erp_height
+    panorama = np.zeros((height, 2 * height, 3), np.uint8)
+    views = representation.whole().render(panorama, "bilinear")
+    assert views.shape[1:] == (*representation.image_size, 3)
+
+
+def test_image_sizes_by_hand() -> None:
+    assert TangentRepresentation(1, 6).image_size == (32, 32)
+    assert TangentRepresentation(0, 6, crop_multiple=16).image_size == (48, 48)
+    assert CubemapRepresentation(6).image_size == (64, 64)
+    assert CubemapRepresentation(6, dim=50, erp_height=300).image_size == (50, 50)
+    assert EquirectRepresentation(6, crop_deg=90).image_size == (128, 256)
+    assert EquirectRepresentation(6, erp_height=300).image_size == (300, 600)
+
+
+def test_the_equirectangular_view_is_the_panorama() -> None:
+    image = _rng().integers(0, 256, (*SHAPE, 3), np.uint8)
+    np.testing.assert_array_equal(
+        EquirectRepresentation(5).whole().render(image, "bilinear"), image[None]
+    )
+
+
+@pytest.mark.parametrize(
+    "representation",
+    [
+        TangentRepresentation(0, 5, faces_per_panorama=5, rotation="so3", mirror=True),
+        CubemapRepresentation(5, rotation="yaw", mirror=True),
+        CubemapRepresentation(5, rotation="so3"),
+        EquirectRepresentation(5, crop_deg=60, rotation="yaw", mirror=True),
+        EquirectRepresentation(5, rotation="so3"),
+    ],
+)
+def test_a_sample_depends_on_its_generator_alone_and_keeps_image_and_labels_together(
+    representation: Representation,
+) -> None:
+    labels = _labels()
+    image = labels.astype(np.float32)
+    seen = []
+    for seed in (0, 0, 1):
+        views = representation.sample(_rng(seed))
+        image_views, label_views = (views.render(x, "nearest") for x in (image, labels))
+        np.testing.assert_array_equal(image_views, label_views)
+        assert label_views.flags.c_contiguous
+        assert label_views.dtype == np.uint8
+        seen.append(label_views)
+    np.testing.assert_array_equal(seen[0], seen[1])
+    assert not np.array_equal(seen[0], seen[2])
+
+
+def test_faces_are_drawn_without_repetition_and_all_of_them_sooner_or_later() -> None:
+    representation = TangentRepresentation(0, 5, faces_per_panorama=5)
+    x = np.arange(64 * 128, dtype=np.float32).reshape(SHAPE)
+    whole = representation.whole().render(x, "nearest")
+    drawn = set()
+    for seed in range(30):
+        views = representation.sample(_rng(seed)).render(x, "nearest")
+        faces = [int(np.flatnonzero((whole == v).all(axis=(1, 2)))[0]) for v in views]
+        assert len(set(faces)) == 5
+        drawn.update(faces)
+    assert drawn == set(range(20))
+
+
+def test_mirroring_flips_half_of_the_samples() -> None:
+    x = np.tile(np.arange(128, dtype=np.float32), (64, 1))
+    representation = EquirectRepresentation(5, mirror=True)
+    views = [representation.sample(_rng(seed)).render(x, "nearest")[0] for seed in range(60)]
+    flipped = [np.array_equal(v, x[:, ::-1]) for v in views]
+    assert all(f or np.array_equal(v, x) for f, v in zip(flipped, views, strict=True))
+    assert 15 < sum(flipped) < 45
+
+
+def test_crops_are_whole_columns_at_random_longitudes_and_cross_the_seam() -> None:
+    x = np.tile(np.arange(128), (64, 1)).astype(np.uint8)
+    representation = EquirectRepresentation(5, crop_deg=90)
+    starts, crossing = set(), 0
+    for seed in range(50):
+        (view,) = representation.sample(_rng(seed)).render(x, "nearest")
+        assert view.shape == (64, 32)
+        first = int(view[0, 0])
+        np.testing.assert_array_equal(view[0], (first + np.arange(32)) % 128)
+        starts.add(first)
+        crossing += first > 96
+    assert len(starts) > 20
+    assert crossing > 3
+
+
+def test_cropping_takes_the_least_covering_side_that_is_a_multiple() -> None:
+    assert TangentRepresentation(0, 6, crop_multiple=16).grid.dim == 48
+    assert TangentRepresentation(0, 7, crop_multiple=32).grid.dim == 96
+    assert TangentRepresentation(0, 6, crop_multiple=1).grid.dim == 46
+
+
+def test_the_panorama_may_be_larger_than_the_level() -> None:
+    assert TangentRepresentation(0, 5, erp_height=512).erp_height == 512
+    assert CubemapRepresentation(5, erp_height=512).erp_height == 512
+    for representation in (TangentRepresentation(0, 5), CubemapRepresentation(5)):
+        assert representation.erp_height == EquirectRepresentation(5).erp_height == 64
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"dim": 64, "crop_multiple": 16}, "representation.dim"),
+        ({"dim": 8}, "dim: found 8; expected at least 24"),
+        ({"faces_per_panorama": 21}, "1 to 20"),
+        ({"faces_per_panorama": 0}, "1 to 20"),
+        ({"crop_multiple": 0}, "crop_multiple: found 0"),
+        ({"erp_height": 0}, "erp_height: found 0"),
+        ({"rotation": "tilt"}, "one of none, yaw, so3"),
+        ({"blend": "average"}, "one of nearest, feather"),
+    ],
+)
+def test_impossible_tangent_settings_are_refused(settings: dict[str, object], message: str) -> None:
+    with pytest.raises(SettingError, match=message):
+        TangentRepresentation(0, 5, **settings)  # type: ignore[arg-type]
+
+
+def test_impossible_equirectangular_settings_are_refused() -> None:
+    with pytest.raises(SettingError, match="crop_deg"):
+        EquirectRepresentation(5, crop_deg=400)
+    with pytest.raises(SettingError, match="expected one image of 64×128"):
+        EquirectRepresentation(5).to_labels(torch.zeros(1, 3, 32, 64), SHAPE)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"dim": 1}, "dim: found 1; expected a whole number, 2 or more"),
+        ({"level": 0}, "dim: found 1; expected a whole number, 2 or more"),
+        ({"level": -1}, "level: found -1"),
+        ({"erp_height": 0}, "erp_height: found 0"),
+        ({"rotation": "tilt"}, "one of none, yaw, so3"),
+    ],
+)
+def test_impossible_cubes_are_refused(settings: dict[str, object], message: str) -> None:
+    with pytest.raises(SettingError, match=message):
+        CubemapRepresentation(**{"level": 5, **settings})  # type: ignore[arg-type]
+
+
+# Turned as a whole, averaged over turns, and where the images look.
+
+TILT = rotation_about((1, 2, 0), math.radians(50)) @ rotation_about((0, 0, 1), 1)
+
+
+@pytest.mark.parametrize("representation", REPRESENTATIONS)
+def test_turned_views_see_the_panorama_turned_back(representation: Representation) -> None:
+    """Independent: turning what is looked at instead, with `rotate_equirect`."""
+    waves = 100 + 50 * np.sin(3 * equirect_directions(SHAPE) @ [[1, 0.3], [0, 1], [1, -0.5]])
+    image = waves.astype(np.float32)
+    views = representation.turned(TILT).whole().render(image, "bilinear")
+    expected = representation.whole().render(rotate_equirect(image, TILT.T), "bilinear")
+    np.testing.assert_allclose(views, expected, atol=2)
+    np.testing.assert_array_equal(representation.turned(TILT).whole().rotations(), TILT[None])
+
+
+@pytest.mark.parametrize("representation", REPRESENTATIONS)
+def test_labels_of_turned_views_come_back_where_they_were(representation: Representation) -> None:
+    labels = _labels()
+    views = representation.turned(TILT).whole()
+    scores = _scores(views.render(labels, "nearest"))
+    back = representation.to_labels(scores, SHAPE, views.rotations()[0])
+    assert back.dtype == torch.int64
+    assert np.mean(back.numpy() == labels) > 0.95
+    wrong = representation.to_labels(scores, SHAPE).numpy()
+    assert np.mean(wrong == labels) < 0.5
+
+
+@pytest.mark.parametrize(("blend", "least"), [("nearest", 0.999), ("feather", 0.95)])
+def test_averaged_turns_have_the_highest_mean_probability(blend: Blend, least: float) -> None:
+    """Against the probabilities of every turn, rendered on their own in double precision.
+
+    Feathered ones are added up with the weights of all turns, there with those of each: almost
+    the same.
+    """
+    representation = TangentRepresentation(0, 4, blend=blend, average_rotations=3).turned(TILT)
+    views = representation.whole()
+    rotations, shape = views.rotations(), (32, 64)
+    assert rotations.shape == (3, 3, 3)
+    np.testing.assert_allclose(rotations[:, :, 2], np.tile(TILT[:, 2], (3, 1)), atol=1e-12)
+    assert views.render(np.zeros((*shape, 3), np.uint8), "bilinear").shape == (60, 16, 16, 3)
+    waves = torch.from_numpy(views.rays()).double() @ torch.tensor([3.0, 2.0, 1.0]).double()
+    scores = torch.randn(60, 5, 16, 16, generator=torch.Generator().manual_seed(0))
+    scores += 4 * torch.sin(waves[:, 2, None, None, None] + torch.arange(5)[:, None, None]).float()
+    mean = torch.zeros(5, *shape, dtype=torch.float64)
+    for of_turn, rotation in zip(torch.split(scores, 20), rotations, strict=True):
+        grid = TangentGrid(0, 4, rotation=rotation)
+        if blend == "nearest":
+            mean += tangent_to_equirect(of_turn.double(), grid, shape).softmax(dim=0)
+        else:
+            mean += tangent_to_equirect(of_turn.double().softmax(dim=1), grid, shape, blend)
+    labels = representation.to_averaged_labels(iter(torch.split(scores, 20)), shape, rotations)
+    assert labels.dtype == torch.int64
+    assert (labels == mean.argmax(dim=0)).double().mean() > least
+
+
+def test_averaging_over_no_turn_is_refused() -> None:
+    with pytest.raises(SettingError, match=r"representation\.average_rotations: found 0"):
+        TangentRepresentation(0, 5, average_rotations=0)
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_rays_say_where_the_pixels_look(mirrored: bool) -> None:
+    grid = TangentGrid(1, 5, 20, TILT)
+    faces = np.array([3, 77, 12])
+    views = PinholeViews(grid, faces, mirrored)
+    edges = (2 * np.arange(20) + 1) / 20 - 1
+    x, y = np.meshgrid(edges, edges)
+    seen = np.einsum("nwc,ijc->nijw", views.rays(), np.stack([x, y, np.ones_like(x)], axis=-1))
+    seen /= np.linalg.norm(seen, axis=-1, keepdims=True)
+    expected = grid.directions(faces)
+    np.testing.assert_allclose(seen, expected[:, :, ::-1] if mirrored else expected, atol=1e-6)
+
+
+def test_what_is_no_pinhole_image_has_no_rays() -> None:
+    assert EquirectRepresentation(5).whole().rays().shape == (0, 3, 3)

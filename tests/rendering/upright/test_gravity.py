@@ -1,0 +1,298 @@
+"""The direction of up by rooms drawn with known turns, and by poses rendered independently."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from tangent_train.errors import SettingError
+from tangent_train.geometry import (
+    TangentGrid,
+    equirect_directions,
+    equirect_to_lonlat,
+    lonlat_to_xyz,
+    random_rotation,
+    rotation_about,
+)
+from tangent_train.rendering import rotate_equirect
+from tangent_train.rendering.upright import gravity
+from tangent_train.rendering.upright.gravity import estimate_up, up_from_pose, upright_rotation
+from tangent_train.rendering.upright.manhattan import ManhattanFrame
+from tests.rendering.drawn_room import draw_room
+
+_UP = np.array([0.0, 0.0, 1.0])
+
+
+def _degrees_between(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
+    return math.degrees(math.atan2(np.linalg.norm(np.cross(one, other)), float(one @ other)))
+
+
+def _tilted(tilt_deg: float, azimuth_deg: float, yaw_deg: float) -> NDArray[np.float64]:
+    azimuth = math.radians(azimuth_deg)
+    tilt = rotation_about((math.cos(azimuth), math.sin(azimuth), 0), math.radians(tilt_deg))
+    return tilt @ rotation_about(_UP, math.radians(yaw_deg))
+
+
+# From the picture
+
+
+@pytest.mark.parametrize("shape", [(128, 256), (151, 303), (256, 512)])
+@pytest.mark.parametrize(
+    ("tilt_deg", "azimuth_deg", "yaw_deg"),
+    [(0, 0, 0), (0, 0, 45), (3, 200, 180), (10, 90, 30), (20, 0, 179), (30, 310, 77), (44, 45, 3)],
+)
+def test_tilted_rooms(
+    shape: tuple[int, int], tilt_deg: float, azimuth_deg: float, yaw_deg: float
+) -> None:
+    turn = _tilted(tilt_deg, azimuth_deg, yaw_deg)
+    gravity = estimate_up(draw_room(shape, turn))
+    assert _degrees_between(gravity.up, turn[:, 2]) < 0.5
+    assert 0.9 < gravity.confidence <= 1
+    np.testing.assert_array_equal(gravity.candidates[0], gravity.up)
+    np.testing.assert_allclose(np.linalg.norm(gravity.candidates, axis=1), 1)
+
+
+def test_a_large_panorama_is_shrunk() -> None:
+    turn = _tilted(25, 70, 10)
+    gravity = estimate_up(draw_room((800, 1600), turn, supersample=1))
+    assert _degrees_between(gravity.up, turn[:, 2]) < 0.2
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_rooms_held_at_any_angle(seed: int) -> None:
+    turn = random_rotation(np.random.default_rng(seed))
+    gravity = estimate_up(draw_room((128, 256), turn), max_tilt_deg=180)
+    assert _degrees_between(gravity.up, turn[:, 2]) < 0.5
+    assert len(gravity.candidates) >= 6
+    # All axes of the room are candidates, upside down as well.
+    for axis in (*turn.T, *-turn.T):
+        assert min(_degrees_between(axis, one) for one in gravity.candidates) < 0.5
+
+
+def test_upside_down() -> None:
+    turn = rotation_about((1, 0, 0), math.pi)
+    room = draw_room((128, 256), turn)
+    assert _degrees_between(estimate_up(room, 180).up, -_UP) < 0.5
+    # Not to be considered: the axis that is nearest to upright is that of the floor.
+    assert _degrees_between(estimate_up(room).up, _UP) < 0.5
+
+
+def test_directions_out_of_reach_are_not_considered() -> None:
+    room = draw_room((128, 256), _tilted(40, 20, 0))
+    near, far = estimate_up(room, max_tilt_deg=30), estimate_up(room, max_tilt_deg=42)
+    assert near.confidence == 0
+    np.testing.assert_array_equal(near.up, _UP)
+    assert all(_degrees_between(one, _UP) <= 30 for one in near.candidates)
+    assert far.confidence > 0.9
+    assert abs(_degrees_between(far.up, _UP) - 40) < 0.5
+
+
+def _waves(seed: int) -> NDArray[np.uint8]:
+    """Noise that looks the same in all directions: waves through space, cut by the sphere."""
+    rng = np.random.default_rng(seed)
+    directions = equirect_directions((128, 256)).reshape(-1, 3)
+    axes = rng.normal(size=(60, 3))
+    length = 2 ** rng.uniform(1, 6, 60)
+    axes *= (length / np.linalg.norm(axes, axis=1))[:, None]
+    values = np.cos(directions @ axes.T + rng.uniform(0, 6, 60)) @ (1 / length)
+    gray = np.clip(128 + 50 * values / values.std(), 0, 255).astype(np.uint8)
+    return np.repeat(gray.reshape(128, 256, 1), 3, axis=-1)
+
+
+def _without_structure() -> dict[str, NDArray[np.uint8]]:
+    rng = np.random.default_rng(0)
+    noise = rng.integers(0, 256, (128, 256, 3), np.uint8)
+    cut = np.zeros_like(noise)
+    cut[40:90, 60:200] = noise[40:90, 60:200]
+    ramp = np.linspace(0, 255, 128).astype(np.uint8)
+    return {
+        "black": np.zeros((128, 256, 3), np.uint8),
+        "grey": np.full((128, 256, 3), 90, np.uint8),
+        "one pixel": np.full((1, 1, 3), 90, np.uint8),
+        "ramp": np.broadcast_to(ramp[:, None, None], (128, 256, 3)).copy(),
+        "noise": noise,
+        "noise of few rows": noise[:32, :64].copy(),
+        "noise on a part": cut,
+        "waves": _waves(1),
+        "other waves": _waves(2),
+    }
+
+
+@pytest.mark.parametrize("name", list(_without_structure()))
+@pytest.mark.parametrize("max_tilt_deg", [45, 180])
+def test_nothing_is_done_where_nothing_is_found(name: str, max_tilt_deg: float) -> None:
+    up, confidence, candidates = estimate_up(_without_structure()[name], max_tilt_deg)
+    np.testing.assert_array_equal(up, _UP)
+    assert confidence == 0
+    assert candidates.shape[1:] == (3,)
+
+
+def test_dark_rooms_with_missing_parts() -> None:
+    turn = _tilted(18, 130, 60)
+    room = draw_room((128, 256), turn) // 8
+    room[:12], room[-9:], room[:, 30:45] = 0, 0, 0
+    assert _degrees_between(estimate_up(room).up, turn[:, 2]) < 0.5
+
+
+def test_it_is_the_same_every_time_and_leaves_its_input() -> None:
+    room = draw_room((128, 256), _tilted(12, 5, 5))
+    before = room.copy()
+    room.setflags(write=False)
+    one, other = estimate_up(room, 180), estimate_up(room[:, :, ::1], 180)
+    np.testing.assert_array_equal(one.candidates, other.candidates)
+    assert one.confidence == other.confidence
+    np.testing.assert_array_equal(room, before)
+    one.up[:] = 0  # not shared
+    assert np.linalg.norm(one.candidates[0]) > 0.9
+
+
+def test_panoramas_that_are_views_of_others() -> None:
+    turn = _tilted(12, 5, 5)
+    room = draw_room((128, 256), turn)
+    other = np.stack([room, room], axis=-1)[..., 1]
+    assert not other.flags.c_contiguous
+    np.testing.assert_array_equal(estimate_up(other).up, estimate_up(room).up)
+
+
+@pytest.mark.parametrize(
+    ("panorama", "found"),
+    [
+        (np.zeros((8, 16), np.uint8), r"shape \(8, 16\)"),
+        (np.zeros((8, 16, 4), np.uint8), r"shape \(8, 16, 4\)"),
+        (np.zeros((0, 16, 3), np.uint8), r"shape \(0, 16, 3\)"),
+        (np.zeros((8, 16, 3), np.float32), "dtype float32"),
+        (np.zeros((8, 16, 3), bool), "dtype bool"),
+    ],
+)
+def test_other_arrays_are_refused(panorama: NDArray[Any], found: str) -> None:
+    with pytest.raises(SettingError, match=f"panorama: found .*{found}"):
+        estimate_up(panorama)
+
+
+@pytest.mark.parametrize("tilt_deg", [0, -10, 181, math.nan])
+def test_impossible_tilts(tilt_deg: float) -> None:
+    with pytest.raises(SettingError, match=r"max_tilt_deg: found .* above 0, at most 180"):
+        estimate_up(np.zeros((8, 16, 3), np.uint8), tilt_deg)
+
+
+def test_probabilities_of_frames_that_share_their_vertical(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three frames that are as likely as none; of one no axis is in reach."""
+    turns = [rotation_about((1, 0, 0), 0.8), np.eye(3), rotation_about(_UP, 0.5)]
+    even = gravity._EVEN_CHANCE
+    frames = [ManhattanFrame(turn, np.full(3, 0.2), even) for turn in turns]
+    shares = np.array([1, 1, 5, 1, 1, 1]) * 7.0
+    monkeypatch.setattr(gravity, "up_probabilities", lambda *_: shares)
+
+    def of(frames: list[ManhattanFrame], tilt_deg: float) -> tuple[Any, Any]:
+        nothing: Any = None
+        return gravity._candidates(nothing, nothing, frames, math.cos(math.radians(tilt_deg)))
+
+    directions, chances = of(frames, 20)
+    np.testing.assert_allclose(directions, [_UP])
+    np.testing.assert_allclose(chances, [2 / 4])
+    directions, chances = of(frames[1:], 180)
+    np.testing.assert_allclose(directions[:2], [_UP, -_UP])
+    np.testing.assert_allclose(chances, [2 / 3 / 2, *[2 / 3 / 10], *[1 / 3 / 10] * 8])
+
+
+def test_the_smallest_panorama_and_tilt() -> None:
+    assert len(estimate_up(draw_room((64, 128), np.eye(3)), max_tilt_deg=1).candidates)
+    small = estimate_up(draw_room((63, 126), np.eye(3)))
+    assert small.candidates.shape == (0, 3)
+    assert small.confidence == 0
+
+
+# Turning upright
+
+
+@given(st.tuples(*[st.floats(-5, 5)] * 3).filter(lambda up: np.linalg.norm(up) > 1e-3))
+def test_the_smallest_turn(up: tuple[float, float, float]) -> None:
+    turn = upright_rotation(up)
+    direction = np.array(up) / np.linalg.norm(up)
+    np.testing.assert_allclose(turn @ _UP, direction, atol=1e-9)
+    np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-9)
+    assert np.linalg.det(turn) > 0
+    # The angle of a rotation is in its trace; no smaller one moves z that far.
+    assert math.isclose(np.trace(turn), 1 + 2 * direction[2], abs_tol=1e-9)
+
+
+def test_the_poles() -> None:
+    np.testing.assert_array_equal(upright_rotation((0, 0, 2)), np.eye(3))
+    np.testing.assert_allclose(upright_rotation((0, 0, -1)), np.diag([-1.0, 1, -1]), atol=1e-15)
+    np.testing.assert_allclose(upright_rotation((1e-200, 0, 1)), np.eye(3), atol=1e-15)
+
+
+@pytest.mark.parametrize("up", [(0, 0, 0), (0, 1), (math.nan, 0, 1), (math.inf, 0, 1), 3.0])
+def test_no_direction(up: Any) -> None:
+    with pytest.raises(SettingError, match=r"up: found .*three numbers"):
+        upright_rotation(up)
+
+
+def test_turned_panoramas_and_grids_are_upright() -> None:
+    turn = _tilted(33, 140, 20)
+    room = draw_room((128, 256), turn)
+    rotation = upright_rotation(turn[:, 2])
+    upright = rotate_equirect(room, rotation.T)
+    assert _degrees_between(estimate_up(upright).up, _UP) < 0.5
+    grid = TangentGrid(0, 5).with_rotation(rotation)
+    # The images around the north pole, of an icosahedron upright in the room, see the ceiling.
+    heights = grid.centers_xyz @ turn[:, 2]
+    np.testing.assert_allclose(np.sort(heights), np.sort(TangentGrid(0, 5).centers_xyz[:, 2]))
+
+
+# From the pose
+
+
+def _horizon_of_pose(pitch_deg: float, roll_deg: float) -> NDArray[np.float64]:
+    """Height in the world, −1 to 1, of what every pixel of a panorama sees.
+
+    By the axes of Google's format: x right, y forward, z up; turned by the heading (clockwise about
+    z), the pitch about x, the roll about y, in that order, each about the axes as already turned.
+    """
+    turn = Rotation.from_euler("ZXY", [-77, pitch_deg, roll_deg], degrees=True).as_matrix()
+    lon, lat = np.moveaxis(
+        equirect_to_lonlat(np.stack(np.meshgrid(np.arange(720), np.arange(360)), -1), (360, 720)),
+        -1,
+        0,
+    )
+    local = np.stack([np.cos(lat) * np.sin(lon), np.cos(lat) * np.cos(lon), np.sin(lat)], axis=-1)
+    heights: NDArray[np.float64] = (local @ turn.T)[..., 2]
+    return heights
+
+
+@pytest.mark.parametrize(
+    ("pitch_deg", "roll_deg"),
+    [(0, 0), (30, 0), (-30, 0), (0, 30), (0, -150), (17, -121), (-24.49, 8.96), (90, 0), (-90, 50)],
+)
+def test_up_is_where_the_zenith_was_rendered(pitch_deg: float, roll_deg: float) -> None:
+    heights = _horizon_of_pose(pitch_deg, roll_deg)
+    row, column = np.unravel_index(heights.argmax(), heights.shape)
+    zenith = lonlat_to_xyz(equirect_to_lonlat((column, row), heights.shape))
+    up = up_from_pose(pitch_deg, roll_deg)
+    assert _degrees_between(up, zenith) < 0.5
+    np.testing.assert_allclose(equirect_directions((360, 720)) @ up, heights, atol=1e-12)
+
+
+def test_signs_of_pitch_and_roll_in_the_words_of_the_format() -> None:
+    # "Pitch, measured in degrees above the horizon, for the center in the image."
+    up = up_from_pose(10, 0)
+    assert math.isclose(math.degrees(math.asin(up[0])), 10)
+    # "As roll increases, the horizon rotates counterclockwise in the image": in the middle of the
+    # image, it rises to the right.
+    heights = _horizon_of_pose(0, 10)
+    rows = np.abs(heights[90:270]).argmin(axis=0)
+    assert rows[400] < rows[360] < rows[320]
+    np.testing.assert_allclose(equirect_directions((360, 720)) @ up_from_pose(0, 10), heights)
+
+
+@pytest.mark.parametrize(("pitch_deg", "roll_deg"), [(math.nan, 0), (0, math.inf)])
+def test_no_angles(pitch_deg: float, roll_deg: float) -> None:
+    with pytest.raises(SettingError, match="pose: found"):
+        up_from_pose(pitch_deg, roll_deg)

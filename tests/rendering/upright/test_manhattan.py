@@ -1,0 +1,126 @@
+"""Segments of known edges, and frames of segments of known directions."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tangent_train.geometry import equirect_directions, random_rotation
+from tangent_train.rendering.upright.line_segments import LineSegments, find_line_segments
+from tangent_train.rendering.upright.manhattan import find_manhattan_frames, followed_axes
+from tests.rendering.drawn_room import draw_room
+
+
+def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+@pytest.mark.parametrize("height", [128, 257, 700])
+@pytest.mark.parametrize("seed", range(4))
+def test_an_edge_all_around_is_found_on_its_great_circle(height: int, seed: int) -> None:
+    normal = _unit(np.random.default_rng(seed).normal(size=3))
+    side = np.clip(equirect_directions((height, 2 * height)) @ normal * height / 3, -1, 1)
+    gray = (130 + 60 * side).astype(np.uint8)
+    segments = find_line_segments(np.repeat(gray[..., None], 3, axis=-1))
+    sines = np.linalg.norm(np.cross(segments.normals_xyz, normal), axis=1)
+    assert np.median(sines) < math.radians(0.3)
+    # No end is two pixels off; where a corner of a face is cut, the piece is short.
+    pixel = math.radians(90) / max(128, height * 2 / math.pi)
+    assert (sines * segments.lengths_rad / 2).max() < 2 * pixel
+    assert 0.9 < segments.lengths_rad.sum() / (2 * math.pi) < 1.05
+    assert np.abs(segments.middles_xyz @ normal).max() < pixel
+    np.testing.assert_allclose(np.linalg.norm(segments.middles_xyz, axis=1), 1)
+    assert np.all(np.diff(segments.lengths_rad) <= 0)
+
+
+def test_edges_of_black_areas_are_left_out() -> None:
+    image = np.full((128, 256, 3), 140, np.uint8)
+    image[:, 100:] = 0
+    image[:20] = 0
+    assert len(find_line_segments(image).lengths_rad) == 0
+    image[image == 0] = 3  # dark, but there
+    assert len(find_line_segments(image).lengths_rad) > 7
+
+
+def test_single_black_pixels_are_no_missing_area() -> None:
+    room = draw_room((128, 256), np.eye(3))
+    dotted = room.copy()
+    dotted[::9, ::9] = 0
+    count = len(find_line_segments(room).lengths_rad)
+    assert len(find_line_segments(dotted).lengths_rad) > count / 3
+
+
+def _segments(
+    axes: NDArray[np.float64], counts: tuple[int, int, int], others: int, seed: int = 0
+) -> LineSegments:
+    """Exact segments along three axes, and some of random directions."""
+    rng = np.random.default_rng(seed)
+    along = np.concatenate([np.repeat(axes.T, counts, axis=0), _unit(rng.normal(size=(others, 3)))])
+    normals = _unit(np.cross(along, rng.normal(size=along.shape)))
+    middles = _unit(np.cross(normals, rng.normal(size=along.shape)))
+    return LineSegments(normals, middles, rng.uniform(0.1, 0.6, len(along)))
+
+
+@pytest.mark.parametrize("counts", [(20, 20, 20), (40, 15, 0), (5, 30, 5)])
+@pytest.mark.parametrize("seed", range(5))
+def test_frames_of_exact_segments(counts: tuple[int, int, int], seed: int) -> None:
+    axes = random_rotation(np.random.default_rng(seed))
+    segments = _segments(axes, counts, others=30, seed=seed)
+    frame = find_manhattan_frames(segments)[0]
+    agreement = np.abs(frame.axes_xyz.T @ axes)
+    np.testing.assert_allclose(np.sort(agreement, axis=1), np.tile([0, 0, 1.0], (3, 1)), atol=0.02)
+    np.testing.assert_allclose(frame.axes_xyz.T @ frame.axes_xyz, np.eye(3), atol=1e-9)
+    order = agreement.argmax(axis=0)
+    weights = np.minimum(segments.lengths_rad, 0.5)
+    exact = np.add.reduceat(np.append(weights, 0), [0, *np.cumsum(counts)])[:3] * (
+        np.array(counts) > 0
+    )
+    assert np.all(frame.support[order] >= 0.9 * exact / weights.sum())
+    assert frame.significance > 3
+
+
+def test_the_significance_by_hand() -> None:
+    axes = random_rotation(np.random.default_rng(3))
+    segments = _segments(axes, (12, 12, 12), others=0)
+    segments = segments._replace(lengths_rad=np.full(36, 0.2))
+    # All follow: 1, less what is by chance within 2° (2/3 sin 2° per axis), in units of 1/√36.
+    expected = (1 - 2 * math.sin(math.radians(2))) * 6
+    assert math.isclose(find_manhattan_frames(segments)[0].significance, expected, rel_tol=1e-3)
+
+
+@pytest.mark.parametrize("count", [4, 10, 40, 200])
+def test_random_segments_are_not_significant(count: int) -> None:
+    best = [
+        find_manhattan_frames(_segments(np.eye(3), (0, 0, 0), count, seed))[0].significance
+        for seed in range(10)
+    ]
+    assert max(best) < 2.2
+
+
+def test_frames_differ() -> None:
+    frames = find_manhattan_frames(_segments(np.eye(3), (10, 10, 10), 60))
+    assert 1 < len(frames) <= 8
+    for i, frame in enumerate(frames):
+        for other in frames[:i]:
+            nearest = np.abs(frame.axes_xyz.T @ other.axes_xyz).max(axis=0)
+            assert nearest.min() < math.cos(math.radians(5.9))
+    significance = [frame.significance for frame in frames]
+    assert significance == sorted(significance, reverse=True)
+
+
+@pytest.mark.parametrize("count", [0, 1, 3])
+def test_too_few_segments(count: int) -> None:
+    assert find_manhattan_frames(_segments(np.eye(3), (0, 0, 0), count)) == []
+
+
+def test_who_follows_which_axis() -> None:
+    degrees = np.radians([0, 1, 3])
+    normals = np.stack([np.sin(degrees), np.full(3, 0.6), np.full(3, 0.8)], axis=-1)
+    column, agreement = followed_axes(
+        LineSegments(_unit(normals), np.eye(3), np.ones(3)), np.eye(3)[:, [2, 0, 1]]
+    )
+    assert column.tolist() == [1, 1, 1]
+    np.testing.assert_allclose(agreement, [1, 0.75, 0], atol=2e-3)

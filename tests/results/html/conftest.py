@@ -1,0 +1,46 @@
+"""A browser, and a report opened in it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tangent_train.results.html import Curve, Table, ViewerImage, write_report
+from tests.results.html.browser import OpenReport, chromium, opened
+from tests.results.html.scene import NAMES, panorama, photo
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from playwright.sync_api import Browser
+
+
+# Not for the whole session: while it runs, no other test could start an event loop.
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with chromium() as running:
+        yield running
+
+
+@pytest.fixture(scope="session")
+def page_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("html") / "a report.html"
+    sphere = panorama()
+    write_report(
+        path,
+        "Test",
+        tables=[Table("Wide", [f"column {k}" for k in range(30)], [["12345.6"] * 30])],
+        curves=[Curve("Loss", "loss", [0, 1, 2], {"train": [3.0, 2.0, 1.0]})],
+        images=[sphere, ViewerImage("bare", sphere.rgb), photo()],
+        class_names=NAMES,
+        notes=["a note without any place to break: " + "x" * 200],
+    )
+    return path
+
+
+@pytest.fixture
+def report(browser: Browser, page_path: Path) -> Iterator[OpenReport]:
+    with opened(browser, page_path) as open_report:
+        yield open_report

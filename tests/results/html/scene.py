@@ -1,0 +1,65 @@
+"""The images that the viewer is tried with, and the comparison with closed forms."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tangent_train.results.html import ViewerImage
+from tangent_train.results.pictures import class_colors
+from tests.results.html.reference import classes_of, colors_of, erp_directions, rays
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from tests.results.html.browser import OpenReport
+
+HEIGHT, WIDTH = 251, 503  # odd, no powers of two
+PHOTO = (120, 200)
+NAMES = ("unknown", *(f"octant {k}" for k in range(1, 8)), "<i>last</i>")
+COLORS = class_colors(len(NAMES)).astype(np.int64)
+START_DEG, PLANET_DEG = 95.0, 250.0
+TOLERANCE = 6  # of 255: JPEG and interpolation
+EDGE = 8  # pixels at the rounded corners of the canvas
+WRONG, UNLABELLED = (214, 39, 40), (110, 110, 110)
+PANORAMA, BARE_PANORAMA, FLAT_PHOTO = range(3)
+
+
+def panorama() -> ViewerImage:
+    directions = erp_directions(HEIGHT, WIDTH)
+    truth = classes_of(directions)
+    prediction = np.maximum(truth, 1)
+    prediction[directions[..., 1] < -0.9] = 8
+    rgb = colors_of(directions).round().astype(np.uint8)
+    return ViewerImage("a <b>sphere</b>", rgb, prediction, truth, note="mIoU 61.2 %")
+
+
+def photo() -> ViewerImage:
+    v, u = np.meshgrid(*(np.linspace(0, 1, n) for n in PHOTO), indexing="ij")
+    rgb = np.stack([40 + 180 * u, 40 + 180 * v, 0 * u + 90], axis=-1).round().astype(np.uint8)
+    prediction = (1 + 2 * (v > 0.5) + (u > 0.5)).astype(np.uint8)
+    return ViewerImage("a photo", rgb, prediction, sphere=False)
+
+
+def close(shown: NDArray[Any], expected: NDArray[Any], but: float = 0.0) -> None:
+    """All colours equal within the tolerance, but for a share of the pixels."""
+    assert shown.shape == expected.shape
+    if shown.ndim == 3:
+        shown, expected = (image[EDGE:-EDGE, EDGE:-EDGE] for image in (shown, expected))
+    far = np.abs(shown - expected).max(axis=-1) > TOLERANCE
+    assert far.mean() <= but, f"{far.sum()} of {far.size} pixels, first at {np.argwhere(far)[:3]}"
+
+
+def view_of(
+    report: OpenReport, lon_deg: float, lat_deg: float, width_deg: float, projection: str = "inside"
+) -> NDArray[np.float64]:
+    """Directions of the pixels of the picture."""
+    height, width = report.pixels().shape[:2]
+    return rays((height, width), lon_deg, lat_deg, width_deg, projection)
+
+
+def step_rad(report: OpenReport, width_deg: float = START_DEG) -> float:
+    """Angle that one pixel of a drag turns: what lies in the middle follows the pointer."""
+    return math.tan(math.radians(width_deg) / 2) / (max(report.box()[2:]) / 2)

@@ -1,0 +1,116 @@
+"""What `PredictionPanels` keeps for the viewer of the report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from torch import distributed
+from torch.multiprocessing.spawn import spawn
+
+from tangent_train.callbacks.panels import PredictionPanels
+from tangent_train.results.html import EncodedImage
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+NAMES = ("unknown", "wall", "floor")
+SHAPE, CROPS = (8, 16), (3, 4, 5)
+
+
+class _Source:
+    """Ten images; photos are cut into crops, whose pixels hold the number of the crop."""
+
+    def __len__(self) -> int:
+        return 10
+
+    def name(self, index: int) -> str:
+        return f"area/room {index}"
+
+    def read(self, index: int) -> Any:
+        rgb = np.full((*SHAPE, 3), 20 * index, np.uint8)
+        crops = np.arange(3, dtype=np.uint8)[:, None, None, None] * np.ones((*CROPS, 3), np.uint8)
+        whole = SimpleNamespace(render=lambda image, interpolation: 60 * crops)
+        sampler = SimpleNamespace(whole=lambda: whole)
+        return SimpleNamespace(rgb=rgb, sampler=lambda representation: sampler)
+
+
+def _tested(folder: Path, count: int, *shape: int) -> PredictionPanels:
+    """The callback after all ten images, two a batch; the first labelled pixel is wrong."""
+    panels = PredictionPanels(folder, count)
+    trainer: Any = SimpleNamespace(datamodule=SimpleNamespace(source=lambda split: _Source()))
+    task: Any = SimpleNamespace(class_names=NAMES, representation=None)
+    panels.on_test_start(trainer, task)
+    for first in range(0, 10, 2):
+        target = torch.ones((2, *shape), dtype=torch.uint8)
+        prediction = target.clone().long()
+        prediction.flatten(1)[:, 0] = 2
+        batch = SimpleNamespace(index=torch.tensor([first, first + 1]), target=target)
+        panels.on_test_batch_end(trainer, task, prediction, batch, first // 2)
+    panels.on_test_end(trainer, task)
+    return panels
+
+
+def _decoded(content: bytes | None) -> NDArray[np.uint8]:
+    assert content is not None
+    pixels: Any = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+    return pixels
+
+
+def test_the_panoramas_of_the_panels_are_kept_for_the_report(tmp_path: Path) -> None:
+    panels = _tested(tmp_path, 4, *SHAPE)
+    chosen = (0, 3, 6, 9)
+    assert [image.name for image in panels.images] == [f"area/room {k}" for k in chosen]
+    assert {path.stem for path in tmp_path.iterdir()} == {f"area_room {k}" for k in chosen}
+    for image, k in zip(panels.images, chosen, strict=True):
+        assert image.sphere
+        assert np.abs(_decoded(image.jpeg).astype(int) - 20 * k).max() <= 1
+        assert np.all(_decoded(image.truth) == 1)
+        prediction = _decoded(image.prediction)
+        assert prediction[0, 0] == 2
+        assert np.count_nonzero(prediction == 1) == 127
+        right = 127 / 128  # of the wall, whose IoU that is; the floor is not in the truth
+        assert (
+            image.note == f"mIoU {100 * right:.1f}\u00a0%, {100 * right:.1f}\u00a0% of pixels right"
+        )
+
+
+def test_the_crops_of_photos_lie_side_by_side(tmp_path: Path) -> None:
+    (image,) = _tested(tmp_path, 1, *CROPS).images
+    assert not image.sphere
+    count, height, width = CROPS
+    assert (image.width, image.height) == (count * width, height)
+    means = _decoded(image.jpeg)[..., 0].reshape(height, count, width).mean(axis=(0, 2))
+    np.testing.assert_allclose(means, [0, 60, 120], atol=12)
+    assert _decoded(image.truth).shape == (height, count * width)
+
+
+def test_no_panels_no_images(tmp_path: Path) -> None:
+    assert _tested(tmp_path, 0, *SHAPE).images == []
+
+
+def _encoded(name: str) -> EncodedImage:
+    return EncodedImage(name, "", True, 1, 1, b"jpeg", b"small", None, None, ())
+
+
+def _gather(rank: int, folder: str) -> None:
+    store = f"file://{folder}/store"
+    distributed.init_process_group("gloo", init_method=store, rank=rank, world_size=2)
+    panels = PredictionPanels(folder)
+    panels._encoded = {k: _encoded(str(k)) for k in ((4, 0) if rank == 0 else (7, 2, 9))}
+    trainer: Any = SimpleNamespace(world_size=2)
+    panels.on_test_end(trainer, trainer)
+    (Path(folder) / f"{rank}.txt").write_text(" ".join(image.name for image in panels.images))
+    distributed.destroy_process_group()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not distributed.is_available(), reason="torch without torch.distributed")
+def test_the_images_of_all_processes_come_together_in_order(tmp_path: Path) -> None:
+    spawn(_gather, (str(tmp_path),), nprocs=2)  # type: ignore[no-untyped-call]
+    assert [(tmp_path / f"{rank}.txt").read_text() for rank in (0, 1)] == ["0 2 4 7 9"] * 2

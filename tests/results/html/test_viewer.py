@@ -1,0 +1,254 @@
+"""What the viewer shows in a real Chromium is compared with closed forms."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+import pytest
+
+from tangent_train.results.html import ViewerImage, encode_image, write_report
+from tests.results.html.browser import NO_WEBGL, OpenReport, opened
+from tests.results.html.reference import (
+    classes_of,
+    colors_of,
+    erp_directions,
+    interpolated,
+    rays,
+)
+from tests.results.html.scene import (
+    BARE_PANORAMA,
+    COLORS,
+    EDGE,
+    FLAT_PHOTO,
+    HEIGHT,
+    NAMES,
+    PHOTO,
+    PLANET_DEG,
+    START_DEG,
+    UNLABELLED,
+    WIDTH,
+    WRONG,
+    close,
+    step_rad,
+    view_of,
+)
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+    from playwright.sync_api import Browser
+
+
+def test_the_first_picture_is_the_overlay_ahead(report: OpenReport) -> None:
+    assert report.page.locator("input[value=overlay]").is_checked()
+    assert report.text(".looking") == "Looking at longitude 0.0°, latitude 0.0° · 95° wide"
+    assert report.text(".caption") == "a <b>sphere</b> · mIoU 61.2 %"
+    report.layer("input")
+    close(report.pixels(), colors_of(view_of(report, 0, 0, START_DEG)))
+
+
+def test_dragging_moves_the_scene_with_the_pointer(report: OpenReport) -> None:
+    report.layer("input")
+    step = math.degrees(step_rad(report))
+    report.drag(-60, 40)
+    close(report.pixels(), colors_of(view_of(report, 60 * step, 40 * step, START_DEG)))
+    assert report.text(".looking").startswith(f"Looking at longitude {60 * step:.1f}°")
+
+
+def test_nothing_is_mirrored(report: OpenReport) -> None:
+    report.layer("input")
+    pixels = report.pixels()
+    row, column = pixels.shape[0] // 2, pixels.shape[1] // 2
+    # Green grows with y, towards longitude 90°, to the right; blue with z, upwards.
+    assert pixels[row, column + 100, 1] > pixels[row, column - 100, 1] + 40
+    assert pixels[row - 100, column, 2] > pixels[row + 100, column, 2] + 40
+
+
+@pytest.mark.parametrize("projection", ["inside", "planet"])
+def test_the_seam_does_not_show(report: OpenReport, projection: str) -> None:
+    report.layer("input")
+    report.drag(math.pi / step_rad(report), 0)
+    assert "longitude −180.0°, latitude 0.0°" in report.text(".looking").replace(" 180", " −180")
+    width_deg = START_DEG if projection == "inside" else PLANET_DEG
+    latitude = 0 if projection == "inside" else -90
+    report.project(projection)
+    view = view_of(report, 180, latitude, width_deg, projection=projection)
+    close(report.pixels(), colors_of(view))
+
+
+@pytest.mark.parametrize(("toward", "latitude"), [(1, 90), (-1, -90)])
+@pytest.mark.parametrize("zoomed", [False, True])
+def test_poles_are_closed(report: OpenReport, toward: int, latitude: int, zoomed: bool) -> None:
+    report.layer("input")
+    report.drag(0, toward * 4000)
+    width_deg = START_DEG
+    if zoomed:
+        report.press(*["+"] * 13)
+        width_deg = 95 / 1.25**13
+    sign = "" if latitude > 0 else "−"
+    assert f"latitude {sign}90.0° · {width_deg:.0f}° wide" in report.text(".looking")
+    pixels = report.pixels()
+    close(pixels, colors_of(view_of(report, 0, latitude, width_deg)))
+    if zoomed:  # 5° across: no pinwheel of the last row's pixels
+        assert np.ptp(pixels[EDGE:-EDGE, EDGE:-EDGE], axis=(0, 1)).max() <= 12
+
+
+def test_seam_and_poles_are_interpolated_like_the_rest(browser: Browser, tmp_path: Path) -> None:
+    """Pixels of 15°: what is wrong with half a pixel at a border shows."""
+    grey = np.random.default_rng(0).integers(0, 256, (12, 24, 1), np.uint8)
+    image = encode_image(ViewerImage("coarse", grey.repeat(3, axis=2)), 1)
+    pixels: Any = cv2.imdecode(np.frombuffer(image.jpeg, np.uint8), cv2.IMREAD_COLOR)
+    write_report(tmp_path / "report.html", "t", images=[image], class_names=NAMES[:1])
+    with opened(browser, tmp_path / "report.html") as report:
+        step = step_rad(report)
+        report.drag(math.pi / step, 0)
+        close(report.pixels(), interpolated(pixels, view_of(report, 180, 0, START_DEG)))
+        report.press("0")
+        report.drag(0, 4000)
+        close(report.pixels(), interpolated(pixels, view_of(report, 0, 90, START_DEG)))
+        report.drag(0, -8000)
+        close(report.pixels(), interpolated(pixels, view_of(report, 0, -90, START_DEG)))
+
+
+def test_the_little_planet_and_the_flat_map(report: OpenReport) -> None:
+    report.layer("input")
+    report.project("planet")
+    view = view_of(report, 0, -90, PLANET_DEG, projection="planet")
+    close(report.pixels(), colors_of(view))
+    report.project("flat")
+    pixels = report.pixels()
+    height, width = pixels.shape[:2]
+    rows = int(width * HEIGHT / WIDTH)
+    top = (height - rows) // 2
+    assert top > EDGE
+    assert pixels[EDGE : top - 1, EDGE:-EDGE].max() < 40, "nothing beyond the poles"
+    fitted = pixels[top + 2 : top + rows - 2]
+    expected = colors_of(erp_directions(height=rows, width=width))[2 : 2 + len(fitted)]
+    close(fitted, expected)
+
+
+def test_layers_show_the_colours_of_their_classes(report: OpenReport) -> None:
+    report.drag(130, 40)  # several octants, errors and the unlabelled disc
+    step = math.degrees(step_rad(report))
+    longitude, latitude = -130 * step, 40 * step
+    view = view_of(report, longitude, latitude, START_DEG)
+    truth, photo = classes_of(view), colors_of(view)
+    prediction = np.where(view[..., 1] < -0.9, 8, np.maximum(truth, 1))
+    assert len(np.unique(truth)) >= 4
+    assert np.mean(truth == 0) > 0.02
+    assert np.mean((prediction != truth) & (truth > 0)) > 0.02
+    grey = (photo @ [0.299, 0.587, 0.114])[..., None]
+    error = np.where((truth == prediction)[..., None], 191.25 + 0.25 * grey, WRONG)
+    error = np.where((truth == 0)[..., None], UNLABELLED, error)
+    expected = {
+        "truth": COLORS[truth],
+        "prediction": COLORS[prediction],
+        "error": error,
+        "overlay": 0.45 * photo + 0.55 * COLORS[prediction],
+    }
+    for layer, colors in expected.items():
+        report.layer(layer)
+        # Borders lie on pixels of the label map, 0.7° each.
+        close(report.pixels(), colors, but=0.03)
+    assert not report.page.locator(".errors").is_visible()
+    report.layer("error")
+    assert report.text(".errors").split() == ["right", "wrong", "unlabelled"]
+
+
+def test_the_slider_sets_the_opacity_of_the_overlay(report: OpenReport) -> None:
+    report.drag(150, 0)
+    longitude = -math.degrees(150 * step_rad(report))
+    (direction,) = rays((1, 1), longitude, 0, 1, "inside")[0]
+    slider = report.page.locator(".opacity input")
+    for share in (100, 0, 30):
+        slider.fill(str(share))
+        report.drawn()
+        color = COLORS[classes_of(direction)] * share / 100 + colors_of(direction) * (
+            1 - share / 100
+        )
+        close(report.center(), color)
+    report.layer("truth")
+    assert not slider.is_visible()
+
+
+def test_photos_are_flat_with_pan_and_zoom(report: OpenReport) -> None:
+    report.choose(FLAT_PHOTO)
+    report.layer("input")
+    assert not report.page.locator(".projection").is_visible()
+    x, y, width, height = report.box()
+    scale = min(width / PHOTO[1], height / PHOTO[0])
+
+    def color(u: float, v: float) -> NDArray[np.float64]:
+        return np.array([40 + 180 * u, 40 + 180 * v, 90])
+
+    pixels = report.pixels()
+    assert pixels[20, 20].max() < 40, "nothing beside it"
+    # A point a quarter to the right and down stays there while the wheel turns.
+    dx, dy = PHOTO[1] * scale / 4, PHOTO[0] * scale / 4
+    row, column = int(height / 2 + dy), int(width / 2 + dx)
+    close(pixels[row, column], color(0.75, 0.75))
+    report.page.mouse.move(x + width / 2 + dx, y + height / 2 + dy)
+    report.page.mouse.wheel(0, -240)
+    report.drawn()
+    zoomed = report.pixels()
+    close(zoomed[row, column], color(0.75, 0.75))
+    factor = math.exp(0.48)
+    close(zoomed[row, int(column - dx)], color(0.75 - 0.25 / factor, 0.75))
+    assert report.text(".readout").startswith("column 1")
+    report.drag(4000, 4000)  # to the upper left corner, no further
+    shown = factor * scale
+    corner = report.pixels()[20, 20]
+    close(corner, color(20.5 / PHOTO[1] / shown, 20.5 / PHOTO[0] / shown))
+
+
+def test_views_stay_when_another_panorama_is_chosen(report: OpenReport) -> None:
+    report.layer("input")
+    report.drag(-80, 20)
+    before = report.pixels()
+    report.choose(BARE_PANORAMA)
+    assert report.text(".caption") == "bare"
+    close(report.pixels(), before)
+
+
+def test_a_lost_context_comes_back(report: OpenReport) -> None:
+    report.layer("truth")
+    before = report.pixels()
+    lose = """() => { const gl = document.querySelector("canvas").getContext("webgl2");
+        window.losing = gl.getExtension("WEBGL_lose_context"); window.losing.loseContext(); }"""
+    report.page.evaluate(lose)
+    report.page.wait_for_selector(".message:not(:empty)")
+    report.page.locator(".gallery button").nth(0).hover()
+    report.page.evaluate("() => window.losing.restoreContext()")
+    report.page.wait_for_selector(".message:empty", state="attached")
+    report.drawn()
+    np.testing.assert_array_equal(report.pixels(), before)
+
+
+def test_without_webgl_images_are_flat_and_it_says_so(browser: Browser, page_path: Path) -> None:
+    with opened(browser, page_path, script=NO_WEBGL) as report:
+        assert "no WebGL 2" in report.text(".message")
+        assert not report.page.locator(".projection").is_visible()
+        x, y, width, height = report.box()
+        scale = min(width / WIDTH, height / HEIGHT)
+        at_45_deg = (int(height / 2 + HEIGHT * scale / 4), int(width / 2 + WIDTH * scale / 8))
+        direction = rays((1, 1), 45, -45, 1, "inside")[0, 0]
+        index = int(classes_of(direction))
+        for layer, color in (
+            ("input", colors_of(direction)),
+            ("truth", COLORS[index]),
+            ("overlay", 0.45 * colors_of(direction) + 0.55 * COLORS[index]),
+        ):
+            report.layer(layer)
+            close(report.pixels()[at_45_deg], color)
+        report.page.mouse.move(x + at_45_deg[1], y + at_45_deg[0])
+        report.drawn()
+        assert f"truth: {NAMES[index]}" in report.text(".readout")
+        report.layer("error")
+        assert report.center() == pytest.approx(UNLABELLED)
+        report.page.mouse.dblclick(x + at_45_deg[1], y + at_45_deg[0])
+        report.drawn()
+        assert report.text(".looking").endswith("× 2.0")
