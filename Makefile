@@ -1,12 +1,13 @@
 # make demo   sets up, makes furnished rooms, trains on them and shows the results
-# make test   sets up and runs the whole test suite
+# make test   sets up and runs the tests, about 5 minutes on two cores
+# make test-all  with the slow ones and the coverage, about 40 minutes; what CI runs
 # make bench  measures speed and memory, under 10 minutes; make bench-compare looks for regressions
 PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 DEMO := runs/make_demo
 
-.PHONY: install demo test lint bench bench-compare
+.PHONY: install demo test test-all lint bench bench-compare
 
 install: $(READY)
 
@@ -30,7 +31,9 @@ demo: install
 	fi
 
 test: install
-	@echo "Running the whole test suite (some minutes on two cores) …"
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow"
+
+test-all: install
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal --cov --cov-report=term:skip-covered
 
 lint: install

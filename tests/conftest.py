@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 import cv2
@@ -15,9 +16,10 @@ from datamodules.core.label_table import CLASSES
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
-    from pathlib import Path
 
     from numpy.typing import NDArray
+
+SLOW = Path(__file__).parent / "slow"
 
 INSTANCES_PER_CLASS = 40  # the table is longer than 256 entries: two bytes of the colour count
 ROOMS = {
@@ -29,6 +31,13 @@ ROOMS = {
     "5b": ("hallway_2", "office_3"),
     "6": ("office_1",),
 }
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """What lies in `tests/slow` is for `make test-all`."""
+    for item in items:
+        if SLOW in item.path.parents:
+            item.add_marker("slow")
 
 
 class FabricateStanford(Protocol):

@@ -1,6 +1,6 @@
 """Pairs of Stanford2D3DS's panoramas: the paper's sixty of area 1, or all of the same rooms.
 
-``stanford_pairs.csv`` holds the paper's tables of pairs and of single results as they are printed:
+``pairs.csv`` holds the paper's tables of pairs and of single results as they are printed:
 number, split, images, overlap of the fields of view, then PMR, MS and P on the equirectangular
 image and at base levels 0, 1 and 2. What does not fit together in print is left so: the means of
 the overlaps are 0.896 (easy) and 0.836 (hard) where the paper's text has 89.35 % and 83.35 %, and

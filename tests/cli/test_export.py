@@ -17,8 +17,8 @@ from PIL import Image
 from tangent_train.checkpoints.trained import load_trained
 from tangent_train.cli import main
 from tangent_train.inference import export as export_module
-from tests.documentation.markdown import commands, shown_files
-from tests.documentation.running import ROOT
+from tests.slow.documentation.markdown import commands, shown_files
+from tests.slow.documentation.running import ROOT
 from tests.tasks.small_networks import save_checkpoint
 
 if TYPE_CHECKING:

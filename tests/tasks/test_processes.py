@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from datamodules.core.samples import TrainingSample
 from tests.conftest import ROOMS
-from tests.faults.small_runs import run_trainer, small_data, small_task
+from tests.slow.faults.small_runs import run_trainer, small_data, small_task
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -19,8 +19,8 @@ from datamodules import SynthRooms
 from datamodules.core.data_check import check_all
 from tangent_train.errors import DataError
 from tests.datamodules.folder.folder_format import write_classes
-from tests.faults import data_sets as sets
-from tests.faults.data_sets import colors, module, partner, write
+from tests.slow.faults import data_sets as sets
+from tests.slow.faults.data_sets import colors, module, partner, write
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -30,7 +30,7 @@ from tangent_train.files import NoRoomError, atomic_path, reserve, write_text
 from tangent_train.metrics.segmentation import ConfusionMatrices
 from tangent_train.rendering import TangentRepresentation
 from tangent_train.results.segmentation import evaluation_results, write_results
-from tests.faults.small_runs import Faulty, run_trainer, small_data, small_task
+from tests.slow.faults.small_runs import Faulty, run_trainer, small_data, small_task
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -85,7 +85,7 @@ def _on_a_small_disk(
 ) -> subprocess.CompletedProcess[str]:
     """Run a shell script in `folder`, with a disk of its own mounted at ``disk``."""
     (folder / "disk").mkdir()
-    root = Path(__file__).parents[2]
+    root = Path(__file__).parents[3]
     mounted = f"mount -t tmpfs -o size={size} none disk\n{script}"
     return subprocess.run(
         ["unshare", "--user", "--map-root-user", "--mount", "sh", "-c", mounted],
@@ -117,7 +117,7 @@ ALL_WRITERS = """
 import os
 from pathlib import Path
 from tangent_train.files import NoRoomError
-from tests.faults.test_full_disk import WRITERS
+from tests.slow.faults.test_full_disk import WRITERS
 for name, write in WRITERS.items():
     path = Path("disk", name)
     path.write_text("old")

@@ -16,7 +16,7 @@ from datamodules.stanford2d3ds.perspective import read_camera_matrix
 from datamodules.stanford2d3ds.poses import read_panorama_pose
 from tangent_train.geometry import TangentGrid, rotation_about
 from tangent_train.rendering.camera_files import CameraFile, read_cameras, write_cameras
-from tests.fuzz.pixels import DEPTH, RGB, SHAPE
+from tests.slow.fuzz.pixels import DEPTH, RGB, SHAPE
 
 __all__ = [
     "camera_seeds",

@@ -15,7 +15,7 @@ from torch import Tensor
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 from tangent_train.errors import SettingError
 from tangent_train.tasks.divergence import BATCH_FILE
-from tests.faults.small_runs import Faulty, run_trainer, small_data, small_task
+from tests.slow.faults.small_runs import Faulty, run_trainer, small_data, small_task
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -1,6 +1,6 @@
-"""Break files for as long as one likes: ``python -m tests.fuzz --minutes 12 [target …]``.
+"""Break files for as long as one likes: ``python -m tests.slow.fuzz --minutes 12 [target …]``.
 
-Inputs are made with the mutations of `tests.fuzz.mutation` by atheris (``pip install atheris``),
+Inputs come from the mutations of `tests.slow.fuzz.mutation`, by atheris (``pip install atheris``),
 which keeps those that reach new code. Every target runs in a process of its own with limits of
 memory and time. An input that ends otherwise than documented is saved, once for every place where
 its error came from, with the error beside it.
@@ -32,7 +32,7 @@ _KINDS = ("error", "crash", "oom", "timeout", "memory")
 
 def main() -> int:
     """Try the targets one after the other; 1 where something was found."""
-    parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m tests.slow.fuzz", description=__doc__)
     parser.add_argument("target", nargs="*", help="all by default")
     parser.add_argument("--minutes", type=float, default=1.0, help="of each target")
     parser.add_argument("--out", type=Path, default=Path("runs/fuzz"), help="for what is found")
@@ -44,7 +44,7 @@ def main() -> int:
         parser.error("this needs atheris: pip install atheris")
     if arguments.child:
         _fuzz(atheris, arguments.target[0], arguments.minutes * 60, arguments.out)
-    from tests.fuzz.targets import TARGETS
+    from tests.slow.fuzz.targets import TARGETS
 
     unknown = sorted(set(arguments.target) - set(TARGETS))
     if unknown:
@@ -64,7 +64,7 @@ def _campaign(name: str, seconds: float, folder: Path) -> int:
     slowest, ended = 0.0, 0
     while (left := end - time.monotonic()) > 1:
         (folder / _COUNTS).write_text('{"inputs": 0, "refused": 0, "slowest": 0}')
-        command = [sys.executable, "-m", "tests.fuzz", "--child", name]
+        command = [sys.executable, "-m", "tests.slow.fuzz", "--child", name]
         command += ["--minutes", str(left / 60), "--out", str(folder)]
         with (folder / "log.txt").open("a") as log:
             code = subprocess.run(command, stdout=log, stderr=log, check=False).returncode
@@ -97,7 +97,7 @@ def _fuzz(atheris: Any, name: str, seconds: float, folder: Path) -> None:
     """Try inputs until the time is over; ends the process."""
     with atheris.instrument_imports(include=["datamodules", "tangent_train"]):
         from datamodules.images.image_opening import MOST_PIXELS
-        from tests.fuzz.targets import LARGEST_IMAGE, TARGETS
+        from tests.slow.fuzz.targets import LARGEST_IMAGE, TARGETS
     target = TARGETS[name]
     seeds = target.seeds()
     for number, seed in enumerate(seeds):
@@ -156,7 +156,9 @@ def _limit_memory() -> None:
 def _save(folder: Path, content: bytes, error: BaseException) -> None:
     """Keep an input whose error comes from a new place."""
     frames = [
-        f for f in traceback.extract_tb(error.__traceback__) if "/tests/fuzz/" not in f.filename
+        f
+        for f in traceback.extract_tb(error.__traceback__)
+        if "/tests/slow/fuzz/" not in f.filename
     ]
     place = f"{Path(frames[-1].filename).stem}-{frames[-1].lineno}" if frames else "check"
     file = folder / f"error-{type(error).__name__}-{place}"

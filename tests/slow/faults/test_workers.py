@@ -17,7 +17,7 @@ from torch.utils.data import get_worker_info
 from datamodules.core.watched_samples import explained
 from tangent_train.cli.machine import machine_faults
 from tangent_train.errors import DataError, SettingError
-from tests.faults.small_runs import Faulty, run_trainer, small_data, small_task
+from tests.slow.faults.small_runs import Faulty, run_trainer, small_data, small_task
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

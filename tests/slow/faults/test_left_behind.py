@@ -41,7 +41,7 @@ def writer(tmp_path: Path) -> Iterator[tuple[subprocess.Popen[str], Path]]:
     """A process in the middle of writing, and its temporary file."""
     with subprocess.Popen(
         [sys.executable, "-c", SLOW_WRITER, str(tmp_path / "file.txt")],
-        env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])},
+        env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[3])},
         stdout=subprocess.PIPE,
         text=True,
     ) as process:
@@ -120,7 +120,7 @@ def test_workers_end_with_their_parent(tmp_path: Path, how: signal.Signals, afte
     """While they start and while they work: none keeps the terminal's pipe open."""
     with subprocess.Popen(
         [sys.executable, "-c", MAKER, str(tmp_path / "rooms")],
-        env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])},
+        env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[3])},
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
     ) as process:
@@ -181,7 +181,7 @@ def test_no_module_of_one_system_is_needed(tmp_path: Path) -> None:
         [sys.executable, "-c", ELSEWHERE],
         check=False,
         cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])},
+        env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[3])},
         capture_output=True,
         text=True,
     )

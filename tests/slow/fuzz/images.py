@@ -22,8 +22,8 @@ from datamodules.images.image_files import read_depth_m
 from datamodules.images.pixel_files import read_pixels
 from datamodules.images.png import check_png, read_color_png, read_depth_png
 from tangent_train.errors import DataError
-from tests.fuzz.mutation import png_chunk
-from tests.fuzz.pixels import DEPTH, RGB, npy, png
+from tests.slow.fuzz.mutation import png_chunk
+from tests.slow.fuzz.pixels import DEPTH, RGB, npy, png
 
 if TYPE_CHECKING:
     from collections.abc import Callable

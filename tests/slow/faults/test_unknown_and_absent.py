@@ -20,7 +20,7 @@ from tangent_train.callbacks.checkpoints import best_checkpoint
 from tangent_train.callbacks.panels import PredictionPanels
 from tangent_train.cli.run import best_on_validation
 from tangent_train.results.segmentation import evaluation_results
-from tests.faults.small_runs import Faulty, run_trainer, small_data, small_task
+from tests.slow.faults.small_runs import Faulty, run_trainer, small_data, small_task
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

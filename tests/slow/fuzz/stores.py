@@ -16,7 +16,7 @@ from datamodules.core.store_files import open_stored, write_stored
 from datamodules.modelnet40.shape_files import ShapeFile
 from datamodules.modelnet40.sphere_files import is_current, read_sphere
 from datamodules.modelnet40.sphere_store import SphereFolder
-from tests.fuzz.pixels import DEPTH, RGB, SHAPE, npy
+from tests.slow.fuzz.pixels import DEPTH, RGB, SHAPE, npy
 
 if TYPE_CHECKING:
     from collections.abc import Callable

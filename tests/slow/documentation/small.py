@@ -16,8 +16,8 @@ from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
 from tangent_train.cli.compose import config_folder
-from tests.documentation.markdown import Command
-from tests.documentation.world import (
+from tests.slow.documentation.markdown import Command
+from tests.slow.documentation.world import (
     DEMO,
     PAPER_PAIRS,
     PLACES,

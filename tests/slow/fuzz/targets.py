@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from tangent_train.errors import DataError
-from tests.fuzz import images, stores, texts
-from tests.fuzz.mutation import mutate, sealed_png
+from tests.slow.fuzz import images, stores, texts
+from tests.slow.fuzz.mutation import mutate, sealed_png
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.documentation.before import made_first, make_way, needs_its_block
-from tests.documentation.markdown import (
+from tests.slow.documentation.before import made_first, make_way, needs_its_block
+from tests.slow.documentation.markdown import (
     SHELLS,
     Command,
     blocks,
@@ -25,9 +25,9 @@ from tests.documentation.markdown import (
     documents,
     shown_files,
 )
-from tests.documentation.running import ROOT, run
-from tests.documentation.small import NoStandInError, small_settings, stand_in
-from tests.documentation.world import CLUSTER, INSTALLED, build_world
+from tests.slow.documentation.running import ROOT, run
+from tests.slow.documentation.small import NoStandInError, small_settings, stand_in
+from tests.slow.documentation.world import CLUSTER, INSTALLED, build_world
 
 if TYPE_CHECKING:
     from tests.conftest import FabricateStanford

@@ -14,8 +14,8 @@ from datamodules.core import data_check
 from tangent_train.cli import main
 from tangent_train.errors import DataError, SettingError
 from tests.datamodules.folder.folder_format import write_classes
-from tests.faults import data_sets as sets
-from tests.faults.data_sets import colors, module, names, partner, write
+from tests.slow.faults import data_sets as sets
+from tests.slow.faults.data_sets import colors, module, names, partner, write
 
 if TYPE_CHECKING:
     from pathlib import Path

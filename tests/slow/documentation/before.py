@@ -6,7 +6,7 @@ import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
-from tests.documentation.world import RGB_CHECKPOINT
+from tests.slow.documentation.world import RGB_CHECKPOINT
 
 MADE_FIRST = {
     name: ("tangent-export", f"checkpoint={RGB_CHECKPOINT}", f"output={name}")

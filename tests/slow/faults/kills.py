@@ -1,9 +1,9 @@
 """Runs that are killed at random moments and resumed, compared with one that nobody disturbed.
 
-``python -m tests.faults.kills --moments 20`` prints what was found; see ``--help``. A run trains
-with dropout, validates, writes checkpoints all the time, evaluates and writes its results; SIGKILL
-comes at a moment drawn between its first checkpoint and its end, and comes again while every other
-run is resumed.
+``python -m tests.slow.faults.kills --moments 20`` prints what was found; see ``--help``. A run
+trains with dropout, validates, writes checkpoints all the time, evaluates and writes its results;
+SIGKILL comes at a moment drawn between its first checkpoint and its end, and comes again while
+every other run is resumed.
 """
 
 from __future__ import annotations
@@ -267,7 +267,7 @@ def _different(run: Path, undisturbed: Path) -> Iterator[str]:
 
 
 def _main() -> int:
-    parser = argparse.ArgumentParser(prog="python -m tests.faults.kills", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m tests.slow.faults.kills", description=__doc__)
     parser.add_argument("--moments", type=int, default=20, help="runs (20)")
     parser.add_argument("--seed", type=int, default=0, help="of the moments (0)")
     options = parser.parse_args()

@@ -15,8 +15,8 @@ from datamodules.synthshapes.settings import ShapeSettings
 from tests.datamodules.folder.folder_format import write_data_set
 from tests.datamodules.stanford2d3ds.stanford_pairs_format import write_paper_pairs
 from tests.datamodules.synthia.synthia_format import write_panoramas, write_views
-from tests.documentation.cluster import write_cluster
-from tests.documentation.running import run
+from tests.slow.documentation.cluster import write_cluster
+from tests.slow.documentation.running import run
 from tests.studies.mnist_format import write_mnist
 
 if TYPE_CHECKING:

@@ -19,8 +19,8 @@ from datamodules.images.image_opening import MOST_PIXELS
 from datamodules.images.pixel_files import read_pixels
 from datamodules.images.png import read_color_png
 from tangent_train.errors import DataError
-from tests.fuzz.mutation import png_chunk
-from tests.fuzz.targets import LARGEST_IMAGE, LONGEST_MESSAGE, TARGETS, Target
+from tests.slow.fuzz.mutation import png_chunk
+from tests.slow.fuzz.targets import LARGEST_IMAGE, LONGEST_MESSAGE, TARGETS, Target
 
 if TYPE_CHECKING:
     from collections.abc import Callable

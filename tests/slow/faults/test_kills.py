@@ -1,4 +1,4 @@
-"""Runs that are killed; ``python -m tests.faults.kills`` does it at more moments."""
+"""Runs that are killed; ``python -m tests.slow.faults.kills`` does it at more moments."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.faults.kills import campaign, killed_while_writing
+from tests.slow.faults.kills import campaign, killed_while_writing
 
 if TYPE_CHECKING:
     from pathlib import Path

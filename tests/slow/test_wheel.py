@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 
 pytestmark = pytest.mark.slow
 
@@ -48,7 +48,7 @@ def test_the_wheel_holds_the_packages_and_the_configs(wheel: Path) -> None:
         "tangent_train/configs/experiment/rooms/demo.yaml",
         "tangent_train/py.typed",
         "datamodules/stanford2d3ds/panoramas.py",
-        "datamodules/stanford_pairs.csv",
+        "datamodules/stanford2d3ds/pairs.csv",
         "datamodules/synthrooms/generate.py",
         "models/unet.py",
     )
