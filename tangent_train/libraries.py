@@ -11,6 +11,7 @@ from importlib import import_module
 from typing import Any
 
 from tangent_train.registry import Local, Weights, import_named
+from tangent_train.setting_rules import from_file
 
 __all__ = ["find"]
 
@@ -26,13 +27,6 @@ _BY_SIGNATURE = {
     "Segformer UPerNet Unet UnetPlusPlus",
 }
 """Classes all of whose named settings may be given, but for these."""
-
-_OF_THE_MACHINE = (
-    "accelerator barebones callbacks default_root_dir devices enable_autolog_hparams fast_dev_run "
-    "inference_mode limit_predict_batches limit_test_batches logger max_time model_registry "
-    "num_nodes plugins profiler strategy"
-)
-"""Settings of the trainer that no file decides: processes, sockets, files, what is looked at."""
 
 _NETWORKS = (
     "aux_logits aux_loss drop_path_rate drop_rate dropout dynamic_img_size features_only "
@@ -59,7 +53,9 @@ def find(module: str, name: str) -> tuple[Any, dict[str, Any]] | None:
         made = import_named(f"{module}.{name}", "_target_")
         arguments = inspect.signature(made).parameters.values()
         named = [a.name for a in arguments if a.kind is not a.VAR_KEYWORD]
-        kinds = {n: Local if n in _OF_THE_MACHINE.split() else _SIMPLE for n in named}
+        trainer = module == "lightning"
+        local = {n for n in named if trainer and not from_file(f"trainer.{n}")}
+        kinds = {n: Local if n in local else _SIMPLE for n in named}
     elif (module, name) == ("timm", "create_model") or _is_of_torchvision(module, name):
         made = import_named(f"{module}.{name}", "_target_")
         named = list(inspect.signature(made).parameters)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Literal
 
 import yaml  # type: ignore[import-untyped]
@@ -13,13 +12,12 @@ from tangent_train.files import write_text
 from tangent_train.registry import Text, check_fields, check_plain
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator
+    from collections.abc import Collection, Mapping
     from pathlib import Path
 
 __all__ = [
     "INPUTS",
     "NORMALIZATION",
-    "flat_settings",
     "read_checkpoint",
     "read_settings",
     "write_settings",
@@ -114,13 +112,3 @@ class _Dumper(yaml.SafeDumper):  # type: ignore[misc]
 def write_settings(path: Path, settings: Mapping[str, Any]) -> None:
     """Write settings as YAML; texts are written so that any reader takes them for what they are."""
     write_text(path, yaml.dump(dict(settings), Dumper=_Dumper, sort_keys=False, allow_unicode=True))
-
-
-def flat_settings(config: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Settings of nested sections as ``section.setting``, with their values."""
-    for key, value in config.items():
-        name = f"{prefix}{key}"
-        if isinstance(value, Mapping):
-            yield from flat_settings(value, f"{name}.")
-        else:
-            yield name, value

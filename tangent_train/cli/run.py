@@ -6,7 +6,7 @@ import json
 import signal
 import sys
 import warnings
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -35,28 +35,14 @@ from tangent_train.checkpoints.content import read_checkpoint, write_settings
 from tangent_train.checkpoints.trained import inputs_in
 from tangent_train.cli.build import Settings, build, check_numbers
 from tangent_train.cli.machine import machine_faults
-from tangent_train.cli.resume import check_resumed
 from tangent_train.cli.sweep import OBJECTIVE_FILE
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import write_text
 from tangent_train.registry import make
+from tangent_train.setting_rules import differing_settings, from_file
 from tangent_train.tasks.averaging import AveragedWeights
 
 __all__ = ["best_on_validation", "build", "evaluate", "prepare", "train"]
-
-_LOCAL = (
-    "data.label_table=",
-    "data.root=",
-    "data.store=",
-    "task.compile",
-    "trainer.accelerator=",
-    "trainer.devices=",
-    "trainer.num_nodes=",
-    "trainer.strategy=",
-    "trust=",
-)
-"""Begins what no file says and a resumed run has to be told again."""
-
 
 # lightning 2.6 asks torch's tree library in a way torch ≥ 2.13 deprecates: nothing to do about it.
 warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)`", FutureWarning)
@@ -78,7 +64,7 @@ def train(settings: Settings, trust: Collection[str] | None = None) -> float | N
     lightning.seed_everything(settings["seed"], workers=True, verbose=False)
     resumed = None if settings["resume"] is None else checkpoints / "last.ckpt"
     if resumed is not None:
-        check_resumed(settings, read_checkpoint(resumed, ("config",))["config"])
+        _check_resumed(settings, read_checkpoint(resumed, ("config",))["config"])
     data, task = build(settings, trust)
     settings = {"choices": _choices(), **settings}
     start = settings["init_from"]
@@ -171,10 +157,23 @@ def _choices() -> dict[str, str]:
     }
 
 
+def _check_resumed(settings: Settings, before: Mapping[str, Any]) -> None:
+    """Refuse to resume a run as another one."""
+    for name, now, then in differing_settings(settings, before, "resume"):
+        raise SettingError(
+            name,
+            found=f"{now!r} for a run that began with {then!r}",
+            expected="no other than before",
+            remedy="Start a new run for it.",
+        )
+
+
 def _typed_local() -> list[str]:
-    """What was typed of it."""
+    """What was typed that no file says: a resumed run has to be told it again."""
     typed = [said.lstrip("+") for said in HydraConfig.get().overrides.task]
-    return [said for said in typed if said.startswith(_LOCAL)]
+    names = [said.partition("=")[0] for said in typed]
+    pairs = zip(names, typed, strict=True)
+    return [said for name, said in pairs if name == "trust" or not from_file(name)]
 
 
 def _trainer(

@@ -18,11 +18,12 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from tangent_train.checkpoints.content import INPUTS, NORMALIZATION, flat_settings, read_checkpoint
+from tangent_train.checkpoints.content import INPUTS, NORMALIZATION, read_checkpoint
 from tangent_train.cli import values
 from tangent_train.cli.compose import STORED, options_of, search_path
 from tangent_train.errors import DataError, SettingError
 from tangent_train.registry import Text, accept, check_fields, check_plain, named_targets
+from tangent_train.setting_rules import flat_settings
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence

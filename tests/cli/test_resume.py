@@ -16,8 +16,6 @@ import pytest
 import torch
 
 from tangent_train.cli import main
-from tangent_train.cli.resume import check_resumed
-from tangent_train.errors import SettingError
 from tests.dropping import TRUST, write_dropout
 
 # No batch statistics.
@@ -199,10 +197,10 @@ def test_checkpoints_say_all_that_later_commands_need(undisturbed: Path) -> None
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("optimizer.lr=1", r"optimizer\.lr: found 1 .*learning rate come from the checkpoint"),
+        ("optimizer.lr=1", r"optimizer\.lr: found 1 for a run that began with"),
         ("data.fold=2", r"data\.fold: found 2 for a run that began with 1"),
         ("seed=3", r"seed: found 3 for a run that began with 0"),
-        ("trainer.accumulate_grad_batches=2", "it would take other steps"),
+        ("trainer.accumulate_grad_batches=2", r"accumulate_grad_batches: found 2 for a run"),
         ("hydra.run.dir=elsewhere", r"found hydra\.run\.dir=elsewhere beside it"),
     ],
 )
@@ -234,14 +232,6 @@ def test_a_run_is_not_resumed_without_its_root_and_what_is_to_be_trusted(
 def _quoted(root: str) -> str:
     name, _, value = root.partition("=")
     return f"{name}={value!r}"
-
-
-def test_where_and_how_it_is_computed_may_change() -> None:
-    before = {"data": {"root": "a", "fold": 1}, "trainer": {"devices": 1}, "network": {"x": 1}}
-    after = {"data": {"root": "b", "fold": 1}, "trainer": {"devices": 2}, "network": {"x": 1}}
-    check_resumed(after, before)
-    with pytest.raises(SettingError, match=r"network\.y.*tensors of its own network"):
-        check_resumed(after | {"network": {"x": 1, "y": 2}}, before)
 
 
 def _processes(folder: Path, *arguments: str, command: Path = COMMAND) -> None:

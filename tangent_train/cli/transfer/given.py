@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from tangent_train.cli.resume import differing_settings
 from tangent_train.errors import SettingError
 from tangent_train.registry import check_fields, check_plain, maker_of
+from tangent_train.setting_rules import differing_settings
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -71,7 +71,7 @@ def _check_network(path: Path, given: dict[str, Any], wanted: dict[str, Any]) ->
         for config in (wanted, given)
     )
     free = [f"network.{name}" for name in ("in_channels", "num_classes", "classes")]
-    differing = differing_settings(now, then, free)
+    differing = [d for d in differing_settings(now, then, "transfer") if d[0] not in free]
     if differing:
         name, value, before = differing[0]
         raise SettingError(

@@ -18,10 +18,10 @@ from filelock import FileLock, Timeout
 from omegaconf import OmegaConf
 
 from tangent_train.cli.processes import command_line, run_environment, run_process
-from tangent_train.cli.resume import differing_settings
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import write_text
 from tangent_train.json_text import parse_json
+from tangent_train.setting_rules import Purpose, differing_settings
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -39,42 +39,6 @@ _RESULTS = "results.json"
 _LAST = Path("checkpoints") / "last.ckpt"
 _REMEDY = "Give another name=, or delete the folder to make it anew."
 _MOST_NAMED = 6
-
-_FREE = (
-    "checkpoint",  # by its digest
-    "checkpoint_every_n_steps",
-    "data.in_memory",
-    "data.label_table",
-    "data.num_workers",
-    "data.root",
-    "data.store",
-    "init_from",
-    "name",
-    "panels",
-    "resume",
-    "task.channels_last",
-    "task.compile",
-    "task.images_per_forward",
-    "tensorboard_images",
-    "trainer.accelerator",
-    "trainer.enable_model_summary",
-    "trainer.enable_progress_bar",
-    "trainer.log_every_n_steps",
-    "trainer.num_sanity_val_steps",
-    "trainer.strategy",
-)
-"""Settings, with all below them, that do not change what a stage finds."""
-
-_ONLY_TRAINING = (
-    "optimizer",
-    "scheduler",
-    "task.images_per_chunk",
-    "trainer.devices",
-    "trainer.max_epochs",
-    "trainer.max_steps",
-    "trainer.num_nodes",
-)
-"""Further ones of a stage that only evaluates."""
 
 
 def stage_state(stage: Stage) -> State:
@@ -198,8 +162,8 @@ def _check_settings(stage: Stage, before: Any) -> None:
             stage.folder / _RECORD, found=f"settings={before!r}", expected="those of the stage",
             remedy=_REMEDY,
         )  # fmt: skip
-    free = _FREE if stage.command == "train" else (*_FREE, *_ONLY_TRAINING)
-    differing = differing_settings(now, before, free)
+    purpose: Purpose = "transfer" if stage.command == "train" else "evaluation"
+    differing = differing_settings(now, before, purpose)
     if not differing:
         return
     named = [f"{name}={then!r} (now {value!r})" for name, value, then in differing[:_MOST_NAMED]]

@@ -20,6 +20,7 @@ from datamodules.stanford2d3ds.files import FOLDS
 from tangent_train.errors import DataError
 from tangent_train.results.reports.paper import CLASSES, PaperRow, paper_row
 from tangent_train.results.reports.runs import RESULTS_FILE, Run
+from tangent_train.setting_rules import may_differ
 
 __all__ = ["REAL", "Figure", "Group", "average", "check_classes", "group_runs"]
 
@@ -33,33 +34,6 @@ _FOLDED = tuple(
     for of_photos in ("", "Perspective")
 )
 _NO_BASE_LEVEL = {"CubemapRepresentation": "cubemap", "PerspectiveRepresentation": "photos"}
-
-_SAME_RUN = (
-    "checkpoint",
-    "checkpoint_every_n_steps",
-    "choices",
-    "data.fold",
-    "data.in_memory",
-    "data.label_table",
-    "data.num_workers",
-    "data.root",
-    "data.seed",
-    "data.store",
-    "hydra",
-    "launcher",
-    "panels",
-    "resume",
-    "seed",
-    "sweep",
-    "task.images_per_forward",
-    "tensorboard_images",
-    "trainer.accelerator",
-    "trainer.enable_model_summary",
-    "trainer.enable_progress_bar",
-    "trainer.log_every_n_steps",
-    "trainer.num_sanity_val_steps",
-)
-"""Settings, with all below them, that may differ within a group."""
 
 
 @dataclass(frozen=True)
@@ -255,7 +229,7 @@ def _identity(run: Run) -> dict[str, Any]:
         # Each fold is fine-tuned from a checkpoint of its own.
         name: value is not None if name == "init_from" else value
         for name, value in run.settings.items()
-        if not any(name == free or name.startswith(f"{free}.") for free in _SAME_RUN)
+        if not may_differ(name, "report")
     }
 
 

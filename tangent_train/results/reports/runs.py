@@ -8,10 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tangent_train.checkpoints.content import INPUTS, flat_settings, read_settings
+from tangent_train.checkpoints.content import INPUTS, read_settings
 from tangent_train.errors import DataError
 from tangent_train.json_text import parse_json
 from tangent_train.registry import check_fields
+from tangent_train.setting_rules import flat_settings
 
 __all__ = [
     "FIGURES",

@@ -1,0 +1,129 @@
+"""One table of what each setting may do: when a run is resumed, reported, shared, or read.
+
+The rule of a setting is that of its longest prefix in the table: ``trainer.precision`` has its own,
+all other settings below ``trainer`` that of ``trainer``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any, Literal
+
+__all__ = ["Purpose", "differing_settings", "flat_settings", "from_file", "may_differ"]
+
+Purpose = Literal["resume", "report", "transfer", "evaluation"]
+"""A run and itself when it is resumed; runs of one group of a report (folds and seeds); a stage of
+a transfer and one that can stand in for it, if it trains, and if it only evaluates a network."""
+
+_ALWAYS = frozenset[Purpose](("resume", "report", "transfer", "evaluation"))
+_COMPUTED_ELSEWHERE = frozenset[Purpose](("resume", "evaluation"))
+_RESUMED = frozenset[Purpose](("resume",))
+
+_MAY_DIFFER: dict[str, frozenset[Purpose]] = {
+    # Where files are, how a run is watched, how fast it is: no result depends on these.
+    "checkpoint": _ALWAYS,
+    "checkpoint_every_n_steps": _ALWAYS,
+    "choices": _ALWAYS,
+    "data.in_memory": _ALWAYS,
+    "data.label_table": _ALWAYS,
+    "data.num_workers": _ALWAYS,
+    "data.root": _ALWAYS,
+    "data.store": _ALWAYS,
+    "panels": _ALWAYS,
+    "resume": _ALWAYS,
+    "task.channels_last": _ALWAYS,
+    "task.compile": _ALWAYS,
+    "task.images_per_forward": _ALWAYS,
+    "tensorboard_images": _ALWAYS,
+    "trainer.accelerator": _ALWAYS,
+    "trainer.enable_model_summary": _ALWAYS,
+    "trainer.enable_progress_bar": _ALWAYS,
+    "trainer.log_every_n_steps": _ALWAYS,
+    "trainer.num_sanity_val_steps": _ALWAYS,
+    "trainer.strategy": _ALWAYS,
+    "init_from": _ALWAYS - {"report"},
+    "name": _ALWAYS - {"report"},
+    # What the runs of a group are the mean over.
+    "data.fold": frozenset(("report",)),
+    "data.seed": frozenset(("report",)),
+    "seed": frozenset(("report",)),
+    # Of the evaluation: it comes after the training that is resumed.
+    "data.test_rotation": _RESUMED,
+    "representation.average_rotations": _RESUMED,
+    "task.absent_class": _RESUMED,
+    # Of the training: an evaluation does not depend on it.
+    "optimizer": frozenset(("evaluation",)),
+    "scheduler": frozenset(("evaluation",)),
+    "task.images_per_chunk": _COMPUTED_ELSEWHERE,
+    "trainer.devices": _COMPUTED_ELSEWHERE,
+    "trainer.max_epochs": _COMPUTED_ELSEWHERE,
+    "trainer.max_steps": _COMPUTED_ELSEWHERE,
+    "trainer.num_nodes": _COMPUTED_ELSEWHERE,
+    # A resumed run may go on for longer, or elsewhere, but takes the same steps.
+    "trainer": _RESUMED,
+    "trainer.accumulate_grad_batches": frozenset(),
+    "trainer.gradient_clip_algorithm": frozenset(),
+    "trainer.gradient_clip_val": frozenset(),
+    "trainer.limit_train_batches": frozenset(),
+    "trainer.overfit_batches": frozenset(),
+    "trainer.precision": frozenset(),
+    "trainer.sync_batchnorm": frozenset(),
+}
+
+_OF_THE_TRAINER = (
+    "accelerator barebones callbacks default_root_dir devices enable_autolog_hparams fast_dev_run "
+    "inference_mode limit_predict_batches limit_test_batches logger max_time model_registry "
+    "num_nodes plugins profiler strategy"
+)
+_OF_THIS_MACHINE = (
+    *("data.label_table", "data.root", "data.store", "task.compile"),
+    *(f"trainer.{name}" for name in _OF_THE_TRAINER.split()),
+)
+"""Paths, processes, sockets, and what is looked at: never taken from a file."""
+
+
+def may_differ(name: str, purpose: Purpose) -> bool:
+    """Whether a setting may differ between two runs.
+
+    Args:
+        name: As ``section.setting``.
+        purpose: What the two are to each other.
+    """
+    while name and name not in _MAY_DIFFER:
+        name = name.rpartition(".")[0]
+    return purpose in _MAY_DIFFER.get(name, ())
+
+
+def from_file(name: str) -> bool:
+    """Whether the settings in a file may give a setting, ``section.setting``."""
+    return not any(f"{name}.".startswith(f"{own}.") for own in _OF_THIS_MACHINE)
+
+
+def flat_settings(config: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Settings of nested sections as ``section.setting``, with their values."""
+    for key, value in config.items():
+        name = f"{prefix}{key}"
+        if isinstance(value, Mapping):
+            yield from flat_settings(value, f"{name}.")
+        else:
+            yield name, value
+
+
+def differing_settings(
+    now: Mapping[str, Any], before: Mapping[str, Any], purpose: Purpose
+) -> list[tuple[str, Any, Any]]:
+    """Settings that differ and must not, with what they are and what they were, sorted by name.
+
+    A setting that one of the two does not have is None there.
+
+    Args:
+        now: A resolved config.
+        before: Another one.
+        purpose: What the two runs are to each other.
+    """
+    new, old = dict(flat_settings(now)), dict(flat_settings(before))
+    return [
+        (name, new.get(name), old.get(name))
+        for name in sorted(new.keys() | old.keys())
+        if new.get(name) != old.get(name) and not may_differ(name, purpose)
+    ]

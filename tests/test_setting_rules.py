@@ -1,0 +1,43 @@
+"""What may differ between runs."""
+
+from __future__ import annotations
+
+import pytest
+
+from tangent_train.setting_rules import Purpose, differing_settings, from_file, may_differ
+
+
+@pytest.mark.parametrize(
+    ("name", "purposes"),
+    [
+        ("data.root", {"resume", "report", "transfer", "evaluation"}),
+        ("task.channels_last", {"resume", "report", "transfer", "evaluation"}),
+        ("task.compile.mode", {"resume", "report", "transfer", "evaluation"}),
+        ("seed", {"report"}),
+        ("data.fold", {"report"}),
+        ("data.inputs", set()),
+        ("network.widths", set()),
+        ("trainer.max_epochs", {"resume", "evaluation"}),
+        ("trainer.precision", set()),
+        ("optimizer.lr", {"evaluation"}),
+        ("init_from", {"resume", "transfer", "evaluation"}),
+        ("rooted", set()),
+    ],
+)
+def test_purposes_for_which_a_setting_may_differ(name: str, purposes: set[Purpose]) -> None:
+    every: tuple[Purpose, ...] = ("resume", "report", "transfer", "evaluation")
+    assert {purpose for purpose in every if may_differ(name, purpose)} == purposes
+
+
+def test_differences_are_found_in_nested_and_missing_settings() -> None:
+    before = {"data": {"root": "a", "fold": 1}, "network": {"x": 1}, "trainer": {"devices": 1}}
+    now = {"data": {"root": "b", "fold": 2}, "network": {"y": 2}, "trainer": {"devices": 2}}
+    assert differing_settings(now, before, "resume") == [
+        ("data.fold", 2, 1), ("network.x", None, 1), ("network.y", 2, None)
+    ]  # fmt: skip
+
+
+def test_files_do_not_decide_about_this_machine() -> None:
+    own = ("data.root", "data.store", "task.compile.options", "trainer.devices", "trainer.plugins")
+    assert not any(map(from_file, own))
+    assert all(map(from_file, ("data.fold", "trainer.max_epochs", "network.root", "task.compiled")))
