@@ -30,6 +30,7 @@ from tangent_train.callbacks.checkpoints import (
     best_checkpoint,
 )
 from tangent_train.callbacks.panels import ProgressBar
+from tangent_train.callbacks.results import evaluated, pictures, write_evaluation
 from tangent_train.callbacks.tensorboard import TrainingSpeed
 from tangent_train.checkpoints.content import read_checkpoint, write_settings
 from tangent_train.checkpoints.trained import inputs_in
@@ -190,7 +191,7 @@ def _trainer(
         "class_names": list(data.class_names),
         **_shown(data),
     }
-    common = [CheckpointContents(contents), *task.pictures(folder, settings)]
+    common = [CheckpointContents(contents), *pictures(task.kind, folder, settings)]
     common += [TrainingSpeed(), ProgressBar()]
     section = settings["trainer"]
     every, epochs = section.get("check_val_every_n_epoch"), section.get("max_epochs")
@@ -226,7 +227,7 @@ def _test(trainer: lightning.Trainer, task: Any, data: Any, checkpoint: Path, fo
             expected="the network and inputs of the checkpoint",
         ) from error
     trainer.test(task, datamodule=data, verbose=False)
-    results = task.results(data.noun)
+    results = evaluated(task, data.noun)
     total = len(data.source("test"))
     if results["images"] != total:
         raise RuntimeError(f"{results['images']} of {total} test {data.noun} were counted")
@@ -284,13 +285,11 @@ def best_on_validation(trainer: lightning.Trainer, folder: Path) -> float | None
 @rank_zero_only
 def _report(task: Any, results: dict[str, Any], checkpoint: Path, folder: Path) -> None:
     console = _console()
-    console.print(task.write_results(results, folder))
+    console.print(write_evaluation(task, results, checkpoint, folder))
     console.print(
         f"Results, pictures and logs are in {folder} (checkpoint {checkpoint.name}).", markup=False
     )
-    page = folder / "report.html"
-    task.write_page(page, results, checkpoint)
-    console.print(f"To look at in a browser: {page}", markup=False)
+    console.print(f"To look at in a browser: {folder / 'report.html'}", markup=False)
 
 
 def _run_folder() -> Path:

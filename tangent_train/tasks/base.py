@@ -6,13 +6,10 @@ import inspect
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import Any, ClassVar
 
 import lightning
 import torch
-from lightning.pytorch.callbacks import Callback
-from rich.table import Table
 from torch import Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
@@ -126,45 +123,6 @@ class Task(lightning.LightningModule, ABC):
 
         Args:
             stage: ``val`` or ``test``.
-        """
-
-    @abstractmethod
-    def pictures(self, folder: Path, settings: Mapping[str, Any]) -> list[Callback]:
-        """Callbacks that show what becomes of the validation and test splits.
-
-        Args:
-            folder: Of the run.
-            settings: Of the run.
-        """
-
-    @abstractmethod
-    def results(self, noun: str) -> dict[str, Any]:
-        """All figures of the last evaluation, as plain values, with ``images`` counted.
-
-        Args:
-            noun: What was scored, in the plural.
-        """
-
-    @abstractmethod
-    def write_results(self, results: dict[str, Any], folder: Path) -> Table:
-        """Write them as files.
-
-        Args:
-            results: From `results`.
-            folder: Where to.
-
-        Returns:
-            A table for the terminal.
-        """
-
-    @abstractmethod
-    def write_page(self, path: Path, results: dict[str, Any], checkpoint: Path) -> None:
-        """Write them as a page, with the curves of the training.
-
-        Args:
-            path: The HTML file.
-            results: From `results`.
-            checkpoint: What was evaluated.
         """
 
     def on_train_start(self) -> None:

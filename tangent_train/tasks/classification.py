@@ -3,29 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float
-from lightning.pytorch.callbacks import Callback
-from rich.table import Table
 from torch import Tensor, nn
 from torch.nn import functional
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
 from datamodules.core.split_module import Kind
-from tangent_train.callbacks.tensorboard import ValidationConfusion
 from tangent_train.errors import SettingError
 from tangent_train.metrics.classification import ClassCounts, classification_scores
 from tangent_train.registry import registered
-from tangent_train.results.classification import (
-    classification_results,
-    classification_table,
-    write_classification_results,
-)
-from tangent_train.results.html.classification import write_classification_report
 from tangent_train.tasks.base import Part, Task
 
 __all__ = ["ClassificationTask"]
@@ -152,20 +142,3 @@ class ClassificationTask(Task):
         # Every process has the same number: the mean over processes changes nothing.
         self.log(f"{stage}/accuracy", scores.accuracy, prog_bar=stage == "val", sync_dist=True)
         self.log(f"{stage}/class_accuracy", scores.class_accuracy, sync_dist=True)
-
-    def pictures(self, folder: Path, settings: Mapping[str, Any]) -> list[Callback]:
-        """The confusion matrix of every validation, for TensorBoard."""
-        return [ValidationConfusion()]
-
-    def results(self, noun: str) -> dict[str, Any]:
-        """See `classification_results.classification_results`."""
-        return classification_results(self.matrix, self.class_names, noun)
-
-    def write_results(self, results: dict[str, Any], folder: Path) -> Table:
-        """Write ``results.json``, ``.csv``, ``.md`` and ``confusion.png``; returns the table."""
-        write_classification_results(results, folder)
-        return classification_table(results)
-
-    def write_page(self, path: Path, results: dict[str, Any], checkpoint: Path) -> None:
-        """Write tables and curves as a page."""
-        write_classification_report(path, results, checkpoint)

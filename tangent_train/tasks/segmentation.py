@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import Any, ClassVar, get_args
 
 import torch
 from jaxtyping import Float, Integer
-from lightning.pytorch.callbacks import Callback
-from rich.table import Table
 from torch import Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
@@ -18,14 +15,10 @@ from torch.optim.lr_scheduler import LRScheduler
 from datamodules.core.class_weights import ClassWeights
 from datamodules.core.split_module import Kind
 from models.held import held_networks
-from tangent_train.callbacks.panels import PredictionPanels
-from tangent_train.callbacks.tensorboard import ValidationPictures
 from tangent_train.errors import SettingError
 from tangent_train.metrics.segmentation import AbsentClass, ConfusionMatrix, segmentation_scores
 from tangent_train.registry import registered
 from tangent_train.rendering import Assembler, EquirectRepresentation
-from tangent_train.results.html.evaluation import write_evaluation_report
-from tangent_train.results.segmentation import evaluation_results, results_table, write_results
 from tangent_train.tasks.base import Part, Task, check_at_once
 from tangent_train.tasks.losses import (
     AuxiliaryTarget,
@@ -274,26 +267,6 @@ class SegmentationTask(Task):
             # Every process has the same number: the mean over processes changes nothing.
             self.log(f"{stage}/miou{suffix}", score.miou, prog_bar=on_bar, sync_dist=True)
             self.log(f"{stage}/macc{suffix}", score.macc, sync_dist=True)
-
-    def pictures(self, folder: Path, settings: Mapping[str, Any]) -> list[Callback]:
-        """Panels of test images, and pictures of validation images for TensorBoard."""
-        shown = settings.get("tensorboard_images", 0)  # configs of older runs do not have it
-        return [PredictionPanels(folder / "panels", settings["panels"]), ValidationPictures(shown)]
-
-    def results(self, noun: str) -> dict[str, Any]:
-        """See `results.evaluation_results`."""
-        return evaluation_results(self.matrices, self.class_names, self.absent_class, noun)
-
-    def write_results(self, results: dict[str, Any], folder: Path) -> Table:
-        """Write ``results.json``, ``.csv`` and ``.md``; returns the table per class."""
-        write_results(results, folder)
-        return results_table(results)
-
-    def write_page(self, path: Path, results: dict[str, Any], checkpoint: Path) -> None:
-        """Write them with a viewer of the panels' images."""
-        callbacks: list[Any] = self.trainer.callbacks  # type: ignore[attr-defined]
-        images = [i for c in callbacks if isinstance(c, PredictionPanels) for i in c.images]
-        write_evaluation_report(path, results, self.class_names, images, checkpoint)
 
 
 def _check_weighting(weighting: str | Sequence[float], class_names: Sequence[str]) -> None:

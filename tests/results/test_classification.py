@@ -17,6 +17,7 @@ from tensorboard.backend.event_processing.event_accumulator import (  # type: ig
     EventAccumulator,
 )
 
+from tangent_train.callbacks.results import evaluated, pictures, write_evaluation
 from tangent_train.callbacks.tensorboard import TrainingSpeed, ValidationConfusion
 from tangent_train.results.classification import (
     classification_results,
@@ -125,11 +126,10 @@ def test_a_task_writes_its_own(tmp_path: Path) -> None:
     task = shape_task()
     trainer = quiet_trainer()
     trainer.test(task, datamodule=Shapes(), verbose=False)
-    results = task.results("shapes")
+    results = evaluated(task, "shapes")
     console = Console(width=120, record=True, file=io.StringIO())
-    console.print(task.write_results(results, tmp_path))
-    task.write_page(tmp_path / "report.html", results, tmp_path / "x.ckpt")
+    console.print(write_evaluation(task, results, tmp_path / "x.ckpt", tmp_path))
     written = {"results.json", "results.csv", "results.md", "confusion.png", "report.html"}
     assert {path.name for path in tmp_path.iterdir()} == written
     assert "9 shapes" in console.export_text()
-    assert [type(c) for c in task.pictures(tmp_path, {})] == [ValidationConfusion]
+    assert [type(c) for c in pictures(task.kind, tmp_path, {})] == [ValidationConfusion]

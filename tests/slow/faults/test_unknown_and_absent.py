@@ -18,8 +18,8 @@ from lightning.pytorch.plugins import MixedPrecision
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 from tangent_train.callbacks.checkpoints import best_checkpoint
 from tangent_train.callbacks.panels import PredictionPanels
+from tangent_train.callbacks.results import evaluated, write_evaluation
 from tangent_train.cli.run import best_on_validation
-from tangent_train.results.segmentation import evaluation_results
 from tests.slow.faults.small_runs import Faulty, run_trainer, small_data, small_task
 
 if TYPE_CHECKING:
@@ -138,12 +138,11 @@ def _evaluate(root: Path, tmp_path: Path, absent: str) -> tuple[dict[str, Any], 
     panels = PredictionPanels(tmp_path / "panels", count=2)
     trainer = run_trainer(tmp_path / "run", callbacks=[panels])
     (logged,) = trainer.test(task, datamodule=data, verbose=False)
-    results = task.results(data.noun)
+    results = evaluated(task, data.noun)
     assert logged["test/miou"] == pytest.approx(
         np.nan if results["miou"] is None else results["miou"], nan_ok=True
     )
-    task.write_results(results, tmp_path / "results")
-    task.write_page(tmp_path / "results" / "report.html", results, tmp_path / "x.ckpt")
+    write_evaluation(task, results, tmp_path / "x.ckpt", tmp_path / "results")
     written = json.loads((tmp_path / "results" / "results.json").read_text())
     assert len(list((tmp_path / "panels").iterdir())) == 2
     return written, _expected(_predictions(data, task), absent)
@@ -212,7 +211,7 @@ def test_a_validation_split_without_a_labelled_pixel_has_no_best_figure(
     trainer = run_trainer(tmp_path, max_epochs=2, limit_val_batches=1.0, callbacks=[best])
     trainer.fit(task, datamodule=data)
     assert (tmp_path / "checkpoints" / "best.ckpt").exists()
-    figures = evaluation_results(task.matrices, CLASSES, "skip")
+    figures = evaluated(task, "panoramas")
     assert figures["miou"] is None
     assert figures["images"] == len(names)
     assert best_on_validation(trainer, tmp_path) is None, "a sweep is not told minus infinity"
