@@ -1,1 +1,1 @@
-"""The paper's figures about distortion, one file per study, and what goes beyond them."""
+"""The paper's figures on distortion, one short script each: ``python -m studies.fov``."""

@@ -27,7 +27,6 @@ __all__ = [
     "prepare",
     "render",
     "report",
-    "study",
     "train",
     "transfer",
 ]
@@ -96,13 +95,6 @@ def report() -> None:
     from tangent_train.cli.report import report as write_report
 
     _with_arguments("report", write_report)
-
-
-def study() -> None:
-    """``tangent-study <name>``: the paper's figures about distortion."""
-    from tangent_train.cli.study import study as make_study
-
-    _with_arguments("study", make_study)
 
 
 def _with_arguments(command: str, run: Callable[[list[str]], None]) -> None:

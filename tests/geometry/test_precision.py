@@ -22,13 +22,6 @@ from tangent_train.geometry import (
     shift_range,
     xyz_to_lonlat,
 )
-from tangent_train.geometry.brown_conrady import distort, undistort
-from tangent_train.geometry.distortion import (
-    angular_distortion,
-    equirect_scales,
-    gnomonic_scales,
-    principal_scales,
-)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -46,13 +39,6 @@ FUNCTIONS: dict[str, Callable[[Any], Any]] = {
     "lonlat_to_equirect": lambda n: lonlat_to_equirect(n[..., :2], (7, 14)),
     "lonlat_to_xyz": lambda n: lonlat_to_xyz(n[..., :2]),
     "xyz_to_lonlat": xyz_to_lonlat,
-    "distort": lambda n: distort(n[..., :2], 0.3),
-    "undistort": lambda n: undistort(n[..., :2], 0.3),
-    "undistort without distortion": lambda n: undistort(n[..., :2], 0),
-    "gnomonic_scales": lambda n: gnomonic_scales(n[0] / n.dtype.type(8)),
-    "equirect_scales": lambda n: equirect_scales(n[0] / n.dtype.type(8)),
-    "angular_distortion": lambda n: angular_distortion(5 + n[0], 1 + abs(n[1])),
-    "principal_scales": lambda n: principal_scales(n[..., :2]),
     "points_m": lambda n: POSE.points_m(n, abs(n[..., 0])),
     "seen": POSE.seen,
     "CubeGrid.project": lambda n: CubeGrid(8).project(n, 1),
@@ -69,7 +55,7 @@ def test_any_numbers_are_taken_as_float64(name: str) -> None:
         _same(found, expected)
 
 
-@pytest.mark.parametrize("name", ["equirect_to_lonlat", "lonlat_to_xyz", "seen", "distort"])
+@pytest.mark.parametrize("name", ["equirect_to_lonlat", "lonlat_to_xyz", "seen"])
 def test_batches_are_what_their_parts_are(name: str) -> None:
     whole = FUNCTIONS[name](WHOLE)
     if isinstance(whole, tuple):

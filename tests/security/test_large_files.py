@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
 import struct
 import time
 import zlib
@@ -24,7 +23,6 @@ from datamodules.images.image_opening import MOST_PIXELS
 from datamodules.images.pixel_files import read_pixels, write_pixels
 from datamodules.images.png import read_color_png, read_depth_png
 from datamodules.images.xmp import read_xmp_tags
-from studies.digits import read_idx
 from tangent_train.errors import DataError, SettingError
 from tangent_train.rendering.camera_files import read_cameras
 
@@ -224,18 +222,6 @@ def test_entities_are_not_expanded(encoding: str, tmp_path: Path) -> None:
     path = _xmp(tmp_path / "a.webp", laughs.encode(encoding))
     with pytest.raises(DataError, match="document type declaration"):
         read_xmp_tags(path, NAMESPACE)
-
-
-def test_packed_digits_are_unpacked_up_to_a_size(tmp_path: Path) -> None:
-    head = struct.pack(">4B3I", 0, 0, 8, 3, 60000, 28, 28)
-    path = tmp_path / "images.gz"
-    with gzip.open(path, "wb", compresslevel=1) as file:
-        file.write(head)
-        for _ in range(200):
-            file.write(bytes(1 << 20))
-    assert path.stat().st_size < 2_000_000
-    with pytest.raises(DataError, match="found 134217712 values"):
-        read_idx(path, 3)
 
 
 @pytest.mark.parametrize("read", [read_classes, read_cameras, LabelTable.from_json])

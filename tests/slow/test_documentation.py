@@ -40,7 +40,6 @@ LEFT = {
     "tangent-evaluate": "results.json",
     "tangent-transfer": "*.md",
     "tangent-report": "report.md",
-    "tangent-study": "*.csv",
 }
 """What a command leaves that was not there."""
 

@@ -64,7 +64,6 @@ def test_the_wheel_holds_the_packages_and_the_configs(wheel: Path) -> None:
         "tangent-keypoints",
         "tangent-prepare",
         "tangent-report",
-        "tangent-study",
         "tangent-transfer",
     ],
 )

@@ -35,7 +35,6 @@ STAND_INS = {
     "checkpoint": f"runs/{RUNS[0]}/{TIME}/checkpoints/best.ckpt",
     "resume": f"runs/{RUNS[0]}/{TIME}",
     "input": "panoramas",
-    "mnist": "mnist",
     "output": "made",
     "data.root": ROOM_FOLDERS[0],
 }
@@ -137,8 +136,9 @@ def _nothing(_arguments: Sequence[str], _folder: Path) -> list[str]:
 
 
 def _benchmark(arguments: Sequence[str], _folder: Path) -> list[str]:
-    """What benchmarks measure takes a while, and has tests of its own."""
-    return ["--help"] if arguments[0] == "-m" and arguments[1].startswith("benchmarks") else []
+    """Benchmarks and studies take a while, and have tests of their own."""
+    slow = arguments[0] == "-m" and arguments[1].startswith(("benchmarks", "studies"))
+    return ["--help"] if slow else []
 
 
 def _run(arguments: Sequence[str], folder: Path) -> list[str]:
@@ -168,20 +168,6 @@ def _transfer(arguments: Sequence[str], folder: Path) -> list[str]:
     return _overrides(settings)
 
 
-def _study(arguments: Sequence[str], _folder: Path) -> list[str]:
-    """Few pixels, one network for one epoch: each where the study is asked for."""
-    small = {
-        "distorted_digits": ["seeds=[0]", "epochs=1"],
-        "representation_distortion": ["side=16"],
-    }
-    return [
-        setting
-        for name, settings in small.items()
-        if {name, "all"} & set(arguments)
-        for setting in settings
-    ]
-
-
 def _evaluation(arguments: Sequence[str], _folder: Path) -> list[str]:
     rooms = any(text.startswith("data=synthrooms") for text in arguments)
     rows = any(text.startswith("representation.erp_height=") for text in arguments)
@@ -209,7 +195,6 @@ _RULES: Mapping[str, Callable[[Sequence[str], Path], list[str]]] = {
     "tangent-prepare": _preparation,
     "tangent-render": _nothing,
     "tangent-report": _nothing,
-    "tangent-study": _study,
     "tangent-train": _run,
     "tangent-transfer": _transfer,
 }

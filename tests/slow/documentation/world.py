@@ -17,7 +17,6 @@ from tests.datamodules.stanford2d3ds.stanford_pairs_format import write_paper_pa
 from tests.datamodules.synthia.synthia_format import write_panoramas, write_views
 from tests.slow.documentation.cluster import write_cluster
 from tests.slow.documentation.running import run
-from tests.studies.mnist_format import write_mnist
 
 if TYPE_CHECKING:
     from tests.conftest import FabricateStanford
@@ -110,7 +109,6 @@ def build_world(folder: Path, fabricate_stanford: FabricateStanford) -> Path:
     _write_pictures(folder)
     _write_tangent_images(folder)
     _write_shapes(folder)
-    write_mnist(folder / "mnist")
     write_data_set(folder / "my_rooms", height=ROWS, depth=True)
     settings = [f"{name}={value}" for name, value in DEMO.items()]
     first, *others = (folder / "runs" / name / TIME for name in RUNS)

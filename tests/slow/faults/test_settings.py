@@ -28,7 +28,6 @@ PREDICT = ("predict", "checkpoint=x.ckpt", "input=image.png", "output=labels")
         (("train", "experiment=rooms/dmo"), r"unknown experiment: .*Did you mean rooms/demo"),
         (("train", "level"), r"override 'level': found no override; expected setting=value"),
         (("predict", "inputs=a"), r"unknown setting: found 'inputs'; .*Did you mean input"),
-        (("study", "fob"), r"unknown study: found 'fob'; .*Did you mean fov"),
         # Levels and images.
         (("train", "level=2", "representation.base_level=2"), r"dim: found 1; expected at least 2"),
         (("train", "level=2", "representation.base_level=3"), r"base_level: found 3; .* level = 2"),

@@ -1,0 +1,111 @@
+"""The studies of distortion, against closed forms, the paper's numbers and ``docs/studies.md``."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import brentq
+
+from studies.angular_resolution import angular_resolution
+from studies.distorted_digits import BODY, distort, enlarge, mean_enlargement, pixel_centers
+from studies.fov import fov
+from studies.output import Row, markdown
+from studies.representation_distortion import representation_distortion
+from studies.surface_area import surface_area
+from tangent_train.geometry import TangentGrid
+
+PAGE = (Path(__file__).resolve().parents[2] / "docs" / "studies.md").read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def distortions() -> dict[str, Row]:
+    return {row["images"]: row for row in representation_distortion((128, 256))}
+
+
+def test_the_page_shows_the_tables() -> None:
+    for rows in (fov(), surface_area(6), angular_resolution()):
+        for line in markdown(rows):
+            assert line in PAGE
+
+
+def test_surface_area_of_the_icosahedron() -> None:
+    edge = 1 / math.sin(math.radians(72))
+    first, *rows = surface_area(4)
+    assert first["vertices on it"] == pytest.approx(5 * math.sqrt(3) * edge**2 / (4 * math.pi))
+    ratios = np.array([row["vertices on it"] for row in rows])
+    np.testing.assert_allclose((1 - ratios[:-1]) / (1 - ratios[1:]), 4, rtol=0.05)
+
+
+def test_fields_of_view_are_angles_between_pixels() -> None:
+    for row in fov(6):
+        grid = TangentGrid(row["base level"], 6)
+        (corners,) = grid.directions([0])
+        assert row["between corners"] == pytest.approx(
+            math.degrees(math.acos(corners[0, 0] @ corners[0, -1])), abs=1e-5
+        )
+    assert all(abs(row["between corners"] - row["paper"]) < 0.05 for row in fov(10))
+    assert [row["base level"] for row in fov(5)] == [0, 1, 2, 3]
+
+
+def test_levels_are_as_fine_as_the_paper_says() -> None:
+    rows = angular_resolution()
+    printed = [row for row in rows if row["paper"] != "–"]
+    assert len(printed) == 7
+    for row in printed:
+        assert row["° per pixel"] == pytest.approx(row["paper"], abs=6e-4)
+    assert [row["level"] for row in rows[11:13]] == [5, 8]
+
+
+def test_distortion_has_its_closed_forms(distortions: dict[str, Row]) -> None:
+    erp, cube, first = (distortions[name] for name in ("ERP", "cube", "b = 0"))
+    gamma = math.gamma
+    beta = math.sqrt(math.pi) / 2 * (gamma(0.25) / gamma(0.75) - gamma(0.75) / gamma(1.25))
+    assert erp["angle mean °"] == pytest.approx(math.degrees(math.pi - 2 * beta), rel=1e-3)
+    middle = math.acos(2 / math.pi)
+    assert erp["area mean %"] == pytest.approx(
+        200 * (math.sin(middle) - 2 * middle / math.pi), rel=1e-3
+    )
+    # The corners of a cube are at cos θ = 1/√3: scales 3 and √3; mean scale of areas 24/4π.
+    corner = math.degrees(2 * math.asin((3 - math.sqrt(3)) / (3 + math.sqrt(3))))
+    assert cube["angle worst °"] == pytest.approx(corner)
+    assert cube["area most"] == pytest.approx(math.sqrt(3) * math.pi / 2, rel=1e-3)
+    # The icosahedron's vertices are 37.377° from the centres of its faces: 2 asin(tan²(θ/2)).
+    angle = math.acos(math.sqrt((5 + 2 * math.sqrt(5)) / 15))
+    assert first["angle worst °"] == pytest.approx(
+        math.degrees(2 * math.asin(math.tan(angle / 2) ** 2))
+    )
+    means = [row["angle mean °"] for row in distortions.values()]
+    assert means == sorted(means, reverse=True)
+
+
+@pytest.mark.parametrize("k1", [0.0, 0.13, 0.5])
+def test_the_lens_agrees_with_a_slow_sampler(k1: float) -> None:
+    side = 7
+    image = np.random.default_rng(3).random((side, side))
+    expected = np.zeros((side, side))
+    for i, j in np.ndindex(side, side):
+        x, y = (2 * j + 1) / side - 1, (2 * i + 1) / side - 1
+        radius = math.hypot(x, y)
+        true = brentq(lambda r, at=radius: r + k1 * r**3 - at, 0, 2, xtol=1e-14)
+        scale = true / radius if radius else 1.0
+        u, v = (x * scale + 1) * side / 2 - 0.5, (y * scale + 1) * side / 2 - 0.5
+        across = np.maximum(0, 1 - abs(u - np.arange(side)))
+        expected[i, j] = np.maximum(0, 1 - abs(v - np.arange(side))) @ image @ across
+    found = distort(torch.from_numpy(image)[None, None], k1)
+    np.testing.assert_allclose(found[0, 0], expected, atol=1e-9)
+
+
+def test_the_zoom_is_the_lens_on_average() -> None:
+    points = pixel_centers(torch.zeros(1, 1, 560, 560))
+    body = points[points.abs().amax(dim=-1) < BODY]
+    expected = float((1 + 0.5 * body.square().sum(dim=-1)).mean())
+    assert mean_enlargement(0.5) == pytest.approx(expected, rel=1e-4)
+    dot = torch.zeros(1, 1, 57, 57)
+    dot[0, 0, 28, 48] = 1
+    columns = enlarge(dot, 0.5)[0, 0].sum(dim=0)
+    found = float(columns @ torch.arange(57.0) / columns.sum())
+    assert found - 28 == pytest.approx(20 * mean_enlargement(0.5), abs=0.1)
