@@ -22,7 +22,7 @@ from lightning.pytorch.utilities.exceptions import SIGTERMException
 from rich.console import Console
 
 from datamodules.core.samples import channel_names
-from models.initialize import initialize, origins_table
+from models import initialize
 from tangent_train.callbacks.checkpoints import (
     AtomicCheckpointIO,
     CheckpointContents,
@@ -71,7 +71,7 @@ def train(settings: Settings, trust: Collection[str] | None = None) -> float | N
     start = settings["init_from"]
     if start is not None and resumed is None:
         origins = initialize(task.network, start, _channels(Path(start), data))
-        rank_zero_only(_console().print)(origins_table(origins, start))
+        rank_zero_only(_console().print)(f"Tensors from {start}\n{origins}", markup=False)
     write_settings(folder / "config.yaml", settings)
     last = LastCheckpoint(checkpoints, settings["checkpoint_every_n_steps"], _typed_local())
     callbacks = [last, LearningRateMonitor()]
