@@ -41,7 +41,7 @@ class MultiView(nn.Module):
     ) -> Float[Tensor, "batch classes"]:
         """Class scores of shapes, each seen in any number of views."""
         scores: Tensor = self.network(images.flatten(0, 1))
-        return scores.unflatten(0, images.shape[:2]).mean(dim=1)
+        return scores.reshape(*images.shape[:2], -1).mean(dim=1)
 
 
 def _fit_head(network: nn.Module, num_classes: int) -> None:

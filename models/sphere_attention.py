@@ -93,16 +93,18 @@ class SphereAttention(nn.Module):
         x = self.norm(listed)
         if self.elevation is not None:
             x = x + self.elevation(along[..., 2:].to(x.dtype))
-        of_sphere = [
+        queries, keys, values = (
             part.unflatten(-1, (self.heads, -1)).transpose(1, 2)
             for part in self.queries_keys_values(x).chunk(3, dim=-1)
-        ]
-        of_image = [
-            part.unflatten(2, (images, -1)).transpose(1, 2).flatten(0, 1) for part in of_sphere
-        ]
+        )
         kappa = self.log_kappa.exp()
-        seen = angular_attention(*of_sphere, along, kappa)
-        own = angular_attention(*of_image, along.reshape(spheres * images, -1, 3), kappa)
+        seen = angular_attention(queries, keys, values, along, kappa)
+        queries, keys, values = (
+            part.unflatten(2, (images, -1)).transpose(1, 2).flatten(0, 1)
+            for part in (queries, keys, values)
+        )
+        along = along.reshape(spheres * images, -1, 3)
+        own = angular_attention(queries, keys, values, along, kappa)
         own = own.reshape(spheres, images, *own.shape[1:]).transpose(1, 2).flatten(2, 3)
         others = (seen - own).to(x.dtype).transpose(1, 2).flatten(2)
         added: Tensor = self.output(others)

@@ -85,6 +85,8 @@ def train(settings: Settings, trust: Collection[str] | None = None) -> float | N
         warnings.filterwarnings("ignore", "Checkpoint directory .* exists and is not empty")
         # Lightning looks for this in the loader; here the data module knows where to go on.
         warnings.filterwarnings("ignore", ".* your dataloader is not resumable")
+        # network.frozen_statistics=true
+        warnings.filterwarnings("ignore", "Found .* in eval mode at the start of training")
         try:
             trainer.fit(task, datamodule=data, ckpt_path=resumed, weights_only=True)
             # First: an error in the test must not cost a sweep its figure.

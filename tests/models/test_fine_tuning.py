@@ -171,5 +171,5 @@ def test_part_of_a_network_can_be_given(tmp_path: Path) -> None:
     encoder, network = _network(), nn.ModuleDict({"encoder": _network(), "head": nn.Linear(3, 2)})
     torch.save(encoder.state_dict(), tmp_path / "x.pt")
     assert set(initialize(network, tmp_path / "x.pt").fresh) == {"head.weight", "head.bias"}
-    found = network["encoder"].state_dict()  # type: ignore[index]
+    found = network["encoder"].state_dict()
     torch.testing.assert_close(found, encoder.state_dict(), rtol=0, atol=0)
