@@ -1,59 +1,94 @@
-"""``tangent-predict``: labels of one's own images, as files."""
+"""``tangent-predict``: label maps of one's own panoramas and photos."""
 
 from __future__ import annotations
 
+import math
 import sys
 import time
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
+import torch
 from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
 
 from datamodules.core.progress import progress_bar
 from datamodules.images.image_files import find_images
 from tangent_train.checkpoints.trained import load_trained
-from tangent_train.cli.prediction.report import (
-    Entry,
-    shares_table,
-    shown_image,
-    summary,
-    what_happens,
-    write_prediction_report,
-)
-from tangent_train.cli.prediction.settings import PredictSettings
+from tangent_train.cli.settings import typed
 from tangent_train.errors import DataError, SettingError
-from tangent_train.inference.labellers import (
-    DepthFolder,
-    Labelled,
-    Labeller,
-    PanoramaLabeller,
-    PhotoLabeller,
+from tangent_train.inference.images import DepthFolder, read_panorama, read_photo
+from tangent_train.inference.predictor import Predictor
+from tangent_train.inference.views import PanoramaViews, PhotoViews
+from tangent_train.results.predictions import (
+    Entry,
+    PredictionFolder,
+    class_shares,
+    mean_shares,
+    output_names,
 )
-from tangent_train.inference.outputs import OutputFolder, output_names
-from tangent_train.inference.panoramas import PanoramaPredictor
-from tangent_train.inference.photos import PhotoPredictor
-from tangent_train.inference.predictor import Runner
-from tangent_train.inference.summary import write_summary
-from tangent_train.json_text import parse_json
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-    from pathlib import Path
+    from collections.abc import Callable, Iterator, Mapping
 
+    from datamodules.images.gpano import PanoramaArea
     from tangent_train.checkpoints.trained import TrainedNetwork
+    from tangent_train.inference.views import InputImage
     from tangent_train.results.html import EncodedImage
 
 __all__ = ["predict"]
 
-_KEPT = ("checkpoint", "projection", "level", "base_level", "blend", "rotations")
-"""What results that are gone on with have to agree in."""
+_OF_PANORAMAS = {"crop": None, "rotations": 1, "upright": None}
+_OF_PHOTOS = {"fov": None}
+_SAVED_EVERY_S = 10.0
+"""So much work is done again after a process was killed."""
 
-_LATER = ("upright", "max_tilt_deg")
-"""Likewise, of results that say it; older ones are of panoramas taken as they were."""
+
+@dataclass(frozen=True)
+class Settings:
+    """See ``configs/predict.yaml``."""
+
+    checkpoint: Path
+    input: str
+    output: Path
+    depth: Path | None
+    depth_scale: float
+    projection: Literal["equirectangular", "perspective"]
+    crop: tuple[float, ...] | None
+    fov: float | None
+    level: int | None
+    base_level: int | None
+    blend: Literal["feather", "nearest"]
+    rotations: int
+    upright: Literal["pose", "auto"] | None
+    max_tilt_deg: float
+    probabilities: bool
+    report: int
+    overwrite: bool
+    resume: bool
+    images_per_forward: int | None
+    device: str
+    trust: tuple[str, ...]
+
+    @property
+    def of_photos(self) -> bool:
+        """Whether the images are photos."""
+        return self.projection == "perspective"
+
+    def kept(self) -> dict[str, Any]:
+        """What decides the labels, as plain values: resumed predictions must agree in it."""
+        others = {"input", "output", "report", "overwrite", "resume", "images_per_forward"}
+        others |= {"device", "trust", "probabilities"}
+        values = {name: value for name, value in asdict(self).items() if name not in others}
+        plain = {n: str(v) if isinstance(v, Path) else v for n, v in values.items()}
+        return plain | {"crop": self.crop and list(self.crop)}
 
 
 def predict(config: Mapping[str, Any]) -> None:
-    """Label images and write what was found.
+    """Predict the labels of images and write what was found.
 
     Args:
         config: The composed ``predict.yaml``.
@@ -62,159 +97,159 @@ def predict(config: Mapping[str, Any]) -> None:
         SettingError: A setting is missing or cannot work.
         DataError: The checkpoint cannot be read, or there are no images.
     """
-    settings = PredictSettings.of(config)
-    paths = _without_results(find_images(settings.input), settings)
-    images = dict(zip(output_names(paths), paths, strict=True))
-    if len(images) < len(paths):
-        raise SettingError("input", found="an image twice", expected="every image once")
+    settings = typed(Settings, config)
+    _check_projection(settings)
+    images = _find_images(settings)
     trained = load_trained(settings.checkpoint, settings.trust)
-    output = OutputFolder(settings.output, trained.class_names, settings.probabilities)
-    labeller = _labeller(settings, trained)
-    earlier = _earlier(settings, trained, output) if settings.resume else {}
-    output.check(images, overwrite=settings.overwrite or bool(earlier))
-    missing = {name: path for name, path in images.items() if name not in earlier}
-    console = Console(soft_wrap=True, highlight=False)
-    how = what_happens(settings, trained, len(images))
-    kept = f"; {len(images) - len(missing)} of them are there already" if earlier else ""
-    console.print(how + kept)
+    folder = PredictionFolder(settings.output, trained.class_names, settings.probabilities)
+    label = _Labeller(
+        settings, _predictor(settings, trained), _depth_folder(settings, trained), folder
+    )
+    earlier = folder.earlier(settings.kept()) if settings.resume else {}
+    if not (settings.overwrite or earlier):
+        folder.check(images)
     entries = [entry for name, entry in earlier.items() if name in images]
-    shown: list[EncodedImage] = []
+    missing = {name: path for name, path in images.items() if name not in earlier}
+    _say(f"{len(images)} images, {len(entries)} of them done already.")
+    saved = -math.inf
     try:
-        for entry, found in _label_all(missing, labeller, output):
+        for entry in _label_all(missing, label):
             entries.append(entry)
-            if found is not None and len(shown) < settings.report:
-                shown.append(shown_image(entry, found, len(trained.class_names)))
+            if time.monotonic() - saved > _SAVED_EVERY_S:
+                _save(folder, settings, entries)
+                saved = time.monotonic()
     except KeyboardInterrupt:
-        console.print(
-            f"Interrupted: {len(entries)} of {len(images)} images are done. resume=true goes on.",
-            markup=False,
-        )
+        _say(f"{len(entries)} of {len(images)} images are done. resume=true goes on.")
         raise
     finally:
-        done = [entry for entry in entries if "error" not in entry]
-        if done:
-            output.write_classes()
-            write_summary(output.path, summary(settings, trained, entries), trained.class_names)
-    if shown:
-        write_prediction_report(output, entries, shown, how)
-    if done:
-        console.print(shares_table(done, trained.class_names))
-        console.print(f"Results are in {output.path}.", markup=False)
-    if len(done) < len(entries):
-        failed = f"{len(entries) - len(done)} of {len(entries)} images"
-        sys.exit(f"tangent-predict: {failed} could not be used, see above")
+        _save(folder, settings, entries)
+    if label.shown:
+        folder.write_page(entries, label.shown)
+    _say(_shares_table(mean_shares(entries, trained.class_names)))
+    _say(f"Results are in {settings.output}.")
+    failed = sum("error" in entry for entry in entries)
+    if failed:
+        sys.exit(f"tangent-predict: {failed} of {len(entries)} images could not be used, see above")
 
 
-def _without_results(paths: Sequence[Path], settings: PredictSettings) -> list[Path]:
-    """The images that are not results of this command in its output folder."""
-    results = [(settings.output / kind).resolve() for kind in ("labels", "color", "overlay")]
-    kept = [p for p in paths if not any(p.resolve().is_relative_to(r) for r in results)]
-    if not kept:
-        raise SettingError("input", found=f"only results in {settings.output}", expected="images")
-    return kept
+@dataclass(frozen=True)
+class _Labeller:
+    """Predicts the labels of one image and writes them.
 
-
-def _earlier(
-    settings: PredictSettings, trained: TrainedNetwork, output: OutputFolder
-) -> dict[str, Entry]:
-    """What is known of the images whose results are there, by name.
-
-    Raises:
-        SettingError: They were made in another way.
+    Attributes:
+        settings: Of the command.
+        predictor: The network.
+        depth: Depth images, for networks that take depth.
+        folder: Where the labels go.
+        shown: Images for the page, those of the first ones done.
     """
-    try:
-        content = parse_json((output.path / "summary.json").read_bytes())
-        entries = {entry["name"]: entry for entry in content["images"] if "error" not in entry}
-        before = {name: content[name] for name in _KEPT}
-        before |= {name: content[name] for name in _LATER if name in content}
-    except (OSError, ValueError, KeyError, TypeError):
-        return {}
-    now = summary(settings, trained, [])
-    for name, value in before.items():
-        if value != now[name]:
+
+    settings: Settings
+    predictor: Predictor
+    depth: DepthFolder | None
+    folder: PredictionFolder
+    shown: list[EncodedImage] = field(default_factory=list)
+
+    def __call__(self, name: str, path: Path, progress: Callable[[float], object]) -> Entry:
+        """What is known of the image afterwards."""
+        image, area = self._read(name.removesuffix(path.suffix), path)
+        scores = self.predictor.predict(image, progress, probabilities=self.settings.probabilities)
+        rgb, labels = image.rgb, scores.labels() + np.uint8(1)  # 0 is the unknown class
+        if area is not None:
+            rgb, labels = area.cut(rgb), area.cut(labels)
+        self.folder.write(name, rgb, labels, scores, area)
+        if len(self.shown) < self.settings.report:
+            self.shown.append(self.folder.viewer_image(name, rgb, labels, area))
+        rows, columns = labels.shape
+        entry = {"file": str(path), "name": name, "rows": rows, "columns": columns}
+        if image.up is not None:
+            entry["tilt_deg"] = round(math.degrees(math.acos(np.clip(image.up[2], -1, 1))), 2)
+        return entry | {"classes": class_shares(labels, self.folder.class_names, image, area)}
+
+    def _read(self, name: str, path: Path) -> tuple[InputImage, PanoramaArea | None]:
+        given = self.settings
+        if given.of_photos:
+            return read_photo(path, name, self.depth, given.fov), None
+        return read_panorama(path, name, self.depth, given.crop, given.upright, given.max_tilt_deg)
+
+
+def _save(folder: PredictionFolder, settings: Settings, entries: list[Entry]) -> None:
+    if any("classes" in entry for entry in entries):  # else nothing is in the way of another try
+        folder.write_summary(settings.kept(), entries)
+
+
+def _check_projection(settings: Settings) -> None:
+    for name, default in (_OF_PANORAMAS if settings.of_photos else _OF_PHOTOS).items():
+        if getattr(settings, name) != default:
             raise SettingError(
                 name,
-                found=now[name],
-                expected=f"{value}, as for the results in {output.path}",
-                remedy="Give another folder, or overwrite=true.",
+                found=getattr(settings, name),
+                expected=f"{default or 'null'} with projection={settings.projection}",
             )
-    return {
-        name: e
-        for name, e in entries.items()
-        if all(f.is_file() for f in output.files(name).values())
-    }
 
 
-def _labeller(settings: PredictSettings, trained: TrainedNetwork) -> Labeller:
-    runner = Runner(trained, _device(settings.device), settings.images_per_forward)
-    depth = _depth(settings, trained)
-    seen = (trained, runner, settings.level, settings.base_level, settings.blend)
-    names = trained.class_names
-    if settings.projection == "perspective":
-        return PhotoLabeller(PhotoPredictor(*seen), names, settings.fov, depth)
-    upright = settings.upright is not None
-    predictor = PanoramaPredictor(*seen, settings.rotations, upright=upright)
-    tilts = settings.upright, settings.max_tilt_deg
-    return PanoramaLabeller(predictor, names, settings.crop, depth, *tilts)
+def _find_images(settings: Settings) -> dict[str, Path]:
+    """The images by name, without results of this command in its output folder."""
+    results = [(settings.output / kind).resolve() for kind in ("labels", "color", "overlay")]
+    paths = [
+        path
+        for path in find_images(settings.input)
+        if not any(path.resolve().is_relative_to(folder) for folder in results)
+    ]
+    if not paths:
+        raise SettingError("input", found=f"only results in {settings.output}", expected="images")
+    return dict(zip(output_names(paths), paths, strict=True))
 
 
-def _depth(settings: PredictSettings, trained: TrainedNetwork) -> DepthFolder | None:
-    if "depth" in trained.inputs:
-        if settings.depth is not None:
-            return DepthFolder(settings.depth, settings.depth_scale)
+def _predictor(settings: Settings, trained: TrainedNetwork) -> Predictor:
+    how = trained, settings.level, settings.base_level, settings.blend
+    views: PhotoViews | PanoramaViews
+    if settings.of_photos:
+        views = PhotoViews(*how)
+    else:
+        views = PanoramaViews(*how, settings.rotations, upright=settings.upright is not None)
+    device = settings.device
+    if device == "auto":
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+    return Predictor(trained, views, device, settings.images_per_forward)
+
+
+def _depth_folder(settings: Settings, trained: TrainedNetwork) -> DepthFolder | None:
+    folder, wanted = settings.depth, "depth" in trained.inputs
+    if wanted != (folder is not None) or (folder is not None and not folder.is_dir()):
         raise SettingError(
             "depth",
-            found="none",
-            expected="a folder of depth images, for a network that takes RGB and depth",
-            remedy="Give depth=<folder>, or use a network trained with data.inputs=[rgb].",
+            found=folder or "none",
+            expected=f"{'a folder of depth images' if wanted else 'null'} for a network that "
+            f"takes {' and '.join(trained.inputs)}",
         )
-    if settings.depth is not None:
-        raise SettingError(
-            "depth",
-            found=str(settings.depth),
-            expected="none, for a network that takes RGB only",
-            remedy="Leave it out.",
-        )
-    return None
-
-
-def _device(name: str) -> str:
-    import torch
-
-    if name != "auto":
-        return name
-    return "cuda" if torch.cuda.is_available() else "cpu"
+    return None if folder is None else DepthFolder(folder, settings.depth_scale)
 
 
 def _label_all(
-    images: Mapping[str, Path], labeller: Labeller, output: OutputFolder
-) -> Iterator[tuple[Entry, Labelled | None]]:
-    """What is known of each image, as soon as its files are written; None for broken ones."""
+    images: Mapping[str, Path], label: Callable[[str, Path, Callable[[float], object]], Entry]
+) -> Iterator[Entry]:
+    """What is known of each image, as soon as its files are written."""
     begun = time.monotonic()
     with progress_bar() as bar:
-        task = bar.add_task("Labelling images", total=len(images), rate="")
+        task = bar.add_task("Predicting", total=len(images), rate="")
         for number, (name, path) in enumerate(images.items(), start=1):
-            entry: Entry = {"file": str(path), "name": name}
-            start = time.monotonic()
             try:
-                found = labeller.label(
-                    path,
-                    name.removesuffix(path.suffix),
-                    lambda share: bar.advance(task, share),
-                    averaged=output.probabilities,
-                )
+                yield label(name, path, lambda share: bar.advance(task, share))
             except (DataError, SettingError, MemoryError) as error:
                 message = f"{path}: {error}" if isinstance(error, MemoryError) else str(error)
                 bar.console.print(message, style="red", markup=False, soft_wrap=True)
-                yield entry | {"error": message}, None
-            else:
-                output.write(name, found)
-                rows, columns = found.labels.shape
-                entry |= {"rows": rows, "columns": columns} | found.figures
-                entry["seconds"] = round(time.monotonic() - start, 3)
-                # Without the scores: one image's are in memory, not two.
-                found = replace(found, mosaic=None)
-                yield entry, found
-                del found
+                yield {"file": str(path), "name": name, "error": message}
             rate = f"{number / (time.monotonic() - begun):.2f} images/s"
             bar.update(task, completed=number, rate=rate)
+
+
+def _shares_table(shares: Mapping[str, float]) -> Table:
+    table = Table("class", "solid angle %", title="Mean over the images")
+    for name, share in sorted(shares.items(), key=lambda item: -item[1]):
+        table.add_row(escape(name), f"{100 * share:.1f}")
+    return table
+
+
+def _say(content: str | Table) -> None:
+    Console(soft_wrap=True, highlight=False).print(content, markup=False)

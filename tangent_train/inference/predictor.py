@@ -1,149 +1,150 @@
-"""What predictors of panoramas and of photos share."""
+"""From views to class scores, and from the scores of all views to a panorama or photo."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+import inspect
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import torch
 
-from datamodules.core.samples import normalize, render_inputs, world_rays
+from datamodules.core.samples import normalize, render_inputs
 from models.held import held_networks
-from models.sphere_context import SphereContext
 from tangent_train.errors import SettingError
+from tangent_train.rendering.mosaic import ScoreMosaic
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Iterator
 
-    from numpy.typing import NDArray
-    from torch import Tensor
+    from torch import Tensor, nn
 
     from tangent_train.checkpoints.trained import TrainedNetwork
-    from tangent_train.geometry import PinholeGrid
-    from tangent_train.rendering.mosaic import ScoreMosaic
-    from tangent_train.rendering.representations.views import Views
+    from tangent_train.inference.views import InputImage, ViewSets
 
-__all__ = ["Done", "InputImage", "Level", "Prediction", "Runner"]
-
-Level = int | Literal["image"] | None
-"""Level s the network sees: a number, that of each image's rows, or (None) as trained."""
-
-Done = Callable[[float], None]
-"""Is told what share of an image has been done since the last time."""
+__all__ = ["Predictor", "sees_rays", "view_scores"]
 
 _FORMAT: Any = torch.channels_last
-"""Of images and network: half the time of a UNet on a CPU."""
+"""Halves the time of a UNet on a CPU."""
 
-_PIXELS_AT_ONCE = 2**20
-"""Pixels the network sees at once, if nothing else is asked for."""
+_PIXELS_PER_FORWARD = 2**20
 
 
-@dataclass(frozen=True)
-class InputImage:
-    """A panorama of the whole sphere, or a photo.
+def sees_rays(network: nn.Module) -> bool:
+    """Whether a network takes where its images look, as one with cross-image attention does."""
+    return any("rays" in inspect.signature(n.forward).parameters for n in held_networks(network))
 
-    Attributes:
-        rgb: ``(H, W, 3)`` uint8.
-        depth: ``(H, W)`` distance from the centre in steps of 1/512 m, 0 where missing; or None.
-        up: ``(3,)`` direction of the zenith of a panorama; None where it is z.
+
+@torch.no_grad()
+def view_scores(
+    network: Callable[..., Any],
+    views: Callable[[slice], Tensor],
+    count: int,
+    per_forward: int,
+    rays: Tensor | None = None,
+) -> Iterator[tuple[slice, Tensor]]:
+    """Scores of the views of one image, a few views at a time.
+
+    Args:
+        network: Maps images ``(n, C, h, w)`` to scores ``(n, K + 1, h, w)``, or to a dict with
+            these under ``"out"``.
+        views: Gives some of the views as images, normalized.
+        count: Number of views N.
+        per_forward: Views per call of the network.
+        rays: ``(N, 3, 3)``, see `Views.rays`, for networks with cross-image attention: they are
+            called once with all views as ``network(images, rays[None])``.
+
+    Yields:
+        Some of the views and their float32 scores ``(n, K, h, w)``, without the unknown class.
     """
-
-    rgb: NDArray[np.uint8]
-    depth: NDArray[np.uint16] | None = None
-    up: NDArray[np.float64] | None = None
-
-
-@dataclass(frozen=True)
-class Prediction:
-    """The scores of one image.
-
-    Attributes:
-        mosaic: The scores; class k of them is label k + 1.
-        level: Level s the network saw.
-        views: Images it saw.
-        grid: The images of a panorama, not turned; None where borders between them do not exist.
-    """
-
-    mosaic: ScoreMosaic
-    level: int
-    views: int
-    grid: PinholeGrid | None = None
+    step = per_forward if rays is None else count
+    for start in range(0, count, step):
+        part = slice(start, min(start + step, count))
+        returned = network(views(part), *(() if rays is None else (rays[None],)))
+        scores: Tensor = returned["out"] if isinstance(returned, dict) else returned
+        yield part, scores[:, 1:].float()
 
 
-class Runner:
-    """Shows a network views of an image, a few at a time.
+class Predictor:
+    """Predicts the class scores of whole panoramas or photos.
 
     Args:
         trained: The network; it is moved to the device.
-        device: Where it runs.
-        views_at_once: A bound on memory; None for as many as fit 2^20 pixels.
+        view_sets: Which views it sees: `PanoramaViews` or `PhotoViews`.
+        device: Any of torch's.
+        images_per_forward: Views per call of the network, a bound on memory; None for as many as
+            have 2^20 pixels. A network with cross-image attention takes all views of a panorama
+            at once, and their scores are held.
 
     Raises:
-        SettingError: There is no such device, or no view at once.
+        SettingError: There is no such device, or `images_per_forward` is less than 1.
     """
 
     def __init__(
-        self, trained: TrainedNetwork, device: str = "cpu", views_at_once: int | None = None
+        self,
+        trained: TrainedNetwork,
+        view_sets: ViewSets,
+        device: str = "cpu",
+        images_per_forward: int | None = None,
     ) -> None:
-        if views_at_once is not None and views_at_once < 1:
-            raise SettingError("images_per_forward", found=views_at_once, expected="1 or more")
+        if images_per_forward is not None and images_per_forward < 1:
+            raise SettingError("images_per_forward", found=images_per_forward, expected="1 or more")
         try:
             self._device = torch.device(device)
-            self._network = trained.network.to(self._device).to(memory_format=_FORMAT)
-        except (RuntimeError, AssertionError) as error:  # torch says so when it lacks CUDA
+            network = trained.network.to(self._device).to(memory_format=_FORMAT)
+        except (RuntimeError, AssertionError) as error:  # AssertionError: torch without CUDA
             raise SettingError(
                 "device", found=f"{device} ({error})", expected="cpu, or a device of this machine"
             ) from error
-        held = held_networks(getattr(self._network, "network", self._network))  # in `Scores`
-        self._of_sphere = next((n for n in held if isinstance(n, SphereContext)), None)
-        self._normalization = trained.normalization
-        self._inputs = trained.inputs
-        self._at_once = views_at_once
-        self.num_classes = len(trained.class_names) - 1
+        rows, columns = view_sets.image_size
+        self._per_forward = images_per_forward or max(1, _PIXELS_PER_FORWARD // (rows * columns))
+        self._network: Any = network
+        inner = getattr(network, "network", network)
+        self._sees_rays = sees_rays(inner)
+        if self._sees_rays:
+            self._network = partial(inner, images_per_chunk=self._per_forward)
+        self._trained, self._view_sets = trained, view_sets
 
-    def parts(self, count: int, size: tuple[int, int]) -> list[NDArray[np.int64]]:
-        """Numbers of the views to show together, of images of this size."""
-        step = self._at_once or max(1, _PIXELS_AT_ONCE // (size[0] * size[1]))
-        return [np.arange(start, min(start + step, count)) for start in range(0, count, step)]
-
-    @torch.inference_mode()
-    def contexts(self, image: InputImage, views: Sequence[Views]) -> list[Tensor | None]:
-        """What views of one sphere learn from each other, for `scores`.
-
-        Args:
-            image: The panorama.
-            views: All of the sphere, in parts that are shown together.
-
-        Returns:
-            For each part; None where the network looks at every image alone.
-        """
-        network = self._of_sphere
-        if network is None:
-            return [None] * len(views)
-        tokens = [network.encode(self._images(image, part)) for part in views]
-        rays = torch.from_numpy(np.concatenate([world_rays(part, image.up) for part in views]))
-        context = network.mix(rays[None].to(self._device), torch.cat(tokens))
-        return list(torch.split(context, [len(part) for part in tokens]))
-
-    @torch.inference_mode()
-    def scores(self, image: InputImage, views: Views, context: Tensor | None = None) -> Tensor:
-        """``(n, K, h, w)`` scores of the views; the unknown class, never predicted, is left out.
+    def predict(
+        self,
+        image: InputImage,
+        progress: Callable[[float], object] = lambda share: None,
+        *,
+        probabilities: bool = False,
+    ) -> ScoreMosaic:
+        """The scores of one image at its own resolution.
 
         Args:
             image: A panorama or photo.
-            views: Some that are shown together.
-            context: Theirs, from `contexts`.
-        """
-        images = self._images(image, views)
-        if self._of_sphere is None or context is None:
-            scores: Tensor = self._network(images)
-        else:
-            scores = self._of_sphere.decode(images, context)
-        return scores[:, 1:]
+            progress: Called with the share of the image done since its last call.
+            probabilities: Whether `ScoreMosaic.probabilities` will be asked for.
 
-    def _images(self, image: InputImage, views: Views) -> Tensor:
-        rendered = [part.to(self._device) for part in render_inputs(image, views, self._inputs)]
-        images = normalize(rendered, self._normalization, self._inputs)
+        Returns:
+            The scores; class k of them is label k + 1.
+        """
+        sets = self._view_sets(image)
+        height, width = image.rgb.shape[:2]
+        mosaic = ScoreMosaic(
+            (height, width),
+            len(self._trained.class_names) - 1,
+            self._view_sets.blend,
+            averaged=probabilities or len(sets) > 1,
+        )
+        for views in sets:
+
+            def images(part: slice, views: Any = views) -> Tensor:
+                return self._images(views.image, views.views(part))
+
+            rays = torch.from_numpy(views.rays).to(self._device)
+            of_sphere = rays if self._sees_rays and len(rays) else None
+            for part, scores in view_scores(
+                self._network, images, views.count, self._per_forward, of_sphere
+            ):
+                views.add(mosaic, scores, part)
+                progress((part.stop - part.start) / views.count / len(sets))
+        return mosaic
+
+    def _images(self, image: InputImage, views: Any) -> Tensor:
+        trained = self._trained
+        rendered = [part.to(self._device) for part in render_inputs(image, views, trained.inputs)]
+        images = normalize(rendered, trained.normalization, trained.inputs)
         return images.contiguous(memory_format=_FORMAT)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, get_args
 
@@ -14,8 +13,8 @@ from torch.optim.lr_scheduler import LRScheduler
 
 from datamodules.core.class_weights import ClassWeights
 from datamodules.core.split_module import Kind
-from models.held import held_networks
 from tangent_train.errors import SettingError
+from tangent_train.inference.predictor import sees_rays, view_scores
 from tangent_train.metrics.segmentation import AbsentClass, ConfusionMatrix, segmentation_scores
 from tangent_train.registry import registered
 from tangent_train.rendering import Assembler, EquirectRepresentation
@@ -111,9 +110,7 @@ class SegmentationTask(Task):
             raise SettingError("task.auxiliary_target", found=auxiliary_target, expected=expected)
         self.auxiliary_weight = auxiliary_weight
         self.auxiliary_target: AuxiliaryTarget = auxiliary_target
-        self.takes_rays = any(
-            "rays" in inspect.signature(held.forward).parameters for held in held_networks(network)
-        )
+        self.takes_rays = sees_rays(network)
         if self.takes_rays and isinstance(representation, EquirectRepresentation):
             raise SettingError(
                 "representation",
@@ -226,23 +223,24 @@ class SegmentationTask(Task):
         Returns:
             Class indices 1 … K of that shape.
         """
-        if rotations is None or len(rotations) == 1:
-            turn = None if rotations is None else rotations[0].cpu().double().numpy()
-            return self.representation.to_labels(self._scores(images, rays), shape, turn) + 1
-        of_turns = [None] * len(rotations) if rays is None else rays.chunk(len(rotations))
-        parts = zip(images.chunk(len(rotations)), of_turns, strict=True)
-        representation: Any = self.representation  # one whose `whole` has several turns
-        labels: Tensor = representation.to_averaged_labels(
-            (self._scores(*part) for part in parts), shape, rotations.cpu().double().numpy()
-        )
+        count = 1 if rotations is None else len(rotations)
+        of_turns = [None] * count if rays is None else rays.chunk(count)
+        scores = (self._scores(*part) for part in zip(images.chunk(count), of_turns, strict=True))
+        turns = None if rotations is None else rotations.cpu().double().numpy()
+        if turns is None or count == 1:
+            turn = None if turns is None else turns[0]
+            return self.representation.to_labels(next(scores), shape, turn) + 1
+        representation: Any = self.representation  # one whose `whole` has several rotations
+        labels: Tensor = representation.to_averaged_labels(scores, shape, turns)
         return labels.to(images.device) + 1
 
     def _scores(self, images: Tensor, rays: Tensor | None) -> Tensor:
-        """Scores of all classes but the unknown one, of all images of a panorama or photo."""
-        if self.takes_rays and rays is not None and rays.numel():
-            return self(images, rays[None])[:, 1:].float()
-        parts = torch.split(images, self.images_per_forward)
-        return torch.cat([self(part)[:, 1:].float() for part in parts])
+        """Scores of all views of one rotation, see `view_scores`."""
+        of_sphere = rays if self.takes_rays and rays is not None and rays.numel() else None
+        parts = view_scores(
+            self, lambda part: images[part], len(images), self.images_per_forward, of_sphere
+        )
+        return torch.cat([scores for _, scores in parts])
 
     def evaluate(self, batch: Any) -> Tensor:
         """Count a batch of panoramas or photos; returns the predictions."""

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from datamodules.images.pixel_files import write_pixels
 from tangent_train.cli import main
 from tangent_train.cli.keypoint_pairs.folder import PICTURES, ResultsFolder
-from tangent_train.inference.outputs import OutputFolder, output_names
+from tangent_train.results.predictions import PredictionFolder, output_names
 from tests.inference.trained import write_checkpoint
 
 SCRIPT = '<img src=x onerror="alert(1)"><script>alert(1)<\\script>'
@@ -28,7 +28,7 @@ _PARTS = st.text(st.characters(exclude_characters="/\0", codec="utf-8"), min_siz
 @example([["..x"], ["...", "x"]])
 def test_predictions_stay_in_their_folder(names: list[list[str]]) -> None:
     paths = [Path("images", *parts) for parts in names]
-    folder = OutputFolder(Path("/output"), ("unknown", "wall"), probabilities=True)
+    folder = PredictionFolder(Path("/output"), ("unknown", "wall"), probabilities=True)
     for name in output_names(paths):
         for file in folder.files(name).values():
             assert file.is_relative_to("/output")

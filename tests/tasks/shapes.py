@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
+from models.views import each_view
 from tangent_train.rendering import TangentRepresentation
 from tangent_train.tasks import ClassificationTask
 
@@ -73,7 +74,7 @@ class SmallNetwork(nn.Module):
         self.head = nn.Linear(8, classes)
 
     def forward(self, images: Tensor) -> Tensor:
-        features = self.features(images.flatten(0, 1)).unflatten(0, images.shape[:2])
+        features = each_view(self.features, images)
         scores: Tensor = self.head(features.mean(dim=(1, 3, 4)))
         return scores
 

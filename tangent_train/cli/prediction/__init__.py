@@ -1,1 +1,0 @@
-"""What tangent-predict is told, and what it tells."""

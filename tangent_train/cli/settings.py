@@ -1,0 +1,79 @@
+"""Settings of a command as an object whose annotations say their types."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from tangent_train.errors import SettingError
+
+__all__ = ["typed"]
+
+_Settings = TypeVar("_Settings")
+
+_SAID = {
+    bool: "true or false",
+    int: "a whole number",
+    float: "a number",
+    str: "a text",
+    Path: "a file or folder",
+    NoneType: "null",
+}
+
+
+def typed(kind: type[_Settings], config: Mapping[str, Any]) -> _Settings:
+    """Make a dataclass of settings; what its fields' values mean is checked where they are used.
+
+    Annotations may be ``bool``, ``int``, ``float``, ``str``, `Path`, ``None``, `Literal`, tuples
+    and unions of these. A single value will do for a tuple, and ``~`` in a path is the home folder.
+
+    Args:
+        kind: The class.
+        config: A value for every field, and perhaps others.
+
+    Raises:
+        SettingError: A value is missing or of another type.
+    """
+    hints = get_type_hints(kind)
+    return kind(**{name: _converted(name, config[name], hint) for name, hint in hints.items()})
+
+
+def _converted(name: str, value: Any, hint: Any) -> Any:
+    options = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+    for option in options:
+        with suppress(TypeError, ValueError):
+            return _as(option, value)
+    found = "none" if value is None else value
+    raise SettingError(name, found=found, expected=" or ".join(map(_said, options)))
+
+
+def _as(kind: Any, value: Any) -> Any:
+    arguments = get_args(kind)
+    if get_origin(kind) is Literal and value in arguments:
+        return value
+    if get_origin(kind) is tuple:
+        values = value if isinstance(value, list | tuple) else [value]
+        kinds = arguments[:1] * len(values) if arguments[-1] is ... else arguments
+        return tuple(_as(each, one) for one, each in zip(values, kinds, strict=True))
+    if kind is Path and isinstance(value, str):
+        return Path(value).expanduser()
+    if kind is float and type(value) in (int, float) and math.isfinite(value):
+        return float(value)
+    if type(value) is kind and kind is not float:
+        return value
+    raise TypeError
+
+
+def _said(kind: Any) -> str:
+    if get_origin(kind) is Literal:
+        return " or ".join(map(str, get_args(kind)))
+    if get_origin(kind) is tuple:
+        *kinds, last = get_args(kind)
+        return f"[{', '.join(_said(one) for one in (kinds if last is ... else (*kinds, last)))}" + (
+            ", …]" if last is ... else "]"
+        )
+    return _SAID[kind]

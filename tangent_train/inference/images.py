@@ -1,0 +1,132 @@
+"""People's own images as input of a network."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from datamodules.core.panoramas import meters_to_steps, resize_nearest
+from datamodules.images.gpano import PanoramaArea, area_of, area_of_crop, whole_area
+from datamodules.images.gpano_pose import up_of
+from datamodules.images.image_files import find_depth, photo_fov_deg, read_depth_m, read_rgb
+from tangent_train.errors import DataError
+from tangent_train.geometry import camera_matrix_from_fov
+from tangent_train.inference.views import InputImage
+from tangent_train.rendering.upright.gravity import estimate_up
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from datamodules.core.panorama_module import Upright
+
+__all__ = ["DepthFolder", "read_panorama", "read_photo"]
+
+_ASPECT_TOLERANCE = 0.01
+
+
+@dataclass(frozen=True)
+class DepthFolder:
+    """Depth images named as the images they belong to, or with ``_depth`` at the end.
+
+    Attributes:
+        path: The folder.
+        units_per_m: Of files with whole numbers.
+    """
+
+    path: Path
+    units_per_m: float
+
+    def read(self, name: str, shape: tuple[int, int]) -> NDArray[np.uint16]:
+        """Depth of an image in steps of 1/512 m, 0 where missing.
+
+        Args:
+            name: Of the image, see `find_depth`.
+            shape: Its rows and columns.
+
+        Raises:
+            DataError: There is none, it is broken, or its aspect ratio is another.
+        """
+        remedy = "Put depth into a folder of its own, with the names of the images."
+        path = find_depth(self.path, name, remedy)
+        depth_m = read_depth_m(path, self.units_per_m)
+        height, width = depth_m.shape
+        if abs(width * shape[0] / (height * shape[1]) - 1) > _ASPECT_TOLERANCE:
+            raise DataError(
+                path,
+                found=f"{height}×{width} pixels",
+                expected=f"the aspect ratio of the image, which has {shape[0]}×{shape[1]}",
+            )
+        return meters_to_steps(resize_nearest(depth_m, shape))
+
+
+def read_panorama(
+    path: Path,
+    name: str,
+    depth: DepthFolder | None = None,
+    crop: Sequence[float] | None = None,
+    upright: Upright = None,
+    max_tilt_deg: float = 60.0,
+) -> tuple[InputImage, PanoramaArea]:
+    """Read a panorama of the whole sphere or a part of it.
+
+    Args:
+        path: Its file.
+        name: Its path below the folder of all images, without suffix.
+        depth: Where its depth is, for networks that take it.
+        crop: What it shows, see `area_of_crop`; None for what its GPano tags say.
+        upright: Where its zenith is: ``pose`` by its GPano tags, ``auto`` by these or else as
+            estimated; None for z.
+        max_tilt_deg: Of estimates, see `estimate_up`.
+
+    Returns:
+        The whole sphere, black where the file shows nothing, and where on it the file lies.
+
+    Raises:
+        DataError: A file cannot be used.
+        SettingError: The crop does not fit the image.
+    """
+    rgb = read_rgb(path)
+    size = (rgb.shape[0], rgb.shape[1])
+    if crop is not None:
+        area = area_of_crop(size, crop)
+    else:
+        area = area_of(path, size) or whole_area(path, size)
+    whole = area.place(rgb)
+    up = None if upright is None else up_of(path)
+    if up is None and upright == "auto":
+        up = estimate_up(whole, max_tilt_deg).found
+    placed_depth = None if depth is None else area.place(depth.read(name, size))
+    return InputImage(whole, placed_depth, up), area
+
+
+def read_photo(
+    path: Path, name: str, depth: DepthFolder | None = None, fov_deg: float | None = None
+) -> InputImage:
+    """Read a photo.
+
+    Args:
+        path: Its file.
+        name: Its path below the folder of all images, without suffix.
+        depth: Where its depth along the optical axis is, for networks that take depth.
+        fov_deg: Its horizontal field of view; None for what its EXIF data say.
+
+    Raises:
+        DataError: A file cannot be used, or the field of view is unknown.
+    """
+    rgb = read_rgb(path)
+    size = (rgb.shape[0], rgb.shape[1])
+    fov_deg = photo_fov_deg(path) if fov_deg is None else fov_deg
+    if fov_deg is None:
+        raise DataError(
+            path,
+            found="no focal length in its EXIF data",
+            expected="the field of view, which tells how large things in the photo are",
+            remedy="Give fov=, the horizontal one in degrees: 65 to 80 for most phones.",
+        )
+    depth_steps = None if depth is None else depth.read(name, size)
+    return InputImage(rgb, depth_steps, camera_matrix=camera_matrix_from_fov(fov_deg, size))

@@ -1,0 +1,322 @@
+"""Which views a network sees of a panorama or photo it was not trained on."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Protocol
+
+import cv2
+import numpy as np
+import torch
+
+from datamodules.core.panoramas import resize_area, resize_depth
+from datamodules.core.photos import distance_from_z_depth
+from datamodules.core.samples import world_rays
+from tangent_train.errors import SettingError
+from tangent_train.registry import make
+from tangent_train.rendering import EquirectRepresentation, PerspectiveRepresentation
+from tangent_train.rendering.representations.perspective import PhotoCrops
+from tangent_train.rendering.representations.pinhole import PinholeRepresentation, spun, turns
+from tangent_train.rendering.representations.views import NO_RAYS, PinholeViews
+from tangent_train.rendering.upright.gravity import upright_rotation
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+    from torch import Tensor
+
+    from tangent_train.checkpoints.trained import TrainedNetwork
+    from tangent_train.geometry import PinholeGrid
+    from tangent_train.rendering import Blend
+    from tangent_train.rendering.mosaic import ScoreMosaic
+
+__all__ = ["InputImage", "PanoramaViews", "PhotoViews", "ViewSet", "ViewSets"]
+
+_TANGENT = "tangent_train.rendering.TangentRepresentation"
+_PERSPECTIVE = "tangent_train.rendering.PerspectiveRepresentation"
+
+_BASE_LEVEL = 1
+"""For networks trained on photos (paper, section 5: transfer uses b = 1)."""
+
+_OVERLAP = 0.25
+"""Least overlap of neighbouring crops of a photo that are feathered, as a share of their side."""
+
+_OVERSAMPLED = 2
+"""Photos are shrunk to so many pixels per pixel of a crop before they are mirrored."""
+
+
+@dataclass(frozen=True)
+class InputImage:
+    """A panorama of the whole sphere, or a photo.
+
+    Attributes:
+        rgb: ``(H, W, 3)`` uint8.
+        depth: ``(H, W)`` uint16 in steps of 1/512 m, 0 where missing: distance from the centre in
+            panoramas, along the optical axis in photos; or None.
+        up: ``(3,)`` direction of the zenith in a panorama; None where that is z.
+        camera_matrix: ``(3, 3)`` K of a photo, integer pixel centres; None for panoramas.
+    """
+
+    rgb: NDArray[np.uint8]
+    depth: NDArray[np.uint16] | None = None
+    up: NDArray[np.float64] | None = None
+    camera_matrix: NDArray[np.float64] | None = None
+
+
+@dataclass(frozen=True)
+class ViewSet:
+    """Views that together show all of an image.
+
+    Attributes:
+        image: The image at the resolution it is rendered from.
+        count: Number of views N.
+        views: Gives some of the views.
+        add: Adds the scores ``(n, K, h, w)`` of some of the views to those of the image.
+        rays: ``(N, 3, 3)`` in a gravity-aligned frame, see `Views.rays`; ``(0, 3, 3)`` where the
+            views are not of one sphere.
+    """
+
+    image: InputImage
+    count: int
+    views: Callable[[slice], Any]
+    add: Callable[[ScoreMosaic, Tensor, slice], None]
+    rays: NDArray[np.float32] = field(default_factory=lambda: NO_RAYS)
+
+
+class ViewSets(Protocol):
+    """Chooses the views of images of one kind; the scores of several sets are averaged."""
+
+    blend: Blend
+    image_size: tuple[int, int]
+
+    def __call__(self, image: InputImage) -> list[ViewSet]:
+        """The view sets of one image."""
+        ...
+
+
+class PanoramaViews:
+    """Views of panoramas: those of the training, if nothing else is asked for.
+
+    Networks trained on photos see tangent images of base level 1, at the level whose angular
+    resolution their crops had.
+
+    Args:
+        trained: The network.
+        level: Level s, the angular resolution; None as trained.
+        base_level: Base level b of tangent images; None as trained.
+        blend: How overlapping views are joined.
+        rotations: Number of icosahedra, rotated about the vertical, to average over.
+        upright: Whether some panoramas will have their own `InputImage.up`.
+
+    Raises:
+        SettingError: The network cannot take such views.
+    """
+
+    def __init__(
+        self,
+        trained: TrainedNetwork,
+        level: int | None = None,
+        base_level: int | None = None,
+        blend: Blend = "feather",
+        rotations: int = 1,
+        *,
+        upright: bool = False,
+    ) -> None:
+        self._seen = _panorama_representation(trained, level, base_level)
+        self._turns = turns(rotations, "rotations")
+        self.image_size = self._seen.image_size
+        self.blend: Blend = blend
+        if isinstance(self._seen, EquirectRepresentation):
+            if rotations > 1 or upright:
+                raise SettingError(
+                    "rotations and upright",
+                    found=f"{rotations}, {upright}",
+                    expected="1 and null for a network that sees equirectangular images",
+                    remedy="Give base_level= to show it tangent images.",
+                )
+            self.blend = "nearest"
+        elif not self._seen.grid.overlapping:
+            self.blend = "nearest"
+
+    def __call__(self, image: InputImage) -> list[ViewSet]:
+        """One set for every rotation."""
+        seen = self._seen
+        if isinstance(seen, EquirectRepresentation):
+            return [_equirect_set(image, seen)]
+        grid = seen.grid
+        if image.up is not None:
+            grid = grid.with_rotation(upright_rotation(image.up))
+        rows = seen.erp_height
+        if image.rgb.shape[0] > rows:
+            image = _resized(image, (rows, 2 * rows))
+        return [_grid_set(image, spun(grid, turn)) for turn in self._turns]
+
+
+class PhotoViews:
+    """Crops of photos, with the size and angular resolution of what the network was trained on.
+
+    Args:
+        trained: The network.
+        level: Level s, the angular resolution; None as trained.
+        base_level: Crops of the size of tangent images of another base level b.
+        blend: ``feather``: crops overlap by a quarter and are averaged.
+
+    Raises:
+        SettingError: The network cannot take such crops.
+    """
+
+    def __init__(
+        self,
+        trained: TrainedNetwork,
+        level: int | None = None,
+        base_level: int | None = None,
+        blend: Blend = "feather",
+    ) -> None:
+        if "elevation" in trained.inputs:
+            raise SettingError(
+                "projection",
+                found="perspective",
+                expected="equirectangular: the network takes the elevation of every pixel, which "
+                "is unknown in photos",
+            )
+        self._crops = _photo_representation(trained, level, base_level)
+        self.image_size = self._crops.image_size
+        self.blend: Blend = blend
+
+    def __call__(self, image: InputImage) -> list[ViewSet]:
+        """Crops that cover the photo; one smaller than a crop is mirrored at its borders."""
+        padded, matrix, to_photo = _padded(image, self._crops)
+        sampler = self._crops.of_camera(matrix, padded.rgb.shape[:2])
+        crops = sampler.cover(_OVERLAP if self.blend == "feather" else 0.0)
+        placed = replace(crops, boxes=to_photo(crops.boxes))
+
+        numbers = np.arange(len(crops.boxes))
+
+        def views(part: slice) -> PhotoCrops:
+            return replace(crops, boxes=crops.boxes[part])
+
+        def add(mosaic: ScoreMosaic, scores: Tensor, part: slice) -> None:
+            mosaic.add_crops(scores, placed, numbers[part])
+
+        return [ViewSet(padded, len(numbers), views, add)]
+
+
+def _panorama_representation(
+    trained: TrainedNetwork, level: int | None, base_level: int | None
+) -> PinholeRepresentation | EquirectRepresentation:
+    settings: dict[str, Any] = dict(trained.representation)
+    kind = settings["_target_"]
+    if kind == _PERSPECTIVE or (base_level is not None and kind != _TANGENT):
+        settings = {"_target_": _TANGENT, "base_level": _BASE_LEVEL}
+    if settings["_target_"] == _TANGENT and base_level not in (None, settings["base_level"]):
+        settings |= {"base_level": base_level, "dim": None, "faces_per_panorama": None}
+    if level not in (None, trained.level):
+        settings |= {"erp_height": None} | ({"dim": None} if "dim" in settings else {})
+    settings["level"] = trained.level if level is None else level
+    made: Any = make(settings, "representation", trained.trust)
+    _check_size(trained, made.image_size)
+    return made
+
+
+def _photo_representation(
+    trained: TrainedNetwork, level: int | None, base_level: int | None
+) -> PerspectiveRepresentation:
+    wanted = trained.level if level is None else level
+    settings = trained.representation
+    if settings["_target_"] == _PERSPECTIVE and base_level is None:
+        half_extent = math.tan(math.radians(settings.get("fov_deg", 45.0)) / 2)
+        half_extent /= 2.0 ** (wanted - trained.level)
+        size = trained.image_size
+    else:
+        seen = _panorama_representation(trained, level, base_level)
+        if isinstance(seen, EquirectRepresentation):
+            return _photo_representation(trained, level, _BASE_LEVEL)
+        size, half_extent = seen.image_size, seen.grid.dim / 2 * seen.grid.pitch
+    _check_size(trained, size)
+    return PerspectiveRepresentation(wanted, 2 * math.degrees(math.atan(half_extent)), size)
+
+
+def _check_size(trained: TrainedNetwork, size: tuple[int, int]) -> None:
+    fixed, multiple = trained.fixed_size, trained.size_multiple
+    if fixed in (None, size) and not any(side % multiple for side in size):
+        return
+    raise SettingError(
+        "level and base_level",
+        found="images of {}×{}".format(*size),
+        expected="those of {}×{} that the network takes".format(*fixed)
+        if fixed
+        else f"multiples of {multiple}, as the network needs",
+        remedy="Leave level and base_level as trained, or use the network's checkpoint."
+        if fixed
+        else "Choose a higher level or a lower base level.",
+    )
+
+
+def _grid_set(image: InputImage, grid: PinholeGrid) -> ViewSet:
+    faces = np.arange(grid.num_images)
+
+    def views(part: slice) -> PinholeViews:
+        return PinholeViews(grid, faces[part])
+
+    def add(mosaic: ScoreMosaic, scores: Tensor, part: slice) -> None:
+        mosaic.add(scores, grid, faces[part])
+
+    rays = world_rays(PinholeViews(grid), image.up)
+    return ViewSet(image, grid.num_images, views, add, rays)
+
+
+def _equirect_set(image: InputImage, seen: EquirectRepresentation) -> ViewSet:
+    """The panorama itself; its scores are one crop that wraps around by a pixel on all sides."""
+    (rows, columns), (height, width) = seen.image_size, image.rgb.shape[:2]
+    right, below = width / columns, height / rows
+    box = np.array([[-right, -below, width + right, height + below]])
+    crop = PhotoCrops(box, (rows + 2, columns + 2))
+
+    def add(mosaic: ScoreMosaic, scores: Tensor, _: slice) -> None:
+        first, last = (scores[..., i : i + 1 or None, :].roll(columns // 2, -1) for i in (0, -1))
+        tall = torch.cat([first, scores, last], dim=-2)
+        mosaic.add_crops(
+            torch.cat([tall[..., -1:], tall, tall[..., :1]], dim=-1), crop, np.array([0])
+        )
+
+    return ViewSet(_resized(image, seen.image_size), 1, lambda _: seen.whole(), add)
+
+
+def _resized(image: InputImage, shape: tuple[int, int]) -> InputImage:
+    """As training resizes panoramas; depth is never averaged."""
+    depth = None if image.depth is None else resize_depth(image.depth, shape)
+    if image.rgb.shape[0] >= shape[0]:
+        return replace(image, rgb=resize_area(image.rgb, shape), depth=depth)
+    rgb = cv2.resize(image.rgb, shape[::-1], interpolation=cv2.INTER_LINEAR)
+    return replace(image, rgb=rgb, depth=depth)
+
+
+def _padded(
+    image: InputImage, wanted: PerspectiveRepresentation
+) -> tuple[InputImage, NDArray[np.float64], Callable[[NDArray[np.float64]], NDArray[np.float64]]]:
+    """A photo mirrored at its borders as far as a crop is larger.
+
+    Returns:
+        The image with distance as depth, its K, and what maps boxes in it to boxes in the photo.
+    """
+    matrix, size = np.array(image.camera_matrix), image.rgb.shape[:2]
+    depth = None if image.depth is None else distance_from_z_depth(image.depth, matrix)
+    pixel = 2 * math.tan(math.radians(wanted.fov_deg) / 2) / wanted.image_size[1]
+    per_pixel = pixel * np.diag(matrix)[[1, 0]]  # photo pixels per crop pixel, down and across
+    # Shrunk first: mirrored at full resolution, a photo of a telescope would fill the memory.
+    kept = np.minimum(1, _OVERSAMPLED / per_pixel)
+    rows, columns = (max(1, round(n * share)) for n, share in zip(size, kept, strict=True))
+    scale = np.array([columns / size[1], rows / size[0]])
+    least = np.ceil(wanted.image_size * per_pixel * scale[::-1] + 1e-6)
+    top, left = (math.ceil(max(0, a - b) / 2) for a, b in zip(least, (rows, columns), strict=True))
+    borders = (top, top, left, left, cv2.BORDER_REFLECT_101)
+    rgb = cv2.copyMakeBorder(resize_area(image.rgb, (rows, columns)), *borders)
+    if depth is not None:
+        depth = cv2.copyMakeBorder(resize_depth(depth, (rows, columns)), *borders)
+    matrix[:2, 2] += 0.5
+    matrix[:2] *= scale[:, None]
+    matrix[:2, 2] += (left - 0.5, top - 0.5)
+    offset, factor = np.tile((left, top), 2), np.tile(scale, 2)
+    return InputImage(rgb, depth), matrix, lambda boxes: (boxes - offset) / factor

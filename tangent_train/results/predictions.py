@@ -1,0 +1,265 @@
+"""The files that predictions leave: label maps, pictures, a summary and a page to look at."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from datamodules.images.pixel_files import write_pixels
+from tangent_train.csv_text import csv_text
+from tangent_train.errors import SettingError
+from tangent_train.files import atomic_path, reserve, write_text
+from tangent_train.geometry import equirect_solid_angles
+from tangent_train.json_text import parse_json
+from tangent_train.results.html import EncodedImage, Table, ViewerImage, encode_image, write_report
+from tangent_train.results.pictures import colorize, overlay_picture
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from datamodules.images.gpano import PanoramaArea
+    from tangent_train.inference.views import InputImage
+    from tangent_train.rendering.mosaic import ScoreMosaic
+
+__all__ = ["Entry", "PredictionFolder", "class_shares", "mean_shares", "output_names"]
+
+_ROWS_AT_ONCE = 64
+_SUMMARY = "summary.json"
+
+Entry = dict[str, Any]
+"""What is known of an image: file, name, rows, columns and ``classes``, or file, name and error."""
+
+
+def output_names(paths: Sequence[Path]) -> list[str]:
+    """A name for every image: its path below the folder all are in, without suffix.
+
+    Images that would share a name keep their suffix.
+
+    >>> output_names([Path("a/x/1.jpg"), Path("a/1.jpg"), Path("a/1.png")])
+    ['x/1', '1.jpg', '1.png']
+    """
+    # Without "..", which would lead out of the output folder.
+    absolute = [Path(os.path.abspath(path)) for path in paths]  # noqa: PTH100
+    shared = len(Path(os.path.commonpath([path.parent for path in absolute])).parts)
+    whole = [Path(*path.parts[shared:]) for path in absolute]
+    short = [path.with_suffix("") for path in whole]
+    # Upper and lower case are the same file on some disks; "1.jpg.png" without suffix is "1.jpg".
+    taken = Counter(str(path).casefold() for path in (*short, *whole))
+    chosen = zip(whole, short, strict=True)
+    return [(a if taken[str(b).casefold()] > 1 else b).as_posix() for a, b in chosen]
+
+
+def class_shares(
+    labels: NDArray[np.integer],
+    class_names: Sequence[str],
+    image: InputImage,
+    area: PanoramaArea | None = None,
+) -> dict[str, float]:
+    """Share of the labelled solid angle that every class has.
+
+    Args:
+        labels: ``(H, W)`` of the image, or of its area; 0 unknown.
+        class_names: K + 1 names, the unknown class first.
+        image: A panorama or photo.
+        area: The part of the sphere that the labels are of.
+
+    Returns:
+        By name, without the unknown class; they add up to 1, or are all 0.
+    """
+    count = len(class_names)
+    total = np.zeros(count)
+    for line, weights in zip(labels, _solid_angles(labels.shape, image, area), strict=True):
+        total += np.bincount(line, weights, minlength=count)
+    known = total[1:].sum()
+    shares = total[1:] / known if known > 0 else total[1:]
+    return dict(zip(class_names[1:], map(float, shares), strict=True))
+
+
+def _solid_angles(
+    shape: tuple[int, ...], image: InputImage, area: PanoramaArea | None
+) -> Iterator[NDArray[np.float64]]:
+    """Relative solid angles of the pixels, row by row: no array as large as the image.
+
+    A photo's pixel at (x, y) on the plane at distance 1 is seen under (1 + x² + y²)^(−3/2).
+    """
+    if image.camera_matrix is None:
+        rows = equirect_solid_angles((image.rgb.shape[0], image.rgb.shape[1])).ravel()
+        for weight in rows if area is None else rows[area.places()[0]]:
+            yield np.full(shape[1], weight)
+        return
+    (fx, _, cx), (_, fy, cy), _ = image.camera_matrix
+    x = (np.arange(shape[1]) - cx) / fx
+    for row in range(shape[0]):
+        yield (1 + x**2 + ((row - cy) / fy) ** 2) ** -1.5
+
+
+def mean_shares(entries: Iterable[Entry], class_names: Sequence[str]) -> dict[str, float]:
+    """Mean over the images of `class_shares`."""
+    shares = [entry["classes"] for entry in entries if "classes" in entry]
+    return {name: sum(s[name] for s in shares) / max(1, len(shares)) for name in class_names[1:]}
+
+
+@dataclass(frozen=True)
+class PredictionFolder:
+    """Where predictions go.
+
+    Attributes:
+        path: The folder.
+        class_names: K + 1 names, the unknown class first.
+        probabilities: Whether they are written too.
+    """
+
+    path: Path
+    class_names: Sequence[str]
+    probabilities: bool = False
+
+    def files(self, name: str) -> dict[str, Path]:
+        """The files of one image, by kind."""
+        kinds = {"labels": ".png", "color": ".png", "overlay": ".png"}
+        kinds |= {"probabilities": ".npy"} if self.probabilities else {}
+        return {kind: self.path / kind / f"{name}{suffix}" for kind, suffix in kinds.items()}
+
+    def check(self, names: Iterable[str]) -> None:
+        """Refuse a folder with files that would be written over.
+
+        Args:
+            names: From `output_names`.
+
+        Raises:
+            SettingError: There is one.
+        """
+        wanted = [file for name in names for file in self.files(name).values()]
+        of_all = ("classes.json", _SUMMARY, "summary.csv", "report.html")
+        there = [file for file in [*wanted, *(self.path / n for n in of_all)] if file.exists()]
+        if there:
+            raise SettingError(
+                "output",
+                found=f"{there[0]}" + (f" and {len(there) - 1} more" if there[1:] else ""),
+                expected="a folder without earlier results",
+                remedy="Give another folder, resume=true to keep them, or overwrite=true.",
+            )
+
+    def earlier(self, settings: Mapping[str, Any]) -> dict[str, Entry]:
+        """The entries of the images whose files are there, by name.
+
+        Args:
+            settings: What earlier predictions must agree in.
+
+        Raises:
+            SettingError: They were made with other settings.
+        """
+        try:
+            content = parse_json((self.path / _SUMMARY).read_bytes())
+            entries = {entry["name"]: entry for entry in content["images"] if "classes" in entry}
+            before = {name: content[name] for name in settings}
+        except (OSError, ValueError, KeyError, TypeError):
+            return {}
+        for name, value in settings.items():
+            if value != before[name]:
+                raise SettingError(
+                    name,
+                    found=value,
+                    expected=f"{before[name]}, as for the results in {self.path}",
+                    remedy="Give another folder, or overwrite=true.",
+                )
+        complete = {n for n in entries if all(f.is_file() for f in self.files(n).values())}
+        return {name: entry for name, entry in entries.items() if name in complete}
+
+    def write(
+        self,
+        name: str,
+        rgb: NDArray[np.uint8],
+        labels: NDArray[np.unsignedinteger],
+        scores: ScoreMosaic,
+        area: PanoramaArea | None = None,
+    ) -> None:
+        """Write labels, coloured labels and overlay of one image, and probabilities if wanted.
+
+        Args:
+            name: From `output_names`.
+            rgb: ``(h, w, 3)`` the image.
+            labels: ``(h, w)`` its labels.
+            scores: Those of the photo, or of the whole sphere.
+            area: Which part of the sphere the image is.
+        """
+        files = self.files(name)
+        write_pixels(files["labels"], labels)
+        write_pixels(files["color"], colorize(labels, len(self.class_names)))
+        write_pixels(files["overlay"], overlay_picture(rgb, labels, self.class_names))
+        if not self.probabilities:
+            return
+        everywhere = np.arange(labels.shape[0]), np.arange(labels.shape[1])
+        rows, columns = everywhere if area is None else area.places()
+        shape = (*labels.shape, len(self.class_names) - 1)
+        with atomic_path(files["probabilities"]) as temporary:
+            array = np.lib.format.open_memmap(temporary, "w+", np.float16, shape)
+            with temporary.open("r+b") as file:
+                reserve(file, temporary.stat().st_size)
+            for start in range(0, len(rows), _ROWS_AT_ONCE):
+                part = slice(start, start + _ROWS_AT_ONCE)
+                array[part] = scores.probabilities(rows[part])[:, columns]
+            array.flush()
+
+    def write_summary(self, settings: Mapping[str, Any], entries: Sequence[Entry]) -> None:
+        """Write ``summary.json``, ``summary.csv`` and ``classes.json`` (label values by name).
+
+        Args:
+            settings: How the images were predicted.
+            entries: Of the images done so far.
+        """
+        names = self.class_names[1:]
+        values = {name: value for value, name in enumerate(names, start=1)}
+        write_text(self.path / "classes.json", json.dumps(values, indent=1) + "\n")
+        content = {**settings, "classes": mean_shares(entries, self.class_names), "images": entries}
+        write_text(self.path / _SUMMARY, json.dumps(content, indent=1) + "\n")
+        columns = ("file", "rows", "columns")
+        rows = [
+            [*map(e.get, columns), *(e.get("classes", {}).get(n) for n in names), e.get("error")]
+            for e in entries
+        ]
+        write_text(self.path / "summary.csv", csv_text([*columns, *names, "error"], rows))
+
+    def viewer_image(
+        self,
+        name: str,
+        rgb: NDArray[np.uint8],
+        labels: NDArray[np.unsignedinteger],
+        area: PanoramaArea | None,
+    ) -> EncodedImage:
+        """An image for `write_page`: some hundred kilobytes to some megabytes; see `write`."""
+        if area is not None:
+            rgb, labels = area.place(rgb), area.place(labels)
+        shown = ViewerImage(name, rgb, labels, sphere=area is not None)
+        return encode_image(shown, len(self.class_names))
+
+    def write_page(self, entries: Sequence[Entry], shown: Sequence[EncodedImage]) -> None:
+        """Write ``report.html``.
+
+        Args:
+            entries: Of all images.
+            shown: Some of them, to look at.
+        """
+        names = self.class_names[1:]
+        rows = [(entry["name"], entry["classes"]) for entry in entries if "classes" in entry]
+        rows.append(("mean", mean_shares(entries, self.class_names)))
+        shares = [[name, *(f"{100 * classes[n]:.1f}" for n in names)] for name, classes in rows]
+        tables = [Table("Solid angle of the classes, %", ["image", *names], shares)]
+        failed = [[entry["name"], entry["error"]] for entry in entries if "error" in entry]
+        if failed:
+            tables.append(Table("Images that could not be used", ["image", "error"], failed))
+        write_report(
+            self.path / "report.html",
+            "Predictions",
+            tables=tables,
+            images=shown,
+            class_names=self.class_names,
+            notes=[f"{len(shown)} of {len(rows) - 1} images are shown."],
+        )

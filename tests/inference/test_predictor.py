@@ -1,0 +1,320 @@
+"""Scores of panoramas and photos: those of an evaluation, at any size, wherever the views are."""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from datamodules import Stanford2D3DS
+from datamodules.core.photos import distance_from_z_depth
+from datamodules.core.samples import normalize, render_inputs
+from tangent_train.checkpoints.trained import Scores
+from tangent_train.errors import SettingError
+from tangent_train.geometry import (
+    TangentGrid,
+    camera_matrix_from_fov,
+    equirect_directions,
+    rotation_about,
+)
+from tangent_train.inference.predictor import Predictor
+from tangent_train.inference.views import InputImage, PanoramaViews, PhotoViews
+from tangent_train.registry import make
+from tangent_train.rendering import rotate_equirect
+from tangent_train.tasks.segmentation import SegmentationTask
+from tests.inference.trained import (
+    CUBE,
+    ERP,
+    PERSPECTIVE,
+    TANGENT,
+    color_network,
+    trained_network,
+)
+from tests.models.sphere_networks import awake, small_context
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from tangent_train.checkpoints.trained import TrainedNetwork
+
+SGD = functools.partial(torch.optim.SGD, lr=1.0)
+
+
+def _labels(
+    trained: TrainedNetwork, image: InputImage, per_forward: int | None = None, **settings: Any
+) -> NDArray[np.unsignedinteger]:
+    kind = PanoramaViews if image.camera_matrix is None else PhotoViews
+    predictor = Predictor(trained, kind(trained, **settings), "cpu", per_forward)
+    shares: list[float] = []
+    scores = predictor.predict(image, shares.append)
+    assert sum(shares) == pytest.approx(1)
+    return scores.labels()
+
+
+def _sphere(height: int) -> NDArray[np.uint8]:
+    """Colours that are smooth on the sphere."""
+    x, y, z = np.moveaxis(equirect_directions((height, 2 * height)), -1, 0)
+    return np.stack([128 + 120 * x, 128 + 120 * y * z, 128 + 120 * z], axis=-1).astype(np.uint8)
+
+
+def _blocks(height: int, width: int) -> NDArray[np.uint8]:
+    rng = np.random.default_rng(height * width)
+    blocks = rng.integers(0, 256, (-(-height // 6), -(-width // 6), 3), np.uint8)
+    return blocks.repeat(6, axis=0).repeat(6, axis=1)[:height, :width]
+
+
+# Panoramas.
+
+
+@pytest.mark.parametrize(
+    ("representation", "blend", "channels"),
+    [
+        (TANGENT, "nearest", 4),
+        (TANGENT | {"blend": "feather"}, "feather", 3),
+        (TANGENT | {"crop_multiple": 2}, "nearest", 3),
+        (ERP, "feather", 3),  # there is nothing to blend
+        (CUBE, "feather", 4),  # its faces do not overlap
+    ],
+)
+def test_labels_are_those_of_an_evaluation(
+    stanford_root: Path, representation: dict[str, Any], blend: str, channels: int
+) -> None:
+    trained = trained_network(representation, channels)
+    made = make(representation, "representation")
+    data = Stanford2D3DS(
+        root=str(stanford_root), representation=made, inputs=trained.inputs, fold=1
+    )
+    task = SegmentationTask(trained.network, made, trained.class_names, SGD)
+    batch = next(iter(data.test_dataloader()))
+    batch = data.on_after_batch_transfer(batch, 0)
+    expected = task.predict_labels(batch.images[0], tuple(batch.target[0].shape)).numpy()
+    image = data.source("test").read(int(batch.index[0]))
+    labels = _labels(trained, InputImage(image.rgb, image.depth), blend=blend)
+    assert len(np.unique(expected)) == 3
+    np.testing.assert_array_equal(labels + 1, expected)
+
+
+@pytest.mark.parametrize("per_forward", [7, 1000])
+def test_cross_image_attention_is_that_of_an_evaluation(per_forward: int) -> None:
+    torch.manual_seed(0)
+    network = small_context().eval()
+    awake(network)
+    image, made = InputImage(_sphere(32)), make(TANGENT, "representation")
+    trained = trained_network(TANGENT, network=Scores(network))
+    labels = _labels(trained, image, per_forward, blend="nearest")
+    task = SegmentationTask(network, made, trained.class_names, SGD).eval()
+    whole = made.whole()
+    rendered = render_inputs(image, whole, trained.inputs)
+    images = normalize(rendered, trained.normalization, trained.inputs)
+    expected = task.predict_labels(images, (32, 64), torch.tensor(whole.rays())).numpy() - 1
+    np.testing.assert_array_equal(labels, expected)
+    with torch.no_grad():
+        alone = task.representation.to_labels(task(images)[:, 1:], (32, 64)).numpy()
+    assert (alone != expected).any(), "attention does something"
+
+
+def test_elevation_follows_the_zenith() -> None:
+    """A network that sees nothing but elevation: up is one class, down another."""
+    network = torch.nn.Conv2d(4, 4, 1)
+    with torch.no_grad():
+        network.weight.zero_()
+        network.weight[1, 3], network.weight[3, 3] = -1, 1
+        network.bias.copy_(torch.tensor([9.0, 0, -9, 0]))  # type: ignore[union-attr]
+    trained = trained_network(TANGENT, network=network, inputs=("rgb", "elevation"))
+    labels = _labels(trained, InputImage(_sphere(32)))
+    assert (labels[:15] == 2).all()
+    assert (labels[17:] == 0).all()
+    tilted = _labels(trained, InputImage(_sphere(32), up=np.array([1.0, 0.0, 0.0])))
+    assert (tilted[:, 20:44] == 2).mean() > 0.85, "around the middle column"
+    with pytest.raises(SettingError, match="expected equirectangular"):
+        PhotoViews(trained)
+
+
+def test_panoramas_that_are_not_upright_are_seen_upright() -> None:
+    trained, rgb = trained_network(TANGENT), _sphere(64)
+    rotation = rotation_about((1, 2, 0), np.radians(40))
+    upright = _labels(trained, InputImage(rgb))
+    tilted = InputImage(rotate_equirect(rgb, rotation), up=rotation @ [0, 0, 1])
+    labels = _labels(trained, tilted)
+    assert (labels == rotate_equirect(upright, rotation, "nearest")).mean() > 0.93
+
+
+def test_views_per_forward_change_nothing() -> None:
+    image, trained = InputImage(_sphere(32)), trained_network(TANGENT)
+    np.testing.assert_array_equal(_labels(trained, image, 7), _labels(trained, image))
+
+
+@pytest.mark.parametrize("representation", [TANGENT, ERP, CUBE])
+@pytest.mark.parametrize("height", [16, 50, 96])
+def test_panoramas_of_any_size_get_labels_of_their_size(
+    representation: dict[str, Any], height: int
+) -> None:
+    """Smooth colours: the labels are those of a network that sees every pixel."""
+    rgb = _sphere(height)
+    labels = _labels(trained_network(representation), InputImage(rgb))
+    assert labels.shape == (height, 2 * height)
+    expected = _labels(trained_network(ERP | {"erp_height": height}), InputImage(rgb))
+    assert (labels == expected).mean() > 0.9
+
+
+@pytest.mark.parametrize("representation", [TANGENT, ERP, CUBE])
+def test_nothing_changes_at_180_degrees(representation: dict[str, Any]) -> None:
+    """A panorama rotated by a half-turn has the labels rotated by a half-turn.
+
+    Not quite near the poles, where images are rotated in themselves: the network is not symmetric.
+    """
+    trained, rgb = trained_network(representation), _sphere(64)
+    labels = _labels(trained, InputImage(rgb), blend="nearest")
+    there = _labels(trained, InputImage(np.roll(rgb, 64, axis=1).copy()), blend="nearest")
+    agreement = (np.roll(there, -64, axis=1) == labels).mean()
+    assert agreement > (0.999 if representation is ERP else 0.97)
+
+
+def test_a_larger_panorama_is_shrunk_without_aliasing() -> None:
+    """A checkerboard finer than the network's pixels is grey to it."""
+    board = (np.indices((128, 256)).sum(axis=0) % 2 * 255).astype(np.uint8)
+    rgb = cv2.cvtColor(board, cv2.COLOR_GRAY2RGB)
+    trained = trained_network(TANGENT)
+    expected = _labels(trained, InputImage(np.full_like(rgb, 128)))
+    np.testing.assert_array_equal(_labels(trained, InputImage(rgb)), expected)
+
+
+def test_probabilities_of_several_rotations_are_averaged(monkeypatch: pytest.MonkeyPatch) -> None:
+    trained, image = trained_network(TANGENT), InputImage(_sphere(32))
+    views = PanoramaViews(trained, blend="nearest", rotations=3)
+    scores = Predictor(trained, views).predict(image)
+    probabilities = scores.probabilities(slice(None))
+    np.testing.assert_allclose(probabilities.sum(axis=-1), 1, atol=1e-5)
+    alone, sets = [], views(image)
+    for k, views_of_turn in enumerate(sets):
+        angle = np.radians(72 / 3 * k)
+        expected = TangentGrid(0, 4, rotation=rotation_about((0, 0, 1), angle) if k else None)
+        grid = views_of_turn.views(slice(0, 20)).grid
+        np.testing.assert_allclose(grid.centers_xyz, expected.centers_xyz, atol=1e-12)
+        monkeypatch.setattr(PanoramaViews, "__call__", lambda *_, only=views_of_turn: [only])
+        single = Predictor(trained, views).predict(image, probabilities=True)
+        alone.append(single.probabilities(slice(None)))
+    np.testing.assert_allclose(probabilities, np.mean(alone, axis=0), atol=1e-5)
+
+
+def test_level_and_base_level_choose_the_views() -> None:
+    def views(representation: dict[str, Any], **settings: Any) -> tuple[int, int]:
+        (found,) = PanoramaViews(trained_network(representation), **settings)(
+            InputImage(_sphere(128))
+        )
+        return found.count, found.views(slice(0, 1)).render(found.image.rgb, "bilinear").shape[1]
+
+    assert views(TANGENT) == (20, 16)
+    assert views(TANGENT, level=5) == (20, 32)
+    assert views(TANGENT, base_level=1) == (80, 8)
+    assert views(ERP, base_level=1) == (80, 8)
+    assert views(PERSPECTIVE) == (80, 32), "of networks trained on photos, base level 1"
+
+
+# Photos.
+
+
+def _photo(rgb: NDArray[np.uint8], fov_deg: float, **more: Any) -> InputImage:
+    size = rgb.shape[0], rgb.shape[1]
+    return InputImage(rgb, camera_matrix=camera_matrix_from_fov(fov_deg, size), **more)
+
+
+def _radians_per_pixel(trained: TrainedNetwork, **settings: Any) -> float:
+    (found,) = PhotoViews(trained, **settings)(_photo(_blocks(12, 12), 90.0))
+    left, _, right, _ = found.views(slice(0, 1)).boxes[0]
+    return float(right - left) / 6 / PhotoViews(trained, **settings).image_size[1]
+
+
+@pytest.mark.parametrize(
+    ("blend", "channels", "size"),
+    [
+        ("nearest", 3, (24, 24)),
+        ("nearest", 4, (48, 72)),
+        ("nearest", 3, (10, 61)),
+        ("feather", 4, (48, 72)),
+        ("feather", 3, (7, 9)),
+    ],
+)
+def test_photos_with_the_networks_pixels_are_labelled_pixel_by_pixel(
+    blend: str, channels: int, size: tuple[int, int]
+) -> None:
+    """Crops that lie on the photo's pixels, a network of single pixels: nothing may move."""
+    network = color_network(channels, kernel=1)
+    trained = trained_network(PERSPECTIVE, channels, network=network)
+    pixel = 2 * math.tan(math.radians(22.5)) / 24
+    image = _photo(_blocks(*size), 2 * math.degrees(math.atan(pixel * size[1] / 2)))
+    inputs = [torch.from_numpy(image.rgb)[None]]
+    if channels == 4:
+        z_depth = 300 + 5 * image.rgb[..., 0].astype(np.uint16)
+        assert image.camera_matrix is not None
+        depth = distance_from_z_depth(z_depth, image.camera_matrix)
+        inputs.append(torch.from_numpy(depth.astype(np.int32))[None])
+        image = InputImage(image.rgb, z_depth, camera_matrix=image.camera_matrix)
+    with torch.no_grad():
+        images = normalize(inputs, trained.normalization, trained.inputs)
+        expected = network(images)[0, 1:].argmax(0).numpy()
+    labels = _labels(trained, image, blend=blend)
+    if blend == "nearest" and size != (10, 61):
+        np.testing.assert_array_equal(labels, expected)
+    else:  # crops lie between whole pixels
+        assert (labels == expected).mean() > 0.9
+
+
+def test_a_photo_of_any_resolution_is_seen_at_the_networks() -> None:
+    trained, coarse = trained_network(PERSPECTIVE), _blocks(96, 96)
+    labels = _labels(trained, _photo(coarse.repeat(3, axis=0).repeat(3, axis=1), 60.0))
+    assert labels.shape == (288, 288)
+    assert (labels[1::3, 1::3] == _labels(trained, _photo(coarse, 60.0))).mean() > 0.95
+
+
+def test_crops_have_the_angular_resolution_the_network_was_trained_with() -> None:
+    tangent, photos = trained_network(TANGENT), trained_network(PERSPECTIVE)
+    assert _radians_per_pixel(tangent) == pytest.approx(TangentGrid(0, 4).pitch)
+    assert _radians_per_pixel(tangent, level=5) == pytest.approx(TangentGrid(0, 5).pitch)
+    assert _radians_per_pixel(tangent, base_level=1) == pytest.approx(TangentGrid(1, 4).pitch)
+    at_45 = 2 * math.tan(math.radians(22.5)) / 24
+    assert _radians_per_pixel(photos) == pytest.approx(at_45)
+    assert _radians_per_pixel(photos, level=7) == pytest.approx(at_45 / 2)
+    assert _radians_per_pixel(trained_network(ERP)) == pytest.approx(TangentGrid(1, 4).pitch)
+    assert _radians_per_pixel(trained_network(CUBE)) == pytest.approx(2 / 16)
+
+
+def test_a_photo_of_a_telescope_needs_little_memory() -> None:
+    """Far smaller than a crop: mirrored at full resolution it would have 14,000² pixels."""
+    trained = trained_network(PERSPECTIVE, network=color_network(kernel=1))
+    rgb = np.zeros((600, 800, 3), np.uint8)
+    rgb[:, 400:] = 255
+    (views,) = PhotoViews(trained)(_photo(rgb, 2.5))
+    assert max(views.image.rgb.shape) < 100
+    labels = _labels(trained, _photo(rgb, 2.5))
+    assert (labels[:, :330] == labels[0, 0]).all()
+    assert (labels[:, 470:] == labels[0, -1]).all()
+    assert labels[0, 0] != labels[0, -1]
+
+
+# What cannot work.
+
+
+def test_impossible_settings_are_refused() -> None:
+    trained = trained_network(TANGENT)
+    with pytest.raises(SettingError, match="rotations: found 0"):
+        PanoramaViews(trained, rotations=0)
+    for settings in ({"rotations": 2}, {"upright": True}):
+        with pytest.raises(SettingError, match=r"rotations and upright: .*base_level="):
+            PanoramaViews(trained_network(ERP), **settings)
+    for kind in (PanoramaViews, PhotoViews):
+        with pytest.raises(SettingError, match="multiples of 16"):
+            kind(trained_network(TANGENT, size_multiple=16), level=3)
+        with pytest.raises(SettingError, match=r"those of 16×16"):
+            kind(trained_network(TANGENT, fixed_size=(16, 16)), level=5)
+    with pytest.raises(SettingError, match="images_per_forward"):
+        Predictor(trained, PanoramaViews(trained), "cpu", 0)
+    with pytest.raises(SettingError, match="device"):
+        Predictor(trained, PanoramaViews(trained), "nonsense")
