@@ -1,15 +1,22 @@
-"""Networks; any other `nn.Module` that maps images to scores works too, named by `_target_`."""
+"""Networks. Any other `nn.Module` that maps images to scores works too, named by ``_target_``.
 
-from models.auxiliary_head import AuxiliaryHead
-from models.fcn_resnet import FCNResNet
-from models.hexunet import HexUNet
-from models.initialize import initialize
-from models.multi_view import MultiView
-from models.shape_classifier import ShapeClassifier
-from models.sphere_attention import SphereAttention
-from models.sphere_context import SphereContext
-from models.stem import widen_stem
-from models.unet import UNet
+Each is imported when it is first asked for: ``models.UNet`` reads ``models/unet.py`` and no other.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from models.auxiliary_head import AuxiliaryHead
+    from models.fcn_resnet import FCNResNet
+    from models.fine_tuning import initialize
+    from models.hexunet import HexUNet
+    from models.multi_view import MultiView
+    from models.shape_classifier import ShapeClassifier
+    from models.sphere_attention import SphereAttention
+    from models.sphere_context import SphereContext
+    from models.stem import widen_stem
+    from models.unet import UNet
 
 __all__ = [
     "AuxiliaryHead",
@@ -23,3 +30,22 @@ __all__ = [
     "initialize",
     "widen_stem",
 ]
+
+_FILES = {
+    "AuxiliaryHead": "auxiliary_head",
+    "FCNResNet": "fcn_resnet",
+    "HexUNet": "hexunet",
+    "MultiView": "multi_view",
+    "ShapeClassifier": "shape_classifier",
+    "SphereAttention": "sphere_attention",
+    "SphereContext": "sphere_context",
+    "UNet": "unet",
+    "initialize": "fine_tuning",
+    "widen_stem": "stem",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _FILES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_FILES[name]}"), name)

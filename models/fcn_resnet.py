@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
+from torch.nn.modules.batchnorm import _BatchNorm
 from torchvision.models import ResNet50_Weights, ResNet101_Weights
 from torchvision.models.segmentation import (
     FCN_ResNet50_Weights,
@@ -17,7 +17,7 @@ from torchvision.models.segmentation import (
 )
 
 from models.pretrained import fetch_tensors, load_tensors, read_tensors
-from models.stem import widen_stem, with_channels
+from models.stem import widen_stem
 from tangent_train.errors import SettingError
 from tangent_train.registry import registered
 
@@ -31,66 +31,31 @@ _PUBLISHED = {
     },
     "imagenet": {50: ResNet50_Weights.IMAGENET1K_V1, 101: ResNet101_Weights.IMAGENET1K_V1},
 }
-_STEM = "backbone.conv1.weight"
 _HEAD = "classifier."
 _LAST = "classifier.4."
 _DROPPED = (_LAST, "aux_classifier.", "backbone.fc.")
-
-
-class _FrozenStatistics(nn.Module):
-    """Batch normalization by the statistics it has, while training too; the rest is learned.
-
-    No subclass of torch's, which Lightning's `sync_batchnorm` would replace.
-    """
-
-    running_mean: Tensor
-    running_var: Tensor
-
-    def __init__(self, learned: nn.BatchNorm2d) -> None:
-        super().__init__()
-        self.weight, self.bias, self.eps = learned.weight, learned.bias, learned.eps
-        for name, buffer in learned.named_buffers():
-            self.register_buffer(name, buffer)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return functional.batch_norm(
-            x, self.running_mean, self.running_var, self.weight, self.bias, eps=self.eps
-        )
-
-
-def _freeze_statistics(network: nn.Module) -> None:
-    """Let training compute what evaluation does.
-
-    Not by `eval()`: the next `train()` would undo it, and Lightning warns of modules in that mode.
-    """
-    for module in list(network.modules()):
-        for name, child in module.named_children():
-            if isinstance(child, nn.BatchNorm2d):
-                module.add_module(name, _FrozenStatistics(child))
-            elif isinstance(child, nn.Dropout):
-                child.p = 0.0
 
 
 @registered
 class FCNResNet(nn.Module):
     """torchvision's FCN on a dilated ResNet, without its auxiliary classifier.
 
-    The last layer is always fresh, and filters of channels after the third start at zero (paper,
-    supplement, "Level 10 parameters").
+    The last layer is always untrained, and the filters of channels after the third start at zero
+    (paper, supplement, "Level 10 parameters").
 
     Args:
         in_channels: Channels of the image: 3 for RGB, 4 for RGB-D.
-        num_classes: Score planes, the unknown class 0 included.
+        num_classes: Classes, the unknown class 0 included.
         depth: 50 or 101.
-        weights: What to start from. ``coco``: torchvision's FCN, trained on COCO. ``imagenet``: its
-            ResNet. Both are fetched on the first use. Or a file: a state dict of the FCN or of the
-            ResNet, or a checkpoint of this package. None: random numbers.
-        frozen_statistics: Train as in evaluation, which the released code does: batch normalization
-            keeps the statistics of `weights`, and nothing is dropped out.
+        weights: Trained RGB weights. ``coco``: torchvision's FCN, trained on COCO; ``imagenet``:
+            its ResNet; both are downloaded on first use. Or a file: a state dict of the FCN or of
+            the ResNet, or a checkpoint of this package. None: random initialization.
+        frozen_statistics: Train in evaluation mode, as the released code does: batch normalization
+            keeps the statistics of `weights`, and dropout is off.
 
     Raises:
-        SettingError: Another depth, less than three channels, or unknown `weights`.
-        DataError: The weights cannot be fetched or read, or do not fit.
+        SettingError: Another depth, fewer than three channels, or unknown `weights`.
+        DataError: The weights cannot be downloaded or read, or do not fit.
     """
 
     def __init__(
@@ -108,14 +73,22 @@ class FCNResNet(nn.Module):
         fcn = _MAKE[depth](
             weights=None, weights_backbone=None, num_classes=num_classes, aux_loss=False
         )
-        self.backbone: nn.Module = widen_stem(fcn.backbone, in_channels)
+        self.backbone: nn.Module = fcn.backbone
         self.classifier: nn.Module = fcn.classifier
+        self.frozen_statistics = frozen_statistics
         if tensors is not None:
-            tensors = _widened(tensors, in_channels)
             with_head = any(name.startswith(_HEAD) for name in tensors)
             load_tensors(self, tensors, weights, fresh=_LAST if with_head else _HEAD)
-        if frozen_statistics:
-            _freeze_statistics(self)
+        widen_stem(self.backbone, in_channels)
+        self.train()
+
+    def train(self, mode: bool = True) -> FCNResNet:
+        """Set the mode; with `frozen_statistics`, normalization and dropout stay as evaluated."""
+        super().train(mode)
+        for module in self.modules() if self.frozen_statistics else ():
+            if isinstance(module, _BatchNorm | nn.Dropout):
+                module.eval()
+        return self
 
     def forward(
         self, images: Float[Tensor, "batch channels height width"]
@@ -138,11 +111,3 @@ def _tensors(weights: str, depth: int) -> dict[str, Tensor]:
     if "conv1.weight" in tensors:  # a ResNet classifier
         tensors = {f"backbone.{name}": tensor for name, tensor in tensors.items()}
     return {name: t for name, t in tensors.items() if not name.startswith(_DROPPED)}
-
-
-def _widened(tensors: Mapping[str, Tensor], in_channels: int) -> dict[str, Tensor]:
-    """The same with zero filters for the channels after the third; wider ones are left alone."""
-    stem = tensors.get(_STEM)
-    if stem is None or stem.shape[1:2] != (3,):
-        return dict(tensors)
-    return {**tensors, _STEM: with_channels(stem, in_channels)}

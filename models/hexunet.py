@@ -6,14 +6,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from models.stride import check_sides
+from models.unet import check_sides
 from tangent_train.registry import registered
 
 __all__ = ["HexUNet"]
 
 _ENCODERS = (32, 64, 128, 256)
 _DECODERS = ((512, 256), (256, 128), (128, 64), (64, 32))
-"""Neck and output channels, coarsest first."""
+"""Bottleneck and output channels, coarsest first."""
 
 
 def _convolution(in_channels: int, out_channels: int, size: int) -> list[nn.Module]:
@@ -25,7 +25,7 @@ def _convolution(in_channels: int, out_channels: int, size: int) -> list[nn.Modu
 
 
 def _encoder(in_channels: int, out_channels: int) -> nn.Sequential:
-    """Two convolutions; the pooling comes after the skip connection has left."""
+    """Two convolutions; pooling follows where the skip connection branches off."""
     return nn.Sequential(
         *_convolution(in_channels, out_channels, 3), *_convolution(out_channels, out_channels, 3)
     )
@@ -49,7 +49,7 @@ class HexUNet(nn.Module):
 
     Args:
         in_channels: Channels of the image: 3 for RGB, 4 for RGB-D.
-        num_classes: Score planes, the unknown class 0 included.
+        num_classes: Classes, the unknown class 0 included.
 
     Example:
         >>> sum(p.numel() for p in HexUNet(3, 14).parameters())
@@ -81,7 +81,7 @@ class HexUNet(nn.Module):
         """Scores of every pixel.
 
         Raises:
-            SettingError: A side is no multiple of the network's stride, 16.
+            SettingError: A side is not a multiple of the network's stride, 16.
         """
         check_sides(images, self.stride, "HexUNet")
         skips = []

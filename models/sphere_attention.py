@@ -1,9 +1,8 @@
-"""Attention between the tokens of a sphere, by content and by the angle between them."""
+"""Cross-image attention: tokens attend to each other by content and by angular distance."""
 
 from __future__ import annotations
 
 import math
-from contextlib import AbstractContextManager, nullcontext
 
 import torch
 from jaxtyping import Float
@@ -17,37 +16,36 @@ __all__ = ["SphereAttention", "angular_attention"]
 
 _USUAL_WIDTH = 128
 _KAPPAS = (0.1, 30.0)
-"""At first: from heads that look all around to ones that look some 15° far."""
+"""Initial concentrations: from heads that see the whole sphere to ones that see about 15°."""
 
 _ALIGNMENT = 8
-"""Sizes of heads that fast kernels take are multiples of it."""
+"""Memory-efficient kernels need head sizes that are multiples of this."""
 
 
 @registered
 class SphereAttention(nn.Module):
-    """Lets all images of a sphere see each other: multi-head attention between their tokens.
+    """Multi-head attention between the tokens of all images of a sphere, for `SphereContext`.
 
-    To a head's logits κ (dᵢ·dⱼ − 1) is added, with the directions d of both tokens and a
-    concentration κ that every head learns. Directions enter in no other way: turning all of them
-    by one rotation changes nothing, and any images of the sphere may be missing. A mixer of
-    `SphereContext`.
+    κ (dᵢ·dⱼ − 1) is added to the logits of a head, with the directions d of the two tokens and a
+    learned concentration κ per head. Directions enter in no other way: the result is invariant to
+    rotations of the sphere, and any subset of its images will do.
 
-    To a token is added what it sees on the sphere less what it would see in its own image: the
-    share of attention that other images have, times how their mean differs from that of its own.
-    An image alone, as a photo, receives nothing and gives no gradient. The last layer starts at
-    zero and is trained by several images of a sphere only: a network trained on photos computes
-    the same with it and without, whatever images are there.
+    A token receives what it sees on the sphere minus what it would see in its own image: the
+    attention that other images get, times how their mean differs from that of its own. An image
+    alone, such as a photo, receives nothing and yields no gradient. The output layer starts at zero
+    and is trained only where a sphere has several images, so a network trained on photos computes
+    the same with it and without.
 
     Args:
         channels: Channels C of the tokens.
-        heads: Heads of the attention.
+        heads: Attention heads.
         width: Channels of queries, keys and values, of all heads together; None for those of the
             tokens, at most 128.
-        elevation: Tell tokens how far up they look (z of their direction). For spheres whose
-            vertical axis is that of the world; rotations then do change the result.
+        elevation: Add a learned function of the elevation (z of the direction) to every token. For
+            gravity-aligned spheres; the result is then not invariant to rotations.
 
     Raises:
-        SettingError: `width` is no multiple of `heads`, or one of them is not positive.
+        SettingError: `width` is not a positive multiple of `heads`.
 
     Example:
         >>> mixer = SphereAttention(channels=16, heads=2)
@@ -59,13 +57,13 @@ class SphereAttention(nn.Module):
         self, channels: int, heads: int = 8, width: int | None = None, elevation: bool = False
     ) -> None:
         super().__init__()
-        if heads < 1:
-            raise SettingError("heads of SphereAttention", found=heads, expected="1 or more")
-        if width is None:
+        if width is None and heads > 0:
             width = max(heads, min(channels, _USUAL_WIDTH) // heads * heads)
-        if width < 1 or width % heads:
+        if heads < 1 or not width or width % heads:
             raise SettingError(
-                "width of SphereAttention", found=width, expected=f"a multiple of its {heads} heads"
+                "heads and width of SphereAttention",
+                found=f"{heads} and {width}",
+                expected="a positive number and a multiple of it",
             )
         self.heads = heads
         self.norm = nn.LayerNorm(channels)
@@ -83,10 +81,10 @@ class SphereAttention(nn.Module):
         tokens: Float[Tensor, "spheres images channels rows columns"],
         directions: Float[Tensor, "spheres images 3 rows columns"],
     ) -> Float[Tensor, "spheres images channels rows columns"]:
-        """What is added to every token.
+        """The residual to be added to every token.
 
         Args:
-            tokens: Features of all images there are of each sphere.
+            tokens: Features of the images of each sphere.
             directions: Unit vectors the tokens look along.
         """
         spheres, images, channels, rows, columns = tokens.shape
@@ -101,15 +99,13 @@ class SphereAttention(nn.Module):
         )
         kappa = self.log_kappa.exp()
         seen = angular_attention(queries, keys, values, along, kappa)
-        own = seen  # of an image alone: nothing is added, with a gradient (0) for all parameters
-        if images > 1:
-            queries, keys, values = (
-                part.unflatten(2, (images, -1)).transpose(1, 2).flatten(0, 1)
-                for part in (queries, keys, values)
-            )
-            along = along.reshape(spheres * images, -1, 3)
-            own = angular_attention(queries, keys, values, along, kappa)
-            own = own.reshape(spheres, images, *own.shape[1:]).transpose(1, 2).flatten(2, 3)
+        queries, keys, values = (
+            part.unflatten(2, (images, -1)).transpose(1, 2).flatten(0, 1)
+            for part in (queries, keys, values)
+        )
+        along = along.reshape(spheres * images, -1, 3)
+        own = angular_attention(queries, keys, values, along, kappa)
+        own = own.reshape(spheres, images, *own.shape[1:]).transpose(1, 2).flatten(2, 3)
         others = (seen - own).to(x.dtype).transpose(1, 2).flatten(2)
         added: Tensor = self.output(others)
         return added.reshape(spheres, images, rows, columns, channels).movedim(-1, 2)
@@ -124,8 +120,8 @@ def angular_attention(
 ) -> Float[Tensor, "spheres heads tokens size"]:
     """Attention with logits ``q·k / √size + κ (dᵢ·dⱼ − 1)``, in single precision or better.
 
-    The −1 is the same for all keys, and κ dᵢ·dⱼ is a scalar product too: three more numbers in
-    queries and keys are all it takes, and no kernel has to hold tokens × tokens of memory.
+    The −1 is common to all keys, and κ dᵢ·dⱼ is a dot product too: three more numbers in queries
+    and keys suffice, and no kernel has to hold tokens × tokens of memory.
 
     Args:
         queries: Of every head.
@@ -135,25 +131,18 @@ def angular_attention(
         kappa: Concentration of every head.
 
     Returns:
-        For every query, the mean of the values, in that precision: differences of means stay exact.
+        Weighted means of the values, in that precision: their differences stay exact.
     """
-    with _without_autocast(queries.device.type):
+    with torch.autocast(queries.device.type, enabled=False):
         size, exact = queries.shape[-1], torch.promote_types(queries.dtype, torch.float32)
         directions = directions[:, None].to(exact).expand(*queries.shape[:-1], 3)
         query = torch.cat(
             [queries.to(exact) * size**-0.5, kappa.to(exact)[:, None, None] * directions], -1
         )
         key = torch.cat([keys.to(exact), directions], -1)
-        # The kernels want one size for all three.
+        # Memory-efficient kernels want one size for all three.
         further = -(size + 3) % _ALIGNMENT
         query, key = (functional.pad(part, (0, further)) for part in (query, key))
         value = functional.pad(values.to(exact), (0, further + 3))
         seen = functional.scaled_dot_product_attention(query, key, value, scale=1.0)
     return seen[..., :size]
-
-
-def _without_autocast(device: str) -> AbstractContextManager[object]:
-    """No half precision here; nothing at all where there is none, as for exporters."""
-    if torch.amp.is_autocast_available(device) and torch.is_autocast_enabled(device):
-        return torch.autocast(device, enabled=False)
-    return nullcontext()

@@ -1,65 +1,55 @@
-"""Images of one sphere that see each other, at a stage of any network."""
+"""Cross-image context: the images of one sphere exchange features at a stage of any network."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import nullcontext
-from functools import partial
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn import functional
+from torch.nn.modules.batchnorm import _BatchNorm
+from torch.utils.checkpoint import checkpoint
 
-from models.chunks import KeptStatistics, joined, recomputed, same_draws, seeds
-from models.sphere_tokens import add_tokens, lone_rays, to_tokens, token_directions
 from models.stages import stage_channels
 from tangent_train.errors import SettingError
 from tangent_train.registry import registered
 
-__all__ = ["SphereContext"]
-
-_HALF_TURN_DEG = 180.0
+__all__ = ["SphereContext", "token_directions"]
 
 
 class _ReachedError(Exception):
-    """Ends a run of the network at the stage.
+    """Ends a run of the network at the stage, whose features it carries."""
 
-    Attributes:
-        tokens: Of the images of the run.
-    """
-
-    def __init__(self, tokens: Tensor) -> None:
+    def __init__(self, features: Tensor) -> None:
         super().__init__("the stage was reached")
-        self.tokens = tokens
+        self.features = features
 
 
 @registered
 class SphereContext(nn.Module):
-    """A network for single images whose images of one sphere see each other.
+    """Lets the images of a sphere exchange features inside a network for single images.
 
-    A tangent image sees only its field of view (paper, supplement, "Limitations"). Here features F
-    at a stage of the network become F + enlarged(mixer(pooled(F))): a few tokens of every image are
-    mixed with those of all images of its sphere, by the directions they look along. Mixers start at
-    zero, so that before training this computes exactly what the network does, and can be added to
-    a trained one. Any subset of the images of a sphere will do, or a single one, to which
-    `SphereAttention` adds nothing.
+    A tangent image sees only its field of view (paper, supplement, "Limitations"). Here the
+    features F at a stage become F + upsample(mixer(pool(F))): a few tokens per image are mixed with
+    those of all images of the sphere, by the directions they look along. Mixers start at zero: at
+    first this computes exactly what the network does, and can be added to a trained one. Any subset
+    of the images of a sphere will do.
 
     Args:
         network: Any module ``(B, C, h, w) -> scores``, a tensor or a mapping of tensors.
-        stage: Name of one of its submodules, whose result is features ``(B, C', h', w')``:
-            ``downs.3`` of a UNet, ``backbone.layer4`` of an FCN-ResNet.
+        stage: Name of a submodule, whose result is features ``(B, C', h', w')``: ``downs.3`` of a
+            UNet, ``backbone.layer4`` of an FCN-ResNet.
         mixer: Makes the mixer from ``channels=C'``: a module that maps tokens ``(S, n, C', t, t)``
-            and their directions ``(S, n, 3, t, t)``, n images of each of S spheres, to what is
-            added to the tokens. `SphereAttention` or another.
-        in_channels: Channels C of the images, to find C' out.
-        channels: C', where it cannot be found out.
-        tokens: Features are averaged to at most so many rows and columns of tokens.
-        fov_deg: Angle that the width of an image spans if nothing else is said about its camera, as
-            of a photo; to `SphereAttention`, which adds nothing there, it does not matter.
+            and directions ``(S, n, 3, t, t)`` of n images on each of S spheres to what is added to
+            the tokens. `SphereAttention` or another.
+        in_channels: Channels C of the images.
+        tokens: Rows and columns of tokens per image, at most.
 
     Raises:
-        SettingError: A setting that cannot work; of stages, it names those there are.
+        SettingError: No token, or no such stage (it names those there are).
     """
 
     def __init__(
@@ -67,25 +57,17 @@ class SphereContext(nn.Module):
         network: nn.Module,
         stage: str,
         mixer: Callable[..., nn.Module],
-        in_channels: int | None = None,
-        channels: int | None = None,
+        in_channels: int,
         tokens: int = 4,
-        fov_deg: float = 45.0,
     ) -> None:
         super().__init__()
-        if not isinstance(tokens, int) or tokens < 1:
-            raise SettingError("network.tokens", found=tokens, expected="a whole number from 1")
-        if not 0 < fov_deg < _HALF_TURN_DEG:
-            raise SettingError("network.fov_deg", found=fov_deg, expected="more than 0, below 180")
-        if any(isinstance(module, SphereContext) for module in network.modules()):
-            raise SettingError(
-                "network.network", found="one with a SphereContext", expected="one without"
-            )
+        if tokens < 1:
+            raise SettingError("network.tokens", found=tokens, expected="1 or more")
         self.network = network
-        self.mixer = mixer(channels=stage_channels(network, stage, in_channels, channels))
-        self.stage, self.tokens, self.fov_deg = stage, tokens, fov_deg
+        self.mixer = mixer(channels=stage_channels(network, stage, in_channels))
+        self.tokens = tokens
         self._at_stage: Callable[[Tensor], Tensor] | None = None
-        # First, so that an auxiliary head at the same stage sees what is added.
+        # First, so that an auxiliary head at the same stage sees features with their context.
         network.get_submodule(stage).register_forward_hook(self._on_features, prepend=True)
 
     def forward(
@@ -94,41 +76,45 @@ class SphereContext(nn.Module):
         rays: Float[Tensor, "spheres images_of_sphere 3 3"] | None = None,
         images_per_chunk: int | None = None,
     ) -> Any:
-        """What the network makes of images that see each other.
+        """The network's result for images with context.
 
         Args:
-            images: Sphere by sphere, as many of each.
+            images: Sphere by sphere, the same number of each.
             rays: For every image the matrix that maps image coordinates (x, y, 1) to directions on
-                the sphere, of any length; x goes from −1 on the left edge of the image to 1 on the
-                right one, y from −1 on the upper edge to 1 on the lower. Of a mirrored image the
-                first column is negated. None: each image is alone on its sphere, with a camera of
-                `fov_deg` held level.
-            images_per_chunk: Bounds memory: no more images at once are in the network, and still
-                all of a sphere see each other, and gradients are the same. Each chunk runs through
-                the network once to the stage and once as a whole, and in training again for the
-                gradient: about twice the time. Batch normalization sees one chunk at a time. None
-                for all images at once.
+                the sphere, of any length; x runs from −1 at the left edge of the image to 1 at the
+                right, y from −1 at the top to 1 at the bottom. For a mirrored image the first
+                column is negated. None for images without context, as photos.
+            images_per_chunk: Bounds memory: at most so many images are in the network at once, with
+                the same context and the same gradients. Each chunk is run up to the stage and then
+                as a whole, and both again in the backward pass: about twice the time. Batch
+                normalization sees one chunk at a time. None for all images at once.
 
         Raises:
-            SettingError: `rays` and images do not fit each other, or the stage was not reached.
+            SettingError: The number of rays and that of images differ.
         """
         if rays is None:
-            rays = lone_rays(images, self.fov_deg)
-        elif rays.shape[0] * rays.shape[1] != images.shape[0]:
+            return self.network(images)
+        if rays.shape[0] * rays.shape[1] != images.shape[0]:
             raise SettingError(
                 "rays",
                 found=f"{rays.shape[0]} spheres of {rays.shape[1]} images",
                 expected=f"spheres of {images.shape[0]} images together",
             )
         if images_per_chunk is None or images_per_chunk >= images.shape[0]:
-            return self._run(images, partial(self._mixed, rays))
+            return self._run(images, lambda x: _add(x, self.mix(rays, self._pooled(x))))
         return self._in_chunks(images, rays, images_per_chunk)
 
     def encode(
         self, images: Float[Tensor, "images channels height width"]
     ) -> Float[Tensor, "images features rows columns"]:
-        """Tokens of images: the first of three steps for those who bound the memory themselves."""
-        return self._encoded(images, None)
+        """Tokens of images: the first of the three steps that bound memory."""
+        try:
+            self._run(images, _stop)
+        except _ReachedError as reached:
+            return self._pooled(reached.features)
+        raise SettingError(
+            "network.stage", found="one that was not run", expected="one that every image passes"
+        )
 
     def mix(
         self,
@@ -145,65 +131,111 @@ class SphereContext(nn.Module):
         images: Float[Tensor, "images channels height width"],
         context: Float[Tensor, "images features rows columns"],
     ) -> Any:
-        """What the network makes of images with their part of the second step: the third."""
-        return self._decoded(images, context, None)
+        """The network's result for images with their part of the second step: the third."""
+        return self._run(images, lambda features: _add(features, context))
 
     def _run(self, images: Tensor, at_stage: Callable[[Tensor], Tensor]) -> Any:
-        """The network's result, with features replaced at the stage."""
         self._at_stage = at_stage
         try:
-            scores = self.network(images)
-            reached = self._at_stage is None
+            return self.network(images)
         finally:
             self._at_stage = None
-        if not reached:
-            raise SettingError(
-                "network.stage",
-                found=f"{self.stage}, which the network does not run",
-                expected="one that it does",
-            )
-        return scores
 
     def _on_features(self, _stage: nn.Module, _inputs: Any, features: Tensor) -> Tensor | None:
-        """The hook; without effect when the network is run by anyone else."""
-        at_stage, self._at_stage = self._at_stage, None
-        return None if at_stage is None else at_stage(features)
+        return None if self._at_stage is None else self._at_stage(features)
 
-    def _mixed(self, rays: Tensor, features: Tensor) -> Tensor:
-        return add_tokens(features, self.mix(rays, to_tokens(features, self.tokens)))
+    def _pooled(self, features: Tensor) -> Tensor:
+        rows, columns = (min(side, self.tokens) for side in features.shape[-2:])
+        return functional.adaptive_avg_pool2d(features, (rows, columns))
 
     @torch.compiler.disable  # type: ignore[untyped-decorator]
     def _in_chunks(self, images: Tensor, rays: Tensor, size: int) -> Any:
-        """Encode in chunks, mix the tokens of all, decode in chunks.
-
-        Of what the network computes no more than one chunk is kept, and each run of a chunk draws
-        the same random numbers. Running statistics take a chunk in when it is first decoded.
-        """
-        kept = KeptStatistics(self.network)
+        """Encode in chunks, mix the tokens of all, decode in chunks."""
         chunks = torch.split(images, size)
-        drawn = seeds(self.network, len(chunks))
+        # Evaluation draws nothing.
+        seeds = (
+            torch.randint(2**62, (len(chunks),)).tolist() if self.training else [0] * len(chunks)
+        )
         tokens = [
-            recomputed(self._encoded, chunk, seed, first=kept, again=kept)
-            for chunk, seed in zip(chunks, drawn, strict=True)
+            self._recomputed(self.encode, chunk, seed=seed, counted=False)
+            for chunk, seed in zip(chunks, seeds, strict=True)
         ]
         contexts = torch.split(self.mix(rays, torch.cat(tokens)), size)
-        decoded = [
-            recomputed(self._decoded, *chunk, first=nullcontext(), again=kept)
-            for chunk in zip(chunks, contexts, drawn, strict=True)
+        parts = [
+            self._recomputed(self.decode, chunk, context, seed=seed, counted=True)
+            for chunk, context, seed in zip(chunks, contexts, seeds, strict=True)
         ]
-        return joined(decoded)
+        if isinstance(parts[0], Tensor):
+            return torch.cat(parts)
+        return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
 
-    def _encoded(self, images: Tensor, seed: int | None) -> Tensor:
-        with same_draws(seed, images.device):
-            try:
-                self._run(images, self._stop)
-            except _ReachedError as reached:
-                return reached.tokens
-        raise AssertionError  # `_run` has refused the stage
+    def _recomputed(
+        self, step: Callable[..., Any], *arguments: Tensor, seed: int | None, counted: bool
+    ) -> Any:
+        """Run a step without keeping activations; the backward pass runs it again.
 
-    def _stop(self, features: Tensor) -> Tensor:
-        raise _ReachedError(to_tokens(features, self.tokens))
+        All runs of a chunk draw the same random numbers, and only one of them (the first, if
+        `counted`) updates the running statistics of batch normalization.
+        """
+        first = iter([counted])
 
-    def _decoded(self, images: Tensor, context: Tensor, seed: int | None) -> Any:
-        with same_draws(seed, images.device):
-            return self._run(images, lambda features: add_tokens(features, context))
+        def run(*inputs: Tensor) -> Any:
+            frozen = () if next(first, False) else self.network.modules()
+            with _same_draws(seed, inputs[0].device), _frozen_statistics(frozen):
+                return step(*inputs)
+
+        return checkpoint(run, *arguments, use_reentrant=False, preserve_rng_state=False)
+
+
+def token_directions(
+    rays: Float[Tensor, "spheres images 3 3"], rows: int, columns: int
+) -> Float[Tensor, "spheres images 3 rows columns"]:
+    """Unit vectors that the centers of tokens look along.
+
+    Args:
+        rays: They map image coordinates to directions, see `SphereContext.forward`.
+        rows: Of tokens.
+        columns: Of tokens.
+    """
+    y, x = (
+        (2 * torch.arange(count, dtype=rays.dtype, device=rays.device) + 1) / count - 1
+        for count in (rows, columns)
+    )
+    along_x, along_y, along_z = rays[..., None, None].unbind(3)
+    # Not a matrix product, which autocast would compute in half precision.
+    return functional.normalize(along_x * x + along_y * y[:, None] + along_z, dim=2)
+
+
+def _add(features: Tensor, tokens: Tensor) -> Tensor:
+    """Add upsampled tokens, in the dtype of the features."""
+    upsampled = functional.interpolate(tokens, features.shape[-2:], mode="bilinear")
+    return features + upsampled.to(features.dtype)
+
+
+def _stop(features: Tensor) -> Tensor:
+    raise _ReachedError(features)
+
+
+@contextmanager
+def _same_draws(seed: int | None, device: torch.device) -> Iterator[None]:
+    """Random numbers that depend on the seed only; the generators are as before afterwards."""
+    devices = [device] if device.type == "cuda" else []
+    with torch.random.fork_rng(devices, enabled=seed is not None):
+        if seed is not None:
+            torch.manual_seed(seed)
+        yield
+
+
+@contextmanager
+def _frozen_statistics(modules: Any) -> Iterator[None]:
+    """Batch normalization by the statistics of the batch that leaves the running ones alone."""
+    norms = [m for m in modules if isinstance(m, _BatchNorm) and m.training]
+    before = [(norm.momentum, norm.num_batches_tracked) for norm in norms]
+    for norm in norms:
+        # The buffers stay in place: a gradient needs the same in all runs.
+        norm.momentum, norm.num_batches_tracked = 0.0, None
+    try:
+        yield
+    finally:
+        for norm, (momentum, batches) in zip(norms, before, strict=True):
+            norm.momentum, norm.num_batches_tracked = momentum, batches

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from tangent_train.errors import SettingError
 from tangent_train.registry import registered
 
-__all__ = ["of_channels", "widen_stem", "with_channels"]
+__all__ = ["first_convolution", "select_channels", "widen_stem"]
 
 _RGB = 3
 
@@ -20,58 +20,59 @@ def widen_stem(network: nn.Module, in_channels: int) -> nn.Module:
     """Let a network for RGB images take further channels, depth for example.
 
     The filters of the further channels start at zero (paper, supplement, "Level 10 parameters"):
-    at first the network does with RGB-D exactly what it did with RGB.
+    untrained, the network computes from RGB-D exactly what it does from RGB.
 
     Args:
-        network: Any; its first convolution, in the order of definition, must be that of the image.
-        in_channels: Channels wanted, red, green and blue first.
+        network: Any network; its first convolution must be the one that sees the image.
+        in_channels: Channels wanted; the first three are red, green and blue.
 
     Returns:
-        The same network, changed in place unless `in_channels` is 3.
+        The network, changed in place.
 
     Raises:
-        SettingError: Less than three channels, or the first convolution does not take three.
+        SettingError: Fewer than three channels, or the first convolution does not take three.
     """
     if in_channels < _RGB:
         raise SettingError("network.in_channels", found=in_channels, expected="3 or more")
-    stem = next((module for module in network.modules() if isinstance(module, nn.Conv2d)), None)
-    if stem is None or stem.in_channels != _RGB or stem.groups != 1:
-        raise SettingError(
-            f"first convolution of {type(network).__name__}",
-            found=stem or "none",
-            expected="one that takes the three channels of an RGB image",
-        )
+    _, stem = first_convolution(network)
+    if stem.in_channels != _RGB or stem.groups != 1:
+        raise _unfit(network, stem)
     if in_channels > _RGB:
-        stem.weight = nn.Parameter(with_channels(stem.weight.detach(), in_channels))
+        places = [*range(_RGB), *[None] * (in_channels - _RGB)]
+        stem.weight = nn.Parameter(select_channels(stem.weight.detach(), places))
         stem.in_channels = in_channels
     return network
 
 
-def with_channels(weight: Tensor, channels: int) -> Tensor:
-    """Filters for so many input channels: those of further ones are zero, others are left out.
+def first_convolution(network: nn.Module) -> tuple[str, nn.Conv2d]:
+    """The first convolution of a network, in the order of definition, and its name.
 
-    Args:
-        weight: ``(out, in, h, w)``.
-        channels: Input channels wanted.
-
-    Returns:
-        ``(out, channels, h, w)``.
+    Raises:
+        SettingError: There is none.
     """
-    further = max(0, channels - weight.shape[1])
-    zeros = weight.new_zeros(weight.shape[0], further, *weight.shape[2:])
-    return torch.cat([weight[:, :channels], zeros], dim=1)
+    for name, module in network.named_modules():
+        if isinstance(module, nn.Conv2d):
+            return name, module
+    raise _unfit(network, "none")
 
 
-def of_channels(weight: Tensor, places: Sequence[int | None]) -> Tensor:
-    """Filters for these input channels.
+def select_channels(weight: Tensor, places: Sequence[int | None]) -> Tensor:
+    """Filters for other input channels.
 
     Args:
         weight: ``(out, in, h, w)``.
-        places: For every channel wanted, which one of `weight` it is; None for a new one, whose
-            filters are zero.
+        places: For every channel wanted, its index in `weight`; None for zeros.
 
     Returns:
         ``(out, len(places), h, w)``.
     """
     zeros = torch.zeros_like(weight[:, 0])
     return torch.stack([zeros if k is None else weight[:, k] for k in places], dim=1)
+
+
+def _unfit(network: nn.Module, found: object) -> SettingError:
+    return SettingError(
+        f"first convolution of {type(network).__name__}",
+        found=found,
+        expected="one that takes the three channels of an RGB image",
+    )

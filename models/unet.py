@@ -9,16 +9,60 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from models.residual import Down, Residual
-from models.stride import check_sides
 from tangent_train.errors import SettingError
 from tangent_train.registry import registered
 
-__all__ = ["UNet"]
+__all__ = ["Down", "Residual", "UNet", "check_sides"]
+
+
+class Residual(nn.Module):
+    """Bottleneck 1×1 – 3×3 – 1×1 with a 1×1 shortcut, all batch-normalized (Jiang et al. 2019).
+
+    Args:
+        in_channels: Input channels.
+        out_channels: Output channels. The bottleneck has the smaller of the two.
+    """
+
+    def __init__(self, in_channels: int, out_channels: int) -> None:
+        super().__init__()
+        neck = min(in_channels, out_channels)
+        self.body = nn.Sequential(
+            nn.Conv2d(in_channels, neck, 1),
+            nn.BatchNorm2d(neck),
+            nn.ReLU(inplace=True),
+            nn.Conv2d(neck, neck, 3, padding=1),
+            nn.BatchNorm2d(neck),
+            nn.ReLU(inplace=True),
+            nn.Conv2d(neck, out_channels, 1),
+            nn.BatchNorm2d(out_channels),
+        )
+        self.shortcut = nn.Sequential(
+            nn.Conv2d(in_channels, out_channels, 1), nn.BatchNorm2d(out_channels)
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Features ``(B, out_channels, h, w)``."""
+        return torch.relu(self.body(x) + self.shortcut(x))
+
+
+class Down(nn.Sequential):
+    """2×2 average pooling and a residual block.
+
+    The released code halves the resolution bilinearly, after the first 1×1 convolution and again
+    in the shortcut. At a ratio of ½ that is a 2×2 mean, which commutes with a 1×1 convolution:
+    pooling once, first, gives the same numbers with a quarter of the work.
+
+    Args:
+        in_channels: Input channels.
+        out_channels: Output channels.
+    """
+
+    def __init__(self, in_channels: int, out_channels: int) -> None:
+        super().__init__(nn.AvgPool2d(2), Residual(in_channels, out_channels))
 
 
 class _Up(nn.Module):
-    """Twice the resolution, joined with the encoder's features of that resolution."""
+    """Twice the resolution, merged with the encoder's features of that resolution."""
 
     def __init__(self, in_channels: int, skip_channels: int, out_channels: int) -> None:
         super().__init__()
@@ -34,12 +78,12 @@ class _Up(nn.Module):
 class UNet(nn.Module):
     """Residual UNet (paper, supplement, "Network training details"; after Jiang et al. 2019).
 
-    With the default widths, four inputs and 14 outputs it has the 2,896,654 trainable parameters
-    of the released code.
+    With the default widths, four input channels and 14 classes it has the 2,896,654 trainable
+    parameters of the released code.
 
     Args:
         in_channels: Channels of the image: 3 for RGB, 4 for RGB-D.
-        num_classes: Score planes, the unknown class 0 included.
+        num_classes: Classes, the unknown class 0 included.
         widths: Channels at full, half, quarter … resolution.
 
     Example:
@@ -54,10 +98,6 @@ class UNet(nn.Module):
         widths: Sequence[int] = (16, 32, 64, 128, 256, 256),
     ) -> None:
         super().__init__()
-        if len(widths) < 2 or min(widths) < 1:
-            raise SettingError(
-                "UNet widths", found=list(widths), expected="two or more positive numbers"
-            )
         self.stride = 2 ** (len(widths) - 1)
         self.stem = nn.Conv2d(in_channels, widths[0], 3, padding=1)
         self.downs = nn.ModuleList(Down(a, b) for a, b in pairwise(widths))
@@ -76,9 +116,9 @@ class UNet(nn.Module):
         """Scores of every pixel.
 
         Raises:
-            SettingError: A side is no multiple of the network's stride (32 by default).
+            SettingError: A side is not a multiple of the network's stride (32 by default).
         """
-        check_sides(images, self.stride, "UNet", remedy=", or fewer network.widths")
+        check_sides(images, self.stride, "UNet")
         skips = [self.stem(images)]
         for down in self.downs:
             skips.append(down(skips[-1]))
@@ -87,3 +127,25 @@ class UNet(nn.Module):
             x = up(x, skips.pop())
         scores: Tensor = self.head(x)
         return scores
+
+
+def check_sides(images: Tensor, stride: int, network: str) -> None:
+    """Refuse images whose sides are not multiples of the network's stride.
+
+    Args:
+        images: ``(B, C, h, w)``.
+        stride: Pixels of the image per pixel of the coarsest features.
+        network: Its name.
+
+    Raises:
+        SettingError: A side is not a multiple.
+    """
+    height, width = images.shape[-2:]
+    if height % stride or width % stride:
+        raise SettingError(
+            f"image size for the {network}",
+            found=f"{height}×{width}",
+            expected=f"sides that are multiples of {stride}",
+            remedy=f"Set representation.crop_multiple={stride}, or choose another "
+            "representation.dim, level or network.",
+        )

@@ -22,7 +22,7 @@ from lightning.pytorch.utilities.exceptions import SIGTERMException
 from rich.console import Console
 
 from datamodules.core.samples import channel_names
-from models.initialize import initialize, origins_table
+from models import initialize
 from tangent_train.callbacks.checkpoints import (
     AtomicCheckpointIO,
     CheckpointContents,
@@ -71,7 +71,7 @@ def train(settings: Settings, trust: Collection[str] | None = None) -> float | N
     start = settings["init_from"]
     if start is not None and resumed is None:
         origins = initialize(task.network, start, _channels(Path(start), data))
-        rank_zero_only(_console().print)(origins_table(origins, start))
+        rank_zero_only(_console().print)(f"Tensors from {start}\n{origins}", markup=False)
     write_settings(folder / "config.yaml", settings)
     last = LastCheckpoint(checkpoints, settings["checkpoint_every_n_steps"], _typed_local())
     callbacks = [last, LearningRateMonitor()]
@@ -85,6 +85,8 @@ def train(settings: Settings, trust: Collection[str] | None = None) -> float | N
         warnings.filterwarnings("ignore", "Checkpoint directory .* exists and is not empty")
         # Lightning looks for this in the loader; here the data module knows where to go on.
         warnings.filterwarnings("ignore", ".* your dataloader is not resumable")
+        # network.frozen_statistics=true
+        warnings.filterwarnings("ignore", "Found .* in eval mode at the start of training")
         try:
             trainer.fit(task, datamodule=data, ckpt_path=resumed, weights_only=True)
             # First: an error in the test must not cost a sweep its figure.

@@ -13,7 +13,7 @@ from torch.nn import functional
 
 from models import SphereAttention
 from models.sphere_attention import angular_attention
-from models.sphere_tokens import token_directions
+from models.sphere_context import token_directions
 from tangent_train.errors import SettingError
 from tangent_train.geometry import random_rotation
 from tests.models.sphere_networks import awake, sphere_rays
@@ -184,16 +184,9 @@ def test_half_precision_does_not_blur_directions() -> None:
     torch.testing.assert_close(whole.float(), expected, rtol=0.2, atol=0.2)
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"heads": 0}, "heads of SphereAttention: found 0"),
-        ({"heads": 3, "width": 8}, "width of SphereAttention: found 8; .* multiple of its 3 heads"),
-        ({"width": 0}, "width of SphereAttention: found 0"),
-    ],
-)
-def test_impossible_sizes_are_refused(settings: dict[str, int], message: str) -> None:
-    with pytest.raises(SettingError, match=message):
+@pytest.mark.parametrize("settings", [{"heads": 0}, {"heads": 3, "width": 8}, {"width": 0}])
+def test_impossible_sizes_are_refused(settings: dict[str, int]) -> None:
+    with pytest.raises(SettingError, match="heads and width of SphereAttention: found"):
         SphereAttention(12, **settings)  # type: ignore[arg-type]
 
 

@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import copy
-import pickle
-import subprocess
-import sys
-from collections import OrderedDict
 from typing import Any
 
 import numpy as np
@@ -15,10 +11,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from models import FCNResNet, SphereContext, UNet
-from models.sphere_tokens import lone_rays, token_directions
+from models import SphereContext
+from models.sphere_context import token_directions
 from tangent_train.errors import SettingError
-from tangent_train.geometry import random_rotation
+from tangent_train.geometry import TangentGrid, random_rotation
 from tests.models.sphere_networks import (
     ATTENTION,
     STAGE,
@@ -26,20 +22,8 @@ from tests.models.sphere_networks import (
     small_context,
     small_unet,
     sphere_rays,
+    tangent_rays,
 )
-
-
-class _Named(nn.Module):
-    """Results as torchvision's networks have them."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.downs = nn.ModuleList([nn.Identity(), nn.Conv2d(3, 8, 4, stride=4)])
-        self.head = nn.Conv2d(8, 2, 1)
-
-    def forward(self, images: Tensor) -> OrderedDict[str, Tensor]:
-        features = self.downs[1](images)
-        return OrderedDict(out=self.head(features), aux=features.mean((2, 3)))
 
 
 @pytest.mark.parametrize("size", [(16, 16), (4, 20), (12, 28)])
@@ -109,15 +93,6 @@ def test_images_see_those_of_their_sphere_and_no_others() -> None:
         assert not torch.allclose(fewer, together[:2], rtol=0, atol=1e-5)
 
 
-def test_one_image_alone_is_left_as_it_is() -> None:
-    context, images = small_context().eval(), torch.randn(3, 3, 16, 16)
-    with torch.no_grad():
-        expected = context.network(images)
-        assert torch.equal(context(images), expected)
-        assert torch.equal(context(images, lone_rays(images, 120.0)), expected)
-        assert not torch.allclose(context(images, sphere_rays(3)), expected, rtol=0, atol=1e-3)
-
-
 def test_what_is_trained_on_photos_is_the_same_on_spheres() -> None:
     """The way from photos to panoramas: the context has learned nothing, and changes nothing."""
     torch.manual_seed(0)
@@ -133,6 +108,11 @@ def test_what_is_trained_on_photos_is_the_same_on_spheres() -> None:
         expected = context.eval().network(images)
         torch.testing.assert_close(context(images, rays), expected, rtol=0, atol=0)
         assert not torch.allclose(before.eval()(images), expected)
+        awake(context.mixer)
+        assert torch.equal(context(images), expected), "without rays there is no context"
+        lone = rays.reshape(5, 1, 3, 3)
+        assert torch.equal(context(images, lone), expected), "nor for an image alone"
+        assert not torch.allclose(context(images, rays), expected, rtol=0, atol=1e-5)
 
 
 def test_mirrored_images_give_mirrored_scores() -> None:
@@ -148,41 +128,37 @@ def test_mirrored_images_give_mirrored_scores() -> None:
         assert not torch.allclose(context(images.flip(-1), rays).flip(-1), scores, atol=1e-3)
 
 
-def test_results_keep_their_names() -> None:
-    context = small_context(_Named()).eval()
-    images, rays = torch.randn(4, 3, 16, 16), sphere_rays(4)
-    with torch.no_grad():
-        whole, parts = context(images, rays), context(images, rays, 3)
-    assert list(whole) == list(parts) == ["out", "aux"]
-    torch.testing.assert_close(dict(whole), dict(parts))
+@pytest.mark.parametrize("dim", [None, 15])
+def test_tokens_of_single_pixels_look_along_the_grid(dim: int | None) -> None:
+    rotation = random_rotation(np.random.default_rng(0))
+    grid = TangentGrid(0, 4, dim, rotation)
+    found = token_directions(tangent_rays(grid)[None], grid.dim, grid.dim)
+    expected = torch.tensor(grid.directions()).movedim(-1, 1)[None]
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
 
 
-def test_copies_are_on_their_own() -> None:
-    context, images, rays = small_context().eval(), torch.randn(2, 3, 16, 16), sphere_rays(2)
-    expected = context(images, rays)
-    copies: list[Any] = [copy.deepcopy(context), pickle.loads(pickle.dumps(context))]
-    assert copy.deepcopy(context).to("meta")(images.to("meta"), rays.to("meta")).shape == (
-        2,
-        4,
-        16,
-        16,
-    )
-    awake(context)
-    for other in copies:
-        torch.testing.assert_close(other(images, rays), expected)
-        assert len(other.network.downs[1]._forward_hooks) == 1
+def test_tokens_of_several_pixels_look_along_their_middle() -> None:
+    grid = TangentGrid(0, 4)
+    pixels = torch.tensor(grid.directions()).movedim(-1, 1)
+    along = (pixels * torch.tensor(grid.centers_xyz)[..., None, None]).sum(1, keepdim=True)
+    found = token_directions(tangent_rays(grid)[None], 4, 2)
+    middle = functional.normalize(functional.adaptive_avg_pool2d(pixels / along, (4, 2)), dim=1)
+    torch.testing.assert_close(found[0], middle, rtol=0, atol=1e-12)
 
 
-def test_the_network_by_itself_is_as_before() -> None:
-    network = small_unet().eval()
-    images = torch.randn(2, 3, 16, 16)
-    expected = network(images)
+def test_copies_are_on_their_own_and_the_network_by_itself_is_as_before() -> None:
+    network, images, rays = small_unet().eval(), torch.randn(2, 3, 16, 16), sphere_rays(2)
+    plain = network(images)
     context = small_context(network).eval()
-    assert not torch.allclose(context(images, sphere_rays(2)), expected, atol=1e-3)
-    assert torch.equal(network(images), expected)
+    expected = context(images, rays)
+    assert not torch.allclose(expected, plain, atol=1e-3)
+    assert torch.equal(network(images), plain)
     with pytest.raises(SettingError, match="multiples of 4"):
-        context(torch.zeros(2, 3, 6, 6))
-    assert torch.equal(network(images), expected), "nothing is left behind by an error"
+        context(torch.zeros(2, 3, 6, 6), rays)
+    assert torch.equal(network(images), plain), "nothing is left behind by an error"
+    other = copy.deepcopy(context)
+    awake(context)
+    torch.testing.assert_close(other(images, rays), expected)
 
 
 def test_half_precision() -> None:
@@ -193,20 +169,6 @@ def test_half_precision() -> None:
         with torch.autocast("cpu", torch.bfloat16):
             for found in (context(images, rays), context(images, rays, 3)):
                 torch.testing.assert_close(found.float(), expected, rtol=0.1, atol=0.1)
-
-
-def test_fcn_resnet() -> None:
-    torch.manual_seed(0)
-    network = FCNResNet(3, 5, 50).eval()
-    images = torch.randn(3, 3, 40, 40)
-    with torch.no_grad():
-        expected = network(images)
-        context = SphereContext(network, "backbone.layer4", ATTENTION, in_channels=3).eval()
-        assert torch.equal(context(images, sphere_rays(3)), expected)
-        awake(context.mixer, 0.05)
-        scores = context(images, sphere_rays(3))
-        torch.testing.assert_close(context(images, sphere_rays(3), 2), scores, rtol=1e-3, atol=1e-4)
-    assert not torch.allclose(scores, expected, atol=1e-3)
 
 
 class Averaging(nn.Module):
@@ -229,55 +191,11 @@ def test_any_mixer_can_be_chosen() -> None:
     with torch.no_grad():
         scores = context(images, rays)
         torch.testing.assert_close(context(images, rays, 3), scores, rtol=1e-4, atol=1e-5)
-    assert scores.shape == (4, 4, 16, 16)
 
 
-@pytest.mark.slow
-def test_it_can_be_compiled() -> None:
-    """In a process where arguments are not checked, which compilers cannot see through."""
-    program = """
-import torch
-from tests.models.sphere_networks import small_context, sphere_rays
-context, images, rays = small_context(), torch.randn(4, 3, 16, 16), sphere_rays(4)
-calls = [(images,), (images, rays), (images, rays, 3)]
-expected = [context.eval()(*call) for call in calls]
-context.compile(backend="aot_eager")
-torch.testing.assert_close([context(*call) for call in calls], expected)
-context.train()
-for call in calls:
-    context.zero_grad()
-    context(*call).square().sum().backward()
-    assert all(parameter.grad is not None for parameter in context.parameters())
-print("the same")
-"""
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=False
-    )
-    assert done.stdout == "the same\n", done.stderr
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"tokens": 0}, r"network\.tokens: found 0"),
-        ({"fov_deg": 180.0}, r"network\.fov_deg: found 180"),
-        ({"in_channels": None}, r"network\.channels: found null"),
-    ],
-)
-def test_impossible_settings_are_refused(settings: dict[str, Any], message: str) -> None:
-    with pytest.raises(SettingError, match=message):
-        small_context(**settings)
-
-
-def test_rays_must_fit_and_the_stage_must_run() -> None:
-    context = small_context()
+def test_impossible_settings_are_refused() -> None:
+    wrong: Any = {"tokens": 0}
+    with pytest.raises(SettingError, match=r"network\.tokens: found 0"):
+        small_context(**wrong)
     with pytest.raises(SettingError, match=r"rays: found 2 spheres of 3 images; .* of 4 images"):
-        context(torch.zeros(4, 3, 16, 16), sphere_rays(3, 2))
-    with pytest.raises(SettingError, match="found one with a SphereContext"):
-        SphereContext(context, f"network.{STAGE}", ATTENTION, 3, 8)
-    unused = UNet(3, 4, (4, 6, 8))
-    unused.spare = nn.Conv2d(3, 4, 1)
-    lost = SphereContext(unused, "spare", ATTENTION, channels=4)
-    for chunk in (None, 1):
-        with pytest.raises(SettingError, match="found spare, which the network does not run"):
-            lost(torch.zeros(2, 3, 16, 16), images_per_chunk=chunk)
+        small_context()(torch.zeros(4, 3, 16, 16), sphere_rays(3, 2))

@@ -1,15 +1,19 @@
-"""Which stages there are, and how many channels they have."""
+"""Stages inside networks, and the auxiliary head at one of them."""
 
 from __future__ import annotations
+
+import copy
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor, nn
 from torchvision.models.segmentation import deeplabv3_mobilenet_v3_large
 
-from models import FCNResNet, HexUNet, UNet
+from models import AuxiliaryHead, FCNResNet, HexUNet, UNet
 from models.stages import stage_channels
 from tangent_train.errors import SettingError
+from tests.models.sphere_networks import STAGE, awake, small_context, small_unet
 
 
 class _Looking(nn.Sequential):
@@ -39,70 +43,75 @@ class _Twice(nn.Module):
     ("network", "stage", "in_channels", "channels"),
     [
         (UNet(4, 14), "downs.4", 4, 256),
-        (UNet(4, 14), "downs.0.1", 4, 32),
-        (UNet(4, 14, [4] * 8), "stem", 4, 4),
         (FCNResNet(3, 5, 50), "backbone.layer4", 3, 2048),
         (HexUNet(3, 5), "encoders.1", 3, 64),
-        (
-            deeplabv3_mobilenet_v3_large(weights=None, weights_backbone=None),
-            "backbone.16",
-            3,
-            960,
-        ),
+        (deeplabv3_mobilenet_v3_large(weights=None, weights_backbone=None), "backbone.16", 3, 960),
         (_Looking(nn.Conv2d(3, 6, 1), nn.Conv2d(6, 2, 1)), "0", 3, 6),
     ],
-    ids=["unet", "deep", "eight", "fcn", "hexunet", "deeplab", "looking"],
+    ids=["unet", "fcn", "hexunet", "deeplab", "looking"],
 )
-def test_channels_are_found_by_running_it(
+def test_channels_are_found_by_running_a_copy(
     network: nn.Module, stage: str, in_channels: int, channels: int
 ) -> None:
     before = {name: tensor.clone() for name, tensor in network.state_dict().items()}
-    hooks = sum(len(module._forward_hooks) for module in network.modules())
     assert stage_channels(network, stage, in_channels) == channels
-    assert stage_channels(network, stage, None, channels) == channels
     assert network.training
-    assert sum(len(module._forward_hooks) for module in network.modules()) == hooks
+    assert not any(module._forward_hooks for module in network.modules())
     torch.testing.assert_close(network.state_dict(), before, rtol=0, atol=0)
 
 
 @pytest.mark.parametrize(
-    ("stage", "in_channels", "channels", "message"),
+    ("network", "stage"),
     [
-        (
-            "downs.9",
-            3,
-            None,
-            r"stage: found 'downs\.9', which is no part; expected a stage of UNet: "
-            r"stem, downs\.0, downs\.1, ups\.0, ups\.1, head\.$",
-        ),
-        ("", 3, None, "found '', which is no part"),
-        ("downs", 3, None, "found 'downs', which does not give one map of features once"),
-        ("downs.9", None, 8, r"a stage of UNet: stem, downs, downs\.0"),
-        ("downs.1", None, None, r"channels: found null; .* features at downs\.1 have"),
-        ("downs.1", 3, 9, r"channels: found 9; expected null, or 8"),
+        (small_unet(), "downs.9"),
+        (small_unet(), "downs"),
+        (_Twice(), "shared"),
+        (_Twice(), "pool"),
     ],
 )
-def test_what_is_no_stage_is_refused(
-    stage: str, in_channels: int | None, channels: int | None, message: str
+def test_what_is_no_stage_is_refused_and_those_there_are_named(
+    network: nn.Module, stage: str
 ) -> None:
+    names = "stem, downs, downs.0, downs.1" if stage.startswith("downs") else "shared, last"
+    message = rf"stage: found '{stage}' of {type(network).__name__}; expected .* There are: {names}"
     with pytest.raises(SettingError, match=message):
-        stage_channels(UNet(3, 4, (4, 6, 8)), stage, in_channels, channels)
+        stage_channels(network, stage, 3)
 
 
-@pytest.mark.parametrize("stage", ["shared", "pool"])
-def test_stages_without_one_map_of_features_are_refused(stage: str) -> None:
-    with pytest.raises(SettingError, match=r"does not give one map of features once.*: last"):
-        stage_channels(_Twice(), stage, 3)
+def _seen(module: nn.Module) -> list[Tensor]:
+    """Collects what a module is given."""
+    inputs: list[Tensor] = []
+    module.register_forward_pre_hook(lambda _module, given: inputs.append(given[0]))
+    return inputs
 
 
-def test_a_network_of_one_size_must_be_told() -> None:
-    class OneSize(nn.Sequential):
-        def forward(self, images: Tensor) -> Tensor:
-            assert images.shape[-2:] == (24, 40)
-            result: Tensor = super().forward(images)  # type: ignore[no-untyped-call]
-            return result
+def test_the_auxiliary_head_scores_the_stage_in_training_only() -> None:
+    network, images = small_unet(), torch.randn(2, 3, 16, 20)
+    module = AuxiliaryHead(network, STAGE, in_channels=3, num_classes=4)
+    features = _seen(network.ups[0])
+    outputs = module.train()(images)
+    assert list(outputs) == ["out", "aux"]
+    assert outputs["out"].shape == (2, 4, 16, 20)
+    weight, bias = module.auxiliary_head.parameters()
+    expected = torch.einsum("kc,nchw->nkhw", weight[:, :, 0, 0], features[0])
+    torch.testing.assert_close(outputs["aux"], expected + bias[:, None, None])
+    outputs["aux"].square().sum().backward(retain_graph=True)
+    grads = {n: p.grad is not None for n, p in module.named_parameters()}
+    assert all(grads[n] == ("ups" not in n and "network.head" not in n) for n in grads)
+    inputs = _seen(module.auxiliary_head)
+    assert torch.equal(module.eval()(images), network.eval()(images))
+    assert not inputs, "it costs nothing in evaluation"
 
-    network = OneSize(nn.Conv2d(3, 6, 1))
-    assert stage_channels(network, "0", 3, 6) == 6
-    with pytest.raises(SettingError, match=r"only found out .* 64×64 or 224×224 or 896×896"):
-        stage_channels(network, "0", 3)
+
+def test_copies_of_the_auxiliary_head_are_on_their_own() -> None:
+    module = AuxiliaryHead(small_unet(), STAGE, in_channels=3, num_classes=4)
+    other, images = copy.deepcopy(module), torch.randn(2, 3, 16, 16)
+    awake(module.auxiliary_head)
+    torch.testing.assert_close(other(images)["out"], module(images)["out"])
+    assert not torch.allclose(other(images)["aux"], module(images)["aux"])
+
+
+def test_context_inside_an_auxiliary_head_would_see_no_rays() -> None:
+    context: Any = small_context()
+    with pytest.raises(SettingError, match=r"network\.network: found SphereContext"):
+        AuxiliaryHead(context, f"network.{STAGE}", 3, 4)

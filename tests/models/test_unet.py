@@ -1,34 +1,45 @@
+"""The paper's two UNets, and what importing a network imports."""
+
 from __future__ import annotations
 
+import subprocess
+import sys
 from typing import Any
 
 import pytest
 import torch
 from torch import nn
 
-from models import UNet
-from models.residual import Down
+import models
+from models import HexUNet, UNet
+from models.unet import Down
 from tangent_train.errors import SettingError
 
 
 @pytest.mark.parametrize(
-    ("in_channels", "num_classes", "parameters"),
-    [(4, 14, 2_896_654), (3, 14, 2_896_654 - 9 * 16), (4, 13, 2_896_654 - 9 * 16 - 1)],
+    ("network", "parameters"),
+    [
+        (UNet(4, 14), 2_896_654),
+        (UNet(3, 13), 2_896_654 - 9 * 16 - 9 * 16 - 1),
+        (HexUNet(3, 14), 7_248_718),
+        (HexUNet(4, 14), 7_248_718 + 9 * 32),
+    ],
 )
-def test_parameters_are_those_of_the_released_code(
-    in_channels: int, num_classes: int, parameters: int
-) -> None:
-    network = UNet(in_channels, num_classes)
+def test_parameters_are_those_of_the_released_code(network: nn.Module, parameters: int) -> None:
     assert sum(p.numel() for p in network.parameters() if p.requires_grad) == parameters
 
 
-@pytest.mark.parametrize("size", [(32, 32), (64, 96)])
-def test_scores_have_the_size_of_the_images(size: tuple[int, int]) -> None:
-    scores = UNet(3, 5, (4, 8, 8, 8, 8, 8))(torch.zeros(2, 3, *size))
-    assert scores.shape == (2, 5, *size)
+def test_convolutions_of_the_hexunet_are_those_of_the_paper_in_order() -> None:
+    convolutions = [m for m in HexUNet(3, 14).modules() if isinstance(m, nn.Conv2d)]
+    layers = [(m.in_channels, m.out_channels, m.kernel_size[0]) for m in convolutions]
+    encoders = [(3, 32), (32, 32), (32, 64), (64, 64), (64, 128), (128, 128), (128, 256)]
+    expected = [(*channels, 3) for channels in (*encoders, (256, 256))]
+    for below, neck, out in ((256, 512, 256), (512, 256, 128), (256, 128, 64), (128, 64, 32)):
+        expected += [(below, neck, 3), (neck, neck, 3), (neck, out, 1)]
+    assert layers == [*expected, (64, 32, 3), (32, 32, 3), (32, 14, 3)]
 
 
-def test_averaging_first_equals_halving_after_the_first_convolution() -> None:
+def test_pooling_first_equals_halving_after_the_first_convolution() -> None:
     down = Down(6, 10).eval()
     x = torch.randn(2, 6, 8, 12)
     residual: Any = down[1]
@@ -45,28 +56,54 @@ def test_averaging_first_equals_halving_after_the_first_convolution() -> None:
     torch.testing.assert_close(down(x), expected)
 
 
-def test_channels_last_gives_the_same_scores() -> None:
-    network = UNet(4, 14, (8, 16, 32, 32)).eval()
-    images = torch.randn(3, 4, 24, 40)
-    expected = network(images)
-    network.to(memory_format=torch.channels_last)
-    torch.testing.assert_close(
-        network(images.to(memory_format=torch.channels_last)), expected, atol=1e-5, rtol=1e-4
-    )
+def test_skip_connections_carry_what_pooling_removes() -> None:
+    """Changing one pixel by little changes its own score although every maximum stays."""
+    network = HexUNet(3, 2).eval()
+    images = torch.rand(1, 3, 32, 32, requires_grad=True)
+    network(images)[0, 0, 9, 9].backward()
+    assert images.grad is not None
+    assert images.grad[0, :, 9, 9].abs().min() > 0
+    assert (images.grad[0, :, 5:14, 5:14] != 0).all(), "the head sees 9×9 pixels at least"
 
 
-def test_every_parameter_gets_a_gradient() -> None:
-    network = UNet(3, 4, (4, 6, 8))
-    network(torch.randn(2, 3, 16, 16)).square().sum().backward()
+@pytest.mark.parametrize("network", [UNet(3, 5, (4, 6, 8)), HexUNet(3, 5)])
+def test_scores_have_the_size_of_the_images_and_every_parameter_learns(network: nn.Module) -> None:
+    scores = network(torch.randn(2, 3, 16, 48))
+    assert scores.shape == (2, 5, 16, 48)
+    scores.square().sum().backward()
     assert all(p.grad is not None for p in network.parameters())
+    network.eval()
+    images = torch.randn(2, 3, 16, 32)
+    expected = network(images)
+    last = network.to(memory_format=torch.channels_last)(images)
+    torch.testing.assert_close(last, expected, atol=1e-5, rtol=1e-4)
 
 
 def test_a_side_that_does_not_fit_is_refused() -> None:
     with pytest.raises(SettingError, match=r"48×64; expected sides that are multiples of 32"):
         UNet(3, 4)(torch.zeros(1, 3, 48, 64))
+    with pytest.raises(SettingError, match=r"HexUNet: found 24×32; .* multiples of 16"):
+        HexUNet(3, 4)(torch.zeros(1, 3, 24, 32))
 
 
-@pytest.mark.parametrize("widths", [(16,), (), (16, 0)])
-def test_impossible_widths_are_refused(widths: tuple[int, ...]) -> None:
-    with pytest.raises(SettingError, match="UNet widths"):
-        UNet(3, 4, widths)
+def test_importing_a_network_imports_its_own_file() -> None:
+    program = "import sys, models.unet; print(*(n for n in sys.modules if n[:4] in {}))"
+    done = subprocess.run(
+        [sys.executable, "-c", program.format("('mode', 'tang', 'data')")],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert {name for name in done.stdout.split() if name.partition(".")[0] != "dataclasses"} == {
+        "models",
+        "models.unet",
+        "tangent_train",
+        "tangent_train.errors",
+        "tangent_train.registry",
+    }
+
+
+def test_all_names_are_there() -> None:
+    assert all(callable(getattr(models, name)) for name in models.__all__)
+    with pytest.raises(AttributeError, match="no attribute 'Nothing'"):
+        models.Nothing  # noqa: B018 - looked up, that is all

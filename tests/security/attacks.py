@@ -22,7 +22,7 @@ _NAMES = (
     "torch.utils.collect_env.run",
     "torch.load",
     "builtins.eval",
-    "models.initialize",
+    "models.fine_tuning",
     "models.fcn_resnet.torch.hub.load",
     "tangent_train.files.write_text",
     "datamodules.__builtins__",

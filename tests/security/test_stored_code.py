@@ -26,7 +26,6 @@ from torch import nn
 
 from datamodules.core.samples import Input
 from models import initialize
-from models.initialize import origins_table
 from tangent_train import registry
 from tangent_train.callbacks.checkpoints import AtomicCheckpointIO, best_checkpoint
 from tangent_train.checkpoints.content import INPUTS, read_checkpoint, read_settings
@@ -516,7 +515,7 @@ def test_terminals_get_no_commands(content: dict[str, Any], run: Path, tmp_path:
     names = {"[/nope][link=x]" + evil: torch.zeros(1), **network.state_dict()}
     torch.save(names, path)
     console = Console(record=True, width=200, force_terminal=True)
-    console.print(origins_table(initialize(network, path), path))
+    console.print(str(initialize(network, path)), markup=False)
     shown = console.export_text()
     assert "[/nope][link=x]a.b" in shown
     assert "\x07" not in shown

@@ -1,0 +1,171 @@
+"""Starting a network from the trained tensors of another one."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from torch import Tensor, nn
+
+from models.pretrained import read_tensors
+from models.stem import first_convolution, select_channels
+from tangent_train.errors import DataError, SettingError, printable
+
+__all__ = ["Origins", "initialize"]
+
+_LISTED = 8
+
+
+class Origins(NamedTuple):
+    """Where the tensors of a network come from.
+
+    Attributes:
+        loaded: Names of those taken unchanged.
+        adapted: Names of those changed to fit, and how.
+        fresh: Names of those left as they were, and why.
+        unused: Names in the file that the network does not have.
+        share: Fraction of the network's numbers that came from the file.
+    """
+
+    loaded: tuple[str, ...]
+    adapted: dict[str, str]
+    fresh: dict[str, str]
+    unused: tuple[str, ...]
+    share: float
+
+    def __str__(self) -> str:
+        """A few lines for the terminal."""
+        lines = [f"loaded: {len(self.loaded)} tensors, {self.share:.0%} of the network's numbers"]
+        for kind, reasons in (("adapted", self.adapted), ("untrained", self.fresh)):
+            lines += [f"{kind}: {len(reasons)}"] * bool(reasons)
+            lines += _some([f"  {name}: {reason}" for name, reason in reasons.items()])
+        lines += [f"not used: {len(self.unused)}"] * bool(self.unused)
+        lines += _some([f"  {name}" for name in self.unused])
+        return printable("\n".join(lines))
+
+
+def initialize(
+    network: nn.Module,
+    path: Path | str,
+    channels: tuple[Sequence[str], Sequence[str]] | None = None,
+) -> Origins:
+    """Load what fits from a checkpoint, a state dict or a safetensors file, in place.
+
+    Names are compared without the prefix that most of the file's (``module.``, ``model.net.``, …)
+    or the network's have, and without ``network.``, so tensors move into and out of modules that
+    wrap a network, as `SphereContext` and `AuxiliaryHead` do. Filters of the first convolution for
+    input channels that the file does not know start at zero (paper, supplement, "Level 10
+    parameters"), so RGB-D begins as RGB. Other tensors of another shape stay as they are: the last
+    layer, for another number of classes.
+
+    Args:
+        network: Changed in place.
+        path: The file, of which nothing but tensors and plain values is read.
+        channels: Names of the input channels of the file's network and of this one; filters of the
+            first convolution are matched by them. By default they are matched by position.
+
+    Raises:
+        DataError: The file cannot be read, or nothing in it fits.
+    """
+    path = Path(path)
+    own = network.state_dict()
+    found = _renamed(read_tensors(path), own)
+    stem = _stem(network)
+    loaded: dict[str, Tensor] = {}
+    adapted: dict[str, str] = {}
+    fresh: dict[str, str] = {}
+    for name, tensor in own.items():
+        given = found.get(name)
+        if given is None:
+            fresh[name] = "not in the file"
+        elif name == stem and _is_stem_of(given, tensor):
+            before, now = _channel_names(given, tensor, channels)
+            loaded[name], changes = _by_channel(given, before, now)
+            if changes:
+                adapted[name] = changes
+        elif given.shape == tensor.shape:
+            loaded[name] = given
+        else:
+            fresh[name] = f"{tuple(given.shape)} in the file, {tuple(tensor.shape)} here"
+    if not any(name in loaded for name, _ in network.named_parameters()):
+        raise DataError(
+            path,
+            found="no tensor that fits" + (f", but {next(iter(found))}" if found else ""),
+            expected=f"tensors of {type(network).__name__}, {next(iter(own))} for one",
+            remedy="Is it a checkpoint of the same network, with the same settings?",
+        )
+    network.load_state_dict({**own, **loaded})
+    return Origins(
+        loaded=tuple(name for name in loaded if name not in adapted),
+        adapted=adapted,
+        fresh=fresh,
+        unused=tuple(name for name in found if name not in own),
+        share=sum(t.numel() for t in loaded.values()) / sum(t.numel() for t in own.values()),
+    )
+
+
+def _stem(network: nn.Module) -> str | None:
+    """The name of the weight of the first convolution."""
+    try:
+        return f"{first_convolution(network)[0]}.weight".removeprefix(".")
+    except SettingError:
+        return None
+
+
+def _is_stem_of(given: Tensor, wanted: Tensor) -> bool:
+    return given.ndim == wanted.ndim and given[:, 0].shape == wanted[:, 0].shape
+
+
+def _channel_names(
+    given: Tensor, wanted: Tensor, channels: tuple[Sequence[str], Sequence[str]] | None
+) -> tuple[Sequence[str], Sequence[str]]:
+    counts = (given.shape[1], wanted.shape[1])
+    if channels is None or counts != (len(channels[0]), len(channels[1])):
+        numbered = [f"channel {k}" for k in range(max(counts))]
+        return numbered[: counts[0]], numbered[: counts[1]]
+    return channels
+
+
+def _by_channel(given: Tensor, before: Sequence[str], now: Sequence[str]) -> tuple[Tensor, str]:
+    """Filters for the channels wanted, and what has changed."""
+    new = ", ".join(name for name in now if name not in before)
+    lost = ", ".join(name for name in before if name not in now)
+    notes = [f"starts at zero: {new}"] * bool(new) + [f"left out: {lost}"] * bool(lost)
+    places = [before.index(name) if name in before else None for name in now]
+    return select_channels(given, places), "; ".join(notes)
+
+
+def _renamed(tensors: Mapping[str, Tensor], own: Iterable[str]) -> dict[str, Tensor]:
+    """The tensors by the network's names, whatever modules wrap the network here and there."""
+    inner_own = {_inner(name): name for name in own}
+    inner = {_inner(name): tensor for name, tensor in tensors.items()}
+    outside, inside = _prefix(inner, inner_own), _prefix(inner_own, inner)
+    renamed = {}
+    for name, tensor in inner.items():
+        if name.startswith(outside):
+            place = inside + name.removeprefix(outside)
+            renamed[inner_own.get(place, place)] = tensor
+    return renamed
+
+
+def _inner(name: str) -> str:
+    """The name without the attributes by which modules of this package hold a network."""
+    return ".".join(part for part in name.split(".") if part != "network")
+
+
+def _prefix(names: Iterable[str], ends: Mapping[str, object]) -> str:
+    """The commonest prefix, of equally common ones the shortest, before one of these ends."""
+    counts: Counter[str] = Counter()
+    for name in names:
+        parts = name.split(".")
+        for k in range(len(parts)):
+            if ".".join(parts[k:]) in ends:
+                counts["".join(f"{part}." for part in parts[:k])] += 1
+    return min(counts, key=lambda prefix: (-counts[prefix], len(prefix)), default="")
+
+
+def _some(lines: list[str]) -> list[str]:
+    more = len(lines) - _LISTED
+    return lines[:_LISTED] + ([f"  and {more} more"] if more > 0 else [])
