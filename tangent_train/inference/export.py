@@ -1,189 +1,220 @@
-"""Writing a trained network for other programs, and proving that it computes the same."""
+"""A trained network as a file for other programs, verified against PyTorch."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import io
+import logging
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
-from typing import NamedTuple, get_args
+from typing import Any, NamedTuple
 
 import torch
-from torch import nn
+from safetensors.torch import save_file
+from torch import Tensor
 
-from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
+from tangent_train.checkpoints.trained import (
+    METADATA_KEY,
+    TrainedNetwork,
+    load_trained,
+    metadata_json,
+)
 from tangent_train.errors import SettingError
 from tangent_train.files import atomic_path
-from tangent_train.inference.export_formats import WRITE, Format, Plan, random_images
 
-__all__ = ["SUFFIXES", "TOLERANCE", "Export", "Format", "export_network"]
+__all__ = ["SUFFIXES", "TOLERANCE", "Export", "export_network"]
 
-SUFFIXES: dict[Format, str] = {"onnx": ".onnx", "safetensors": ".safetensors"}
-"""What the names of the files end with; `load_trained` goes by it."""
+SUFFIXES = (".onnx", ".safetensors")
 
 TOLERANCE = 1e-4
-"""Largest difference to PyTorch, as a share of the range of its scores."""
-
-_PROTOBUF_BYTES = 2**31
-"""What a single ONNX file can hold."""
+"""Largest difference between the file's scores and PyTorch's, relative to their range."""
 
 _BATCHES = (1, 3)
-"""Images at once when the written file is compared; what is traced has two."""
+"""Batch sizes that are compared; the one that is traced is 2."""
+
+_LEAST_TRACED = 32
 
 
 class Export(NamedTuple):
     """What was written.
 
     Attributes:
-        trained: The network as the file gives it back: with its `fixed_size`.
-        difference: Largest difference between a score of the file and PyTorch's.
-        share: The same as a share of the range of PyTorch's scores.
+        trained: The network as the file gives it back.
+        difference: Largest difference between its scores and PyTorch's, relative to their range.
     """
 
     trained: TrainedNetwork
     difference: float
-    share: float
 
 
 class _DifferenceError(Exception):
-    """What a file computes is not what the network computes."""
+    """The file does not compute what the network computes."""
 
 
 def export_network(
     trained: TrainedNetwork,
     path: Path,
-    form: Format,
     *,
     image_size: tuple[int, int] | None = None,
     opset: int | None = None,
 ) -> Export:
     """Write a network, read it again and compare it with PyTorch on random images.
 
-    Batches may have any length. Height and width may be any multiple of the network's stride where
-    the exporter can express that; where it cannot, only the trained size, and the file says so.
+    The batch size is dynamic. Height and width are too (multiples of the network's stride) where
+    the exporter can express that, else they are those of the training, and the file says so.
 
     Args:
         trained: The network; of a checkpoint or of a safetensors file.
-        path: The file, with the suffix of the format. It appears when all is well, else not at all.
-        form: ``onnx``: the computation, for onnxruntime and others. ``safetensors``: the tensors,
-            and the settings of the network that takes them.
-        image_size: The only rows and columns to write it for; of ONNX.
-        opset: Version of ONNX's operators; default the exporter's own.
+        path: The file: ``.onnx``, the computation, for onnxruntime and others; or
+            ``.safetensors``, the tensors, with the settings of the network that takes them. It
+            appears when it has been verified, else not at all.
+        image_size: The only rows and columns to write an ONNX file for.
+        opset: Version of ONNX's operators; the exporter's default.
 
     Raises:
-        SettingError: A setting does not fit the format, the network cannot be exported, or the file
-            does not compute the same: scores differ by more than `TOLERANCE` of their range.
+        SettingError: A setting does not fit the format, the network cannot be exported, or the
+            scores differ by more than `TOLERANCE` of their range.
     """
-    _check(trained, path, form, image_size, opset)
-    only = image_size or trained.fixed_size
-    write = WRITE[form]
-    if only is None and form != "safetensors":
+    suffix = path.suffix.lower()
+    _check(trained, path, image_size, opset)
+    sizes = [image_size or trained.fixed_size]
+    if suffix == ".onnx" and sizes == [None]:
+        sizes.append(trained.image_size)
+    failure: Exception | None = None
+    for size in sizes:
+        planned = replace(trained, fixed_size=size)
         try:
-            return _written(write, Plan(trained, None, opset), path)
+            with atomic_path(path) as temporary:
+                if suffix == ".onnx":
+                    _write_onnx(planned, temporary, opset)
+                else:
+                    _write_safetensors(planned, temporary)
+                return _verified(planned, temporary)
         except (SettingError, OSError):
             raise
-        except Exception:  # whatever the exporter cannot do with sizes that are left open
-            only = trained.image_size
-    try:
-        return _written(write, Plan(trained, only, opset), path)
-    except (SettingError, OSError):
-        raise
-    except Exception as error:
-        raise _refused(form, error) from error
-
-
-def _written(write: Callable[[Plan, Path], None], plan: Plan, path: Path) -> Export:
-    with atomic_path(path) as temporary:
-        write(plan, temporary)
-        return _compared(plan, temporary)
+        except Exception as error:  # whatever the exporter cannot do with dynamic sizes
+            failure = error
+    cause: BaseException | None = failure
+    while cause is not None and cause.__cause__ is not None:
+        cause = cause.__cause__
+    raise SettingError(
+        "output",
+        found=f"{path.name}, which cannot be written ({str(cause).strip().partition(chr(10))[0]})",
+        expected="a network that the exporter of torch understands",
+        remedy="A .safetensors file takes every network.",
+    ) from failure
 
 
 def _check(
-    trained: TrainedNetwork,
-    path: Path,
-    form: Format,
-    image_size: tuple[int, int] | None,
-    opset: int | None,
+    trained: TrainedNetwork, path: Path, image_size: tuple[int, int] | None, opset: int | None
 ) -> None:
-    if form not in get_args(Format):
-        raise SettingError("format", found=repr(form), expected=", ".join(get_args(Format)))
-    if path.suffix.lower() != SUFFIXES[form]:
-        raise SettingError(
-            "output", found=path.name, expected=f"a name ending in {SUFFIXES[form]} for {form}"
-        )
+    if path.suffix.lower() not in SUFFIXES:
+        expected = f"a name ending in {' or '.join(SUFFIXES)}"
+        raise SettingError("output", found=path.name, expected=expected)
     if trained.settings is None:
         raise SettingError(
             "checkpoint",
             found="an exported network, of which only the computation is known",
             expected="a checkpoint of tangent-train, or a safetensors file",
         )
-    if opset is not None and form != "onnx":
-        raise SettingError("opset", found=opset, expected=f"null: {form} has none")
-    if image_size is not None:
-        _check_size(trained, form, image_size)
-    if form == "onnx":
-        _check_onnx(trained.network)
-
-
-def _check_size(trained: TrainedNetwork, form: Format, size: tuple[int, int]) -> None:
+    if path.suffix.lower() == ".safetensors" and (image_size, opset) != (None, None):
+        raise SettingError(
+            "image_size and opset", found=(image_size, opset), expected="null for .safetensors"
+        )
     step, fixed = trained.size_multiple, trained.fixed_size
-    if form == "safetensors":
-        raise SettingError("image_size", found=list(size), expected="null: tensors have none")
-    if any(side < 1 or side % step for side in size) or (fixed and size != fixed):
+    if image_size is not None and (
+        any(side < 1 or side % step for side in image_size) or fixed not in (None, image_size)
+    ):
         raise SettingError(
             "image_size",
-            found=list(size),
+            found=list(image_size),
             expected=f"{list(fixed)}" if fixed else f"[height, width], multiples of {step}",
         )
 
 
-def _check_onnx(network: nn.Module) -> None:
-    size = sum(t.numel() * t.element_size() for t in network.state_dict().values())
-    if size >= _PROTOBUF_BYTES:
+def _write_onnx(trained: TrainedNetwork, path: Path, opset: int | None) -> None:
+    missing = [name for name in ("onnx", "onnxruntime", "onnxscript") if not find_spec(name)]
+    if missing:
         raise SettingError(
-            "format=onnx",
-            found=f"a network of {size / 2**30:.1f} GiB",
-            expected="less than 2 GiB, what one ONNX file can hold",
-            remedy="Use format=safetensors.",
+            f"output={path.suffix}",
+            found=f"no package {missing[0]}",
+            expected="the packages for ONNX",
+            remedy="Run: pip install 'tangent-train[export]'",
         )
+    step, size = trained.size_multiple, trained.fixed_size
+    shape: dict[int, Any] = {0: torch.export.Dim("batch")}
+    if size is None:
+        shape |= {2: step * torch.export.Dim("h"), 3: step * torch.export.Dim("w")}
+        least = -(-_LEAST_TRACED // step)
+        size = step * max(3, least), step * max(4, least + 1)  # no two dimensions are equal
+    with _quiet_exporter():
+        program: Any = torch.onnx.export(
+            trained.network,
+            (_random_images(trained, 2, size),),
+            dynamo=True,
+            input_names=["images"],
+            output_names=["scores"],
+            dynamic_shapes=(shape,),
+            opset_version=opset,
+            verbose=False,
+        )
+    written = program.model.opset_imports[""]
+    if opset not in (None, written):
+        raise SettingError("opset", found=opset, expected=f"{written} for this network")
+    program.model.metadata_props[METADATA_KEY] = metadata_json(replace(trained, settings=None))
+    program.save(path, external_data=False)
+
+
+@contextmanager
+def _quiet_exporter() -> Iterator[None]:
+    """Hide the exporter's notes to its developers: what it writes is verified anyway."""
+    disabled = logging.root.manager.disable
+    logging.disable()
+    try:
+        silent = io.StringIO()
+        with warnings.catch_warnings(), redirect_stdout(silent), redirect_stderr(silent):
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logging.disable(disabled)
+
+
+def _write_safetensors(trained: TrainedNetwork, path: Path) -> None:
+    network: Any = trained.network
+    # Copies: the format knows neither tensors that share memory nor other memory formats.
+    tensors = {n: t.contiguous().clone() for n, t in network.network.state_dict().items()}
+    save_file(tensors, path, metadata={"format": "pt", METADATA_KEY: metadata_json(trained)})
+    path.chmod(0o644)  # it was replaced by one that only its owner may read
 
 
 @torch.no_grad()
-def _compared(plan: Plan, path: Path) -> Export:
-    """Read the file as any user does and compare; raises `_DifferenceError`."""
-    trained = plan.trained
+def _verified(trained: TrainedNetwork, path: Path) -> Export:
+    """Read the file as any user does and compare."""
     exported = load_trained(path, trained.trust)
-    difference = share = 0.0
-    for size in plan.compared_sizes:
+    rows, columns = trained.image_size
+    step = trained.size_multiple
+    rows, columns = (max(step, side // step * step) for side in (rows, columns))
+    sizes = [(rows, columns), (rows + step, columns + 2 * step)]
+    largest = 0.0
+    for size in sizes if trained.fixed_size is None else [trained.fixed_size]:
         for count in _BATCHES:
-            images = random_images(plan.trained, count, size)
-            expected, found = plan.trained.network(images), exported.network(images)
+            images = _random_images(trained, count, size)
+            expected, found = trained.network(images), exported.network(images)
             if found.shape != expected.shape:
                 raise _DifferenceError(f"scores {tuple(found.shape)}, not {tuple(expected.shape)}")
-            most = float((found - expected).abs().max())
             span = float(expected.max() - expected.min())
-            if not most <= TOLERANCE * span:  # so that NaN is refused too
+            difference = float((found - expected).abs().max())
+            if not difference <= TOLERANCE * span:  # so that NaN is refused too
                 raise _DifferenceError(
-                    f"scores that differ by {most:.2g} from PyTorch's, whose range is {span:.2g}"
+                    f"its scores differ from PyTorch's by {difference:.2g}, of {span:.2g}"
                 )
-            difference = max(difference, most)
-            share = max(share, most / span if span else 0.0)
-    return Export(exported, difference, share)
+            largest = max(largest, difference / span if span else 0.0)
+    return Export(exported, largest)
 
 
-def _refused(form: Format, error: Exception) -> SettingError:
-    if isinstance(error, _DifferenceError):
-        return SettingError(
-            f"format={form}",
-            found=str(error),
-            expected=f"the same, up to {TOLERANCE:g} of that range",
-            remedy="The file was not kept; try another format.",
-        )
-    cause: BaseException = error
-    while cause.__cause__ is not None:
-        cause = cause.__cause__
-    first_line = str(cause).strip().partition("\n")[0] or type(cause).__name__
-    return SettingError(
-        f"format={form}",
-        found=f"a network that cannot be exported ({first_line})",
-        expected="one that the exporter of torch understands",
-        remedy="format=safetensors takes every network.",
-    )
+def _random_images(trained: TrainedNetwork, count: int, size: tuple[int, int]) -> Tensor:
+    generator = torch.Generator().manual_seed(count)
+    return torch.randn(count, trained.in_channels, *size, generator=generator)
