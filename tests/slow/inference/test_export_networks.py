@@ -29,6 +29,13 @@ NETWORKS: dict[str, dict[str, Any]] = {
             "aux_loss": False,
         },
     },
+    "context, of which every image is alone": {
+        "_target_": "models.SphereContext",
+        "in_channels": 4,
+        "stage": "downs.1",
+        "mixer": {"_target_": "models.SphereAttention", "_partial_": True, "heads": 2},
+        "network": UNET,
+    },
     "smp": {
         "_target_": "segmentation_models_pytorch.Unet",
         "encoder_name": "resnet18",
