@@ -47,7 +47,7 @@ def evaluated(task: Any, noun: str) -> dict[str, Any]:
         noun: What was scored, in the plural.
     """
     if task.kind == "classification":
-        return classification_results(task.matrix, task.class_names, noun)
+        return classification_results(task.matrices, task.class_names, noun)
     return evaluation_results(task.matrices, task.class_names, task.absent_class, noun)
 
 

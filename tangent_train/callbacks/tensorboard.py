@@ -114,11 +114,11 @@ class ValidationConfusion(Callback):
             return
         task: Any = pl_module
         step = _step(trainer)
-        scores = classification_scores(task.matrix)
+        scores = classification_scores(task.matrices)
         for name, accuracy in zip(task.class_names, scores.of_class, strict=True):
             if not np.isnan(accuracy):
                 writer.add_scalar(f"val_accuracy/{name}", accuracy, step)
-        picture = confusion_picture(task.matrix, task.class_names, unknown=False)
+        picture = confusion_picture(task.matrices, task.class_names, unknown=False)
         writer.add_image("val/confusion", picture, step, dataformats="HWC")
 
 

@@ -23,6 +23,7 @@ from rich.console import Console
 
 from datamodules.core.samples import channel_names
 from models import initialize
+from tangent_train.callbacks.averaging import averaged_weights
 from tangent_train.callbacks.checkpoints import (
     AtomicCheckpointIO,
     CheckpointContents,
@@ -41,7 +42,6 @@ from tangent_train.errors import DataError, SettingError
 from tangent_train.files import write_text
 from tangent_train.registry import make
 from tangent_train.setting_rules import differing_settings, from_file
-from tangent_train.tasks.averaging import AveragedWeights
 
 __all__ = ["best_on_validation", "build", "evaluate", "prepare", "train"]
 
@@ -75,11 +75,12 @@ def train(settings: Settings, trust: Collection[str] | None = None) -> float | N
     write_settings(folder / "config.yaml", settings)
     last = LastCheckpoint(checkpoints, settings["checkpoint_every_n_steps"], _typed_local())
     callbacks = [last, LearningRateMonitor()]
-    if settings["ema"] is not None:
-        callbacks.append(AveragedWeights(settings["ema"]))
     if data.validation_fraction:
         callbacks.append(best_checkpoint(checkpoints, task.monitor))
     trainer = _trainer(settings, folder, data, task, callbacks, trust)
+    if settings["ema"] is not None:  # first: the last step is in the average that is saved
+        average = averaged_weights(settings["ema"], trainer.strategy.root_device)
+        trainer.callbacks.insert(0, average)  # type: ignore[attr-defined]
     with warnings.catch_warnings(), machine_faults(folder, data):
         # The checkpoints of a resumed run are meant to be there.
         warnings.filterwarnings("ignore", "Checkpoint directory .* exists and is not empty")

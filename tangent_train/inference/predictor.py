@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from datamodules.core.samples import normalize, render_inputs
-from models.held import held_networks
 from tangent_train.errors import SettingError
 from tangent_train.rendering.mosaic import ScoreMosaic
 
@@ -31,7 +30,7 @@ _PIXELS_PER_FORWARD = 2**20
 
 def sees_rays(network: nn.Module) -> bool:
     """Whether a network takes where its images look, as one with cross-image attention does."""
-    return any("rays" in inspect.signature(n.forward).parameters for n in held_networks(network))
+    return "rays" in inspect.signature(network.forward).parameters
 
 
 @torch.no_grad()

@@ -1,7 +1,6 @@
 """Tasks: what is learned and how it is scored. Networks are injected, never imported."""
 
 from tangent_train.tasks.classification import ClassificationTask
-from tangent_train.tasks.schedules import WarmupCosineLR
 from tangent_train.tasks.segmentation import SegmentationTask
 
-__all__ = ["ClassificationTask", "SegmentationTask", "WarmupCosineLR"]
+__all__ = ["ClassificationTask", "SegmentationTask"]

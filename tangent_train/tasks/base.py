@@ -1,4 +1,4 @@
-"""What all tasks share: one gradient of a batch, the optimizer, and what a run asks of them."""
+"""What all tasks share: one gradient per batch, the optimizer, and the scores of a split."""
 
 from __future__ import annotations
 
@@ -16,36 +16,40 @@ from torch.optim.lr_scheduler import LRScheduler
 
 from datamodules.core.split_module import Kind
 from tangent_train.errors import SettingError
-from tangent_train.tasks.divergence import LossWatch, check_weights, stop
+from tangent_train.tasks.divergence import check_weights, refuse_loss
 
-__all__ = ["Part", "Task", "check_at_once"]
+__all__ = ["Part", "Task"]
 
 Part = tuple[tuple[Tensor, ...], Tensor]
 """Inputs of the network and their labels."""
 
 
 class Task(lightning.LightningModule, ABC):
-    """Trains a network on batches of spheres and says what runs need to know about it.
+    """Trains a network on batches of spheres and scores it.
 
     All images of a batch, on all processes, make one gradient: the loss is a sum over the batch
-    divided by a norm of the batch, whatever the chunks it is computed in.
+    divided by a norm of the batch, in whatever chunks it is computed.
 
     Args:
-        network: What is trained.
+        network: The network to train.
         representation: What made its images.
         class_names: Names of the classes.
         optimizer: Makes the optimizer from parameters.
-        scheduler: Makes a learning rate scheduler from the optimizer, or None. When it takes
-            `total_steps`, it is told the length of the training and stepped every step.
-        label_smoothing: Share of the target spread over all classes.
+        scheduler: Makes a learning rate scheduler from the optimizer, or None. One that takes
+            `total_steps` is told the length of the training and stepped every step, others every
+            epoch.
+        label_smoothing: Fraction of the target that is spread over all classes.
         images_per_chunk: Images trained at once, a bound on memory; None for the whole batch.
-        channels_last: Memory format of the network, often faster.
+            Batch normalization sees one chunk at a time.
+        channels_last: Memory format of network and images, often faster.
         compile: Arguments of `torch.compile` for the network, empty for its defaults; None not to.
 
     Attributes:
-        kind: What is learned; data modules say what they are labelled for.
-        monitor: The figure of the validation split that makes an epoch the best one.
+        kind: What is learned.
+        monitor: The score on the validation split that selects the best epoch.
         takes: What a network for this task maps to what, for messages.
+        metric: The torchmetrics class that counts predictions, made from the number of classes.
+        matrices: What `metric` counted in the last evaluation.
 
     Raises:
         SettingError: A setting that cannot work.
@@ -54,6 +58,8 @@ class Task(lightning.LightningModule, ABC):
     kind: ClassVar[Kind]
     monitor: ClassVar[str]
     takes: ClassVar[str]
+    metric: ClassVar[type[Any]]
+    matrices: Any
 
     def __init__(
         self,
@@ -62,7 +68,6 @@ class Task(lightning.LightningModule, ABC):
         class_names: Sequence[str],
         optimizer: Callable[..., Optimizer],
         scheduler: Callable[..., LRScheduler] | None = None,
-        *,
         label_smoothing: float = 0.0,
         images_per_chunk: int | None = None,
         channels_last: bool = False,
@@ -71,7 +76,8 @@ class Task(lightning.LightningModule, ABC):
         super().__init__()
         if not 0 <= label_smoothing < 1:
             raise SettingError("task.label_smoothing", found=label_smoothing, expected="0 to 1")
-        check_at_once("images_per_chunk", images_per_chunk)
+        if images_per_chunk is not None and images_per_chunk < 1:
+            raise SettingError("task.images_per_chunk", found=images_per_chunk, expected="from 1")
         self.memory_format = torch.channels_last if channels_last else torch.contiguous_format
         self.network: nn.Module = network.to(memory_format=self.memory_format)
         if compile is not None:
@@ -82,48 +88,42 @@ class Task(lightning.LightningModule, ABC):
         self.make_scheduler = scheduler
         self.label_smoothing = label_smoothing
         self.images_per_chunk = images_per_chunk
-        self._loss_watch = LossWatch()
+        self.confusion: Any = self.metric(len(self.class_names))
+        self._pending: tuple[Tensor, Any, Any] | None = None
 
     @abstractmethod
     def example(self, channels: int) -> Tensor:
         """An empty input of the network, of the size of the run."""
 
     @abstractmethod
-    def training_labels(self, batch: Any) -> Tensor:
-        """The labels of all inputs of a batch."""
-
-    @abstractmethod
-    def training_parts(self, batch: Any) -> list[Part]:
-        """A batch in parts that are trained one after the other, a bound on memory."""
+    def training_pairs(self, batch: Any) -> tuple[Tensor, Tensor]:
+        """Inputs of the network and their labels, with a common first dimension."""
 
     @abstractmethod
     def loss_sum(self, inputs: tuple[Tensor, ...], labels: Tensor) -> Tensor:
-        """The loss of one part, a sum.
-
-        Args:
-            inputs: Of the network.
-            labels: Of the inputs.
-        """
+        """The loss of some inputs, a sum."""
 
     @abstractmethod
     def loss_norm(self, labels: Tensor) -> Tensor:
-        """What the loss of all is divided by: known before any network has run.
-
-        Args:
-            labels: Of all inputs.
-        """
+        """What the sum over all labels is divided by."""
 
     @abstractmethod
     def evaluate(self, batch: Any) -> Tensor:
-        """Count what the network makes of a batch; returns the predictions for the callbacks."""
+        """Add the predictions for a batch to `confusion` and return them."""
 
     @abstractmethod
-    def log_scores(self, stage: str) -> None:
-        """Log the scores of all that was counted, keep them for the results, and start anew.
+    def scores(self) -> dict[str, float]:
+        """The scores of `matrices` by name."""
 
-        Args:
-            stage: ``val`` or ``test``.
-        """
+    def training_parts(self, batch: Any) -> list[Part]:
+        """A batch in parts of at most `images_per_chunk` images, but no less than one input."""
+        inputs, labels = self.training_pairs(batch)
+        images_each = inputs.shape[1:-3].numel()
+        size = len(inputs)
+        if self.images_per_chunk is not None:
+            size = max(1, self.images_per_chunk // images_each)
+        pairs = zip(torch.split(inputs, size), torch.split(labels, size), strict=True)
+        return [((part,), of_part) for part, of_part in pairs]
 
     def on_train_start(self) -> None:
         """Refuse to resume a schedule that was made for another length of training.
@@ -131,13 +131,13 @@ class Task(lightning.LightningModule, ABC):
         Raises:
             SettingError: The length has changed.
         """
-        steps = int(self.trainer.estimated_stepping_batches)
+        steps = self.trainer.estimated_stepping_batches
         for config in self.trainer.lr_scheduler_configs:
             planned = getattr(config.scheduler, "total_steps", steps)
             if planned != steps:
                 raise SettingError(
                     "trainer.max_epochs, trainer.devices and data.…_per_step",
-                    found=f"{steps} steps of training",
+                    found=f"{steps} training steps",
                     expected=f"{planned}, which the schedule of the resumed run was made for",
                     remedy="Resume with the same, or start a new run.",
                 )
@@ -149,35 +149,45 @@ class Task(lightning.LightningModule, ABC):
         processes this is still inside `DistributedDataParallel.forward`, which exchanges gradients
         only in a backward pass that follows it: once, after the last part.
         """
-        norm = self._whole_norm(self.training_labels(batch))
-        batches = self.trainer.accumulate_grad_batches
+        *parts, last = self.training_parts(batch)
+        strategy, batches = self.trainer.strategy, self.trainer.accumulate_grad_batches
+        # The mean over processes, as gradients are averaged.
+        norm: Any = sum(self.loss_norm(labels) for _, labels in (*parts, last))
+        norm = strategy.reduce(norm, reduce_op="mean").clamp(min=torch.finfo(norm.dtype).tiny)
         if batch_idx % batches == 0:
             self.trainer.optimizers[0].zero_grad()
-        *parts, last = self.training_parts(batch)
         value = norm.new_zeros(())
         for part in parts:
-            loss = self._loss(part, norm)
-            self.trainer.strategy.backward(loss / batches, None)
+            loss = self.loss_sum(*part) / norm
+            strategy.backward(loss / batches, None)
             value += loss.detach()
-        loss = self._loss(last, norm)
-        # The mean over processes, each divided by the mean norm, is the loss of the whole batch.
-        whole: Any = self.trainer.strategy.reduce(value + loss.detach(), reduce_op="mean")
+        loss = self.loss_sum(*last) / norm
+        whole: Any = strategy.reduce(value + loss.detach(), reduce_op="mean")
         self.log("train/loss", whole, prog_bar=True)
-        self._loss_watch.begin(whole, batch)
+        # Copied while a GPU is busy with the backward pass.
+        copied = torch.cuda.Event() if whole.is_cuda else None  # type: ignore[no-untyped-call]
+        self._pending = (whole.to("cpu", non_blocking=True), copied, batch)
+        if copied is not None:
+            copied.record()
         return loss
 
     def on_after_backward(self) -> None:
-        """Stop before a step whose loss is no number, on all processes.
+        """Stop before a step whose loss is not finite, on all processes.
 
-        What gradients do when `trainer.precision=16-mixed` scales them too far is not looked at:
-        such steps are left out and the scale shrinks, as it should.
+        Gradients are not looked at: with `trainer.precision=16-mixed` those that overflow are
+        skipped and the loss scale shrinks, as it should.
 
         Raises:
-            SettingError: It is none.
+            SettingError: The loss is not finite.
         """
-        found = self._loss_watch.end()  # None after all parts but the last
-        if found is not None and not math.isfinite(found[0]):
-            stop(self, *found)
+        if self._pending is None:  # a part that is not the last
+            return
+        loss, copied, batch = self._pending
+        self._pending = None
+        if copied is not None:
+            copied.synchronize()
+        if not math.isfinite(loss):
+            refuse_loss(self, float(loss), batch)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """See `check_weights`."""
@@ -186,63 +196,60 @@ class Task(lightning.LightningModule, ABC):
     def optimizer_zero_grad(self, *_: Any) -> None:
         """Nothing: `training_step` clears the gradients before its first part."""
 
-    def _whole_norm(self, labels: Tensor) -> Tensor:
-        """The norm of the loss over all processes; as their gradients are averaged, the mean."""
-        norm = self.loss_norm(labels)
-        mean: Tensor = self.trainer.strategy.reduce(norm, reduce_op="mean")
-        return mean.clamp(min=torch.finfo(norm.dtype).tiny)
-
-    def _loss(self, part: Part, norm: Tensor) -> Tensor:
-        return self.loss_sum(*part) / norm
-
     def validation_step(self, batch: Any, batch_idx: int) -> Tensor:
-        """Count a batch of the validation split."""
+        """Evaluate a batch of the validation split."""
         return self.evaluate(batch)
 
     def test_step(self, batch: Any, batch_idx: int) -> Tensor:
-        """Count a batch of the test split."""
+        """Evaluate a batch of the test split."""
         return self.evaluate(batch)
 
     def on_validation_epoch_end(self) -> None:
         """Log the scores of the validation split."""
-        self.log_scores("val")
+        self._log_scores("val")
 
     def on_test_epoch_end(self) -> None:
         """Log the scores of the test split."""
-        self.log_scores("test")
+        self._log_scores("test")
+
+    def _log_scores(self, stage: str) -> None:
+        self.matrices = self.confusion.compute()
+        self.confusion.reset()
+        for name, score in self.scores().items():
+            key = f"{stage}/{name}"
+            # Every process has the same number: the mean over processes changes nothing.
+            self.log(key, score, prog_bar=key == self.monitor, sync_dist=True)
 
     def configure_optimizers(self) -> Any:
         """Optimizer, and scheduler if there is one."""
         return self.optimization(lambda: int(self.trainer.estimated_stepping_batches))
 
     def optimization(self, count_steps: Callable[[], int]) -> Any:
-        """The same for any number of steps.
-
-        Args:
-            count_steps: Of the whole training; asked for where the scheduler wants to know.
-        """
+        """Optimizer and scheduler for any number of steps, asked for only if it is needed."""
         optimizer = self.make_optimizer(self.parameters())
         if self.make_scheduler is None:
             return optimizer
         by_step = "total_steps" in inspect.signature(self.make_scheduler).parameters
         length = {"total_steps": count_steps()} if by_step else {}
-        scheduler = self.make_scheduler(optimizer, **length)
-        interval = "step" if by_step else "epoch"
-        return {
-            "optimizer": optimizer,
-            "lr_scheduler": {"scheduler": scheduler, "interval": interval},
+        scheduler = {
+            "scheduler": self.make_scheduler(optimizer, **length),
+            "interval": "step" if by_step else "epoch",
         }
+        return {"optimizer": optimizer, "lr_scheduler": scheduler}
 
+    def checked_scores(self, scores: Any, expected: tuple[int, ...]) -> Tensor:
+        """The network's scores.
 
-def check_at_once(name: str, count: object) -> None:
-    """Refuse a bound on memory that lets nothing through.
-
-    Args:
-        name: Of the setting, below ``task``.
-        count: Images at once; None for no bound.
-
-    Raises:
-        SettingError: It is neither a whole number from 1 nor None.
-    """
-    if count is not None and (not isinstance(count, int) or count < 1):
-        raise SettingError(f"task.{name}", found=count, expected="a whole number from 1")
+        Raises:
+            SettingError: They are of another shape than expected.
+        """
+        found = tuple(scores.shape) if isinstance(scores, Tensor) else type(scores).__name__
+        if found != expected:
+            raise SettingError(
+                "scores of the network",
+                found=found,
+                expected=expected,
+                remedy="Set network.num_classes to the number of classes, or to null.",
+            )
+        checked: Tensor = scores
+        return checked
