@@ -105,11 +105,11 @@ def test_validations_are_shown_in_tensorboard_and_the_page(tmp_path: Path) -> No
     encoded = np.frombuffer(events.Images("val/confusion")[-1].encoded_image_string, np.uint8)
     picture = cv2.imdecode(encoded, cv2.IMREAD_COLOR_RGB)
     np.testing.assert_array_equal(
-        picture, confusion_picture(task.matrix, task.class_names, unknown=False)
+        picture, confusion_picture(task.matrices, task.class_names, unknown=False)
     )
     mean = np.mean([events.Scalars(f"val_accuracy/{n}")[-1].value for n in task.class_names])
     assert mean == pytest.approx(events.Scalars("val/class_accuracy")[-1].value, rel=1e-6)
-    assert events.Scalars("val/accuracy")[-1].value == np.float32(task.matrix.trace() / 9)
+    assert events.Scalars("val/accuracy")[-1].value == np.float32(task.matrices.trace() / 9)
     assert events.Scalars("speed/images_per_s")[0].value > 0
 
     checkpoint = tmp_path / "checkpoints" / "best.ckpt"

@@ -9,7 +9,6 @@ from torch import Tensor
 from torch.nn import functional
 
 from tangent_train.tasks.losses import (
-    AuxiliaryTarget,
     auxiliary_sum,
     cross_entropy_norm,
     cross_entropy_sum,
@@ -83,7 +82,7 @@ def _scores(*shape: int, dtype: torch.dtype = torch.float64, seed: int = 1) -> T
 
 
 WEIGHTS = torch.tensor([7.0, 1.0, 0.5, 2.0, 0.0], dtype=torch.float64)
-SIZES = [(1, 1), (3, 4), (6, 8), (5, 7), (4, 3), (12, 16), (13, 5), (24, 16)]
+SIZES = [(1, 1), (3, 4), (5, 7), (12, 16), (13, 5), (24, 16)]
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -103,42 +102,30 @@ def test_histograms_give_the_loss_of_enlarged_scores(size: tuple[int, int]) -> N
     )
 
 
-@pytest.mark.parametrize("target", ["histogram", "labels"])
-def test_cells_of_pixels_of_one_class_are_compared_with_it(target: AuxiliaryTarget) -> None:
+def test_cells_of_pixels_of_one_class_are_compared_with_it() -> None:
     scores, coarse = _scores(2, 5, 3, 4), _labels(2, 3, 4)
     labels = coarse.repeat_interleave(5, 1).repeat_interleave(7, 2)
-    found = auxiliary_sum(scores, labels, WEIGHTS, target) / cross_entropy_norm(labels, WEIGHTS)
+    found = auxiliary_sum(scores, labels, WEIGHTS) / cross_entropy_norm(labels, WEIGHTS)
     expected = functional.cross_entropy(scores, coarse.long(), WEIGHTS, ignore_index=0)
     torch.testing.assert_close(found, expected)
 
 
-def test_labels_are_those_at_the_centres() -> None:
-    scores, labels = _scores(2, 5, 3, 4), _labels(2, 9, 20)
-    found = auxiliary_sum(scores, labels, WEIGHTS, "labels")
-    central = labels[:, [1, 4, 7]][:, :, [2, 7, 12, 17]]
-    torch.testing.assert_close(found, 15 * cross_entropy_sum(scores, central, WEIGHTS))
-
-
-@pytest.mark.parametrize("target", ["histogram", "labels"])
 @pytest.mark.parametrize("size", [(3, 4), (12, 16)])
-def test_auxiliary_parts_add_up_and_unknown_counts_for_nothing(
-    target: AuxiliaryTarget, size: tuple[int, int]
-) -> None:
+def test_auxiliary_parts_add_up_and_unknown_counts_for_nothing(size: tuple[int, int]) -> None:
     scores, labels = _scores(4, 5, *size), _labels(4, 12, 16)
     labels[1] = 0
-    whole = auxiliary_sum(scores, labels, WEIGHTS, target)
-    parts = [auxiliary_sum(scores[k:e], labels[k:e], WEIGHTS, target) for k, e in ((0, 3), (3, 4))]
+    whole = auxiliary_sum(scores, labels, WEIGHTS)
+    parts = [auxiliary_sum(scores[k:e], labels[k:e], WEIGHTS) for k, e in ((0, 3), (3, 4))]
     torch.testing.assert_close(torch.stack(parts).sum(), whole)
     (gradient,) = torch.autograd.grad(whole, scores)
     assert float(gradient[1].abs().max()) == 0
     assert float(gradient[0].abs().max()) > 0
 
 
-@pytest.mark.parametrize("target", ["histogram", "labels"])
-def test_auxiliary_losses_are_not_computed_in_half_precision(target: AuxiliaryTarget) -> None:
+def test_auxiliary_losses_are_not_computed_in_half_precision() -> None:
     labels = torch.full((4, 300, 300), 2, dtype=torch.uint8)
     scores = torch.zeros(4, 3, 10, 10, dtype=torch.float16)
     weights = torch.ones(3, dtype=torch.float16)
     with torch.autocast("cpu", torch.bfloat16):
-        found = auxiliary_sum(scores, labels, weights, target)
+        found = auxiliary_sum(scores, labels, weights)
     assert float(found) == pytest.approx(labels.numel() * math.log(3), rel=1e-5)

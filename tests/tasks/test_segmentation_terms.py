@@ -1,4 +1,4 @@
-"""What segmentation minimises beside cross-entropy, and networks that know where they look."""
+"""The loss of an auxiliary head, and networks that know where they look."""
 
 from __future__ import annotations
 
@@ -11,10 +11,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.utils.data import DataLoader
 
-from tangent_train.errors import SettingError
 from tangent_train.rendering import TangentRepresentation
 from tangent_train.tasks import SegmentationTask
-from tests.tasks.quiet_trainer import quiet_trainer
+from tests.tasks.shapes import quiet_trainer
 
 NAMES = ("unknown", "a", "b")
 WEIGHTS = torch.tensor([0.0, 1.0, 3.0])
@@ -57,19 +56,6 @@ def test_the_auxiliary_head_adds_the_loss_of_its_cells(weight: float) -> None:
     enlarged = outputs["aux"].repeat_interleave(4, 2).repeat_interleave(4, 3)
     expected = mean(outputs["out"], labels.long()) + weight * mean(enlarged, labels.long())
     torch.testing.assert_close(found, expected)
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"auxiliary_weight": -1}, r"task\.auxiliary_weight: found -1"),
-        ({"auxiliary_weight": float("nan")}, r"task\.auxiliary_weight: found nan"),
-        ({"auxiliary_target": "mean"}, r"task\.auxiliary_target: found mean.*histogram or labels"),
-    ],
-)
-def test_impossible_terms(settings: dict[str, Any], message: str) -> None:
-    with pytest.raises(SettingError, match=message):
-        SegmentationTask(TwoHeads(), TANGENT, NAMES, partial(torch.optim.SGD, lr=0.1), **settings)
 
 
 # Networks that are told where their images look.
@@ -144,24 +130,3 @@ def test_evaluation_tells_it_the_rays_of_every_turn() -> None:
     assert network.told == [((1, 20, 3, 3), 7)] * 2
     pixels = task.matrices.pixels
     assert pixels[1, 1] + pixels[2, 2] == pixels.sum() == 32 * 64
-
-
-def test_a_wrapper_that_hands_everything_on_is_told_too() -> None:
-    class Outer(nn.Module):
-        def __init__(self, network: nn.Module) -> None:
-            super().__init__()
-            self.network = network
-
-        def forward(self, images: Tensor, *arguments: Any) -> Any:
-            return self.network(images, *arguments)
-
-    optimizer = partial(torch.optim.SGD, lr=0.1)
-    assert SegmentationTask(Outer(Looking()), TANGENT, NAMES, optimizer).takes_rays
-    assert not SegmentationTask(Outer(TwoHeads()), TANGENT, NAMES, optimizer).takes_rays
-
-
-def test_without_rays_it_is_called_as_any_other() -> None:
-    network = Looking()
-    task = SegmentationTask(network, TANGENT, NAMES, partial(torch.optim.SGD, lr=0.1))
-    assert task(torch.zeros(2, 2, 16, 16)).shape == (2, 3, 16, 16)
-    assert network.told == [((2, 1, 3, 3), None)]

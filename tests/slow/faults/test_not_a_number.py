@@ -1,4 +1,4 @@
-"""Losses and weights that are no numbers: training stops, keeps the batch, and harms nothing."""
+"""NaN in losses and weights: the training stops before the network or a checkpoint is harmed."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from torch import Tensor
 
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 from tangent_train.errors import SettingError
-from tangent_train.tasks.divergence import BATCH_FILE
 from tests.slow.faults.small_runs import Faulty, run_trainer, small_data, small_task
 
 if TYPE_CHECKING:
@@ -23,13 +22,6 @@ if TYPE_CHECKING:
 
 
 pytestmark = pytest.mark.filterwarnings("ignore:You defined a `validation_step`:UserWarning")
-
-FACES = 20
-
-
-def _batch(folder: Path) -> dict[str, Any]:
-    content: dict[str, Any] = torch.load(folder / BATCH_FILE, weights_only=True)
-    return content
 
 
 def _last(folder: Path) -> dict[str, Any]:
@@ -54,7 +46,7 @@ def _names_of_step(data: Stanford2D3DS, step: int) -> list[str]:
     ids=["plain", "in chunks", "accumulated"],
 )
 @pytest.mark.parametrize("value", [torch.nan, torch.inf], ids=str)
-def test_a_loss_that_is_no_number_stops_before_the_step(
+def test_a_loss_that_is_not_finite_stops_before_the_step(
     stanford_root: Path,
     tmp_path: Path,
     trainer: dict[str, Any],
@@ -65,29 +57,20 @@ def test_a_loss_that_is_no_number_stops_before_the_step(
 ) -> None:
     network = Faulty(at, lambda scores: scores.index_fill(1, torch.tensor([1]), value))
     data = small_data(stanford_root)
-    expected = rf"loss of step {step} \(epoch 0, area_.*\): found (nan|inf), of images and weights"
-    with pytest.raises(SettingError, match=expected) as caught:
+    with pytest.raises(SettingError, match=r"found (nan|inf), from finite images and") as caught:
         run_trainer(tmp_path, max_epochs=1, checkpoint_every=1, **trainer).fit(
             small_task(network, **settings), datamodule=data
         )
-    for word in ("optimizer.lr", "trainer.gradient_clip_val", str(tmp_path / BATCH_FILE)):
+    batches = step * trainer.get("accumulate_grad_batches", 1) + (1 if trainer else 0)
+    (name,) = _names_of_step(data, batches)
+    place = f"loss of step {step} (epoch 0, {name})"
+    for word in (place, "optimizer.lr", "trainer.gradient_clip_val"):
         assert word in str(caught.value)
     torch.testing.assert_close(network.layer.weight.detach(), network.weights[at], rtol=0, atol=0)
     assert _last(tmp_path)["global_step"] == step
-    batch = _batch(tmp_path)
-    batches = step * trainer.get("accumulate_grad_batches", 1) + (1 if trainer else 0)
-    assert batch["names"] == _names_of_step(data, batches)
-    assert (batch["step"], batch["epoch"]) == (step, 0)
-    assert batch["images"].shape == (1, FACES, 3, 16, 16)
-    assert batch["labels"].shape == (1, FACES, 16, 16)
-    images = batch["images"].flatten(0, 1)
-    part = images[7:14] if settings else images
-    torch.testing.assert_close(part, network.seen[at], rtol=0, atol=0)
 
 
-def test_weights_that_are_no_numbers_never_replace_a_good_checkpoint(
-    stanford_root: Path, tmp_path: Path
-) -> None:
+def test_nan_weights_never_replace_a_good_checkpoint(stanford_root: Path, tmp_path: Path) -> None:
     # The loss of a step is still a number, its gradient is not: that of a root at 0.
     network = Faulty(1, lambda scores: scores + (scores * 0).sqrt())
     task = small_task(network)
@@ -104,7 +87,7 @@ def test_a_network_that_is_broken_already_is_said_to_be(
     stanford_root: Path, tmp_path: Path
 ) -> None:
     network = Faulty(1, lambda scores: scores + (scores * 0).sqrt())
-    with pytest.raises(SettingError, match=r"loss of step 2 .* no numbers already, in network\."):
+    with pytest.raises(SettingError, match=r"loss of step 2 .* not finite already: network\."):
         run_trainer(tmp_path, max_epochs=1).fit(
             small_task(network), datamodule=small_data(stanford_root)
         )
@@ -118,13 +101,13 @@ def test_a_statistic_of_batch_normalization_counts_as_a_weight(
     normalization.running_var[3] = torch.nan
     network = torch.nn.Sequential(Faulty(), normalization)
     network.register_buffer("mask", torch.full((2,), -torch.inf))  # is one a network may have
-    with pytest.raises(SettingError, match=r"in network\.1\.running_var; expected numbers"):
+    with pytest.raises(SettingError, match=r"in network\.1\.running_var; expected finite"):
         run_trainer(tmp_path, max_epochs=1).fit(
             small_task(network), datamodule=small_data(stanford_root)
         )
 
 
-def test_images_that_are_no_numbers_are_named(
+def test_nan_in_images_is_named(
     stanford_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     data = small_data(stanford_root)
@@ -136,9 +119,8 @@ def test_images_that_are_no_numbers_are_named(
         return images
 
     monkeypatch.setattr(data, "normalized", with_hole)
-    with pytest.raises(SettingError, match="of images that hold values that are no numbers"):
+    with pytest.raises(SettingError, match="from images with NaN or infinite values"):
         run_trainer(tmp_path, max_epochs=1).fit(small_task(Faulty()), datamodule=data)
-    assert _batch(tmp_path)["images"].isnan().nonzero().tolist() == [[0, 3, 1, 2, 5]]
 
 
 class Scales(torch.nn.Module):
@@ -178,7 +160,6 @@ def test_gradients_that_overflow_are_left_out_and_the_scale_shrinks(
     torch.testing.assert_close(before, after, rtol=0, atol=0)
     assert not torch.equal(after, later), "and the next step is made"
     assert scaler.get_scale() == 2.0**13
-    assert not (tmp_path / BATCH_FILE).exists()
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -195,7 +176,6 @@ def test_scores_beyond_half_precision_stop_and_another_precision_is_named(
     )
     with pytest.raises(SettingError, match=r"loss of step 1 .* trainer\.precision=bf16-mixed"):
         trainer.fit(small_task(network), datamodule=small_data(stanford_root))
-    assert _batch(tmp_path)["step"] == 1
     exact = Faulty(1, lambda scores: scores * 1e6)
     run_trainer(tmp_path / "exact", max_steps=4).fit(
         small_task(exact, optimizer=partial(torch.optim.SGD, lr=1e-9)),
@@ -223,7 +203,6 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.slow
 def test_all_processes_stop_when_the_loss_of_one_is_no_number(
     stanford_root: Path, tmp_path: Path
 ) -> None:
@@ -245,9 +224,4 @@ def test_all_processes_stop_when_the_loss_of_one_is_no_number(
     assert done.returncode == 1
     assert "loss of step 2" in done.stderr
     assert "Traceback" not in done.stderr
-    batches = [
-        torch.load(tmp_path / "run" / f"stopped_batch_{rank}.pt", weights_only=True)
-        for rank in (0, 1)
-    ]
-    assert batches[0]["names"] != batches[1]["names"], "each process keeps its own"
     assert _last(tmp_path / "run")["global_step"] == 0

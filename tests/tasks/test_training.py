@@ -1,10 +1,11 @@
-"""The gradient of a batch of spheres, computed a few images at a time."""
+"""The gradient of a batch of spheres, in chunks of images and over processes."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterator
 from functools import partial
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import lightning
@@ -13,10 +14,12 @@ import torch
 from lightning.pytorch.strategies import DDPStrategy
 from torch import Tensor, nn
 from torch.distributed.algorithms.ddp_comm_hooks import default_hooks
+from torch.optim.lr_scheduler import LinearLR, OneCycleLR, StepLR
 from torch.utils.data import DataLoader
 
 from tangent_train.rendering import TangentRepresentation
 from tangent_train.tasks import SegmentationTask
+from tests.tasks.shapes import quiet_trainer
 
 
 class Sample(NamedTuple):
@@ -59,10 +62,8 @@ def _network() -> nn.Module:
     )
 
 
-def _gradients(
-    images_per_chunk: int | None, trainer: dict[str, Any], **settings: Any
-) -> tuple[list[Tensor], Tensor]:
-    task = SegmentationTask(
+def _task(images_per_chunk: int | None = None, **settings: Any) -> SegmentationTask:
+    return SegmentationTask(
         _network(),
         TangentRepresentation(base_level=0, level=4),
         ("unknown", "a", "b", "c"),
@@ -72,18 +73,18 @@ def _gradients(
         images_per_chunk=images_per_chunk,
         **settings,
     )
+
+
+def _gradients(
+    images_per_chunk: int | None, trainer: dict[str, Any], **settings: Any
+) -> tuple[list[Tensor], Tensor]:
     gradients = Gradients()
     # Accumulated: two steps, of two panoramas and of the third one.
     batch_size = 1 if "accumulate_grad_batches" in trainer else 3
-    lightning.Trainer(
-        logger=False,
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        accelerator="cpu",
-        limit_val_batches=0,
-        **trainer | {"callbacks": [gradients, *trainer.get("callbacks", [])]},
-    ).fit(task, datamodule=Data(batch_size))
+    callbacks = {"callbacks": [gradients, *trainer.get("callbacks", [])]}
+    quiet_trainer(limit_val_batches=0, **trainer | callbacks).fit(
+        _task(images_per_chunk, **settings), datamodule=Data(batch_size)
+    )
     return gradients.found, gradients.loss
 
 
@@ -108,25 +109,14 @@ def test_chunks_give_the_gradient_of_the_whole_batch(size: int, trainer: dict[st
         assert float(norm) == pytest.approx(0.01, rel=1e-3), "clipped once, as a whole"
 
 
-@pytest.mark.parametrize(
-    ("trainer", "settings"),
-    [
-        ({"precision": "bf16-mixed"}, {}),
-        ({}, {"channels_last": True}),
-        ({}, {"compile": {"backend": "aot_eager"}}),
-        ({"precision": "bf16-mixed"}, {"channels_last": True, "compile": {"backend": "aot_eager"}}),
-    ],
-    ids=["bf16", "channels_last", "compiled", "all"],
-)
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:torch")
-def test_faster_arithmetic_works_in_chunks(
-    trainer: dict[str, Any], settings: dict[str, Any]
-) -> None:
+def test_faster_arithmetic_works_in_chunks_and_names_stay() -> None:
+    fast: dict[str, Any] = {"channels_last": True, "compile": {"backend": "aot_eager"}}
+    assert _task(**fast).state_dict().keys() == _task().state_dict().keys()
     exact, _ = _gradients(None, {"max_steps": 1})
-    fast, _ = _gradients(8, {"max_steps": 1} | trainer, **settings)
-    tolerance = 3e-2 if "precision" in trainer else 1e-5
-    for expected, found in zip(exact, fast, strict=True):
-        assert float((found - expected).norm() / expected.norm()) < tolerance
+    found, _ = _gradients(8, {"max_steps": 1, "precision": "bf16-mixed"}, **fast)
+    for one, other in zip(found, exact, strict=True):
+        assert float((one - other).norm() / other.norm()) < 3e-2
 
 
 class Exchanges(lightning.Callback):
@@ -166,14 +156,67 @@ def test_processes_exchange_gradients_once_after_the_last_chunk() -> None:
     torch.testing.assert_close(found, expected)
 
 
-def test_compiling_keeps_the_names_of_the_tensors() -> None:
-    task = SegmentationTask(
-        _network(),
-        TangentRepresentation(base_level=0, level=4),
-        ("unknown", "a", "b", "c"),
-        partial(torch.optim.SGD, lr=0.1),
-        compile={"backend": "aot_eager"},
-    )
-    assert {name for name in task.state_dict() if name.startswith("network")} == {
-        f"network.{name}" for name in _network().state_dict()
+class _Together:
+    """The strategy of one of several processes, of which the others' norms are known."""
+
+    def __init__(self, norms: list[Tensor]) -> None:
+        self._mean = torch.stack(norms).mean(dim=0)
+        self._asked = 0
+
+    def reduce(self, value: Tensor, reduce_op: str) -> Tensor:
+        assert reduce_op == "mean"
+        self._asked += 1
+        return self._mean if self._asked == 1 else value  # then the loss, which is only shown
+
+    def backward(self, loss: Tensor, _: None) -> None:
+        loss.backward()  # type: ignore[no-untyped-call]
+
+
+@pytest.mark.parametrize("chunk", [None, 7])
+def test_the_mean_of_processes_gradients_is_that_of_their_batches_together(
+    chunk: int | None,
+) -> None:
+    """Though one has many more labelled pixels than the other."""
+    generator = torch.Generator().manual_seed(0)
+    images = torch.randn(2, 20, 2, 16, 16, generator=generator)
+    labels = torch.randint(0, 4, (2, 20, 16, 16), generator=generator).to(torch.uint8)
+    labels[0, :, 1:] = 0
+    task: Any = _task(chunk)
+    task.class_weights.copy_(torch.tensor([0.0, 1.0, 3.0, 0.2]))
+    task.log = lambda *_, **__: None
+
+    def gradient(part: slice, norms: list[Tensor]) -> Tensor:
+        optimizer = torch.optim.SGD(task.parameters())
+        task._trainer = SimpleNamespace(
+            accumulate_grad_batches=1, optimizers=[optimizer], strategy=_Together(norms)
+        )
+        task.training_step(Sample(images[part], labels[part]), 0).backward()
+        return torch.cat([p.grad.flatten() for p in task.network.parameters()])
+
+    norms = [task.loss_norm(part) for part in labels]
+    of_each = [gradient(slice(k, k + 1), norms) for k in (0, 1)]
+    together = gradient(slice(0, 2), [task.loss_norm(labels.flatten(0, 1))])
+    torch.testing.assert_close(sum(of_each) / 2, together, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("scheduler", [StepLR, LinearLR, OneCycleLR])
+def test_schedulers_step_by_epoch_or_over_the_whole_training(scheduler: Any) -> None:
+    settings = {
+        StepLR: {"step_size": 1, "gamma": 0.5},
+        LinearLR: {"start_factor": 1.0, "end_factor": 0.5, "total_iters": 1},
+        OneCycleLR: {"max_lr": 0.1},
     }
+    seen: list[float] = []
+
+    class Watch(lightning.Callback):
+        def on_train_batch_start(self, trainer: Any, *_: Any) -> None:
+            seen.append(trainer.optimizers[0].param_groups[0]["lr"])
+
+    task = _task(scheduler=partial(scheduler, **settings[scheduler]))
+    trainer = quiet_trainer(max_epochs=2, limit_val_batches=0, callbacks=[Watch()])
+    trainer.fit(task, datamodule=Data(1))
+    if scheduler is OneCycleLR:
+        assert len(set(seen)) == 6, "stepped every step"
+        assert seen[-1] < 1e-5, "ends at the end of training"
+    else:
+        assert seen == pytest.approx([0.1] * 3 + [0.05] * 3)
