@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Literal
 
 from datamodules.core.panorama_pairs import PairedPanorama, PanoramaPair, PanoramaPairs
 from datamodules.images.gpano import area_of, whole_area
-from datamodules.images.image_files import find_images, read_rgb
+from datamodules.images.image_files import find_images
+from datamodules.images.pixel_files import read_rgb
 from tangent_train.errors import DataError, SettingError
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 from datamodules.core.panoramas import Panorama
 from datamodules.core.sampling import sample_rng
 from datamodules.core.sources import ImageSource, count_labels
-from datamodules.images.gpano_pose import up_of
+from datamodules.images.gpano import up_of
 from tangent_train.geometry import random_rotation, rotation_about
 from tangent_train.rendering import rotate_equirect
 from tangent_train.rendering.upright.gravity import estimate_up

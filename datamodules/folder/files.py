@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from datamodules.core.problems import Noted, raised
-from datamodules.images.image_files import find_depth, find_images, read_depth_size, read_image_size
-from datamodules.images.image_opening import open_image
-from datamodules.images.png import PngHeader, check_panorama_size, check_png_end, read_png_header
+from datamodules.images.image_files import find_depth, find_images
+from datamodules.images.pixel_files import read_image_size, read_pixels, read_rgb
+from datamodules.images.png import PngHeader, check_panorama_size, read_png_header
 from tangent_train.errors import DataError
 
 if TYPE_CHECKING:
@@ -114,7 +114,6 @@ def check_panorama(
     size = None
     with noted(files.name, files.rgb):
         size = read_image_size(files.rgb)
-        check_png_end(files.rgb)
         check_panorama_size(files.rgb, size, erp_height)
     with noted(files.name):
         header = read_png_header(files.labels)
@@ -122,8 +121,7 @@ def check_panorama(
         _check_size(files.labels, (header.height, header.width), files.rgb, size)
     with noted(files.name):
         if files.depth is not None:
-            _check_size(files.depth, read_depth_size(files.depth), files.rgb, size)
-            check_png_end(files.depth)
+            _check_size(files.depth, read_image_size(files.depth), files.rgb, size)
 
 
 def _check_kind(path: Path, header: PngHeader, *, in_colors: bool) -> None:
@@ -165,14 +163,7 @@ def read_codes(path: Path, *, in_colors: bool) -> NDArray[np.integer]:
     Raises:
         DataError: The file is broken.
     """
-    with open_image(path) as image:
-        if in_colors:
-            image.load()
-            image.info.pop("transparency", None)  # Pillow would warn that it is lost
-            colors: NDArray[Any] = np.asarray(image.convert("RGB"))
-            return colors
-        codes: NDArray[Any] = np.asarray(image)
-        return codes if codes.ndim == 2 else codes[..., 0]
+    return read_rgb(path) if in_colors else read_pixels(path, indices=True)
 
 
 def check_class_codes(

@@ -35,7 +35,7 @@ from datamodules.folder.files import (
     read_codes,
 )
 from datamodules.folder.splits import FolderSplits
-from datamodules.images.image_files import read_depth_m, read_rgb
+from datamodules.images.pixel_files import read_depth_m, read_rgb
 from tangent_train.errors import SettingError
 from tangent_train.registry import registered
 

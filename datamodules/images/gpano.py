@@ -1,20 +1,21 @@
-"""Panoramas that are a part of the sphere: which part, and their place on the whole of it.
+"""What cameras and stitchers say about a panorama: which part of the sphere it is, and its pose.
 
-Cameras and stitchers write it into the XMP data of an image, in the tags of Google's Photo Sphere
-format (https://developers.google.com/streetview/spherical-metadata): the size the whole panorama
-would have, and where in it the image lies.
+They write it into the XMP data of the image, in the tags of Google's Photo Sphere format
+(https://developers.google.com/streetview/spherical-metadata): the size the whole panorama would
+have, the place of the image in it, and the pitch and roll of the camera.
 """
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from datamodules.core.panoramas import resize_nearest
-from datamodules.images.xmp import read_xmp_tags
 from tangent_train.errors import DataError, SettingError
+from tangent_train.rendering.upright.gravity import up_from_pose
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -22,13 +23,13 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-__all__ = ["NAMESPACE", "PanoramaArea", "area_of", "area_of_crop", "whole_area"]
+__all__ = ["PanoramaArea", "area_of", "area_of_crop", "up_of", "whole_area"]
 
 _Pixel = TypeVar("_Pixel", bound=np.generic)
 
-NAMESPACE = "http://ns.google.com/photos/1.0/panorama/"
-"""Of all tags of the format."""
-
+_NAMESPACE = b"http://ns.google.com/photos/1.0/panorama/"
+_REACH = 1 << 16  # bytes around the namespace in which the tags are
+_TAG = re.compile(rb"""[\s<]GPano:(\w+)(?:\s*=\s*["']([^"'<]{0,40})|>\s*([^<]{0,40}))""")
 _SIZES = (
     "FullPanoWidthPixels",
     "FullPanoHeightPixels",
@@ -37,9 +38,8 @@ _SIZES = (
     "CroppedAreaLeftPixels",
     "CroppedAreaTopPixels",
 )
-_TOLERANCE = 0.02  # of pixels that should be square: angles and sizes are given in round numbers
-_MOST_COLUMNS = 32768  # of the whole panorama, as of images that are one
-_MOST_NUMBER = 1e9  # of pixels, of a tag that may be one
+_TOLERANCE = 0.02  # of pixels that should be square: angles and sizes are rounded
+_MOST_COLUMNS = 32768  # of the whole panorama
 _SAY_IT = "Say with crop=[west,east,south,north] in degrees what the image shows."
 _NOT_WHOLE = (
     "If it is a part of a panorama, say which with crop=[west,east,south,north] in degrees or with "
@@ -54,10 +54,10 @@ class PanoramaArea:
     Attributes:
         full_shape: Rows H and columns W = 2 H of the whole panorama.
         rows: First row of the image in it, and the one after its last.
-        columns: The same of columns; the first is below W, the last may be beyond: such an image
-            goes on at the left, across ±180°.
+        columns: The same of columns; the first is below W, the last may be beyond: the image then
+            continues at the left, across ±180°.
         image_shape: Rows and columns of the image itself: those of its place, or a little more or
-            less where these were no whole numbers.
+            less where these were rounded.
     """
 
     full_shape: tuple[int, int]
@@ -89,39 +89,32 @@ class PanoramaArea:
         Raises:
             ValueError: The image has another size.
         """
-        self._check(image, self.image_shape)
-        top, bottom = self.rows
-        left, right = self.columns
-        placed = resize_nearest(image, (bottom - top, right - left))
+        if image.shape[:2] != self.image_shape:
+            raise ValueError(f"an image of {image.shape[:2]} pixels; expected {self.image_shape}")
+        rows, columns = slice(*self.rows), np.arange(*self.columns) % self.full_shape[1]
+        placed = resize_nearest(image, (self.rows[1] - self.rows[0], len(columns)))
         if self.is_whole:
             return placed
         whole = np.full((*self.full_shape, *image.shape[2:]), fill, image.dtype)
-        before = min(right, self.full_shape[1]) - left
-        whole[top:bottom, left : left + before] = placed[:, :before]
-        whole[top:bottom, : right - left - before] = placed[:, before:]
+        whole[rows, columns] = placed
         return whole
 
     def cut(self, whole: NDArray[_Pixel]) -> NDArray[_Pixel]:
-        """Take the image's part out of a whole panorama again; the inverse of `place`.
+        """Take the image's part out of a whole panorama; the inverse of `place`.
 
         Args:
             whole: ``(H, W[, C])``.
 
         Returns:
-            ``(h, w[, C])``; may be a view.
+            ``(h, w[, C])``.
 
         Raises:
             ValueError: The panorama has another size.
         """
-        self._check(whole, self.full_shape)
-        width = self.full_shape[1]
-        left, right = self.columns
-        part = whole[slice(*self.rows)]
-        if right <= width:
-            part = part[:, left:right]
-        else:
-            part = np.concatenate([part[:, left:], part[:, : right - width]], axis=1)
-        return resize_nearest(part, self.image_shape)
+        if whole.shape[:2] != self.full_shape:
+            raise ValueError(f"a panorama of {whole.shape[:2]}; expected {self.full_shape}")
+        rows, columns = self.places()
+        return whole[rows[:, None], columns]
 
     def places(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Rows ``(h,)`` and columns ``(w,)`` of the whole panorama that `cut` takes."""
@@ -130,16 +123,11 @@ class PanoramaArea:
         height, width = self.image_shape
         return resize_nearest(rows, (height, 1))[:, 0], resize_nearest(columns, (1, width))[0]
 
-    @staticmethod
-    def _check(image: NDArray[Any], shape: tuple[int, int]) -> None:
-        if image.shape[:2] != shape:
-            raise ValueError(f"an image of {image.shape[:2]} pixels; expected {shape}")
-
 
 def area_of(path: Path, size: tuple[int, int]) -> PanoramaArea | None:
     """The place of an image by its own GPano tags.
 
-    Images that were made smaller or larger after the tags were written are taken to show the same.
+    Images that were resized after the tags were written are taken to show the same.
 
     Args:
         path: JPEG, PNG, TIFF or WebP.
@@ -149,9 +137,9 @@ def area_of(path: Path, size: tuple[int, int]) -> PanoramaArea | None:
         None where the image does not say, or not all.
 
     Raises:
-        DataError: The file cannot be read, or the tags cannot be those of such an image.
+        DataError: The tags cannot be those of such an image.
     """
-    tags = read_xmp_tags(path, NAMESPACE)
+    tags = _gpano_tags(path)
     projection = tags.get("ProjectionType", "equirectangular")
     if projection != "equirectangular":
         raise DataError(
@@ -162,7 +150,24 @@ def area_of(path: Path, size: tuple[int, int]) -> PanoramaArea | None:
         )
     if not all(name in tags for name in _SIZES):
         return None
-    return _area_of_tags(path, size, [_number(path, name, tags[name]) for name in _SIZES])
+    full_width, full_height, width, height, left, top = (
+        _number(path, name, tags[name], 1e9) for name in _SIZES
+    )
+    inside = 0 < width <= full_width and height > 0 and top >= 0 and top + height <= full_height
+    if not (
+        inside and _agree(full_width, 2 * full_height) and _agree(size[1] / width, size[0] / height)
+    ):
+        raise DataError(
+            path,
+            found=f"GPano tags of {height:g}×{width:g} pixels at ({top:g}, {left:g}) of "
+            f"{full_height:g}×{full_width:g} in an image of {size[0]}×{size[1]}",
+            expected="a part, shaped like this image, of a panorama twice as wide as high",
+            remedy=f"The image may have been cut after they were written. {_SAY_IT}",
+        )
+    if (width, height) == (full_width, full_height) and abs(size[1] - 2 * size[0]) <= 1:
+        return whole_area(path, size)
+    west = left % full_width / full_width
+    return _area(path, size, (west, width / full_width), (top / full_height, height / full_height))
 
 
 def area_of_crop(size: tuple[int, int], crop: Sequence[float]) -> PanoramaArea:
@@ -175,18 +180,19 @@ def area_of_crop(size: tuple[int, int], crop: Sequence[float]) -> PanoramaArea:
 
     Raises:
         SettingError: There is no such part, or the image would not have square pixels.
+        DataError: The whole panorama would be too large.
     """
-    expected = "[west,east,south,north] in degrees, −180 to 180 and −90 to 90, south below north"
-    if len(crop) != 4:
-        raise SettingError("crop", found=list(crop), expected=expected)
-    west, east, south, north = crop
-    if not (-180 <= west <= 180 and -180 <= east <= 180 and -90 <= south < north <= 90):
-        raise SettingError("crop", found=list(crop), expected=expected)
-    width = east - west if east > west else east - west + 360
-    if not 0 < width < 360 and (west, east) != (-180, 180):
+    west, east, south, north = crop if len(crop) == 4 else (0, 0, 0, 0)
+    if not (-180 <= west <= 180 and -180 <= east <= 180 and -90 <= south < north <= 90) or (
+        (east - west) % 360 == 0 and (west, east) != (-180, 180)
+    ):
         raise SettingError(
-            "crop", found=list(crop), expected="east other than west; [-180,180,…] is all around"
+            "crop",
+            found=list(crop),
+            expected="[west,east,south,north] in degrees, −180 to 180 and −90 to 90, south below "
+            "north, east other than west; [-180,180,…] is all around",
         )
+    width = east - west if east > west else east - west + 360
     pixels_deg = width / size[1], (north - south) / size[0]
     if not _agree(*pixels_deg):
         raise SettingError(
@@ -195,25 +201,17 @@ def area_of_crop(size: tuple[int, int], crop: Sequence[float]) -> PanoramaArea:
             f"of {size[0]}×{size[1]}",
             expected="angles that make them square",
         )
-    if size[1] * 360 / width > _MOST_COLUMNS:
-        raise SettingError(
-            "crop",
-            found=f"{list(crop)} for an image of {size[0]}×{size[1]}",
-            expected=f"a part of a panorama of at most {_MOST_COLUMNS} columns",
-            remedy="Shrink the image, or take it as a photo (projection=perspective).",
-        )
-    return _area(
-        size, ((west + 180) / 360, width / 360), ((90 - north) / 180, (north - south) / 180)
-    )
+    across, down = ((west + 180) / 360, width / 360), ((90 - north) / 180, (north - south) / 180)
+    return _area(f"crop={list(crop)}", size, across, down)
 
 
 def whole_area(path: Path, size: tuple[int, int]) -> PanoramaArea:
-    """The place of an image that shows all of the sphere.
+    """The place of an image that shows the whole sphere.
 
     Args:
         path: The image, for the message.
         size: Its rows and columns. One column too many or too few is allowed: programs that shrink
-            images round so. It is left out, or its neighbour stands for it.
+            images round so. It is left out, or its neighbour is repeated.
 
     Raises:
         DataError: It is not twice as wide as high.
@@ -229,50 +227,74 @@ def whole_area(path: Path, size: tuple[int, int]) -> PanoramaArea:
     return PanoramaArea((height, 2 * height), (0, height), (0, 2 * height), size)
 
 
-def _area_of_tags(path: Path, size: tuple[int, int], tags: Sequence[int]) -> PanoramaArea:
-    full_width, full_height, width, height, left, top = tags
-    stated = (
-        f"GPano tags of {height}×{width} pixels at ({top}, {left}) of {full_height}×{full_width}"
-    )
-    inside = 0 < width <= full_width and height > 0 and top >= 0 and top + height <= full_height
-    if not inside or not _agree(full_width, 2 * full_height):
+def up_of(path: Path) -> NDArray[np.float64] | None:
+    """The direction of up in a panorama by its own GPano tags, see `up_from_pose`.
+
+    Args:
+        path: JPEG, PNG, TIFF or WebP.
+
+    Returns:
+        ``(3,)`` unit vector in the panorama's frame. None where the image does not say, or says 0
+        for pitch and roll: programs that do not know write that.
+
+    Raises:
+        DataError: A tag is not such an angle.
+    """
+    tags = _gpano_tags(path)
+    pitch = _number(path, "PosePitchDegrees", tags.get("PosePitchDegrees", "0"), 90)
+    roll = _number(path, "PoseRollDegrees", tags.get("PoseRollDegrees", "0"), 180)
+    return None if pitch == roll == 0 else up_from_pose(pitch, roll)
+
+
+def _gpano_tags(path: Path) -> dict[str, str]:
+    """GPano tags, written as attributes or as elements; nothing is parsed as XML.
+
+    The file is scanned for them as for XMP packets (XMP specification part 3): all image formats
+    hold XMP as plain UTF-8, and exiftool writes it behind the pixels of PNG files.
+    """
+    content = path.read_bytes()
+    place = content.find(_NAMESPACE)
+    packet = content[max(place - _REACH, 0) : place + _REACH] if place >= 0 else b""
+    return {
+        name.decode(): (attribute or element).decode(errors="replace").strip()
+        for name, attribute, element in _TAG.findall(packet)
+    }
+
+
+def _number(path: Path, name: str, text: str, most: float) -> float:
+    try:
+        number = float(text)
+    except ValueError:
+        number = float("nan")
+    if not abs(number) <= most:
         raise DataError(
             path,
-            found=stated,
-            expected="a part of a panorama that is twice as wide as high",
-            remedy=_SAY_IT,
+            found=f"GPano:{name} {text!r}",
+            expected=f"a number from −{most:g} to {most:g}",
+            remedy=f"Remove the tag, for example with exiftool -XMP-GPano:{name}= <file>.",
         )
-    if not _agree(size[1] / width, size[0] / height):
-        raise DataError(
-            path,
-            found=f"{stated} in an image of {size[0]}×{size[1]}",
-            expected="those of this image",
-            remedy=f"It was cut after they were written. {_SAY_IT}",
-        )
-    if (width, height) == (full_width, full_height) and abs(size[1] - 2 * size[0]) <= 1:
-        return whole_area(path, size)
-    if size[1] / width * full_width > _MOST_COLUMNS:
-        raise DataError(
-            path,
-            found=stated,
-            expected=f"a part of a panorama of at most {_MOST_COLUMNS} columns",
-            remedy="Shrink the image, or take it as a photo (projection=perspective).",
-        )
-    west = left % full_width / full_width
-    return _area(size, (west, width / full_width), (top / full_height, height / full_height))
+    return number
 
 
 def _area(
-    size: tuple[int, int], across: tuple[float, float], down: tuple[float, float]
+    subject: object, size: tuple[int, int], across: tuple[float, float], down: tuple[float, float]
 ) -> PanoramaArea:
     """The place of an image.
 
     Args:
+        subject: Of the error.
         size: Its rows and columns.
-        across: Its left edge and its width, as shares of the whole panorama's.
+        across: Its left edge and its width, as fractions of the whole panorama's.
         down: Its upper edge and its height.
     """
     full_height = max(1, round(size[1] / across[1] / 2))
+    if 2 * full_height > _MOST_COLUMNS:
+        raise DataError(
+            subject,
+            found=f"a part of a panorama of {2 * full_height} columns",
+            expected=f"at most {_MOST_COLUMNS}",
+            remedy="Shrink the image, or take it as a photo (projection=perspective).",
+        )
     rows = _span(down, full_height, size[0])
     first, end = _span(across, 2 * full_height, size[1])
     end = min(end, first + 2 * full_height)
@@ -294,15 +316,3 @@ def _span(share: tuple[float, float], whole: int, pixels: int) -> tuple[int, int
 
 def _agree(one: float, other: float) -> bool:
     return abs(one - other) <= _TOLERANCE * max(one, other)
-
-
-def _number(path: Path, name: str, text: str) -> int:
-    try:
-        number = float(text)
-    except ValueError:
-        number = float("nan")
-    if not abs(number) <= _MOST_NUMBER:
-        raise DataError(
-            path, found=f"GPano:{name} {text!r}", expected="a number of pixels", remedy=_SAY_IT
-        )
-    return round(number)

@@ -1,21 +1,26 @@
-"""Images and arrays of any kind of number, read and written as they are: 8 and 16 bits, floats."""
+"""Reading and writing people's own images: colours, depth, labels, arrays.
+
+Pillow opens every image and says what it is; OpenCV decodes the 16-bit colours that Pillow would
+cut to 8 bits, and writes.
+"""
 
 from __future__ import annotations
 
+import math
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
-from PIL.TiffImagePlugin import ImageFileDirectory_v2
+from PIL import ExifTags, Image, ImageOps
 
-from datamodules.images.exr import read_exr
-from datamodules.images.image_files import read_array, read_rgb
-from datamodules.images.image_opening import check_pixels, open_image, oriented_array
-from datamodules.images.png import decoded
+from datamodules.images.exr import read_exr, read_exr_size
+from datamodules.images.png import MOST_PIXELS, check_pixels, decode, read_png_header
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import atomic_path, write_bytes
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     from numpy.typing import DTypeLike, NDArray
@@ -25,139 +30,265 @@ __all__ = [
     "PIXEL_SUFFIXES",
     "READABLE_SUFFIXES",
     "check_writable",
+    "photo_fov_deg",
+    "read_array",
+    "read_depth_m",
+    "read_image_size",
     "read_pixels",
+    "read_rgb",
     "write_pixels",
 ]
 
-_EIGHT = (np.dtype(np.uint8),)
-_SIXTEEN = (*_EIGHT, np.dtype(np.uint16))
 _WRITABLE = {
-    ".png": _SIXTEEN,
-    ".jpg": _EIGHT,
-    ".jpeg": _EIGHT,
-    ".webp": _EIGHT,
-    ".tif": (*_SIXTEEN, np.dtype(np.float32)),
-    ".tiff": (*_SIXTEEN, np.dtype(np.float32)),
+    ".png": ("uint8", "uint16"),
+    ".jpg": ("uint8",),
+    ".jpeg": ("uint8",),
+    ".webp": ("uint8",),
+    ".tif": ("uint8", "uint16", "float32"),
+    ".tiff": ("uint8", "uint16", "float32"),
 }
-"""Types of numbers that images hold, by what their names end in; ``.npy`` holds any."""
+"""Pixel types by suffix; ``.npy`` holds any."""
 
 PIXEL_SUFFIXES = (*_WRITABLE, ".npy")
-"""What names of files of pixels end in, in lower case."""
+"""Suffixes that `write_pixels` takes, in lower case."""
 
 READABLE_SUFFIXES = (*PIXEL_SUFFIXES, ".exr")
-"""What names of files end in that `read_pixels` takes."""
+"""Suffixes that `read_pixels` takes."""
 
 LOSSY_SUFFIXES = (".jpg", ".jpeg", ".webp")
-"""Files whose pixels come back a little other: not for labels and depth."""
+"""Formats that change pixels a little: not for labels and depth."""
 
-_PNG, _PNG_BITS, _PNG_COLOR = b"\x89PNG\r\n\x1a\n", 24, 25
-_GREY_WITH_ALPHA = 4
-_TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
-_BIG = (b"+\0", b"\0+")
-_COLUMNS, _ROWS = 256, 257  # tags of TIFF
-_GREY_MODES = ("1", "L", "LA")
+_FORMATS = ("JPEG", "PNG", "TIFF", "WEBP")
+_SINGLE_CHANNEL = ("L", "I", "F", "I;16", "I;16L", "I;16B", "I;16N")
+_MOST_M = 1e4  # depth beyond it marks missing: some files have 1e10 there
+_MISSING_UNITS = 65535
+_FILM_DIAGONAL_MM = math.hypot(36, 24)
+
+Image.MAX_IMAGE_PIXELS = MOST_PIXELS
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Image.Image]:
+    """An image whose size is allowed, not decoded yet; errors in the block name the file."""
+    try:
+        with Image.open(path, formats=_FORMATS) as image:
+            check_pixels(path, image.height, image.width)
+            if image.format == "PNG":
+                read_png_header(path)
+            yield image
+    except (DataError, MemoryError):
+        raise
+    # Decoders of broken files raise anything, from OSError to SyntaxError and IndexError.
+    except Exception as error:
+        raise DataError(
+            path,
+            found=error,
+            expected="a whole JPEG, PNG, TIFF or WebP image",
+            remedy="Copy or export the file again.",
+        ) from error
+
+
+def _exif(image: Image.Image) -> Image.Exif:
+    """EXIF data; none where they are broken, or behind the pixels of a PNG file."""
+    if image.format == "PNG" and "exif" not in image.info:
+        return Image.Exif()  # Pillow would decode the pixels to look for them
+    try:
+        return image.getexif()
+    except Exception:  # the parser raises many kinds of errors
+        return Image.Exif()
+
+
+def read_image_size(path: Path) -> tuple[int, int]:
+    """Rows and columns that `read_pixels` gives, from the header of the file.
+
+    Raises:
+        DataError: It cannot be read, or is not an image.
+    """
+    suffix = path.suffix.lower()
+    if suffix == ".exr":
+        return read_exr_size(path)
+    if suffix == ".npy":
+        height, width = read_array(path).shape[:2]
+        return height, width
+    with _opened(path) as image:
+        return _upright_size(image)
+
+
+def _upright_size(image: Image.Image) -> tuple[int, int]:
+    # Of TIFF files, Pillow gives the size after rotation.
+    orientation = 1 if image.format == "TIFF" else _exif(image).get(ExifTags.Base.Orientation)
+    quarter = orientation in (5, 6, 7, 8)
+    return (image.width, image.height) if quarter else (image.height, image.width)
 
 
 def read_pixels(path: Path, *, indices: bool) -> NDArray[Any]:
-    """Read an image or an array as it is; only transparency is left out.
+    """Read an image or an array as stored; alpha is dropped, the EXIF orientation applied.
 
     Args:
         path: JPEG, PNG, TIFF, WebP, OpenEXR (one channel of it) or ``.npy``.
-        indices: Of an image with a palette, whether to give the indices, not the colours.
+        indices: Of an image with a palette (or of 1 bit), whether to give indices or colours.
 
     Returns:
         ``(H, W)`` where there is one channel, else ``(H, W, C)``, colours in RGB order. An array is
-        mapped from its file and must not be written to.
+        memory-mapped and read-only.
 
     Raises:
-        DataError: The file cannot be read or is broken, or its array is no image.
+        DataError: The file cannot be read or is broken, or its array is not an image.
     """
-    if path.suffix.lower() == ".npy":
-        return _read_array(path)
-    if path.suffix.lower() == ".exr":
+    suffix = path.suffix.lower()
+    if suffix == ".npy":
+        return read_array(path)
+    if suffix == ".exr":
         return read_exr(path)
+    with _opened(path) as image:
+        tiles = str(getattr(image, "tile", ""))  # how pixels are stored: "RGB;16B"
+        if image.mode in ("RGB", "RGBA", "LA") and ";16" in tiles:
+            return _decode_16_bit(path, grey=image.mode == "LA")
+        oriented = ExifTags.Base.Orientation in _exif(image)
+        image.load()
+        upright = ImageOps.exif_transpose(image) if oriented else image
+        if upright.mode in _SINGLE_CHANNEL or (upright.mode in ("1", "P") and indices):
+            stored = np.array(upright, np.uint8 if upright.mode == "1" else None)
+            return stored.astype(stored.dtype.newbyteorder("="), copy=False)
+        if upright.mode == "LA":
+            return np.array(upright.getchannel(0))
+        upright.info.pop("transparency", None)  # Pillow warns that RGB loses it
+        return np.array(upright if upright.mode == "RGB" else upright.convert("RGB"))
+
+
+def _decode_16_bit(path: Path, *, grey: bool) -> NDArray[Any]:
+    pixels = decode(path, cv2.IMREAD_UNCHANGED)
+    return np.ascontiguousarray(pixels[..., 0] if grey else pixels[..., 2::-1])
+
+
+def read_rgb(path: Path) -> NDArray[np.uint8]:
+    """Decode the colours of an image, ``(H, W, 3)``.
+
+    Of 16 bits per channel the upper 8 are kept; grey becomes three equal channels; alpha is
+    dropped; the EXIF orientation is applied.
+
+    Args:
+        path: JPEG, PNG, TIFF or WebP.
+
+    Raises:
+        DataError: The file cannot be read, is broken, or holds other values than colours.
+    """
+    pixels = read_pixels(path, indices=False)
+    if pixels.dtype == np.uint16:
+        pixels = (pixels >> 8).astype(np.uint8)
+    if pixels.dtype != np.uint8 or pixels.shape[2:] not in ((), (3,)):
+        raise DataError(
+            path,
+            found=f"{pixels.dtype} of shape {pixels.shape}",
+            expected="colours of 8 or 16 bits",
+            remedy="Export the image as JPEG or PNG.",
+        )
+    return pixels if pixels.ndim == 3 else np.repeat(pixels[..., None], 3, axis=-1)
+
+
+def read_depth_m(path: Path, units_per_m: float) -> NDArray[np.float32]:
+    """Read a depth map.
+
+    Args:
+        path: PNG, TIFF or array of integers, which are units; or TIFF, array or OpenEXR image of
+            floats, which are metres.
+        units_per_m: Units in a metre, 1000 for millimetres.
+
+    Returns:
+        ``(H, W)`` metres; 0 where depth is missing: where the file has 0 or less, NaN, infinity,
+        more than 10 km or, of 16-bit integers, 65535.
+
+    Raises:
+        DataError: The file cannot be read, is broken, or holds no depth.
+        SettingError: The units are not positive.
+    """
+    if not 0 < units_per_m < math.inf:
+        raise SettingError("depth units per metre", found=units_per_m, expected="more than 0")
+    stored = read_pixels(path, indices=True)
+    if stored.ndim != 2 or stored.dtype in (np.uint8, np.bool_):
+        raise DataError(
+            path,
+            found=f"{stored.dtype} of shape {stored.shape}",
+            expected="depth: 16-bit grey PNG or TIFF, 32-bit float TIFF, .npy or .exr",
+        )
+    depth = stored.astype(np.float32)
+    if stored.dtype.kind != "f":
+        depth /= np.float32(units_per_m)
+    missing = ~((depth > 0) & (depth <= _MOST_M))
+    if stored.dtype == np.uint16:
+        missing |= stored == _MISSING_UNITS
+    depth[missing] = 0
+    return depth
+
+
+def read_array(path: Path) -> NDArray[Any]:
+    """Memory-map the pixels of a ``.npy`` file, read-only.
+
+    Returns:
+        ``(H, W)`` or ``(H, W, C)`` numbers; of one channel without the last dimension.
+
+    Raises:
+        DataError: It cannot be read, or is not an array of pixels.
+    """
     try:
-        with path.open("rb") as file:
-            start = file.read(_PNG_COLOR + 1)
-    except OSError as error:
-        raise DataError(path, found=error, expected="an image or a .npy file") from error
-    is_png = start.startswith(_PNG) and len(start) > _PNG_COLOR
-    if start.startswith(_TIFF) or (is_png and start[_PNG_BITS] == 16):
-        deep = _read_deep(path, grey=is_png and start[_PNG_COLOR] == _GREY_WITH_ALPHA)
-        if deep is not None:
-            return deep
-    with open_image(path) as image:
-        if image.mode in _GREY_MODES or (image.mode == "P" and indices):
-            band = np.asarray(image if image.mode != "LA" else image.getchannel(0), np.uint8)
-            return np.ascontiguousarray(oriented_array(band, image))
-    return read_rgb(path)
-
-
-def _read_array(path: Path) -> NDArray[Any]:
-    array = read_array(path, mapped=True)
-    if array.ndim not in (2, 3) or 0 in array.shape or array.dtype.kind not in "buif":
+        with np.errstate(over="ignore"):  # by the sizes in a broken header
+            array = np.load(path, mmap_mode="r", allow_pickle=False)
+        usable = array.ndim in (2, 3) and 0 not in array.shape and array.dtype.kind in "buif"
+    # Broken headers raise anything, also tokenize.TokenError; archives have no dimensions.
+    except Exception as error:
+        raise DataError(path, found=error, expected="one array, saved with numpy.save") from error
+    if not usable:
         raise DataError(
             path,
             found=f"{array.dtype} of shape {array.shape}",
             expected="numbers of shape (H, W) or (H, W, C)",
         )
-    return array
+    pixels: NDArray[Any] = array
+    return pixels[..., 0] if pixels.ndim == 3 and pixels.shape[-1] == 1 else pixels
 
 
-def _read_deep(path: Path, *, grey: bool) -> NDArray[Any] | None:
-    """Pixels of more than 8 bits, which Pillow would cut to 8; None if they have only 8."""
-    size = _size(path)
-    if size is None:
-        return None  # Pillow will say what is wrong
-    check_pixels(path, *size)
-    image = decoded(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
-    if image is None or image.dtype == np.uint8:
-        return None
-    if image.ndim == 2 or grey:
-        return np.ascontiguousarray(image if image.ndim == 2 else image[..., 0])
-    return np.ascontiguousarray(image[..., 2::-1] if image.shape[2] in (3, 4) else image)
+def photo_fov_deg(path: Path) -> float | None:
+    """Horizontal field of view of a photo in degrees, from its EXIF data.
 
+    They hold the focal length of a camera with 36×24 mm film and the same field of view along the
+    diagonal (CIPA DCG-001), whatever the aspect ratio of the photo.
 
-def _size(path: Path) -> tuple[int, int] | None:
-    """Rows and columns by the header of a PNG or TIFF file, whose pixels Pillow may not know."""
-    with path.open("rb") as file:
-        head = file.read(_PNG_BITS)
-        if head.startswith(_PNG):
-            return int.from_bytes(head[20:24], "big"), int.from_bytes(head[16:20], "big")
+    Returns:
+        None where they do not say.
+
+    Raises:
+        DataError: The file cannot be read, or is not an image.
+    """
+    with _opened(path) as image:
+        height, width = _upright_size(image)
         try:
-            directory = ImageFileDirectory_v2(head[: 16 if head[2:4] in _BIG else 8])
-            file.seek(directory.next)
-            directory.load(file)
-            return int(directory[_ROWS]), int(directory[_COLUMNS])
-        except Exception:  # its reader raises many kinds of errors
+            exif = _exif(image).get_ifd(ExifTags.IFD.Exif)
+            film_mm = float(exif.get(ExifTags.Base.FocalLengthIn35mmFilm, 0))
+        except Exception:  # broken EXIF data
             return None
+    if not 0 < film_mm < math.inf:  # 0 stands for unknown
+        return None
+    focal_pixels = film_mm / _FILM_DIAGONAL_MM * math.hypot(height, width)
+    return math.degrees(2 * math.atan(width / (2 * focal_pixels)))
 
 
 def check_writable(suffix: str, dtype: DTypeLike, channels: int) -> None:
-    """Refuse what a file of this kind cannot hold as it is.
+    """Refuse pixels that a file cannot hold as they are.
 
     Args:
-        suffix: What the name ends in, in lower case, with the dot.
+        suffix: Of the file, in lower case, with the dot.
         dtype: Of the pixels.
         channels: Of the pixels.
 
     Raises:
         SettingError: The suffix is unknown, or such a file cannot hold such pixels.
     """
-    if suffix not in PIXEL_SUFFIXES:
-        raise SettingError(
-            "file name", found=f"'{suffix}' at its end", expected=" or ".join(PIXEL_SUFFIXES)
-        )
-    able = [
-        name
-        for name in PIXEL_SUFFIXES
-        if name == ".npy" or (np.dtype(dtype) in _WRITABLE[name] and channels in (1, 3))
-    ]
-    if suffix not in able:
+    able = [s for s in _WRITABLE if np.dtype(dtype).name in _WRITABLE[s] and channels in (1, 3)]
+    if suffix not in (*able, ".npy"):
         raise SettingError(
             f"{suffix} files",
             found=f"{np.dtype(dtype)} pixels of {channels} channel{'s' if channels > 1 else ''}",
-            expected=f"one that can hold them: {' or '.join(able)}",
+            expected=f"one that can hold them: {' or '.join((*able, '.npy'))}",
         )
 
 
@@ -165,7 +296,7 @@ def write_pixels(path: Path, pixels: NDArray[Any]) -> None:
     """Write pixels as they are, atomically.
 
     Args:
-        path: The file; its name says the format.
+        path: The file; its suffix gives the format.
         pixels: ``(H, W)`` or ``(H, W, C)``, colours in RGB order.
 
     Raises:
@@ -178,14 +309,8 @@ def write_pixels(path: Path, pixels: NDArray[Any]) -> None:
             np.save(file, pixels, allow_pickle=False)
         return
     ordered = np.ascontiguousarray(pixels if pixels.ndim == 2 else pixels[..., ::-1])
-    try:
-        done, encoded = cv2.imencode(suffix, ordered)
-    except cv2.error:
-        done, encoded = False, ordered
+    done, encoded = cv2.imencode(suffix, ordered)
     if not done:
-        raise SettingError(
-            path.name,
-            found=f"{pixels.shape[0]}×{pixels.shape[1]} pixels",
-            expected=f"sides that {suffix} files can have",
-        )
+        found = f"{pixels.shape[0]}×{pixels.shape[1]} pixels"
+        raise SettingError(path.name, found=found, expected=f"a size that {suffix} files can have")
     write_bytes(path, encoded.tobytes())

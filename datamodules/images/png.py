@@ -1,4 +1,4 @@
-"""PNG files: what their header promises, checked without decoding, and their pixels."""
+"""PNG files of data sets: checked by their headers, decoded by OpenCV."""
 
 from __future__ import annotations
 
@@ -9,30 +9,33 @@ from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 import cv2
 import numpy as np
 
-from datamodules.images.image_opening import check_pixels
 from tangent_train.errors import DataError, SettingError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
 
 __all__ = [
+    "MOST_PIXELS",
     "PngHeader",
     "check_panorama_size",
+    "check_pixels",
     "check_png",
-    "check_png_end",
-    "decoded",
+    "decode",
     "read_color_png",
     "read_depth_png",
     "read_png",
     "read_png_header",
 ]
 
+MOST_PIXELS = 32768 * 16384
+"""Pixels of an image, at most: a file of a few kilobytes can claim more than memory holds."""
+
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_HEADER = struct.Struct(">16sIIBB")  # start; width, height, bits, color
 _START = _SIGNATURE + b"\x00\x00\x00\rIHDR"
-_HEADER_BYTES = 26  # the signature, IHDR's length and name, then its first ten bytes
 _COLOR_TYPES = {0: "grey", 2: "RGB", 3: "palette", 4: "grey with alpha", 6: "RGBA"}
 _REMEDY = "Copy or extract the file again."
 
@@ -46,66 +49,66 @@ class PngHeader(NamedTuple):
     color: str
 
 
-def read_png_header(path: Path) -> PngHeader:
-    """Read the header of a PNG file and follow its chunks to the end, decoding nothing.
-
-    Args:
-        path: The file.
+def check_pixels(path: Path, height: int, width: int) -> None:
+    """Refuse an image that is too large to be decoded, by the size its header claims.
 
     Raises:
-        DataError: It cannot be read, is no PNG, or parts are missing.
+        DataError: It has no pixels, or more than `MOST_PIXELS`.
+    """
+    if not 0 < height * width <= MOST_PIXELS:
+        raise DataError(
+            path,
+            found=f"{height}×{width} pixels",
+            expected=f"1 to {MOST_PIXELS} pixels",
+            remedy="Shrink the image.",
+        )
+
+
+def read_png_header(path: Path) -> PngHeader:
+    """Read the header of a PNG file and follow its chunks to the end; nothing is decoded.
+
+    Raises:
+        DataError: It cannot be read, is not a PNG file, is truncated, or has too many pixels.
     """
     try:
         with path.open("rb") as file:
-            start = file.read(_HEADER_BYTES)
-            size = file.seek(0, os.SEEK_END)
-            whole = _chunks_end(_reader(file)) == size
+            start = file.read(_HEADER.size)
+            is_png = start.startswith(_START) and len(start) == _HEADER.size
+            is_whole = is_png and _has_all_chunks(file)
     except OSError as error:
         raise DataError(path, found=error, expected="a PNG file", remedy=_REMEDY) from error
-    if len(start) < _HEADER_BYTES or not start.startswith(_START):
-        raise DataError(path, found="no PNG header", expected="a PNG file", remedy=_REMEDY)
-    if not whole:
-        raise _cut_off(path, size)
-    width, height, bits, color = struct.unpack(">IIBB", start[len(_START) :])
+    if not is_whole:
+        found = "a truncated PNG file" if is_png else "no PNG header"
+        raise DataError(path, found=found, expected="a whole PNG file", remedy=_REMEDY)
+    _, width, height, bits, color = _HEADER.unpack(start)
+    check_pixels(path, height, width)
     return PngHeader(height, width, bits, _COLOR_TYPES.get(color, f"color type {color}"))
 
 
-def check_png_end(path: Path) -> None:
-    """Make sure that nothing is missing at the end of a file, if it is a PNG.
-
-    What comes behind the end is no matter: some programs leave notes there.
-
-    Raises:
-        DataError: It is cut off, or cannot be read.
-    """
-    try:
-        with path.open("rb") as file:
-            if file.read(len(_SIGNATURE)) != _SIGNATURE:
-                return
-            size = file.seek(0, os.SEEK_END)
-            end = _chunks_end(_reader(file))
-    except OSError as error:
-        raise DataError(path, found=error, expected="an image", remedy=_REMEDY) from error
-    if end is None or end > size:
-        raise _cut_off(path, size)
-
-
-def _cut_off(path: Path, size: int) -> DataError:
-    return DataError(
-        path, found=f"{size} bytes, parts missing", expected="a whole PNG", remedy=_REMEDY
-    )
+def _has_all_chunks(file: BinaryIO) -> bool:
+    # OpenCV allocates the bytes that a chunk claims, up to 2 GB, before it reads them.
+    size = file.seek(0, os.SEEK_END)
+    position, name = len(_SIGNATURE), b""
+    while name != b"IEND":
+        file.seek(position)
+        head = file.read(8)
+        name = head[4:]
+        position += 12 + int.from_bytes(head[:4], "big")
+        if position > size or not name.isalpha():
+            return False
+    return True
 
 
 def check_png(path: Path, bits: int, colors: Sequence[str]) -> PngHeader:
-    """Read the header of a PNG file that has to be as a data set was released.
+    """Read the header of a PNG file whose pixel format is known.
 
     Args:
         path: The file.
         bits: Per channel.
-        colors: What `PngHeader.color` may be.
+        colors: Allowed values of `PngHeader.color`.
 
     Raises:
-        DataError: It cannot be read, is no PNG, parts are missing, or it has other pixels.
+        DataError: As by `read_png_header`, or it has another pixel format.
     """
     header = read_png_header(path)
     if header.bits != bits or header.color not in colors:
@@ -119,12 +122,12 @@ def check_png(path: Path, bits: int, colors: Sequence[str]) -> PngHeader:
 
 
 def check_panorama_size(path: Path, size: tuple[int, int], erp_height: int) -> None:
-    """Make sure that an image is a whole panorama of enough rows.
+    """Check that an image is a full panorama of enough rows.
 
     Args:
         path: The image.
         size: Its rows and columns.
-        erp_height: Rows that are wanted.
+        erp_height: Rows needed.
 
     Raises:
         DataError: It is not twice as wide as high.
@@ -147,28 +150,8 @@ def check_panorama_size(path: Path, size: tuple[int, int], erp_height: int) -> N
         )
 
 
-def _reader(file: BinaryIO) -> Callable[[int], bytes]:
-    def eight_bytes_at(position: int) -> bytes:
-        file.seek(position)
-        return file.read(8)
-
-    return eight_bytes_at
-
-
-def _chunks_end(eight_bytes_at: Callable[[int], bytes]) -> int | None:
-    """Where the IEND chunk ends, following the lengths of the chunks; None if there is none."""
-    position = 8
-    while True:
-        head = eight_bytes_at(position)
-        if len(head) < 8 or not head[4:].isalpha():
-            return None
-        position += 12 + int.from_bytes(head[:4], "big")
-        if head[4:] == b"IEND":
-            return position
-
-
 def read_color_png(path: Path) -> NDArray[np.uint8]:
-    """Decode an 8-bit colour image, ``(H, W, 3)`` in RGB order; alpha is dropped.
+    """Decode 8-bit colours, ``(H, W, 3)`` in RGB order; alpha is dropped.
 
     Raises:
         DataError: The file is broken.
@@ -177,7 +160,7 @@ def read_color_png(path: Path) -> NDArray[np.uint8]:
 
 
 def read_depth_png(path: Path) -> NDArray[np.uint16]:
-    """Decode a 16-bit grey image, ``(H, W)``.
+    """Decode 16-bit grey values, ``(H, W)``.
 
     Raises:
         DataError: The file is broken.
@@ -186,7 +169,7 @@ def read_depth_png(path: Path) -> NDArray[np.uint16]:
 
 
 def read_png(path: Path, flags: int) -> NDArray[Any]:
-    """Decode a PNG file as OpenCV does: blue first.
+    """Decode a PNG file with OpenCV: channels in BGR order.
 
     Args:
         path: The file.
@@ -195,31 +178,21 @@ def read_png(path: Path, flags: int) -> NDArray[Any]:
     Raises:
         DataError: The file is broken, or too large to be decoded.
     """
-    # Decoding from memory keeps "cannot open" and "cannot decode" apart, and any path works.
+    read_png_header(path)
+    return decode(path, flags)
+
+
+def decode(path: Path, flags: int) -> NDArray[Any]:
+    """Decode an image file whose size was checked with OpenCV: channels in BGR order.
+
+    Raises:
+        DataError: The file is broken.
+    """
     try:
-        content = np.frombuffer(path.read_bytes(), np.uint8)
-    except OSError as error:
-        raise DataError(path, found=error, expected="a PNG file", remedy=_REMEDY) from error
-    head = content[:_HEADER_BYTES].tobytes()
-    image = None
-    # Nothing else is given to the decoder, which knows more formats than are needed.
-    if head.startswith(_START) and len(head) == _HEADER_BYTES:
-        width, height = struct.unpack_from(">II", head, len(_START))
-        check_pixels(path, height, width)
-        image = decoded(content, flags)
+        # From memory: `cv2.imread` knows no paths beyond the system's code page.
+        image = cv2.imdecode(np.fromfile(path, np.uint8), flags)
+    except (OSError, cv2.error) as error:
+        raise DataError(path, found=error, expected="an image", remedy=_REMEDY) from error
     if image is None:
-        raise DataError(path, found="a broken PNG", expected="one that decodes", remedy=_REMEDY)
+        raise DataError(path, found="a broken image", expected="one that decodes", remedy=_REMEDY)
     return image
-
-
-def decoded(content: NDArray[np.uint8], flags: int) -> NDArray[Any] | None:
-    """Pixels of an image as OpenCV decodes it: blue first; None where it cannot."""
-    if content[: len(_SIGNATURE)].tobytes() == _SIGNATURE:
-        # OpenCV would take as much memory as a chunk says it has bytes, up to 2 GB.
-        end = _chunks_end(lambda position: content[position : position + 8].tobytes())
-        if end is None or end > content.size:
-            return None
-    try:
-        return cv2.imdecode(content, flags) if content.size else None
-    except cv2.error:  # more pixels than OpenCV allows
-        return None

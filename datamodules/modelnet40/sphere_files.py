@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from datamodules.images.image_files import read_array
+from datamodules.images.pixel_files import read_array
 from datamodules.modelnet40.mesh_spheres import CHANNELS, clean_mesh, mesh_spheres
 from datamodules.modelnet40.off_files import read_off
 from tangent_train.errors import DataError
@@ -103,7 +103,7 @@ def read_sphere(path: Path, shape: tuple[int, int]) -> NDArray[np.uint16]:
         DataError: It is missing or broken.
     """
     try:
-        steps: NDArray[np.uint16] = read_array(path)
+        steps: NDArray[np.uint16] = np.array(read_array(path))
     except DataError as error:
         raise DataError(
             path,

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from datamodules.core.panoramas import meters_to_steps, resize_nearest
-from datamodules.images.gpano import PanoramaArea, area_of, area_of_crop, whole_area
-from datamodules.images.gpano_pose import up_of
-from datamodules.images.image_files import find_depth, photo_fov_deg, read_depth_m, read_rgb
+from datamodules.images.gpano import PanoramaArea, area_of, area_of_crop, up_of, whole_area
+from datamodules.images.image_files import find_depth
+from datamodules.images.pixel_files import photo_fov_deg, read_depth_m, read_rgb
 from tangent_train.errors import DataError
 from tangent_train.geometry import camera_matrix_from_fov
 from tangent_train.inference.views import InputImage

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from datamodules.core.store_files import open_stored
-from datamodules.images.image_files import read_array
+from datamodules.images.pixel_files import read_array
 from datamodules.modelnet40.sphere_files import read_sphere
 from models.pretrained import read_tensors
 from tangent_train.checkpoints.content import read_checkpoint

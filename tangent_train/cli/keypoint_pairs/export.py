@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from datamodules.images.image_files import read_image_size
+from datamodules.images.pixel_files import read_image_size
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import atomic_path, write_text
 from tangent_train.json_text import parse_json

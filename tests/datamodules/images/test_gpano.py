@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from datamodules.images.gpano import PanoramaArea, area_of, area_of_crop, whole_area
+from datamodules.images.gpano import PanoramaArea, area_of, area_of_crop, up_of, whole_area
 from tangent_train.errors import DataError, SettingError
 from tangent_train.geometry import equirect_to_lonlat
+from tangent_train.rendering.upright.gravity import up_from_pose
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -62,9 +63,8 @@ def _save(path: Path, xmp: str | bytes, shape: tuple[int, int] = (40, 60)) -> Pa
     return path
 
 
-def _add_text(path: Path, text: bytes, *, before_pixels: bool, packed: bool = False) -> None:
-    data = b"XML:com.adobe.xmp\0" + (b"\1" if packed else b"\0") + b"\0\0\0"
-    data = b"iTXt" + data + (zlib.compress(text) if packed else text)
+def _add_text(path: Path, text: bytes, *, before_pixels: bool) -> None:
+    data = b"iTXtXML:com.adobe.xmp\0\0\0\0\0" + text
     chunk = struct.pack(">I", len(data) - 4) + data + struct.pack(">I", zlib.crc32(data))
     content = path.read_bytes()
     place = content.index(b"IDAT" if before_pixels else b"IEND") - 4
@@ -81,20 +81,11 @@ def test_tags_of_all_formats(tmp_path: Path, suffix: str, written: Any) -> None:
     assert area_of(path, (40, 60)) == _AREA
 
 
-@pytest.mark.parametrize("packed", [False, True])
-def test_tags_behind_the_pixels_of_a_png(tmp_path: Path, packed: bool) -> None:
+def test_tags_behind_the_pixels_of_a_png(tmp_path: Path) -> None:
     path = tmp_path / "image.png"
     Image.new("RGB", (60, 40)).save(path)
-    _add_text(path, _attributes(_TAGS).encode(), before_pixels=False, packed=packed)
+    _add_text(path, _attributes(_TAGS).encode(), before_pixels=False)
     assert area_of(path, (40, 60)) == _AREA
-
-
-def test_padding_and_other_encodings(tmp_path: Path) -> None:
-    padded = b"\xef\xbb\xbf" + _attributes(_TAGS).replace("\ufeff", "").encode() + b"  \0\0"
-    wide = _attributes(_TAGS).replace("\ufeff", "").encode("utf-16")
-    for number, xmp in enumerate((padded, wide)):
-        path = _save(tmp_path / f"{number}.jpg", xmp)
-        assert area_of(path, (40, 60)) == _AREA, number
 
 
 def test_images_that_say_nothing(tmp_path: Path) -> None:
@@ -105,20 +96,10 @@ def test_images_that_say_nothing(tmp_path: Path) -> None:
         tmp_path / "none.jpg",
         _save(tmp_path / "incomplete.jpg", _attributes(incomplete)),
         _save(tmp_path / "other.jpg", other),
-        _save(tmp_path / "broken.jpg", _attributes(_TAGS)[:-40]),
     ]
     for path in paths:
         assert area_of(path, (40, 60)) is None, path.name
-
-
-def test_entities_are_refused(tmp_path: Path) -> None:
-    bomb = '<!DOCTYPE x [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;">]>' + _elements(_TAGS)
-    outside = '<!DOCTYPE x SYSTEM "http://127.0.0.1:1/x.dtd">' + _elements(_TAGS)
-    for text in (bomb, outside):
-        for number, encoding in enumerate(("utf-8", "utf-16")):
-            path = _save(tmp_path / f"{number}.jpg", text.replace("\ufeff", "").encode(encoding))
-            with pytest.raises(DataError, match="found XMP data with a document type declaration"):
-                area_of(path, (40, 60))
+        assert up_of(path) is None
 
 
 @pytest.mark.parametrize("size", [(20, 30), (80, 120), (27, 40), (33, 50)])
@@ -147,10 +128,15 @@ def _angles_deg(area: PanoramaArea, corner_xy: tuple[int, int]) -> NDArray[np.fl
         ({"ProjectionType": "cylindrical"}, (40, 60), "GPano:ProjectionType cylindrical"),
         ({"FullPanoWidthPixels": "many"}, (40, 60), "GPano:FullPanoWidthPixels 'many'"),
         ({"FullPanoWidthPixels": "inf"}, (40, 60), "GPano:FullPanoWidthPixels 'inf'"),
-        ({"FullPanoHeightPixels": "100"}, (40, 60), r"of 100×360; expected a part"),
-        ({"CroppedAreaTopPixels": "150"}, (40, 60), r"at \(150, 100\) of 180×360; expected a part"),
+        ({"FullPanoHeightPixels": "100"}, (40, 60), r"of 100×360 .*expected a part"),
+        (
+            {"CroppedAreaTopPixels": "150"},
+            (40, 60),
+            r"at \(150, 100\) of 180×360 .*expected a part",
+        ),
         ({"CroppedAreaImageWidthPixels": "0"}, (40, 60), "40×0 pixels"),
-        ({}, (40, 50), r"in an image of 40×50; expected those of this image\. It was cut"),
+        ({}, (40, 50), r"in an image of 40×50; .*may have been cut after"),
+        ({"FullPanoWidthPixels": "9e7", "FullPanoHeightPixels": "4.5e7"}, (40, 60), "columns"),
     ],
 )
 def test_tags_that_cannot_be_are_refused(
@@ -235,7 +221,7 @@ def test_images_of_another_size_are_refused() -> None:
     area = PanoramaArea((8, 16), (2, 5), (3, 8), (3, 5))
     with pytest.raises(ValueError, match=r"\(3, 6\) pixels; expected \(3, 5\)"):
         area.place(np.zeros((3, 6)))
-    with pytest.raises(ValueError, match=r"\(3, 5\) pixels; expected \(8, 16\)"):
+    with pytest.raises(ValueError, match=r"\(3, 5\); expected \(8, 16\)"):
         area.cut(np.zeros((3, 5)))
 
 
@@ -284,7 +270,7 @@ def test_crop(
     assert area_of_crop(size, crop) == PanoramaArea(full_shape, rows, columns, size)
 
 
-@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("seed", range(12))
 def test_edges_are_where_the_crop_says(seed: int) -> None:
     rng = np.random.default_rng(seed)
     across, down = rng.uniform(20, 350), rng.uniform(10, 170)
@@ -327,12 +313,47 @@ def test_impossible_crops(crop: tuple[float, ...], message: str) -> None:
         area_of_crop((100, 100), crop)
 
 
-@pytest.mark.parametrize("crop", [(-180, 180, -45, 45), (135, -135, -45, 45), (-180, 180, -90, 90)])
-def test_places_are_the_rows_and_columns_that_are_cut(crop: tuple[float, ...]) -> None:
-    west, east, south, north = crop
-    width = (east - west) % 360 or 360
-    area = area_of_crop((round((north - south) / 3), round(width / 3)), crop)
-    height, columns_in_all = area.full_shape
-    whole = np.arange(height * columns_in_all).reshape(area.full_shape)
-    rows, columns = area.places()
-    np.testing.assert_array_equal(whole[rows][:, columns], area.cut(whole))
+def test_a_crop_of_a_panorama_too_large_for_memory() -> None:
+    with pytest.raises(DataError, match="at most 32768"):
+        area_of_crop((100, 100), (0, 0.1, 0, 0.1))
+
+
+# Pose
+
+
+@pytest.mark.parametrize(
+    ("tags", "pitch_deg", "roll_deg"),
+    [
+        ({"PosePitchDegrees": "-24.49", "PoseRollDegrees": "-121.0"}, -24.49, -121),
+        ({"PosePitchDegrees": "5"}, 5, 0),
+        ({"PoseRollDegrees": "180", "PoseHeadingDegrees": "77"}, 0, 180),
+    ],
+)
+def test_pose(tmp_path: Path, tags: dict[str, str], pitch_deg: float, roll_deg: float) -> None:
+    for written in (_attributes, _elements):
+        up = up_of(_save(tmp_path / "image.jpg", written(tags)))
+        assert up is not None
+        np.testing.assert_array_equal(up, up_from_pose(pitch_deg, roll_deg))
+
+
+def test_zero_pitch_and_roll_is_what_programs_write_that_do_not_know(tmp_path: Path) -> None:
+    tags = {"PosePitchDegrees": "0.0", "PoseRollDegrees": "-0"}
+    assert up_of(_save(tmp_path / "image.jpg", _attributes(tags))) is None
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("PosePitchDegrees", "91"),
+        ("PosePitchDegrees", "steep"),
+        ("PoseRollDegrees", "nan"),
+        ("PoseRollDegrees", "180.5"),
+        ("PoseRollDegrees", ""),
+    ],
+)
+def test_impossible_poses(tmp_path: Path, name: str, value: str) -> None:
+    path = _save(tmp_path / "image.jpg", _attributes({name: value}))
+    with pytest.raises(
+        DataError, match=rf"image\.jpg: found GPano:{name} .*expected a number from"
+    ):
+        up_of(path)

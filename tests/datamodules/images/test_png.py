@@ -1,16 +1,27 @@
 from __future__ import annotations
 
+import struct
+import zlib
 from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 import pytest
 
-from datamodules.images.png import PngHeader, read_color_png, read_depth_png, read_png_header
-from tangent_train.errors import DataError
+from datamodules.images.png import (
+    PngHeader,
+    check_panorama_size,
+    check_png,
+    read_color_png,
+    read_depth_png,
+    read_png_header,
+)
+from tangent_train.errors import DataError, SettingError
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+READERS = [read_png_header, read_color_png, read_depth_png]
 
 
 def _write(path: Path, image: np.ndarray[Any, Any]) -> Path:
@@ -29,7 +40,9 @@ def _write(path: Path, image: np.ndarray[Any, Any]) -> Path:
 )
 def test_header(tmp_path: Path, shape: tuple[int, ...], dtype: Any, bits: int, color: str) -> None:
     path = _write(tmp_path / "image.png", np.zeros(shape, dtype))
-    assert read_png_header(path) == PngHeader(4, 8, bits, color)
+    assert check_png(path, bits, (color,)) == PngHeader(4, 8, bits, color)
+    with pytest.raises(DataError, match=rf"found {bits}-bit {color}; expected 8-bit palette"):
+        check_png(path, 8, ("palette",))
 
 
 def test_color_is_rgb_and_alpha_is_dropped(tmp_path: Path) -> None:
@@ -47,30 +60,52 @@ def test_depth_keeps_16_bits(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read, depth)
 
 
-@pytest.mark.parametrize("content", [b"", b"hello, not a picture at all......"])
-def test_no_png(tmp_path: Path, content: bytes) -> None:
+@pytest.mark.parametrize("read", READERS)
+def test_files_that_are_not_png(tmp_path: Path, read: Any) -> None:
     path = tmp_path / "image.png"
-    path.write_bytes(content)
-    with pytest.raises(DataError, match=r"image\.png: found no PNG header"):
-        read_png_header(path)
-    with pytest.raises(DataError, match=r"image\.png: found a broken PNG"):
-        read_color_png(path)
+    with pytest.raises(DataError, match="No such file"):
+        read(path)
+    jpeg = cv2.imencode(".jpg", np.zeros((64, 64, 3), np.uint8))[1].tobytes()
+    for content in (b"", jpeg):
+        path.write_bytes(content)
+        with pytest.raises(DataError, match=r"image\.png: found no PNG header"):
+            read(path)
 
 
+@pytest.mark.parametrize("read", READERS)
 @pytest.mark.parametrize("missing", [slice(-20, None), slice(-1, None), slice(1000, 3000)])
-def test_parts_are_missing(tmp_path: Path, missing: slice) -> None:
+def test_truncated_files_are_named(tmp_path: Path, missing: slice, read: Any) -> None:
     noise = np.random.default_rng(0).integers(0, 256, (64, 128, 3), np.uint8)
     path = _write(tmp_path / "image.png", noise)
     content = bytearray(path.read_bytes())
     del content[missing]
     path.write_bytes(content)
-    with pytest.raises(DataError, match="parts missing"):
-        read_png_header(path)
-    with pytest.raises(DataError, match="broken PNG"):
+    with pytest.raises(DataError, match=r"image\.png: found a truncated PNG"):
+        read(path)
+
+
+def test_notes_behind_the_end_are_ignored(tmp_path: Path) -> None:
+    path = _write(tmp_path / "image.png", np.ones((4, 8, 3), np.uint8))
+    path.write_bytes(path.read_bytes() + b"notes")
+    assert read_color_png(path).shape == (4, 8, 3)
+
+
+def test_broken_pixels(tmp_path: Path) -> None:
+    def chunk(name: bytes, content: bytes) -> bytes:
+        end = struct.pack(">I", zlib.crc32(name + content))
+        return struct.pack(">I", len(content)) + name + content + end
+
+    path = tmp_path / "image.png"
+    header = struct.pack(">IIBBBBB", 8, 4, 8, 2, 0, 0, 0)
+    chunks = chunk(b"IHDR", header) + chunk(b"IDAT", b"no zlib") + chunk(b"IEND", b"")
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunks)
+    with pytest.raises(DataError, match=r"image\.png: found a broken image"):
         read_color_png(path)
 
 
-@pytest.mark.parametrize("read", [read_png_header, read_color_png, read_depth_png])
-def test_missing_file(tmp_path: Path, read: Any) -> None:
-    with pytest.raises(DataError, match="No such file"):
-        read(tmp_path / "image.png")
+def test_size_of_panoramas(tmp_path: Path) -> None:
+    check_panorama_size(tmp_path, (64, 128), 64)
+    with pytest.raises(DataError, match="found 64×127 pixels; expected twice as wide as high"):
+        check_panorama_size(tmp_path, (64, 127), 64)
+    with pytest.raises(SettingError, match="at most the 64 rows"):
+        check_panorama_size(tmp_path, (64, 128), 65)

@@ -1,91 +1,216 @@
-"""The readers that are given broken files."""
+"""Readers of other people's files: valid files to break, and what has to come out."""
 
 from __future__ import annotations
 
-import warnings
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+import json
+from contextlib import suppress
+from io import BytesIO
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
 
+import cv2
+import numpy as np
+import OpenEXR
+from PIL import Image
+
+from datamodules.core.label_table import CLASSES, LabelTable
+from datamodules.folder.classes import read_classes
+from datamodules.images.gpano import area_of, up_of
+from datamodules.images.pixel_files import read_depth_m, read_pixels
+from datamodules.images.png import check_png, read_color_png, read_depth_png
+from datamodules.modelnet40.off_files import read_off
+from datamodules.stanford2d3ds.perspective import read_camera_matrix
+from datamodules.stanford2d3ds.poses import read_panorama_pose
 from tangent_train.errors import DataError
-from tests.slow.fuzz import images, stores, texts
-from tests.slow.fuzz.mutation import mutate, sealed_png
+from tangent_train.geometry import TangentGrid, rotation_about
+from tangent_train.rendering.camera_files import CameraFile, read_cameras, write_cameras
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from pathlib import Path
-    from random import Random
 
-    # A part of a file, and how to put another one in its place; None where there is none.
-    Inner = Callable[[bytes], tuple[bytes, Callable[[bytes], bytes]] | None]
+    from numpy.typing import NDArray
 
-__all__ = ["LARGEST_IMAGE", "LONGEST_MESSAGE", "TARGETS", "Target"]
+__all__ = ["TARGETS"]
 
-LARGEST_IMAGE = 1 << 22
-"""Pixels, at most: all that take long to decode are refused, and memory is not used up by them."""
-
-LONGEST_MESSAGE = 1000
-"""Characters of an error, without the path: the file itself is not shown."""
+_SHAPE = (8, 16)
+_RNG = np.random.default_rng(0)
+_RGB: NDArray[np.uint8] = _RNG.integers(0, 256, (*_SHAPE, 3), np.uint8)
+_DEPTH: NDArray[np.uint16] = _RNG.integers(0, 5000, _SHAPE, np.uint16)
 
 
-@dataclass(frozen=True)
-class Target:
-    """A reader.
-
-    Attributes:
-        seeds: Makes valid files.
-        read: Reads a file; what comes out wrong is an AssertionError.
-        inner: A part that is broken by itself, the file around it made right again.
-        sealed: Makes checksums right again.
-    """
-
-    seeds: Callable[[], list[bytes]]
-    read: Callable[[Path], None]
-    inner: Inner | None = None
-    sealed: Callable[[bytes], bytes] | None = None
-
-    def broken(self, content: bytes, rng: Random, others: list[bytes]) -> bytes:
-        """A file with faults."""
-        found = self.inner(content) if self.inner is not None and rng.random() < 0.6 else None
-        if found is not None:
-            part, put = found
-            return put(mutate(part, rng, [part]))
-        faulty = mutate(content, rng, others)
-        return self.sealed(faulty) if self.sealed is not None and rng.random() < 0.7 else faulty
-
-    def try_on(self, path: Path, content: bytes) -> str:
-        """Read a file that holds `content`; only documented errors may come out.
-
-        Returns:
-            "read" or "refused".
-        """
-        path.write_bytes(content)
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("error")
-                warnings.filterwarnings("ignore", module="PIL")  # broken EXIF data, and the like
-                warnings.filterwarnings("ignore", "Reading `.npy`")  # as Python 2 wrote them
-                self.read(path)
-        except DataError as error:
-            size = len(str(error).replace(str(path), ""))
-            assert size <= LONGEST_MESSAGE, f"a message of {size} characters"
-            return "refused"
-        return "read"
+def _image(
+    pixels: NDArray[Any], kind: str = "png", mode: str | None = None, **options: Any
+) -> bytes:
+    file, image = BytesIO(), Image.fromarray(pixels)
+    (image.convert(mode) if mode else image).save(file, kind, **options)
+    return file.getvalue()
 
 
-TARGETS = {
-    "label_table": Target(texts.table_seeds, texts.read_table),
-    "classes": Target(texts.class_seeds, texts.read_class_list),
-    "cameras": Target(texts.camera_seeds, texts.read_camera_list),
-    "pose": Target(texts.pose_seeds, texts.read_pose),
-    "off": Target(texts.off_seeds, texts.read_mesh),
-    "label_image": Target(
-        images.picture_seeds, images.read_picture, inner=images.scanlines, sealed=sealed_png
-    ),
-    "xmp": Target(images.xmp_seeds, images.read_xmp, inner=images.xmp_part),
-    "pixels": Target(
-        images.pixel_seeds, images.read_image, inner=stores.npy_part, sealed=sealed_png
-    ),
-    "store": Target(stores.store_seeds, stores.read_store, inner=stores.store_part),
-    "spheres": Target(stores.sphere_seeds, stores.read_spheres, inner=stores.npy_part),
+def _npy(array: NDArray[Any]) -> bytes:
+    file = BytesIO()
+    np.save(file, array)
+    return file.getvalue()
+
+
+def _json(*contents: Any) -> list[bytes]:
+    return [json.dumps(content).encode() for content in contents]
+
+
+def _table_seeds() -> list[bytes]:
+    return _json(["<UNK>_0_<UNK>_0_0", *(f"{n}_{i}_office_{i}_1" for i, n in enumerate(CLASSES))])
+
+
+def _read_table(path: Path) -> None:
+    ids = LabelTable.from_json(path).class_ids
+    assert 0 <= ids.min() <= ids.max() <= len(CLASSES)
+
+
+def _pose_seeds() -> list[bytes]:
+    turn = [[0.0, 1, 0, 0.5], [0, 0, -1, 1.5], [-1, 0, 0, -2]]
+    pose = {"camera_rt_matrix": turn, "camera_original_rotation": [1.5708, 0.0, 0.3]}
+    pose |= {"camera_location": [-0.5, 2.25, 1.5]}
+    square = pose | {"camera_rt_matrix": [*turn, [0, 0, 0, 1]]}
+    return _json(pose, square, {"camera_k_matrix": [[100.0, 0, 32], [0, 100.0, 32], [0, 0, 1]]})
+
+
+def _read_pose(path: Path) -> None:
+    if b"camera_k_matrix" in path.read_bytes():
+        assert read_camera_matrix(path).shape == (3, 3)
+        return
+    pose = read_panorama_pose(path)
+    turn = pose.world_from_panorama
+    np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-4)
+    assert np.isfinite(pose.location_m).all()
+
+
+def _class_seeds() -> list[bytes]:
+    numbers = {"wall": 1, "floor": [2, 3], "window": 255}
+    return _json([None, "wall", "floor"], numbers, {"wall": "#ff0000", "floor": ["#00ff00"]})
+
+
+def _read_class_list(path: Path) -> None:
+    classes = read_classes(path)
+    assert 1 <= len(classes.names) <= 255
+    assert classes.decode(_RGB if classes.in_colors else _DEPTH).shape == _SHAPE
+
+
+def _off_seeds() -> list[bytes]:
+    points = b"0 0 0\n1 0 0\n1 1 0\n0 1 0.5\n"
+    return [
+        b"OFF\n4 2 0\n" + points + b"3 0 1 2\n3 0 2 3\n",
+        b"OFF4 2 0\n" + points + b"3 0 1 2 255 0 0\n4 3 0 1 2\n",
+    ]
+
+
+def _read_mesh(path: Path) -> None:
+    mesh = read_off(path)
+    assert np.isfinite(mesh.vertices).all()
+    assert 0 <= mesh.triangles.min() <= mesh.triangles.max() < len(mesh.vertices)
+
+
+def _camera_seeds() -> list[bytes]:
+    rotated = TangentGrid(1, 5, 20, rotation_about(np.array([0, 0, 1.0]), 0.3))
+    seeds = []
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "cameras.json"
+        for grid, faces in ((TangentGrid(0, 4), range(20)), (rotated, (3, 7))):
+            files = tuple(f"{face:05d}.png" for face in faces)
+            write_cameras(path, CameraFile("room.jpg", (64, 128), grid, tuple(faces), files))
+            seeds.append(path.read_bytes())
+    return seeds
+
+
+def _read_camera_list(path: Path) -> None:
+    cameras = read_cameras(path)
+    assert len(cameras.faces) == len(cameras.files)
+    assert cameras.grid.directions(cameras.faces[:1]).shape[1:] == (cameras.grid.dim,) * 2 + (3,)
+
+
+def _label_image_seeds() -> list[bytes]:
+    indices = np.zeros_like(_RGB)
+    indices[..., 2] = _RGB[..., 2] % 14
+    return [_image(indices), _image(np.dstack([indices, indices[..., :1]])), _image(_DEPTH)]
+
+
+def _read_label_image(path: Path) -> None:
+    with path.open("rb") as file:
+        is_depth = file.read(25)[24:] == b"\x10"
+    if is_depth:
+        header = check_png(path, 16, ("grey",))
+        assert read_depth_png(path).shape == header[:2]
+        return
+    header = check_png(path, 8, ("RGB", "RGBA"))
+    labels = LabelTable(np.arange(14, dtype=np.uint8)).decode(read_color_png(path))
+    assert labels.shape == header[:2]
+    assert labels.max() <= len(CLASSES)
+
+
+def _gpano_seeds() -> list[bytes]:
+    tags = {"ProjectionType": "equirectangular", "FullPanoWidthPixels": 360}
+    tags |= {"FullPanoHeightPixels": 180, "CroppedAreaImageWidthPixels": 60}
+    tags |= {"CroppedAreaImageHeightPixels": 40, "CroppedAreaLeftPixels": 100}
+    tags |= {"CroppedAreaTopPixels": 30, "PosePitchDegrees": -3.5, "PoseRollDegrees": 12}
+    start = '<r:Description xmlns:GPano="http://ns.google.com/photos/1.0/panorama/"'
+    attributes = " ".join(f'GPano:{name}="{value}"' for name, value in tags.items())
+    elements = "".join(f"<GPano:{name}>{value}</GPano:{name}>" for name, value in tags.items())
+    texts = [f"{start} {attributes}/>", f"{start}>{elements}</r:Description>"]
+    black = np.zeros((40, 60, 3), np.uint8)
+    return [_image(black, "webp", xmp=text.encode()) for text in texts]
+
+
+def _read_gpano(path: Path) -> None:
+    up = up_of(path)
+    assert up is None or abs(np.linalg.norm(up) - 1) < 1e-9
+    area = area_of(path, (40, 60))
+    if area is not None:
+        rows, columns = area.places()
+        assert (len(rows), len(columns)) == area.image_shape
+        assert 0 <= rows.min() <= rows.max() < area.full_shape[0] <= 16384
+        assert 0 <= columns.min() <= columns.max() < area.full_shape[1] == 2 * area.full_shape[0]
+
+
+def _pixel_seeds() -> list[bytes]:
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    seeds = [_npy(_DEPTH), _npy(_RGB), _image(_RGB, mode="P"), _image(_RGB, mode="LA")]
+    seeds += [_image(_RGB, kind, exif=exif) for kind in ("png", "webp", "jpeg")]
+    seeds += [
+        _image(_RGB, "tiff"),
+        _image(_RGB, "tiff", "1"),
+        _image(_DEPTH),
+        _image(_DEPTH, "tiff"),
+    ]
+    seeds += [_image(_DEPTH.astype(np.float32), "tiff")]
+    seeds += [cv2.imencode(s, np.dstack([_DEPTH] * 3))[1].tobytes() for s in (".png", ".tiff")]
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "a.exr"
+        header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.PIZ_COMPRESSION}
+        OpenEXR.File(header, {"Z": _DEPTH.astype(np.float32)}).write(str(path))
+        return [*seeds, path.read_bytes()]
+
+
+def _read_image(path: Path) -> None:
+    suffix = {b"\x93": ".npy", b"P": ".npy", b"\x76": ".exr"}.get(path.read_bytes()[:1], ".png")
+    path = path.replace(path.with_suffix(suffix))
+    for indices in (True, False):
+        pixels = read_pixels(path, indices=indices)
+        assert pixels.ndim in (2, 3)
+        assert pixels.dtype.kind in "buif"
+        assert 0 not in pixels.shape
+    with suppress(DataError):  # colours are none
+        depth = read_depth_m(path, 1000.0)
+        assert 0 <= depth.min() <= depth.max() <= 1e4
+
+
+TARGETS: dict[str, tuple[Callable[[], list[bytes]], Callable[[Path], None]]] = {
+    "label_table": (_table_seeds, _read_table),
+    "classes": (_class_seeds, _read_class_list),
+    "cameras": (_camera_seeds, _read_camera_list),
+    "pose": (_pose_seeds, _read_pose),
+    "off": (_off_seeds, _read_mesh),
+    "label_image": (_label_image_seeds, _read_label_image),
+    "gpano": (_gpano_seeds, _read_gpano),
+    "pixels": (_pixel_seeds, _read_image),
 }
-"""Of every name what is tried; files of any content may come."""
+"""By name: valid files, and a reader that asserts what comes out."""
