@@ -23,8 +23,11 @@ if TYPE_CHECKING:
     from datamodules.stanford2d3ds.perspective import Stanford2D3DSPerspective
     from datamodules.synthia.omnisynthia import OmniSynthia
     from datamodules.synthia.perspective import SynthiaPerspective
-    from datamodules.synthrooms.datamodule import SynthRooms, SynthRoomsPerspective
-    from datamodules.synthrooms.pairs import SynthRoomsPairs
+    from datamodules.synthrooms.datamodule import (
+        SynthRooms,
+        SynthRoomsPairs,
+        SynthRoomsPerspective,
+    )
     from datamodules.synthshapes.datamodule import SynthShapes
 
 __all__ = [
@@ -66,7 +69,7 @@ _MODULES = {
     "Stanford2D3DSPerspective": "datamodules.stanford2d3ds.perspective",
     "StanfordPairs": "datamodules.stanford2d3ds.pairs",
     "SynthRooms": "datamodules.synthrooms.datamodule",
-    "SynthRoomsPairs": "datamodules.synthrooms.pairs",
+    "SynthRoomsPairs": "datamodules.synthrooms.datamodule",
     "SynthRoomsPerspective": "datamodules.synthrooms.datamodule",
     "SynthShapes": "datamodules.synthshapes.datamodule",
     "SynthiaPerspective": "datamodules.synthia.perspective",

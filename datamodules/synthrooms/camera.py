@@ -109,33 +109,26 @@ class Pose:
 
 
 class View(Protocol):
-    """A picture to be taken."""
-
-    @property
-    def pose(self) -> Pose:
-        """Its pose."""
-        ...
+    """The pixels of a picture: their rays, and depth from distances along them."""
 
     def rays(self, dx: float = 0.0, dy: float = 0.0) -> NDArray[np.float32]:
         """Directions in the room of all pixels, moved by (dx, dy) pixels: ``(h, w, 3)`` units."""
         ...
 
-    def depth_m(
-        self, distance_m: NDArray[np.float32], rays: NDArray[np.float32]
-    ) -> NDArray[np.float32]:
-        """What the depth picture holds for distances along `rays`."""
+    def depth_m(self, distance_m: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Depth ``(h, w)`` as stored, of distances along `rays`."""
         ...
 
 
 @dataclass(frozen=True)
 class PanoramaView:
-    """A whole panorama of ``height × 2 height`` pixels; its depth is the distance."""
+    """A panorama of ``height × 2 height`` pixels; its depth is the distance."""
 
     pose: Pose
     height: int
 
     def rays(self, dx: float = 0.0, dy: float = 0.0) -> NDArray[np.float32]:
-        """See `View.rays`."""
+        """Directions in the room of all pixels, moved by (dx, dy) pixels: ``(h, w, 3)`` units."""
         shape = (self.height, 2 * self.height)
         columns = np.stack([np.arange(shape[1]) + dx, np.zeros(shape[1])], axis=-1)
         rows = np.stack([np.zeros(shape[0]), np.arange(shape[0]) + dy], axis=-1)
@@ -148,17 +141,14 @@ class PanoramaView:
         spread = np.cos(lat).astype(np.float32)[:, None, None] * level
         return spread + vertical.astype(np.float32)[:, None, :]
 
-    def depth_m(
-        self, distance_m: NDArray[np.float32], rays: NDArray[np.float32]
-    ) -> NDArray[np.float32]:
-        """See `View.depth_m`."""
-        del rays
+    def depth_m(self, distance_m: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Depth of distances along all rays, ``(h, w)``: the distance itself."""
         return distance_m
 
 
 @dataclass(frozen=True)
 class PerspectiveView:
-    """A square pinhole picture; its depth is the z-depth.
+    """A square pinhole image; its depth is the z-depth.
 
     Attributes:
         pose: Its pose.
@@ -176,17 +166,15 @@ class PerspectiveView:
         return camera_matrix_from_fov(math.degrees(self.fov_rad), (self.size, self.size))
 
     def rays(self, dx: float = 0.0, dy: float = 0.0) -> NDArray[np.float32]:
-        """See `View.rays`."""
+        """Directions in the room of all pixels, moved by (dx, dy) pixels: ``(h, w, 3)`` units."""
         moved = self.camera_matrix
         moved[:2, 2] -= (dx, dy)
         directions = perspective_directions(moved, (self.size, self.size)).astype(np.float32)
         return directions @ self.pose.world_from_camera.T.astype(np.float32)
 
-    def depth_m(
-        self, distance_m: NDArray[np.float32], rays: NDArray[np.float32]
-    ) -> NDArray[np.float32]:
-        """See `View.depth_m`."""
-        return distance_m * (rays @ self.pose.world_from_camera[:, 2].astype(np.float32))
+    def depth_m(self, distance_m: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Depth along the optical axis of distances along all rays, ``(h, w)``."""
+        return distance_m * (self.rays() @ self.pose.world_from_camera[:, 2].astype(np.float32))
 
 
 def draw_view(

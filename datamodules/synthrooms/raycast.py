@@ -9,7 +9,7 @@ import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
-from datamodules.synthrooms.texture import MaterialTable, albedo
+from datamodules.synthrooms.materials import albedo, material_table
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -72,7 +72,7 @@ class RayScene:
         self._normals = normals / size
         self._areas = size[:, 0] / 2
         self._triangles = triangles
-        self.materials = MaterialTable.of([part.material for part in room.parts])
+        self.materials = material_table([part.material for part in room.parts])
         self.item_of_part = np.array([part.item for part in room.parts])
         self._lights = room.lights
         self._ambient = _bounced_light(room)
@@ -117,7 +117,7 @@ class RayScene:
         light = self._ambient * self._openness(lifted, hits.normals, spread)[:, None]
         for lamp in self._lights:
             light += self._direct(lamp, lifted, hits.normals, place)[:, None]
-        light += self.materials.emission[hits.part, None]
+        light += self.materials["emission"][hits.part, None]
         light *= albedo(self.materials, hits.part, hits.points, hits.normals)
         light[~hits.found] = 0
         return light

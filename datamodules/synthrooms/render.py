@@ -172,7 +172,7 @@ def render(
     color += rng.normal(0, camera.noise, color.shape).astype(np.float32)
     rgb = np.clip(color * 255 + 0.5, 0, 255).astype(np.uint8)
     rgb[black] = 0
-    return Picture(rgb, view.depth_m(distance, rays), items)
+    return Picture(rgb, view.depth_m(distance), items)
 
 
 def _colors(
@@ -199,7 +199,7 @@ def _display(light: Floats) -> Floats:
 
 def _unscanned(scene: RayScene, hits: Hits, holes: Holes) -> NDArray[np.bool_]:
     missing = ~hits.found | (hits.cosine < _GRAZING) | holes.cover(hits.points)
-    return missing | scene.materials.unscanned[hits.part]
+    return missing | scene.materials["unscanned"][hits.part]
 
 
 def _bands(shape: tuple[int, int]) -> Iterator[slice]:

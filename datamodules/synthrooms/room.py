@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from functools import partialmethod
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import trimesh
+from trimesh import creation
 
 from datamodules.synthrooms.layout import FloorPlan, Frame
-from datamodules.synthrooms.palette import Material, Palette
+from datamodules.synthrooms.materials import Material, Palette
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -21,22 +21,17 @@ if TYPE_CHECKING:
 __all__ = ["UNKNOWN", "Item", "Light", "Part", "Room"]
 
 UNKNOWN = "<UNK>"
-"""Class of what nobody labelled."""
+"""Class of unlabelled items."""
 
-Shape = Literal["box", "cylinder", "prism", "ball"]
-Triple = tuple[float, float, float]
+_SHAPES = {
+    "box": creation.box((1, 1, 1)),
+    "cylinder": creation.cylinder(0.5, 1.0, sections=16),
+    "prism": creation.cylinder(0.5, 1.0, sections=6),
+    "ball": creation.icosphere(subdivisions=2, radius=0.5),
+}
+"""Each fills the cube of side 1 around the origin; cylinder and prism are upright."""
 
-
-@functools.cache
-def _unit_shape(shape: Shape) -> NDArray[np.float64]:
-    """Triangles ``(n, 3, 3)`` of a shape that fills the cube of side 1 around the origin."""
-    mesh = {
-        "box": lambda: trimesh.creation.box((1, 1, 1)),
-        "cylinder": lambda: trimesh.creation.cylinder(0.5, 1.0, sections=16),
-        "prism": lambda: trimesh.creation.cylinder(0.5, 1.0, sections=6),
-        "ball": lambda: trimesh.creation.icosphere(subdivisions=2, radius=0.5),
-    }[shape]()
-    return np.array(mesh.triangles, np.float64)
+_Triple = tuple[float, float, float]
 
 
 class Part(NamedTuple):
@@ -69,52 +64,33 @@ class Light(NamedTuple):
     intensity: float
 
 
+@dataclass
 class Item:
-    """One labelled object, put together from parts.
+    """One labelled object, composed of parts.
 
-    Args:
+    Attributes:
         parts: The room's parts, to which its own are added.
         index: Position in `Room.items`.
         frame: Where it stands; all parts are given in this frame.
     """
 
-    def __init__(self, parts: list[Part], index: int, frame: Frame) -> None:
-        self._parts = parts
-        self._index = index
-        self._frame = frame
+    parts: list[Part]
+    index: int
+    frame: Frame
 
-    def box(self, material: Material, center: Triple, size: Triple, yaw: float = 0.0) -> None:
-        """Add a box of `size`, turned by `yaw` about its own vertical."""
-        self._add("box", material, center, size, yaw)
-
-    def cylinder(self, material: Material, center: Triple, size: Triple) -> None:
-        """Add an upright cylinder of diameters ``size[0]``, ``size[1]`` and height ``size[2]``."""
-        self._add("cylinder", material, center, size)
-
-    def prism(self, material: Material, center: Triple, size: Triple) -> None:
-        """Add an upright six-sided prism."""
-        self._add("prism", material, center, size)
-
-    def ball(self, material: Material, center: Triple, size: Triple) -> None:
-        """Add an ellipsoid of diameters `size`."""
-        self._add("ball", material, center, size)
-
-    def legs(
-        self, material: Material, spread: tuple[float, float], height: float, thick: float
+    def add(
+        self, shape: str, material: Material, center: _Triple, size: _Triple, yaw: float = 0.0
     ) -> None:
-        """Add four upright legs from the floor, ``±spread`` metres from the middle."""
-        for x in (-spread[0], spread[0]):
-            for y in (-spread[1], spread[1]):
-                self.box(material, (x, y, height / 2), (thick, thick, height))
-
-    def _add(
-        self, shape: Shape, material: Material, center: Triple, size: Triple, yaw: float = 0.0
-    ) -> None:
-        place = self._frame.at(*center, yaw)
+        """Add one of `_SHAPES`, scaled to `size` and rotated by `yaw` about its own vertical."""
+        place = self.frame.at(*center, yaw)
         cos, sin = math.cos(place.yaw), math.sin(place.yaw)
         turn = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1.0]])
-        triangles = _unit_shape(shape) * size @ turn.T + np.array(place[:3])
-        self._parts.append(Part(self._index, material, triangles))
+        unit = np.array(_SHAPES[shape].triangles, np.float64)
+        self.parts.append(Part(self.index, material, unit * size @ turn.T + np.array(place[:3])))
+
+    box = partialmethod(add, "box")
+    cylinder = partialmethod(add, "cylinder")
+    ball = partialmethod(add, "ball")
 
 
 @dataclass
@@ -128,7 +104,7 @@ class Room:
         items: Class name of every item.
         parts: Parts of all items.
         lights: Lamps and windows that shine.
-        reflectance: ``(3,)`` mean share of light that floor, ceiling and walls throw back.
+        reflectance: ``(3,)`` mean albedo of floor, ceiling and walls.
     """
 
     rng: np.random.Generator

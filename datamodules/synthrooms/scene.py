@@ -6,20 +6,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from datamodules.synthrooms.furniture.clutter import add_floor_clutter, add_lamp, add_wall_clutter
-from datamodules.synthrooms.furniture.openings import add_door, add_window
-from datamodules.synthrooms.furniture.seating import add_chair, add_sofa
-from datamodules.synthrooms.furniture.storage import add_board, add_bookcase
-from datamodules.synthrooms.furniture.structure import (
-    add_beams,
-    add_ceiling,
-    add_column,
-    add_floor,
-    add_walls,
-)
-from datamodules.synthrooms.furniture.tables import add_desk, add_table
+from datamodules.synthrooms import clutter, furniture, structure
 from datamodules.synthrooms.layout import FloorPlan
-from datamodules.synthrooms.palette import Palette
+from datamodules.synthrooms.materials import Palette
 from datamodules.synthrooms.room import Room
 
 if TYPE_CHECKING:
@@ -53,19 +42,19 @@ ROOM_TYPES = {
 """The real set's room types: share of rooms, limits of the long and the short side in metres."""
 
 _PROGRAM: tuple[tuple[Callable[[Room], None], float, int, int], ...] = (
-    (add_column, 0.75, 1, 2),
-    (add_door, 1.0, 1, 2),
-    (add_bookcase, 0.85, 1, 2),
-    (add_board, 0.9, 1, 2),
-    (add_window, 0.95, 1, 2),
-    (add_sofa, 0.85, 1, 2),
-    (add_beams, 0.75, 1, 1),
-    (add_lamp, 1.0, 1, 2),
-    (add_table, 0.95, 1, 2),
-    (add_desk, 0.75, 1, 2),
-    (add_chair, 0.8, 1, 3),
-    (add_floor_clutter, 1.0, 2, 5),
-    (add_wall_clutter, 0.9, 1, 3),
+    (structure.add_column, 0.75, 1, 2),
+    (structure.add_door, 1.0, 1, 2),
+    (furniture.add_bookcase, 0.85, 1, 2),
+    (furniture.add_board, 0.9, 1, 2),
+    (structure.add_window, 0.95, 1, 2),
+    (furniture.add_sofa, 0.85, 1, 2),
+    (structure.add_beams, 0.75, 1, 1),
+    (clutter.add_lamp, 1.0, 1, 2),
+    (furniture.add_table, 0.95, 1, 2),
+    (furniture.add_desk, 0.75, 1, 2),
+    (furniture.add_chair, 0.8, 1, 3),
+    (clutter.add_floor_clutter, 1.0, 2, 5),
+    (clutter.add_wall_clutter, 0.9, 1, 3),
 )
 """Furniture in order of placement: how, in which share of rooms, how many (least and most)."""
 
@@ -79,7 +68,9 @@ def draw_room_type(rng: np.random.Generator) -> str:
 def shell(rng: np.random.Generator, plan: FloorPlan) -> Room:
     """An empty room: floor, ceiling and walls."""
     room = Room(rng, plan, Palette(rng))
-    materials = (add_floor(room), add_ceiling(room), add_walls(room))
+    materials = [
+        add(room) for add in (structure.add_floor, structure.add_ceiling, structure.add_walls)
+    ]
     room.reflectance = np.mean([material.color**2 for material in materials], axis=0)
     return room
 

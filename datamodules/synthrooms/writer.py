@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "INSTANCES",
-    "KINDS",
+    "SUFFIXES",
     "PictureName",
     "RoomName",
     "encode_picture",
@@ -38,8 +38,8 @@ __all__ = [
     "pose_record",
 ]
 
-KINDS = {"rgb": ".png", "depth": ".png", "semantic": ".png", "pose": ".json"}
-"""What is written of every picture, with the suffix."""
+SUFFIXES = {"rgb": ".png", "depth": ".png", "semantic": ".png", "pose": ".json"}
+"""Files of every picture by kind."""
 
 INSTANCES = {
     "beam": 8,
@@ -112,10 +112,10 @@ class PictureName(NamedTuple):
         return "equirectangular" if self.frame is None else str(self.frame)
 
     def file(self, kind: str) -> PurePosixPath:
-        """Path of one of `KINDS`, relative to the data set's folder."""
+        """Path of a kind of `SUFFIXES`, relative to the data set's folder."""
         name = f"camera_{self.camera}_{self.room}_frame_{self.frame_text}_domain_{kind}"
         group = "pano" if self.frame is None else "data"
-        return PurePosixPath(f"area_{self.room.area}", group, kind, name + KINDS[kind])
+        return PurePosixPath(f"area_{self.room.area}", group, kind, name + SUFFIXES[kind])
 
 
 def label_strings(rooms: Sequence[RoomName]) -> list[str]:

@@ -17,8 +17,8 @@ import pytest
 from datamodules.core.panorama_pairs import PanoramaPair
 from datamodules.stanford2d3ds.pairs import StanfordPairs, published_pairs
 from datamodules.stanford2d3ds.poses import read_panorama_pose
+from datamodules.synthrooms.datamodule import SynthRoomsPairs
 from datamodules.synthrooms.generate import generate_rooms
-from datamodules.synthrooms.pairs import SynthRoomsPairs
 from datamodules.synthrooms.settings import RoomSettings
 from tangent_train.errors import DataError, SettingError
 from tangent_train.geometry import equirect_directions

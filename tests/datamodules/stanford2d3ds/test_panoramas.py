@@ -227,7 +227,7 @@ def _cut_off(path: Path) -> None:
 DAMAGES: dict[str, tuple[str, Callable[[Path], object], str]] = {
     "no depth": ("depth", Path.unlink, r"depth\.png: found .*No such file"),
     "no semantic": ("semantic", Path.unlink, r"semantic\.png: found .*No such file"),
-    "cut off": ("rgb", _cut_off, r"rgb\.png: found .* parts missing"),
+    "cut off": ("rgb", _cut_off, r"rgb\.png: found .* truncated"),
     "no png": ("semantic", lambda p: p.write_bytes(b"P6 1 1 255 ..."), "no PNG header"),
     "8-bit depth": (
         "depth",
@@ -272,7 +272,7 @@ def test_damage_inside_a_file_is_found_on_reading(broken_root: Path, strips: Any
     content[len(content) // 2] ^= 255
     path.write_bytes(content)
     source = Stanford2D3DS(broken_root, strips).source("test")
-    with pytest.raises(DataError, match=r"rgb\.png: found a broken PNG"):
+    with pytest.raises(DataError, match=r"rgb\.png: found a broken image"):
         source.read(0)
 
 

@@ -211,7 +211,7 @@ def _rewrite(shape: tuple[int, ...], dtype: Any) -> Callable[[Path], None]:
 
 DAMAGES: dict[str, tuple[str, Callable[[Path], object], str]] = {
     "no labels": ("GT/LABELS_Correct", lambda p: p.unlink(), "No such file"),
-    "cut off": ("RGB", _cut_off, "parts missing"),
+    "cut off": ("RGB", _cut_off, "truncated"),
     "labels of 16 bits": ("GT/LABELS_Correct", _rewrite((32, 64), np.uint16), "16-bit grey"),
     "coloured labels": ("GT/LABELS_Correct", _rewrite((32, 64, 3), np.uint8), "8-bit RGB"),
     "8-bit depth": ("Depth", _rewrite((32, 64), np.uint8), "8-bit grey; expected 16-bit grey"),

@@ -204,10 +204,8 @@ class StreetView:
         directions = perspective_directions(moved, self.size)
         return (directions @ self.pose.world_from_camera.T).astype(np.float32)
 
-    def depth_m(
-        self, distance_m: NDArray[np.float32], rays: NDArray[np.float32]
-    ) -> NDArray[np.float32]:
-        return distance_m * (rays @ self.pose.world_from_camera[:, 2].astype(np.float32))
+    def depth_m(self, distance_m: NDArray[np.float32]) -> NDArray[np.float32]:
+        return distance_m * (self.rays() @ self.pose.world_from_camera[:, 2].astype(np.float32))
 
 
 ROOM_SIZE, ROOM_FOCAL, ROOM_HEIGHT = (190, 320), 133.185, 400
@@ -450,7 +448,7 @@ def _rewrite(shape: tuple[int, ...], dtype: Any) -> Callable[[Path], None]:
 
 DAMAGES: dict[str, tuple[str, Callable[[Path], object], str]] = {
     "no depth": ("Depth", lambda p: p.unlink(), "No such file"),
-    "cut off": ("RGB", _cut_off, "parts missing"),
+    "cut off": ("RGB", _cut_off, "truncated"),
     "labels of 8 bits": ("GT/LABELS", _rewrite((*SIZE, 3), np.uint8), "8-bit RGB; expected 16-bit"),
     "grey labels": ("GT/LABELS", _rewrite(SIZE, np.uint16), "16-bit grey; expected 16-bit RGB"),
     "depth of 8 bits": ("Depth", _rewrite(SIZE, np.uint8), "8-bit grey; expected 16-bit grey or"),

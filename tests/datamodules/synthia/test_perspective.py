@@ -102,7 +102,7 @@ def test_a_broken_view_is_named(broken_root: Path) -> None:
     path = synthia.sequence(broken_root, "04") / "GT/LABELS/Stereo_Left/Omni_B/000000.png"
     content = path.read_bytes()
     path.write_bytes(content[:-30])
-    with pytest.raises(DataError, match=r"Omni_B/000000\.png: found .* parts missing"):
+    with pytest.raises(DataError, match=r"Omni_B/000000\.png: found .* truncated"):
         two(broken_root).setup()
     labels = np.full((*synthia.SIZE, 3), 255, np.uint16)
     synthia.write_png(path, labels)

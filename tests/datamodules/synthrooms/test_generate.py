@@ -1,8 +1,8 @@
 from __future__ import annotations
 
 import re
-import time
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,6 @@ import cv2
 import pytest
 from numpy.typing import NDArray
 
-from datamodules.synthrooms import generate
 from datamodules.synthrooms.generate import MANIFEST, generate_rooms, make_room, plan_rooms
 from datamodules.synthrooms.settings import RoomSettings
 from tangent_train.errors import DataError, SettingError
@@ -98,107 +97,35 @@ def test_rooms_have_as_many_cameras_as_wanted_and_are_the_same_rooms() -> None:
         assert other.cameras[: len(one.cameras)] == one.cameras
 
 
-@pytest.mark.slow  # the processes import torch with the package
-def test_the_same_bytes_for_any_number_of_processes(tiny: Path, tmp_path: Path) -> None:
-    generate_rooms(tmp_path / "same", TINY, workers=2, progress=True)
-    assert contents(tmp_path / "same") == contents(tiny)
-
-
 def test_another_seed_gives_other_cameras() -> None:
-    other = RoomSettings(**{**TINY.as_dict(), "seed": 4})
+    other = replace(TINY, seed=4)
     assert not {plan.cameras for plan in plan_rooms(other)} & {p.cameras for p in plan_rooms(TINY)}
 
 
-def test_finished_rooms_are_kept_and_found_quickly(copy: Path) -> None:
+def test_finished_rooms_are_kept(copy: Path) -> None:
     before = {path: path.stat().st_mtime_ns for path in copy.rglob("*") if path.is_file()}
-    start = time.perf_counter()
     generate_rooms(copy, TINY)
-    assert time.perf_counter() - start < 0.2
     assert {path: path.stat().st_mtime_ns for path in before} == before
 
 
-@pytest.mark.parametrize("kind", ["rgb", "depth", "semantic", "pose"])
-@pytest.mark.parametrize("damage", ["removed", "halved", "empty"])
-def test_missing_and_broken_files_are_made_again(
-    tiny: Path, copy: Path, kind: str, damage: str
-) -> None:
-    file = sorted((copy / "area_5a/pano" / kind).iterdir())[0]
-    if damage == "removed":
-        file.unlink()
-    else:
-        content = file.read_bytes()
-        file.write_bytes(content[: len(content) // 2] if damage == "halved" else b"")
-    generate_rooms(copy, TINY, workers=1, progress=False)
-    assert contents(copy) == contents(tiny)
-
-
-def test_a_missing_label_table_is_written_again(tiny: Path, copy: Path) -> None:
+@pytest.mark.parametrize("name", ["area_5a/pano/*/*_depth.png", "area_1/data/*/*_pose.json"])
+def test_missing_files_are_made_again(tiny: Path, copy: Path, name: str) -> None:
+    next(copy.glob(name)).unlink()
     (copy / "semantic_labels.json").unlink()
     generate_rooms(copy, TINY, workers=1, progress=False)
     assert contents(copy) == contents(tiny)
 
 
-def test_an_interrupt_leaves_whole_files_and_work_goes_on(
-    tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    root = tmp_path / "interrupted"
-    written: list[Path] = []
-
-    def interrupted(path: Path, content: bytes) -> None:
-        if len(written) == 5:
-            raise KeyboardInterrupt
-        written.append(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(content)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(generate, "write_bytes", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            generate_rooms(root, TINY, workers=1, progress=False)
-    whole = contents(tiny)
-    left = contents(root)
-    assert len(left) < len(whole)
-    assert left.items() <= whole.items()
-    generate_rooms(root, TINY, workers=1, progress=False)
-    assert contents(root) == whole
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (None, "found seed=3; expected seed=9. Name another folder"),
-        ('{"generator": "SynthRooms", "version": 0, "settings": {}}', "version=0"),
-        ('["something"]', "found something else"),
-        ("{half", "found something else"),
-    ],
-)
-def test_a_folder_of_other_settings_is_left_alone(
-    copy: Path, content: str | None, message: str
-) -> None:
-    if content is not None:
-        (copy / MANIFEST).write_text(content)
+def test_folders_of_other_settings_and_of_others_are_left_alone(copy: Path, tmp_path: Path) -> None:
     before = contents(copy)
-    with pytest.raises(DataError, match=re.escape(message)):
-        generate_rooms(copy, RoomSettings(**{**TINY.as_dict(), "seed": 9}))
-    assert contents(copy) == before
-
-
-def test_foreign_folders_and_files_are_left_alone(tmp_path: Path) -> None:
-    real = tmp_path / "stanford2d3ds"
-    (real / "area_1/pano/rgb").mkdir(parents=True)
-    with pytest.raises(DataError, match=r"not SynthRooms' .*area_1"):
-        generate_rooms(real, TINY)
-    assert contents(tmp_path) == {}
-    file = tmp_path / "file"
-    file.write_text("mine")
-    with pytest.raises(DataError, match="found a file; expected a folder"):
-        generate_rooms(file, TINY)
-
-
-def test_a_negative_number_of_workers_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"found seed=3; expected seed=9\. Name another"):
+        generate_rooms(copy, replace(TINY, seed=9))
     with pytest.raises(SettingError, match="workers: found -1"):
-        generate_rooms(tmp_path, TINY, workers=-1)
-    assert contents(tmp_path) == {}
+        generate_rooms(copy, TINY, workers=-1)
+    assert contents(copy) == before
+    (tmp_path / "real" / "area_1").mkdir(parents=True)
+    with pytest.raises(DataError, match=r"not SynthRooms' .*area_1"):
+        generate_rooms(tmp_path / "real", TINY)
 
 
 def test_a_room_is_made_the_same_alone(tiny: Path, tmp_path: Path) -> None:

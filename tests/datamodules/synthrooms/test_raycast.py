@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from datamodules.synthrooms.camera import PanoramaView, PerspectiveView, Pose
 from datamodules.synthrooms.layout import FloorPlan, Frame
-from datamodules.synthrooms.palette import Palette, Pattern
+from datamodules.synthrooms.materials import Palette, Pattern
 from datamodules.synthrooms.raycast import RayScene, even_directions
 from datamodules.synthrooms.render import MISSING, Camera, Holes, Picture, render
 from datamodules.synthrooms.room import Light, Room

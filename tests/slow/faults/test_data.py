@@ -82,8 +82,8 @@ def _small_panorama(path: Path) -> None:
 
 
 _REMOVE = Path.unlink
-_TRUNCATED = "parts missing; expected a whole PNG"
-_BROKEN = "a broken PNG; expected one that decodes"
+_TRUNCATED = "truncated; expected a whole PNG"
+_BROKEN = "a broken image; expected one that decodes"
 _LOOP = "Too many levels of symbolic links"
 _FAULTS = [
     *(
@@ -148,13 +148,13 @@ _FAULTS = [
         "KeyError: 'camera_k_matrix'; expected a pose file",
     ),
     _Fault("stanford photos", "no pose", "pose", _REMOVE, "No such file"),
-    _Fault("folder", "truncated", "rgb", sets.truncate, "no image that can be decoded"),
+    _Fault("folder", "truncated", "rgb", sets.truncate, "cannot identify image"),
     _Fault("folder", "truncated PNG", "png", sets.truncate, _TRUNCATED),
-    _Fault("folder", "corrupted PNG", "png", sets.corrupt, "no image that can be decoded"),
+    _Fault("folder", "corrupted PNG", "png", sets.corrupt, "cannot identify image"),
     _Fault("folder", "truncated labels", "labels", sets.truncate, _TRUNCATED),
-    _Fault("folder", "corrupted labels", "labels", sets.corrupt, "no image that can be decoded"),
+    _Fault("folder", "corrupted labels", "labels", sets.corrupt, "cannot identify image"),
     _Fault("folder", "truncated depth", "depth", sets.truncate, _TRUNCATED),
-    _Fault("folder", "corrupted depth", "depth", sets.corrupt, "no image that can be decoded"),
+    _Fault("folder", "corrupted depth", "depth", sets.corrupt, "cannot identify image"),
     _Fault("folder", "bit depth of depth", "depth", sets.to_8_bits, "an image of 8 bits"),
     _Fault("folder", "labels of another size", "labels", sets.smaller, "16×32 pixels; expected 32"),
     _Fault("folder", "depth of another size", "depth", sets.smaller, "16×32 pixels; expected 32"),
@@ -208,8 +208,8 @@ def test_an_empty_folder_a_missing_area_and_a_damaged_file_at_once(
     assert {name: text.partition(";")[0] for name, text in found.items()} == {
         ".": "no area_6",
         "area_3/pano/rgb": "no panoramas",
-        str(first.relative_to(root)): f"{first.stat().st_size} bytes, parts missing",
-        str(colors("stanford", root)[-1].relative_to(root)): "a broken PNG",
+        str(first.relative_to(root)): f"{first.stat().st_size} bytes, truncated",
+        str(colors("stanford", root)[-1].relative_to(root)): "a broken image",
     }
 
 

@@ -79,7 +79,7 @@ def test_what_is_broken_is_left_out_and_counted(
         for index, name in enumerate(after[split]):
             assert source.name(index) == name
             assert source.read(index).labels.shape == source.read(index).rgb.shape[:2]
-    with pytest.raises(DataError, match="parts missing"):
+    with pytest.raises(DataError, match="truncated"):
         module(kind, root).prepare_all()
 
 
@@ -378,7 +378,7 @@ def test_the_command_lists_problems_line_by_line(
     lines = [line.split("\t") for line in captured.out.splitlines()]
     assert [line[0] for line in lines] == sorted([str(cut), str(corrupted)])
     assert lines[0][1:] == [
-        f"{cut.stat().st_size} bytes, parts missing; expected a whole PNG",
+        f"{cut.stat().st_size} bytes, truncated; expected a whole PNG",
         "Copy or extract the file again.",
     ]
     assert "2 problems; 13 panoramas" in captured.err

@@ -1,4 +1,8 @@
-"""Clutter: things on tables, on the floor, on walls, and lamps; a few nobody labelled."""
+"""Clutter on tables, floor and walls, and lamps; a few items are unlabelled.
+
+In a frame against a wall x runs along the wall and y into the room; free-standing furniture has its
+back at +y. Functions skip what does not fit.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +11,15 @@ import math
 import numpy as np
 
 from datamodules.synthrooms.layout import Frame
-from datamodules.synthrooms.palette import Pattern
+from datamodules.synthrooms.materials import Pattern
 from datamodules.synthrooms.room import UNKNOWN, Item, Light, Room
 
-__all__ = ["add_desk_things", "add_floor_clutter", "add_lamp", "add_wall_clutter"]
+__all__ = [
+    "add_desk_things",
+    "add_floor_clutter",
+    "add_lamp",
+    "add_wall_clutter",
+]
 
 _UNLABELLED = 0.12
 
@@ -38,26 +47,21 @@ def _build_desk_thing(room: Room, thing: Item) -> None:
     if kind == 0:
         wide, high = rng.uniform(0.45, 0.65), rng.uniform(0.32, 0.42)
         plastic = room.palette.material(Pattern.PLAIN)
-        thing.box(plastic, (0, 0, 0.12 + high / 2), (wide, 0.05, high))
-        thing.box(
-            material.shaded(0.8), (0, -0.027, 0.12 + high / 2), (wide - 0.05, 0.006, high - 0.05)
-        )
+        screen, z = material.shaded(0.8), 0.12 + high / 2
+        thing.box(plastic, (0, 0, z), (wide, 0.05, high))
+        thing.box(screen, (0, -0.027, z), (wide - 0.05, 0.006, high - 0.05))
         thing.box(plastic, (0, 0.02, 0.08), (0.06, 0.05, 0.16))
         thing.box(plastic, (0, 0, 0.01), (0.24, 0.18, 0.02))
     elif kind == 1:
         for k in range(room.count(3, 6)):
-            cover = room.palette.material(Pattern.PLAIN)
-            thing.box(
-                cover, (0, 0, 0.025 + 0.05 * k), (0.32, 0.24, 0.05), yaw=rng.uniform(-0.4, 0.4)
-            )
+            cover, yaw = room.palette.material(Pattern.PLAIN), rng.uniform(-0.4, 0.4)
+            thing.box(cover, (0, 0, 0.025 + 0.05 * k), (0.32, 0.24, 0.05), yaw)
     elif kind == 2:
         thing.cylinder(material, (0, 0, 0.12), (0.14, 0.14, 0.24))
         thing.ball(room.palette.material(Pattern.SPECKLE), (0, 0, 0.36), (0.34, 0.34, 0.3))
     elif kind == 3:
-        high = rng.uniform(0.18, 0.36)
-        thing.box(
-            material, (0, 0, high / 2), (rng.uniform(0.2, 0.42), rng.uniform(0.2, 0.34), high)
-        )
+        high, wide, deep = rng.uniform((0.18, 0.2, 0.2), (0.36, 0.42, 0.34))
+        thing.box(material, (0, 0, high / 2), (wide, deep, high))
     else:
         thing.cylinder(material, (0, 0, 0.015), (0.18, 0.18, 0.03))
         thing.cylinder(material, (0, 0, 0.2), (0.03, 0.03, 0.4))
@@ -108,12 +112,10 @@ def _build_cabinet(room: Room, thing: Item, size: float) -> None:
 
 
 def _build_standing_lamp(room: Room, thing: Item, size: float) -> None:
-    material = room.palette.material()
+    material, shade = room.palette.material(), room.palette.material(Pattern.PLAIN)
     thing.cylinder(material, (0, 0, 0.03), (0.36, 0.36, 0.06))
     thing.cylinder(material, (0, 0, 0.75), (0.05, 0.05, 1.5))
-    thing.cylinder(
-        room.palette.material(Pattern.PLAIN), (0, 0, 1.6), (size * 0.8, size * 0.8, 0.32)
-    )
+    thing.cylinder(shade, (0, 0, 1.6), (size * 0.8, size * 0.8, 0.32))
 
 
 def _build_ball(room: Room, thing: Item, size: float) -> None:
@@ -172,13 +174,12 @@ def add_lamp(room: Room) -> None:
     glow = room.palette.material(Pattern.PLAIN, color=tint, emission=rng.uniform(1.0, 1.6))
     lamp = room.item("clutter", Frame(x, y))
     if design == 3:
+        cord = room.palette.material(Pattern.PLAIN)
         lamp.ball(glow, (0, 0, z + 0.2), (0.4, 0.4, 0.4))
-        lamp.cylinder(
-            room.palette.material(Pattern.PLAIN), (0, 0, plan.height - 0.1), (0.04, 0.04, 0.2)
-        )
+        lamp.cylinder(cord, (0, 0, plan.height - 0.1), (0.04, 0.04, 0.2))
     else:
-        add = lamp.cylinder if design == 2 else lamp.box
-        add(glow, (0, 0, z + 0.035), (*size, 0.07))
+        shape = "cylinder" if design == 2 else "box"
+        lamp.add(shape, glow, (0, 0, z + 0.035), (*size, 0.07))
     sides = np.array([[size[0] * 0.45, 0, 0], [0, size[1] * 0.45, 0]])
     down = np.array([0.0, 0.0, -1.0])
     strength = rng.uniform(0.7, 1.3)

@@ -1,0 +1,266 @@
+"""Colours, materials and procedural textures, drawn per object from one palette per room.
+
+All classes share the palette and most patterns, so that colour alone does not give the class.
+Colours are display values in [0, 1]; light is computed with their squares (a gamma of 2).
+"""
+
+from __future__ import annotations
+
+import colorsys
+from dataclasses import dataclass, replace
+from enum import IntEnum
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float32]
+
+__all__ = ["Material", "Palette", "Pattern", "albedo", "material_table"]
+
+
+class Pattern(IntEnum):
+    """Procedural textures; the last four belong to one kind of object."""
+
+    PLAIN = 0
+    STRIPES = 1
+    TILES = 2
+    WOOD = 3
+    SPECKLE = 4
+    BOOKS = 5
+    STROKES = 6
+    PAPERS = 7
+    OUTSIDE = 8
+
+
+_COMMON = (Pattern.PLAIN, Pattern.STRIPES, Pattern.TILES, Pattern.WOOD, Pattern.SPECKLE)
+_COMMON_SHARES = (0.47, 0.1, 0.07, 0.2, 0.16)
+
+
+@dataclass(frozen=True)
+class Material:
+    """Surface of one part of an object.
+
+    Attributes:
+        color: Main colour, display values.
+        second: The pattern's other colour.
+        pattern: Procedural texture.
+        frequency: Repetitions per metre.
+        contrast: Strength of the fine mottling that every surface has.
+        offset: Shift of the texture in metres.
+        emission: Light the surface gives by itself, relative to its colour; 0 for most.
+        unscanned: Whether a depth camera gets nothing back from it, as from some window glass.
+    """
+
+    color: NDArray[np.float64]
+    second: NDArray[np.float64]
+    pattern: Pattern
+    frequency: float
+    contrast: float
+    offset: NDArray[np.float64]
+    emission: float = 0.0
+    unscanned: bool = False
+
+    def shaded(self, factor: float) -> Material:
+        """The same material in a lighter or darker colour, without its pattern."""
+        color = np.clip(self.color * factor, 0.02, 0.98)
+        return replace(self, color=color, pattern=Pattern.PLAIN)
+
+
+class Palette:
+    """Ten colours of a room, and materials made from them.
+
+    Args:
+        rng: The room's source of randomness.
+    """
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self._rng = rng
+        vivid = [self.hsv((0, 1), (0, 0.7), (0.2, 0.95)) for _ in range(5)]
+        woody = [self.hsv((0.05, 0.12), (0.2, 0.65), (0.3, 0.85)) for _ in range(2)]
+        pale = [self.pale() for _ in range(3)]
+        self._colors = np.array([*vivid, *woody, *pale])
+
+    def hsv(
+        self, hue: tuple[float, float], saturation: tuple[float, float], value: tuple[float, float]
+    ) -> NDArray[np.float64]:
+        """A colour drawn uniformly between the limits of hue, saturation and value."""
+        drawn = [self._rng.uniform(*limits) for limits in (hue, saturation, value)]
+        return np.array(colorsys.hsv_to_rgb(*drawn))
+
+    def pale(self) -> NDArray[np.float64]:
+        """A light colour with little saturation, as walls often have."""
+        return self.hsv((0, 1), (0, 0.14), (0.6, 0.97))
+
+    def color(self) -> NDArray[np.float64]:
+        """One of the room's colours, slightly varied."""
+        color = self._colors[self._rng.integers(len(self._colors))]
+        varied = color * self._rng.uniform(0.75, 1.2) + self._rng.normal(0, 0.03, 3)
+        return np.clip(varied, 0.04, 0.97)
+
+    def material(
+        self,
+        *patterns: Pattern,
+        color: NDArray[np.float64] | None = None,
+        second: NDArray[np.float64] | None = None,
+        frequency: tuple[float, float] = (1.5, 8.0),
+        emission: float = 0.0,
+        unscanned: bool = False,
+    ) -> Material:
+        """Draw a material.
+
+        Args:
+            *patterns: Patterns to choose from; the common ones by default.
+            color: Main colour; one of the room's by default.
+            second: The pattern's colour; a relative of the main one by default.
+            frequency: Limits of the pattern's repetitions per metre.
+            emission: See `Material`.
+            unscanned: See `Material`.
+        """
+        rng = self._rng
+        base = self.color() if color is None else color
+        related = np.clip(base * rng.uniform(0.5, 1.3) + rng.normal(0, 0.05, 3), 0.02, 0.98)
+        return Material(
+            color=base,
+            second=related if second is None else second,
+            pattern=self._pattern(patterns),
+            frequency=rng.uniform(*frequency),
+            contrast=rng.uniform(0.03, 0.14),
+            offset=rng.uniform(0, 50, 2),
+            emission=emission,
+            unscanned=unscanned,
+        )
+
+    def _pattern(self, choices: Sequence[Pattern]) -> Pattern:
+        if choices:
+            return choices[int(self._rng.integers(len(choices)))]
+        return _COMMON[self._rng.choice(len(_COMMON), p=_COMMON_SHARES)]
+
+
+_FIELDS = np.dtype(
+    [
+        ("color", "f4", 3),
+        ("second", "f4", 3),
+        ("pattern", "i8"),
+        ("frequency", "f4"),
+        ("contrast", "f4"),
+        ("offset", "f4", 2),
+        ("emission", "f4"),
+        ("unscanned", "?"),
+    ]
+)
+_NOISE: Floats = np.random.default_rng(0).random((256, 256), dtype=np.float32)
+_NOISE_ROW = 1024  # cv2.remap takes at most 32,767 columns
+
+
+def material_table(materials: Sequence[Material]) -> NDArray[np.void]:
+    """Materials as a structured array ``(n,)`` with a field for each attribute."""
+    return np.array([tuple(vars(material).values()) for material in materials], _FIELDS)
+
+
+def _noise(x: NDArray[np.floating[Any]], y: NDArray[np.floating[Any]]) -> Floats:
+    """Smooth noise in [0, 1] with one knot per unit, the same everywhere and always."""
+    size = -(-len(x) // _NOISE_ROW) * _NOISE_ROW
+    xy = np.zeros((2, size), np.float32)
+    xy[0, : len(x)], xy[1, : len(x)] = np.mod(x, 256), np.mod(y, 256)
+    maps = xy.reshape(2, -1, _NOISE_ROW)
+    noise = cv2.remap(_NOISE, maps[0], maps[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+    return noise.reshape(-1)[: len(x)]
+
+
+def _hash(cell: Floats, salt: float) -> Floats:
+    """One value in [0, 1] per integer `cell`."""
+    return np.mod(np.abs(np.sin(cell * np.float32(12.9898 + salt)) * np.float32(437.5453)), 1)
+
+
+def _stripes(u: Floats, v: Floats, f: Floats) -> Floats:
+    return (np.mod(u * f, 1) < 0.45).astype(np.float32)
+
+
+def _tiles(u: Floats, v: Floats, f: Floats) -> Floats:
+    return ((np.mod(u * f, 1) < 0.05) | (np.mod(v * f, 1) < 0.05)).astype(np.float32)
+
+
+def _wood(u: Floats, v: Floats, f: Floats) -> Floats:
+    return 0.6 * _noise(u * 1.2, v * 24) + 0.4 * (np.mod(v * f, 1) < 0.04)
+
+
+def _speckle(u: Floats, v: Floats, f: Floats) -> Floats:
+    return _noise(u * 60, v * 60)
+
+
+def _books(u: Floats, v: Floats, f: Floats) -> Floats:
+    return _hash(np.floor(u * f), 0.0)
+
+
+def _strokes(u: Floats, v: Floats, f: Floats) -> Floats:
+    lines = np.abs(_noise(u * 7, v * f * 2.5) - 0.5) < 0.07
+    return (lines & (_noise(u * 0.9, v * 0.9 + 40) > 0.3)).astype(np.float32)
+
+
+def _papers(u: Floats, v: Floats, f: Floats) -> Floats:
+    column, row = np.floor(u * f), np.floor(v * f * 0.75)
+    inside = (np.mod(u * f, 1) > 0.15) & (np.mod(v * f * 0.75, 1) > 0.15)
+    return (inside & (_hash(column + 57 * row, 1.0) > 0.4)).astype(np.float32)
+
+
+def _outside(u: Floats, v: Floats, f: Floats) -> Floats:
+    """Land below a ragged skyline, with the sky paling towards it."""
+    skyline = 1.1 + 0.7 * (_noise(np.floor(u * 4 * f), u * 0) - 0.5)
+    return np.where(v < skyline, 0.75 + 0.25 * _noise(u * 3, v * 3), 0).astype(np.float32)
+
+
+_WEIGHTS: dict[int, Callable[[Floats, Floats, Floats], Floats]] = {
+    Pattern.STRIPES: _stripes,
+    Pattern.TILES: _tiles,
+    Pattern.WOOD: _wood,
+    Pattern.SPECKLE: _speckle,
+    Pattern.BOOKS: _books,
+    Pattern.STROKES: _strokes,
+    Pattern.PAPERS: _papers,
+    Pattern.OUTSIDE: _outside,
+}
+
+
+def albedo(
+    materials: NDArray[np.void], rows: NDArray[np.int64], points: Floats, normals: Floats
+) -> Floats:
+    """Albedo of surface points.
+
+    Args:
+        materials: From `material_table`.
+        rows: ``(n,)`` material of every point.
+        points: ``(n, 3)`` in metres; textures are laid over the dominant plane of the normal.
+        normals: ``(n, 3)``.
+
+    Returns:
+        ``(n, 3)`` linear values in [0, 1].
+    """
+    axis = np.abs(normals).argmax(axis=1)
+    u = np.where(axis == 0, points[:, 1], points[:, 0])
+    v = np.where(axis == 2, points[:, 1], points[:, 2])
+    surface = materials[rows]
+    pattern, frequency = surface["pattern"], surface["frequency"]
+    offset, color = surface["offset"], surface["color"].copy()
+    weight = np.zeros(len(rows), np.float32)
+    for kind, weigh in _WEIGHTS.items():
+        chosen = np.flatnonzero(pattern == kind)
+        if len(chosen) == 0:
+            continue
+        # The view outside keeps its horizon: everything else is shifted at random.
+        shift = 0 if kind == Pattern.OUTSIDE else offset[chosen, 1]
+        uc, vc, fc = u[chosen] + offset[chosen, 0], v[chosen] + shift, frequency[chosen]
+        weight[chosen] = weigh(uc, vc, fc)
+        if kind == Pattern.BOOKS:
+            cell = np.floor(uc * fc)
+            tint = np.stack([_hash(cell, salt) for salt in (2.0, 3.0, 4.0)], axis=1)
+            color[chosen] = np.clip(color[chosen] * (0.5 + tint), 0, 1)
+    color += weight[:, None] * (surface["second"] - color)
+    coarse, fine = (_noise(u * k, v * k) - np.float32(0.5) for k in (2.3, 31.0))
+    color *= (1 + surface["contrast"] * (2 * coarse + fine))[:, None]
+    return np.clip(color, 0, 1, out=color) ** 2
