@@ -82,7 +82,7 @@ def _opened(path: Path) -> Iterator[Image.Image]:
     except Exception as error:
         raise DataError(
             path,
-            found=error,
+            found=f"no image that can be decoded ({error})",
             expected="a whole JPEG, PNG, TIFF or WebP image",
             remedy="Copy or export the file again.",
         ) from error

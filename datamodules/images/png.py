@@ -78,8 +78,8 @@ def read_png_header(path: Path) -> PngHeader:
     except OSError as error:
         raise DataError(path, found=error, expected="a PNG file", remedy=_REMEDY) from error
     if not is_whole:
-        found = "a truncated PNG file" if is_png else "no PNG header"
-        raise DataError(path, found=found, expected="a whole PNG file", remedy=_REMEDY)
+        found = f"{path.stat().st_size} bytes, truncated" if is_png else "no PNG header"
+        raise DataError(path, found=found, expected="a whole PNG", remedy=_REMEDY)
     _, width, height, bits, color = _HEADER.unpack(start)
     check_pixels(path, height, width)
     return PngHeader(height, width, bits, _COLOR_TYPES.get(color, f"color type {color}"))

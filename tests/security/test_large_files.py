@@ -112,7 +112,7 @@ def test_chunks_that_claim_gigabytes_are_not_decoded(read: Read, tmp_path: Path)
     path = _png(tmp_path / "a.png", 16, 8)
     whole = path.read_bytes()
     path.write_bytes(whole[:33] + struct.pack(">I", 3_000_000_000) + whole[37:])
-    with pytest.raises(DataError, match=r"a\.png: found a truncated PNG"):
+    with pytest.raises(DataError, match=r"a\.png: found .* truncated"):
         read(path)
 
 

@@ -80,7 +80,7 @@ def test_truncated_files_are_named(tmp_path: Path, missing: slice, read: Any) ->
     content = bytearray(path.read_bytes())
     del content[missing]
     path.write_bytes(content)
-    with pytest.raises(DataError, match=r"image\.png: found a truncated PNG"):
+    with pytest.raises(DataError, match=r"image\.png: found .* truncated"):
         read(path)
 
 
