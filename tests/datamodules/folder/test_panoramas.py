@@ -356,7 +356,7 @@ def _small_depth_array(root: Path) -> None:
         (_color_label, r"view\.1\.png: found 8-bit RGB; expected .*names values"),
         (_bits_label, r"view\.1\.png: found 1-bit grey; expected 8-bit grey.*Convert"),
         (_narrow_image, r"view\.1\.jpg: found 32×60 pixels; expected twice as wide"),
-        (_broken_image, r"view\.1\.jpg: found cannot identify image"),
+        (_broken_image, r"view\.1\.jpg: found no image that can be decoded"),
         (_two_images, r"view\.1\.png: found view\.1\.jpg beside it|view\.1\.jpg: found view"),
         (_no_images, r"images: found nothing; expected"),
         (_no_labels, r"labels: found no such folder; .*docs/own_data\.md"),
