@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from benchmarks.report import amount
-from tangent_train.results.reports.chart import COLORS, png_bytes
+from tangent_train.results.chart import COLORS, png_bytes
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

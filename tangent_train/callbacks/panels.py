@@ -1,4 +1,4 @@
-"""What happens around training: pictures and progress."""
+"""Pictures of the test, and the progress bar."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ from lightning.pytorch.callbacks import Callback, RichProgressBar
 
 from tangent_train.errors import SettingError
 from tangent_train.files import write_bytes
-from tangent_train.results.html.evaluation import image_note
-from tangent_train.results.html.images import EncodedImage, ViewerImage, encode_image
+from tangent_train.metrics.segmentation import segmentation_scores
+from tangent_train.results.html import EncodedImage, ViewerImage, encode_image
 from tangent_train.results.pictures import prediction_panel, shown_image, side_by_side
+from tangent_train.results.tables import percent
 
 __all__ = ["PredictionPanels", "ProgressBar"]
 
@@ -32,6 +33,9 @@ class PredictionPanels(Callback):
     Attributes:
         images: The same, compressed, for the viewer of the report; after the test those of all
             processes, in the order of the split.
+
+    Raises:
+        SettingError: Less than 0.
     """
 
     def __init__(self, folder: Path | str, count: int = 6) -> None:
@@ -63,27 +67,30 @@ class PredictionPanels(Callback):
             batch.index.tolist(), outputs, batch.target, strict=True
         ):
             if index in chosen:
-                image: Any = source.read(index)
-                shown = (
-                    shown_image(image, target, pl_module.representation),
-                    side_by_side(target.cpu().numpy()),
-                    side_by_side(prediction.cpu().numpy()),
-                )
-                class_names: Any = pl_module.class_names
-                panel = prediction_panel(*shown, class_names)
-                encoded = cv2.imencode(".png", cv2.cvtColor(panel, cv2.COLOR_RGB2BGR))[1]
-                name = source.name(index).replace("/", "_")
-                write_bytes(self.folder / f"{name}.png", encoded.tobytes())
-                rgb, truth, labels = shown
-                viewed = ViewerImage(
-                    source.name(index),
-                    rgb,
-                    labels,
-                    truth,
-                    sphere=target.ndim == _PANORAMA_DIMENSIONS,
-                    note=image_note(truth, labels, len(class_names)),
-                )
-                self._encoded[index] = encode_image(viewed, len(class_names))
+                rgb = shown_image(source.read(index), target, pl_module.representation)
+                truth, labels = (side_by_side(x.cpu().numpy()) for x in (target, prediction))
+                sphere = target.ndim == _PANORAMA_DIMENSIONS
+                self._keep(index, source.name(index), rgb, truth, labels, pl_module, sphere)
+
+    def _keep(
+        self,
+        index: int,
+        name: str,
+        rgb: Any,
+        truth: Any,
+        labels: Any,
+        task: Any,
+        sphere: bool,
+    ) -> None:
+        panel = prediction_panel(rgb, truth, labels, task.class_names)
+        encoded = cv2.imencode(".png", cv2.cvtColor(panel, cv2.COLOR_RGB2BGR))[1]
+        write_bytes(self.folder / f"{name.replace('/', '_')}.png", encoded.tobytes())
+        classes = len(task.class_names)
+        pairs = truth.astype(np.int64).ravel() * classes + labels.ravel()
+        counts = np.bincount(pairs, minlength=classes**2).reshape(classes, classes)
+        note = f"mIoU {percent(segmentation_scores(counts).miou)}\u00a0%" if truth.any() else ""
+        viewed = ViewerImage(name, rgb, labels, truth, sphere=sphere, note=note)
+        self._encoded[index] = encode_image(viewed, classes)
 
     def on_test_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Bring together what the processes have."""

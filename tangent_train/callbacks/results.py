@@ -7,18 +7,19 @@ from pathlib import Path
 from typing import Any
 
 from lightning.pytorch.callbacks import Callback
-from rich.table import Table
 
 from tangent_train.callbacks.panels import PredictionPanels
 from tangent_train.callbacks.tensorboard import ValidationConfusion, ValidationPictures
-from tangent_train.results.classification import (
-    classification_results,
-    classification_table,
-    write_classification_results,
+from tangent_train.results.evaluation import (
+    classification_record,
+    confusion_table,
+    headline,
+    result_tables,
+    segmentation_record,
+    write_results,
 )
-from tangent_train.results.html.classification import write_classification_report
-from tangent_train.results.html.evaluation import write_evaluation_report
-from tangent_train.results.segmentation import evaluation_results, results_table, write_results
+from tangent_train.results.html import write_report
+from tangent_train.results.record import Record
 
 __all__ = ["evaluated", "pictures", "write_evaluation"]
 
@@ -34,42 +35,40 @@ def pictures(kind: str, folder: Path, settings: Mapping[str, Any]) -> list[Callb
     if kind == "classification":
         return [ValidationConfusion()]
     return [
+        ValidationConfusion(),
         PredictionPanels(folder / "panels", settings["panels"]),
         ValidationPictures(settings.get("tensorboard_images", 0)),
     ]
 
 
-def evaluated(task: Any, noun: str) -> dict[str, Any]:
-    """All figures of the last evaluation of a task, as plain values.
+def evaluated(task: Any, noun: str) -> Record:
+    """The record of the last evaluation of a task.
 
     Args:
         task: With the matrices of that evaluation.
         noun: What was scored, in the plural.
     """
     if task.kind == "classification":
-        return classification_results(task.matrices, task.class_names, noun)
-    return evaluation_results(task.matrices, task.class_names, task.absent_class, noun)
+        return classification_record(task.matrices, task.class_names, noun)
+    return segmentation_record(task.matrices, task.class_names, task.absent_class, noun)
 
 
-def write_evaluation(task: Any, results: dict[str, Any], checkpoint: Path, folder: Path) -> Table:
+def write_evaluation(task: Any, record: Record, checkpoint: Path, folder: Path) -> None:
     """Write ``results.*`` and ``report.html``.
 
     Args:
         task: What was evaluated, still attached to its trainer.
-        results: From `evaluated`.
+        record: From `evaluated`.
         checkpoint: Its weights.
         folder: Where to.
-
-    Returns:
-        The table for the terminal.
     """
-    page = folder / "report.html"
-    if task.kind == "classification":
-        write_classification_results(results, folder)
-        write_classification_report(page, results, checkpoint)
-        return classification_table(results)
-    write_results(results, folder)
+    write_results(record, folder)
     callbacks = task.trainer.callbacks
-    images = [i for c in callbacks if isinstance(c, PredictionPanels) for i in c.images]
-    write_evaluation_report(page, results, task.class_names, images, checkpoint)
-    return results_table(results)
+    write_report(
+        folder / "report.html",
+        f"Evaluation of {checkpoint.name}",
+        tables=[*result_tables(record), confusion_table(record)],
+        images=[i for c in callbacks if isinstance(c, PredictionPanels) for i in c.images],
+        class_names=task.class_names,
+        notes=[headline(record), f"Checkpoint: {checkpoint}"],
+    )

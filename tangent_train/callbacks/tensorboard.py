@@ -1,4 +1,4 @@
-"""What TensorBoard shows of a training beside its curves: pictures, per-class figures, speed."""
+"""What TensorBoard shows of a training beside its curves: pictures, scores per class, speed."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from tangent_train.errors import SettingError
 from tangent_train.metrics.classification import classification_scores
 from tangent_train.metrics.segmentation import segmentation_scores
-from tangent_train.results.confusion_picture import confusion_picture
+from tangent_train.results.chart import confusion_picture
 from tangent_train.results.pictures import prediction_panel, shown_image, side_by_side
 
 __all__ = ["TrainingSpeed", "ValidationConfusion", "ValidationPictures"]
@@ -26,19 +26,12 @@ _MOST_ROWS = 256
 
 _PANORAMA_DIMENSIONS = 2
 
-_Labels = NDArray[np.integer]
-
 
 class ValidationPictures(Callback):
-    """Shows in TensorBoard, after every validation, what became of a few images and of each class.
+    """Shows a few validation images in TensorBoard, after every validation.
 
-    * ``val_images/<name>``: input, truth, prediction and error; always the same images, spread over
-      those that the first process sees.
-    * ``val_iou/<class>``: IoU of the classes that occur.
-    * ``val/confusion``: the confusion matrix, in percent of the true class.
-
-    They stand at the same steps as ``val/miou``. Only the first process draws; nothing is drawn
-    without a logger for TensorBoard.
+    ``val_images/<name>``: input, truth, prediction and error; always the same images, spread over
+    those that the first process sees.
 
     Args:
         count: How many images.
@@ -51,7 +44,6 @@ class ValidationPictures(Callback):
         if count < 0:
             raise SettingError("tensorboard_images", found=count, expected="0 or more")
         self.count = count
-        self._shown: dict[int, tuple[NDArray[np.uint8], _Labels]] = {}
 
     def on_validation_batch_end(  # noqa: D102 - a hook of Lightning
         self,
@@ -69,41 +61,23 @@ class ValidationPictures(Callback):
             return
         target, index = batch.target[0], int(batch.index[0])
         task: Any = pl_module
-        prediction = outputs[0]
         data: Any = trainer.datamodule  # type: ignore[attr-defined]
         source = data.source("val")
-        if index not in self._shown:
-            rgb = shown_image(source.read(index), target, task.representation)
-            self._shown[index] = _smaller(rgb), _smaller(side_by_side(target.cpu().numpy()))
-        shown = _smaller(side_by_side(prediction.cpu().numpy()))
-        panel = prediction_panel(*self._shown[index], shown, task.class_names)
+        rgb = shown_image(source.read(index), target, task.representation)
+        labels = (side_by_side(x.cpu().numpy()) for x in (target, outputs[0]))
+        panel = prediction_panel(_smaller(rgb), *map(_smaller, labels), task.class_names)
         tag = f"val_images/{source.name(index).replace('/', '_')}"
         writer.add_image(tag, panel, _step(trainer), dataformats="HWC")
 
-    def on_validation_end(  # noqa: D102 - a hook of Lightning; the scores are there now
-        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
-    ) -> None:
-        writer = _writer(trainer)
-        if writer is None:
-            return
-        task: Any = pl_module
-        step, matrix = _step(trainer), task.matrices.pixels
-        scores = segmentation_scores(matrix, task.absent_class)
-        for name, iou in zip(task.class_names[1:], scores.iou, strict=True):
-            if not np.isnan(iou):
-                writer.add_scalar(f"val_iou/{name}", iou, step)
-        picture = confusion_picture(matrix, task.class_names)
-        writer.add_image("val/confusion", picture, step, dataformats="HWC")
-
 
 class ValidationConfusion(Callback):
-    """Shows in TensorBoard, after every validation of a classification, what became of each class.
+    """Shows in TensorBoard, after every validation, how every class fares.
 
-    * ``val_accuracy/<class>``: share of the classes that occur that was classified rightly.
+    * ``val_iou/<class>``, of shapes ``val_accuracy/<class>``: of the classes that occur.
     * ``val/confusion``: the confusion matrix, in percent of the true class.
 
-    They stand at the same steps as ``val/accuracy``. Only the first process draws; nothing is drawn
-    without a logger for TensorBoard.
+    They stand at the same steps as ``val/miou``. Only the first process draws, and only with a
+    TensorBoard logger.
     """
 
     def on_validation_end(  # noqa: D102 - a hook of Lightning; the scores are there now
@@ -113,12 +87,18 @@ class ValidationConfusion(Callback):
         if writer is None:
             return
         task: Any = pl_module
+        segmentation = task.kind == "segmentation"
+        if segmentation:
+            matrix, name = task.matrices.pixels, "val_iou"
+            values = segmentation_scores(matrix, task.absent_class).iou
+        else:
+            matrix, name = task.matrices, "val_accuracy"
+            values = classification_scores(matrix).of_class
         step = _step(trainer)
-        scores = classification_scores(task.matrices)
-        for name, accuracy in zip(task.class_names, scores.of_class, strict=True):
-            if not np.isnan(accuracy):
-                writer.add_scalar(f"val_accuracy/{name}", accuracy, step)
-        picture = confusion_picture(task.matrices, task.class_names, unknown=False)
+        for class_name, value in zip(task.class_names[int(segmentation) :], values, strict=True):
+            if not np.isnan(value):
+                writer.add_scalar(f"{name}/{class_name}", value, step)
+        picture = confusion_picture(matrix, task.class_names, unknown=segmentation)
         writer.add_image("val/confusion", picture, step, dataformats="HWC")
 
 

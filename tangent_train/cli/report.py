@@ -1,59 +1,47 @@
-"""``tangent-report``: what the command line says, and the files it leaves."""
+"""``tangent-report``: mean and spread of finished runs, beside the paper's figures."""
 
 from __future__ import annotations
 
 import argparse
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tangent_train.errors import SettingError
-from tangent_train.json_text import parse_json
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
 __all__ = ["report"]
 
-_FILES = ("report.json", "report.md", "report.csv", "report.png")
+_MADE_BY = "tangent-report"
 
 
 def report(arguments: Sequence[str]) -> None:
-    """Read runs, print the tables, write ``report.md``, ``.csv``, ``.json`` and ``.png``.
+    """Read runs, print the table, write ``report.md``, ``.csv``, ``.json`` and ``.png``.
 
     Args:
         arguments: The command line after the program's name.
 
     Raises:
         DataError: Runs are missing or cannot be read.
-        SettingError: The output folder holds files of these names that are no report.
+        SettingError: The output folder holds files of these names that are not a report.
     """
     options = _parser().parse_args(arguments)
     _check_output(options.output)
     # Heavy, and not needed to say what is wrong with the command line.
     from rich.console import Console
 
-    from tangent_train.files import write_bytes, write_text
-    from tangent_train.results.reports import tables
-    from tangent_train.results.reports.chart import report_png
-    from tangent_train.results.reports.groups import group_runs
-    from tangent_train.results.reports.runs import find_runs, load_run, unfinished_runs
+    from tangent_train.results.comparisons import runs_report
+    from tangent_train.results.record import find_runs, load_record, unfinished_runs
 
-    groups = group_runs([load_run(folder) for folder in find_runs(options.folders)])
-    remarks = tables.notes(groups)
-    remarks += [f"{run}: not finished, left out." for run in unfinished_runs(options.folders)]
-    # The mark of a report first: an interrupted one can be written again.
-    write_text(options.output / "report.json", tables.report_json(groups, remarks))
-    write_text(options.output / "report.md", tables.report_markdown(groups, remarks))
-    write_text(options.output / "report.csv", tables.report_csv(groups))
-    write_bytes(options.output / "report.png", report_png(groups))
+    records = [load_record(folder) for folder in find_runs(options.folders)]
+    notes = [f"{run}: not finished, left out." for run in unfinished_runs(options.folders)]
+    found = runs_report(records, _MADE_BY, notes)
+    found.write(options.output, "report")
     console = Console(highlight=False)
-    for table in tables.report_tables(groups):
-        console.print(table)
-    for remark in remarks:
-        console.print(f"- {remark}", soft_wrap=True, markup=False)
-    files = f"Per class, beside the paper: {options.output / 'report.md'}, .csv, .json, .png"
-    console.print(files, soft_wrap=True, markup=False)
+    console.print(found.tables()[0].terminal())
+    for line in (*(f"- {note}" for note in found.all_notes()), f"Files: {options.output}/report.*"):
+        console.print(line, soft_wrap=True, markup=False)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -77,26 +65,17 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _check_output(folder: Path) -> None:
-    """Refuse to write where no folder can be, and over files that no report left there."""
-    parent = next(path for path in folder.absolute().parents if path.exists())
-    place = folder if folder.exists() else parent
-    if not place.is_dir() or not os.access(place, os.W_OK):
-        raise SettingError("--output", found=str(folder), expected="a folder that can be written")
-    there = [name for name in _FILES if (folder / name).exists()]
-    if there and not _is_report(folder / "report.json"):
+    """Refuse to write over files that another program left there."""
+    made_by_us = folder / "report.json"
+    there = [
+        path for path in folder.glob("report.*") if path.suffix in (".md", ".csv", ".png", ".json")
+    ]
+    if there and not (
+        made_by_us.is_file()
+        and f'"made_by": "{_MADE_BY}"' in made_by_us.read_text(errors="replace")[:200]
+    ):
         raise SettingError(
             "--output",
-            found=f"{folder / there[0]}, which tangent-report did not write",
+            found=f"{there[0]}, which tangent-report did not write",
             expected="a new folder, or one with an earlier report",
-            remedy="Give another folder.",
         )
-
-
-def _is_report(path: Path) -> bool:
-    from tangent_train.results.reports.tables import MADE_BY
-
-    try:
-        content = parse_json(path.read_text())
-    except (OSError, ValueError):
-        return False
-    return isinstance(content, dict) and content.get("made_by") == MADE_BY

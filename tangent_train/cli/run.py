@@ -41,6 +41,8 @@ from tangent_train.cli.sweep import OBJECTIVE_FILE
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import write_text
 from tangent_train.registry import make
+from tangent_train.results.evaluation import headline, result_tables
+from tangent_train.results.record import Record
 from tangent_train.setting_rules import differing_settings, from_file
 
 __all__ = ["best_on_validation", "build", "evaluate", "prepare", "train"]
@@ -230,11 +232,11 @@ def _test(trainer: lightning.Trainer, task: Any, data: Any, checkpoint: Path, fo
             expected="the network and inputs of the checkpoint",
         ) from error
     trainer.test(task, datamodule=data, verbose=False)
-    results = evaluated(task, data.noun)
+    record = evaluated(task, data.noun)
     total = len(data.source("test"))
-    if results["images"] != total:
-        raise RuntimeError(f"{results['images']} of {total} test {data.noun} were counted")
-    _report(task, results, checkpoint, folder)
+    if record.images != total:
+        raise RuntimeError(f"{record.images} of {total} test {data.noun} were counted")
+    _report(task, record, checkpoint, folder)
 
 
 def _check_fits(content: dict[str, Any], data: Any, checkpoint: Path) -> None:
@@ -286,13 +288,14 @@ def best_on_validation(trainer: lightning.Trainer, folder: Path) -> float | None
 
 
 @rank_zero_only
-def _report(task: Any, results: dict[str, Any], checkpoint: Path, folder: Path) -> None:
+def _report(task: Any, record: Record, checkpoint: Path, folder: Path) -> None:
+    write_evaluation(task, record, checkpoint, folder)
     console = _console()
-    console.print(write_evaluation(task, results, checkpoint, folder))
+    console.print(headline(record), markup=False)
+    console.print(result_tables(record)[0].terminal())
     console.print(
-        f"Results, pictures and logs are in {folder} (checkpoint {checkpoint.name}).", markup=False
+        f"Results, pictures and logs: {folder}; report.html opens in a browser.", markup=False
     )
-    console.print(f"To look at in a browser: {folder / 'report.html'}", markup=False)
 
 
 def _run_folder() -> Path:

@@ -1,7 +1,6 @@
-"""One self-contained HTML file with tables, curves and a viewer of panoramas; no network needed."""
+"""One self-contained HTML file with tables and a viewer of panoramas; no network needed."""
 
 from tangent_train.results.html.images import EncodedImage, ViewerImage, encode_image
 from tangent_train.results.html.page import write_report
-from tangent_train.results.html.parts import Curve, Table
 
-__all__ = ["Curve", "EncodedImage", "Table", "ViewerImage", "encode_image", "write_report"]
+__all__ = ["EncodedImage", "ViewerImage", "encode_image", "write_report"]

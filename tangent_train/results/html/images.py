@@ -23,10 +23,8 @@ BUDGET_BYTES = 8_000_000
 MOST_PIXELS = 4096
 """The longer side of an image in the report."""
 
-_QUALITIES = (90, 85, 80, 70, 60, 45, 30)
-_THUMBNAIL_BYTES = 40_000
-_THUMBNAIL_SHAPE = (108, 216)
-_LABEL_VALUES = 256
+_THUMBNAIL_PIXELS = 216
+_QUALITY = 88
 
 
 @dataclass(frozen=True)
@@ -85,45 +83,40 @@ def encode_image(
 ) -> EncodedImage:
     """Compress an image so that it takes no more than its share of the report.
 
-    Sides longer than `MOST_PIXELS` are shrunk: colours by area, labels to the nearest. Label maps,
-    exact, may take half of the budget, halved in size until they do; the picture gets the rest, its
-    quality lowered step by step and then its size.
+    Sides longer than `MOST_PIXELS` are shrunk, colors by area, labels to the nearest; all are
+    halved in size until they fit.
 
     Args:
         image: What to show.
         class_count: K + 1, the unknown class 0 included.
         budget_bytes: Of the HTML file, where files are written in base64.
 
-    Returns:
-        The compressed image.
-
     Raises:
         DataError: Arrays of other shapes or types, or class indices out of range.
     """
     _check(image, class_count)
-    height, width = image.rgb.shape[:2]
-    rgb = _shrunk(image.rgb, cv2.INTER_AREA)
-    room = budget_bytes * 3 // 4 - _THUMBNAIL_BYTES
     maps = {"truth": image.truth, "prediction": image.prediction}
-    labels = {
-        kind: _shrunk(labels.astype(np.uint8, copy=False), cv2.INTER_NEAREST_EXACT)
-        for kind, labels in maps.items()
-        if labels is not None
-    }
-    pngs = _label_pngs(labels, room // 2)
-    scale = max(s / t for s, t in zip(_THUMBNAIL_SHAPE, rgb.shape[:2], strict=True))
-    small = rgb if scale >= 1 else _resized(rgb, scale, cv2.INTER_AREA)
+    labels = {k: v.astype(np.uint8, copy=False) for k, v in maps.items() if v is not None}
+    thumbnail = _jpeg(_shrunk(image.rgb, _THUMBNAIL_PIXELS, cv2.INTER_AREA))
+    room, side = budget_bytes * 3 // 4 - len(thumbnail), MOST_PIXELS
+    while True:
+        small = {k: _shrunk(v, side, cv2.INTER_NEAREST_EXACT) for k, v in labels.items()}
+        pngs = {k: _encoded(".png", v, [cv2.IMWRITE_PNG_COMPRESSION, 6]) for k, v in small.items()}
+        jpeg = _jpeg(_shrunk(image.rgb, side, cv2.INTER_AREA))
+        if len(jpeg) + sum(map(len, pngs.values())) <= room or side == 1:
+            break
+        side //= 2
     return EncodedImage(
         name=image.name,
         note=image.note,
         sphere=image.sphere,
-        width=width,
-        height=height,
-        jpeg=_jpeg_within(rgb, room - sum(map(len, pngs.values()))),
-        thumbnail=_jpeg_within(small, _THUMBNAIL_BYTES // 2),
+        width=image.rgb.shape[1],
+        height=image.rgb.shape[0],
+        jpeg=jpeg,
+        thumbnail=thumbnail,
         prediction=pngs.get("prediction"),
         truth=pngs.get("truth"),
-        shares=_shares(list(labels.values()), class_count, sphere=image.sphere),
+        shares=_shares(list(small.values()), class_count, sphere=image.sphere),
     )
 
 
@@ -137,7 +130,7 @@ def _check(image: ViewerImage, class_count: int) -> None:
         )
     for kind, labels in (("truth", image.truth), ("prediction", image.prediction)):
         if labels is not None:
-            _check_labels(f"{kind} of {image.name}", labels, min(class_count, _LABEL_VALUES))
+            _check_labels(f"{kind} of {image.name}", labels, min(class_count, 256))
 
 
 def _check_labels(name: str, labels: NDArray[np.integer], count: int) -> None:
@@ -154,41 +147,19 @@ def _check_labels(name: str, labels: NDArray[np.integer], count: int) -> None:
         )
 
 
-def _shrunk(pixels: NDArray[np.uint8], interpolation: int) -> NDArray[np.uint8]:
-    scale = MOST_PIXELS / max(pixels.shape[:2])
-    return pixels if scale >= 1 else _resized(pixels, scale, interpolation)
-
-
-def _resized(pixels: NDArray[np.uint8], scale: float, interpolation: int) -> NDArray[np.uint8]:
-    height, width = (max(1, round(side * scale)) for side in pixels.shape[:2])
+def _shrunk(pixels: NDArray[np.uint8], side: int, interpolation: int) -> NDArray[np.uint8]:
+    """With a longer side of at most `side` pixels."""
+    scale = side / max(pixels.shape[:2])
+    if scale >= 1:
+        return pixels
+    height, width = (max(1, round(length * scale)) for length in pixels.shape[:2])
     resized: Any = cv2.resize(pixels, (width, height), interpolation=interpolation)
     return resized
 
 
-def _label_pngs(labels: dict[str, NDArray[np.uint8]], room: int) -> dict[str, bytes]:
-    while True:
-        pngs = {kind: _png(indices) for kind, indices in labels.items()}
-        whole = sum(map(len, pngs.values()))
-        if whole <= room or max((v.size for v in labels.values()), default=1) == 1:
-            return pngs
-        labels = {
-            kind: _resized(indices, 0.5, cv2.INTER_NEAREST_EXACT)
-            for kind, indices in labels.items()
-        }
-
-
-def _png(indices: NDArray[np.uint8]) -> bytes:
-    return _encoded(".png", indices, [cv2.IMWRITE_PNG_COMPRESSION, 6])
-
-
-def _jpeg_within(rgb: NDArray[np.uint8], room: int) -> bytes:
-    while True:
-        bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
-        for quality in _QUALITIES:
-            jpeg = _encoded(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
-            if len(jpeg) <= room or rgb[..., 0].size == 1:
-                return jpeg
-        rgb = _resized(rgb, 0.5, cv2.INTER_AREA)
+def _jpeg(rgb: NDArray[np.uint8]) -> bytes:
+    bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
+    return _encoded(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
 
 
 def _encoded(suffix: str, pixels: Any, settings: Sequence[int]) -> bytes:

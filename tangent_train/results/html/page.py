@@ -7,15 +7,14 @@ import itertools
 import json
 import re
 from base64 import b64encode
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
 from tangent_train.files import atomic_path
-from tangent_train.results.html.curves import curve_html
 from tangent_train.results.html.images import EncodedImage, ViewerImage, encode_image
-from tangent_train.results.html.parts import Curve, Table, paragraphs, table_html
 from tangent_train.results.pictures import class_colors
+from tangent_train.results.tables import Table
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -33,7 +32,6 @@ def write_report(
     title: str,
     *,
     tables: Sequence[Table] = (),
-    curves: Sequence[Curve] = (),
     images: Iterable[ViewerImage | EncodedImage] = (),
     class_names: Sequence[str] = (),
     notes: Sequence[str] = (),
@@ -43,27 +41,26 @@ def write_report(
     Args:
         path: The file.
         title: Of the page.
-        tables: Shown below the viewer.
-        curves: Likewise; those without a finite value are left out.
+        tables: Below the viewer.
         images: For the viewer, taken one at a time: only one of them is in memory.
         class_names: K + 1 names of the classes in the label maps, the unknown class first.
         notes: Lines below the title, the most important first.
 
     Raises:
         DataError: An image has arrays of other shapes or types, or unknown class indices.
-        SettingError: A line of a curve has another number of points than its axis.
     """
-    encoded = _encoded(images, len(class_names))
+    encoded = (
+        image if isinstance(image, EncodedImage) else encode_image(image, len(class_names))
+        for image in images
+    )
     first = next(encoded, None)
-    has_images = first is not None
     parts: dict[str, str] = {
         "title": html.escape(title),
-        "notes": paragraphs(notes),
+        "notes": "\n".join(f"<p>{html.escape(note)}</p>" for note in notes),
         "style": _resource("viewer.css"),
-        "viewer": _viewer(class_names) if has_images else "",
-        "script": _script() if has_images else "",
-        "curves": _group("curves", map(curve_html, curves)),
-        "tables": _group("tables", map(table_html, tables)),
+        "viewer": "" if first is None else _viewer(class_names),
+        "script": "" if first is None else _script(),
+        "tables": "\n".join(table.html() for table in tables),
     }
     page = _filled(_resource("page.html"), parts)
     before, _, after = page.partition(_IMAGES)
@@ -77,24 +74,8 @@ def write_report(
         file.write(after)
 
 
-def _encoded(
-    images: Iterable[ViewerImage | EncodedImage], class_count: int
-) -> Iterator[EncodedImage]:
-    for image in images:
-        encoded = image if isinstance(image, EncodedImage) else encode_image(image, class_count)
-        del image  # before the next one is made
-        yield encoded
-
-
-def _group(name: str, cards: Iterable[str]) -> str:
-    content = "\n".join(filter(None, cards))
-    return f'<div class="{name}">\n{content}\n</div>' if content else ""
-
-
 def _viewer(class_names: Sequence[str]) -> str:
-    colors = class_colors(len(class_names)).tolist()[
-        : len(class_names)
-    ]  # a picture may have no classes
+    colors = class_colors(len(class_names)).tolist()[: len(class_names)]  # perhaps no classes
     classes = [{"name": name, "rgb": rgb} for name, rgb in zip(class_names, colors, strict=True)]
     parts = {"images": _IMAGES, "classes": _json(classes), "shader": _resource("viewer.frag")}
     return _filled(_resource("viewer.html"), parts)

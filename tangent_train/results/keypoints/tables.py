@@ -16,7 +16,8 @@ from tangent_train.results.keypoints.means import (
     splits_of,
 )
 from tangent_train.results.keypoints.representations import SHRUNK
-from tangent_train.results.reports.cells import Cells, markdown_table, percent, terminal_table
+from tangent_train.results.tables import Table as CellTable
+from tangent_train.results.tables import percent
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -24,6 +25,9 @@ if TYPE_CHECKING:
     from datamodules.stanford2d3ds.pairs import PublishedPair
 
 __all__ = ["KeypointReport", "overall_cells", "overall_tables", "pairs_csv", "shown_name"]
+
+Cells = tuple[str, ...]
+"""A row of a table."""
 
 _PAPER_REPRESENTATIONS = ("ERP", "L0", "L1", "L2")
 _CONDITIONS = {
@@ -122,19 +126,19 @@ class KeypointReport:
             if self.published and split.split in PAPER_STATISTICS:
                 pairs, overlap, count = PAPER_STATISTICS[split.split]
                 rows.append(("paper", str(pairs), f"{100 * overlap:.2f}", str(count)))
-        yield from (*markdown_table(rows, 1), "")
+        yield from (*_markdown(rows, 1), "")
 
     def _overall(self) -> Iterator[str]:
         for condition in self.conditions:
             yield from (f"## {_CONDITIONS[condition]}", "")
-            yield from (*markdown_table(overall_cells(self, condition), 2), "")
+            yield from (*_markdown(overall_cells(self, condition), 2), "")
 
     def _per_pair(self) -> Iterator[str]:
         for condition in self.conditions:
             title = _CONDITIONS[condition]
             yield from (f"## Per pair: {title[0].lower()}{title[1:]}", "")
             yield "PMR / MS / P in percent, – where a figure is not defined."
-            yield from ("", *markdown_table(self._pair_rows(condition), 2), "")
+            yield from ("", *_markdown(self._pair_rows(condition), 2), "")
 
     def _pair_rows(self, condition: str) -> list[Cells]:
         rows: list[Cells] = [("pair", "split", "overlap %", *map(shown_name, self.representations))]
@@ -164,7 +168,7 @@ class KeypointReport:
         if failed:
             yield from ("## Pairs that could not be used", "")
             rows: list[Cells] = [("pair", "why"), *((e.name, str(e.error)) for e in failed)]
-            yield from (*markdown_table(rows, 2), "")
+            yield from (*_markdown(rows, 2), "")
 
 
 def overall_cells(report: KeypointReport, condition: str) -> list[Cells]:
@@ -247,7 +251,7 @@ def _number(value: float | None, digits: int = 0) -> str:
 def overall_tables(report: KeypointReport) -> list[Table]:
     """The tables of means for the terminal."""
     return [
-        terminal_table(
+        _terminal(
             _CONDITIONS[condition],
             [
                 tuple(text.replace("**", "") for text in row)
@@ -286,3 +290,12 @@ def pairs_csv(entries: Sequence[PairEntry], published: Mapping[str, PublishedPai
                 }
             )
     return csv_text(_COLUMNS, rows)
+
+
+def _markdown(rows: Sequence[Cells], left: int) -> list[str]:
+    table = CellTable("", rows[0], rows[1:], text_columns=range(left))
+    return table.markdown().splitlines()
+
+
+def _terminal(title: str, rows: Sequence[Cells], left: Sequence[int]) -> Table:
+    return CellTable(title, rows[0], rows[1:], text_columns=left).terminal()

@@ -1,0 +1,142 @@
+"""What reports compare: groups of runs, the stages of a transfer, one network at several levels."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+
+from tangent_train.results.paper import published
+from tangent_train.results.record import Record
+from tangent_train.results.report import Report
+from tangent_train.results.rows import Row, check_alike, group_runs
+
+__all__ = ["levels_report", "runs_report", "transfer_report"]
+
+_REPRESENTATIONS = {"Cubemap": "cube map", "Equirect": "ERP", "Perspective": "photos"}
+_ROTATIONS = {None: "–", "none": "–", "yaw": "z", "so3": "SO3"}
+"""The field's names: none, about the vertical axis, any."""
+
+
+def runs_report(records: Sequence[Record], made_by: str, notes: Sequence[str] = ()) -> Report:
+    """The report over finished runs: mean and spread of each group, beside the paper's figures.
+
+    Args:
+        records: Of the runs.
+        made_by: See `Report`.
+        notes: Further ones.
+    """
+    rows = [replace(row, facts=_facts(row.records)) for row in group_runs(records)]
+    together = sorted([*published(records), *rows], key=_by_data)
+    return Report("Report", made_by, together, [*_repeated(rows), *notes])
+
+
+def _by_data(row: Row) -> tuple[str, int]:
+    level = row.facts["s"]
+    return row.facts["data"], int(level) if level.isdigit() else 0
+
+
+def _repeated(rows: Sequence[Row]) -> Iterator[str]:
+    for row in rows:
+        seen: set[tuple[int | None, int | None]] = set()
+        for record in row.records:
+            if (record.fold, record.seed) in seen:
+                where = "" if record.fold is None else f"fold {record.fold}, "
+                twice = f"{where}seed {record.seed} more than once, also in {record.folder}."
+                yield f"{row.label}: {twice}"
+            seen.add((record.fold, record.seed))
+
+
+def transfer_report(stages: Mapping[str, Sequence[Record]], made_by: str) -> Report:
+    """The report of a transfer from photos to panoramas, beside the paper's.
+
+    Args:
+        stages: Evaluations by the names of their stages: S, S-erp and S-FT-10, tested on panoramas,
+            are compared with P and P-FT-10, tested on photos, after as much fine-tuning.
+        made_by: See `Report`.
+    """
+    records = [record for found in stages.values() for record in found]
+    check_alike(records)
+    rows = [Row(name, tuple(found), _facts(found)) for name, found in stages.items()]
+    panoramas = [r for name, found in stages.items() if name[0] == "S" for r in found]
+    rows += published(panoramas, transfer=True)
+    by_name = {row.label: row for row in rows}
+    rows = [replace(row, partner=by_name.get(_photos_of(row.label))) for row in rows]
+    return Report("Transfer from photos to panoramas", made_by, rows)
+
+
+def _photos_of(stage: str) -> str:
+    """The stage on photos with as much fine-tuning.
+
+    >>> _photos_of("S-FT-10 (paper)"), _photos_of("S-erp"), _photos_of("P")
+    ('P-FT-10 (paper)', 'P', '')
+    """
+    name, mark, paper = stage.partition(" (paper)")
+    if name[0] != "S":
+        return ""
+    photos = f"P{name[1:]}" if "-FT-" in name else "P"
+    return photos + mark + paper
+
+
+def levels_report(
+    levels: Mapping[int, Sequence[Record]], trained_level: float, made_by: str
+) -> Report:
+    """The report over one network at several levels of the panoramas.
+
+    The paper's third transfer experiment: photos are normalized to the angular resolution of one
+    level; scores fall the further that of the panoramas is from it.
+
+    Args:
+        levels: Evaluations by level.
+        trained_level: The level whose angular resolution the photos had in training; between two
+            levels where it is that of neither.
+        made_by: See `Report`.
+    """
+    check_alike([record for found in levels.values() for record in found])
+    rows = {
+        level: Row(f"level {level}", tuple(levels[level]), _facts(levels[level]))
+        for level in sorted(levels)
+    }
+    nearest = min(rows, key=lambda level: abs(level - trained_level))
+    compared = [
+        row if level == nearest else replace(row, partner=rows[nearest])
+        for level, row in rows.items()
+    ]
+    note = f"Photos in training: the angular resolution of level {trained_level:g}."
+    return Report("One network at several levels", made_by, compared, [note])
+
+
+def _facts(records: Sequence[Record]) -> dict[str, str]:
+    record = records[0]
+    rotations = [record.settings.get(n) for n in ("representation.rotation", "data.test_rotation")]
+    facts = {
+        "data": record.data,
+        "s": str(record.settings.get("level") or "–"),
+        "input": _inputs(record) if record.kind == "segmentation" else "–",
+        "b": _base_level(record),
+    }
+    if record.kind == "classification":
+        facts["rotated in training / test"] = " / ".join(
+            _ROTATIONS.get(name, str(name)) for name in rotations
+        )
+    folds = [str(fold) for fold in dict.fromkeys(r.fold for r in records) if fold is not None]
+    return facts | {"folds": ", ".join(folds) or "–", "runs": str(len(records))}
+
+
+def _inputs(record: Record) -> str:
+    """RGB or RGB-D, as the paper writes it, and further inputs."""
+    names = record.settings.get("data.inputs") or ()
+    further = [name for name in names if name not in ("rgb", "depth")]
+    return " + ".join(["RGB-D" if "depth" in names else "RGB", *further])
+
+
+def _base_level(record: Record) -> str:
+    """The base level b of tangent images, or the representation that has none."""
+    base = record.settings.get("representation.base_level")
+    return _representation(record) if base is None else str(base)
+
+
+def _representation(record: Record) -> str:
+    """How the network saw the images."""
+    target = str(record.settings.get("representation._target_")).rpartition(".")[2]
+    name = target.removesuffix("Representation")
+    return _REPRESENTATIONS.get(name, "tangent images" if name == "Tangent" else name)

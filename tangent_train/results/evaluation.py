@@ -1,0 +1,233 @@
+"""From the confusion matrices of an evaluation to its record, tables and files."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tangent_train.csv_text import csv_text
+from tangent_train.files import write_bytes, write_text
+from tangent_train.metrics.classification import classification_scores
+from tangent_train.metrics.segmentation import (
+    BAND_EDGES_DEG,
+    AbsentClass,
+    ConfusionMatrices,
+    segmentation_scores,
+)
+from tangent_train.results.chart import confusion_picture, row_shares
+from tangent_train.results.record import RESULTS_FILE, SCORES, Record
+from tangent_train.results.tables import Table, percent
+
+__all__ = [
+    "classification_record",
+    "confusion_table",
+    "headline",
+    "largest_loss",
+    "result_tables",
+    "segmentation_record",
+    "write_results",
+]
+
+_HEADINGS = {
+    "images": "images",
+    "share": "pixels %",
+    "taken_for": "most often taken for",
+    "taken_for_share": "%",
+}
+"""Of the columns per class that are no scores."""
+
+_MEAN_OF = {
+    "segmentation": {
+        "iou": "miou",
+        "accuracy": "macc",
+        "iou_solid_angle": "miou_solid_angle",
+        "accuracy_solid_angle": "macc_solid_angle",
+    },
+    "classification": {"accuracy": "class_accuracy"},
+}
+"""By kind, the mean over the classes of each score."""
+
+
+def segmentation_record(
+    matrices: ConfusionMatrices,
+    class_names: Sequence[str],
+    absent_class: AbsentClass,
+    noun: str = "panoramas",
+) -> Record:
+    """The record of a segmentation.
+
+    Args:
+        matrices: Counts over the data set.
+        class_names: K + 1 names, the unknown class first.
+        absent_class: What classes absent from the truth do to the means.
+        noun: What was scored, in the plural. Photos have neither solid angles nor latitude bands.
+    """
+    on_sphere = bool(matrices.solid_angle.any())
+    pixels = segmentation_scores(matrices.pixels, absent_class)
+    solid = segmentation_scores(matrices.solid_angle, absent_class if on_sphere else "skip")
+    classes = [
+        {
+            "class": name,
+            "iou": _plain(pixels.iou[k]),
+            "accuracy": _plain(pixels.accuracy[k]),
+            "iou_solid_angle": _plain(solid.iou[k]),
+            "accuracy_solid_angle": _plain(solid.accuracy[k]),
+            "share": _plain(pixels.share[k]),
+            **_taken_for(matrices.pixels[k + 1], k + 1, class_names),
+        }
+        for k, name in enumerate(class_names[1:])
+    ]
+    bands = [
+        {"latitude_deg": [south, north], "miou": _plain(scores.miou), "macc": _plain(scores.macc)}
+        for north, south, band in zip(
+            BAND_EDGES_DEG[:-1], BAND_EDGES_DEG[1:], matrices.bands, strict=True
+        )
+        for scores in [segmentation_scores(band, absent_class)]
+        if on_sphere
+    ]
+    means = {
+        "miou": _plain(pixels.miou),
+        "macc": _plain(pixels.macc),
+        "miou_solid_angle": _plain(solid.miou),
+        "macc_solid_angle": _plain(solid.macc),
+    }
+    confusion = matrices.pixels.tolist()
+    return Record(
+        "segmentation", noun, matrices.images, means, classes, bands, confusion, absent_class
+    )
+
+
+def classification_record(
+    confusion: NDArray[np.int64], class_names: Sequence[str], noun: str = "shapes"
+) -> Record:
+    """The record of a classification.
+
+    Args:
+        confusion: ``(K, K)`` counts, rows truth, columns prediction.
+        class_names: K names.
+        noun: What was classified, in the plural.
+    """
+    scores = classification_scores(confusion)
+    classes = [
+        {
+            "class": name,
+            "images": int(scores.counts[k]),
+            "accuracy": _plain(scores.of_class[k]),
+            **_taken_for(confusion[k], k, class_names),
+        }
+        for k, name in enumerate(class_names)
+    ]
+    means = {
+        "accuracy": _plain(scores.accuracy),
+        "class_accuracy": _plain(scores.class_accuracy),
+    }
+    images = int(confusion.sum())
+    return Record("classification", noun, images, means, classes, confusion=confusion.tolist())
+
+
+def _taken_for(row: NDArray[np.int64], own: int, class_names: Sequence[str]) -> dict[str, Any]:
+    """The other class that most of a class was taken for, and its share; the first of equals."""
+    missed = row.copy()
+    missed[own] = 0
+    other = int(missed.argmax())
+    if not missed[other]:
+        return {"taken_for": None, "taken_for_share": None}
+    return {"taken_for": class_names[other], "taken_for_share": float(missed[other] / row.sum())}
+
+
+def _plain(value: float) -> float | None:
+    return None if math.isnan(value) else float(value)
+
+
+def headline(record: Record) -> str:
+    """The scores over all classes in one line."""
+    means = [
+        f"{heading} {percent(record.means[name])}\u00a0%"
+        for name, heading in SCORES[record.kind].means.items()
+        if record.means[name] is not None
+    ]
+    return f"{', '.join(means)} over {record.images} {record.noun}".strip()
+
+
+def largest_loss(record: Record) -> str:
+    """The class that takes most from the mean, and what it is taken for; empty without labels."""
+    score = SCORES[record.kind].worst
+    labelled = [e for e in record.classes if e.get("share", e.get("images"))]
+    if not labelled:
+        return ""
+    worst = min(labelled, key=lambda entry: float(entry[score]))
+    name = SCORES[record.kind].per_class[score]
+    text = f"Largest loss: {worst['class']}, {percent(worst[score])} % {name}"
+    if worst["taken_for"] is not None:
+        share = percent(worst["taken_for_share"])
+        text += f"; most often taken for {worst['taken_for']} ({share} % of it)"
+    return f"{text}."
+
+
+def result_tables(record: Record) -> list[Table]:
+    """The scores per class, with their means, and per latitude band.
+
+    Args:
+        record: Of an evaluation.
+    """
+    scores, mean_of = SCORES[record.kind], _MEAN_OF[record.kind]
+    columns = [
+        name
+        for name in record.classes[0]
+        if name != "class" and (record.latitude_bands or not name.endswith("_solid_angle"))
+    ]
+    headings = {**_HEADINGS, **{name: f"{text} %" for name, text in scores.per_class.items()}}
+    rows = [[e["class"], *(_cell(e[name]) for name in columns)] for e in record.classes]
+    means = (_cell(record.means[mean_of[c]]) if c in mean_of else "" for c in columns)
+    rows.append(["mean", *means])
+    texts = [0, *(1 + k for k, name in enumerate(columns) if name == "taken_for")]
+    header = ["class", *(headings[name] for name in columns)]
+    tables = [Table("Per class", header, rows, largest_loss(record), texts)]
+    if record.latitude_bands:
+        rows = [
+            ["{}° … {}°".format(*b["latitude_deg"]), _cell(b["miou"]), _cell(b["macc"])]
+            for b in record.latitude_bands
+        ]
+        tables.append(Table("By latitude", ("latitude", "mIoU %", "mAcc %"), rows))
+    return tables
+
+
+def _cell(value: Any) -> str:
+    return percent(value) if value is None or isinstance(value, float) else str(value)
+
+
+def confusion_table(record: Record) -> Table:
+    """The confusion matrix as a heat map: percent of the true class."""
+    unknown = record.kind == "segmentation"
+    shares = np.nan_to_num(row_shares(record.confusion, unknown=unknown))
+    rows = [
+        (name, *(f"{100 * share:.0f}" if share >= 0.005 else "" for share in row))
+        for name, row in zip(record.class_names, shares, strict=True)
+    ]
+    note = "Rows: truth; columns: prediction; % of the row."
+    return Table("Confusion", ("", *record.class_names), rows, note, shades=shares.tolist())
+
+
+def write_results(record: Record, folder: Path) -> None:
+    """Write ``results.json``, ``.csv`` and ``.md``, each atomically.
+
+    Of a classification also ``confusion.png``.
+
+    Args:
+        record: Of an evaluation.
+        folder: Where to.
+    """
+    write_text(folder / RESULTS_FILE, record.json())
+    write_text(folder / "results.csv", csv_text(list(record.classes[0]), record.classes))
+    tables = "\n".join(table.markdown() for table in result_tables(record))
+    write_text(folder / "results.md", f"# Results\n\n{headline(record)}\n\n{tables}")
+    if record.kind == "classification":
+        picture = confusion_picture(record.confusion, record.class_names, unknown=False)
+        encoded = cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))[1]
+        write_bytes(folder / "confusion.png", encoded.tobytes())

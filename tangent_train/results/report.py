@@ -1,0 +1,235 @@
+"""Reports over several evaluations: rows of scores as tables, files and a chart."""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from datamodules.stanford2d3ds.files import FOLDS
+from tangent_train.csv_text import csv_text
+from tangent_train.files import write_bytes, write_text
+from tangent_train.results.chart import report_png
+from tangent_train.results.record import SCORES, Record
+from tangent_train.results.rows import Row, Statistic
+from tangent_train.results.tables import Table, percent
+
+__all__ = ["Report"]
+
+_LEGEND = (
+    "Percent. Mean over folds of the mean over seeds; ± the sample standard deviation over folds, "
+    "in brackets that over seeds within a fold."
+)
+_CHANGE = (
+    " Change: the ratio to the row named there, over the folds and seeds that both have, less 1."
+)
+
+
+@dataclass(frozen=True)
+class Report:
+    """Rows of scores, all of one kind and over the same classes.
+
+    Attributes:
+        title: Of the report.
+        made_by: The command that writes it; stands in the JSON file.
+        rows: Evaluations, and published figures.
+        notes: Sentences about the rows.
+    """
+
+    title: str
+    made_by: str
+    rows: Sequence[Row]
+    notes: Sequence[str] = field(default_factory=list)
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Names of the classes."""
+        return self.rows[0].records[0].class_names
+
+    @property
+    def kind(self) -> str:
+        """Kind of the tasks."""
+        return self.rows[0].records[0].kind
+
+    def tables(self) -> list[Table]:
+        """All classes, every class, and latitude bands."""
+        banded = [row for row in self.rows if row.bands]
+        tables = [self._overall(), *self._per_class()]
+        if banded:
+            rows = [
+                (
+                    f"{band[0]:g}° … {band[1]:g}°",
+                    *(percent(row.score("miou", band).mean) for row in banded),
+                )
+                for band in banded[0].bands
+            ]
+            header = ("latitude", *(row.label for row in banded))
+            tables.append(Table("mIoU % by latitude", header, rows))
+        return tables
+
+    def _overall(self) -> Table:
+        compared = any(row.partner for row in self.rows)
+        facts = list(dict.fromkeys(name for row in self.rows for name in row.facts))
+        header = ["", *facts]
+        for heading in SCORES[self.kind].means.values():
+            header += [f"{heading} %", "change"] if compared else [f"{heading} %"]
+        rows = []
+        for row in self.rows:
+            cells = [row.label, *(row.facts.get(name, "–") for name in facts)]
+            for name in SCORES[self.kind].means:
+                cells.append(_cell(row.score(name), len(row.folds)))
+                cells += [_change(row.kept(name).mean)] if compared else []
+            rows.append(cells)
+        note = _LEGEND + _CHANGE * compared
+        return Table(self.title, header, rows, note, range(1 + len(facts)))
+
+    def _per_class(self) -> Iterator[Table]:
+        for name, heading in SCORES[self.kind].per_class.items():
+            rows = [
+                (row.label, *(_cell(row.score(name, c), len(row.folds)) for c in self.classes))
+                for row in self.rows
+                if not name.endswith("_solid_angle")
+                and any(row.score(name, c).mean is not None for c in self.classes)
+            ]
+            if rows:
+                yield Table(f"{heading[0].upper()}{heading[1:]} %", ("", *self.classes), rows)
+
+    def losses(self) -> list[str]:
+        """For every row its worst class, or that which loses most against the partner."""
+        found = (_loss(row, SCORES[self.kind].worst, self.classes) for row in self.rows)
+        return [sentence for sentence in found if sentence]
+
+    def all_notes(self) -> list[str]:
+        """What has to be known beside the scores."""
+        lacking: dict[str, list[str]] = defaultdict(list)
+        own = [row for row in self.rows if not row.published]
+        for row in own:
+            missing = [str(fold) for fold in FOLDS if fold not in row.folds]
+            if missing and row.folds != (None,):
+                lacking[" and ".join(missing)].append(row.label)
+        notes = [
+            f"{', '.join(labels)}: fold {folds} missing; not a mean of {len(FOLDS)} folds."
+            for folds, labels in lacking.items()
+        ]
+        return [*self.losses(), *notes, *self.notes]
+
+    def write(self, folder: Path, name: str) -> None:
+        """Write the report as ``.json``, ``.md``, ``.csv`` and ``.png``, each atomically.
+
+        Args:
+            folder: Where to.
+            name: Of the files.
+        """
+        write_text(folder / f"{name}.json", self._json())  # first: it says who wrote the others
+        write_text(folder / f"{name}.md", self._markdown())
+        figures = list(self.figures())
+        write_text(folder / f"{name}.csv", csv_text(list(dict.fromkeys(
+            key for figure in figures for key in figure)), figures))  # fmt: skip
+        write_bytes(folder / f"{name}.png", report_png(self.title, self.rows, self.made_by))
+
+    def figures(self) -> Iterator[dict[str, Any]]:
+        """A line per row, fold ("mean" over all), class or band, and score; shares of 1."""
+        scores = SCORES[self.kind]
+        for row in self.rows:
+            scopes = [(fold, row.of_fold(fold)) for fold in row.folds if fold is not None]
+            for fold, part in [*scopes, ("mean", row)]:
+                facts = {"row": row.label, **row.facts, "fold": fold}
+                entries = [("mean", None, name) for name in scores.means]
+                entries += [(c, c, name) for c in self.classes for name in scores.per_class]
+                entries += [("mean", band, name) for band in row.bands for name in scores.per_band]
+                for class_name, where, name in entries:
+                    south, north = where if isinstance(where, tuple) else (None, None)
+                    yield {
+                        **facts,
+                        "class": class_name,
+                        "south": south,
+                        "north": north,
+                        "score": name,
+                        **part.score(name, where)._asdict(),
+                        "kept": part.kept(name, where).mean,
+                    }
+
+    def _markdown(self) -> str:
+        first, *others = (table.markdown() for table in self.tables())
+        notes = "".join(f"- {note}\n" for note in self.all_notes())
+        runs = [
+            (row.label, str(r.fold or "–"), str(r.seed), str(r.folder))
+            for row in self.rows
+            if not row.published
+            for r in row.records
+        ]
+        table = Table("Runs", ("", "fold", "seed", "run"), runs, text_columns=(0, 3))
+        return "\n".join([f"# {first[3:]}", notes, *others, table.markdown()])
+
+    def _json(self) -> str:
+        rows = [
+            {
+                "row": row.label,
+                **row.facts,
+                "published": row.published,
+                "compared_with": row.partner and row.partner.label,
+                "runs": [
+                    {"folder": str(r.folder), "fold": r.fold, "seed": r.seed, "images": r.images}
+                    for r in row.records
+                ],
+            }
+            for row in self.rows
+        ]
+        content = {
+            "made_by": self.made_by,
+            "unit": "shares of 1",
+            "rows": rows,
+            "figures": list(self.figures()),
+            "notes": self.all_notes(),
+        }
+        return json.dumps(content, indent=1) + "\n"
+
+
+def _loss(row: Row, score: str, classes: Sequence[str]) -> str:
+    """The class that takes most from the mean; those that no label names do not count."""
+    found = []
+    for name in classes:
+        labelled = [r for r in row.records if _is_labelled(r, name)]
+        own = replace(row, records=tuple(labelled)).score(score, name).mean if labelled else None
+        base = row.partner.score(score, name).mean if row.partner else 0.0
+        if own is not None and base is not None:
+            found.append((own - base, name, base, own))
+    if not found or row.published:
+        return ""
+    _, name, base, own = min(found)
+    if row.partner is None:
+        return f"{row.label}: largest loss: {name}, {percent(own)} % {score}."
+    return (
+        f"{row.label}: largest loss against {row.partner.label}: {name}, "
+        f"{percent(base)} % to {percent(own)} % {score}."
+    )
+
+
+def _is_labelled(record: Record, name: str) -> bool:
+    """Whether a class has labels: ``absent_class=zero`` scores others with 0."""
+    return bool(record.score("share", name) or record.score("images", name))
+
+
+def _cell(found: Statistic, folds: int) -> str:
+    """A score with its spreads; "of 2" where it is over fewer folds than the row."""
+    if found.mean is None:
+        return "–"
+    over_folds = "" if found.over_folds is None else f" ± {percent(found.over_folds)}"
+    over_seeds = "" if found.over_seeds is None else f" (± {percent(found.over_seeds)})"
+    lacking = f" of {found.folds}" if found.folds < folds else ""
+    return percent(found.mean) + over_folds + over_seeds + lacking
+
+
+def _change(kept: float | None) -> str:
+    """What is kept of another score, as a change.
+
+    >>> _change(0.955), _change(1.026), _change(0.9999)
+    ('−4.5 %', '+2.6 %', '+0.0 %')
+    """
+    if kept is None:
+        return "–"
+    rounded = round(100 * (kept - 1), 1) + 0.0  # no −0.0
+    return f"{rounded:+.1f} %".replace("-", "−")

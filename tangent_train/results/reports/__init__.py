@@ -1,1 +1,0 @@
-"""Finished runs read from disk, and several of them as one result."""

@@ -1,0 +1,207 @@
+"""Rows of a report: evaluations alike but for fold and seed, as mean and spread.
+
+A score of a row is first averaged over the seeds of each fold, then over the folds, as the paper's
+"averaged over the 3 folds". Two spreads, sample standard deviations, tell two things: over the
+folds' means, how different the folds are; over seeds, pooled over the folds that have several, how
+far training itself is repeatable.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from statistics import fmean, stdev
+from typing import Any, NamedTuple
+
+from tangent_train.errors import DataError
+from tangent_train.results.record import RESULTS_FILE, Band, Record
+from tangent_train.setting_rules import may_differ
+
+__all__ = ["Row", "Statistic", "average", "check_alike", "group_runs"]
+
+
+class Statistic(NamedTuple):
+    """A score over folds and seeds, a share of 1.
+
+    Attributes:
+        mean: Over the folds' means; None where it is defined in no run.
+        over_folds: Standard deviation of the folds' means; None with one fold.
+        over_seeds: Pooled standard deviation within folds; None with one seed for each.
+        folds: How many folds have the score: a class may be absent from a fold.
+    """
+
+    mean: float | None
+    over_folds: float | None
+    over_seeds: float | None
+    folds: int
+
+
+@dataclass(frozen=True)
+class Row:
+    """Evaluations that differ only in fold and seed.
+
+    Attributes:
+        label: Name of the row.
+        records: The evaluations.
+        facts: What else the row's tables say of it, by column.
+        partner: The row that its scores are compared with.
+        published: Whether it is from a paper.
+    """
+
+    label: str
+    records: tuple[Record, ...]
+    facts: Mapping[str, str] = field(default_factory=dict)
+    partner: Row | None = None
+    published: bool = False
+
+    @property
+    def folds(self) -> tuple[int | None, ...]:
+        """The folds it has."""
+        return tuple(dict.fromkeys(record.fold for record in self.records))
+
+    @property
+    def bands(self) -> tuple[Band, ...]:
+        """Its latitude bands."""
+        return tuple(dict.fromkeys(band for record in self.records for band in record.bands))
+
+    def of_fold(self, fold: int | None) -> Row:
+        """Its part of a fold, with its partner's."""
+        records = tuple(record for record in self.records if record.fold == fold)
+        partner = None if self.partner is None else self.partner.of_fold(fold)
+        return replace(self, records=records, partner=partner)
+
+    def score(self, name: str, part: str | Band | None = None) -> Statistic:
+        """Mean over folds of the mean over seeds, with both spreads.
+
+        Args:
+            name: As in `Record.score`.
+            part: As in `Record.score`.
+        """
+        return average((fold, value) for (fold, _), value in self._values(name, part))
+
+    def kept(self, name: str, part: str | Band | None = None) -> Statistic:
+        """The ratio of its score to its partner's, over the folds and seeds that both have.
+
+        The mean is the ratio of the two means, the spreads are those of the single ratios. Pixels
+        of photos cover nearly the same solid angle: what panoramas score by solid angle is compared
+        with what photos score by pixels.
+
+        Args:
+            name: As in `Record.score`.
+            part: As in `Record.score`.
+
+        Returns:
+            None for the mean where there is no partner, or where its score is undefined or 0.
+        """
+        if self.partner is None:
+            return average([])
+        by_pixels = name.removesuffix("_solid_angle")
+        base = dict(self.partner._values(name, part) or self.partner._values(by_pixels, part))
+        pairs = [(key[0], own, base[key]) for key, own in self._values(name, part) if key in base]
+        before = average((fold, base) for fold, _, base in pairs).mean
+        if not before:
+            return average([])
+        ratios = average((fold, own / base) for fold, own, base in pairs if base)
+        own = average((fold, own) for fold, own, _ in pairs).mean
+        return ratios._replace(mean=None if own is None else own / before)
+
+    def _values(
+        self, name: str, part: str | Band | None
+    ) -> list[tuple[tuple[int | None, int | None], float]]:
+        found = (((r.fold, r.seed), r.score(name, part)) for r in self.records)
+        return [(key, value) for key, value in found if value is not None]
+
+
+def average(values: Iterable[tuple[int | None, float]]) -> Statistic:
+    """Mean over folds of the mean over seeds, with both spreads.
+
+    Args:
+        values: Fold and score of each run that has the score.
+
+    >>> average([(1, 0.25), (1, 0.75), (2, 1.0)]).mean
+    0.75
+    """
+    of_fold: dict[int | None, list[float]] = defaultdict(list)
+    for fold, value in values:
+        of_fold[fold].append(value)
+    means = [fmean(found) for found in of_fold.values()]
+    several = [found for found in of_fold.values() if len(found) > 1]
+    freedom = sum(len(found) - 1 for found in several)
+    squares = sum((len(found) - 1) * stdev(found) ** 2 for found in several)
+    return Statistic(
+        mean=fmean(means) if means else None,
+        over_folds=stdev(means) if len(means) > 1 else None,
+        over_seeds=(squares / freedom) ** 0.5 if freedom else None,
+        folds=len(means),
+    )
+
+
+def check_alike(records: Sequence[Record]) -> None:
+    """Check that evaluations are of one kind and have the same classes.
+
+    Raises:
+        DataError: They are not.
+    """
+    first = records[0]
+    for record in records:
+        if (record.kind, record.class_names) != (first.kind, first.class_names):
+            raise DataError(
+                record.folder / RESULTS_FILE,
+                found=f"{record.kind}, classes {', '.join(record.class_names)}",
+                expected=f"{first.kind}, classes {', '.join(first.class_names)}, as in "
+                f"{first.folder / RESULTS_FILE}",
+                remedy="Report them separately.",
+            )
+
+
+def group_runs(records: Sequence[Record]) -> list[Row]:
+    """Put evaluations together that differ only in fold and seed.
+
+    Args:
+        records: Of finished runs, with their settings.
+
+    Returns:
+        Rows in the order of their first runs, labelled with the names of the runs, and with the
+        settings by which they differ from others of the same name.
+
+    Raises:
+        DataError: They have different classes.
+    """
+    check_alike(records)
+    members: dict[str, list[Record]] = defaultdict(list)
+    for record in records:
+        members[json.dumps(_identity(record), sort_keys=True, default=str)].append(record)
+    labels = _labels([found[0] for found in members.values()])
+    return [
+        Row(label, tuple(sorted(found, key=lambda r: (r.fold or 0, r.seed or 0, str(r.folder)))))
+        for label, found in zip(labels, members.values(), strict=True)
+    ]
+
+
+def _identity(record: Record) -> dict[str, Any]:
+    return {
+        # Each fold is fine-tuned from a checkpoint of its own.
+        name: value is not None if name == "init_from" else value
+        for name, value in record.settings.items()
+        if not may_differ(name, "report")
+    }
+
+
+def _labels(firsts: Sequence[Record]) -> list[str]:
+    labels: list[str] = []
+    used: Counter[str] = Counter()
+    for record in firsts:
+        own = _identity(record)
+        others = [o for o in map(_identity, firsts) if o.get("name") == own.get("name")]
+        differing = [
+            f"{setting}={own.get(setting)}"
+            for setting in sorted({key for other in others for key in other})
+            if any(other.get(setting) != own.get(setting) for other in others)
+        ]
+        text = ", ".join(differing[:3]) + (", …" if len(differing) > 3 else "")
+        label = str(own.get("name") or record.folder.name) + (f" ({text})" if text else "")
+        used[label] += 1
+        labels.append(f"{label} #{used[label]}" if used[label] > 1 else label)
+    return labels

@@ -1,0 +1,107 @@
+"""One description of a table, written as Markdown, for the terminal and as HTML."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from rich import table as rich_table
+from rich.markup import escape
+
+__all__ = ["Table", "markdown_line", "percent"]
+
+
+@dataclass(frozen=True)
+class Table:
+    """Cells of text under a header.
+
+    Attributes:
+        title: Above the table.
+        header: One name per column.
+        rows: As many cells each.
+        note: Below the table.
+        text_columns: Columns that are aligned to the left; the others hold numbers.
+        shades: For every row a number from 0 to 1 for each cell after the first: a heat map in
+            HTML.
+    """
+
+    title: str
+    header: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    note: str = ""
+    text_columns: Sequence[int] = (0,)
+    shades: Sequence[Sequence[float]] | None = None
+
+    def markdown(self, heading: str = "##") -> str:
+        """The table as Markdown, below a heading.
+
+        Args:
+            heading: Marks the level of the heading.
+        """
+        rule = ["---" if k in self.text_columns else "---:" for k in range(len(self.header))]
+        lines = [f"{heading} {self.title}", ""] if self.title else []
+        lines += map(markdown_line, (self.header, rule, *self.rows))
+        lines += ["", self.note] if self.note else []
+        return "\n".join(lines) + "\n"
+
+    def terminal(self) -> rich_table.Table:
+        """The table for the terminal."""
+        table = rich_table.Table(title=escape(self.title), caption=escape(self.note) or None)
+        for k, name in enumerate(self.header):
+            table.add_column(escape(name), justify="left" if k in self.text_columns else "right")
+        for row in self.rows:
+            table.add_row(*map(escape, row))
+        return table
+
+    def html(self) -> str:
+        """The table as an HTML section."""
+        title, note = html.escape(self.title), html.escape(self.note)
+        kinds = ["" if k in self.text_columns else "number" for k in range(len(self.header))]
+        header = "".join(
+            f'<th{_class(kind)} scope="col"><span>{html.escape(name)}</span></th>'
+            for name, kind in zip(self.header, kinds, strict=True)
+        )
+        shades = self.shades or [[]] * len(self.rows)
+        rows = (_html_row(r, kinds, s) for r, s in zip(self.rows, shades, strict=True))
+        # The scrolling region takes the focus, so that keys can scroll it.
+        return (
+            f'<section class="card">\n<h2>{title}</h2>\n<p class="note">{note}</p>\n'
+            f'<div class="wide" tabindex="0" role="region" aria-label="{title}">\n'
+            f"<table{_class('heat' if self.shades else '')}>\n<thead><tr>{header}</tr></thead>\n"
+            f"<tbody>\n{chr(10).join(rows)}\n</tbody></table></div></section>"
+        )
+
+
+def _html_row(cells: Sequence[str], kinds: Sequence[str], shades: Sequence[float]) -> str:
+    first, *others = map(html.escape, cells)
+    parts = [f'<th scope="row">{first}</th>']
+    for k, text in enumerate(others):
+        kind, style = kinds[k + 1], ""
+        if shades:
+            kind = "strong" if shades[k] > 0.5 else ""
+            style = f' style="--share:{shades[k]:.3f}"'
+        parts.append(f"<td{_class(kind)}{style}>{text}</td>")
+    return f"<tr>{''.join(parts)}</tr>"
+
+
+def _class(name: str) -> str:
+    return f' class="{name}"' if name else ""
+
+
+def markdown_line(cells: Sequence[str]) -> str:
+    r"""One line of a Markdown table.
+
+    >>> print(markdown_line(("a", "b|c")))
+    | a | b\|c |
+    """
+    return "| " + " | ".join(text.replace("|", r"\|") for text in cells) + " |"
+
+
+def percent(share: float | None) -> str:
+    """A share of 1 in percent, without the sign; a dash where it is undefined.
+
+    >>> percent(0.4562), percent(None)
+    ('45.6', '–')
+    """
+    return "–" if share is None else f"{100 * share:.1f}"

@@ -1,1 +1,0 @@
-"""The results of a transfer from photos to panoramas as tables and charts."""
