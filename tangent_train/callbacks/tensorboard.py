@@ -64,8 +64,8 @@ class ValidationPictures(Callback):
         data: Any = trainer.datamodule  # type: ignore[attr-defined]
         source = data.source("val")
         rgb = shown_image(source.read(index), target, task.representation)
-        labels = (side_by_side(x.cpu().numpy()) for x in (target, outputs[0]))
-        panel = prediction_panel(_smaller(rgb), *map(_smaller, labels), task.class_names)
+        truth, labels = (_smaller(side_by_side(x.cpu().numpy())) for x in (target, outputs[0]))
+        panel = prediction_panel(_smaller(rgb), truth, labels, task.class_names)
         tag = f"val_images/{source.name(index).replace('/', '_')}"
         writer.add_image(tag, panel, _step(trainer), dataformats="HWC")
 

@@ -156,9 +156,9 @@ def headline(record: Record) -> str:
 
 
 def largest_loss(record: Record) -> str:
-    """The class that takes most from the mean, and what it is taken for; empty without labels."""
+    """The class that takes most from the mean, and what it is taken for; empty without a loss."""
     score = SCORES[record.kind].worst
-    labelled = [e for e in record.classes if e.get("share", e.get("images"))]
+    labelled = [e for e in record.classes if e.get("share", e.get("images")) and e[score] < 1]
     if not labelled:
         return ""
     worst = min(labelled, key=lambda entry: float(entry[score]))

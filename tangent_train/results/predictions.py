@@ -17,8 +17,9 @@ from tangent_train.errors import SettingError
 from tangent_train.files import atomic_path, reserve, write_text
 from tangent_train.geometry import equirect_solid_angles
 from tangent_train.json_text import parse_json
-from tangent_train.results.html import EncodedImage, Table, ViewerImage, encode_image, write_report
+from tangent_train.results.html import EncodedImage, ViewerImage, encode_image, write_report
 from tangent_train.results.pictures import colorize, overlay_picture
+from tangent_train.results.tables import Table
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -254,7 +255,9 @@ class PredictionFolder:
         tables = [Table("Solid angle of the classes, %", ["image", *names], shares)]
         failed = [[entry["name"], entry["error"]] for entry in entries if "error" in entry]
         if failed:
-            tables.append(Table("Images that could not be used", ["image", "error"], failed))
+            tables.append(
+                Table("Images that could not be used", ["image", "error"], failed, "", (0, 1))
+            )
         write_report(
             self.path / "report.html",
             "Predictions",

@@ -13,7 +13,7 @@ from datamodules.stanford2d3ds.files import FOLDS
 from tangent_train.csv_text import csv_text
 from tangent_train.files import write_bytes, write_text
 from tangent_train.results.chart import report_png
-from tangent_train.results.record import SCORES, Record
+from tangent_train.results.record import SCORES, Band, Record
 from tangent_train.results.rows import Row, Statistic
 from tangent_train.results.tables import Table, percent
 
@@ -126,8 +126,8 @@ class Report:
         write_text(folder / f"{name}.json", self._json())  # first: it says who wrote the others
         write_text(folder / f"{name}.md", self._markdown())
         figures = list(self.figures())
-        write_text(folder / f"{name}.csv", csv_text(list(dict.fromkeys(
-            key for figure in figures for key in figure)), figures))  # fmt: skip
+        columns = list(dict.fromkeys(key for figure in figures for key in figure))
+        write_text(folder / f"{name}.csv", csv_text(columns, figures))
         write_bytes(folder / f"{name}.png", report_png(self.title, self.rows, self.made_by))
 
     def figures(self) -> Iterator[dict[str, Any]]:
@@ -137,6 +137,7 @@ class Report:
             scopes = [(fold, row.of_fold(fold)) for fold in row.folds if fold is not None]
             for fold, part in [*scopes, ("mean", row)]:
                 facts = {"row": row.label, **row.facts, "fold": fold}
+                entries: list[tuple[str, str | Band | None, str]]
                 entries = [("mean", None, name) for name in scores.means]
                 entries += [(c, c, name) for c in self.classes for name in scores.per_class]
                 entries += [("mean", band, name) for band in row.bands for name in scores.per_band]

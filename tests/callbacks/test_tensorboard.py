@@ -21,12 +21,17 @@ from torch import nn
 
 from datamodules import Stanford2D3DS, Stanford2D3DSPerspective
 from datamodules.core.samples import EvaluationImages
-from tangent_train.callbacks.tensorboard import TrainingSpeed, ValidationPictures
+from tangent_train.callbacks.tensorboard import (
+    TrainingSpeed,
+    ValidationConfusion,
+    ValidationPictures,
+)
 from tangent_train.errors import SettingError
 from tangent_train.rendering import PerspectiveRepresentation, TangentRepresentation
-from tangent_train.results.confusion_picture import confusion_picture
+from tangent_train.results.chart import confusion_picture
 from tangent_train.results.pictures import colorize, prediction_panel
 from tangent_train.tasks import SegmentationTask
+from tests.tasks.shapes import Shapes, shape_task
 
 if TYPE_CHECKING:
     from tests.conftest import FabricateStanford
@@ -48,14 +53,13 @@ def _panoramas(root: Path) -> Stanford2D3DS:
 
 
 def _fit(
-    folder: Path, data: Any, task: SegmentationTask, *, count: int = 2, **settings: Any
+    folder: Path, data: Any, task: Any, *, count: int = 2, **settings: Any
 ) -> lightning.Trainer:
-    resumed = settings.pop("ckpt_path", None)
     trainer = lightning.Trainer(
         **{"max_epochs": 2} | settings,
         accelerator="cpu",
         logger=TensorBoardLogger(folder, name="", version="tensorboard"),
-        callbacks=[ValidationPictures(count), TrainingSpeed()],
+        callbacks=[ValidationPictures(count), ValidationConfusion(), TrainingSpeed()],
         enable_checkpointing=False,
         enable_progress_bar=False,
         enable_model_summary=False,
@@ -64,7 +68,7 @@ def _fit(
         log_every_n_steps=1,
         default_root_dir=folder,
     )
-    trainer.fit(task, datamodule=data, ckpt_path=resumed, weights_only=True)
+    trainer.fit(task, datamodule=data)
     return trainer
 
 
@@ -173,25 +177,6 @@ def test_the_speed_is_that_of_training_alone(stanford_root: Path, tmp_path: Path
     assert _steps(events, "speed/epoch_s") == [STEPS - 1, 2 * STEPS - 1]
 
 
-def test_a_resumed_run_goes_on_at_the_same_steps(
-    stanford_root: Path,
-    tmp_path: Path,
-    trained: tuple[Path, SegmentationTask, Stanford2D3DS],
-) -> None:
-    data = _panoramas(stanford_root)
-    trainer = _fit(tmp_path, data, _task(TANGENT, data.class_names), max_epochs=1)
-    trainer.save_checkpoint(tmp_path / "x.ckpt")
-    data = _panoramas(stanford_root)
-    task = _task(TANGENT, data.class_names)
-    _fit(tmp_path, data, task, ckpt_path=tmp_path / "x.ckpt")
-    resumed, whole = _events(tmp_path), _events(trained[0])
-    for tag in (*whole.Tags()["images"], "val_iou/wall", "speed/epoch_s"):
-        assert _steps(resumed, tag) == _steps(whole, tag)
-    for tag in whole.Tags()["images"]:
-        for event, other in zip(resumed.Images(tag), whole.Images(tag), strict=True):
-            assert event.encoded_image_string == other.encoded_image_string
-
-
 def test_crops_of_a_photo_stand_side_by_side(
     fabricate_stanford: FabricateStanford, tmp_path: Path
 ) -> None:
@@ -215,19 +200,15 @@ def test_crops_of_a_photo_stand_side_by_side(
     assert events.Scalars("speed/images_per_s")[0].value > 0
 
 
-@pytest.mark.parametrize("rows", [512, 513, 2048])
-def test_large_panoramas_are_shown_smaller(rows: int) -> None:
-    from tangent_train.callbacks.tensorboard import _smaller
-
-    step = -(-rows // 256)
-    rng = np.random.default_rng(0)
-    labels = rng.integers(0, 14, (rows, 2 * rows)).astype(np.uint8)
-    small = _smaller(labels)
-    assert small.shape[0] <= 256
-    np.testing.assert_array_equal(small[3, 5], labels[3 * step + step // 2, 5 * step + step // 2])
-    colors = _smaller(np.full((rows, 2 * rows, 3), 77, np.uint8))
-    assert colors.shape == (*small.shape, 3)
-    assert np.all(colors == 77)
+def test_shapes_have_accuracies_and_no_unknown_class(tmp_path: Path) -> None:
+    task: Any = shape_task()
+    _fit(tmp_path, Shapes(), task, count=0)
+    events = _events(tmp_path)
+    assert _steps(events, "val/confusion") == [2, 5]
+    expected = confusion_picture(task.matrices, task.class_names, unknown=False)
+    np.testing.assert_array_equal(_picture(events.Images("val/confusion")[-1]), expected)
+    mean = np.mean([events.Scalars(f"val_accuracy/{n}")[-1].value for n in task.class_names])
+    assert mean == pytest.approx(events.Scalars("val/class_accuracy")[-1].value, rel=1e-6)
 
 
 def test_nothing_is_drawn_by_other_processes_or_without_tensorboard(tmp_path: Path) -> None:
@@ -246,7 +227,7 @@ def test_nothing_is_drawn_by_other_processes_or_without_tensorboard(tmp_path: Pa
         pictures = ValidationPictures(3)
         unused: Any = Unused()
         pictures.on_validation_batch_end(trainer, unused, None, unused, 0)
-        pictures.on_validation_end(trainer, unused)
+        ValidationConfusion().on_validation_end(trainer, unused)
     assert not list(tmp_path.rglob("events*"))
 
 

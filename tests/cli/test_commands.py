@@ -21,7 +21,7 @@ from tangent_train.callbacks.checkpoints import LastCheckpoint
 from tangent_train.checkpoints.content import read_settings
 from tangent_train.cli import main, run
 from tangent_train.cli.stored import stored_arguments
-from tangent_train.results.reports.runs import load_run
+from tangent_train.results.record import load_record
 
 AREAS = ("1", "2", "3", "4", "5a", "5b", "6")
 SETTINGS = [
@@ -85,7 +85,7 @@ def test_a_run_leaves_everything_in_its_folder(run_folder: Path) -> None:
     assert picture is not None
     assert picture.shape[1] == 2 * 512 + 8
     page = (run_folder / "report.html").read_text()
-    assert all(f"<h2>{title}</h2>" in page for title in ("Validation", "Confusion"))
+    assert all(f"<h2>{title}</h2>" in page for title in ("Per class", "Confusion"))
     assert page.count('<li><button type="button"><img') == 1
 
 
@@ -104,7 +104,7 @@ def test_evaluating_the_checkpoint_repeats_the_numbers_exactly(
     checkpoint = run_folder / "checkpoints" / "best.ckpt"
     _run(monkeypatch, "evaluate", f"checkpoint={checkpoint}", rooms, "hydra.run.dir=again")
     assert _results(tmp_path / "again") == _results(run_folder)
-    again, before = (load_run(folder).settings for folder in (tmp_path / "again", run_folder))
+    again, before = (load_record(folder).settings for folder in (tmp_path / "again", run_folder))
     differing = {n for n in again.keys() | before.keys() if again.get(n) != before.get(n)}
     # And what was evaluated can be read with its figures; on which processor is said anew.
     assert differing == {"checkpoint", "trainer.accelerator"}

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tangent_train.results.confusion_picture import confusion_picture, row_shares
+from tangent_train.results.chart import confusion_picture, row_shares
 
 DARKEST = (8, 48, 107)  # all pixels of a class
 GREY = (204, 204, 204)

@@ -21,7 +21,7 @@ from tangent_train.checkpoints.trained import load_trained
 from tangent_train.cli import main
 from tangent_train.cli.keypoint_pairs.export import ColmapExport
 from tangent_train.errors import DataError
-from tangent_train.results.reports.runs import load_run
+from tangent_train.results.record import load_record
 from tests.inference.trained import write_checkpoint
 
 
@@ -159,5 +159,5 @@ def test_neither_do_archives_of_keypoints_nor_results(created: Path, tmp_path: P
         export.finish(["a"])
     _pickle(tmp_path / "results.json", created)
     with pytest.raises(DataError, match=r"results\.json"):
-        load_run(tmp_path)
+        load_record(tmp_path)
     assert not created.exists()

@@ -44,7 +44,7 @@ from tangent_train.cli.stored import CHOOSABLE, StoredRun, stored_run
 from tangent_train.errors import DataError, SettingError
 from tangent_train.registry import accept, check_plain, make, named_targets
 from tangent_train.rendering.camera_files import read_cameras
-from tangent_train.results.reports.runs import load_run
+from tangent_train.results.record import load_record
 from tests.datamodules.folder.folder_format import write_classes, write_data_set
 from tests.security.attacks import attacks, json_attacks, places, replaced, sampled
 from tests.security.watch import CANARY, watched
@@ -255,7 +255,7 @@ def test_nothing_in_the_settings_of_a_run_is_interpreted(run: Path, forbidden: P
     settings = read_settings(run / "config.yaml")
     for place, value in sampled(list(json_attacks(forbidden)), list(places(settings)), each=2):
         (folder / "config.yaml").write_text(yaml.safe_dump(replaced(settings, place, value)))
-        _nothing_happens(load_run, folder, forbidden, (place, value))
+        _nothing_happens(load_record, folder, forbidden, (place, value))
 
 
 def test_nothing_in_lists_of_cameras_and_results_of_keypoints_is_interpreted(

@@ -3,38 +3,27 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
-from rich.table import Table
 
 from tangent_train.cli.transfer.stages import STUDY, Stage, checked_study
-from tangent_train.files import write_bytes, write_text
 from tangent_train.geometry import camera_matrix_from_fov
 from tangent_train.registry import make
-from tangent_train.results.reports.runs import Run, load_run
-from tangent_train.results.transfer import chart, levels
-from tangent_train.results.transfer import tables as transfer_tables
-from tangent_train.results.transfer.report import StageResult, gather
+from tangent_train.results.comparisons import levels_report, transfer_report
+from tangent_train.results.record import Record, load_record
 
 __all__ = ["trained_level", "write_report"]
 
-
-class _Report(NamedTuple):
-    """What both kinds of report are written from."""
-
-    name: str
-    texts: dict[str, str]
-    png: bytes
-    tables: Sequence[Table]
-    notes: Sequence[str]
+_MADE_BY = "tangent-transfer"
 
 
 def write_report(config: DictConfig, folder: Path, stages: Sequence[Stage]) -> list[str]:
-    """Print the tables, write ``.md``, ``.csv``, ``.json`` and ``.png``.
+    """Print the table, write ``.md``, ``.csv``, ``.json`` and ``.png``.
 
     Args:
         config: The composed ``transfer.yaml``.
@@ -42,56 +31,24 @@ def write_report(config: DictConfig, folder: Path, stages: Sequence[Stage]) -> l
         stages: Finished ones.
 
     Returns:
-        What is to be said after the tables.
+        What is to be said after the table.
 
     Raises:
         DataError: The results of a stage cannot be used.
     """
-    report = _levels(config, stages) if checked_study(config) else _transfer(stages)
-    for suffix, text in report.texts.items():
-        write_text(folder / f"{report.name}.{suffix}", text)
-    write_bytes(folder / f"{report.name}.png", report.png)
-    console = Console(highlight=False)
-    for table in report.tables:
-        console.print(table)
-    notes = [f"- {note}" for note in report.notes]
-    return [*notes, f"Tables and a chart: {folder / report.name}.md, .csv, .json, .png"]
-
-
-def _transfer(stages: Sequence[Stage]) -> _Report:
-    report = gather(
-        [
-            StageResult(s.name, s.on, s.epochs, s.representation, s.fold, s.seed, _run(s))
-            for s in stages
-        ]
-    )
-    texts = {
-        "json": transfer_tables.transfer_json(report),
-        "md": transfer_tables.transfer_markdown(report),
-        "csv": transfer_tables.transfer_csv(report),
-    }
-    notes = transfer_tables.transfer_notes(report)
-    tables = transfer_tables.transfer_tables(report)
-    return _Report("transfer", texts, chart.transfer_png(report), tables, notes)
-
-
-def _levels(config: DictConfig, stages: Sequence[Stage]) -> _Report:
-    results = [
-        levels.LevelResult(s.level, s.fold, s.seed, _run(s)) for s in stages if s.level is not None
-    ]
-    report = levels.gather_levels(results, trained_level(config))
-    texts = {
-        "json": levels.levels_json(report),
-        "md": levels.levels_markdown(report),
-        "csv": levels.levels_csv(report),
-    }
-    notes = levels.levels_notes(report)
-    tables = levels.levels_tables(report)
-    return _Report(STUDY, texts, chart.levels_png(report), tables, notes)
-
-
-def _run(stage: Stage) -> Run:
-    return load_run(stage.folder)
+    found: dict[Any, list[Record]] = defaultdict(list)
+    study = checked_study(config)
+    for stage in sorted(stages, key=lambda s: (s.epochs, s.on != "photos", s.fold or 0, s.seed)):
+        if not study or stage.level is not None:
+            found[stage.level if study else stage.name].append(load_record(stage.folder))
+    if study:
+        name, report = STUDY, levels_report(found, trained_level(config), _MADE_BY)
+    else:
+        name, report = "transfer", transfer_report(found, _MADE_BY)
+    report.write(folder, name)
+    Console(highlight=False).print(report.tables()[0].terminal())
+    notes = [f"- {note}" for note in report.all_notes()]
+    return [*notes, f"Tables and a chart: {folder / name}.md, .csv, .json, .png"]
 
 
 def trained_level(config: DictConfig) -> float:

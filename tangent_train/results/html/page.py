@@ -7,7 +7,7 @@ import itertools
 import json
 import re
 from base64 import b64encode
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
@@ -49,10 +49,7 @@ def write_report(
     Raises:
         DataError: An image has arrays of other shapes or types, or unknown class indices.
     """
-    encoded = (
-        image if isinstance(image, EncodedImage) else encode_image(image, len(class_names))
-        for image in images
-    )
+    encoded = _encoded(images, len(class_names))
     first = next(encoded, None)
     parts: dict[str, str] = {
         "title": html.escape(title),
@@ -72,6 +69,15 @@ def write_report(
         for image in itertools.chain(filter(None, [first]), encoded):
             _write_image(file, image)
         file.write(after)
+
+
+def _encoded(
+    images: Iterable[ViewerImage | EncodedImage], class_count: int
+) -> Iterator[EncodedImage]:
+    for image in images:
+        encoded = image if isinstance(image, EncodedImage) else encode_image(image, class_count)
+        del image  # before the next one is made
+        yield encoded
 
 
 def _viewer(class_names: Sequence[str]) -> str:

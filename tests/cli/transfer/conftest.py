@@ -8,7 +8,7 @@ import pytest
 
 from tangent_train.cli import compose
 from tangent_train.cli.transfer import command, stage_runs
-from tangent_train.results.transfer import chart
+from tangent_train.results import report
 from tests.cli.transfer.pretended_runs import PretendedRuns
 
 
@@ -21,6 +21,5 @@ def runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> PretendedRuns:
     # Tested by themselves, and slow.
     monkeypatch.setattr(command, "_try", lambda _: None)
     monkeypatch.setattr(compose, "check_overrides", lambda *_: None)
-    for name in ("transfer_png", "levels_png"):
-        monkeypatch.setattr(chart, name, lambda _: b"a picture")
+    monkeypatch.setattr(report, "report_png", lambda *_: b"a picture")
     return pretended

@@ -15,7 +15,7 @@ from omegaconf import OmegaConf
 from tangent_train.checkpoints.content import write_settings
 from tangent_train.cli import main
 from tangent_train.metrics.segmentation import ConfusionMatrices
-from tangent_train.results.segmentation import evaluation_results, write_results
+from tangent_train.results.evaluation import segmentation_record, write_results
 
 SETTINGS = (
     "experiment=rooms/transfer",
@@ -77,7 +77,7 @@ class PretendedRuns:
         pixels[1:, 0] = 100 - hits
         bands = np.zeros((6, 3, 3), np.int64)
         matrices = ConfusionMatrices(pixels, pixels / 10, bands, 4)
-        results = evaluation_results(matrices, ("unknown", "wall", "floor"), "skip")
+        results = segmentation_record(matrices, ("unknown", "wall", "floor"), "skip")
         write_results(results, folder)
         return 0, []
 

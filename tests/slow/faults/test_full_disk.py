@@ -29,7 +29,8 @@ from tangent_train.cli.machine import machine_faults
 from tangent_train.files import NoRoomError, atomic_path, reserve, write_text
 from tangent_train.metrics.segmentation import ConfusionMatrices
 from tangent_train.rendering import TangentRepresentation
-from tangent_train.results.segmentation import evaluation_results, write_results
+from tangent_train.results.evaluation import segmentation_record, write_results
+from tangent_train.results.record import Record
 from tests.slow.faults.small_runs import Faulty, run_trainer, small_data, small_task
 
 if TYPE_CHECKING:
@@ -186,11 +187,11 @@ def test_a_store_keeps_what_is_whole_and_goes_on(stanford_root: Path, tmp_path: 
     assert len(list(store.rglob("*.panorama"))) == 14
 
 
-def _results(figure: int) -> dict[str, Any]:
+def _results(figure: int) -> Record:
     pixels = np.full((14, 14), figure)
     bands = np.zeros((6, 14, 14), np.int64)
     matrices = ConfusionMatrices(pixels, pixels.astype(float), bands, 5)
-    return evaluation_results(matrices, Stanford2D3DS.class_names, "skip")
+    return segmentation_record(matrices, Stanford2D3DS.class_names, "skip")
 
 
 def test_results_that_do_not_fit_leave_the_old_ones(tmp_path: Path) -> None:

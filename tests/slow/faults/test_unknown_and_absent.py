@@ -140,7 +140,7 @@ def _evaluate(root: Path, tmp_path: Path, absent: str) -> tuple[dict[str, Any], 
     (logged,) = trainer.test(task, datamodule=data, verbose=False)
     results = evaluated(task, data.noun)
     assert logged["test/miou"] == pytest.approx(
-        np.nan if results["miou"] is None else results["miou"], nan_ok=True
+        np.nan if results.means["miou"] is None else results.means["miou"], nan_ok=True
     )
     write_evaluation(task, results, tmp_path / "x.ckpt", tmp_path / "results")
     written = json.loads((tmp_path / "results" / "results.json").read_text())
@@ -212,7 +212,7 @@ def test_a_validation_split_without_a_labelled_pixel_has_no_best_figure(
     trainer.fit(task, datamodule=data)
     assert (tmp_path / "checkpoints" / "best.ckpt").exists()
     figures = evaluated(task, "panoramas")
-    assert figures["miou"] is None
-    assert figures["images"] == len(names)
+    assert figures.means["miou"] is None
+    assert figures.images == len(names)
     assert best_on_validation(trainer, tmp_path) is None, "a sweep is not told minus infinity"
     assert not list(tmp_path.glob("*.json"))

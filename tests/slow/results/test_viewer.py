@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 from tangent_train.results.html import ViewerImage, encode_image, write_report
-from tests.results.html.browser import NO_WEBGL, OpenReport, opened
-from tests.results.html.reference import (
+from tests.slow.results.browser import NO_WEBGL, OpenReport, opened
+from tests.slow.results.reference import (
     classes_of,
     colors_of,
     erp_directions,
     interpolated,
     rays,
 )
-from tests.results.html.scene import (
+from tests.slow.results.scene import (
     BARE_PANORAMA,
     COLORS,
     EDGE,

@@ -9,12 +9,12 @@ import numpy as np
 
 from tangent_train.results.html import ViewerImage
 from tangent_train.results.pictures import class_colors
-from tests.results.html.reference import classes_of, colors_of, erp_directions, rays
+from tests.slow.results.reference import classes_of, colors_of, erp_directions, rays
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from tests.results.html.browser import OpenReport
+    from tests.slow.results.browser import OpenReport
 
 HEIGHT, WIDTH = 251, 503  # odd, no powers of two
 PHOTO = (120, 200)

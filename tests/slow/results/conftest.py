@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tangent_train.results.html import Curve, Table, ViewerImage, write_report
-from tests.results.html.browser import OpenReport, chromium, opened
-from tests.results.html.scene import NAMES, panorama, photo
+from tangent_train.results.html import ViewerImage, write_report
+from tangent_train.results.tables import Table
+from tests.slow.results.browser import OpenReport, chromium, opened
+from tests.slow.results.scene import NAMES, panorama, photo
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -32,7 +33,6 @@ def page_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
         path,
         "Test",
         tables=[Table("Wide", [f"column {k}" for k in range(30)], [["12345.6"] * 30])],
-        curves=[Curve("Loss", "loss", [0, 1, 2], {"train": [3.0, 2.0, 1.0]})],
         images=[sphere, ViewerImage("bare", sphere.rgb), photo()],
         class_names=NAMES,
         notes=["a note without any place to break: " + "x" * 200],

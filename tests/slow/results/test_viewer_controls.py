@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from tangent_train.results.html import ViewerImage, write_report
-from tests.results.html.browser import OpenReport, opened
-from tests.results.html.reference import (
+from tests.slow.results.browser import OpenReport, opened
+from tests.slow.results.reference import (
     classes_of,
     colors_of,
     rays,
 )
-from tests.results.html.scene import (
+from tests.slow.results.scene import (
     BARE_PANORAMA,
     COLORS,
     FLAT_PHOTO,

@@ -1,0 +1,85 @@
+"""Records with given scores, and runs on disk that hold them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+
+from tangent_train.results.record import SCORES, Record
+from tangent_train.setting_rules import flat_settings
+
+NAMES = ("wall", "floor", "sofa")
+BANDS = ((45.0, 90.0), (-90.0, 45.0))
+SETTINGS = {
+    "name": "mine",
+    "seed": 0,
+    "level": 7,
+    "data": {
+        "_target_": "datamodules.Stanford2D3DS",
+        "fold": 1,
+        "inputs": ["rgb", "depth"],
+        "test_rotation": None,
+        "root": "/data",
+    },
+    "representation": {"_target_": "rendering.TangentRepresentation", "base_level": 0},
+    "optimizer": {"lr": 0.01},
+}
+
+
+def made_record(
+    scores: Sequence[float | None],
+    names: Sequence[str] = NAMES,
+    bands: Sequence[float] = (),
+    **settings: Any,
+) -> Record:
+    """All scores of a class the same, the means those of the classes that are there.
+
+    Args:
+        scores: Of the classes.
+        names: Of the classes.
+        bands: Score of each band.
+        settings: Changes of `SETTINGS`, two underscores for a point.
+    """
+    config = OmegaConf.create(SETTINGS)
+    for name, value in settings.items():
+        OmegaConf.update(config, name.replace("__", "."), value)
+    flat = dict(flat_settings(OmegaConf.to_container(config)))  # type: ignore[arg-type]
+    present = [value for value in scores if value is not None]
+    found = SCORES["segmentation"]
+    return Record(
+        "segmentation",
+        "panoramas",
+        5,
+        dict.fromkeys(found.means, sum(present) / len(present)),
+        [
+            {"class": name, **dict.fromkeys(found.per_class, value), "share": 0.1}
+            for name, value in zip(names, scores, strict=True)
+        ],
+        [
+            {"latitude_deg": list(band), "miou": value, "macc": value}
+            for band, value in zip(BANDS, bands, strict=False)
+        ],
+        settings=flat,
+        folder=Path(f"/runs/{flat['data.fold']}_{flat['seed']}"),
+    )
+
+
+def write_run(folder: Path, record: Record) -> Path:
+    """The run that a record is of: its results and settings."""
+    folder.mkdir(parents=True)
+    (folder / "results.json").write_text(record.json())
+    settings: Any = OmegaConf.create()
+    for name, value in record.settings.items():
+        OmegaConf.update(settings, name, value)
+    OmegaConf.save(settings, folder / "config.yaml")
+    return folder
+
+
+def without_solid_angle(record: Record) -> Record:
+    """As photos are scored."""
+    means = {k: None if k.endswith("_solid_angle") else v for k, v in record.means.items()}
+    return replace(record, means=means)

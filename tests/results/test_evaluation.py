@@ -1,0 +1,142 @@
+"""Records, tables and files of an evaluation, from matrices counted by hand."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from tangent_train.callbacks.results import evaluated, pictures, write_evaluation
+from tangent_train.callbacks.tensorboard import ValidationConfusion
+from tangent_train.metrics.segmentation import ConfusionMatrices
+from tangent_train.results.chart import confusion_picture
+from tangent_train.results.evaluation import (
+    classification_record,
+    headline,
+    largest_loss,
+    result_tables,
+    segmentation_record,
+    write_results,
+)
+from tangent_train.results.record import Record
+from tests.tasks.shapes import Shapes, quiet_trainer, shape_task
+
+NAMES = ("unknown", "wall", "floor", "=sofa")
+SHAPES = ("bottle", "chair [old]", "mug", "plant")
+SHAPE_MATRIX = np.array([[4, 0, 0, 0], [0, 8, 0, 0], [3, 0, 1, 0], [0, 0, 0, 0]])
+
+
+def _matrices(pixels: dict[tuple[int, int], int] | None = None) -> ConfusionMatrices:
+    """Walls found by 90 %, floors by half, no sofa."""
+    erp = np.zeros((4, 4), np.int64)
+    for place, count in (pixels or {(1, 1): 90, (1, 2): 10, (2, 2): 50, (2, 1): 50}).items():
+        erp[place] = count
+    bands = np.zeros((6, 4, 4), np.int64)
+    bands[2] = erp
+    return ConfusionMatrices(erp, erp / 10, bands, 7)
+
+
+def _record(absent: Any = "skip", noun: str = "panoramas") -> Record:
+    return segmentation_record(_matrices(), NAMES, absent, noun)
+
+
+def test_the_json_file_is_plain_and_complete(tmp_path: Path) -> None:
+    write_results(_record(), tmp_path)
+    read = json.loads((tmp_path / "results.json").read_text())
+    assert (read["kind"], read["images"], read["noun"]) == ("segmentation", 7, "panoramas")
+    assert read["absent_class"] == "skip"
+    assert read["macc"] == read["macc_solid_angle"] == (0.9 + 0.5) / 2
+    assert read["miou"] == (90 / 150 + 50 / 110) / 2
+    assert [entry["class"] for entry in read["classes"]] == ["wall", "floor", "=sofa"]
+    assert read["classes"][2]["iou"] is None, "absent: undefined"
+    assert (read["classes"][1]["taken_for"], read["classes"][1]["taken_for_share"]) == ("wall", 0.5)
+    assert read["latitude_bands"][2] == {
+        "latitude_deg": [0, 30],
+        "miou": read["miou"],
+        "macc": read["macc"],
+    }
+    assert read["latitude_bands"][0]["miou"] is None
+    assert read["confusion"][1] == [0, 90, 10, 0]
+
+
+def test_csv_and_markdown_hold_the_same_scores(tmp_path: Path) -> None:
+    write_results(_record("zero"), tmp_path)
+    with (tmp_path / "results.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["class"] for row in rows] == ["wall", "floor", "'=sofa"], "no formula"
+    assert [float(row["iou"]) for row in rows] == [0.6, 50 / 110, 0.0]
+    text = (tmp_path / "results.md").read_text()
+    assert "mIoU 35.2\u00a0%" in text
+    assert "| wall | 60.0 | 90.0 | 60.0 | 90.0 | 50.0 | floor | 10.0 |" in text
+    assert "| mean | 35.2 | 46.7 | 35.2 | 46.7 |  |  |  |" in text
+    assert "| 0° … 30° | 35.2 | 46.7 |" in text
+
+
+def test_photos_have_neither_solid_angles_nor_latitudes() -> None:
+    none = np.zeros((4, 4))
+    matrices = _matrices()._replace(solid_angle=none, bands=np.zeros((6, 4, 4), np.int64))
+    record = segmentation_record(matrices, NAMES, "zero", "photos")
+    assert record.means["miou_solid_angle"] is None
+    assert record.latitude_bands == []
+    (table,) = result_tables(record)
+    assert not [name for name in table.header if "solid angle" in name]
+    assert headline(record) == "mAcc 46.7\u00a0%, mIoU 35.2\u00a0% over 7 photos"
+
+
+@pytest.mark.parametrize(
+    ("pixels", "sentence"),
+    [
+        (
+            {(1, 1): 90, (1, 2): 10, (2, 2): 50, (2, 1): 30, (2, 3): 20},
+            "Largest loss: floor, 45.5 % IoU; most often taken for wall (30.0 % of it).",
+        ),
+        ({(1, 1): 5, (0, 3): 9, (2, 1): 5, (2, 2): 90}, "Largest loss: wall, 50.0 % IoU."),
+        ({(1, 1): 5, (3, 3): 1}, ""),
+        ({(0, 1): 7}, ""),
+    ],
+)
+def test_the_largest_loss_is_that_of_a_labelled_class(
+    pixels: dict[tuple[int, int], int], sentence: str
+) -> None:
+    for absent in ("skip", "zero"):
+        record = segmentation_record(_matrices(pixels), NAMES, absent)
+        assert largest_loss(record) == sentence
+        assert result_tables(record)[0].note == sentence
+
+
+def test_shapes_are_counted_per_class_and_over_all(tmp_path: Path) -> None:
+    record = classification_record(SHAPE_MATRIX, SHAPES)
+    assert record.means == {"accuracy": 13 / 16, "class_accuracy": 0.75}
+    assert largest_loss(record) == (
+        "Largest loss: mug, 25.0 % accuracy; most often taken for bottle (75.0 % of it)."
+    )
+    write_results(record, tmp_path)
+    text = (tmp_path / "results.md").read_text()
+    assert "| mug | 4 | 25.0 | bottle | 75.0 |" in text
+    assert "| plant | 0 | – | – | – |" in text
+    assert "| mean |  | 75.0 |  |  |" in text
+    read = cv2.imread(str(tmp_path / "confusion.png"))
+    assert read is not None
+    drawn = confusion_picture(SHAPE_MATRIX, SHAPES, unknown=False)
+    np.testing.assert_array_equal(cv2.cvtColor(read, cv2.COLOR_BGR2RGB), drawn)
+
+
+def test_an_evaluated_task_leaves_files_and_a_page(tmp_path: Path) -> None:
+    task = shape_task()
+    trainer = quiet_trainer()
+    trainer.test(task, datamodule=Shapes(), verbose=False)
+    record = evaluated(task, "shapes")
+    assert record.images == 9
+    write_evaluation(task, record, tmp_path / "x.ckpt", tmp_path)
+    written = {"results.json", "results.csv", "results.md", "confusion.png", "report.html"}
+    assert {path.name for path in tmp_path.iterdir()} == written
+    page = (tmp_path / "report.html").read_text()
+    assert f"<p>{headline(record)}</p>" in page
+    for title in ("Per class", "Confusion"):
+        assert f"<h2>{title}</h2>" in page
+    assert [type(c) for c in pictures(task.kind, tmp_path, {})] == [ValidationConfusion]

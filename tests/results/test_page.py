@@ -1,0 +1,120 @@
+"""The report's page: names stay text, nothing outside is referred to."""
+
+from __future__ import annotations
+
+import io
+import json
+from html.parser import HTMLParser
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from tangent_train.results.html import ViewerImage, write_report
+from tangent_train.results.tables import Table
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+NASTY = """</script><script>throw 1</script><!-- <b>&amp; "it's" {{images}} <!--images-->"""
+NAMES = ("unknown", "wall", "floor", NASTY)
+
+
+class _Reader(HTMLParser):
+    """Elements, attributes and texts as a browser would take them."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.attributes: list[tuple[str, str, str]] = []
+        self.texts: list[str] = []
+        self.scripts: list[str] = []
+        self.feed(page)
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.attributes += [(tag, name, value or "") for name, value in attrs]
+
+    def handle_data(self, data: str) -> None:
+        inside_script = self.tags and self.tags[-1] == "script" and self.cdata_elem is not None
+        (self.scripts if inside_script else self.texts).append(data)
+
+
+def _page(path: Path, **content: Any) -> str:
+    write_report(path, **content)
+    return path.read_text(encoding="utf-8")
+
+
+@pytest.fixture
+def nasty_page(tmp_path: Path) -> str:
+    labels = np.array([[0, 1], [2, 3]], np.uint8)
+    image = ViewerImage(NASTY, np.zeros((4, 8, 3), np.uint8), labels, labels, note=NASTY)
+    return _page(
+        tmp_path / "report.html",
+        title=NASTY,
+        tables=[Table(NASTY, (NASTY, "x"), [(NASTY, NASTY)], NASTY)],
+        images=[image, image],
+        class_names=NAMES,
+        notes=[NASTY],
+    )
+
+
+def test_names_stay_text_wherever_they_stand(nasty_page: str) -> None:
+    reader = _Reader(nasty_page)
+    # title, heading, note; table: title, note, header, 2 cells; 2 thumbnails with notes.
+    assert sum(NASTY in text for text in reader.texts) == 12
+    assert "b" not in reader.tags
+    assert reader.tags.count("script") == 5, "2 images, classes, shader, viewer"
+    images = [json.loads(s) for s in reader.scripts if s.startswith('{"name"')]
+    assert [image["name"] for image in images] == [NASTY, NASTY]
+    (classes,) = (json.loads(s) for s in reader.scripts if s.startswith("[{"))
+    assert [entry["name"] for entry in classes] == list(NAMES)
+    assert classes[0]["rgb"] == [0, 0, 0]
+
+
+def test_the_page_refers_to_nothing_outside_and_forbids_it(nasty_page: str) -> None:
+    reader = _Reader(nasty_page)
+    for tag, name, value in reader.attributes:
+        if name in ("src", "href", "srcset", "action"):
+            assert value.startswith("data:"), (tag, name)
+    assert not {"iframe", "object", "embed"} & set(reader.tags)
+    style = nasty_page.partition("<style>")[2].partition("</style>")[0]
+    assert "url(" not in style
+    assert "@import" not in style
+    policy = next(v for t, n, v in reader.attributes if n == "content" and "default-src" in v)
+    assert policy.startswith("default-src 'none'; img-src data: blob:;")
+
+
+def test_without_images_there_is_no_viewer(tmp_path: Path) -> None:
+    page = _page(tmp_path / "report.html", title="Ä → 360°", notes=["one", "two"])
+    reader = _Reader(page)
+    assert not {"script", "canvas", "table", "svg"} & set(reader.tags)
+    assert "<title>Ä → 360°</title>" in page
+    assert [text for text in reader.texts if text in ("one", "two")] == ["one", "two"]
+    assert "{{" not in page
+
+
+def test_tables_align_columns_and_shade_heat_maps() -> None:
+    text = Table("t", ("class", "a"), [("wall", "61.2"), ("floor", "–")]).html()
+    assert '<th scope="col"><span>class' in text
+    assert '<th class="number" scope="col"><span>a' in text
+    assert text.count('<td class="number">') == 2
+    heat = Table("t", ("", "a", "b"), [("x", "25", "90")], shades=[[0.25, 0.9]]).html()
+    assert '<td style="--share:0.250">25</td>' in heat
+    assert '<td class="strong" style="--share:0.900">90</td>' in heat
+
+
+def test_tables_for_the_terminal_and_markdown_take_any_text() -> None:
+    table = Table("[t]", ("", "[red]"), [("a|b", "[/]")], "[note]")
+    console = Console(width=80, record=True, file=io.StringIO())
+    console.print(table.terminal())
+    shown = console.export_text()
+    assert all(text in shown for text in ("[t]", "[red]", "[/]", "[note]"))
+    assert r"| a\|b | [/] |" in table.markdown()
+
+
+def test_rows_of_another_length_are_an_error() -> None:
+    with pytest.raises((IndexError, ValueError)):
+        Table("t", ("a", "b"), [("1", "2", "3", "4")]).html()

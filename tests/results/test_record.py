@@ -1,0 +1,92 @@
+"""Finished runs, found and read."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tangent_train.errors import DataError
+from tangent_train.results.record import find_runs, load_record, unfinished_runs
+from tests.results.made_records import BANDS, made_record, write_run
+
+SCORES = (0.1, 0.2, None)
+
+
+def test_a_record_is_read_as_it_was_written(tmp_path: Path) -> None:
+    record = made_record(SCORES, bands=(0.5, 0.25))
+    read = load_record(write_run(tmp_path / "a", record))
+    assert read.json() == record.json()
+    assert read.settings == record.settings
+    assert (read.fold, read.seed, read.data) == (1, 0, "Stanford2D3DS")
+    assert read.bands == BANDS
+    assert read.score("miou", BANDS[1]) == 0.25
+    assert read.score("miou", (0.0, 15.0)) is None
+    assert read.score("iou", "floor") == 0.2
+    assert read.score("iou", "sofa") is None
+
+
+def test_settings_are_what_is_written_and_nothing_is_looked_up(tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "a", made_record(SCORES))
+    with (folder / "config.yaml").open("a") as file:
+        file.write("lr: ${optimizer.lr}\nhome: ${oc.env:HOME}\n")
+    settings = load_record(folder).settings
+    assert [settings[name] for name in ("lr", "home")] == ["${optimizer.lr}", "${oc.env:HOME}"]
+
+
+def test_runs_are_found_once_and_unfinished_ones_named(tmp_path: Path) -> None:
+    for name in ("b", "a"):
+        write_run(tmp_path / name, made_record(SCORES))
+    (tmp_path / "cut" / "checkpoints").mkdir(parents=True)
+    found = find_runs([tmp_path / "b", tmp_path])
+    assert [path.name for path in found] == ["b", "a"]
+    assert unfinished_runs([tmp_path]) == [(tmp_path / "cut").resolve()]
+    with pytest.raises(DataError, match=r"cut/results.json: .*tangent-train resume=.*cut"):
+        find_runs([tmp_path / "cut"])
+    with pytest.raises(DataError, match="no such folder"):
+        find_runs([tmp_path / "nowhere"])
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "FileNotFoundError"),
+        ("{", "JSONDecodeError"),
+        ("[]", "TypeError"),
+        ('{"kind": "segmentation"}', "KeyError: 'macc'"),
+        ('{"kind": "keypoints"}', "KeyError"),
+        ("[" * 100_000, "nested too deeply"),
+    ],
+)
+def test_broken_results_are_named(content: str | None, message: str, tmp_path: Path) -> None:
+    path = write_run(tmp_path / "a", made_record(SCORES)) / "results.json"
+    path.unlink()
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(DataError, match=rf"a/results\.json: found .*{message}"):
+        load_record(path.parent)
+
+
+@pytest.mark.parametrize("value", [52.5, "0.5", True, -0.1, float("nan")])
+@pytest.mark.parametrize("place", ["miou", "classes", "latitude_bands"])
+def test_scores_must_be_shares(value: object, place: str, tmp_path: Path) -> None:
+    path = write_run(tmp_path / "a", made_record(SCORES, bands=(0.5,))) / "results.json"
+    results = json.loads(path.read_text())
+    if place == "miou":
+        results["miou"] = value
+    else:
+        results[place][0]["iou" if place == "classes" else "miou"] = value
+    path.write_text(json.dumps(results))
+    with pytest.raises(DataError, match=r"results\.json: found .*instead of a share of 1"):
+        load_record(path.parent)
+
+
+@pytest.mark.parametrize("content", [None, "[1, 2]", "a: &b 1\nc: *b", "a: [", "level: high"])
+def test_broken_settings_are_named(content: str | None, tmp_path: Path) -> None:
+    path = write_run(tmp_path / "a", made_record(SCORES)) / "config.yaml"
+    path.unlink()
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(DataError, match=r"config\.yaml: found .*expected the settings"):
+        load_record(path.parent)

@@ -1,0 +1,317 @@
+"""Reports over runs, transfers and levels: tables, files, the paper's figures, the chart."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from datamodules.modelnet40.shape_files import MODELNET40
+from datamodules.stanford2d3ds.panoramas import CLASSES
+from tangent_train.results.chart import report_png
+from tangent_train.results.comparisons import levels_report, runs_report, transfer_report
+from tangent_train.results.paper import published
+from tangent_train.results.record import Record
+from tangent_train.results.report import Report
+from tangent_train.results.rows import Row
+from tests.results.made_records import NAMES, made_record, without_solid_angle
+
+REAL = CLASSES
+STAGES = ("P", "S", "P-FT-1", "S-FT-1", "P-FT-10", "S-FT-10")
+OF_THE_PAPER = {"level": 8, "representation__base_level": 1}
+
+
+def _runs_report(*records: Record) -> Report:
+    return runs_report(records, "tangent-report", ["a note"])
+
+
+def _cells(report: Report, table: int = 0) -> dict[str, dict[str, str]]:
+    """By row and column."""
+    found = report.tables()[table]
+    return {row[0]: dict(zip(found.header[1:], row[1:], strict=True)) for row in found.rows}
+
+
+def _paper(names: tuple[str, ...] = STAGES, **settings: Any) -> dict[str, Row]:
+    record = made_record([0.5] * 13, REAL, **{**OF_THE_PAPER, **settings})
+    return {row.label.removesuffix(" (paper)"): row for row in transfer_report(
+        {name: [record] for name in names}, "tangent-transfer").rows if row.published}  # fmt: skip
+
+
+def test_the_tables_show_means_spreads_and_what_is_missing() -> None:
+    report = _runs_report(
+        made_record([0.1, 0.5, 0.5], data__fold=1),
+        made_record([0.3, 0.5, None], data__fold=3),
+        made_record([0.3, 0.5, None], data__fold=3, seed=1),
+        made_record([0.3, 0.5, None], data__fold=3, seed=1),
+    )
+    cells = _cells(report)["mine"]
+    assert (cells["data"], cells["s"], cells["input"], cells["b"]) == (
+        *("Stanford2D3DS", "7", "RGB-D", "0"),
+    )
+    assert (cells["folds"], cells["runs"], cells["mIoU %"]) == ("1, 3", "4", "38.3 ± 2.4 (± 0.0)")
+    accuracy, iou = (_cells(report, k)["mine"] for k in (1, 2))
+    assert (
+        accuracy
+        == iou
+        == {
+            "wall": "20.0 ± 14.1 (± 0.0)",
+            "floor": "50.0 ± 0.0 (± 0.0)",
+            "sofa": "50.0 of 1",
+        }
+    )
+    assert report.all_notes() == [
+        "mine: largest loss: wall, 20.0 % iou.",
+        "mine: fold 2 missing; not a mean of 3 folds.",
+        "mine: fold 3, seed 1 more than once, also in /runs/3_1.",
+        "a note",
+    ]
+
+
+def test_all_files_hold_the_same_scores(tmp_path: Path) -> None:
+    records = [made_record([0.1, 0.4, None], bands=(0.6, 0.2), data__fold=fold) for fold in (1, 2)]
+    _runs_report(*records, made_record([0.1, 0.4, None], name="a|b [red]")).write(tmp_path, "x")
+    assert {path.name for path in tmp_path.iterdir()} == {
+        f"x.{s}" for s in ["json", "md", "csv", "png"]
+    }
+    read = json.loads((tmp_path / "x.json").read_text())
+    assert (read["made_by"], read["unit"]) == ("tangent-report", "shares of 1")
+    (ours,) = (row for row in read["rows"] if row["row"] == "mine")
+    assert [run["fold"] for run in ours["runs"]] == [1, 2]
+    assert ours["runs"][0]["images"] == 5
+    with (tmp_path / "x.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == len(read["figures"])
+    for row, figure in zip(rows, read["figures"], strict=True):
+        assert {k: v for k, v in row.items() if v} == {
+            k: str(v) for k, v in figure.items() if v is not None
+        }
+    scopes = [
+        r for r in rows if r["row"] == "mine" and r["score"] == "miou" and r["class"] == "mean"
+    ]
+    assert [(r["fold"], r["south"], r["mean"]) for r in scopes if r["fold"] == "mean"] == [
+        ("mean", "", "0.25"), ("mean", "45.0", "0.6"), ("mean", "-90.0", "0.2"),
+    ]  # fmt: skip
+    text = (tmp_path / "x.md").read_text()
+    assert text.startswith("# Report\n")
+    assert r"| a\|b [red] | 10.0 | 40.0 | – |" in text
+    assert "| 45° … 90° | 60.0 |" in text
+    assert "| mine | 2 | 0 | /runs/2_0 |" in text
+
+
+@pytest.mark.parametrize(
+    ("settings", "name"),
+    [
+        ({"data__inputs": ["rgb"]}, "RGB 0"),
+        ({"data__inputs": ["rgb", "depth", "elevation"]}, "RGB-D + elevation 0"),
+        ({"representation__base_level": None}, "RGB-D tangent images"),
+        (
+            {
+                "representation__base_level": None,
+                "representation___target_": "r.EquirectRepresentation",
+            },
+            "RGB-D ERP",
+        ),
+    ],
+)
+def test_inputs_and_representations_have_their_names(settings: dict[str, Any], name: str) -> None:
+    cells = _cells(_runs_report(made_record([0.5] * 3, **settings)))["mine"]
+    assert f"{cells['input']} {cells['b']}" == name
+
+
+def test_the_papers_rows_stand_beside_the_same_data_and_resolution() -> None:
+    report = _runs_report(made_record([0.5] * 13, REAL))
+    cells = _cells(report)
+    assert set(cells) == {
+        "tangent images (paper)", "Tateno et al. (paper)", "Lee et al. (paper)", "mine",
+    }  # fmt: skip
+    ours = cells["tangent images (paper)"]
+    assert (ours["b"], ours["mAcc %"], ours["mIoU %"]) == ("0", "59.1", "44.9")
+    assert cells["Lee et al. (paper)"]["mIoU %"] == "–"
+    per_class = _cells(report, 1)["tangent images (paper)"]
+    assert (per_class["beam"], per_class["board"]) == ("30.4", "57.2")
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"data___target_": "datamodules.SynthRooms"},
+        {"data__test_rotation": "so3"},
+        {"level": 6},
+        {"names": REAL[:12]},
+    ],
+)
+def test_nothing_published_stands_beside_other_data(changes: dict[str, Any]) -> None:
+    names = changes.get("names", REAL)
+    settings = {name: value for name, value in changes.items() if name != "names"}
+    record = made_record([0.5] * len(names), names, **settings)
+    assert published([record]) == []
+    assert not _paper(**settings) if names is REAL else True
+
+
+def test_the_papers_means_are_those_of_its_classes() -> None:
+    rows = [
+        row
+        for level in (5, 7, 10)
+        for row in published([made_record([0.5] * 13, REAL, level=level)])
+        if row.score("iou", "wall").mean is not None
+    ]
+    assert len(rows) == 5
+    for row in rows:
+        for name, mean, within in (("iou", "miou", 6e-4), ("accuracy", "macc", 1.1e-3)):
+            classes = [row.score(name, label).mean or 0.0 for label in REAL]
+            assert row.score(mean).mean == pytest.approx(fmean(classes), abs=within)
+
+
+@pytest.mark.parametrize(
+    ("name", "macc", "miou"),
+    [
+        ("P", 61.8, 45.7),
+        ("S", 57.4, 42.3),
+        ("S-FT-1", 61.2, 47.0),
+        ("P-FT-10", 61.0, 47.1),
+        ("S-FT-10", 64.0, 49.6),
+    ],
+)
+def test_the_papers_transfer_is_the_mean_of_its_printed_folds(
+    name: str, macc: float, miou: float
+) -> None:
+    row = _paper()[name]
+    assert row.folds[:3] == (1, 2, 3)
+    assert row.score("macc").mean == pytest.approx(macc / 100, abs=5e-4)
+    assert row.score("miou").mean == pytest.approx(miou / 100, abs=5e-4)
+    if "FT-1" not in name or "FT-10" in name:  # the per-class table is over all folds
+        classes = fmean(row.score("iou", label).mean or 0.0 for label in REAL)
+        assert classes == pytest.approx(miou / 100, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("fold", "name", "macc", "miou"),
+    [
+        (1, "S", -2.5, -4.5), (1, "S-FT-1", 2.6, 0.0), (1, "S-FT-10", 8.9, 3.5),
+        (2, "S", -17.2, -10.6), (2, "S-FT-1", -6.7, 2.5), (2, "S-FT-10", -1.9, 7.1),
+        (3, "S", -2.6, -7.5), (3, "S-FT-1", 3.6, 0.6), (3, "S-FT-10", 7.2, 5.6),
+    ],
+)  # fmt: skip
+def test_the_papers_changes_are_those_printed(
+    fold: int, name: str, macc: float, miou: float
+) -> None:
+    """Within the rounding of what they were computed from, here from figures of one decimal."""
+    row = _paper()[name].of_fold(fold)
+    for score, change in (("macc", macc), ("miou", miou)):
+        kept = row.kept(score).mean
+        assert kept is not None
+        assert 100 * (kept - 1) == pytest.approx(change, abs=0.35)
+
+
+@pytest.mark.parametrize(
+    ("name", "score", "changes"),
+    [
+        ("S", "accuracy", "-18.1 -20.2 -19.6 0.9 -0.3 -20.2 16.4 11.4 5.4 -0.1 -27.4 -7.1 -3.7"),
+        ("S-FT-10", "iou", "62.2 -3.4 4.6 13.9 13.2 2.7 2.8 4.9 7.7 22.5 0.3 2.5 -12.7"),
+    ],
+)
+def test_the_papers_changes_of_classes_are_those_printed(
+    name: str, score: str, changes: str
+) -> None:
+    row = _paper()[name]
+    for label, change in zip(REAL, map(float, changes.split()), strict=True):
+        kept = row.kept(score, label).mean
+        assert kept is not None
+        assert 100 * (kept - 1) == pytest.approx(change, abs=1.1)
+
+
+def test_omnisynthia_stands_beside_by_level() -> None:
+    settings: dict[str, Any] = {
+        "data___target_": "datamodules.OmniSynthia",
+        "data__fold": None,
+        "level": 7,
+    }
+    record = made_record([0.5] * 13, [f"class {k}" for k in range(13)], **settings)
+    report = transfer_report({"P": [record], "S": [record]}, "x")
+    cells = _cells(report)
+    assert cells["S (paper)"]["mIoU %"] == "44.9"
+    assert cells["Zhang et al., native (paper)"]["mAcc %"] == "57.1"
+    assert len(cells) == 2 + 4
+
+
+def test_a_transfer_compares_panoramas_with_photos_of_as_much_fine_tuning() -> None:
+    photos = without_solid_angle(made_record([0.4, 0.8, 0.6]))
+    sphere = made_record([0.3, 0.8, 0.4], bands=(0.1, 0.2))
+    tuned = made_record([0.8, 0.8, 0.8])
+    stages = {"P": [photos], "S": [sphere], "S-erp": [tuned], "S-FT-10": [tuned]}
+    report = transfer_report(stages, "tangent-transfer")
+    table = report.tables()[0]
+    change = table.header.index("change", table.header.index("mIoU %"))
+    assert [row[change] for row in table.rows] == ["–", "−16.7 %", "+33.3 %", "–"]
+    assert "S: largest loss against P: sofa, 60.0 % to 40.0 % iou." in report.all_notes()
+    assert [row.partner and row.partner.label for row in report.rows] == [None, "P", "P", None]
+
+
+def test_levels_are_compared_with_that_nearest_to_the_photos_resolution() -> None:
+    levels = {7: [made_record([0.4] * 3, level=7)], 6: [made_record([0.2] * 3, level=6)]}
+    report = levels_report(levels, 7.3, "tangent-transfer")
+    assert [row.label for row in report.rows] == ["level 6", "level 7"]
+    assert report.rows[0].kept("miou").mean == pytest.approx(0.5)
+    assert report.all_notes()[-1].endswith("the angular resolution of level 7.3.")
+
+
+def test_shapes_are_told_apart_by_how_they_were_rotated() -> None:
+    classes = [{"class": name, "images": 3, "accuracy": 0.5} for name in MODELNET40]
+    settings = {
+        "data._target_": "datamodules.ModelNet40",
+        "level": 5,
+        "name": "shapes",
+        "representation.rotation": "yaw",
+        "data.test_rotation": "so3",
+        "representation.base_level": 0,
+    }
+    means = {"accuracy": 0.8, "class_accuracy": 0.7}
+    record = Record("classification", "shapes", 120, means, classes, settings=settings)
+    cells = _cells(_runs_report(record))
+    assert cells["shapes"]["rotated in training / test"] == "z / SO3"
+    assert (cells["shapes"]["accuracy %"], cells["shapes"]["mean of the classes %"]) == (
+        *("80.0", "70.0"),
+    )
+    assert cells["tangent images (paper)"]["accuracy %"] == "89.1"
+    assert len(cells) == 5
+
+
+def test_the_class_that_no_label_names_is_not_the_largest_loss() -> None:
+    record = made_record([0.5, 0.4, 0.0])
+    record.classes[2]["share"] = 0.0  # type: ignore[index]  # absent, counted as 0
+    assert _runs_report(record).losses() == ["mine: largest loss: floor, 40.0 % iou."]
+
+
+def test_the_chart_shows_a_bar_of_the_right_height() -> None:
+    def blue_rows(share: float) -> int:
+        rows = [Row("$a$ " * 30, (made_record([share] * 3),))]
+        encoded = np.frombuffer(report_png("Report", rows, "x"), np.uint8)
+        picture = cv2.imdecode(encoded, cv2.IMREAD_COLOR)
+        assert picture is not None
+        blue = (picture == (0xB2, 0x72, 0x00)).all(-1)  # OpenCV's order
+        return int(blue.any(1).sum())
+
+    low, middle, high = map(blue_rows, (0.0, 0.4, 0.8))  # two rows of axes, the legend's handle
+    assert high - middle == pytest.approx(middle - low, abs=8)
+    assert high - low > 200
+
+
+def test_the_chart_takes_bands_published_rows_and_nothing() -> None:
+    sphere = made_record([0.5, None, 0.1], bands=(0.5, 0.1))
+    rows = [
+        Row("S", (sphere,)),
+        Row("x (paper)", (made_record([0.5, 0.2, 0.1]),), published=True),
+    ]
+    sizes = []
+    for found in (rows[1:], rows):
+        picture = cv2.imdecode(np.frombuffer(report_png("", found, "x"), np.uint8), 1)
+        assert picture is not None
+        sizes.append(picture.shape[0])
+    assert sizes[1] > 1.3 * sizes[0], "another panel"
+    assert len(NAMES) == 3

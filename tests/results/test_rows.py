@@ -1,0 +1,121 @@
+"""Means over folds and seeds, and what is kept, against figures worked out by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from tangent_train.errors import DataError
+from tangent_train.results.record import Record
+from tangent_train.results.rows import Row, Statistic, group_runs
+from tests.results.made_records import made_record, without_solid_angle
+
+
+@pytest.fixture
+def three_folds() -> list[Record]:
+    """Folds 1 (three seeds), 2 (one), 3 (two, without sofas)."""
+    return [
+        *(
+            made_record([wall, 0.5, 0.5], seed=seed, data__fold=1)
+            for seed, wall in enumerate((0.1, 0.2, 0.6))
+        ),
+        made_record([0.6, 0.8, 0.7], data__fold=2),
+        *(
+            made_record([wall, 0.2, None], data__fold=3, seed=seed, data__root="/other")
+            for seed, wall in enumerate((0.8, 1.0))
+        ),
+    ]
+
+
+def test_seeds_are_averaged_within_folds_and_then_the_folds(three_folds: list[Record]) -> None:
+    (row,) = group_runs(three_folds[::-1])
+    assert row.folds == (1, 2, 3)
+    wall = row.score("iou", "wall")
+    # Folds: (0.1 + 0.2 + 0.6) / 3 = 0.3, 0.6, 0.9. Not the mean of the six runs, 0.55.
+    assert wall.mean == pytest.approx(0.6)
+    assert wall.over_folds == pytest.approx(0.3)
+    # Squares within folds: 0.04 + 0.01 + 0.09 and 0.01 + 0.01, over 2 + 1 degrees of freedom.
+    assert wall.over_seeds == pytest.approx((0.16 / 3) ** 0.5)
+    assert wall.folds == 3
+
+
+def test_a_class_absent_from_a_fold_is_left_out_there(three_folds: list[Record]) -> None:
+    (row,) = group_runs(three_folds)
+    assert row.score("accuracy", "sofa") == pytest.approx((0.6, 0.02**0.5, 0, 2))
+    assert row.of_fold(3).score("iou", "sofa") == Statistic(None, None, None, 0)
+
+
+@pytest.fixture
+def transfer() -> Row:
+    """Panoramas compared with photos, two folds of two seeds."""
+    photos = {(2, 0): 0.8, (1, 0): 0.4, (1, 1): 0.6, (2, 1): 0.8, (3, 0): 0.1}
+    sphere = {(1, 1): 0.5, (1, 0): 0.3, (2, 1): 0.7, (2, 0): 0.9, (3, 1): 0.9}
+    before, after = (
+        tuple(made_record([v] * 3, data__fold=f, seed=s) for (f, s), v in values.items())
+        for values in (photos, sphere)
+    )
+    return Row("S", after, partner=Row("P", tuple(map(without_solid_angle, before))))
+
+
+@pytest.mark.parametrize("name", ["miou", "miou_solid_angle"])
+def test_what_is_kept_is_the_ratio_of_the_means_over_what_both_have(
+    transfer: Row, name: str
+) -> None:
+    kept = transfer.kept(name)
+    # Folds 1 and 2: 0.4 and 0.8 of 0.5 and 0.8; fold 3 has other seeds.
+    assert kept.mean == pytest.approx(0.6 / 0.65)
+    assert kept.folds == 2
+    # Seeds: 3/4 and 5/6, 9/8 and 7/8; half the squared differences, over 2 degrees of freedom.
+    assert kept.over_seeds == pytest.approx((((1 / 12) ** 2 / 2 + 0.25**2 / 2) / 2) ** 0.5)
+    assert transfer.of_fold(1).kept(name).mean == pytest.approx(0.8)
+
+
+def test_nothing_is_kept_of_nothing(transfer: Row) -> None:
+    assert transfer.partner is not None
+    assert transfer.partner.kept("miou").mean is None
+    zero = Row("P", tuple(made_record([0.0] * 3, data__fold=fold) for fold in (1, 2)))
+    assert replace(transfer, partner=zero).kept("iou", "wall").mean is None
+
+
+def test_other_settings_make_other_groups_named_by_what_differs() -> None:
+    records = [
+        made_record([0.1, 0.2, 0.3], optimizer__lr=rate, data__fold=fold)
+        for rate, fold in [(0.01, 1), (0.01, 2), (0.02, 1), (0.02, 2)]
+    ]
+    records.append(made_record([0.1, 0.2, 0.3], name="other", optimizer__lr=0.03))
+    assert [(row.label, len(row.records)) for row in group_runs(records)] == [
+        ("mine (optimizer.lr=0.01)", 2),
+        ("mine (optimizer.lr=0.02)", 2),
+        ("other", 1),
+    ]
+
+
+@pytest.mark.parametrize(
+    "changes", [{"init_from": "b.ckpt"}, {"task__channels_last": True}, {"data__store": "/s"}]
+)
+def test_where_and_how_a_run_was_computed_makes_no_other_group(changes: dict[str, Any]) -> None:
+    first = made_record([0.1, 0.2, 0.3], init_from="a.ckpt", task__channels_last=False)
+    settings: dict[str, Any] = {"init_from": "a.ckpt", "task__channels_last": False} | changes
+    second = made_record([0.1, 0.2, 0.3], seed=1, **settings)
+    assert len(group_runs([first, second])) == 1
+
+
+def test_groups_that_differ_in_much_have_labels_of_their_own() -> None:
+    values = [(0, 0), (1, 1), (0, 9)]
+    records = [made_record([0.1, 0.2, 0.3], a=v, b=v, c=v, d=last) for v, last in values]
+    assert [row.label for row in group_runs(records)] == [
+        "mine (a=0, b=0, c=0, …)",
+        "mine (a=1, b=1, c=1, …)",
+        "mine (a=0, b=0, c=0, …) #2",
+    ]
+
+
+def test_runs_with_other_classes_are_refused() -> None:
+    records = [
+        made_record([0.1, 0.2, 0.3]),
+        made_record([0.1, 0.2], ("wall", "road"), data__fold=2),
+    ]
+    with pytest.raises(DataError, match=r"2_0/results\.json: .*wall, road.*1_0/results\.json"):
+        group_runs(records)
