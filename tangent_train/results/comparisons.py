@@ -13,6 +13,9 @@ from tangent_train.results.rows import Row, check_alike, group_runs
 __all__ = ["levels_report", "runs_report", "transfer_report"]
 
 _REPRESENTATIONS = {"Cubemap": "cube map", "Equirect": "ERP", "Perspective": "photos"}
+_CHANGE_OF_STAGES = (
+    "Change: against photos after as much fine-tuning, over the folds and seeds that both have."
+)
 _ROTATIONS = {None: "–", "none": "–", "yaw": "z", "so3": "SO3"}
 """The field's names: none, about the vertical axis, any."""
 
@@ -61,7 +64,7 @@ def transfer_report(stages: Mapping[str, Sequence[Record]], made_by: str) -> Rep
     rows += published(panoramas, transfer=True)
     by_name = {row.label: row for row in rows}
     rows = [replace(row, partner=by_name.get(_photos_of(row.label))) for row in rows]
-    return Report("Transfer from photos to panoramas", made_by, rows)
+    return Report("Transfer from photos to panoramas", made_by, rows, (), _CHANGE_OF_STAGES)
 
 
 def _photos_of(stage: str) -> str:
@@ -102,7 +105,8 @@ def levels_report(
         for level, row in rows.items()
     ]
     note = f"Photos in training: the angular resolution of level {trained_level:g}."
-    return Report("One network at several levels", made_by, compared, [note])
+    change = f"Change: against level {nearest}, over the folds and seeds that both have."
+    return Report("One network at several levels", made_by, compared, [note], change)
 
 
 def _facts(records: Sequence[Record]) -> dict[str, str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +23,6 @@ _LEGEND = (
     "Percent. Mean over folds of the mean over seeds; ± the sample standard deviation over folds, "
     "in brackets that over seeds within a fold."
 )
-_CHANGE = (
-    " Change: the ratio to the row named there, over the folds and seeds that both have, less 1."
-)
 
 
 @dataclass(frozen=True)
@@ -37,12 +34,14 @@ class Report:
         made_by: The command that writes it; stands in the JSON file.
         rows: Evaluations, and published figures.
         notes: Sentences about the rows.
+        compared: What the column "change" compares; empty without one.
     """
 
     title: str
     made_by: str
     rows: Sequence[Row]
-    notes: Sequence[str] = field(default_factory=list)
+    notes: Sequence[str] = ()
+    compared: str = ""
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -71,19 +70,24 @@ class Report:
         return tables
 
     def _overall(self) -> Table:
-        compared = any(row.partner for row in self.rows)
-        facts = list(dict.fromkeys(name for row in self.rows for name in row.facts))
+        scores = SCORES[self.kind].means
+        names = list(dict.fromkeys(name for row in self.rows for name in row.facts))
+        values = {name: [row.facts.get(name, "–") for row in self.rows] for name in names}
+        alike = [name for name in names if len(set(values[name])) == 1]
+        facts = [name for name in names if name not in alike]
+        changes = {name for name in scores if self.compared and not name.endswith("_solid_angle")}
         header = ["", *facts]
-        for heading in SCORES[self.kind].means.values():
-            header += [f"{heading} %", "change"] if compared else [f"{heading} %"]
+        for name, heading in scores.items():
+            header += [f"{heading} %", "change"] if name in changes else [f"{heading} %"]
         rows = []
-        for row in self.rows:
-            cells = [row.label, *(row.facts.get(name, "–") for name in facts)]
-            for name in SCORES[self.kind].means:
+        for k, row in enumerate(self.rows):
+            cells = [row.label, *(values[name][k] for name in facts)]
+            for name in scores:
                 cells.append(_cell(row.score(name), len(row.folds)))
-                cells += [_change(row.kept(name).mean)] if compared else []
+                cells += [_change(row.kept(name).mean)] if name in changes else []
             rows.append(cells)
-        note = _LEGEND + _CHANGE * compared
+        common = "; ".join(f"{name} {values[name][0]}" for name in alike)
+        note = " ".join(filter(None, (f"{common}." if alike else "", _LEGEND, self.compared)))
         return Table(self.title, header, rows, note, range(1 + len(facts)))
 
     def _per_class(self) -> Iterator[Table]:

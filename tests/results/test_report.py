@@ -51,10 +51,9 @@ def test_the_tables_show_means_spreads_and_what_is_missing() -> None:
         made_record([0.3, 0.5, None], data__fold=3, seed=1),
     )
     cells = _cells(report)["mine"]
-    assert (cells["data"], cells["s"], cells["input"], cells["b"]) == (
-        *("Stanford2D3DS", "7", "RGB-D", "0"),
-    )
-    assert (cells["folds"], cells["runs"], cells["mIoU %"]) == ("1, 3", "4", "38.3 ± 2.4 (± 0.0)")
+    assert cells["mIoU %"] == "38.3 ± 2.4 (± 0.0)"
+    note = report.tables()[0].note
+    assert note.startswith("data Stanford2D3DS; s 7; input RGB-D; b 0; folds 1, 3; runs 4. Percent")
     accuracy, iou = (_cells(report, k)["mine"] for k in (1, 2))
     assert (
         accuracy
@@ -120,8 +119,8 @@ def test_all_files_hold_the_same_scores(tmp_path: Path) -> None:
     ],
 )
 def test_inputs_and_representations_have_their_names(settings: dict[str, Any], name: str) -> None:
-    cells = _cells(_runs_report(made_record([0.5] * 3, **settings)))["mine"]
-    assert f"{cells['input']} {cells['b']}" == name
+    (row,) = _runs_report(made_record([0.5] * 3, **settings)).rows
+    assert f"{row.facts['input']} {row.facts['b']}" == name
 
 
 def test_the_papers_rows_stand_beside_the_same_data_and_resolution() -> None:

@@ -40,9 +40,9 @@ def test_all_stages_run_in_order_and_the_tables_are_written(
         f"transfer.{suffix}" for suffix in ("md", "csv", "json", "png")
     }
     table = (HERE / "transfer.md").read_text()
-    assert "| S-FT-1 | tangent images | 100.0 | +100.0 % | 200.0 % | 100.0 |" in table
-    assert "| P | photos | 50.0 | – | – | 50.0 |" in table
-    assert "Transfer: fold 1" in out
+    assert "| S-FT-1 | SynthRooms | 1 | 100.0 | +100.0 % | 100.0 | +100.0 % |" in table
+    assert "| P | SynthRoomsPerspective | photos | 50.0 | – | 50.0 | – |" in table
+    assert "Transfer from photos to panoramas" in out
 
 
 def test_finished_stages_are_not_run_again(
@@ -127,7 +127,7 @@ def test_the_study_of_the_angular_resolution(
     assert seen == [16, 32, 32]
     levels = {path.name for path in HERE.glob("angular_resolution.*")}
     assert levels == {f"angular_resolution.{suffix}" for suffix in ("md", "csv", "json", "png")}
-    assert "change from level 4" in (HERE / "angular_resolution.md").read_text()
+    assert "against level 4" in (HERE / "angular_resolution.md").read_text()
 
 
 @pytest.mark.parametrize(
@@ -180,7 +180,7 @@ def test_another_representation_takes_the_place_of_tangent_images(
     assert names == ["P", "S", "S-cubemap", "P-FT-1", "S-FT-1"], "S is S-erp"
     erp = {"_target_", "level", "crop_deg", "rotation", "mirror", "erp_height"}
     assert set(runs.configs[1].representation) == erp, "and no base level of the experiment"
-    assert "| S | ERP |" in (HERE / "transfer.md").read_text()
+    assert "| S | SynthRooms | ERP |" in (HERE / "transfer.md").read_text()
 
 
 def test_the_level_of_the_photos() -> None:
