@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from datamodules.images.pixel_files import read_array
-from datamodules.modelnet40.mesh_spheres import CHANNELS, clean_mesh, mesh_spheres
-from datamodules.modelnet40.off_files import read_off
+from datamodules.modelnet40.meshes import CHANNELS, clean_mesh, mesh_spheres, read_off
 from tangent_train.errors import DataError
 from tangent_train.files import atomic_path
 from tangent_train.json_text import parse_json

@@ -13,7 +13,7 @@ from rich.console import Console
 
 from datamodules.core.processes import in_processes, number_of_processes
 from datamodules.core.progress import show_progress
-from datamodules.modelnet40.mesh_spheres import CHANNELS
+from datamodules.modelnet40.meshes import CHANNELS
 from datamodules.modelnet40.sphere_files import is_current, make_sphere, read_sphere, stamp
 from tangent_train.errors import DataError
 from tangent_train.files import write_text

@@ -1,12 +1,11 @@
-"""SynthShapes as a data module: ModelNet40's own, after making the files."""
+"""SynthShapes as a data module: ModelNet40's own, after generating the files."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
 from datamodules.modelnet40.datamodule import ModelNet40
-from datamodules.synthshapes.families import CLASSES
-from datamodules.synthshapes.settings import ShapeSettings
+from datamodules.synthshapes.generate import CLASSES, ShapeSettings, generate_shapes
 from tangent_train.registry import registered
 
 if TYPE_CHECKING:
@@ -20,12 +19,12 @@ __all__ = ["SynthShapes"]
 
 @registered
 class SynthShapes(ModelNet40):
-    """Shapes made on the first use, read as ModelNet40: the data set that needs no download.
+    """Synthetic shapes, generated on first use and read as ModelNet40: no download.
 
     Args:
         root: Folder for the files.
         representation: What the network sees of a sphere.
-        shapes: Which shapes to make.
+        shapes: Which shapes to generate.
         **settings: All others of `ModelNet40`.
 
     Raises:
@@ -50,7 +49,5 @@ class SynthShapes(ModelNet40):
         return CLASSES
 
     def make_files(self) -> None:
-        """Make the files, unless they are there."""
-        from datamodules.synthshapes.generate import generate_shapes
-
+        """Generate the files, unless they are there."""
         generate_shapes(self.root, self.shapes)

@@ -79,7 +79,7 @@ def lamp(parts: Parts) -> None:
     height = parts.between(0.3, 1.7)
     base = height * parts.between(0.1, 0.24)
     thick = height * parts.between(0.008, 0.03)
-    parts.turned([(0, 0), (base, 0), (base * parts.between(0.5, 1), 0.04), (0, 0.05)])
+    parts.revolved([(0, 0), (base, 0), (base * parts.between(0.5, 1), 0.04), (0, 0.05)])
     shade, low = height * parts.between(0.1, 0.28), height * parts.between(0.12, 0.3)
     x = 0.0
     if parts.chance(0.3):
@@ -95,7 +95,7 @@ def lamp(parts: Parts) -> None:
         parts.ellipsoid((x, 0, height), (shade, shade, low * 0.7))
     else:
         top = shade * parts.between(0.3, 1.0)
-        parts.turned([(shade, height - low), (top, height)], (x, 0, 0))
+        parts.revolved([(shade, height - low), (top, height)], (x, 0, 0))
 
 
 def _plate(
@@ -107,7 +107,7 @@ def _plate(
         return width, depth
     radius = (width + depth) / 4
     low = height - thick
-    parts.turned([(0, low), (radius, low), (radius, height), (0, height)])
+    parts.revolved([(0, low), (radius, low), (radius, height), (0, height)])
     inside = radius * math.sqrt(2) * 0.95  # of a square
     return inside, inside
 
@@ -134,7 +134,7 @@ def _pedestal(parts: Parts, size: float, height: float) -> None:
     parts.rod((0, 0, 0.03), (0, 0, height), size * parts.between(0.04, 0.1))
     reach = size * parts.between(0.3, 0.5)
     if parts.chance(0.5):
-        parts.turned([(0, 0), (reach, 0), (reach * 0.8, 0.03), (0, 0.06)])
+        parts.revolved([(0, 0), (reach, 0), (reach * 0.8, 0.03), (0, 0.06)])
         return
     count = int(parts.rng.integers(3, 6))
     for k in range(count):

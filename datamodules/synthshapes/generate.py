@@ -1,42 +1,80 @@
-"""Generating a data set: shapes in parallel, files whole or not at all, resumable."""
+"""SynthShapes: ten families of shapes, generated in ModelNet40's own tree."""
 
 from __future__ import annotations
 
-import os
-from contextlib import closing
+import zlib
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from trimesh.exchange.off import export_off
 
 from datamodules.core.made_folders import claim_folder
 from datamodules.core.processes import in_processes, number_of_processes
 from datamodules.core.progress import show_progress
-from datamodules.modelnet40.off_files import write_off
-from datamodules.synthshapes.families import CLASSES, make_shape
+from datamodules.synthshapes import furniture, vessels
+from datamodules.synthshapes.parts import Parts
+from tangent_train.errors import SettingError
+from tangent_train.files import write_text
+from tangent_train.geometry import rotation_about
 
 if TYPE_CHECKING:
-    from collections.abc import Generator
+    from collections.abc import Callable
     from pathlib import Path
 
-    from datamodules.synthshapes.settings import ShapeSettings
+    from trimesh import Trimesh
 
-__all__ = ["MANIFEST", "VERSION", "ShapePlan", "generate_shapes", "plan_shapes"]
+__all__ = ["CLASSES", "MANIFEST", "ShapeSettings", "generate_shapes", "make_shape", "plan_shapes"]
 
 MANIFEST = "synthshapes.json"
 """File that marks a folder as SynthShapes and holds its settings."""
 
-VERSION = 1
-"""Version of the generator; another one makes other shapes from the same settings."""
-
+_VERSION = 2
 _PER_PROCESS = 200
+_FAMILIES: dict[str, Callable[[Parts], None]] = {
+    "airplane": vessels.airplane,
+    "bench": furniture.bench,
+    "bottle": vessels.bottle,
+    "bowl": vessels.bowl,
+    "chair": furniture.chair,
+    "cup": vessels.cup,
+    "lamp": furniture.lamp,
+    "stool": furniture.stool,
+    "table": furniture.table,
+    "vase": vessels.vase,
+}
+
+CLASSES = tuple(_FAMILIES)
+"""Names of the classes, in alphabetical order."""
+
+
+@dataclass(frozen=True)
+class ShapeSettings:
+    """Settings of a data set; the same settings give the same bytes.
+
+    Attributes:
+        seed: Seed of everything, 0 or more.
+        train: Shapes of every class for training (and validation).
+        test: Shapes of every class for the test.
+
+    Raises:
+        SettingError: A setting that cannot work.
+    """
+
+    seed: int = 0
+    train: int = 80
+    test: int = 30
+
+    def __post_init__(self) -> None:
+        for name, value in asdict(self).items():
+            least = 0 if name == "seed" else 1
+            if type(value) is not int or value < least:
+                expected = f"an integer of {least} or more"
+                raise SettingError(f"data.shapes.{name}", found=repr(value), expected=expected)
 
 
 class ShapePlan(NamedTuple):
-    """A shape before it is made.
-
-    Attributes:
-        label: Its class.
-        part: ``train`` or ``test``.
-        number: From 1, unique in the class.
-    """
+    """A shape before it is made: its class, ``train`` or ``test``, its number from 1."""
 
     label: str
     part: str
@@ -44,18 +82,14 @@ class ShapePlan(NamedTuple):
 
     @property
     def file(self) -> str:
-        """Its path in the data set, as that of ModelNet40."""
+        """Its path in the data set, as in ModelNet40."""
         return f"{self.label}/{self.part}/{self.label}_{self.number:04d}.off"
 
 
 def plan_shapes(settings: ShapeSettings) -> list[ShapePlan]:
     """All shapes of a data set: of each class those for training, then those for the test."""
     parts = ["train"] * settings.train + ["test"] * settings.test
-    return [
-        ShapePlan(label, part, number)
-        for label in CLASSES
-        for number, part in enumerate(parts, start=1)
-    ]
+    return [ShapePlan(c, part, number) for c in CLASSES for number, part in enumerate(parts, 1)]
 
 
 def generate_shapes(
@@ -64,11 +98,11 @@ def generate_shapes(
     """Write a data set in ModelNet40's tree; finished files are kept.
 
     The same settings give the same bytes for any number of workers, whether or not the work was
-    interrupted. An interrupt leaves whole files only.
+    interrupted.
 
     Args:
         root: Folder of the data set: new, empty, or of the same settings.
-        settings: What to make.
+        settings: What to generate.
         workers: Processes; 0 and 1 work in this one. By default one per CPU core, fewer for little
             work.
         progress: Whether to show a progress bar.
@@ -79,29 +113,58 @@ def generate_shapes(
     """
     plans = plan_shapes(settings)
     processes = number_of_processes(workers, len(plans), _PER_PROCESS)
-    claim_folder(root, MANIFEST, "SynthShapes", VERSION, settings.as_dict())
-    missing = [plan for plan in plans if not _is_whole(root / plan.file)]
-    if not missing:
-        return
-    done = len(plans) - len(missing)
-    with closing(_make(root, settings.seed, missing, processes)) as making:
-        show_progress(making, "Making shapes", "shapes", len(plans), before=done, show=progress)
+    claim_folder(root, MANIFEST, "SynthShapes", _VERSION, asdict(settings))
+    missing = [plan for plan in plans if not (root / plan.file).exists()]
+    if missing:
+        making = in_processes(_write, [(root, settings.seed, plan) for plan in missing], processes)
+        before = len(plans) - len(missing)
+        show_progress(making, "Making shapes", "shapes", len(plans), before=before, show=progress)
 
 
-def _make(root: Path, seed: int, plans: list[ShapePlan], processes: int) -> Generator[None]:
-    pieces = [(root, seed, plan) for plan in plans]
-    return in_processes(_make_file, pieces, processes)
+def _write(root: Path, seed: int, plan: ShapePlan) -> None:
+    write_text(root / plan.file, export_off(make_shape(seed, plan.label, plan.number)))
 
 
-def _make_file(root: Path, seed: int, plan: ShapePlan) -> None:
-    write_off(root / plan.file, make_shape(seed, plan.label, plan.number))
+def make_shape(seed: int, label: str, number: int) -> Trimesh:
+    """One shape, the same for the same arguments.
+
+    Like models of catalogues it has units and an origin of its own, and about the heading of its
+    class.
+
+    Args:
+        seed: Seed of the data set.
+        label: Class.
+        number: Which of its class.
+    """
+    # The name, not its place: classes that are added later leave the others as they are.
+    rng = np.random.default_rng((seed, zlib.crc32(label.encode()), number))
+    parts = Parts(rng)
+    _FAMILIES[label](parts)
+    if parts.chance(0.25):
+        _put_beside(parts)
+    mesh = parts.mesh()
+    vertices = mesh.vertices
+    # Stretched, and tapered a little towards the top or the bottom.
+    size = vertices.max(axis=0) - vertices.min(axis=0)
+    stretch = np.exp(rng.normal(0, 0.12, 3))
+    share = (vertices[:, 2:] - vertices[:, 2:].min()) / size[2] - 0.5
+    taper = 1 + rng.normal(0, 0.08) * share
+    vertices = vertices * stretch * np.concatenate([taper, taper, np.ones_like(taper)], axis=1)
+    heading = rotation_about((0, 0, 1), rng.normal(0, 0.12))
+    unit, origin = np.exp(rng.uniform(-3, 4)), rng.normal(0, 1, 3)
+    mesh.vertices = (vertices @ heading.T + origin * size) * unit
+    return mesh
 
 
-def _is_whole(path: Path) -> bool:
-    """Whether a file is there and ends with a line."""
-    try:
-        with path.open("rb") as file:
-            file.seek(-1, os.SEEK_END)
-            return file.read() == b"\n"
-    except OSError:
-        return False
+def _put_beside(parts: Parts) -> None:
+    """An object that is not a part of the shape, on the ground next to it."""
+    low, high = parts.mesh().bounds
+    size = float(np.max(high - low)) * parts.between(0.06, 0.2)
+    angle = parts.between(0, 2 * np.pi)
+    reach = (high - low)[:2] / 2 + size
+    x, y = (low + high)[:2] / 2 + reach * (np.cos(angle), np.sin(angle))
+    center = (float(x), float(y), float(low[2]) + size)
+    if parts.chance(0.5):
+        parts.ellipsoid(center, (size, size, size))
+    else:
+        parts.box(center, [2 * size] * 3, rotation_about((0, 0, 1), angle))

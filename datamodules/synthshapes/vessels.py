@@ -29,10 +29,10 @@ def bottle(parts: Parts) -> None:
     foot = radius * parts.between(0.7, 1)
     body = [(foot, 0), (radius, height * 0.06), (waist, shoulder * 0.5), (radius, shoulder)]
     outline = _curve(body, [(neck, slope), (neck * parts.between(1, 1.25), height)])
-    parts.turned([(0, 0), *outline, *([(0, height)] if parts.chance(0.35) else [])])
+    parts.revolved([(0, 0), *outline, *([(0, height)] if parts.chance(0.35) else [])])
     if parts.chance(0.35):
         cap, top = neck * parts.between(1.05, 1.5), height * parts.between(1.02, 1.12)
-        parts.turned([(cap, height * 0.94), (cap, top), (0, top)])
+        parts.revolved([(cap, height * 0.94), (cap, top), (0, top)])
     if parts.chance(0.15):
         _handle(parts, radius, height * 0.5, height * parts.between(0.12, 0.2))
 
@@ -53,9 +53,9 @@ def vase(parts: Parts) -> None:
     if parts.chance(0.5):
         _walled(parts, outline, belly * parts.between(0.04, 0.12))
     else:
-        parts.turned([(0, 0), *outline])
+        parts.revolved([(0, 0), *outline])
     if parts.chance(0.2):
-        parts.turned([(mouth * 1.05, height), (mouth * 0.4, height * 1.06), (0, height * 1.1)])
+        parts.revolved([(mouth * 1.05, height), (mouth * 0.4, height * 1.06), (0, height * 1.1)])
     if parts.chance(0.2):
         for side in (-1, 1) if parts.chance(0.6) else (1,):
             at = height * parts.between(0.4, 0.6)
@@ -70,7 +70,7 @@ def cup(parts: Parts) -> None:
     lift = height * parts.between(0.15, 0.6) if parts.chance(0.2) else 0.0
     if lift:
         parts.rod((0, 0, 0), (0, 0, lift), top * 0.1)
-        parts.turned([(0, 0), (top * 0.7, 0), (0, height * 0.05)])
+        parts.revolved([(0, 0), (top * 0.7, 0), (0, height * 0.05)])
     bulge = (bottom + top) / 2 * parts.between(0.9, 1.2)
     outside = _curve([(bottom, lift), (bulge, lift + height / 2), (top, lift + height)])
     _walled(parts, outside, top * parts.between(0.04, 0.12))
@@ -91,7 +91,7 @@ def bowl(parts: Parts) -> None:
     _walled(parts, outside, radius * parts.between(0.02, 0.1))
     if parts.chance(0.4):
         low = -height * parts.between(0.1, 0.4)
-        parts.turned([(foot, 0), (foot * parts.between(0.8, 1.2), low)])
+        parts.revolved([(foot, 0), (foot * parts.between(0.8, 1.2), low)])
     if parts.chance(0.2):
         for side in (-1, 1) if parts.chance(0.6) else (1,):
             _handle(parts, side * radius * 0.95, height * 0.65, height * 0.25)
@@ -144,7 +144,7 @@ def _walled(parts: Parts, outside: Sequence[tuple[float, float]], wall: float) -
     """An open vessel with a bottom and a wall; the outline rises."""
     low = outside[0][1]
     inside = [(max(r - wall, 0.001), max(z, low + wall)) for r, z in reversed(outside)]
-    parts.turned([(0, low), *outside, *inside, (0, low + wall)])
+    parts.revolved([(0, low), *outside, *inside, (0, low + wall)])
 
 
 def _handle(parts: Parts, x: float, z: float, size: float) -> None:

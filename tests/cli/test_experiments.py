@@ -11,8 +11,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
-from datamodules.synthshapes.generate import generate_shapes
-from datamodules.synthshapes.settings import ShapeSettings
+from datamodules.synthshapes.generate import ShapeSettings, generate_shapes
 from tangent_train.cli.build import build
 from tangent_train.cli.compose import config_folder
 from tangent_train.cli.transfer.stages import folds_and_seeds, plan

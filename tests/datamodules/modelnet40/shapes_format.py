@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Literal
 
-from datamodules.modelnet40.off_files import write_off
-from datamodules.synthshapes.families import make_shape
+from datamodules.synthshapes.generate import make_shape
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -28,5 +27,7 @@ def write_tree(
             part = "train" if number <= train else "test"
             name = f"{label}_{number:04d}.off"
             place = f"{label}/{part}" if layout == "by class" else f"modelnet40_{part}"
-            write_off(root / place / name, make_shape(0, _LIKE.get(label, label), number))
+            path = root / place / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            make_shape(0, _LIKE.get(label, label), number).export(path)
     return root

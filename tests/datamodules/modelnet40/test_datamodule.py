@@ -11,8 +11,7 @@ from lightning import LightningModule, Trainer
 
 from datamodules.core.split_module import Split
 from datamodules.modelnet40.datamodule import ModelNet40
-from datamodules.modelnet40.mesh_spheres import CHANNELS, clean_mesh, mesh_spheres
-from datamodules.modelnet40.off_files import Mesh, read_off, write_off
+from datamodules.modelnet40.meshes import CHANNELS, clean_mesh, mesh_spheres, read_off
 from datamodules.modelnet40.shape_files import MODELNET40
 from datamodules.modelnet40.shape_samples import (
     SPHERE_NORMALIZATION,
@@ -316,10 +315,10 @@ def test_views_of_a_turned_shape_are_views_of_its_turned_mesh(
     """Independent of the renderers: the mesh itself is turned, and rays are cast again."""
     ball = trimesh.creation.icosphere(4)
     x, y = ball.vertices[:, :1], ball.vertices[:, 1:2]
-    egg = ball.vertices * (0.4, 0.7, 1) * (1 + 0.3 * x + 0.2 * y)
+    ball.vertices = ball.vertices * (0.4, 0.7, 1) * (1 + 0.3 * x + 0.2 * y)
     root = write_tree(tmp_path, counts={"bottle": (1, 2)})
     for path in (root / "bottle/test").iterdir():
-        write_off(path, Mesh(np.array(egg), np.array(ball.faces, np.int64)))
+        ball.export(path)
     module = ModelNet40(root, representation, test_rotation=rotation, validation_fraction=0)
     module.prepare_data()
     samples = module.evaluation_samples("test")
@@ -328,8 +327,8 @@ def test_views_of_a_turned_shape_are_views_of_its_turned_mesh(
         turn = samples.rotation(index)
         assert bool(turn[2, 2] > 1 - 1e-12) is (rotation == "yaw")
         mesh = clean_mesh(read_off(root / f"{module.sample_name('test', index)}.off"))
-        turned = mesh._replace(vertices=mesh.vertices @ turn.T)
-        steps = np.rint(mesh_spheres(turned, (64, 128)) * STEPS).astype(np.uint16)
+        mesh.vertices = mesh.vertices @ turn.T
+        steps = np.rint(mesh_spheres(mesh, (64, 128)) * STEPS).astype(np.uint16)
         views = representation.whole()
         expected = np.concatenate(
             [views.render(steps[..., k : k + 3], "bilinear") for k in (0, 3)], axis=-1

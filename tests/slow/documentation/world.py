@@ -10,8 +10,7 @@ import cv2
 import numpy as np
 from PIL import ExifTags, Image
 
-from datamodules.synthshapes.generate import generate_shapes
-from datamodules.synthshapes.settings import ShapeSettings
+from datamodules.synthshapes.generate import ShapeSettings, generate_shapes
 from tests.datamodules.folder.folder_format import write_data_set
 from tests.datamodules.stanford2d3ds.stanford_pairs_format import write_paper_pairs
 from tests.datamodules.synthia.synthia_format import write_panoramas, write_views

@@ -19,7 +19,7 @@ from datamodules.folder.classes import read_classes
 from datamodules.images.gpano import area_of, up_of
 from datamodules.images.pixel_files import read_depth_m, read_pixels
 from datamodules.images.png import check_png, read_color_png, read_depth_png
-from datamodules.modelnet40.off_files import read_off
+from datamodules.modelnet40.meshes import read_off
 from datamodules.stanford2d3ds.perspective import read_camera_matrix
 from datamodules.stanford2d3ds.poses import read_panorama_pose
 from tangent_train.errors import DataError
@@ -106,7 +106,7 @@ def _off_seeds() -> list[bytes]:
 def _read_mesh(path: Path) -> None:
     mesh = read_off(path)
     assert np.isfinite(mesh.vertices).all()
-    assert 0 <= mesh.triangles.min() <= mesh.triangles.max() < len(mesh.vertices)
+    assert 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices)
 
 
 def _camera_seeds() -> list[bytes]:

@@ -1,0 +1,148 @@
+"""Meshes in OFF files, as ModelNet40's, and what they look like from the sphere around them.
+
+The recipe is that of Cohen et al., Spherical CNNs (2018), which the paper follows. A mesh is moved
+so that the centroid of its surface is at the origin, and scaled to reach to `RADIUS`. From every
+point of the unit sphere that is the direction of a pixel of an equirectangular image, a ray goes
+inward through the origin. Three channels describe its first hit, three more that of the convex hull
+of the mesh:
+
+==== ============================================== ==========
+0, 3 distance t from the unit sphere                1 if none
+1, 4 ``|n·r|``: n the normal there, r the direction 0 if none
+2, 5 ``|n×r|``                                      0 if none
+==== ============================================== ==========
+
+The axes of the mesh are those of the panorama: z is up, and the y axis is in the middle of its
+right half. So the image shows the mesh as it is seen from outside, and not mirrored.
+"""
+
+from __future__ import annotations
+
+import re
+from io import StringIO
+from typing import TYPE_CHECKING
+
+import numpy as np
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+from scipy.spatial import ConvexHull, QhullError
+from trimesh import Trimesh
+from trimesh.exchange.off import load_off
+
+from tangent_train.errors import DataError
+from tangent_train.geometry import equirect_directions
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+__all__ = ["CHANNELS", "RADIUS", "clean_mesh", "mesh_spheres", "read_off"]
+
+CHANNELS = 6
+"""Of the mesh and of its convex hull, three each."""
+
+RADIUS = 0.99
+"""Distance of the farthest vertex from the origin."""
+
+_DIGITS = 6
+"""Vertices that agree to so many decimals of the longest extent are merged."""
+
+_LEAST_HEIGHT = 1e-8
+"""Triangles lower than this part of the longest extent are dropped."""
+
+_COUNTS = re.compile(r"OFF\s*(\d{1,15})\s+(\d{1,15})")
+
+
+def read_off(path: Path) -> Trimesh:
+    """Read a mesh with trimesh's OFF loader; polygons become triangles.
+
+    Raises:
+        DataError: The file cannot be read, is no such file, is truncated or has no triangles.
+    """
+    try:
+        text = path.read_text(encoding="latin-1")
+        loaded = load_off(StringIO(text))
+    # Of broken files the loader raises anything from ValueError to IndexError.
+    except Exception as error:
+        raise _unreadable(path, error) from error
+    # The loader takes files that end within the faces, and coordinates that are NaN.
+    lines = re.sub("#.*", "", text)
+    counts = _COUNTS.search(lines)
+    rows = len(re.findall(r"\n[^\S\n]*\S", lines[counts.end() :])) if counts else 0
+    if counts is None or rows < int(counts[1]) + int(counts[2]):
+        raise _unreadable(path, f"{rows} lines of vertices and faces, fewer than its header says")
+    if not len(loaded["faces"]) or not np.isfinite(loaded["vertices"]).all():
+        raise _unreadable(path, "no triangles with finite coordinates")
+    return Trimesh(**loaded, process=False)
+
+
+def _unreadable(path: Path, found: object) -> DataError:
+    return DataError(
+        path, found=found, expected="a mesh in OFF format", remedy="Copy or extract it again."
+    )
+
+
+def clean_mesh(mesh: Trimesh) -> Trimesh:
+    """Remove duplicates and degenerate triangles, and centre the mesh in the unit sphere.
+
+    The centroid of the surface, which need not be closed, is moved to the origin, and the mesh is
+    scaled to `RADIUS`.
+
+    Raises:
+        DataError: There is no surface, or its size overflows.
+    """
+    with np.errstate(over="ignore"):
+        low, high = mesh.bounds
+        extent = float(np.max(high - low))
+    if not 0 < extent < np.inf:
+        raise DataError("mesh", found=f"an extent of {extent:g}", expected="a surface")
+    clean = Trimesh((mesh.vertices - low) / extent, mesh.faces, process=False)
+    clean.merge_vertices(digits_vertex=_DIGITS)
+    clean.update_faces(clean.nondegenerate_faces(height=_LEAST_HEIGHT) & clean.unique_faces())
+    clean.remove_unreferenced_vertices()
+    if not len(clean.faces):
+        raise DataError("mesh", found="no triangle with an area", expected="a surface")
+    vertices = clean.vertices - clean.centroid
+    vertices *= RADIUS / np.linalg.norm(vertices, axis=1).max()
+    return Trimesh(vertices, clean.faces, process=False)
+
+
+def mesh_spheres(mesh: Trimesh, shape: tuple[int, int]) -> NDArray[np.float64]:
+    """The spherical images of a mesh and of its convex hull.
+
+    A flat mesh has no hull: it is its own.
+
+    Args:
+        mesh: From `clean_mesh`.
+        shape: ``(H, W)`` of the equirectangular images.
+
+    Returns:
+        ``(H, W, 6)`` channels; distances are below 2, the others at most 1.
+    """
+    directions = equirect_directions(shape).reshape(-1, 3)
+    try:
+        hull = Trimesh(mesh.vertices, ConvexHull(mesh.vertices).simplices, process=False)
+    except QhullError:
+        hull = mesh
+    images = [_cast(surface, directions) for surface in (mesh, hull)]
+    return np.concatenate(images, axis=1).reshape(*shape, CHANNELS)
+
+
+def _cast(mesh: Trimesh, directions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Distance, ``|n·r|`` and ``|n×r|`` of first hits of rays inward, ``(n, 3)``."""
+    # Robust: no ray slips through between two triangles that share an edge.
+    tree = EmbreeScene(robust=True)
+    _keep = TriangleMesh(tree, mesh.triangles.astype(np.float32))
+    origins = directions.astype(np.float32)
+    answer = tree.run(origins, -origins, query="INTERSECT", output=1)
+    hit = np.flatnonzero(answer["primID"] >= 0)
+    corners = mesh.triangles[answer["primID"][hit]]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    image = np.zeros((len(directions), 3))
+    image[:, 0] = 1
+    image[hit, 0] = answer["tfar"][hit]
+    image[hit, 1] = np.abs(np.einsum("ij,ij->i", normal, directions[hit]))
+    image[hit, 2] = np.linalg.norm(np.cross(normal, directions[hit]), axis=1)
+    return image
