@@ -141,7 +141,7 @@ def test_an_ellipsoid() -> None:
         assert abs(error.mean()) < 1e-3
 
 
-def _slow(mesh: Mesh, rays: NDArray[np.float64]) -> tuple[Any, Any]:
+def _slow(mesh: Trimesh, rays: NDArray[np.float64]) -> tuple[Any, Any]:
     """Distance and triangle of first hits in float64 (Möller and Trumbore), infinite where none."""
     a, b, c = np.array(mesh.triangles).transpose(1, 0, 2)
     best, which = np.full(len(rays), np.inf), np.full(len(rays), -1)
