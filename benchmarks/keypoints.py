@@ -15,9 +15,7 @@ from benchmarks.measuring import Table, Way, measure
 from benchmarks.report import table_text
 from benchmarks.rooms import made_rooms
 from tangent_train.geometry import TangentGrid, equirect_shape
-from tangent_train.keypoints.detectors import Detector
-from tangent_train.keypoints.equirect import detect_on_equirect
-from tangent_train.keypoints.tangent import detect_on_tangent_images
+from tangent_train.keypoints import Detector, detect_on_equirect, detect_on_tangent_images
 
 if TYPE_CHECKING:
     import numpy as np

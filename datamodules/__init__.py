@@ -10,7 +10,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from datamodules.core.image_pairs import ImagePairs
+    from datamodules.core.panorama_pairs import ImagePairs
     from datamodules.core.panoramas import Panorama
     from datamodules.core.photos import Photo
     from datamodules.core.samples import EvaluationSample, Normalization, TrainingSample, normalize
@@ -58,7 +58,7 @@ _MODULES = {
     "EpochSampler": "datamodules.core.sampling",
     "EvaluationSample": "datamodules.core.samples",
     "FolderPanoramas": "datamodules.folder.panoramas",
-    "ImagePairs": "datamodules.core.image_pairs",
+    "ImagePairs": "datamodules.core.panorama_pairs",
     "ModelNet40": "datamodules.modelnet40.datamodule",
     "Normalization": "datamodules.core.samples",
     "OmniSynthia": "datamodules.synthia.omnisynthia",

@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
+import os
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING, NamedTuple
+from itertools import combinations, pairwise
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Literal, NamedTuple
+
+from datamodules.images.gpano import area_of, whole_area
+from datamodules.images.image_files import find_images
+from datamodules.images.pixel_files import read_rgb
+from tangent_train.errors import DataError, SettingError
 
 if TYPE_CHECKING:
-    from pathlib import Path
+    from collections.abc import Mapping, Sequence
 
     import numpy as np
     from numpy.typing import NDArray
 
     from tangent_train.geometry import PanoramaPose
 
-__all__ = ["PairedPanorama", "PanoramaPair", "PanoramaPairs"]
+__all__ = ["ImagePairs", "PairedPanorama", "PanoramaPair", "PanoramaPairs", "PublishedPair"]
 
 
 class PairedPanorama(NamedTuple):
@@ -22,16 +31,16 @@ class PairedPanorama(NamedTuple):
     Attributes:
         name: Unique in the data set: the same panorama in another pair has the same name.
         rgb: ``(H, W, 3)`` uint8.
+        file: The image it was read from.
         distance_m: ``(H, W)`` float32 metres from the centre, NaN where missing; or None.
         pose: Where it was taken; or None.
-        file: The image it was read from; or None.
     """
 
     name: str
     rgb: NDArray[np.uint8]
+    file: Path
     distance_m: NDArray[np.float32] | None = None
     pose: PanoramaPose | None = None
-    file: Path | None = None
 
 
 class PanoramaPair(NamedTuple):
@@ -50,19 +59,47 @@ class PanoramaPair(NamedTuple):
     right: PairedPanorama
 
 
+class PublishedPair(NamedTuple):
+    """A pair of the paper, and what the paper reports of it.
+
+    Attributes:
+        number: 0 to 59.
+        split: ``easy`` or ``hard``.
+        left: Camera, abbreviated, and room: ``0f65e09_hallway_7``.
+        right: The same.
+        fov_overlap: Overlap of the fields of view, 0 to 1.
+        scores: PMR, MS and P, shares, by representation: ``ERP``, ``L0``, ``L1``, ``L2``.
+    """
+
+    number: int
+    split: str
+    left: str
+    right: str
+    fov_overlap: float
+    scores: dict[str, tuple[float, ...]]
+
+
 class PanoramaPairs(ABC):
-    """Pairs to read one by one."""
+    """Pairs to read one by one.
 
-    def make_files(self) -> None:  # noqa: B027, one that has all its files makes none
-        """Make what is not there yet; called before anything else."""
+    Attributes:
+        published: The paper's figures by the name of a pair, where the pairs are the paper's.
+    """
 
+    published: Mapping[str, PublishedPair] = MappingProxyType({})
+
+    def make_files(self) -> None:  # noqa: B027, most have all their files
+        """Generate what is not there yet; called before anything else."""
+
+    @property
     @abstractmethod
-    def __len__(self) -> int:
-        """Number of pairs."""
+    def names(self) -> Sequence[str]:
+        """Names of the pairs, in their order."""
 
+    @property
     @abstractmethod
-    def name(self, index: int) -> str:
-        """Name of a pair; see `PanoramaPair`."""
+    def files(self) -> Sequence[Path]:
+        """The images of all panoramas."""
 
     @abstractmethod
     def read(self, index: int) -> PanoramaPair:
@@ -71,3 +108,79 @@ class PanoramaPairs(ABC):
         Raises:
             DataError: A file cannot be used.
         """
+
+
+class ImagePairs(PanoramaPairs):
+    """Pairs of panoramas that are image files, without depth and pose.
+
+    Args:
+        left: One panorama; together with `right`.
+        right: The other.
+        input: Instead: a folder of panoramas, or a pattern, see `find_images`.
+        pairing: Of `input`: `consecutive`, each with the next in the order of the paths; or `all`,
+            each with each.
+
+    Raises:
+        SettingError: Settings do not fit together.
+        DataError: There are no two panoramas.
+    """
+
+    def __init__(
+        self,
+        left: str | None = None,
+        right: str | None = None,
+        input: str | None = None,  # noqa: A002, the name of the setting
+        pairing: Literal["consecutive", "all"] = "consecutive",
+    ) -> None:
+        given = tuple(name is not None for name in (left, right, input))
+        if given not in ((True, True, False), (False, False, True)):
+            raise SettingError(
+                "input",
+                found=f"left={left} right={right} input={input}",
+                expected="left=<panorama> right=<panorama>, or input=<folder of panoramas>",
+            )
+        if pairing not in ("consecutive", "all"):
+            raise SettingError("pairing", found=pairing, expected="consecutive or all")
+        if input is not None:
+            paths = find_images(input)
+        else:
+            paths = [path for side in (str(left), str(right)) for path in find_images(side)]
+        if len(paths) < 2 or (input is None and len(paths) > 2):
+            expected = "two panoramas" + ("" if input is None else " or more")
+            raise DataError(input or left, found=f"{len(paths)}", expected=expected)
+        self._paths = paths
+        indices = range(len(paths))
+        chosen = pairwise(indices) if pairing == "consecutive" else combinations(indices, 2)
+        self._pairs = list(chosen)
+        absolute = [path.absolute() for path in paths]
+        root = os.path.commonpath([path.parent for path in absolute])
+        relative = [path.relative_to(root) for path in absolute]
+        short = [path.with_suffix("").as_posix() for path in relative]
+        unique = len(set(short)) == len(set(paths))
+        self._names = short if unique else [path.as_posix() for path in relative]
+
+    @property
+    def names(self) -> list[str]:
+        """The names of both files."""
+        return [f"{self._names[left]} – {self._names[right]}" for left, right in self._pairs]
+
+    @property
+    def files(self) -> list[Path]:
+        """See `PanoramaPairs`."""
+        return self._paths
+
+    def read(self, index: int) -> PanoramaPair:
+        """Read a pair; of panoramas that are a part of the sphere the rest is black.
+
+        Raises:
+            DataError: A file cannot be used.
+        """
+        left, right = (self._panorama(k) for k in self._pairs[index])
+        return PanoramaPair(self.names[index], None, left, right)
+
+    def _panorama(self, index: int) -> PairedPanorama:
+        path = self._paths[index]
+        rgb = read_rgb(path)
+        size = (rgb.shape[0], rgb.shape[1])
+        area = area_of(path, size) or whole_area(path, size)
+        return PairedPanorama(self._names[index], area.place(rgb), path)

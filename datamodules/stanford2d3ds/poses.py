@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from datamodules.synthrooms.camera import CAMERA_FROM_SPHERE, euler_rotation
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError
 from tangent_train.geometry import PanoramaPose
 from tangent_train.json_text import parse_json
 
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 
 __all__ = ["read_panorama_pose"]
 
+_MOST = 1e6  # metres and radians
 _KEYS = {"camera_rt_matrix": (3, 4), "camera_original_rotation": (3,), "camera_location": (3,)}
-_REMEDY = "Copy or extract the file again."
 
 
 def read_panorama_pose(path: Path) -> PanoramaPose:
@@ -45,45 +45,26 @@ def read_panorama_pose(path: Path) -> PanoramaPose:
     Raises:
         DataError: It cannot be read, or holds no pose.
     """
-    record = _read_record(path)
-    rt, angles, location = (_numbers(path, record, key, shape) for key, shape in _KEYS.items())
-    if np.abs(angles).max() > 2 * math.pi:
-        angles = np.radians(angles)
-    original = euler_rotation(angles)
     try:
-        with np.errstate(over="ignore", invalid="ignore"):  # huge numbers make no rotation
-            turn = original @ rt[:, :3] @ original @ CAMERA_FROM_SPHERE
-            return PanoramaPose(turn, location)
-    except SettingError as error:
+        record = parse_json(path.read_bytes())
+        rt, angles, location = (_numbers(record[key], shape) for key, shape in _KEYS.items())
+        if np.abs(angles).max() > 2 * math.pi:
+            angles = np.radians(angles)
+        original = euler_rotation(angles)
+        return PanoramaPose(original @ rt[:, :3] @ original @ CAMERA_FROM_SPHERE, location)
+    except (OSError, ValueError, TypeError, KeyError, OverflowError, FloatingPointError) as error:
         raise DataError(
-            path, found=f"a camera_rt_matrix that is no rotation ({error})", expected="one"
+            path,
+            found=f"{type(error).__name__}: {error}",
+            expected=f"a pose as JSON, with {', '.join(_KEYS)}",
+            remedy="Copy or extract the file again.",
         ) from error
 
 
-def _read_record(path: Path) -> dict[str, Any]:
-    try:
-        record = parse_json(path.read_bytes())
-    except (OSError, ValueError) as error:
-        raise DataError(path, found=error, expected="a pose as JSON", remedy=_REMEDY) from error
-    if not isinstance(record, dict):
-        raise DataError(path, found="other JSON", expected="a pose", remedy=_REMEDY)
-    return record
-
-
-def _numbers(
-    path: Path, record: dict[str, Any], key: str, shape: tuple[int, ...]
-) -> NDArray[np.float64]:
-    try:
-        values = np.array(record.get(key), np.float64)
-    except (ValueError, TypeError, OverflowError):
-        values = np.array(np.nan)
+def _numbers(value: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    numbers = np.array(value, np.float64)
     # Some releases have a fourth row 0 0 0 1.
-    values = values[:3] if values.shape == (4, 4) else values
-    if values.shape != shape or not np.isfinite(values).all():
-        raise DataError(
-            path,
-            found=f"{key} {record.get(key, 'missing')}",
-            expected=f"{'×'.join(map(str, shape))} numbers",
-            remedy=_REMEDY,
-        )
-    return values
+    numbers = numbers[:3] if numbers.shape == (4, 4) else numbers
+    if numbers.shape != shape or not np.abs(numbers).max() <= _MOST:
+        raise ValueError(f"{value}, not {'×'.join(map(str, shape))} numbers")
+    return numbers

@@ -46,7 +46,7 @@ _PATHS = ("back", "cameras", "checkpoint", "depth", "figure", "input", "left", "
 """Settings of export, keypoints, predict and render that name files or folders."""
 
 _KEYPOINTS = "keypoints"
-_PAIRS = ("image_pairs", "stanford2d3ds_pairs", "synthrooms_pairs")
+_PAIRS = ("stanford2d3ds_pairs", "synthrooms_pairs")
 """Data that only it takes."""
 
 _TRANSFER = "transfer"

@@ -2,40 +2,42 @@
 
 from __future__ import annotations
 
+import os
+import re
 import sys
-import time
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
+from rich.progress import track
 
-from datamodules.core.image_pairs import ImagePairs
-from datamodules.core.panorama_pairs import PanoramaPairs
-from datamodules.core.progress import progress_bar
-from datamodules.stanford2d3ds.pairs import StanfordPairs, published_pairs
-from tangent_train.cli.keypoint_pairs.export import ColmapExport
-from tangent_train.cli.keypoint_pairs.folder import EXPORT, ResultsFolder
-from tangent_train.cli.keypoint_pairs.outputs import PairOutputs
-from tangent_train.cli.keypoint_pairs.settings import KeypointSettings
-from tangent_train.cli.processes import ended_by_sigterm
+from datamodules.core.panorama_pairs import ImagePairs, PanoramaPairs
+from datamodules.images.pixel_files import read_image_size
+from tangent_train.cli import values
 from tangent_train.errors import DataError, SettingError
-from tangent_train.keypoints.detectors import Detector
-from tangent_train.keypoints.motion_search import colmap
+from tangent_train.files import write_bytes
+from tangent_train.json_text import parse_json
+from tangent_train.keypoints import Detector
+from tangent_train.keypoints.colmap import add_pair
+from tangent_train.keypoints.two_view import colmap
 from tangent_train.registry import make, maker_of
-from tangent_train.results.keypoints.compare import Comparer, Matching
-from tangent_train.results.keypoints.entries import PairEntry
-from tangent_train.results.keypoints.representations import Representations
-from tangent_train.results.keypoints.tables import KeypointReport, overall_tables, shown_name
+from tangent_train.results.keypoints.compare import AS_GIVEN, Comparer, Comparison, Row
+from tangent_train.results.keypoints.report import KeypointReport, matches_png
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
+
+    from datamodules.core.panorama_pairs import PanoramaPair
 
 __all__ = ["keypoints"]
 
-_SECONDS_BETWEEN_WRITES = 5.0
+_OF_IMAGES = ("left", "right", "input", "pairing")
+_NOT_DECIDING = ("output", "max_pairs", *_OF_IMAGES)
+"""Settings that may differ when a run is continued; those of the images are part of ``data``."""
 
 
 def keypoints(config: Mapping[str, Any]) -> None:
-    """Compare keypoints of panoramas and of tangent images on pairs, and write what was found.
+    """Compare keypoints of panoramas and of tangent images on pairs, and write the figures.
 
     Args:
         config: The composed ``keypoints.yaml``.
@@ -44,166 +46,160 @@ def keypoints(config: Mapping[str, Any]) -> None:
         SettingError: A setting is missing or cannot work.
         DataError: There are no pairs.
     """
-    settings = KeypointSettings.of(config)
-    colmap()  # pycolmap is needed: it is missed now rather than after minutes
-    with ended_by_sigterm():  # after it: pycolmap has a handler that prints its stack
-        _compare_and_tell(_pairs(config), settings)
-
-
-def _compare_and_tell(pairs: PanoramaPairs, settings: KeypointSettings) -> None:
-    comparer = _comparer(settings)
-    folder = ResultsFolder(settings.output, settings.deciding)
-    outputs = _outputs(settings, comparer, folder)
-    if outputs.export is not None and isinstance(pairs, ImagePairs):
-        count = min(len(pairs), settings.max_pairs or len(pairs))
-        outputs.export.check_files([file for k in range(count) for file in pairs.files(k)])
-    earlier = folder.open(overwrite=settings.overwrite)
+    output = values.path(config, "output")
+    if output is None:
+        raise SettingError("output", found="none", expected="a folder for the results")
+    comparer = _comparer(config)
+    colmap()  # pycolmap is missed now rather than after minutes
+    data, pairs = _pairs(config)
+    deciding = {name: config[name] for name in config if name not in _NOT_DECIDING}
+    settings = {**deciding, "data": data}
+    done = _earlier(output, settings)
     pairs.make_files()
-    names = [pairs.name(k) for k in range(len(pairs))][: settings.max_pairs]
-    missing = outputs.missing(names, earlier)
+    names = pairs.names[: values.optional_whole(config, "max_pairs", 1)]
     console = Console(soft_wrap=True, highlight=False)
-    console.print(_what_happens(settings, comparer, len(names), len(missing)), markup=False)
-    entries = dict(earlier)
-    try:
-        _compare_all(pairs, missing, comparer, outputs, entries)
-    except (KeyboardInterrupt, SystemExit):
-        done = sum(name in entries for name in names)
-        console.print(
-            f"Interrupted: {done} of {len(names)} pairs are done. The same command goes on.",
-            markup=False,
-        )
-        raise
-    finally:
-        ordered = [entries[n] for n in map(pairs.name, range(len(pairs))) if n in entries]
-        _write(folder, ordered, pairs, comparer, settings)
-    for table in overall_tables(_report(ordered, pairs, comparer, settings)):
-        console.print(table)
-    if any(entry.error is None for entry in ordered):
-        console.print(f"Results are in {folder.path}.", markup=False)
-    good = [name for name in names if entries[name].error is None]
-    if outputs.export is not None and good and not outputs.export.is_complete(good):
-        root = outputs.export.finish(good)
-        console.print(f"For COLMAP: {outputs.export.folder}, image_path {root}", markup=False)
-    if len(good) < len(names):
-        failed = f"{len(names) - len(good)} of {len(names)} pairs"
-        sys.exit(f"tangent-keypoints: {failed} could not be used, see above")
-
-
-def _pairs(config: Mapping[str, Any]) -> PanoramaPairs:
-    kind = maker_of(config["data"], "data")
-    if not issubclass(kind, PanoramaPairs):
-        raise SettingError(
-            "data",
-            found=config["data"]["_target_"],
-            expected="pairs: data=synthrooms_pairs, stanford2d3ds_pairs or image_pairs",
-        )
-    given = [name for name in ("left", "right", "input") if config[name] is not None]
-    if given and not issubclass(kind, ImagePairs):
-        raise SettingError(
-            given[0],
-            found=config[given[0]],
-            expected="none with other data than image_pairs",
-            remedy="Leave it or data= out.",
-        )
-    pairs: PanoramaPairs = make(config["data"], "data")
-    return pairs
-
-
-def _comparer(settings: KeypointSettings) -> Comparer:
-    return Comparer(
-        Representations(
-            settings.base_levels,
-            Detector(settings.detector),
-            settings.margin,
-            shrunk=settings.controls,
-        ),
-        Matching(settings.ratio, settings.mutual, settings.max_error_deg, settings.seed),
-        settings.level,
-        turned=settings.controls,
-    )
-
-
-def _outputs(settings: KeypointSettings, comparer: Comparer, folder: ResultsFolder) -> PairOutputs:
-    export = None
-    if settings.export != "none":
-        names = tuple(comparer.representations.names)
-        export = ColmapExport(folder.path / EXPORT, settings.export, names)
-    return PairOutputs(folder, settings.pictures, settings.controls, export)
-
-
-def _what_happens(settings: KeypointSettings, comparer: Comparer, count: int, missing: int) -> str:
-    """One line before the work begins."""
-    kept = f"; {count - missing} of them are there already" if missing < count else ""
-    names = ", ".join(map(shown_name, comparer.representations.names))
-    level = "of each pair" if settings.level is None else settings.level
-    turned = ", also with the right panorama turned" if settings.controls else ""
-    noun = "pair" if count == 1 else "pairs"
-    return f"{count} {noun}, {settings.detector}, {names}, level {level}{turned}{kept}"
-
-
-def _compare_all(
-    pairs: PanoramaPairs,
-    missing: Sequence[int],
-    comparer: Comparer,
-    outputs: PairOutputs,
-    entries: dict[str, PairEntry],
-) -> None:
-    """Fill `entries` pair by pair, and write them every few seconds."""
-    begun = written = time.monotonic()
-    with progress_bar(show=bool(missing)) as bar:
-        task = bar.add_task("Comparing pairs", total=len(missing), rate="")
-        for number, (name, entry) in enumerate(
-            _compared(pairs, missing, comparer, outputs), start=1
-        ):
-            entries[name] = entry
-            if entry.error is not None:
-                message = f"Pair {name}: {entry.error}"
-                bar.console.print(message, style="red", markup=False, soft_wrap=True)
-            for side in entry.without_keypoints:
-                message = f"Pair {name}: no keypoint on {side}"
-                bar.console.print(message, style="yellow", markup=False, soft_wrap=True)
-            if time.monotonic() - written > _SECONDS_BETWEEN_WRITES:
-                outputs.folder.write(entries.values())
-                written = time.monotonic()
-            rate = f"{number / (time.monotonic() - begun):.2f} pairs/s"
-            bar.update(task, completed=number, rate=rate)
-
-
-def _compared(
-    pairs: PanoramaPairs, missing: Sequence[int], comparer: Comparer, outputs: PairOutputs
-) -> Iterator[tuple[str, PairEntry]]:
-    for index in missing:
-        name = pairs.name(index)
+    missing = [(k, name) for k, name in enumerate(names) if name not in done]
+    if len(missing) < len(names):
+        message = f"{len(names) - len(missing)} of {len(names)} pairs are there already"
+        console.print(message, markup=False)
+    for index, name in track(missing, "Comparing pairs", console=console, disable=not missing):
         try:
             pair = pairs.read(index)
             comparison = comparer.compare(pair)
-            outputs.write(index, pair, comparison)
+            if config["export"]:
+                _export(output / "export", pairs.files, pair, comparison)
         except (DataError, MemoryError) as error:  # of this pair; a SettingError is of all
-            yield name, PairEntry(name, error=str(error) or type(error).__name__)
-        else:
-            yield name, comparison.entry
+            console.print(f"Pair {name}: {error or 'too little memory'}", markup=False)
+            continue
+        if index < values.whole(config, "pictures", 0):
+            for condition in comparison.images:
+                write_bytes(
+                    output / "matches" / f"{index:03}_{_file_name(name)}_{condition}.png",
+                    matches_png(comparison, condition),
+                )
+        done[name] = comparison.rows
+        _report(pairs, done, comparer, settings).write(output)
+    _tell(console, output, pairs, _report(pairs, done, comparer, settings), names)
 
 
-def _write(
-    folder: ResultsFolder,
-    entries: Sequence[PairEntry],
-    pairs: PanoramaPairs,
-    comparer: Comparer,
-    settings: KeypointSettings,
-) -> None:
-    folder.write(entries)
-    if any(entry.error is None for entry in entries):
-        folder.write_tables(_report(entries, pairs, comparer, settings))
+def _comparer(config: Mapping[str, Any]) -> Comparer:
+    base_levels = config["base_level"]
+    return Comparer(
+        base_levels=tuple(base_levels) if isinstance(base_levels, list) else (base_levels,),
+        detector=Detector(config["detector"]),
+        margin=values.whole(config, "margin", 0),
+        level=values.optional_whole(config, "level", 2),
+        ratio=values.number(config, "ratio", 0, 1.001),
+        mutual=values.flag(config, "mutual"),
+        max_error_deg=values.number(config, "max_error_deg", 0, 20),
+        seed=values.whole(config, "seed", 0),
+        controls=values.flag(config, "controls"),
+    )
+
+
+def _pairs(config: Mapping[str, Any]) -> tuple[Any, PanoramaPairs]:
+    """The settings of the pairs, and the pairs: one's own images, or those of a data set."""
+    images = {name: config[name] for name in _OF_IMAGES}
+    if any(images[name] is not None for name in ("left", "right", "input")):
+        return images, ImagePairs(**images)
+    if not issubclass(maker_of(config["data"], "data"), PanoramaPairs):
+        raise SettingError(
+            "data",
+            found=config["data"]["_target_"],
+            expected="pairs: synthrooms_pairs or stanford2d3ds_pairs",
+        )
+    return config["data"], make(config["data"], "data")
+
+
+def _earlier(output: Path, settings: Mapping[str, Any]) -> dict[str, list[Row]]:
+    """Figures of the pairs that are done already, by name.
+
+    Raises:
+        SettingError: The folder holds something else, or results of other settings.
+    """
+    if not output.exists() or not any(output.iterdir()):
+        return {}
+    try:
+        content = parse_json((output / "results.json").read_bytes())
+        before, rows = content["settings"], content["rows"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise SettingError(
+            "output", found=f"{output} with other files", expected="a new or empty folder"
+        ) from error
+    for name, value in settings.items():
+        if before.get(name) != value:
+            raise SettingError(
+                name,
+                found=value,
+                expected=f"{before.get(name)}, as for the results in {output}",
+                remedy="Give another output, or remove that folder.",
+            )
+    done: dict[str, list[Row]] = {}
+    for row in rows:
+        done.setdefault(row["pair"], []).append(row)
+    return done
 
 
 def _report(
-    entries: Sequence[PairEntry],
     pairs: PanoramaPairs,
+    done: Mapping[str, Sequence[Row]],
     comparer: Comparer,
-    settings: KeypointSettings,
+    settings: Mapping[str, Any],
 ) -> KeypointReport:
-    of_paper = isinstance(pairs, StanfordPairs) and pairs.is_published
-    published = {str(pair.number): pair for pair in published_pairs()} if of_paper else {}
-    return KeypointReport(
-        tuple(entries), tuple(comparer.representations.names), published, settings.told
-    )
+    rows = [row for name in pairs.names for row in done.get(name, ())]
+    return KeypointReport(rows, comparer.representations, settings, pairs.published)
+
+
+def _tell(
+    console: Console,
+    output: Path,
+    pairs: PanoramaPairs,
+    report: KeypointReport,
+    names: Sequence[str],
+) -> None:
+    for table in report.means():
+        console.print(table.terminal())
+    if report.rows:
+        console.print(f"Results are in {output}.", markup=False)
+    if (output / "export").exists():
+        root = _root(pairs.files)
+        console.print(f"For COLMAP: {output / 'export'}, image_path {root}", markup=False)
+    failed = len(set(names) - {row["pair"] for row in report.rows})
+    if failed:
+        sys.exit(f"tangent-keypoints: {failed} of {len(names)} pairs could not be used, see above")
+
+
+def _export(
+    folder: Path, files: Sequence[Path], pair: PanoramaPair, comparison: Comparison
+) -> None:
+    """Add the pair as it is, not rotated, to the database of every representation.
+
+    Raises:
+        DataError: A file is a part of a panorama.
+    """
+    sides = (pair.left.file, pair.right.file)
+    shapes = (read_image_size(sides[0]), read_image_size(sides[1]))
+    for file, (height, width) in zip(sides, shapes, strict=True):
+        if abs(width - 2 * height) > 1:
+            found = f"{height}×{width} pixels, a part of a panorama"
+            raise DataError(file, found=found, expected="a whole one: COLMAP knows no others")
+    root = _root(files)
+    names = tuple(file.absolute().relative_to(root).as_posix() for file in sides)
+    for name, found_ in comparison.found[AS_GIVEN].items():
+        path = folder / _file_name(name) / "database.db"
+        both = (found_.left, found_.right)
+        add_pair(path, (names[0], names[1]), shapes, both, found_.matches, found_.geometry)
+
+
+def _root(files: Sequence[Path]) -> Path:
+    """The folder that holds all images, directly or in its folders."""
+    return Path(os.path.commonpath([file.absolute().parent for file in files]))
+
+
+def _file_name(name: str) -> str:
+    """A name as part of the name of a file, at most 80 characters.
+
+    >>> _file_name("hall/a – hall/b")
+    'hall_a_hall_b'
+    """
+    return re.sub(r"[^\w.-]+", "_", name).strip("_.")[:80] or "pair"

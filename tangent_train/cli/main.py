@@ -123,15 +123,12 @@ def _compose_and_run(command: str, typed: list[str]) -> None:
     from omegaconf import OmegaConf
 
     from tangent_train.cli.compose import check_overrides, quote_path
-    from tangent_train.cli.keypoint_pairs.arguments import keypoint_arguments
     from tangent_train.cli.stored import CHOOSABLE, stored_run
 
     as_module = __name__ == "__main__"
     arguments = typed[1:] if as_module else typed
     if command in _OF_FILES:
         arguments = [quote_path(argument) for argument in arguments]
-    if command == "keypoints":
-        arguments = keypoint_arguments(arguments)
     said, config_name = arguments, command
     stored = stored_run(command, arguments)
     if stored is None:

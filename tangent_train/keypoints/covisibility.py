@@ -3,169 +3,158 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from tangent_train.errors import SettingError
 from tangent_train.geometry import (
-    equirect_solid_angles,
     equirect_to_lonlat,
+    lonlat_to_equirect,
     lonlat_to_xyz,
+    xyz_to_lonlat,
 )
-from tangent_train.keypoints.depth_view import DepthView
-from tangent_train.keypoints.spherical import angles_between, unit_directions
+from tangent_train.keypoints.spherical import angles_between
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import NDArray
 
-__all__ = [
-    "DepthView",
-    "MatchTruth",
-    "Tolerance",
-    "Visibility",
-    "correct_matches",
-    "fov_overlap",
-    "visible_count",
-    "visible_from",
-]
+    from tangent_train.geometry import PanoramaPose
 
-_BLOCK = 2**17
-"""Directions looked at together."""
+__all__ = ["DepthView", "MatchTruth", "correct_matches", "fov_overlap", "visible_from"]
+
+_TOLERANCE, _TOLERANCE_M = 0.03, 0.03
+"""How far behind a surface a point still counts as seen: share of its distance, and metres."""
+
+_SMOOTH = 1.1
+"""Distances of neighbouring pixels of one surface rarely differ by more than this factor."""
+
+_ROWS = 512
+"""Rows of a panorama on which the overlap is sampled."""
 
 
-class Tolerance(NamedTuple):
-    """How far behind what a panorama sees a point may be and still count as seen.
+@dataclass(frozen=True, eq=False)
+class DepthView:
+    """What a panorama knows of the room.
 
-    Attributes:
-        relative: Share of the point's distance.
-        absolute_m: Metres on top.
+    Args:
+        distance_m: ``(H, W)`` distances from the centre in metres, of any resolution; NaN where
+            missing.
+        pose: Where it was taken.
     """
 
-    relative: float = 0.03
-    absolute_m: float = 0.03
+    distance_m: NDArray[np.floating]
+    pose: PanoramaPose
 
+    def distances(
+        self, directions_xyz: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Distances in directions.
 
-_TOLERANCE = Tolerance()
+        Between four pixels of one surface 1/d is interpolated, which is linear in the direction on
+        a plane. At depth edges the distance is that of the nearest pixel that has one; its surface
+        may go on towards the next pixel, farther away.
 
+        Args:
+            directions_xyz: ``(n, 3)``.
 
-class Visibility(NamedTuple):
-    """Which directions of one panorama another one should see.
+        Returns:
+            ``(n,)`` distances in metres, and ``(n,)`` how far the same surface may be; NaN where
+            all four pixels are missing.
+        """
+        height, width = self.distance_m.shape
+        u, v = lonlat_to_equirect(xyz_to_lonlat(directions_xyz), (height, width)).T
+        column, row = np.floor(u), np.floor(v)
+        right, below = u - column, v - row
+        taps = [
+            self._tap(
+                row + i, column + j, (below if i else 1 - below) * (right if j else 1 - right)
+            )
+            for i in (0, 1)
+            for j in (0, 1)
+        ]
+        four, weight = (np.array(values) for values in zip(*taps, strict=True))
+        touched = weight > 1e-6  # others are among the four by rounding only
+        there = touched & ~np.isnan(four)
+        farthest = np.where(there, four, -np.inf).max(axis=0)
+        closest = np.where(there, four, np.inf).min(axis=0)
+        nearest = np.where(there, weight, -np.inf).argmax(axis=0)
+        distance = np.take_along_axis(four, nearest[None], axis=0)[0]
+        smooth = (there == touched).all(axis=0) & (farthest <= _SMOOTH * closest)
+        distance[smooth] = 1 / np.where(there, weight / four, 0.0).sum(axis=0)[smooth]
+        distance[~there.any(axis=0)] = np.nan
+        return distance, distance * np.where(smooth, 1.0, _SMOOTH)
 
-    Attributes:
-        visible: ``(n,)`` bool. A direction without distance does not count as visible: it cannot
-            be placed. Where the other panorama has no distance nothing is known to hide the point,
-            and it counts as visible.
-        known: ``(n,)`` bool, both distances are there.
-    """
-
-    visible: NDArray[np.bool_]
-    known: NDArray[np.bool_]
+    def _tap(
+        self,
+        row: NDArray[np.float64],
+        column: NDArray[np.float64],
+        weight: NDArray[np.float64],
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Distances of pixels, across the seam and beyond the poles, and their weights."""
+        height, width = self.distance_m.shape
+        beyond = (row < 0) | (row >= height)
+        columns = (column + beyond * (width / 2)).astype(np.int64) % width
+        rows = np.clip(row, 0, height - 1).astype(np.int64)
+        return self.distance_m[rows, columns].astype(np.float64), weight
 
 
 def visible_from(
-    directions_xyz: ArrayLike,
-    source: DepthView,
-    target: DepthView,
-    tolerance: Tolerance = _TOLERANCE,
-) -> Visibility:
-    """Which of a panorama's directions show what another panorama sees, too.
+    directions_xyz: NDArray[np.float64], source: DepthView, target: DepthView
+) -> NDArray[np.bool_]:
+    """Which directions of one panorama show what another one sees as well.
 
-    A panorama has no borders, so only what is in between hides a point: it is visible unless the
-    target's distance in its direction is shorter than its own, by more than the tolerance.
+    A panorama has no borders: a point is visible unless the target's distance in its direction is
+    shorter than its own by more than 3 % and 3 cm. A direction without distance cannot be placed
+    and does not count; where the target has no distance nothing is known to occlude the point.
 
     Args:
-        directions_xyz: ``(n, 3)`` directions in the source.
+        directions_xyz: ``(n, 3)`` unit vectors in the source.
         source: The panorama they belong to.
-        target: The one that should see them.
-        tolerance: How much farther a point may be than what the target sees.
-
-    Raises:
-        SettingError: The directions are none.
-    """
-    directions = unit_directions(directions_xyz)
-    visible, known = np.zeros((2, len(directions)), np.bool_)
-    for start in range(0, len(directions), _BLOCK):
-        part = slice(start, start + _BLOCK)
-        distance_m, _ = source.distances(directions[part])
-        points_m = source.pose.points_m(directions[part], distance_m)
-        placed = ~np.isnan(distance_m)
-        seen_xyz, away_m = target.pose.seen(np.where(placed[:, None], points_m, 0.0))
-        _, reach_m = target.distances(seen_xyz)
-        limit_m = reach_m + tolerance.absolute_m + tolerance.relative * away_m
-        visible[part] = placed & ~(away_m > limit_m)  # NaN hides nothing
-        known[part] = placed & ~np.isnan(reach_m)
-    return Visibility(visible, known)
-
-
-def visible_count(
-    directions_xyz: ArrayLike,
-    source: DepthView,
-    target: DepthView,
-    tolerance: Tolerance = _TOLERANCE,
-) -> int:
-    """How many keypoints of the source the target should see: the paper's n_L and n_R.
-
-    Args:
-        directions_xyz: ``(n, 3)`` keypoints of the source.
-        source: Their panorama.
-        target: The other panorama.
-        tolerance: See `visible_from`.
-    """
-    return int(visible_from(directions_xyz, source, target, tolerance).visible.sum())
-
-
-def fov_overlap(
-    left: DepthView,
-    right: DepthView,
-    tolerance: Tolerance = _TOLERANCE,
-    *,
-    rows: int = 512,
-    by_solid_angle: bool = False,
-) -> float:
-    """Overlap of the fields of view (paper, section "Sparse keypoint correspondences").
-
-    The mean of two shares: of the right panorama's points those the left camera sees, and vice
-    versa. Points are pixels that have a distance. Like the paper's, which over-count the poles,
-    unless they are weighted.
-
-    Args:
-        left: One panorama.
-        right: The other.
-        tolerance: See `visible_from`.
-        rows: Of larger panoramas about that many rows and twice as many columns are counted,
-            evenly spread.
-        by_solid_angle: Weigh every pixel by its solid angle.
+        target: The one that may see them.
 
     Returns:
-        0 to 1, NaN where one of the two has no distances.
+        ``(n,)`` bool.
     """
-    shares = (
-        _seen_share(source, target, tolerance, rows, by_solid_angle)
-        for source, target in ((left, right), (right, left))
-    )
-    return math.fsum(shares) / 2
+    distance_m, _ = source.distances(directions_xyz)
+    placed = ~np.isnan(distance_m)
+    points_m = source.pose.points_m(directions_xyz, np.where(placed, distance_m, 1.0))
+    seen_xyz, away_m = target.pose.seen(points_m)
+    _, reach_m = target.distances(seen_xyz)
+    return placed & ~(away_m > reach_m + _TOLERANCE_M + _TOLERANCE * away_m)  # NaN hides nothing
 
 
-def _seen_share(
-    source: DepthView, target: DepthView, tolerance: Tolerance, rows: int, by_solid_angle: bool
-) -> float:
-    height, width = source.distance_m.shape
-    chosen_rows, chosen_columns = (
+def fov_overlap(left: DepthView, right: DepthView) -> float:
+    """Overlap of the fields of view (paper, section "Sparse keypoint correspondences").
+
+    The mean of two shares: of the right panorama's points, those that the left camera sees, and
+    vice versa. Points are pixels that have a distance; like the paper's share, this over-counts
+    the poles.
+
+    Returns:
+        0 to 1; NaN where one of the two has no distances.
+    """
+    return (_seen_share(left, right) + _seen_share(right, left)) / 2
+
+
+def _seen_share(source: DepthView, target: DepthView) -> float:
+    shape = (source.distance_m.shape[0], source.distance_m.shape[1])
+    rows, columns = (
         np.arange(step // 2, size, step)
-        for size, step in (
-            (height, max(1, round(height / rows))),
-            (width, max(1, round(width / (2 * rows)))),
+        for size, step in zip(
+            shape, (_step(shape[0], _ROWS), _step(shape[1], 2 * _ROWS)), strict=True
         )
     )
-    there = ~np.isnan(source.distance_m[np.ix_(chosen_rows, chosen_columns)])
+    there = ~np.isnan(source.distance_m[np.ix_(rows, columns)])
     if not there.any():
         return math.nan
-    pixels = np.stack(np.meshgrid(chosen_columns, chosen_rows), axis=-1)[there]
-    directions = lonlat_to_xyz(equirect_to_lonlat(pixels, (height, width)))
-    visible = visible_from(directions, source, target, tolerance).visible
-    areas = equirect_solid_angles((height, width))[pixels[:, 1]]
-    return float(np.average(visible, weights=areas if by_solid_angle else None))
+    pixels = np.stack(np.meshgrid(columns, rows), axis=-1)[there]
+    directions = lonlat_to_xyz(equirect_to_lonlat(pixels, shape))
+    return float(visible_from(directions, source, target).mean())
+
+
+def _step(size: int, wanted: int) -> int:
+    return max(1, round(size / wanted))
 
 
 class MatchTruth(NamedTuple):
@@ -173,7 +162,7 @@ class MatchTruth(NamedTuple):
 
     Attributes:
         correct: ``(m,)`` bool.
-        known: ``(m,)`` bool, a distance is there in one of the two panoramas.
+        known: ``(m,)`` bool, one of the two panoramas has a distance.
     """
 
     correct: NDArray[np.bool_]
@@ -181,37 +170,27 @@ class MatchTruth(NamedTuple):
 
 
 def correct_matches(
-    left_xyz: ArrayLike,
-    right_xyz: ArrayLike,
+    left_xyz: NDArray[np.float64],
+    right_xyz: NDArray[np.float64],
     left: DepthView,
     right: DepthView,
     max_error_deg: float = 1.0,
 ) -> MatchTruth:
-    """Judge matches by depth and pose instead of by the geometry estimated from them.
+    """Judge matches by depth and pose, independently of any estimated geometry.
 
-    The left point is placed at its distance and seen from the right, and the other way round; the
-    match is correct where one of the two ends within `max_error_deg` of its partner. One is enough:
-    keypoints are often at edges of depth, where the other distance may be the background's.
+    The left point is placed at its distance and seen from the right, and vice versa; the match is
+    correct where one of the two ends within `max_error_deg` of its partner. One is enough:
+    keypoints are often at depth edges, where the other distance may be that of the background.
 
     Args:
-        left_xyz: ``(m, 3)`` directions in the left panorama.
-        right_xyz: ``(m, 3)`` directions in the right one.
+        left_xyz: ``(m, 3)`` unit vectors in the left panorama.
+        right_xyz: ``(m, 3)`` unit vectors in the right one.
         left: The left panorama.
         right: The right one.
         max_error_deg: Largest angle.
-
-    Raises:
-        SettingError: The directions are none or do not belong together.
     """
-    rays = unit_directions(left_xyz), unit_directions(right_xyz)
-    if len(rays[0]) != len(rays[1]):
-        raise SettingError(
-            "matched directions",
-            found=f"{len(rays[0])} and {len(rays[1])}",
-            expected="as many left ones as right ones",
-        )
-    there = _transfer_errors_deg(rays[0], rays[1], left, right)
-    back = _transfer_errors_deg(rays[1], rays[0], right, left)
+    there = _transfer_errors_deg(left_xyz, right_xyz, left, right)
+    back = _transfer_errors_deg(right_xyz, left_xyz, right, left)
     correct = (there <= max_error_deg) | (back <= max_error_deg)
     return MatchTruth(correct, ~(np.isnan(there) & np.isnan(back)))
 

@@ -1,188 +1,269 @@
-"""The motion between two panoramas, and which matches agree with it."""
+"""Two-view geometry of panoramas: the motion between them among matches most of which may be wrong.
+
+pycolmap calls are in COLMAP's camera axes: x right, y down, z to the middle of the panorama.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from tangent_train.errors import SettingError
-from tangent_train.keypoints.epipolar import (
-    Motion,
-    chance_share,
-    log_false_alarms,
-    motion_errors,
-    prefers_rotation,
-)
-from tangent_train.keypoints.motion_search import find_motion, find_rotation
-from tangent_train.keypoints.spherical import angles_between, unit_directions
+from tangent_train.keypoints.motion import Motion, is_by_chance, motion_errors, prefers_rotation
+from tangent_train.keypoints.spherical import angles_between
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
 
     from tangent_train.geometry import PanoramaPose
 
-__all__ = ["Kind", "TwoView", "estimate_two_view"]
+__all__ = ["TwoView", "colmap", "estimate_two_view", "rigid_matrix"]
 
-Kind = Literal["general", "rotation", "none"]
+_CAMERA_FROM_PANORAMA = np.array([[0, 1.0, 0], [0, 0, -1.0], [1.0, 0, 0]])
+"""From `tangent_train.geometry`'s axes to COLMAP's; it mirrors."""
 
-_SAMPLE = 5
-"""Matches that some essential matrix fits whatever they are."""
+_MIN_INLIERS = 8
+"""COLMAP asks for 15; the test for chance makes fewer trustworthy."""
 
-_PRECISION_RAD = math.radians(0.01)
-"""Better than any keypoint: differences below it say nothing."""
+_MAX_TRIALS = 50_000
+_STARTS = 4
+_DRAWS, _HYPOTHESES = 2**15, 512
+"""Pairs of matches tried for a rotation: enough at 2 % of inliers."""
+
+_REFINEMENTS = 6
 
 
 @dataclass(frozen=True, eq=False)
 class TwoView:
-    """How the right panorama was taken, seen from the left one: ``x_right = R x_left + t``.
-
-    Both in the axes of `tangent_train.geometry`. Two images do not tell the length of t.
+    """The motion ``x_right = R x_left + t`` in the axes of `tangent_train.geometry`.
 
     Attributes:
-        kind: ``general``; ``rotation``, both were taken at one place as far as the matches tell;
-            ``none``, no motion fits more matches than chance would.
-        inliers: ``(m,)`` bool, matches within the largest error of the motion; none for ``none``.
-        errors_deg: ``(m,)`` float64 angles between the matches and where the motion allows them
-            (`motion_errors`), one criterion for both kinds; NaN for ``none``.
-        rotation: ``(3, 3)`` R, None for ``none``.
+        inliers: ``(m,)`` bool, matches within the largest error of the motion.
+        rotation: ``(3, 3)`` R; None if no motion fits more matches than chance would.
         translation: ``(3,)`` t of length 1, the direction of the left centre in the right panorama;
-            None unless ``general``.
+            None without a motion, and for a pure rotation.
     """
 
-    kind: Kind
     inliers: NDArray[np.bool_]
-    errors_deg: NDArray[np.float64]
-    rotation: NDArray[np.float64] | None
-    translation: NDArray[np.float64] | None
+    rotation: NDArray[np.float64] | None = None
+    translation: NDArray[np.float64] | None = None
 
     @property
-    def essential(self) -> NDArray[np.float64] | None:
-        """``(3, 3)`` E = [t]ₓ R with ``rightᵀ E left = 0``; None unless ``general``."""
-        if self.rotation is None or self.translation is None:
-            return None
-        x, y, z = self.translation
-        return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ self.rotation
-
-    def right_pose(self, left: PanoramaPose, baseline_m: float = 1.0) -> PanoramaPose | None:
-        """Pose of the right panorama.
-
-        Args:
-            left: Pose of the left one.
-            baseline_m: Distance between the two, which images do not tell.
-
-        Returns:
-            None for ``none``.
-        """
+    def kind(self) -> Literal["general", "rotation", "none"]:
+        """Whether there is a motion, and whether it has a translation."""
         if self.rotation is None:
-            return None
-        if self.translation is None:
-            return left.moved(self.rotation, np.zeros(3))
-        return left.moved(self.rotation, baseline_m * self.translation)
+            return "none"
+        return "rotation" if self.translation is None else "general"
 
     def pose_error_deg(self, left: PanoramaPose, right: PanoramaPose) -> tuple[float, float]:
-        """Difference from true poses.
+        """Errors against the true poses.
 
         Args:
             left: True pose of the left panorama.
             right: True pose of the right one.
 
         Returns:
-            Angle between the rotations, and angle between the directions of translation, both in
-            degrees from 0 to 180; NaN where one of the two is unknown or the true centres are one.
+            Angle between the rotations, and angle between the directions of translation, in
+            degrees; NaN where the estimate has none, or the true centres coincide.
         """
         rotation, translation_m = right.relative_to(left)
-        turn = shift = math.nan
+        rotation_error = translation_error = math.nan
         if self.rotation is not None:
             # |R − R'| = 2 √2 sin(α / 2), which is precise for small angles.
             chord = float(np.linalg.norm(self.rotation - rotation)) / math.sqrt(8)
-            turn = math.degrees(2 * math.asin(min(chord, 1.0)))
+            rotation_error = math.degrees(2 * math.asin(min(chord, 1.0)))
         length = float(np.linalg.norm(translation_m))
         if self.translation is not None and length > 0:
             true = translation_m / length
-            shift = math.degrees(angles_between(self.translation, true))
-        return turn, shift
+            translation_error = math.degrees(angles_between(self.translation, true))
+        return rotation_error, translation_error
 
 
 def estimate_two_view(
-    left_xyz: ArrayLike,
-    right_xyz: ArrayLike,
+    left_xyz: NDArray[np.float64],
+    right_xyz: NDArray[np.float64],
     max_error_deg: float = 1.0,
     *,
     seed: int = 0,
-    min_inliers: int = 8,
-    max_trials: int = 50_000,
 ) -> TwoView:
     """Find the motion between two panoramas from putative matches, all around the sphere.
 
-    A general motion comes from COLMAP's five-point RANSAC (`find_motion`), a rotation from pairs of
-    matches; Torr's criterion decides between them (`prefers_rotation`), because a general motion
-    fits the matches of a rotation, too, with any translation. What is left must fit more matches
-    than a motion would by chance (`log_false_alarms`): some motion fits 30 of 3000 wrong ones.
-    The same matches and seed give the same result.
+    A general motion comes from COLMAP's five-point RANSAC, a rotation from pairs of matches. Torr's
+    criterion decides between them (`prefers_rotation`), because a general motion fits the matches
+    of a rotation as well. A motion that chance explains is none (`is_by_chance`).
 
     Args:
-        left_xyz: ``(m, 3)`` directions in the left panorama, of any length but 0.
-        right_xyz: ``(m, 3)`` directions in the right one.
-        max_error_deg: How far off inliers may be, above 0 and up to 20 degrees.
-        seed: Of the random samples, 0 or more.
-        min_inliers: With fewer there is no motion. COLMAP asks for 15; the test for chance makes
-            fewer trustworthy. At least 6: some motion fits any five matches.
-        max_trials: Most samples of five matches.
+        left_xyz: ``(m, 3)`` unit vectors in the left panorama.
+        right_xyz: ``(m, 3)`` unit vectors in the right one.
+        max_error_deg: Largest error of an inlier.
+        seed: Of the random samples.
 
     Raises:
-        SettingError: The directions or a setting cannot be used, or pycolmap is missing.
+        SettingError: pycolmap is missing.
     """
-    left, right = unit_directions(left_xyz), unit_directions(right_xyz)
-    if len(left) != len(right):
-        found = f"{len(left)} and {len(right)}"
-        raise SettingError("matched directions", found=found, expected="as many on either side")
-    _check(max_error_deg, seed, min_inliers, max_trials)
-    max_error_rad = math.radians(max_error_deg)
-    if len(left) < min_inliers:
-        return _nothing(len(left))
-    general = find_motion(left, right, max_error_rad, seed=seed, max_trials=max_trials)
-    rotation = find_rotation(left, right, max_error_rad, seed=seed)
-    motion = _preferred(left, right, general, rotation, max_error_rad)
+    nothing = TwoView(np.zeros(len(left_xyz), np.bool_))
+    if len(left_xyz) < _MIN_INLIERS:
+        return nothing
+    search = _Search(left_xyz, right_xyz, math.radians(max_error_deg), seed)
+    general, rotation = search.general(), search.rotation()
+    motion = general or rotation
+    if general is not None and rotation is not None:
+        errors = search.errors(general), search.errors(rotation)
+        motion = rotation if prefers_rotation(*errors, search.max_error_rad) else general
     if motion is None:
-        return _nothing(len(left))
-    errors_rad = motion_errors(left, right, motion)
-    inliers = errors_rad <= max_error_rad
-    count = int(inliers.sum())
-    share = chance_share(left, right, motion, max_error_rad)
-    if count < min_inliers or log_false_alarms(len(left), count, motion.sample, share) > 0:
-        return _nothing(len(left))
-    kind: Kind = "rotation" if motion.translation is None else "general"
-    return TwoView(kind, inliers, np.degrees(errors_rad), *motion)
-
-
-def _preferred(
-    left_xyz: NDArray[np.float64],
-    right_xyz: NDArray[np.float64],
-    general: Motion | None,
-    rotation: Motion | None,
-    max_error_rad: float,
-) -> Motion | None:
-    if general is None or rotation is None:
-        return general or rotation
-    moved, turned = (motion_errors(left_xyz, right_xyz, way) for way in (general, rotation))
-    if not (moved <= max_error_rad).any():
-        return rotation
-    return rotation if prefers_rotation(moved, turned, max_error_rad, _PRECISION_RAD) else general
-
-
-def _nothing(count: int) -> TwoView:
-    return TwoView("none", np.zeros(count, np.bool_), np.full(count, np.nan), None, None)
-
-
-def _check(max_error_deg: float, seed: int, min_inliers: int, max_trials: int) -> None:
-    for name, value, good, expected in (
-        ("max_error_deg", max_error_deg, 0 < max_error_deg <= 20, "above 0, at most 20"),
-        ("seed", seed, 0 <= seed < 2**31, "0 to 2147483647"),
-        ("min_inliers", min_inliers, min_inliers > _SAMPLE, f"{_SAMPLE + 1} or more"),
-        ("max_trials", max_trials, max_trials >= 1, "1 or more"),
+        return nothing
+    inliers = search.errors(motion) <= search.max_error_rad
+    if inliers.sum() < _MIN_INLIERS or is_by_chance(
+        left_xyz, right_xyz, motion, search.max_error_rad
     ):
-        if not good:
-            raise SettingError(name, found=value, expected=expected)
+        return nothing
+    return TwoView(inliers, *motion)
+
+
+@dataclass(frozen=True)
+class _Search:
+    """Matches among which a motion is sought."""
+
+    left_xyz: NDArray[np.float64]
+    right_xyz: NDArray[np.float64]
+    max_error_rad: float
+    seed: int
+
+    def errors(self, motion: Motion) -> NDArray[np.float64]:
+        return motion_errors(self.left_xyz, self.right_xyz, motion)
+
+    def cost(self, motion: Motion) -> float:
+        return float((np.minimum(self.errors(motion), self.max_error_rad) ** 2).sum())
+
+    def general(self) -> Motion | None:
+        """The best of several runs of COLMAP's LO-RANSAC on rays, each refined.
+
+        A single run may stop at a motion that is degrees away and fits nearly as many matches.
+        `pycolmap.estimate_calibrated_two_view_geometry` measures errors in pixels of the ERP, so
+        that it loses matches near the poles.
+        """
+        pycolmap = colmap()
+        left, right = (rays @ _CAMERA_FROM_PANORAMA.T for rays in (self.left_xyz, self.right_xyz))
+
+        def refit(chosen: NDArray[np.bool_], motion: Motion) -> Motion | None:
+            pose = pycolmap.Rigid3d(rigid_matrix(*motion))
+            refined = pycolmap.refine_relative_pose(pose, left, right, chosen)
+            return None if refined is None else _motion(refined["cam2_from_cam1"])
+
+        options = pycolmap.RANSACOptions()
+        # The Sampson error is a one-sided one over √2 where both sides weigh the same.
+        options.max_error = self.max_error_rad / math.sqrt(2)
+        options.max_num_trials = _MAX_TRIALS // _STARTS
+        options.min_inlier_ratio = 0.01
+        options.confidence = 0.9999
+        found: list[Motion] = []
+        for number in np.random.SeedSequence(self.seed).generate_state(_STARTS) % 2**31:
+            options.random_seed = int(number)
+            start = pycolmap.estimate_relative_pose(left, right, options)
+            # COLMAP's choice among the four motions of an essential matrix counts points in front
+            # of both cameras; where rays are nearly parallel that is noise.
+            twins = [] if start is None else _twins(_motion(start["cam2_from_cam1"]))
+            found += [self._refined(twin, refit) for twin in twins]
+        return min(found, key=self.cost, default=None)
+
+    def rotation(self) -> Motion | None:
+        """Of rotations through two matches each the best, refined."""
+        rng = np.random.default_rng(self.seed)
+        pairs = rng.integers(0, len(self.left_xyz), (_DRAWS, 2))
+        # A rotation keeps the angle between two directions; those nearly parallel fix no rotation.
+        apart = [
+            np.linalg.norm(np.diff(rays[pairs], axis=1)[:, 0], axis=-1)
+            for rays in (self.left_xyz, self.right_xyz)
+        ]
+        same = np.abs(apart[0] - apart[1]) < 2 * self.max_error_rad
+        wide = apart[0] > 10 * self.max_error_rad
+        wide &= apart[0] < 2 * math.cos(5 * self.max_error_rad)
+        chosen = pairs[same & wide][:_HYPOTHESES]
+        if not len(chosen):
+            return None
+        rotations = _rotations(self.left_xyz[chosen], self.right_xyz[chosen])
+        # |R l − r|² = 2 − 2 Σ R_ij r_i l_j, for all rotations and matches in one product.
+        products = np.einsum("mi,mj->ijm", self.right_xyz, self.left_xyz).reshape(9, -1)
+        squares = 2 - 2 * rotations.reshape(-1, 9) @ products
+        costs = np.minimum(squares, self.max_error_rad**2).sum(axis=1)
+
+        def refit(fits: NDArray[np.bool_], _: Motion) -> Motion:
+            return Motion(_rotations(self.left_xyz[fits], self.right_xyz[fits]))
+
+        return self._refined(Motion(rotations[int(np.argmin(costs))]), refit)
+
+    def _refined(
+        self, motion: Motion, refit: Callable[[NDArray[np.bool_], Motion], Motion | None]
+    ) -> Motion:
+        """Fit again to what fits well, as long as that lowers the cost."""
+        for _ in range(_REFINEMENTS):
+            errors = self.errors(motion)
+            fits = errors <= self.max_error_rad
+            if fits.sum() < 2 * motion.sample:
+                break
+            # What is far off for this scene is rather a wrong match that fits by chance.
+            sigma = 1.4826 * float(np.median(errors[fits]))
+            better = refit(errors <= min(self.max_error_rad, 3 * sigma + 1e-9), motion)
+            if better is None or self.cost(better) >= self.cost(motion):
+                break
+            motion = better
+        return motion
+
+
+def colmap() -> Any:
+    """The module ``pycolmap``.
+
+    Raises:
+        SettingError: It is not installed.
+    """
+    try:
+        import pycolmap
+    except ImportError as error:
+        raise SettingError(
+            "keypoints",
+            found="no pycolmap",
+            expected="the packages of the extra keypoints",
+            remedy="Run: pip install 'tangent-train[keypoints]'",
+        ) from error
+    return pycolmap
+
+
+def rigid_matrix(
+    rotation: NDArray[np.float64], translation: NDArray[np.float64] | None
+) -> NDArray[np.float64]:
+    """``(3, 4)`` [R | t] in COLMAP's axes of a motion in those of `tangent_train.geometry`."""
+    axes = _CAMERA_FROM_PANORAMA
+    shift = np.zeros(3) if translation is None else axes @ translation
+    return np.column_stack([axes @ rotation @ axes.T, shift])
+
+
+def _motion(cam2_from_cam1: Any) -> Motion:
+    """COLMAP's motion in the axes of `tangent_train.geometry`."""
+    axes = _CAMERA_FROM_PANORAMA
+    translation = axes.T @ cam2_from_cam1.translation
+    rotation = axes.T @ cam2_from_cam1.rotation.matrix() @ axes
+    return Motion(rotation, translation / np.linalg.norm(translation))
+
+
+def _twins(start: Motion) -> list[Motion]:
+    """The four motions of one essential matrix (Hartley and Zisserman, result 9.19)."""
+    rotation, t = start
+    if t is None:
+        return [start]
+    half_turn = 2 * np.outer(t, t) - np.eye(3)
+    return [Motion(r, way) for r in (rotation, half_turn @ rotation) for way in (t, -t)]
+
+
+def _rotations(
+    left_xyz: NDArray[np.float64], right_xyz: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """``(..., 3, 3)`` least-squares rotations from left to right (Kabsch)."""
+    u, _, vt = np.linalg.svd(np.swapaxes(right_xyz, -1, -2) @ left_xyz)
+    u[..., -1] *= np.linalg.det(u @ vt)[..., None]
+    rotations: NDArray[np.float64] = u @ vt
+    return rotations

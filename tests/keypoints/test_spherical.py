@@ -1,30 +1,21 @@
-from __future__ import annotations
+"""Keypoints on the sphere: Jacobians, sizes and orientations there and back."""
 
-from typing import Any
+from __future__ import annotations
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tangent_train.errors import SettingError
-from tangent_train.geometry import (
-    equirect_to_lonlat,
-    lonlat_to_equirect,
-    lonlat_to_xyz,
-    random_rotation,
-    rotation_about,
-    xyz_to_lonlat,
-)
+from tangent_train.geometry import equirect_to_lonlat, lonlat_to_xyz, rotation_about
 from tangent_train.keypoints.spherical import (
     SphericalKeypoints,
     angles_between,
     equirect_jacobian,
     local_to_sphere,
-    unit_directions,
 )
 
 SHAPE = (90, 210)
-"""Neither even halves nor twice as wide as high."""
+"""Not twice as wide as high."""
 
 
 def keypoints(count: int = 50, seed: int = 0) -> SphericalKeypoints:
@@ -50,17 +41,10 @@ def direction(pixels_xy: NDArray[np.float64]) -> NDArray[np.float64]:
 def test_the_panoramas_jacobian_is_the_derivative() -> None:
     rng = np.random.default_rng(0)
     pixels = rng.uniform([-0.5, -0.4], [SHAPE[1] - 0.5, SHAPE[0] - 0.6], (200, 2))
-    step = 1e-5
-    numeric = np.stack(
-        [
-            (direction(pixels + step * axis) - direction(pixels - step * axis)) / (2 * step)
-            for axis in np.eye(2)
-        ],
-        axis=-1,
-    )
-    np.testing.assert_allclose(
-        equirect_jacobian(direction(pixels), SHAPE), numeric, rtol=0, atol=1e-9
-    )
+    steps = 1e-5 * np.eye(2)
+    numeric = [(direction(pixels + step) - direction(pixels - step)) / 2e-5 for step in steps]
+    found = equirect_jacobian(direction(pixels), SHAPE)
+    np.testing.assert_allclose(found, np.stack(numeric, axis=-1), rtol=0, atol=1e-9)
 
 
 def skewed_maps(count: int = 40) -> NDArray[np.float64]:
@@ -88,8 +72,8 @@ def test_sizes_are_diameters_of_discs_of_the_same_area() -> None:
     jacobian = skewed_maps()
     diameters = np.random.default_rng(3).uniform(1, 5, len(jacobian))
     sizes, _ = local_to_sphere(jacobian, diameters, np.zeros(len(jacobian)))
-    turn = np.linspace(0, 2 * np.pi, 2001)
-    circle = np.stack([np.cos(turn), np.sin(turn)]) / 2
+    angle = np.linspace(0, 2 * np.pi, 2001)
+    circle = np.stack([np.cos(angle), np.sin(angle)]) / 2
     for matrix, diameter, size in zip(jacobian, diameters, sizes, strict=True):
         outline = matrix @ (diameter * circle)
         triangles = np.cross(outline[:, :-1].T, outline[:, 1:].T) / 2
@@ -133,75 +117,15 @@ def test_angles_are_precise_from_0_to_180_degrees() -> None:
     angles = np.array([0, 1e-12, 1e-5, 1.0, np.pi / 2, np.pi - 1e-5, np.pi])
     ends = np.array([rotation_about(axis, angle) @ start for angle in angles])
     np.testing.assert_allclose(angles_between(start, ends), angles, rtol=1e-9, atol=1e-15)
-    np.testing.assert_allclose(angles_between(ends, start), angles, rtol=1e-9, atol=1e-15)
-    assert angles_between(start, axis).shape == ()
     assert angles_between(ends[:0], start).shape == (0,)
 
 
-def test_directions_of_any_length_become_unit_vectors() -> None:
-    unit = unit_directions(np.array([[0, 3, -4], [1e-9, 0, 0]]))
-    np.testing.assert_allclose(unit, np.array([[0, 0.6, -0.8], [1, 0, 0]]))
-    assert unit_directions(np.empty((0, 3))).shape == (0, 3)
-    for wrong, message in (
-        ([1.0, 0, 0], r"shape \(3,\); expected \(n, 3\)"),
-        ([[1.0, 0]], r"shape \(1, 2\)"),
-        ([[0.0, 0, 0]], "0 or no numbers"),
-        ([[np.inf, 0, 0]], "0 or no numbers"),
-    ):
-        with pytest.raises(SettingError, match=message):
-            unit_directions(wrong)
-
-
-def arrays(points: SphericalKeypoints) -> dict[str, NDArray[Any]]:
-    return vars(points)
-
-
-@pytest.mark.parametrize(
-    "chosen", [np.arange(50) % 3 == 0, np.arange(50)[::-1], [4, 4, 0], [], np.zeros(50, bool)]
-)
-def test_select_takes_masks_and_indices(chosen: Any) -> None:
-    points = keypoints()
-    taken = points.select(chosen)
-    index = np.flatnonzero(chosen) if np.asarray(chosen).dtype == np.bool_ else list(chosen)
-    assert len(taken) == len(index)
-    for name, values in arrays(taken).items():
-        whole = arrays(points)[name]
-        assert values.dtype == whole.dtype
-        assert values.shape[1:] == whole.shape[1:]
-        for value, k in zip(values, index, strict=True):
-            np.testing.assert_array_equal(value, whole[k])
-
-
-def test_concatenated_keeps_the_order() -> None:
+def test_parts_are_put_together_and_selected_in_order() -> None:
     parts = [keypoints(3, 1), keypoints(0, 2), keypoints(4, 3)]
     whole = SphericalKeypoints.concatenated(parts)
     assert len(whole) == 7
-    np.testing.assert_array_equal(whole.images, [*parts[0].images, *parts[2].images])
-    np.testing.assert_array_equal(whole.select(range(3, 7)).descriptors, parts[2].descriptors)
-
-
-def test_turned_moves_directions_and_orientations_together() -> None:
-    points, turn = keypoints(), random_rotation(np.random.default_rng(5))
-    turned = points.turned(turn)
-    for k in (0, 17):
-        np.testing.assert_allclose(turned.directions_xyz[k], turn @ points.directions_xyz[k])
-        np.testing.assert_allclose(turned.orientations_xyz[k], turn @ points.orientations_xyz[k])
-    assert turned.descriptors is points.descriptors
-    with pytest.raises(SettingError, match="rotation"):
-        points.turned(np.diag([1.0, -1, 1]))
-
-
-def test_places_in_a_panorama_of_another_size() -> None:
-    points = keypoints()
-    lonlat = xyz_to_lonlat(points.directions_xyz)
-    for shape in ((64, 128), (33, 47)):
-        expected = lonlat_to_equirect(lonlat, shape)
-        np.testing.assert_array_equal(points.equirect_pixels(shape), expected)
-
-
-@pytest.mark.parametrize("name", list(arrays(keypoints(1))))
-def test_arrays_that_do_not_belong_together_are_refused(name: str) -> None:
-    parts = dict(arrays(keypoints(5)))
-    parts[name] = parts[name][:4]
-    with pytest.raises(SettingError, match="keypoints: found shapes"):
-        SphericalKeypoints(**parts)
+    again = whole.select(np.arange(3, 7)), whole.select(np.arange(7) > 2)
+    for selected in again:
+        for name, values in vars(selected).items():
+            np.testing.assert_array_equal(values, vars(parts[2])[name])
+            assert values.dtype == vars(parts[2])[name].dtype

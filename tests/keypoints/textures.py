@@ -1,7 +1,8 @@
-"""Panoramas of closed forms: turned ones are computed, not resampled."""
+"""Panoramas of closed forms: rotated ones are computed, not resampled."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,10 +20,7 @@ if TYPE_CHECKING:
 def texture(
     shape: tuple[int, int], rotation: ArrayLike | None = None, seed: int = 0
 ) -> NDArray[np.uint8]:
-    """A sphere cut out of random grey volumes: alike in all directions.
-
-    Turned by a rotation, direction d shows what was at Rᵀd.
-    """
+    """A sphere cut out of random grey volumes, isotropic; rotated, direction d shows Rᵀd."""
     directions = equirect_directions(shape)
     if rotation is not None:
         directions = directions @ np.asarray(rotation)
@@ -62,8 +60,18 @@ def angles_deg(left_xyz: NDArray[np.float64], right_xyz: NDArray[np.float64]) ->
     return np.degrees(2 * np.arcsin(np.linalg.norm(left_xyz - right_xyz, axis=-1).clip(0, 2) / 2))
 
 
+def rotated(points: SphericalKeypoints, rotation: ArrayLike) -> SphericalKeypoints:
+    """The keypoints of the rotated panorama: directions and orientations become R·d."""
+    matrix = np.asarray(rotation)
+    return replace(
+        points,
+        directions_xyz=points.directions_xyz @ matrix.T,
+        orientations_xyz=points.orientations_xyz @ matrix.T,
+    )
+
+
 class Agreement:
-    """Keypoints of a panorama beside those of the turned one, each with the most similar one near.
+    """Keypoints of a panorama and of the rotated one, each with the most similar one near.
 
     Attributes:
         share: Of all keypoints, those with another of similar size within 1°.

@@ -2,89 +2,111 @@
 
 from __future__ import annotations
 
-import time
+import math
 import zlib
-from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+import cv2
 import numpy as np
 
 from tangent_train.errors import SettingError
-from tangent_train.geometry import nearest_level, random_rotation
-from tangent_train.keypoints.matching import match
-from tangent_train.keypoints.two_view import estimate_two_view
+from tangent_train.geometry import (
+    PanoramaPose,
+    TangentGrid,
+    equirect_shape,
+    nearest_level,
+    random_rotation,
+)
+from tangent_train.keypoints import (
+    Detector,
+    SphericalKeypoints,
+    TwoView,
+    detect_on_equirect,
+    detect_on_tangent_images,
+    estimate_two_view,
+    match,
+)
+from tangent_train.keypoints.covisibility import (
+    DepthView,
+    correct_matches,
+    fov_overlap,
+    visible_from,
+)
 from tangent_train.rendering import rotate_equirect
-from tangent_train.results.keypoints.entries import AS_GIVEN, TURNED, PairEntry, Scored
-from tangent_train.results.keypoints.found import Found
-from tangent_train.results.keypoints.representations import Representations, at_level
-from tangent_train.results.keypoints.seen import Seen
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from datamodules.core.panorama_pairs import PairedPanorama, PanoramaPair
-    from tangent_train.keypoints.spherical import SphericalKeypoints
 
-__all__ = ["Comparer", "Comparison", "Matching"]
+__all__ = ["AS_GIVEN", "ROTATED", "SHRUNK", "Comparer", "Comparison", "Found", "Row", "shrunk_rows"]
 
-_PANORAMAS_KEPT = 4
+Row = dict[str, Any]
+"""Figures of one pair, condition and representation, see `Comparer.compare`."""
+
+AS_GIVEN, ROTATED = "as_given", "rotated"
+"""Conditions: both panoramas as they are; the right one randomly rotated."""
+
+SHRUNK = "ERP ×0.71"
+"""The panorama with pixels as large as those of tangent images, see `shrunk_rows`."""
 
 
-@dataclass(frozen=True)
-class Matching:
-    """How keypoints are matched and geometry is estimated.
+class Found(NamedTuple):
+    """Keypoints of two panoramas, ``(m, 2)`` matches among them, and their geometry."""
 
-    Attributes:
-        ratio: See `match`.
-        mutual: See `match`.
-        max_error_deg: See `estimate_two_view`.
-        seed: Of random samples and of the random rotations.
-    """
-
-    ratio: float = 0.8
-    mutual: bool = True
-    max_error_deg: float = 1.0
-    seed: int = 0
-
-    def turn(self, name: str) -> NDArray[np.float64]:
-        """The random rotation of the right panorama of a pair, the same in every run."""
-        return random_rotation(np.random.default_rng([self.seed, zlib.crc32(name.encode())]))
+    left: SphericalKeypoints
+    right: SphericalKeypoints
+    matches: NDArray[np.int64]
+    geometry: TwoView
 
 
 class Comparison(NamedTuple):
-    """What was found out about a pair.
+    """A compared pair.
 
     Attributes:
-        entry: Figures.
+        rows: Figures.
         found: Keypoints and matches by condition and representation.
         images: The left and the right panorama of every condition, as keypoints were detected.
     """
 
-    entry: PairEntry
+    rows: list[Row]
     found: Mapping[str, Mapping[str, Found]]
     images: Mapping[str, tuple[NDArray[np.uint8], NDArray[np.uint8]]]
 
 
 @dataclass
 class Comparer:
-    """Compares representations on pairs; remembers keypoints of the last panoramas.
+    """Compares representations on pairs.
 
     Attributes:
-        representations: What keypoints are detected on.
-        matching: How they are matched.
+        base_levels: Of the tangent images.
+        detector: Of keypoints.
+        margin: Pixels added around every tangent image.
         level: Level s; None for the level nearest to the larger panorama.
-        turned: Whether the right panorama is also turned by a random rotation.
+        ratio: See `match`.
+        mutual: See `match`.
+        max_error_deg: See `estimate_two_view`.
+        seed: Of random samples and of the random rotations.
+        controls: Whether to compare the shrunk panorama and the rotated one as well.
     """
 
-    representations: Representations
-    matching: Matching
+    base_levels: tuple[int, ...]
+    detector: Detector = field(default_factory=Detector)
+    margin: int = 32
     level: int | None = None
-    turned: bool = True
-    _kept: OrderedDict[tuple[str, int], dict[str, SphericalKeypoints]] = field(
-        default_factory=OrderedDict
-    )
+    ratio: float = 0.8
+    mutual: bool = True
+    max_error_deg: float = 1.0
+    seed: int = 0
+    controls: bool = True
+    _kept: dict[tuple[str, int], dict[str, SphericalKeypoints]] = field(default_factory=dict)
+
+    @property
+    def representations(self) -> list[str]:
+        """``ERP``, the shrunk one with controls, and ``L0``, ``L1`` … for the base levels."""
+        return ["ERP", *[SHRUNK] * self.controls, *(f"L{b}" for b in self.base_levels)]
 
     def compare(self, pair: PanoramaPair) -> Comparison:
         """Compare all representations on one pair.
@@ -92,98 +114,179 @@ class Comparer:
         Args:
             pair: The pair.
 
+        Returns:
+            Among its figures are n_L and n_R as ``visible_left`` and ``visible_right`` (all
+            keypoints where depth and pose are unknown), PMR, MS and P as shares of 1, and, where
+            depth and pose are known, the errors of the estimated motion and how many of the
+            ``judged`` matches are ``correct``. None stands for what is undefined.
+
         Raises:
             SettingError: The panoramas are too small for the level or for a base level.
         """
-        begun = time.monotonic()
-        rows, level = self._rows_and_level(pair)
-        turns = {AS_GIVEN: np.eye(3)}
-        if self.turned:
-            turns[TURNED] = self.matching.turn(pair.name)
-        left, right = (at_level(side.rgb, level) for side in (pair.left, pair.right))
-        images = {
-            condition: (left, right if condition == AS_GIVEN else rotate_equirect(right, turn))
-            for condition, turn in turns.items()
-        }
-        seen = Seen(pair, self.matching.max_error_deg)
+        level = self._level(pair)
+        sides = (pair.left, pair.right)
+        # A panorama of the pair before is not searched again.
+        self._kept = {(side.name, level): self._kept.get((side.name, level), {}) for side in sides}
+        left, right = (_at_level(side.rgb, level) for side in sides)
+        rotations = {AS_GIVEN: np.eye(3)}
+        if self.controls:
+            rng = np.random.default_rng([self.seed, zlib.crc32(pair.name.encode())])
+            rotations[ROTATED] = random_rotation(rng)
+        views = [_depth_view(side) for side in sides]
+        overlap = None if None in views else _defined(fov_overlap(*views))  # type: ignore[arg-type]
+        rows: list[Row] = []
         found: dict[str, dict[str, Found]] = {}
-        scored: list[Scored] = []
-        for condition, turn in turns.items():
-            found[condition] = {}
-            for name in self.representations.names:
-                both = self._found(pair, images[condition], level, condition, name)
-                found[condition][name] = both
-                scored.append(seen.scored(both, turn, condition, name))
-        entry = PairEntry(
-            name=pair.name,
-            split=pair.split,
-            left=pair.left.name,
-            right=pair.right.name,
-            rows=rows,
-            level=level,
-            fov_overlap=seen.fov_overlap(),
-            has_geometry=seen.has_geometry,
-            scored=tuple(scored),
-            seconds=round(time.monotonic() - begun, 2),
-        )
-        return Comparison(entry, found, images)
+        images: dict[str, tuple[NDArray[np.uint8], NDArray[np.uint8]]] = {}
+        for condition, rotation in rotations.items():
+            images[condition] = (
+                left,
+                right if condition == AS_GIVEN else rotate_equirect(right, rotation),
+            )
+            found[condition] = self._matched(pair, images[condition], level, condition)
+            for name, one in found[condition].items():
+                row = {
+                    "pair": pair.name,
+                    "split": pair.split,
+                    "left": pair.left.name,
+                    "right": pair.right.name,
+                    "level": level,
+                    "fov_overlap": overlap,
+                    "visible_by": "all keypoints" if overlap is None else "depth",
+                    "condition": condition,
+                    "representation": name,
+                }
+                rows.append(row | self._figures(one, rotation, *views))
+        return Comparison(rows, found, images)
 
-    def _rows_and_level(self, pair: PanoramaPair) -> tuple[int, int]:
-        """Rows of the larger panorama, and the level to detect keypoints at.
-
-        Raises:
-            SettingError: The level is finer than the panorama, which would only be magnified, or
-                too coarse for a base level.
-        """
-        larger = max(pair.left, pair.right, key=lambda side: side.rgb.shape[0])
-        rows = larger.rgb.shape[0]
+    def _level(self, pair: PanoramaPair) -> int:
+        rows = max(side.rgb.shape[0] for side in (pair.left, pair.right))
         own = nearest_level(rows)
-        of_panorama = f"that of {larger.name}, {rows} rows"
         if self.level is not None and self.level > own:
-            raise SettingError("level", found=self.level, expected=f"at most {own}, {of_panorama}")
-        level = own if self.level is None else self.level
-        reason = f"The level is {of_panorama}." if self.level is None else ""
-        self.representations.check_level(level, reason)
-        return rows, level
+            expected = f"at most {own}, that of pair {pair.name} with {rows} rows"
+            raise SettingError("level", found=self.level, expected=expected)
+        return own if self.level is None else self.level
 
-    def _found(
+    def _matched(
         self,
         pair: PanoramaPair,
         images: tuple[NDArray[np.uint8], NDArray[np.uint8]],
         level: int,
         condition: str,
-        name: str,
-    ) -> Found:
-        left = self._detected(pair.left, images[0], level, name)
-        if condition == AS_GIVEN:
-            right = self._detected(pair.right, images[1], level, name)
-        else:
-            right = self.representations.detect(images[1], level, name)
-        how = self.matching
-        matches = match(
-            left.descriptors,
-            right.descriptors,
-            self.representations.detector.norm,
-            how.ratio,
-            mutual=how.mutual,
-        )
-        geometry = estimate_two_view(
-            left.directions_xyz[matches[:, 0]],
-            right.directions_xyz[matches[:, 1]],
-            how.max_error_deg,
-            seed=how.seed,
-        )
-        return Found(left, right, matches, geometry)
+    ) -> dict[str, Found]:
+        grids = {f"L{b}": TangentGrid(b, level) for b in self.base_levels}
+        found: dict[str, Found] = {}
+        for name in self.representations:
+            both = []
+            for side, image in zip((pair.left, pair.right), images, strict=True):
+                rotated = condition == ROTATED and side is pair.right
+                kept = {} if rotated else self._kept[side.name, level]
+                if name not in kept:
+                    kept[name] = self._detect(image, level, name, grids.get(name))
+                both.append(kept[name])
+            left, right = both
+            matches = match(
+                left.descriptors,
+                right.descriptors,
+                self.detector.norm,
+                self.ratio,
+                mutual=self.mutual,
+            )
+            rays = left.directions_xyz[matches[:, 0]], right.directions_xyz[matches[:, 1]]
+            geometry = estimate_two_view(*rays, self.max_error_deg, seed=self.seed)
+            found[name] = Found(left, right, matches, geometry)
+        return found
 
-    def _detected(
-        self, panorama: PairedPanorama, image: NDArray[np.uint8], level: int, name: str
+    def _detect(
+        self, rgb: NDArray[np.uint8], level: int, name: str, grid: TangentGrid | None
     ) -> SphericalKeypoints:
-        """Keypoints of a panorama that may be in several pairs."""
-        key = (panorama.name, level)
-        kept = self._kept.setdefault(key, {})
-        self._kept.move_to_end(key)
-        while len(self._kept) > _PANORAMAS_KEPT:
-            self._kept.popitem(last=False)
-        if name not in kept:
-            kept[name] = self.representations.detect(image, level, name)
-        return kept[name]
+        if grid is not None:
+            return detect_on_tangent_images(rgb, grid, self.detector, self.margin)
+        if name == SHRUNK:
+            rgb = _shrunk(rgb, shrunk_rows(level))
+        return detect_on_equirect(rgb, self.detector)
+
+    def _figures(
+        self,
+        found: Found,
+        rotation: NDArray[np.float64],
+        left: DepthView | None,
+        right: DepthView | None,
+    ) -> Row:
+        visible = keypoints = (len(found.left), len(found.right))
+        truth: Row = dict.fromkeys(_TRUTH)
+        if left is not None and right is not None:
+            visible, truth = _truth(found, rotation, left, right, self.max_error_deg)
+        putative, inliers = len(found.matches), int(found.geometry.inliers.sum())
+        return {
+            "keypoints_left": keypoints[0],
+            "keypoints_right": keypoints[1],
+            "visible_left": visible[0],
+            "visible_right": visible[1],
+            "putative": putative,
+            "inliers": inliers,
+            "pmr": putative * sum(1 / n for n in visible) / 2 if all(visible) else None,
+            "ms": inliers * sum(1 / n for n in visible) / 2 if all(visible) else None,
+            "p": inliers / putative if putative else None,
+            "geometry": found.geometry.kind,
+            **truth,
+        }
+
+
+_TRUTH = ("rotation_error_deg", "translation_error_deg", "judged", "correct")
+
+
+def _truth(
+    found: Found,
+    rotation: NDArray[np.float64],
+    left: DepthView,
+    right: DepthView,
+    max_error_deg: float,
+) -> tuple[tuple[int, int], Row]:
+    """Visible keypoints on either side, and the figures that need depth and pose."""
+    left_xyz = found.left.directions_xyz
+    # Back to the right panorama as it is, whose depth needs no resampling.
+    right_xyz = found.right.directions_xyz @ rotation
+    visible = visible_from(left_xyz, left, right), visible_from(right_xyz, right, left)
+    first, second = found.matches.T
+    judged = correct_matches(left_xyz[first], right_xyz[second], left, right, max_error_deg)
+    rotated = PanoramaPose(right.pose.world_from_panorama @ rotation.T, right.pose.location_m)
+    errors = found.geometry.pose_error_deg(left.pose, rotated)
+    figures = (*map(_defined, errors), int(judged.known.sum()), int(judged.correct.sum()))
+    counts = int(visible[0].sum()), int(visible[1].sum())
+    return counts, dict(zip(_TRUTH, figures, strict=True))
+
+
+def _depth_view(panorama: PairedPanorama) -> DepthView | None:
+    if panorama.distance_m is None or panorama.pose is None:
+        return None
+    return DepthView(panorama.distance_m, panorama.pose)
+
+
+def _defined(value: float) -> float | None:
+    """A figure, or None where it is undefined: JSON has no NaN."""
+    return float(value) if math.isfinite(value) else None
+
+
+def shrunk_rows(level: int) -> int:
+    """Rows of a panorama whose pixels are as large as those of tangent images of a level.
+
+    Tangent images have pixels R_v(b−1)/2^(s−b) wide, more than the π/2^(s+1) of the panorama:
+    0.709 times as many fit. Fewer, larger pixels show less noise, so that this much of a gain has
+    nothing to do with distortion. Base levels 0 and 1 have the same pixels, those of level 2 are
+    6 % larger.
+
+    >>> shrunk_rows(10)
+    1453
+    """
+    return round(math.pi / TangentGrid(0, level).pitch)
+
+
+def _at_level(rgb: NDArray[np.uint8], level: int) -> NDArray[np.uint8]:
+    return _shrunk(rgb, equirect_shape(level)[0])
+
+
+def _shrunk(rgb: NDArray[np.uint8], rows: int) -> NDArray[np.uint8]:
+    """A panorama, averaged over areas where it has more rows."""
+    if rgb.shape[0] <= rows:
+        return rgb
+    return cv2.resize(rgb, (2 * rows, rows), interpolation=cv2.INTER_AREA)

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from datamodules.core.image_pairs import ImagePairs
+from datamodules.core.panorama_pairs import ImagePairs
 from tangent_train.errors import DataError, SettingError
 
 
@@ -29,70 +29,54 @@ def folder(tmp_path: Path) -> Path:
 
 def test_two_files(folder: Path) -> None:
     pairs = ImagePairs(left=str(folder / "b.png"), right=str(folder / "a.png"))
-    assert len(pairs) == 1
-    assert pairs.name(0) == "b – a"
+    assert pairs.names == ["b – a"]
     pair = pairs.read(0)
     assert (pair.left.name, pair.right.name, pair.split) == ("b", "a", None)
     assert pair.left.rgb[0, 0].tolist() == [255, 0, 10]
-    assert pair.left.distance_m is None
-    assert pair.left.pose is None
+    assert (pair.left.distance_m, pair.left.pose) == (None, None)
     assert pair.left.file == folder / "b.png"
 
 
 def test_the_pairs_of_a_folder(folder: Path) -> None:
-    following = ImagePairs(input=str(folder))
-    assert [following.name(k) for k in range(len(following))] == ["a – b", "b – d", "d – e"]
+    assert ImagePairs(input=str(folder)).names == ["a – b", "b – c/d", "c/d – e"]
     every = ImagePairs(input=str(folder / "*.png"), pairing="all")
-    assert [every.name(k) for k in range(len(every))] == ["a – b", "a – e", "b – e"]
+    assert every.names == ["a – b", "a – e", "b – e"]
 
 
 def test_namesakes_are_told_apart(tmp_path: Path) -> None:
     for name in ("one/room.png", "two/room.png", "two/room.jpg"):
         _write(tmp_path / name, 0)
-    pairs = ImagePairs(input=str(tmp_path / "*" / "room.png"))
-    assert pairs.name(0) == "one/room – two/room"
-    kinds = ImagePairs(input=str(tmp_path / "two"))
-    assert kinds.name(0) == "room.jpg – room.png"
+    pattern = str(tmp_path / "*" / "room.png")
+    assert ImagePairs(input=pattern).names == ["one/room – two/room"]
+    assert ImagePairs(input=str(tmp_path / "two")).names == ["room.jpg – room.png"]
     twice = ImagePairs(left=str(tmp_path / "one/room.png"), right=str(tmp_path / "one/room.png"))
-    assert twice.name(0) == "room – room"
+    assert twice.names == ["room – room"]
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({}, "input: found none"),
+        ({}, "input: found left=None"),
         ({"left": "a.png"}, "input: found left=a.png"),
         ({"left": "a.png", "right": "b.png", "input": "x"}, "input: found left=a.png"),
-        ({"left": "a.png", "input": "x"}, "input: found left=a.png, input=x"),
         ({"input": ".", "pairing": "every"}, "pairing: found every"),
-        ({"left": ".", "right": "a.png"}, "left: found 4 images"),
-        ({"left": "a.png", "right": "nofile.png"}, "right: no such file: nofile.png"),
+        ({"left": ".", "right": "a.png"}, ".: found 5; expected two panoramas"),
+        ({"left": "a.png", "right": "nofile.png"}, "nofile.png"),
+        ({"input": "a.png"}, "a.png: found 1; expected two panoramas or more"),
     ],
 )
 def test_settings_that_do_not_fit_are_named(
     folder: Path, monkeypatch: pytest.MonkeyPatch, settings: dict[str, Any], message: str
 ) -> None:
     monkeypatch.chdir(folder)
-    with pytest.raises(SettingError, match=re.escape(message)):
+    with pytest.raises((SettingError, DataError), match=re.escape(message)):
         ImagePairs(**settings)
-
-
-def test_one_panorama_is_no_pair(tmp_path: Path) -> None:
-    _write(tmp_path / "a.png", 0)
-    with pytest.raises(DataError, match="two panoramas or more"):
-        ImagePairs(input=str(tmp_path))
 
 
 def test_photos_are_refused_when_read_and_a_column_too_many_is_not(tmp_path: Path) -> None:
     _write(tmp_path / "a.png", 0, (8, 17))
     _write(tmp_path / "b.png", 0, (8, 12))
-    pairs = ImagePairs(input=str(tmp_path))
-    with pytest.raises(
-        DataError, match=r"b\.png: found 8×12 pixels; .* GPano tags that say where it lies\.$"
-    ):
-        pairs.read(0)
-    assert ImagePairs(str(tmp_path / "a.png"), str(tmp_path / "a.png")).read(0).left.rgb.shape == (
-        8,
-        16,
-        3,
-    )
+    with pytest.raises(DataError, match=r"b\.png: found 8×12 pixels"):
+        ImagePairs(input=str(tmp_path)).read(0)
+    path = str(tmp_path / "a.png")
+    assert ImagePairs(path, path).read(0).left.rgb.shape == (8, 16, 3)

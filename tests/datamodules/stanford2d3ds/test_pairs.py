@@ -60,30 +60,13 @@ def test_the_table_is_the_papers() -> None:
     assert smallest_easy == max(pair.fov_overlap for pair in pairs if pair.split == "hard") == 0.86
 
 
-# The paper's means, of rounded figures: within 0.1 point, except one cell that is a misprint there.
-PAPER_MEANS = {
-    "easy": ((26.3, 13.6, 46.0), (32.4, 16.6, 46.4), (34.6, 17.7, 47.5), (31.9, 16.1, 46.5)),
-    "hard": ((22.2, 8.2, 36.9), (28.4, 11.1, 39.5), (30.1, 11.7, 39.6), (27.4, 10.9, 40.2)),
-}
-
-
-@pytest.mark.parametrize("split", ["easy", "hard"])
-def test_single_results_have_the_means_that_the_paper_prints(split: str) -> None:
-    scores = [list(p.scores.values()) for p in published_pairs() if p.split == split]
-    away = np.abs(100 * np.mean(scores, axis=0) - PAPER_MEANS[split])
-    if split == "hard":
-        assert 0.2 < away[1, 0] < 0.3
-        away[1, 0] = 0
-    assert away.max() < 0.16
-
-
 # Files are found by the beginnings of their names.
 
 
 def test_all_pairs_are_found(area: Path) -> None:
     pairs = StanfordPairs(area)
-    assert pairs.is_published
-    assert [pairs.name(k) for k in range(len(pairs))] == [str(k) for k in range(60)]
+    assert list(pairs.published) == pairs.names == [str(k) for k in range(60)]
+    assert len(pairs.files) == 120
     pair = pairs.read(24)
     assert (pair.name, pair.split) == ("24", "easy")
     assert re.fullmatch(r"area_1/hallway_6/ee20957[0-9a-f]{25}", pair.left.name)
@@ -104,34 +87,19 @@ def test_missing_and_ambiguous_names_are_told_at_once(area: Path, tmp_path: Path
     # The same beginning in another room is another panorama.
     write_panorama(root, "5a18aa0" + "a" * 25, "office_99", 0)
     message = (
-        "not there: 33e598f_office_15, f85a909_office_3; fits several: 5512025_office_23; expected"
+        "33e598f_office_15 (0 times), 5512025_office_23 (2 times), f85a909_office_3 (0 times); "
     )
     with pytest.raises(DataError, match=re.escape(message)):
-        len(StanfordPairs(root))
+        _ = StanfordPairs(root).names
 
 
 def test_what_is_not_there_is_said(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"area_1.*Get Stanford2D3DS"):
-        len(StanfordPairs(tmp_path))
-    with pytest.raises(DataError, match=r"no area; expected area_1"):
-        len(StanfordPairs(tmp_path, "rooms"))
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"pairs": "all"}, "data.pairs: found all"),
-        ({"areas": ["1"]}, "data.areas"),
-        ({"pairs": "rooms", "areas": ["7"]}, "data.areas"),
-        ({"erp_height": 0}, "data.erp_height"),
-        ({"erp_height": 2.5}, "data.erp_height"),
-    ],
-)
-def test_settings_that_cannot_work_are_named(
-    area: Path, settings: dict[str, Any], message: str
-) -> None:
-    with pytest.raises(SettingError, match=re.escape(message)):
-        StanfordPairs(area, **settings)
+        _ = StanfordPairs(tmp_path).names
+    with pytest.raises(DataError, match=r"no two panoramas of one room; expected area_1"):
+        _ = StanfordPairs(tmp_path, "rooms").names
+    with pytest.raises(SettingError, match=r"data\.pairs: found all"):
+        StanfordPairs(tmp_path, "all")  # type: ignore[arg-type]
 
 
 def test_a_panorama_smaller_than_wanted_is_refused(area: Path) -> None:
@@ -153,13 +121,12 @@ def test_depth_of_another_size_is_refused(tmp_path: Path) -> None:
 
 def test_pairs_of_rooms(rooms: Path) -> None:
     pairs = SynthRoomsPairs(rooms, ROOMS)
-    names = [pairs.name(k) for k in range(len(pairs))]
-    assert len(set(names)) == len(names) >= 3
-    assert not pairs.is_published
+    assert len(set(pairs.names)) == len(pairs.names) >= 3
+    assert not pairs.published
     panoramas = sorted((rooms / "area_1/pano/rgb").iterdir())
     counts = Counter(re.split("_", path.name)[3] for path in panoramas)
-    assert len(pairs) == sum(math.comb(count, 2) for count in counts.values())
-    for index in range(len(pairs)):
+    assert len(pairs.names) == sum(math.comb(count, 2) for count in counts.values())
+    for index in range(len(pairs.names)):
         pair = pairs.read(index)
         assert pair.split is None
         left, right = (side.name.rpartition("/")[0] for side in (pair.left, pair.right))
@@ -204,9 +171,9 @@ def _disagreement(pair: PanoramaPair) -> float:
     return float(np.nanmedian(np.abs(found - predicted) / found))
 
 
-def test_depth_and_pose_of_made_rooms_agree(rooms: Path) -> None:
+def test_depth_and_pose_of_synthetic_rooms_agree(rooms: Path) -> None:
     pairs = SynthRoomsPairs(rooms, ROOMS)
-    for index in range(len(pairs)):
+    for index in range(len(pairs.names)):
         pair = pairs.read(index)
         assert _disagreement(pair) < 0.04
         wrong = pair._replace(left=pair.left._replace(pose=pair.right.pose))
@@ -229,10 +196,11 @@ def test_the_pose_is_the_documented_formula(rooms: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"camera_rt_matrix": None}, "camera_rt_matrix None; expected 3×4 numbers"),
-        ({"camera_rt_matrix": [[1, 2], [3]]}, "camera_rt_matrix"),
-        ({"camera_location": [0, 0, float("nan")]}, "camera_location"),
-        ({"camera_rt_matrix": [[1.0, 0, 0, 0]] * 3}, "no rotation"),
+        ({"camera_rt_matrix": None}, "not 3×4 numbers"),
+        ({"camera_rt_matrix": [[1, 2], [3]]}, "found ValueError"),
+        ({"camera_location": [0, 0, float("nan")]}, "not 3 numbers"),
+        ({"camera_rt_matrix": [[1e300, 0, 0, 0]] * 3}, "not 3×4 numbers"),
+        ({"camera_rt_matrix": [[1.0, 0, 0, 0]] * 3}, "rotation"),
     ],
 )
 def test_broken_poses_are_named(tmp_path: Path, change: dict[str, Any], message: str) -> None:

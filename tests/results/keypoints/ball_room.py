@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,11 +26,11 @@ def ball_panorama(name: str, pose: PanoramaPose, shape: tuple[int, int] = SHAPE)
     distance = -along + np.sqrt(along**2 + RADIUS_M**2 - pose.location_m @ pose.location_m)
     points = pose.points_m(directions, distance) / RADIUS_M
     rgb = np.repeat(_texture(points)[..., None], 3, axis=-1)
-    return PairedPanorama(name, rgb, distance.astype(np.float32), pose)
+    return PairedPanorama(name, rgb, Path(f"{name}.png"), distance.astype(np.float32), pose)
 
 
 def ball_pair(name: str = "ball", shape: tuple[int, int] = SHAPE) -> PanoramaPair:
-    """Two panoramas 0.5 m apart, turned any way."""
+    """Two panoramas 0.5 m apart, randomly rotated."""
     rng = np.random.default_rng(1)
     left = PanoramaPose(random_rotation(rng) @ FLIP_Y, [0.1, 0.2, -0.1])
     right = PanoramaPose(random_rotation(rng) @ FLIP_Y, [0.4, -0.2, -0.1])

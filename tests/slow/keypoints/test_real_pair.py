@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 from pathlib import Path
 
@@ -11,11 +10,13 @@ import numpy as np
 import pytest
 
 from tangent_train.geometry import TangentGrid
-from tangent_train.keypoints.detectors import Detector
-from tangent_train.keypoints.equirect import detect_on_equirect
-from tangent_train.keypoints.matching import match
-from tangent_train.keypoints.tangent import detect_on_tangent_images
-from tangent_train.keypoints.two_view import estimate_two_view
+from tangent_train.keypoints import (
+    Detector,
+    detect_on_equirect,
+    detect_on_tangent_images,
+    estimate_two_view,
+    match,
+)
 from tests.keypoints.scenes import angle_deg, rotation_angle_deg
 
 REAL_DATA = os.environ.get("TANGENT_REAL_DATA")
@@ -23,9 +24,6 @@ REAL_DATA = os.environ.get("TANGENT_REAL_DATA")
 
 @pytest.mark.real_data
 @pytest.mark.skipif(REAL_DATA is None, reason="TANGENT_REAL_DATA is not set")
-@pytest.mark.skipif(
-    importlib.util.find_spec("pycolmap") is None, reason="pycolmap is not installed"
-)
 @pytest.mark.parametrize("base_level", [None, 0, 1, 2])
 def test_one_camera_above_the_other(base_level: int | None) -> None:
     detector, found = Detector(), []

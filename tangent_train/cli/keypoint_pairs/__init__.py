@@ -1,1 +1,0 @@
-"""What tangent-keypoints is told, and where it leaves its results."""

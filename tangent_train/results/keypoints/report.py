@@ -1,0 +1,268 @@
+"""``results.json``, ``pairs.csv``, ``keypoints.md``: the paper's tables; pictures of matches."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tangent_train.csv_text import csv_text
+from tangent_train.files import write_text
+from tangent_train.results.keypoints.compare import AS_GIVEN, ROTATED, Comparison, Row
+from tangent_train.results.tables import Table, percent
+
+if TYPE_CHECKING:
+    from datamodules.core.panorama_pairs import PublishedPair
+
+__all__ = ["KeypointReport", "matches_png", "with_splits"]
+
+_CONDITIONS = {AS_GIVEN: "As they are", ROTATED: "Right panorama randomly rotated"}
+_SCORES = {"pmr": "PMR %", "ms": "MS %", "p": "P %"}
+_MEDIANS = {
+    "rotation_error_deg": "rotation error °, median",
+    "translation_error_deg": "translation error °, median",
+}
+_BY_DEPTH = (
+    "n_L and n_R are the keypoints visible to the other panorama, by depth and pose and with "
+    "occlusion."
+)
+_ALL = (
+    "n_L and n_R are all keypoints, as depth and pose are unknown: PMR and MS are smaller than "
+    "among the visible ones."
+)
+_MOST_LINES = 150
+
+
+@dataclass(frozen=True)
+class KeypointReport:
+    """All tables over the pairs of one data set.
+
+    Attributes:
+        rows: From `Comparer.compare`, of all pairs.
+        representations: In the order of the columns.
+        settings: What decides the figures.
+        published: The paper's pairs by name, where the data are those; else empty.
+    """
+
+    rows: Sequence[Row]
+    representations: Sequence[str]
+    settings: Mapping[str, Any]
+    published: Mapping[str, PublishedPair]
+
+    def write(self, folder: Path) -> None:
+        """Write ``results.json``, ``pairs.csv`` and ``keypoints.md``."""
+        rows = with_splits(self.rows)
+        write_text(folder / "pairs.csv", csv_text(list(rows[0]), rows))
+        write_text(folder / "keypoints.md", self.markdown())
+        content = {"settings": self.settings, "rows": self.rows}
+        write_text(
+            folder / "results.json", json.dumps(content, indent=1, ensure_ascii=False) + "\n"
+        )
+
+    def markdown(self) -> str:
+        """All tables."""
+        settings = ", ".join(f"{k} {v}" for k, v in self.settings.items() if k != "data")
+        by_depth = {row["visible_by"] == "depth" for row in self.rows}
+        head = [f"# Keypoints\n\nSettings: {settings}.\n"]
+        head += [
+            f"{text}\n" for known, text in ((True, _BY_DEPTH), (False, _ALL)) if known in by_depth
+        ]
+        tables = [self._splits(), *self.means(), *map(self._per_pair, self._conditions())]
+        return "\n".join([*head, *(table.markdown() for table in tables)])
+
+    def means(self) -> list[Table]:
+        """Means over the pairs of each split, a table for each condition."""
+        header = ("split", "metric", *self.representations)
+        return [
+            Table(
+                _CONDITIONS[condition],
+                header,
+                list(self._mean_rows(condition)),
+                text_columns=(0, 1),
+            )
+            for condition in self._conditions()
+        ]
+
+    def _conditions(self) -> list[str]:
+        return [c for c in _CONDITIONS if any(row["condition"] == c for row in self.rows)]
+
+    def _mean_rows(self, condition: str) -> Iterator[Sequence[str]]:
+        for split, rows in _by_split(self.rows).items():
+            chosen = [
+                [r for r in rows if (r["condition"], r["representation"]) == (condition, name)]
+                for name in self.representations
+            ]
+            printed = self._printed(split) if condition == AS_GIVEN else {}
+            title = f"{split} ({len({row['pair'] for row in rows})})"
+            for key, metric in _SCORES.items():
+                yield (title, metric, *(percent(_mean(part, key)) for part in chosen))
+                title = ""
+                if key in printed:
+                    shares = (printed[key].get(name) for name in self.representations)
+                    yield ("", f"{metric}, paper", *(percent(_number(share)) for share in shares))
+            if any(row["judged"] is not None for part in chosen for row in part):
+                shares_ = (_mean_of(map(_correct_share, part)) for part in chosen)
+                yield ("", "right matches %", *map(percent, shares_))
+            counts = (_mean_of(map(_keypoints, part)) for part in chosen)
+            yield ("", "keypoints", *(_text(count, 0) for count in counts))
+            yield ("", "inliers", *(_text(_mean(part, "inliers"), 0) for part in chosen))
+            for key, metric in _MEDIANS.items():
+                medians = [_median(part, key) for part in chosen]
+                if any(median is not None for median in medians):
+                    yield ("", metric, *(_text(median, 2) for median in medians))
+
+    def _splits(self) -> Table:
+        rows: list[Sequence[str]] = []
+        for split, found in _by_split(self.rows).items():
+            erp = [r for r in found if (r["condition"], r["representation"]) == (AS_GIVEN, "ERP")]
+            overlap, inliers = _mean(erp, "fov_overlap"), _mean(erp, "inliers")
+            rows.append((split, str(len(erp)), percent(overlap), _text(inliers, 0)))
+            if printed := self._printed(split):
+                share = 100 * float(printed["fov_overlap"]["ERP"])
+                rows.append(("paper", "30", f"{share:.2f}", printed["inliers"]["ERP"]))
+        header = ("split", "pairs", "overlap of the fields of view %", "inliers on ERP")
+        return Table("Pairs", header, rows)
+
+    def _printed(self, split: str) -> Mapping[str, Mapping[str, str]]:
+        """The paper's figures of a split by name and representation, if the pairs are its own."""
+        return _paper().get(split, {}) if self.published else {}
+
+    def _per_pair(self, condition: str) -> Table:
+        header = ("pair", "split", "overlap %", *self.representations)
+        rows: list[Sequence[str]] = []
+        for name, found in _grouped(with_splits(self.rows), "pair").items():
+            of = {r["representation"]: r for r in found if r["condition"] == condition}
+            one = found[0]
+            cells = [_triple([of[n][key] for key in _SCORES]) for n in self.representations]
+            rows.append((name, one["split"] or "–", percent(one["fov_overlap"]), *cells))
+            printed = self.published.get(name)
+            if printed is not None and condition == AS_GIVEN:
+                cells = [_triple(printed.scores.get(n, (None,) * 3)) for n in self.representations]
+                rows.append(("paper", "", percent(printed.fov_overlap), *cells))
+        title = f"Per pair: {_CONDITIONS[condition].lower()}"
+        return Table(title, header, rows, note="PMR / MS / P in percent.", text_columns=(0, 1))
+
+
+def with_splits(rows: Sequence[Row]) -> list[Row]:
+    """Divide pairs in two halves by their overlaps, as the paper's are, where no split is given.
+
+    Args:
+        rows: Of all pairs.
+
+    Returns:
+        The half with the smaller overlaps is ``hard``, the other, which may have one more,
+        ``easy``. Nothing is divided where an overlap is unknown or all are the same.
+    """
+    overlaps = {row["pair"]: row["fov_overlap"] for row in rows}
+    given = any(row["split"] for row in rows)
+    if given or None in overlaps.values() or len(set(overlaps.values())) < 2:
+        return list(rows)
+    ordered = sorted(overlaps, key=lambda name: overlaps[name])
+    hard = set(ordered[: len(ordered) // 2])
+    return [{**row, "split": "hard" if row["pair"] in hard else "easy"} for row in rows]
+
+
+def _by_split(rows: Sequence[Row]) -> dict[str, list[Row]]:
+    groups = _grouped(with_splits(rows), "split")
+    order = sorted(groups, key=lambda name: (name != "hard", name != "easy"))
+    return {name or "all": groups[name] for name in order}
+
+
+def _grouped(rows: Sequence[Row], key: str) -> dict[Any, list[Row]]:
+    groups: dict[Any, list[Row]] = {}
+    for row in rows:
+        groups.setdefault(row[key], []).append(row)
+    return groups
+
+
+def _paper() -> dict[str, dict[str, dict[str, str]]]:
+    """The tables of the paper by split, figure and representation."""
+    text = Path(__file__).with_name("paper.csv").read_text(encoding="utf-8")
+    found: dict[str, dict[str, dict[str, str]]] = {}
+    for row in csv.DictReader(io.StringIO(text)):
+        found.setdefault(row["split"], {})[row["figure"]] = row
+    return found
+
+
+def _correct_share(row: Row) -> float | None:
+    return row["correct"] / row["judged"] if row["judged"] else None
+
+
+def _keypoints(row: Row) -> float:
+    return (row["keypoints_left"] + row["keypoints_right"]) / 2
+
+
+def _mean(rows: Sequence[Row], key: str) -> float | None:
+    return _mean_of(row[key] for row in rows)
+
+
+def _mean_of(values: Iterable[float | None]) -> float | None:
+    """Mean over the pairs of which the figure is defined."""
+    known = [value for value in values if value is not None]
+    return sum(known) / len(known) if known else None
+
+
+def _median(rows: Sequence[Row], key: str) -> float | None:
+    known = [row[key] for row in rows if row[key] is not None]
+    return float(np.median(known)) if known else None
+
+
+def _number(text: str | None) -> float | None:
+    return float(text) if text else None
+
+
+def _text(value: float | None, digits: int) -> str:
+    return "–" if value is None else f"{value:.{digits}f}"
+
+
+def _triple(scores: Sequence[float | None]) -> str:
+    return "–" if all(s is None for s in scores) else " / ".join(map(percent, scores))
+
+
+def matches_png(comparison: Comparison, condition: str) -> bytes:
+    """A picture of the matches of one pair, a panel for each representation.
+
+    The left panorama is above the right one. Lines join up to 150 inliers, coloured by their
+    longitude on the left, the shorter way around; red dots are other matches.
+
+    Args:
+        comparison: The compared pair.
+        condition: One of its conditions.
+
+    Returns:
+        A PNG file.
+    """
+    from matplotlib.collections import LineCollection
+    from matplotlib.figure import Figure
+
+    left, right = comparison.images[condition]
+    (rows, width), found = left.shape[:2], comparison.found[condition]
+    figure = Figure((8 * len(found), 8), layout="constrained")
+    panels = figure.subplots(1, len(found), squeeze=False)[0]
+    for axes, (name, one) in zip(panels, found.items(), strict=True):
+        axes.imshow(left, extent=(-0.5, width - 0.5, rows - 0.5, -0.5), alpha=0.6)
+        axes.imshow(right, extent=(-0.5, width - 0.5, 2 * rows - 0.5, rows - 0.5), alpha=0.6)
+        starts = one.left.equirect_pixels((rows, width))[one.matches[:, 0]]
+        ends = one.right.equirect_pixels((rows, width))[one.matches[:, 1]] + np.array([0, rows])
+        inliers = one.geometry.inliers
+        for dots in (starts[~inliers], ends[~inliers]):
+            axes.plot(*dots.T, ".", color="darkred", markersize=3)
+        shown = np.random.default_rng(0).permutation(np.flatnonzero(inliers))[:_MOST_LINES]
+        lines = np.stack([starts[shown], ends[shown]], axis=1)
+        lines[:, 1, 0] += width * np.rint((lines[:, 0, 0] - lines[:, 1, 0]) / width)
+        for shift in (-width, 0, width):  # what leaves at one side comes back at the other
+            moved = lines + np.array([shift, 0])
+            axes.add_collection(
+                LineCollection(list(moved), array=starts[shown, 0], cmap="hsv", clim=(0, width))
+            )
+        axes.set(xlim=(-0.5, width - 0.5), ylim=(2 * rows - 0.5, -0.5), xticks=[], yticks=[])
+        axes.set_title(f"{name}: {len(inliers)} matches, {int(inliers.sum())} inliers")
+    file = io.BytesIO()
+    figure.savefig(file, format="png")
+    return file.getvalue()
