@@ -71,48 +71,18 @@ class PanoramaArea:
         height, width = self.full_shape
         return self.rows == (0, height) and self.columns == (0, width)
 
-    @property
-    def known(self) -> NDArray[np.bool_]:
-        """``(H, W)``: where the image is."""
-        return self.place(np.ones(self.image_shape, np.bool_))
-
-    def place(self, image: NDArray[_Pixel], fill: float = 0) -> NDArray[_Pixel]:
-        """Lay the image onto the whole panorama.
-
-        Args:
-            image: ``(h, w[, C])``.
-            fill: Value of all other pixels.
-
-        Returns:
-            ``(H, W[, C])``; the image itself if it is the whole panorama.
-
-        Raises:
-            ValueError: The image has another size.
-        """
-        if image.shape[:2] != self.image_shape:
-            raise ValueError(f"an image of {image.shape[:2]} pixels; expected {self.image_shape}")
+    def place(self, image: NDArray[_Pixel]) -> NDArray[_Pixel]:
+        """Lay the image ``(h, w[, C])`` onto a panorama ``(H, W[, C])`` that is 0 elsewhere."""
         rows, columns = slice(*self.rows), np.arange(*self.columns) % self.full_shape[1]
         placed = resize_nearest(image, (self.rows[1] - self.rows[0], len(columns)))
         if self.is_whole:
             return placed
-        whole = np.full((*self.full_shape, *image.shape[2:]), fill, image.dtype)
+        whole = np.zeros((*self.full_shape, *image.shape[2:]), image.dtype)
         whole[rows, columns] = placed
         return whole
 
     def cut(self, whole: NDArray[_Pixel]) -> NDArray[_Pixel]:
-        """Take the image's part out of a whole panorama; the inverse of `place`.
-
-        Args:
-            whole: ``(H, W[, C])``.
-
-        Returns:
-            ``(h, w[, C])``.
-
-        Raises:
-            ValueError: The panorama has another size.
-        """
-        if whole.shape[:2] != self.full_shape:
-            raise ValueError(f"a panorama of {whole.shape[:2]}; expected {self.full_shape}")
+        """The image's part ``(h, w[, C])`` of a panorama ``(H, W[, C])``; inverse of `place`."""
         rows, columns = self.places()
         return whole[rows[:, None], columns]
 
@@ -295,23 +265,13 @@ def _area(
             expected=f"at most {_MOST_COLUMNS}",
             remedy="Shrink the image, or take it as a photo (projection=perspective).",
         )
-    rows = _span(down, full_height, size[0])
-    first, end = _span(across, 2 * full_height, size[1])
-    end = min(end, first + 2 * full_height)
-    turns = first // (2 * full_height) * 2 * full_height
-    bottom = min(rows[1], full_height)
-    top = max(0, bottom - (rows[1] - rows[0]))
-    return PanoramaArea(
-        (full_height, 2 * full_height), (top, bottom), (first - turns, end - turns), size
-    )
-
-
-def _span(share: tuple[float, float], whole: int, pixels: int) -> tuple[int, int]:
-    """First and end of a span that has its own number of pixels, if that is right within one."""
-    first = round(share[0] * whole)
-    exact = share[1] * whole
-    count = pixels if abs(exact - pixels) < 1 else max(1, round(exact))
-    return first, first + count
+    full_width = 2 * full_height
+    left, width = round(across[0] * full_width) % full_width, min(size[1], full_width)
+    exact = down[1] * full_height
+    height = size[0] if abs(exact - size[0]) < 1 else max(1, round(exact))
+    height = min(height, full_height)
+    top = min(round(down[0] * full_height), full_height - height)
+    return PanoramaArea((full_height, full_width), (top, top + height), (left, left + width), size)
 
 
 def _agree(one: float, other: float) -> bool:

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from PIL import ExifTags, Image, ImageOps
 
 from datamodules.images.pixel_files import (
-    PIXEL_SUFFIXES,
     check_writable,
     photo_fov_deg,
     read_depth_m,
@@ -67,15 +66,7 @@ def test_what_is_written_is_read(
     np.testing.assert_array_equal(again, pixels)
 
 
-@pytest.mark.parametrize("suffix", [".png", ".tif"])
-def test_other_programs_see_the_same_colours(suffix: str, tmp_path: Path) -> None:
-    pixels = _pixels(np.uint8, 7, 9, 3)
-    write_pixels(tmp_path / f"a{suffix}", pixels)
-    with Image.open(tmp_path / f"a{suffix}") as image:
-        np.testing.assert_array_equal(np.asarray(image), pixels)
-
-
-@pytest.mark.parametrize("suffix", [".jpg", ".jpeg", ".webp"])
+@pytest.mark.parametrize("suffix", [".jpg", ".webp"])
 def test_lossy_formats_keep_the_order_of_colours(suffix: str, tmp_path: Path) -> None:
     pixels = np.full((16, 16, 3), (200, 100, 20), np.uint8)
     write_pixels(tmp_path / f"a{suffix}", pixels)
@@ -94,17 +85,6 @@ def test_transparency_is_left_out(tmp_path: Path) -> None:
     np.testing.assert_array_equal(
         read_pixels(tmp_path / "deep.png", indices=True), deep[..., 2::-1]
     )
-
-
-def test_palettes(tmp_path: Path) -> None:
-    indices = np.arange(12, dtype=np.uint8).reshape(3, 4)
-    image = Image.fromarray(indices)
-    image = Image.frombytes("P", (4, 3), indices.tobytes())
-    image.putpalette([value for k in range(12) for value in (k, 2 * k, 255 - k)])
-    image.save(tmp_path / "a.png")
-    np.testing.assert_array_equal(read_pixels(tmp_path / "a.png", indices=True), indices)
-    colors = read_pixels(tmp_path / "a.png", indices=False)
-    np.testing.assert_array_equal(colors[2, 1], (9, 18, 246))
 
 
 def test_one_channel_arrays_have_no_axis_for_it(tmp_path: Path) -> None:
@@ -154,13 +134,11 @@ def _npy(array: Any) -> bytes:
     ("name", "content"),
     [
         ("a.npy", b""),
-        ("a.npy", b"no array"),
         ("a.npy", _npz()),
         ("a.npy", _npy(np.array([{}]))),
         ("a.npy", _npy(np.ones(4))),
         ("a.npy", _npy(np.ones((0, 4)))),
         ("a.npy", _npy(np.array([["a"]]))),
-        ("a.png", b""),
         ("a.png", b"\x89PNG\r\n\x1a\n" + b"\0" * 16 + b"\x10\x02"),
         ("a.tif", b"II*\0\0\0\0\0"),
         ("a.jpg", b"no image"),
@@ -170,12 +148,6 @@ def test_broken_files(name: str, content: bytes, tmp_path: Path) -> None:
     (tmp_path / name).write_bytes(content)
     with pytest.raises(DataError, match=name):
         read_pixels(tmp_path / name, indices=True)
-
-
-@pytest.mark.parametrize("suffix", [*PIXEL_SUFFIXES, ".exr"])
-def test_missing_files(suffix: str, tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=f"a{suffix}"):
-        read_pixels(tmp_path / f"a{suffix}", indices=True)
 
 
 # Colours
@@ -263,6 +235,7 @@ def test_grey_palette_and_transparency(tmp_path: Path) -> None:
         "palette": colors[alpha % 4],
         "see_through": colors[alpha % 4],
     }
+    np.testing.assert_array_equal(read_pixels(tmp_path / "palette.png", indices=True), alpha % 4)
     for name, pixels in expected.items():
         np.testing.assert_array_equal(read_rgb(tmp_path / f"{name}.png"), pixels, err_msg=name)
 
