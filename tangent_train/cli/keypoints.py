@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from datamodules.core.panorama_pairs import PanoramaPair
 
-__all__ = ["keypoints"]
+__all__ = ["earlier_results", "file_name", "keypoints"]
 
 _OF_IMAGES = ("left", "right", "input", "pairing")
 _NOT_DECIDING = ("output", "max_pairs", *_OF_IMAGES)
@@ -54,7 +54,7 @@ def keypoints(config: Mapping[str, Any]) -> None:
     data, pairs = _pairs(config)
     deciding = {name: config[name] for name in config if name not in _NOT_DECIDING}
     settings = {**deciding, "data": data}
-    done = _earlier(output, settings)
+    done = earlier_results(output, settings)
     pairs.make_files()
     names = pairs.names[: values.optional_whole(config, "max_pairs", 1)]
     console = Console(soft_wrap=True, highlight=False)
@@ -74,7 +74,7 @@ def keypoints(config: Mapping[str, Any]) -> None:
         if index < values.whole(config, "pictures", 0):
             for condition in comparison.images:
                 write_bytes(
-                    output / "matches" / f"{index:03}_{_file_name(name)}_{condition}.png",
+                    output / "matches" / f"{index:03}_{file_name(name)}_{condition}.png",
                     matches_png(comparison, condition),
                 )
         done[name] = comparison.rows
@@ -83,9 +83,10 @@ def keypoints(config: Mapping[str, Any]) -> None:
 
 
 def _comparer(config: Mapping[str, Any]) -> Comparer:
-    base_levels = config["base_level"]
+    given = config["base_level"]
+    levels = given if isinstance(given, list) else [given]
     return Comparer(
-        base_levels=tuple(base_levels) if isinstance(base_levels, list) else (base_levels,),
+        base_levels=tuple(values.whole({"base_level": b}, "base_level", 0) for b in levels),
         detector=Detector(config["detector"]),
         margin=values.whole(config, "margin", 0),
         level=values.optional_whole(config, "level", 2),
@@ -111,7 +112,7 @@ def _pairs(config: Mapping[str, Any]) -> tuple[Any, PanoramaPairs]:
     return config["data"], make(config["data"], "data")
 
 
-def _earlier(output: Path, settings: Mapping[str, Any]) -> dict[str, list[Row]]:
+def earlier_results(output: Path, settings: Mapping[str, Any]) -> dict[str, list[Row]]:
     """Figures of the pairs that are done already, by name.
 
     Raises:
@@ -119,9 +120,12 @@ def _earlier(output: Path, settings: Mapping[str, Any]) -> dict[str, list[Row]]:
     """
     if not output.exists() or not any(output.iterdir()):
         return {}
+    done: dict[str, list[Row]] = {}
     try:
         content = parse_json((output / "results.json").read_bytes())
-        before, rows = content["settings"], content["rows"]
+        before = dict(content["settings"])
+        for row in content["rows"]:
+            done.setdefault(row["pair"], []).append(row)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise SettingError(
             "output", found=f"{output} with other files", expected="a new or empty folder"
@@ -134,9 +138,6 @@ def _earlier(output: Path, settings: Mapping[str, Any]) -> dict[str, list[Row]]:
                 expected=f"{before.get(name)}, as for the results in {output}",
                 remedy="Give another output, or remove that folder.",
             )
-    done: dict[str, list[Row]] = {}
-    for row in rows:
-        done.setdefault(row["pair"], []).append(row)
     return done
 
 
@@ -186,7 +187,7 @@ def _export(
     root = _root(files)
     names = tuple(file.absolute().relative_to(root).as_posix() for file in sides)
     for name, found_ in comparison.found[AS_GIVEN].items():
-        path = folder / _file_name(name) / "database.db"
+        path = folder / file_name(name) / "database.db"
         both = (found_.left, found_.right)
         add_pair(path, (names[0], names[1]), shapes, both, found_.matches, found_.geometry)
 
@@ -196,10 +197,10 @@ def _root(files: Sequence[Path]) -> Path:
     return Path(os.path.commonpath([file.absolute().parent for file in files]))
 
 
-def _file_name(name: str) -> str:
+def file_name(name: str) -> str:
     """A name as part of the name of a file, at most 80 characters.
 
-    >>> _file_name("hall/a – hall/b")
+    >>> file_name("hall/a – hall/b")
     'hall_a_hall_b'
     """
     return re.sub(r"[^\w.-]+", "_", name).strip("_.")[:80] or "pair"

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from datamodules.images.pixel_files import write_pixels
 from tangent_train.cli import main
-from tangent_train.cli.keypoint_pairs.folder import PICTURES, ResultsFolder
+from tangent_train.cli.keypoints import file_name
 from tangent_train.results.predictions import PredictionFolder, output_names
 from tests.inference.trained import write_checkpoint
 
@@ -40,8 +40,8 @@ def test_predictions_stay_in_their_folder(names: list[list[str]]) -> None:
 @example("..")
 @example("/etc/passwd")
 def test_pictures_of_pairs_stay_in_their_folder(name: str) -> None:
-    file = ResultsFolder(Path("/output"), {}).picture(3, name, "given")
-    assert file.parent == Path("/output", PICTURES)
+    assert Path("/output", file_name(name)).parent == Path("/output")
+    assert file_name(name).strip(".")
 
 
 def _run(monkeypatch: pytest.MonkeyPatch, command: str, *arguments: str) -> None:

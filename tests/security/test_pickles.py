@@ -19,7 +19,6 @@ from models.pretrained import read_tensors
 from tangent_train.checkpoints.content import read_checkpoint
 from tangent_train.checkpoints.trained import load_trained
 from tangent_train.cli import main
-from tangent_train.cli.keypoint_pairs.export import ColmapExport
 from tangent_train.errors import DataError
 from tangent_train.results.record import load_record
 from tests.inference.trained import write_checkpoint
@@ -149,14 +148,7 @@ def test_no_reader_unpickles(make: Any, name: str, created: Path, tmp_path: Path
         assert not created.exists()
 
 
-def test_neither_do_archives_of_keypoints_nor_results(created: Path, tmp_path: Path) -> None:
-    export = ColmapExport(tmp_path, "colmap_text", ("erp",))
-    part = export._part("erp", "pair", "a")
-    part.parent.mkdir(parents=True)
-    with part.open("wb") as file:
-        np.savez(file, sides=np.array([Creating(created)], object))
-    with pytest.raises(ValueError, match="allow_pickle=False"):
-        export.finish(["a"])
+def test_neither_do_results(created: Path, tmp_path: Path) -> None:
     _pickle(tmp_path / "results.json", created)
     with pytest.raises(DataError, match=r"results\.json"):
         load_record(tmp_path)

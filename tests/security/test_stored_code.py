@@ -39,7 +39,7 @@ from tangent_train.cli import main
 from tangent_train.cli import stored as stored_module
 from tangent_train.cli.build import build
 from tangent_train.cli.compose import check_overrides, config_folder
-from tangent_train.cli.keypoint_pairs.folder import RESULTS, ResultsFolder
+from tangent_train.cli.keypoints import earlier_results
 from tangent_train.cli.stored import CHOOSABLE, StoredRun, stored_run
 from tangent_train.errors import DataError, SettingError
 from tangent_train.registry import accept, check_plain, make, named_targets
@@ -266,11 +266,11 @@ def test_nothing_in_lists_of_cameras_and_results_of_keypoints_is_interpreted(
     _run(monkeypatch, "render", f"input={panorama}", "output=tangent", "level=4", "base_level=0")
     cameras = next(Path("tangent").rglob("cameras.json"))
     Path("found").mkdir()
-    results = Path("found") / RESULTS
-    pairs = {"program": "tangent-keypoints", "version": 1, "settings": {"level": 5}, "pairs": []}
+    results = Path("found") / "results.json"
+    pairs = {"settings": {"level": 5}, "rows": [{"pair": "a", "pmr": 0.5}]}
     for path, use, honest in (
         (cameras, read_cameras, json.loads(cameras.read_text())),
-        (results, lambda p: ResultsFolder(p.parent, {"level": 5}).open(overwrite=False), pairs),
+        (results, lambda p: earlier_results(p.parent, {"level": 5}), pairs),
     ):
         for place, value in sampled(list(json_attacks(forbidden)), list(places(honest)), each=1):
             path.write_text(json.dumps(replaced(honest, place, value)))
