@@ -9,7 +9,7 @@ from functools import cache
 from pathlib import Path
 
 from datamodules.stanford2d3ds.files import AREAS as ALL_AREAS
-from datamodules.stanford2d3ds.panoramas import FileName
+from datamodules.stanford2d3ds.files import FileName
 from datamodules.synthrooms.generate import generate_rooms
 from datamodules.synthrooms.settings import RoomSettings
 

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from datamodules.core.label_table import CLASSES
+from datamodules.stanford2d3ds.label_table import CLASSES
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

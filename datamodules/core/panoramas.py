@@ -1,4 +1,4 @@
-"""Panoramas in memory, whatever data set they come from: sizes, masks, sources.
+"""Panoramas in memory, whatever data set they come from: sizes and masks.
 
 Everything about one panorama (RGB, depth, labels) is brought to the size a run reads with **one**
 pixel grid: the outer edges of source and target agree, so target row i covers source rows
@@ -9,28 +9,22 @@ from the source pixel at its centre.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol, TypeVar
+from typing import TYPE_CHECKING, Literal, NamedTuple, TypeVar
 
 import cv2
 import numpy as np
 
-from datamodules.core.sources import ImageSource, ReadableImages
 from tangent_train.rendering.upright.gravity import upright_rotation
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-    from pathlib import Path
-
     from numpy.typing import NDArray
 
     from tangent_train.rendering.representations.pinhole import Representation, Sampler
 
 __all__ = [
     "STEPS_PER_M",
-    "FileSource",
     "Mask",
     "Panorama",
-    "ReadablePanoramas",
     "Turn",
     "mask_black",
     "meters_to_steps",
@@ -46,7 +40,7 @@ Mask = Literal["labels", "any_black", "all_black"]
 """Which pixels count as unknown besides those without a label; see `mask_black`."""
 
 Turn = float | Literal["so3"] | None
-"""How test panoramas are turned: tilted by degrees, any way, or not."""
+"""How test panoramas are rotated: tilted by degrees, uniformly over all rotations, or not."""
 
 STEPS_PER_M = 512
 """Depth is in steps of 1/512 m, as in the files of Stanford2D3DS."""
@@ -80,64 +74,6 @@ class Panorama(NamedTuple):
         """All labels: predictions are rendered back to the panorama."""
         del representation
         return self.labels
-
-
-class FileSource(ImageSource["Panorama"], Protocol):
-    """Panoramas of one size decoded from files: what a prepared store is made of."""
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Rows and columns of the panoramas."""
-        ...
-
-    @property
-    def variant(self) -> str:
-        """A name for the settings that runs of the same data differ in, such as the size.
-
-        Each has its own folder in a store.
-        """
-        ...
-
-    @property
-    def settings(self) -> Mapping[str, str]:
-        """What decides the pixels besides the files, by name."""
-        ...
-
-    def files(self, index: int) -> Mapping[str, Path]:
-        """The file of every part of one panorama: `rgb`, `labels` and, where read, `depth`."""
-        ...
-
-
-class ReadablePanoramas(ReadableImages[Panorama]):
-    """Some of the panoramas of another source, see `ReadableImages`.
-
-    Args:
-        source: Where they come from.
-        indices: Which, by their numbers there.
-    """
-
-    def __init__(self, source: FileSource, indices: Sequence[int]) -> None:
-        super().__init__(source, indices)
-        self._files = source
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """See `FileSource`, as all others."""
-        return self._files.shape
-
-    @property
-    def variant(self) -> str:
-        """As of the source."""
-        return self._files.variant
-
-    @property
-    def settings(self) -> Mapping[str, str]:
-        """As of the source."""
-        return self._files.settings
-
-    def files(self, index: int) -> Mapping[str, Path]:
-        """As of the source."""
-        return self._files.files(self._indices[index])
 
 
 def resize_area(image: NDArray[np.uint8], shape: tuple[int, int]) -> NDArray[np.uint8]:

@@ -2,56 +2,72 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar
-
-import numpy as np
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, ClassVar
 
 from datamodules.core.photos import Photo
-from datamodules.core.segmentation_module import SegmentationDataModule, Split
+from datamodules.core.pipeline import SplitItems, in_threads
+from datamodules.core.problems import Problems
+from datamodules.core.reading import ImageFiles, ImageReader, PhotoReading, check_headers
+from datamodules.core.samples import (
+    RGB_NORMALIZATION,
+    RGBD_NORMALIZATION,
+    ImageSamples,
+    Input,
+    Normalization,
+)
+from datamodules.core.split_module import Found, Split, SplitDataModule
+from datamodules.core.store import Store
 from tangent_train.errors import DataError, SettingError
 from tangent_train.geometry import shift_range
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from tangent_train.rendering.representations.perspective import PerspectiveRepresentation
 
 __all__ = ["PhotoDataModule", "Split"]
 
 
-class PhotoDataModule(SegmentationDataModule[Photo]):
-    """Photos of one data set.
+@dataclass(kw_only=True, eq=False, repr=False)
+class PhotoDataModule(SplitDataModule[ImageFiles]):
+    """Labelled photos of one data set.
 
-    A data set says which photos it has (`find_splits`) and its `class_names`.
+    A data set says which photos it has (`find_images`) and its `class_names`, the unknown one (0)
+    first. The representation is the camera that all photos are brought to.
 
     Args:
-        representation: The camera that all photos are brought to.
-        photos_per_step: Photos per training step and process.
-        **settings: All others of `SegmentationDataModule`.
+        photos_per_step: Photos per training step and process. Evaluation takes one at a time.
+        inputs: What the network is shown, `rgb` and perhaps `depth`.
+        color_jitter: Strength of the colour augmentation, 0 (none) to 1, see `jitter_colors`.
+
+    Attributes:
+        normalizations: The default ones, without and with depth.
 
     Raises:
         SettingError: A setting that cannot work.
     """
 
     noun: ClassVar[str] = "photos"
+    normalizations: ClassVar[tuple[Normalization, Normalization]] = (
+        RGB_NORMALIZATION,
+        RGBD_NORMALIZATION,
+    )
 
-    def __init__(
-        self,
-        representation: PerspectiveRepresentation,
-        *,
-        photos_per_step: int = 16,
-        **settings: Any,
-    ) -> None:
-        if not hasattr(representation, "of_camera"):
+    photos_per_step: int = 16
+    inputs: Sequence[Input] = ("rgb", "depth")
+    color_jitter: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not hasattr(self.representation, "of_camera"):
             raise SettingError(
                 "representation",
-                found=type(representation).__name__,
+                found=type(self.representation).__name__,
                 expected="one for photos",
                 remedy="Choose representation=perspective, or panoramas, as data=synthrooms.",
             )
-        super().__init__(representation, photos_per_step, **settings)
+        default = self.normalizations["depth" in self.inputs]
+        self.samples = ImageSamples(self.inputs, self.normalization or default, self.color_jitter)
+        self.inputs, self.normalization = self.samples.inputs, self.samples.normalization
         if "elevation" in self.inputs:
             raise SettingError(
                 "data.inputs",
@@ -61,26 +77,40 @@ class PhotoDataModule(SegmentationDataModule[Photo]):
                 "its filters start at zero.",
             )
 
-    def check_camera(
-        self, path: Path, camera_matrix: NDArray[np.float64], size: tuple[int, int]
-    ) -> None:
-        """Make sure that crops fit into a photo.
+    @abstractmethod
+    def find_images(
+        self, problems: Problems
+    ) -> tuple[ImageReader, Mapping[Split, Sequence[ImageFiles]]]:
+        """See `PanoramaDataModule`."""
 
-        Args:
-            path: The photo.
-            camera_matrix: ``(3, 3)`` K.
-            size: ``(height, width)``.
+    def find(self, problems: Problems) -> Found[ImageFiles]:
+        """See `SplitDataModule`."""
+        reader, splits = self.find_images(problems)
+        store = Store.of(self.store, "photos", reader.settings)
+        found = Found(splits, PhotoReading(reader), store)
+        files = found.of(list(splits))
+        for _ in in_threads(partial(self._check, reader=reader, problems=problems), files):
+            pass
+        return found
 
-        Raises:
-            DataError: It sees less than a crop has to.
-        """
-        fov_deg, crop = self.representation.fov_deg, self.representation.image_size
-        try:
-            shift_range(camera_matrix, size, fov_deg, crop)
-        except SettingError as error:
-            raise DataError(
-                path,
-                found=error.found,
-                expected=f"all of a crop of {fov_deg:g}°",
-                remedy="Lower representation.fov_deg, or leave the photo out.",
-            ) from error
+    def pipeline(self, found: Found[ImageFiles], split: Split) -> SplitItems[ImageFiles, Photo]:
+        """From files or store."""
+        return SplitItems(found.splits[split], found.read, Photo, found.store)
+
+    def _check(self, files: ImageFiles, reader: ImageReader, problems: Problems) -> None:
+        """Make sure that the files are whole and that crops fit into the photo."""
+        size = check_headers(files, reader, problems)
+        if size is None:
+            return
+        representation: Any = self.representation
+        with problems.noted(files.name, files.rgb):
+            camera_matrix = reader.camera(files)
+            try:
+                shift_range(camera_matrix, size, representation.fov_deg, representation.image_size)
+            except SettingError as error:
+                raise DataError(
+                    files.rgb,
+                    found=error.found,
+                    expected=f"all of a crop of {representation.fov_deg:g}°",
+                    remedy="Lower representation.fov_deg, or leave the photo out.",
+                ) from error

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, TypeVar, get_args
+from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, Protocol, TypeVar, get_args
 
 import numpy as np
 import torch
@@ -23,7 +23,7 @@ from tangent_train.rendering.upright.gravity import upright_rotation
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from datamodules.core.sources import ImageSource, LabelledImage, ShownImage
+    from datamodules.core.pipeline import SplitItems
     from tangent_train.rendering.representations.pinhole import Views
 
 __all__ = [
@@ -32,9 +32,11 @@ __all__ = [
     "RGB_NORMALIZATION",
     "EvaluationImages",
     "EvaluationSample",
+    "ImageSamples",
     "Input",
     "Inputs",
     "Normalization",
+    "ShownImage",
     "TrainingImages",
     "TrainingSample",
     "channel_names",
@@ -66,6 +68,28 @@ _Images = TypeVar("_Images", Inputs, Tensor)
 _Sample = TypeVar("_Sample", "TrainingSample[Inputs]", "EvaluationSample[Inputs]")
 
 
+class ShownImage(Protocol):
+    """What a network is shown views of."""
+
+    @property
+    def rgb(self) -> NDArray[np.uint8]:
+        """``(H, W, 3)`` colours."""
+        ...
+
+    @property
+    def depth(self) -> NDArray[np.uint16] | None:
+        """``(H, W)`` distance from the centre of projection in steps of 1/512 m, 0 where missing.
+
+        None where depth is no input.
+        """
+        ...
+
+    @property
+    def up(self) -> NDArray[np.float64] | None:
+        """``(3,)`` direction of the zenith in a panorama; None where that is z, and in photos."""
+        ...
+
+
 @dataclass(frozen=True)
 class Normalization:
     """Mean and standard deviation of the channels R, G, B (of 0 to 1) and perhaps depth (metres).
@@ -95,6 +119,32 @@ class Normalization:
                 found=f"mean {self.mean}, std {self.std}",
                 expected="3 numbers each, 4 with depth, 6 of shapes, std greater than 0",
             )
+
+    @classmethod
+    def of(
+        cls, given: Normalization | Mapping[str, Sequence[float]], channels: int
+    ) -> Normalization:
+        """The same, made of its `mean` and `std` if need be.
+
+        Args:
+            given: It, or a mapping.
+            channels: How many it has to have.
+
+        Raises:
+            SettingError: It has others.
+        """
+        if isinstance(given, Mapping):
+            if set(given) != {"mean", "std"}:
+                expected = "mean and std"
+                raise SettingError("data.normalization", found=dict(given), expected=expected)
+            given = cls(given["mean"], given["std"])
+        if given.channels != channels:
+            raise SettingError(
+                "data.normalization",
+                found=f"{given.channels} channels",
+                expected=f"{channels}, as the inputs have",
+            )
+        return given
 
     @property
     def channels(self) -> int:
@@ -204,6 +254,53 @@ class EvaluationSample(NamedTuple, Generic[_Images]):
     index: int  # type: ignore[assignment]  # nobody needs tuple.index
 
 
+class ImageSamples:
+    """Makes the samples of labelled images, and the input of a network.
+
+    Args:
+        inputs: What the network is shown, `rgb` and perhaps others, see `Input`.
+        normalization: Of RGB and depth, or its `mean` and `std`.
+        color_jitter: Strength of the colour augmentation, 0 (none) to 1, see `jitter_colors`.
+
+    Attributes:
+        inputs: As given, in the order of the channels.
+        normalization: As given.
+        in_channels: Of all inputs together.
+
+    Raises:
+        SettingError: A setting that cannot work.
+    """
+
+    def __init__(
+        self,
+        inputs: Sequence[Input],
+        normalization: Normalization | Mapping[str, Sequence[float]],
+        color_jitter: float,
+    ) -> None:
+        self.inputs = _checked_inputs(inputs)
+        self.normalization = Normalization.of(normalization, 3 + ("depth" in inputs))
+        self.in_channels = len(channel_names(self.inputs))
+        if not isinstance(color_jitter, int | float) or not 0 <= color_jitter <= 1:
+            raise SettingError("data.color_jitter", found=color_jitter, expected="0 to 1")
+        self._color_jitter = color_jitter
+
+    def training(self, source: Any, representation: Any, seed: Seed) -> TrainingImages:
+        """Samples `TrainingSample`."""
+        return TrainingImages(source, representation, seed, self.inputs, self._color_jitter)
+
+    def evaluation(self, source: Any, representation: Any) -> EvaluationImages:
+        """Samples `EvaluationSample`."""
+        return EvaluationImages(source, representation, self.inputs)
+
+    def collate(self, samples: list[Any]) -> Any:
+        """A batch of samples, see `collate`."""
+        return collate(samples)
+
+    def normalized(self, batch: Any) -> Tensor:
+        """The images of a batch as the network takes them."""
+        return normalize(batch.images, self.normalization, self.inputs)
+
+
 class TrainingImages(Dataset[TrainingSample[Inputs]]):
     """Random views of images, by (epoch, index).
 
@@ -217,7 +314,7 @@ class TrainingImages(Dataset[TrainingSample[Inputs]]):
 
     def __init__(
         self,
-        source: ImageSource[LabelledImage],
+        source: SplitItems[Any, Any],
         representation: Any,
         seed: Seed,
         inputs: Sequence[Input],
@@ -258,7 +355,7 @@ class EvaluationImages(Dataset[EvaluationSample[Inputs]]):
     """
 
     def __init__(
-        self, source: ImageSource[LabelledImage], representation: Any, inputs: Sequence[Input]
+        self, source: SplitItems[Any, Any], representation: Any, inputs: Sequence[Input]
     ) -> None:
         self._source = source
         self._representation = representation
@@ -278,6 +375,19 @@ class EvaluationImages(Dataset[EvaluationSample[Inputs]]):
             torch.from_numpy(views.rotations().astype(np.float32)),
             index,
         )
+
+
+def _checked_inputs(inputs: Sequence[Input]) -> tuple[Input, ...]:
+    """Names of inputs in the order of their channels."""
+    ordered = tuple(name for name in INPUTS if name in inputs)
+    known = not isinstance(inputs, str) and sorted(ordered) == sorted(inputs)
+    if not known or "rgb" not in inputs:
+        raise SettingError(
+            "data.inputs",
+            found=inputs if isinstance(inputs, str) else list(inputs),
+            expected="a list: rgb, perhaps depth and elevation",
+        )
+    return ordered
 
 
 def collate(samples: list[_Sample]) -> _Sample:

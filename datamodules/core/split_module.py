@@ -1,31 +1,37 @@
-"""What the data modules of all data sets share: splits, loaders, the order of samples, resuming."""
+"""What the data modules of all data sets share: splits, checks, the store, loaders, resuming."""
 
 from __future__ import annotations
 
+import re
+import time
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, Protocol, TypeVar
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar, Generic, Literal, NamedTuple, Protocol, TypeVar
 
 import cv2
+import numpy as np
 import torch
 from lightning import LightningDataModule
 from lightning.pytorch.trainer.states import TrainerFn
-from lightning.pytorch.utilities import rank_zero_warn
+from lightning.pytorch.utilities import rank_zero_only, rank_zero_warn
+from rich.console import Console
+from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from datamodules.core.data_check import find_usable
+from datamodules.core.class_weights import ClassWeights, class_weights
+from datamodules.core.pipeline import Item, SplitItems, in_threads
 from datamodules.core.problems import Problems
+from datamodules.core.progress import show_progress
 from datamodules.core.samples import Normalization
-from datamodules.core.sampling import EpochSampler
-from datamodules.core.watched_samples import WatchedLoader, WatchedSamples, explained
-from tangent_train.errors import SettingError
+from datamodules.core.sampling import EpochSampler, Seed
+from datamodules.core.store import Store
+from tangent_train.errors import DataError, SettingError
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
-    from pathlib import Path
-
-    from torch import Tensor
-
-__all__ = ["SPLITS", "Kind", "Source", "Split", "SplitDataModule", "at_least"]
+__all__ = ["SPLITS", "Found", "Kind", "Split", "SplitDataModule", "at_least"]
 
 Split = Literal["train", "val", "test"]
 """A part of a data set."""
@@ -33,152 +39,173 @@ Split = Literal["train", "val", "test"]
 SPLITS: tuple[Split, ...] = ("train", "val", "test")
 """All of them."""
 
-
 Kind = Literal["segmentation", "classification"]
 """What a data set is labelled for: classes of pixels, or of whole shapes."""
 
+SAMPLED = 32
+"""How many images are decoded as training begins, at most."""
 
-class Source(Protocol):
-    """What a split has, by number."""
+_SECONDS = 2.0
+_GO_ON = (
+    "tangent-check with the same data settings lists all there are; data.skip_broken=true goes on "
+    "without what is broken."
+)
+_FEWER = (
+    "Memory may be too small for as many: use fewer (0 works in the process itself), a lower "
+    "level, or a store (data.store=…, data.in_memory=false); or enlarge /dev/shm (docker run "
+    "--shm-size=8g)."
+)
+_CAUGHT = re.compile(r"\ACaught \w+ in DataLoader worker.*\.(?:Data|Setting)Error: ", re.DOTALL)
 
-    def __len__(self) -> int:
-        """How many there are."""
+_Item = TypeVar("_Item", bound=Item)
+_Result = TypeVar("_Result")
+
+
+class Samples(Protocol):
+    """How the images of a split become what a network is trained and evaluated on."""
+
+    @property
+    def in_channels(self) -> int:
+        """Number of input channels."""
         ...
 
-    def name(self, index: int) -> str:
-        """A short name of one of them, which no other has."""
+    @property
+    def normalization(self) -> Normalization:
+        """Of those that are measured."""
+        ...
+
+    def training(self, source: Any, representation: Any, seed: Seed) -> Dataset[Any]:
+        """Random views, by (epoch, index)."""
+        ...
+
+    def evaluation(self, source: Any, representation: Any) -> Dataset[Any]:
+        """All of every image, by (epoch, index); the epoch changes nothing."""
+        ...
+
+    def collate(self, samples: list[Any]) -> Any:
+        """A batch of samples."""
+        ...
+
+    def normalized(self, batch: Any) -> Tensor:
+        """The images of a batch as the network takes them, float32, on the device they are on."""
         ...
 
 
-_Source = TypeVar("_Source", bound=Source)
+class Found(NamedTuple, Generic[_Item]):
+    """What there is of a data set.
+
+    Attributes:
+        splits: The files of every image or shape.
+        read: Reads one from its files, see `pipeline.Reading`.
+        store: Where they are prepared, if anywhere.
+    """
+
+    splits: Mapping[Split, Sequence[_Item]]
+    read: Callable[[_Item], Any]
+    store: Store | None = None
+
+    def of(self, splits: Sequence[Split]) -> list[_Item]:
+        """What some splits have."""
+        return [item for split in splits for item in self.splits[split]]
 
 
-class SplitDataModule(LightningDataModule, ABC, Generic[_Source]):
+@dataclass(kw_only=True, eq=False, repr=False)
+class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
     """A data set split for training, validation and test.
 
-    A kind of data says what its splits are (`find_splits`) and how they become samples
-    (`training_samples`, `evaluation_samples`, `normalized`).
+    A data set is a dataclass: its fields are the settings `data.*` of a config. It says what its
+    splits consist of (`find`), how they are read (`pipeline`) and what is made of them (`samples`).
 
     The trainer must be made with ``use_distributed_sampler=False``, see `EpochSampler`.
 
     Args:
+        root: Folder of the data set.
         representation: What the network sees.
-        per_step: Panoramas, photos or shapes (`noun`) per training step and process.
-        normalization: Of the input channels.
+        validation_fraction: Share of the training data that is held out for validation; 0 for no
+            validation.
+        normalization: Of the input channels, or its `mean` and `std`; by default that of the data.
         num_workers: Worker processes of a loader; the samples are the same for any number.
-        seed: Seed of order, views, augmentation and turns, 0 or more.
-        stream: Another number draws another order and other views from the same seed: who trains
-            on, a network that has seen those of stream 0, sees new ones.
-        in_memory: Keep what is read in memory, see `remembered`.
+        seed: Seed of order, views and augmentation, 0 or more.
+        stream: Another number draws another order and other views from the same seed: training
+            that starts from a network which has seen those of stream 0 sees new ones.
+        store: Folder of a prepared store, see `store`: everything is decoded once, then read from
+            there. The samples are the same without.
+        in_memory: Keep what is read in memory.
         skip_broken: Leave out what cannot be used, after reading all once, instead of refusing.
 
     Attributes:
         class_names: Name of every class.
         kind: What its labels say.
         noun: What the data set consists of, in the plural.
-        in_channels: Number of input channels.
-        normalization: As given.
-        root: Folder of the data set.
-        validation_fraction: Share of what is for training that is kept for validation.
+        samples: Makes the samples of a split and the input of the network.
         is_made: Whether `make_files` makes all of it.
-        problems: What `find_splits` found to be wrong.
 
     Raises:
         SettingError: A setting that cannot work.
     """
 
-    class_names: tuple[str, ...]
-    kind: ClassVar[Kind]
+    kind: ClassVar[Kind] = "segmentation"
     noun: ClassVar[str]
     is_made: ClassVar[bool] = False
-    root: Path
-    validation_fraction: float
 
-    def __init__(
-        self,
-        representation: Any,
-        per_step: int,
-        normalization: Normalization,
-        *,
-        num_workers: int = 0,
-        seed: int = 0,
-        stream: int = 0,
-        in_memory: bool = False,
-        skip_broken: bool = False,
-    ) -> None:
+    root: Path = field(kw_only=False)
+    representation: Any = field(kw_only=False)
+    validation_fraction: float = 0.1
+    normalization: Normalization | Mapping[str, Sequence[float]] | None = None
+    num_workers: int = 0
+    seed: int = 0
+    stream: int = 0
+    store: Path | None = None
+    in_memory: bool = False
+    skip_broken: bool = False
+    class_names: tuple[str, ...] = field(init=False)
+    samples: Samples = field(init=False)
+
+    def __post_init__(self) -> None:
         super().__init__()
-        self.representation = representation
-        self.normalization = normalization
-        self.in_channels = normalization.channels
-        self._setting = f"{self.noun}_per_step"
-        self.per_step = at_least(f"data.{self._setting}", per_step, 1)
-        self.num_workers = at_least("data.num_workers", num_workers, 0)
-        self.seed = at_least("data.seed", seed, 0)
-        self.drawn_from = self.seed, at_least("data.stream", stream, 0)
-        self.in_memory = in_memory
-        self.skip_broken = skip_broken
-        self.problems = Problems()
-        self._splits: Mapping[Split, _Source] = {}
-        self._sources: dict[Split, _Source] = {}
+        self.root = Path(self.root)
+        self.store = None if self.store is None else Path(self.store)
+        if not 0 <= self.validation_fraction < 1:
+            raise SettingError(
+                "data.validation_fraction", found=self.validation_fraction, expected="0 to below 1"
+            )
+        for name in ("num_workers", "seed", "stream"):
+            at_least(f"data.{name}", getattr(self, name), 0)
+        at_least(f"data.{self._per_step}", self.per_step, 1)
+        self._found: Any = None
+        self._sources: dict[Split, SplitItems[_Item, Any]] = {}
         self._start = (0, 0)
-        self._watched: dict[Split, WatchedSamples] = {}
+
+    # --- what a kind of data says ------------------------------------------------------------
 
     @abstractmethod
-    def find_splits(self) -> Mapping[Split, _Source]:
-        """What all splits have as it is on disk, checked without reading all of it.
-
-        What is wrong with some of it is noted in `problems`, and left out here.
-
-        Raises:
-            DataError: Something is missing or cannot be used.
-            SettingError: It does not fit the representation.
-        """
-
-    @abstractmethod
-    def content(self, splits: Mapping[Split, _Source]) -> tuple[int, Iterator[None]]:
-        """All that there is to read, whole, to note in `problems` what is broken.
+    def find(self, problems: Problems) -> Found[_Item]:
+        """What all splits have, checked without decoding it.
 
         Args:
-            splits: From `find_splits`.
+            problems: Where it is noted what is wrong; what is, is found nevertheless.
 
-        Returns:
-            How many images or shapes, and what reads one after the other and yields each time.
+        Raises:
+            DataError: The data set as a whole cannot be used.
         """
 
-    def readable(self, splits: Mapping[Split, _Source]) -> Mapping[Split, _Source]:
-        """The same without what turns out to be broken when all is read, noted in `problems`."""
-        return splits
-
-    def sampled_splits(self) -> Sequence[Split]:
-        """The splits to read some of before training: those that are not read whole then."""
-        return ()
-
     @abstractmethod
-    def remembered(self, source: _Source) -> _Source:
-        """The same, read once, now, and kept in memory."""
+    def pipeline(self, found: Found[_Item], split: Split) -> SplitItems[_Item, Any]:
+        """How what a split has is read."""
 
-    @abstractmethod
-    def training_samples(self) -> Dataset[Any]:
-        """Samples of the training split, by (epoch, index)."""
+    def make_files(self) -> None:
+        """Make the files of the data set, where it is one that is made."""
 
-    @abstractmethod
-    def evaluation_samples(self, split: Split) -> Dataset[Any]:
-        """Samples of a whole split, by (epoch, index); the epoch changes nothing."""
+    def in_parallel(
+        self, work: Callable[[_Item], _Result], items: Sequence[_Item]
+    ) -> Generator[_Result]:
+        """The results of some work on each of several images or shapes, as they come."""
+        return in_threads(work, items)
 
-    @abstractmethod
-    def normalized(self, batch: Any) -> Tensor:
-        """The images of a batch as the network takes them, float32, on the device they are on."""
-
-    def collate(self) -> Callable[[list[Any]], Any] | None:
-        """What makes a batch of samples; torch's own by default."""
-        return None
-
-    def evaluation_size(self) -> int:
-        """Samples of a batch in validation and test."""
-        return 1
+    # --- checks --------------------------------------------------------------------------------
 
     def setup(self, stage: str | None = None) -> None:
-        """Find what is there, once, see `find_splits`.
+        """Find what is there, once.
 
         Args:
             stage: Ignored: what a test will need is checked before training already.
@@ -187,47 +214,206 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Source]):
             DataError: Something is broken: all that was found is named.
             SettingError: A setting does not suit the data.
         """
-        if not self._splits:
-            self._splits = find_usable(self)
-
-    def open_split(self, split: Split) -> _Source:
-        """What one split has as it is on disk."""
-        self.setup()
-        return self._splits[split]
-
-    def make_files(self) -> None:
-        """Make the files of the data set, where it is one that is made."""
+        if self._found is None:
+            self._found = self._usable()
 
     def prepare_data(self) -> None:
-        """Make the files; before training, read some of them.
+        """Make the files, and what the store lacks; before training, decode some images.
+
+        An evaluation prepares the test split only.
 
         Raises:
             DataError: Something is broken.
         """
         self.make_files()
-        training = self.trainer is not None and self.trainer.state.fn == TrainerFn.FITTING
-        if training and not self.skip_broken:
-            self._splits = find_usable(self, self.sampled_splits())
+        stage = None if self.trainer is None else self.trainer.state.fn
+        self._found = self._usable(sample=stage == TrainerFn.FITTING)
+        if self._found.store is not None and not self.skip_broken:
+            problems = Problems()
+            splits: Sequence[Split] = ("test",) if stage == TrainerFn.TESTING else SPLITS
+            self._read_all(self._found, splits, problems)
+            problems.refuse(self.root, _GO_ON)
 
-    def prepare_all(self) -> None:
-        """Make and check all that there is to make and check before any run."""
-        self.make_files()
-        self.setup("fit")
+    def count(self, split: Split) -> int:
+        """How many images or shapes a split has."""
+        return len(self._all_found().splits[split])
 
-    def source(self, split: Split) -> _Source:
-        """What one split has: in memory, if asked for."""
+    def check(self, *, progress: bool = True) -> tuple[Problems, int]:
+        """Read all of the data set; nothing is made or written.
+
+        Args:
+            progress: Whether to show a progress bar.
+
+        Returns:
+            All that is wrong, and how many images or shapes were read.
+        """
+        problems = Problems()
+        found: Any = Found(dict.fromkeys(SPLITS, ()), _nothing)
+        with problems.noted():
+            if self.is_made and not self.root.is_dir():
+                raise DataError(
+                    self.root,
+                    found="no such folder",
+                    expected="the data set",
+                    remedy="Run tangent-prepare with the same settings: it makes it.",
+                )
+            found = self.find(problems)
+        usable = problems.without(found.of(SPLITS))
+        parts = getattr(found.read, "parts", lambda item: [partial(found.read, item)])
+        work = self.in_parallel(partial(_failures, parts), usable)
+        self._note(work, problems, "Checking", len(usable), show=progress)
+        return problems, len(usable)
+
+    def _all_found(self) -> Found[_Item]:
+        self.setup()
+        return self._found
+
+    def _usable(self, *, sample: bool = False) -> Found[_Item]:
+        """What can be used; all is refused if something cannot, unless that is to be left out."""
+        problems = Problems()
+        found: Any = None
+        with problems.noted():
+            found = self.find(problems)
+        if problems.fatal:
+            problems.refuse(self.root)
+        if self.skip_broken:
+            self._read_all(found, SPLITS, problems)
+            return self._without(found, problems)
+        if sample and self.store is None:
+            self._read_some(found, problems)
+        problems.refuse(self.root, _GO_ON)
+        return found
+
+    def _read_all(self, found: Found[_Item], splits: Sequence[Split], problems: Problems) -> None:
+        """Read everything once, into the store if there is one; note what is broken."""
+        items, store = problems.without(found.of(splits)), found.store
+        total = len(items)
+        work = partial(_read_failures, found.read)
+        if store is not None:
+            items = [item for item in items if not store.is_current(item.name, item.parts)]
+            work = partial(_make_failures, found.read, store)
+        done = 0
+        if items and store is not None:  # the first one tells how large they are
+            done = 1
+            self._note(in_threads(work, items[:1]), problems, "", 1, show=False)
+            store.check_room(items[0].name, len(items) - 1)
+        if items[done:]:
+            what = "Checking the data" if store is None else f"Preparing {self.noun}"
+            before = total - len(items) + done
+            self._note(self.in_parallel(work, items[done:]), problems, what, total, before=before)
+
+    def _note(
+        self, work: Generator[_Failures], problems: Problems, what: str, total: int, **bar: Any
+    ) -> None:
+        """Follow some work on images, and note what it finds to be broken."""
+
+        def failed() -> Generator[None]:
+            for item, errors in work:
+                for error in errors:
+                    with problems.noted(item.name, next(iter(item.parts.values()))):
+                        raise error
+                yield
+
+        with closing(work):  # an interrupt drops what is queued
+            show_progress(failed(), what, self.noun, total, **bar)
+
+    def _read_some(self, found: Found[_Item], problems: Problems) -> None:
+        """Decode some images from all over the data set, other ones for other seeds."""
+        items = problems.without(found.of(SPLITS))
+        rng = np.random.default_rng(self.seed)
+        strata = np.array_split(np.arange(len(items)), min(SAMPLED, len(items)) or 1)
+        chosen = rng.permutation([rng.choice(stratum) for stratum in strata if len(stratum)])
+        until = time.monotonic() + _SECONDS
+
+        def until_late() -> Generator[_Failures]:
+            read = partial(_read_failures, found.read)
+            for failures in in_threads(read, [items[place] for place in chosen]):
+                yield failures
+                if time.monotonic() > until:
+                    return
+
+        self._note(until_late(), problems, "", 0, show=False)
+
+    def _without(self, found: Found[_Item], problems: Problems) -> Found[_Item]:
+        broken = problems.items
+        splits = {split: problems.without(items) for split, items in found.splits.items()}
+        for split, items in splits.items():
+            if found.splits[split] and not items:
+                raise DataError(
+                    self.root,
+                    found=f"no {self.noun} for {split} that can be used",
+                    expected="one or more",
+                    remedy="tangent-check lists what is wrong with them.",
+                )
+        if broken:
+            total = len(broken.union(item.name for item in found.of(SPLITS)))
+            _tell(
+                f"{len(broken)} of {total} {self.noun} are broken and left out "
+                "(data.skip_broken=true); tangent-check lists them."
+            )
+        return found._replace(splits=splits)
+
+    # --- samples and loaders -------------------------------------------------------------------
+
+    def training_samples(self) -> Dataset[Any]:
+        """Samples of the training split, by (epoch, index)."""
+        return self.samples.training(self.source("train"), self.representation, self.drawn_from)
+
+    def evaluation_samples(self, split: Split) -> Dataset[Any]:
+        """Samples of a whole split, by (epoch, index); the epoch changes nothing."""
+        return self.samples.evaluation(self.source(split), self.representation)
+
+    def class_weights(self, kind: ClassWeights) -> Tensor:
+        """Weights of the classes in the loss, from the labels of the training split.
+
+        Args:
+            kind: See `class_weights.class_weights`.
+
+        Raises:
+            SettingError: Another kind.
+        """
+        counts = np.zeros(256, np.int64)
+        if kind != "none":
+            source = self.source("train")
+            for labels in in_threads(source.labels, range(len(source))):
+                counts += np.bincount(labels.ravel(), minlength=256)
+        return class_weights(counts[: len(self.class_names)], kind)
+
+    def source(self, split: Split) -> SplitItems[_Item, Any]:
+        """The images of one split: in memory, if asked for."""
         if split not in self._sources:
-            source = self.opened(split)
-            self._sources[split] = self.remembered(source) if self.in_memory else source
+            source = self.pipeline(self._all_found(), split)
+            if self.in_memory:
+                source.remember(self.root)
+            self._sources[split] = source
         return self._sources[split]
-
-    def opened(self, split: Split) -> _Source:
-        """What one split has, as it is to be read."""
-        return self.open_split(split)
 
     def sample_name(self, split: Split, index: int) -> str:
         """A short name of what has this index in the samples of the split."""
         return self.source(split).name(index)
+
+    @property
+    def per_step(self) -> int:
+        """Images or shapes per training step and process."""
+        return int(getattr(self, self._per_step))
+
+    @property
+    def in_channels(self) -> int:
+        """Number of input channels."""
+        return self.samples.in_channels
+
+    @property
+    def drawn_from(self) -> tuple[int, int]:
+        """Seed and stream."""
+        return self.seed, self.stream
+
+    @property
+    def _per_step(self) -> str:
+        return f"{self.noun}_per_step"
+
+    def evaluation_size(self) -> int:
+        """Samples of a batch in validation and test."""
+        return 1
 
     def state_dict(self) -> dict[str, int]:
         """Where training is: the epoch, and the batches of it that are done."""
@@ -241,7 +427,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Source]):
         return {
             "epoch": epoch,
             "batches": batches,
-            self._setting: self.per_step,
+            self._per_step: self.per_step,
             "processes": trainer.world_size,
         }
 
@@ -253,10 +439,10 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Source]):
         """
         processes = 1 if self.trainer is None else self.trainer.world_size
         now = processes, self.per_step
-        before = state_dict["processes"], state_dict[self._setting]
+        before = state_dict["processes"], state_dict[self._per_step]
         if state_dict["batches"] and now != before:
             raise SettingError(
-                f"trainer.devices and data.{self._setting}",
+                f"trainer.devices and data.{self._per_step}",
                 found=f"{now[0]} processes of {now[1]} {self.noun}",
                 expected=f"{before[0]} of {before[1]}, as before",
                 remedy="Within an epoch, resume as the run was started.",
@@ -273,7 +459,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Source]):
         Returns:
             The same with float32 images, channels first.
         """
-        images = self.normalized(batch)
+        images = self.samples.normalized(batch)
         if self.trainer is not None:  # which converted the batch when it had no float images yet
             images = self.trainer.precision_plugin.convert_input(images)
         return batch._replace(images=images)
@@ -295,12 +481,23 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Source]):
         """What to tell the user of an error during training or evaluation.
 
         Args:
-            error: It.
+            error: As a loader raised it, perhaps for one of its workers.
 
         Returns:
-            One that names the sample that a worker process died of; or the same.
+            An error of a worker as it was raised there; what may help when a worker was killed; or
+            the same error.
         """
-        return explained(error, self._watched.values())
+        if isinstance(error, RuntimeError) and str(error).startswith("DataLoader worker (pid"):
+            return SettingError(
+                "data.num_workers",
+                found=f"{self.num_workers}, and a {str(error).partition('. ')[0]}",
+                expected="workers that live",
+                remedy=_FEWER,
+            )
+        if not isinstance(error, DataError | SettingError):
+            return error
+        message, caught = _CAUGHT.subn("", str(error))
+        return type(error)(message.rstrip()) if caught else error
 
     def _evaluation_loader(self, split: Split) -> DataLoader[Any]:
         dataset = self.evaluation_samples(split)
@@ -316,28 +513,68 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Source]):
         shuffle: bool,
     ) -> DataLoader[Any]:
         rank, world_size = _process()
-        source = self.source(split)
-        left_out = len(source) % world_size
+        count = len(self.source(split))
+        left_out = count % world_size
         if shuffle and left_out:
             rank_zero_warn(
-                f"{left_out} of {len(source)} training {self.noun}, others every time, are left "
+                f"{left_out} of {count} training {self.noun}, others every time, are left "
                 f"out of each epoch: {world_size} processes take as many each.",
                 category=UserWarning,
             )
-        watched = WatchedSamples(dataset, source.name, self.num_workers)
-        self._watched[split] = watched
-        return WatchedLoader(
-            watched,
+        return DataLoader(
+            dataset,
             batch_size=batch_size,
-            sampler=EpochSampler(len(source), self.drawn_from, shuffle, rank, world_size, start),
+            sampler=EpochSampler(count, self.drawn_from, shuffle, rank, world_size, start),
             # Its own: the loader draws seeds for its workers, which would shift those of dropout.
             generator=torch.Generator().manual_seed(self.seed),
             num_workers=self.num_workers,
             persistent_workers=self.num_workers > 0,
             pin_memory=torch.cuda.is_available(),
             worker_init_fn=_opencv_without_threads,
-            collate_fn=self.collate(),
+            collate_fn=self.samples.collate,
         )
+
+
+_Failures = tuple[Item, list[Exception]]
+"""An image or shape, and what is wrong with it."""
+
+
+def _failures(parts: Callable[[Any], Sequence[Callable[[], object]]], item: Item) -> _Failures:
+    """Decode the files of one image, each by itself."""
+    errors: list[Exception] = []
+    for read in parts(item):
+        try:
+            read()
+        except (DataError, SettingError, OSError) as error:
+            errors.append(error)
+    return item, errors
+
+
+def _read_failures(read: Callable[[Any], object], item: Item) -> _Failures:
+    return _failures(lambda one: [partial(read, one)], item)
+
+
+def _make_failures(read: Callable[[Any], object], store: Store, item: Item) -> _Failures:
+    """Write the prepared file of one image."""
+
+    def make() -> None:
+        store.make(item.name, item.parts, lambda: _arrays(read(item)))
+
+    return _failures(lambda _: [make], item)
+
+
+def _nothing(item: Any) -> None:
+    del item
+
+
+def _arrays(image: Any) -> dict[str, Any]:
+    """Those of a named tuple that are there."""
+    return {name: array for name, array in image._asdict().items() if array is not None}
+
+
+@rank_zero_only
+def _tell(text: str) -> None:
+    Console(soft_wrap=True, highlight=False).print(text, markup=False)
 
 
 def _process() -> tuple[int, int]:

@@ -58,45 +58,38 @@ class FolderClasses:
         parts = [self.codes.tobytes(), self.labels.tobytes(), bytes([self.in_colors])]
         return hashlib.sha256(b"".join(parts)).hexdigest()[:16]
 
-    def decode(self, stored: NDArray[np.integer]) -> NDArray[np.uint8]:
+    def decode(self, stored: NDArray[np.integer], path: object = "labels") -> NDArray[np.uint8]:
         """Labels of the pixels of a label image; 0 where they have no class.
 
         Args:
             stored: ``(H, W)`` values, or ``(H, W, 3)`` uint8 colours.
+            path: Where they are from.
 
         Returns:
             ``(H, W)``.
+
+        Raises:
+            DataError: A value is past the end of the list that names the classes, and does not mark
+                unknown pixels (255, and 65535 of 16 bits).
 
         >>> codes, labels = np.array([7], np.int32), np.array([1], np.uint8)
         >>> classes = FolderClasses(("wall",), codes, labels, in_colors=False)
         >>> classes.decode(np.array([[6, 7, 8]])).tolist()
         [[0, 1, 0]]
         """
+        if self.length is not None:
+            past = stored[(stored >= self.length) & ~np.isin(stored, _UNKNOWN_VALUES)]
+            if past.size:
+                raise DataError(
+                    path,
+                    found=f"value {past.min()} in {past.size} pixel{'s' * (past.size > 1)}",
+                    expected=f"0 to {self.length - 1}, the places in the list of classes.json, or "
+                    f"{_UNKNOWN_VALUES[0]}",
+                    remedy="Name the class, or write null in its place in the list.",
+                )
         codes = self.pack(stored)
         place = np.minimum(np.searchsorted(self.codes, codes), len(self.codes) - 1)
         return np.where(self.codes[place] == codes, self.labels[place], np.uint8(0))
-
-    def check(self, stored: NDArray[np.integer], path: Path) -> None:
-        """Make sure that no value is past the end of the list that names the classes.
-
-        Args:
-            stored: As of `decode`.
-            path: Where it is from.
-
-        Raises:
-            DataError: One is, that does not mark unknown pixels (255, and 65535 of 16 bits).
-        """
-        if self.length is None:
-            return
-        past = stored[(stored >= self.length) & ~np.isin(stored, _UNKNOWN_VALUES)]
-        if past.size:
-            raise DataError(
-                path,
-                found=f"value {past.min()} in {past.size} pixel{'s' * (past.size > 1)}",
-                expected=f"0 to {self.length - 1}, the places in the list of classes.json, or "
-                f"{_UNKNOWN_VALUES[0]}",
-                remedy="Name the class, or write null in its place in the list.",
-            )
 
     def pack(self, stored: NDArray[np.integer]) -> NDArray[np.int32]:
         """One number for each pixel of a label image, as in `codes`."""

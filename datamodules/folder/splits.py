@@ -6,15 +6,15 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from datamodules.core.group_drawing import draw_groups
-from datamodules.core.problems import Noted, raised
-from datamodules.core.segmentation_module import SPLITS, Split
+from datamodules.core.split_module import SPLITS, Split
 from tangent_train.errors import DataError, SettingError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from datamodules.folder.files import PanoramaFiles
+    from datamodules.core.problems import Problems
+    from datamodules.core.reading import ImageFiles
 
 __all__ = ["FolderSplits"]
 
@@ -50,26 +50,22 @@ class FolderSplits:
             raise SettingError(
                 "data.test_fraction", found=self.test_fraction, expected="above 0 to below 1"
             )
-        if not 0 <= self.validation_fraction < 1:
-            raise SettingError(
-                "data.validation_fraction", found=self.validation_fraction, expected="0 to below 1"
-            )
         if self.seed < 0:
             raise SettingError("data.split_seed", found=self.seed, expected="0 or more")
 
     def divide(
-        self, panoramas: Sequence[PanoramaFiles], noted: Noted = raised
-    ) -> dict[Split, list[PanoramaFiles]]:
+        self, panoramas: Sequence[ImageFiles], problems: Problems
+    ) -> dict[Split, list[ImageFiles]]:
         """The panoramas of every split, each in the order given.
 
         Args:
             panoramas: All of the data set.
-            noted: Where wrong lines of lists go, to go on after them.
+            problems: Where wrong lines of lists are noted.
 
         Raises:
             DataError: A list cannot be used, or there are too few scenes to draw from.
         """
-        listed = self._read_lists(panoramas, noted)
+        listed = self._read_lists(panoramas, problems)
         named = {name for names in listed.values() for name in names}
         rest = [files for files in panoramas if files.name not in named]
         if "test" in listed:
@@ -92,7 +88,7 @@ class FolderSplits:
         }
 
     def _read_lists(
-        self, panoramas: Sequence[PanoramaFiles], noted: Noted
+        self, panoramas: Sequence[ImageFiles], problems: Problems
     ) -> dict[Split, set[str]]:
         """The names in each list that is there."""
         names = {files.name: files.name for files in panoramas}
@@ -106,13 +102,13 @@ class FolderSplits:
                 continue
             listed[split] = set()
             for line in _lines(path):
-                with noted((split, line)):
+                with problems.noted(f"{path.name}: {line}"):
                     listed[split].add(_listed_name(path, line, names, owners))
         return listed
 
-    def _draw(self, split: Split, panoramas: Sequence[PanoramaFiles], fraction: float) -> set[str]:
+    def _draw(self, split: Split, panoramas: Sequence[ImageFiles], fraction: float) -> set[str]:
         """The names in some scenes, the same for the same seed."""
-        scenes = {files.scene for files in panoramas}
+        scenes = {_scene(files) for files in panoramas}
         drawn = draw_groups(scenes, fraction, [self.seed, SPLITS.index(split)])
         if not drawn:
             raise DataError(
@@ -121,7 +117,7 @@ class FolderSplits:
                 expected="two or more: first folders, or images that are in none",
                 remedy=f"Have more of them, or {_named_in(split)}.",
             )
-        return {files.name for files in panoramas if files.scene in drawn}
+        return {files.name for files in panoramas if _scene(files) in drawn}
 
     def _some(self, split: Split, names: set[str]) -> set[str]:
         """The names, if there are any."""
@@ -133,6 +129,11 @@ class FolderSplits:
                 remedy=f"{_named_in(split).capitalize()}.",
             )
         return names
+
+
+def _scene(files: ImageFiles) -> str:
+    """The first folder of the name; the name itself of an image that is in none."""
+    return files.name.partition("/")[0]
 
 
 def _listed_name(path: Path, line: str, names: dict[str, str], owners: dict[str, Path]) -> str:

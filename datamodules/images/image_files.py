@@ -7,13 +7,13 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from datamodules.core.links import note_links
 from tangent_train.errors import DataError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
+    from contextlib import AbstractContextManager
 
-    from datamodules.core.problems import Noted
+    Noted = Callable[..., AbstractContextManager[None]]
 
 __all__ = ["DEPTH_SUFFIXES", "IMAGE_SUFFIXES", "find_depth", "find_images"]
 
@@ -30,7 +30,7 @@ def find_images(pattern: str | Path, noted: Noted | None = None) -> list[Path]:
     Args:
         pattern: A file; a folder, searched recursively; or a glob pattern, with ``**`` for folders
             of any depth. ``~`` is the home folder.
-        noted: Where broken links and folders that cannot be opened are reported.
+        noted: Where folders that cannot be opened are reported, see `Problems.noted`.
 
     Returns:
         Sorted paths. Of folders and patterns only files with one of `IMAGE_SUFFIXES`, in lower or
@@ -49,7 +49,8 @@ def find_images(pattern: str | Path, noted: Noted | None = None) -> list[Path]:
     else:
         found = [Path(name) for name in glob.glob(str(path), recursive=True)]  # noqa: PTH207
     images = sorted({file for file in found if file.suffix.lower() in IMAGE_SUFFIXES})
-    images = [file for file in images if file.is_file() and not file.name.startswith(".")]
+    # Links that lead nowhere stay: whoever reads them says so.
+    images = [file for file in images if not file.is_dir() and not file.name.startswith(".")]
     if not images:
         raise DataError(
             pattern,
@@ -66,15 +67,12 @@ def _walk(folder: Path, noted: Noted | None) -> Iterator[Path]:
 
     def closed(error: OSError) -> None:
         if noted is not None:
-            with noted(Path(error.filename)):
+            with noted(None, Path(error.filename)):
                 raise error
 
     for parent, folders, names in os.walk(folder, followlinks=True, onerror=closed):
         real = os.path.realpath(parent)
         folders[:] = [] if real in seen else [name for name in folders if name[0] != "."]
-        if noted is not None:
-            passed_over = note_links(Path(parent), (*folders, *names), noted)
-            folders[:] = [name for name in folders if name not in passed_over]
         yield from (Path(parent, name) for name in names if real not in seen and name[0] != ".")
         seen.add(real)
 

@@ -61,6 +61,11 @@ class ShapeFile(NamedTuple):
     label: str
     part: Literal["train", "test"]
 
+    @property
+    def parts(self) -> dict[str, Path]:
+        """The files that its spheres are made from."""
+        return {"mesh": self.path}
+
 
 def find_shapes(root: Path) -> list[ShapeFile]:
     """All meshes of a data set, ordered by name within each part.

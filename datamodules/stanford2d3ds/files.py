@@ -6,12 +6,11 @@ import os
 import re
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
-from datamodules.core.problems import Noted, raised
-from datamodules.images.png import check_panorama_size, check_png
+from datamodules.core.problems import Problems
+from datamodules.core.reading import ImageFiles
 from tangent_train.errors import DataError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
     from pathlib import Path
 
 
@@ -22,9 +21,6 @@ __all__ = [
     "MISSING_DEPTH",
     "FileName",
     "PictureFiles",
-    "check_cameras",
-    "check_panorama",
-    "check_picture",
     "list_pictures",
 ]
 
@@ -47,7 +43,6 @@ _NAME = re.compile(
     r"camera_([0-9a-f]{32})_([A-Za-z]+)_(\d+)_frame_(equirectangular|\d+)"
     r"_domain_([a-z]+(?:_[a-z]+)*)(\.\w+)"
 )
-_FORMATS = {"rgb": (8, ("RGB", "RGBA")), "semantic": (8, ("RGB", "RGBA")), "depth": (16, ("grey",))}
 
 
 class FileName(NamedTuple):
@@ -113,6 +108,14 @@ class PictureFiles(NamedTuple):
         return f"area_{self.area}/{room}/{self.name.camera}"
 
     @property
+    def image(self) -> ImageFiles:
+        """As a panorama or photo to be read."""
+        if self.name.frame == "equirectangular":
+            return ImageFiles(self.short_name, self.rgb, self.semantic, self.depth)
+        name = f"{self.short_name}/{self.name.frame}"
+        return ImageFiles(name, self.rgb, self.semantic, self.depth, self.pose)
+
+    @property
     def pose(self) -> Path:
         """Camera and pose."""
         name = self.name._replace(domain="pose", suffix=".json")
@@ -124,7 +127,7 @@ def list_pictures(
     area: str,
     group: Literal["pano", "data"],
     with_depth: bool,
-    noted: Noted = raised,
+    problems: Problems | None = None,
 ) -> list[PictureFiles]:
     """The panoramas or photos of one area, in the order of their names.
 
@@ -133,7 +136,7 @@ def list_pictures(
         area: One of `AREAS`.
         group: Panoramas or photos.
         with_depth: Whether depth is wanted.
-        noted: Where errors go, to go on after them.
+        problems: Where it is noted what is wrong, to go on after it.
 
     Raises:
         DataError: There are none, or other files.
@@ -141,14 +144,17 @@ def list_pictures(
     folder = root / f"area_{area}" / group
     found = []
     images: list[Path] = []
+    noted = (problems or (raised := Problems())).noted
     with noted():
         images = _list_images(folder / "rgb", "panoramas" if group == "pano" else "photos")
     for rgb in images:
-        with noted(rgb, rgb):
+        with noted(str(rgb), rgb):
             name = FileName.parse(rgb.name)
             depth = folder / "depth" / str(name._replace(domain="depth"))
             semantic = folder / "semantic" / str(name._replace(domain="semantic"))
             found.append(PictureFiles(area, name, rgb, semantic, depth if with_depth else None))
+    if problems is None:
+        raised.refuse(folder)
     return found
 
 
@@ -165,81 +171,3 @@ def _list_images(folder: Path, kind: str) -> list[Path]:
     if not paths:
         raise DataError(folder, found=why, expected="camera_….png files", remedy=GET_IT)
     return sorted(paths)
-
-
-def check_cameras(pictures: Iterable[PictureFiles], noted: Noted = raised) -> None:
-    """Check that no picture is there twice, as a copy in another room or area.
-
-    The two parts of area 5 share rooms, and are always in the same split: a camera may be in both.
-
-    Args:
-        pictures: Of all areas.
-        noted: Where errors go, to go on after them.
-
-    Raises:
-        DataError: One is.
-    """
-    seen: dict[tuple[str, str], list[PictureFiles]] = {}
-    for picture in pictures:
-        before = seen.setdefault((picture.name.camera, picture.name.frame), [])
-        for other in before:
-            with noted(picture):
-                if other.area == picture.area or other.room[0] != picture.room[0]:
-                    raise DataError(
-                        picture.rgb,
-                        found=f"the camera of {other.rgb}",
-                        expected="every camera in one room of one area",
-                        remedy="Remove the copy, with its depth, labels and pose.",
-                    )
-        before.append(picture)
-
-
-def check_panorama(files: PictureFiles, erp_height: int, noted: Noted = raised) -> None:
-    """Check that all files are there, of one size and readable at `erp_height`; nothing is decoded.
-
-    Args:
-        files: Of the panorama.
-        erp_height: Rows that are wanted.
-        noted: Where errors go, to go on after them.
-
-    Raises:
-        DataError: A file is missing, cut off, or of another size or pixel format.
-        SettingError: The panorama has fewer rows than wanted.
-    """
-    size = check_picture(files, noted)
-    with noted(files, files.rgb):
-        if size is not None:
-            check_panorama_size(files.rgb, size, erp_height)
-
-
-def check_picture(files: PictureFiles, noted: Noted = raised) -> tuple[int, int] | None:
-    """Check that all images are there and of one size; nothing is decoded.
-
-    Args:
-        files: Of the panorama or photo.
-        noted: Where errors go, to go on after them.
-
-    Returns:
-        Rows and columns; None after an error in the colours' file.
-
-    Raises:
-        DataError: A file is missing, cut off, or of another size or pixel format.
-    """
-    size = None
-    partners = [(files.rgb, "rgb"), (files.semantic, "semantic")]
-    if files.depth is not None:
-        partners.append((files.depth, "depth"))
-    for path, domain in partners:
-        with noted(files):
-            header = check_png(path, *_FORMATS[domain])
-            height, width = header.height, header.width
-            if domain == "rgb":
-                size = height, width
-            if size is not None and (height, width) != size:
-                raise DataError(
-                    path,
-                    found=f"{height}×{width} pixels",
-                    expected=f"{size[0]}×{size[1]}, as {files.rgb.name}",
-                    remedy="Copy or extract both files again.",
-                )
-    return size

@@ -2,150 +2,118 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from datamodules.core.group_drawing import draw_groups
-from datamodules.core.label_table import LabelTable
-from datamodules.core.problems import Noted, raised
-from datamodules.core.segmentation_module import Split
-from datamodules.stanford2d3ds.files import AREAS, FOLDS, GET_IT, PictureFiles, check_cameras
+from datamodules.stanford2d3ds.files import AREAS, FOLDS, GET_IT, PictureFiles, list_pictures
 from tangent_train.errors import DataError, SettingError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from datamodules.core.problems import Problems
+    from datamodules.core.reading import ImageFiles
+    from datamodules.core.split_module import Split
+
+__all__ = ["check_choice", "find_pictures"]
 
 
-__all__ = ["StanfordSplits"]
+def check_choice(fold: int, areas: Sequence[str]) -> None:
+    """Make sure that there are areas for training and for testing.
 
-_TABLE_NAME = "semantic_labels.json"
+    Raises:
+        SettingError: There are not.
+    """
+    if fold not in FOLDS:
+        raise SettingError("data.fold", found=repr(fold), expected="1, 2 or 3")
+    testing = set(FOLDS[fold])
+    if not set(areas) <= set(AREAS) or not testing & set(areas) or set(areas) <= testing:
+        raise SettingError(
+            "data.areas",
+            found=list(areas),
+            expected=f"some of {', '.join(AREAS)}: for testing (fold {fold}: "
+            f"{', '.join(FOLDS[fold])}) and for training (others)",
+        )
 
 
-class StanfordSplits:
-    """The three folds of the authors of the data set, with rooms for validation.
+def find_pictures(
+    root: Path,
+    group: Literal["pano", "data"],
+    problems: Problems,
+    *,
+    fold: int,
+    areas: Sequence[str],
+    with_depth: bool,
+    validation_fraction: float,
+    seed: int,
+) -> dict[Split, list[ImageFiles]]:
+    """The panoramas or photos of every split.
 
     Validation pictures are those of whole rooms drawn from the training areas, so that nothing is
     ever chosen by the test areas.
 
     Args:
         root: Folder with ``area_1`` … ``area_6``.
+        group: Panoramas or photos.
+        problems: Where it is noted what is missing or there twice.
         fold: 1, 2 or 3, see `FOLDS`.
         areas: Areas to use, all of which must be there.
-        validation_fraction: Share of the training rooms for validation: at least one room, never
-            all; 0 for no validation.
+        with_depth: Whether depth is an input.
+        validation_fraction: Share of the training rooms: at least one room, never all.
         seed: Chooses the validation rooms.
-        label_table: The class table, when it is not where the release has it.
 
     Raises:
-        SettingError: A setting that cannot work.
+        DataError: There is no data set, or only one room to train on, and one is wanted for
+            validation.
     """
-
-    def __init__(
-        self,
-        root: str | Path,
-        *,
-        fold: int = 1,
-        areas: Sequence[str] = AREAS,
-        validation_fraction: float = 0.1,
-        seed: int = 0,
-        label_table: str | Path | None = None,
-    ) -> None:
-        if fold not in FOLDS:
-            raise SettingError("data.fold", found=repr(fold), expected="1, 2 or 3")
-        if not 0 <= validation_fraction < 1:
-            raise SettingError(
-                "data.validation_fraction", found=validation_fraction, expected="0 to below 1"
-            )
-        testing = set(FOLDS[fold])
-        if not set(areas) <= set(AREAS) or not testing & set(areas) or set(areas) <= testing:
-            raise SettingError(
-                "data.areas",
-                found=list(areas),
-                expected=f"some of {', '.join(AREAS)}: for testing (fold {fold}: "
-                f"{', '.join(FOLDS[fold])}) and for training (others)",
-            )
-        self.root = Path(root)
-        self.areas = tuple(areas)
-        self._testing = testing
-        self._fraction = validation_fraction
-        self._seed = seed
-        self._label_table = None if label_table is None else Path(label_table)
-
-    def read_label_table(self, noted: Noted = raised) -> LabelTable:
-        """The class table, after a look at the folders.
-
-        Args:
-            noted: Where missing areas go, to go on after them.
-
-        Raises:
-            DataError: An area or the table is missing, or the table cannot be used.
-        """
-        if not self.root.is_dir():
+    if not root.is_dir():
+        raise DataError(root, found="no such folder", expected="the data set", remedy=GET_IT)
+    there = [area for area in areas if (root / f"area_{area}").is_dir()]
+    with problems.noted():
+        if len(there) < len(areas):
             raise DataError(
-                self.root, found="no such folder", expected="the data set", remedy=GET_IT
+                root,
+                found="no " + ", ".join(f"area_{area}" for area in areas if area not in there),
+                expected="all of " + ", ".join(f"area_{area}" for area in areas),
+                remedy=GET_IT,
             )
-        missing = [f"area_{area}" for area in self.areas if not self._is_there(area)]
-        with noted():
-            if missing:
-                raise DataError(
-                    self.root,
-                    found="no " + ", ".join(missing),
-                    expected="all of " + ", ".join(f"area_{area}" for area in self.areas),
-                    remedy=GET_IT,
-                )
-        return LabelTable.from_json(self._find_table())
-
-    def divide(
-        self, list_area: Callable[[str], list[PictureFiles]], noted: Noted = raised
-    ) -> dict[Split, list[PictureFiles]]:
-        """The pictures of every split.
-
-        Args:
-            list_area: Gives those of an area that is there.
-            noted: Where pictures that are there twice go, to go on after them.
-
-        Raises:
-            DataError: There is only one room to train on, and one is wanted for validation; or
-                pictures are there twice.
-        """
-        there = [area for area in self.areas if self._is_there(area)]
-        files = [picture for area in there for picture in list_area(area)]
-        check_cameras(files, noted)
-        training = [picture for picture in files if picture.area not in self._testing]
-        rooms = self._choose_rooms(training)
-        return {
-            "train": [picture for picture in training if picture.room not in rooms],
-            "val": [picture for picture in training if picture.room in rooms],
-            "test": [picture for picture in files if picture.area in self._testing],
-        }
-
-    def _is_there(self, area: str) -> bool:
-        return (self.root / f"area_{area}").is_dir()
-
-    def _find_table(self) -> Path:
-        if self._label_table is not None:
-            return self._label_table
-        places = (self.root / _TABLE_NAME, self.root / "assets" / _TABLE_NAME)
-        for place in places:
-            if place.is_file():
-                return place
-        raise DataError(
-            places[0],
-            found="no class table",
-            expected=f"it there or at {places[1]}",
-            remedy="Copy it from the release (assets), or name it in data.label_table.",
-        )
-
-    def _choose_rooms(self, files: Sequence[PictureFiles]) -> set[tuple[str, str, int]]:
-        """Draw the rooms for validation, the same for the same seed."""
-        if self._fraction == 0:
-            return set()
-        rooms = draw_groups((picture.room for picture in files), self._fraction, self._seed)
-        if files and not rooms:
+    listed = [list_pictures(root, area, group, with_depth, problems) for area in there]
+    pictures = [picture for pictures in listed for picture in pictures]
+    _check_cameras(pictures, problems)
+    training = [picture for picture in pictures if picture.area not in FOLDS[fold]]
+    rooms: set[tuple[str, str, int]] = set()
+    if validation_fraction:
+        rooms = draw_groups((picture.room for picture in training), validation_fraction, seed)
+        if training and not rooms:
             raise DataError(
-                self.root,
+                root,
                 found="one training room",
                 expected="two or more, to keep some for validation",
                 remedy="Set data.validation_fraction=0, or use more rooms.",
             )
-        return rooms
+    return {
+        "train": [picture.image for picture in training if picture.room not in rooms],
+        "val": [picture.image for picture in training if picture.room in rooms],
+        "test": [picture.image for picture in pictures if picture.area in FOLDS[fold]],
+    }
+
+
+def _check_cameras(pictures: Sequence[PictureFiles], problems: Problems) -> None:
+    """Note pictures that are there twice, as a copy in another room or area.
+
+    The two parts of area 5 share rooms, and are always in the same split: a camera may be in both.
+    """
+    seen: dict[tuple[str, str], list[PictureFiles]] = {}
+    for picture in pictures:
+        before = seen.setdefault((picture.name.camera, picture.name.frame), [])
+        for other in before:
+            with problems.noted(picture.image.name):
+                if other.area == picture.area or other.room[0] != picture.room[0]:
+                    raise DataError(
+                        picture.rgb,
+                        found=f"the camera of {other.rgb}",
+                        expected="every camera in one room of one area",
+                        remedy="Remove the copy, with its depth, labels and pose.",
+                    )
+        before.append(picture)

@@ -1,4 +1,4 @@
-"""The files of SYNTHIA's video sequences and of OmniSYNTHIA: names, partners, cameras.
+"""The files of SYNTHIA's video sequences and of OmniSYNTHIA: names and cameras.
 
 On disk, as released (`0X` is 01, 02, 04, 05 or 06)::
 
@@ -20,29 +20,21 @@ from __future__ import annotations
 
 import math
 import os
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from datamodules.core.problems import Noted, raised
-from datamodules.images.png import check_png
+from datamodules.core.reading import ImageFiles
 from tangent_train.errors import DataError
 
 if TYPE_CHECKING:
-    from collections.abc import Hashable, Mapping
     from pathlib import Path
 
     from numpy.typing import NDArray
 
-
 __all__ = [
     "GET_IT",
-    "PANORAMA_FORMATS",
     "VIEWS",
-    "VIEW_FORMATS",
-    "PictureFiles",
-    "check_files",
-    "check_root",
     "list_frames",
     "list_panoramas",
     "panorama_files",
@@ -61,51 +53,23 @@ GET_IT = (
 )
 """What to do when the data set is not there."""
 
-Formats = dict[str, tuple[int, tuple[str, ...]]]
-"""Bits and colour types by part."""
-
-VIEW_FORMATS: Formats = {
-    "rgb": (8, ("RGB", "RGBA")),
-    "labels": (16, ("RGB", "RGBA")),
-    "depth": (16, ("grey", "RGB", "RGBA")),
-}
-"""Pixel formats of a view."""
-
-PANORAMA_FORMATS: Formats = {
-    "rgb": (8, ("RGB", "RGBA")),
-    "labels": (8, ("grey",)),
-    "depth": (16, ("grey",)),
-}
-"""Pixel formats of a panorama."""
-
 _SIZE = (760, 1280)
 _FOCAL, _CENTER = 532.740352, (640.0, 380.0)  # of images of that size, centre from pixel corners
 _NAME = "[0-9]" * 6 + ".png"
 
 
-class PictureFiles(NamedTuple):
-    """The files of one view or panorama."""
-
-    rgb: Path
-    labels: Path
-    depth: Path | None
-
-    @property
-    def parts(self) -> Mapping[str, Path]:
-        """Those there are, by name."""
-        return {part: path for part, path in self._asdict().items() if path is not None}
-
-
-# --- names ------------------------------------------------------------------------------------
-
-
 def sequence_folder(root: Path, sequence: str) -> Path:
     """Folder of a sequence.
 
+    Raises:
+        DataError: The data set is not there at all.
+
     >>> from pathlib import Path
-    >>> sequence_folder(Path("synthia"), "01").name
+    >>> sequence_folder(Path("."), "01").name
     'SYNTHIA-SEQS-01-SUMMER'
     """
+    if not root.is_dir():
+        raise DataError(root, found="no such folder", expected="the data set", remedy=GET_IT)
     return root / f"SYNTHIA-SEQS-{sequence}-SUMMER"
 
 
@@ -114,18 +78,29 @@ def views_folder(folder: Path, view: str) -> Path:
     return folder / "RGB" / "Stereo_Left" / f"Omni_{view}"
 
 
-def view_files(folder: Path, view: str, frame: str, *, with_depth: bool) -> PictureFiles:
-    """Files of one view of the sequence in `folder`; `frame` is as ``000000``."""
+def view_files(root: Path, sequence: str, frame: str, view: str, *, with_depth: bool) -> ImageFiles:
+    """Files of one of `VIEWS` of a frame; `frame` is as ``000000``."""
+    folder = sequence_folder(root, sequence)
     place = f"Stereo_Left/Omni_{view}/{frame}.png"
-    depth = folder / "Depth" / place if with_depth else None
-    return PictureFiles(folder / "RGB" / place, folder / "GT" / "LABELS" / place, depth)
+    camera = _camera_file(folder)
+    return ImageFiles(
+        f"sequence_{sequence}/{frame}/{view}",
+        folder / "RGB" / place,
+        folder / "GT" / "LABELS" / place,
+        folder / "Depth" / place if with_depth else None,
+        camera if camera.exists() else None,
+    )
 
 
-def panorama_files(folder: Path, frame: str, *, with_depth: bool) -> PictureFiles:
-    """Files of one panorama of the sequence in `folder`; `frame` is as ``000000``."""
-    pano, name = folder / "pano", f"{frame}.png"
-    depth = pano / "Depth" / name if with_depth else None
-    return PictureFiles(pano / "RGB" / name, pano / "GT" / "LABELS_Correct" / name, depth)
+def panorama_files(root: Path, sequence: str, frame: str, *, with_depth: bool) -> ImageFiles:
+    """Files of one panorama; `frame` is as ``000000``."""
+    pano, name = sequence_folder(root, sequence) / "pano", f"{frame}.png"
+    return ImageFiles(
+        f"sequence_{sequence}/{frame}",
+        pano / "RGB" / name,
+        pano / "GT" / "LABELS_Correct" / name,
+        pano / "Depth" / name if with_depth else None,
+    )
 
 
 def list_frames(folder: Path) -> list[str]:
@@ -154,54 +129,6 @@ def _listed(folder: Path) -> list[Path]:
         ) from error
 
 
-# --- what the headers tell -----------------------------------------------------------------------
-
-
-def check_root(root: Path) -> None:
-    """Make sure that the folder of the data set is there.
-
-    Raises:
-        DataError: It is not.
-    """
-    if not root.is_dir():
-        raise DataError(root, found="no such folder", expected="the data set", remedy=GET_IT)
-
-
-def check_files(
-    files: PictureFiles, formats: Formats, noted: Noted = raised, item: Hashable = None
-) -> tuple[int, int]:
-    """Check that all files are there, whole, of one size and as released; nothing is decoded.
-
-    Args:
-        files: Of one view or panorama.
-        formats: `VIEW_FORMATS` or `PANORAMA_FORMATS`.
-        noted: Where errors go, to go on after them.
-        item: What they are noted of.
-
-    Returns:
-        Rows and columns; (0, 0) of none that could be read.
-
-    Raises:
-        DataError: A file is missing, cut off, or of another size or pixel format.
-    """
-    size = None
-    for part, path in files.parts.items():
-        with noted(item):
-            header = check_png(path, *formats[part])
-            size = size or (header.height, header.width)
-            if (header.height, header.width) != size:
-                raise DataError(
-                    path,
-                    found=f"{header.height}×{header.width} pixels",
-                    expected=f"{size[0]}×{size[1]}, as {files.rgb}",
-                    remedy="Copy or extract both files again.",
-                )
-    return size or (0, 0)
-
-
-# --- cameras -------------------------------------------------------------------------------------
-
-
 def read_camera(folder: Path, size: tuple[int, int]) -> NDArray[np.float64]:
     """Camera matrix of all views of a sequence.
 
@@ -218,7 +145,7 @@ def read_camera(folder: Path, size: tuple[int, int]) -> NDArray[np.float64]:
     Raises:
         DataError: The file holds something else, or is missing and the views have another size.
     """
-    path = folder / "CameraParams" / "intrinsics.txt"
+    path = _camera_file(folder)
     if path.exists():
         focal, center = _parse_camera(path, size)
     elif size == _SIZE:
@@ -256,3 +183,7 @@ def _parse_camera(
         f"of views of {size[0]}×{size[1]}",
         remedy="Extract the file again; without it the camera of the release is used.",
     )
+
+
+def _camera_file(folder: Path) -> Path:
+    return folder / "CameraParams" / "intrinsics.txt"

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeVar
+from itertools import chain
+from typing import TYPE_CHECKING
 
 from tangent_train.errors import DataError, SettingError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Mapping, Sequence
 
-    from datamodules.core.segmentation_module import Split
+    from datamodules.core.reading import ImageFiles
+    from datamodules.core.split_module import Split
 
-__all__ = ["FRAMES", "SEQUENCES", "TEST", "TRAIN", "SequenceSplits", "choose_frames"]
+__all__ = ["FRAMES", "SEQUENCES", "TEST", "TRAIN", "checked_sequences", "choose_frames", "divide"]
 
 SEQUENCES: tuple[str, ...] = ("01", "02", "04", "05", "06")
 """The sequences there are; OmniSYNTHIA has their summers."""
@@ -24,8 +25,6 @@ TEST: tuple[str, ...] = ("04",)
 
 FRAMES = 500
 """About as many frames of each sequence became panoramas of OmniSYNTHIA."""
-
-_Item = TypeVar("_Item")
 
 
 def choose_frames(frames: Sequence[str], count: int = FRAMES) -> list[str]:
@@ -46,78 +45,60 @@ def choose_frames(frames: Sequence[str], count: int = FRAMES) -> list[str]:
     return list(frames[::step])
 
 
-@dataclass(frozen=True)
-class SequenceSplits:
-    """Sequences for training and test, and what validation takes from the former.
+def checked_sequences(
+    train: Sequence[str], test: Sequence[str]
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Names of the sequences for training and for the test; numbers are made such names.
+
+    Raises:
+        SettingError: There are none of a kind, or some are for both.
+    """
+    # YAML reads 01 as a number.
+    names = tuple(tuple(str(sequence).zfill(2) for sequence in some) for some in (train, test))
+    for kind, some, others in (("train", names[0], ()), ("test", names[1], names[0])):
+        if not some or not set(some) <= set(SEQUENCES) - set(others):
+            raise SettingError(
+                f"data.{kind}_sequences",
+                found=list(some),
+                expected=f"some of {', '.join(SEQUENCES)}, none for both training and test",
+            )
+    return names[0], names[1]
+
+
+def divide(
+    frames: Mapping[str, Sequence[Sequence[ImageFiles]]],
+    test: Sequence[str],
+    validation_fraction: float,
+) -> dict[Split, list[ImageFiles]]:
+    """What belongs to which split.
 
     Frames of a sequence are nearly the same as their neighbours, so validation takes those at the
     end of each training sequence, not some here and there.
 
-    Attributes:
-        train: Sequences, as ``01``; numbers are made such names.
-        test: Likewise.
+    Args:
+        frames: Of every sequence, in order: the images of each frame.
+        test: Sequences for the test; all others are for training.
         validation_fraction: Share of each training sequence for validation: at least one frame,
             never all; 0 for no validation.
 
     Raises:
-        SettingError: A setting that cannot work.
+        DataError: A training sequence has a single frame, and validation wants some.
     """
-
-    train: tuple[str, ...]
-    test: tuple[str, ...]
-    validation_fraction: float
-
-    def __post_init__(self) -> None:
-        for name in ("train", "test"):
-            # YAML reads 01 as a number.
-            sequences = tuple(str(sequence).zfill(2) for sequence in getattr(self, name))
-            object.__setattr__(self, name, sequences)
-            others = set(self.train) if name == "test" else set()
-            if not sequences or not set(sequences) <= set(SEQUENCES) - others:
-                raise SettingError(
-                    f"data.{name}_sequences",
-                    found=list(sequences),
-                    expected=f"some of {', '.join(SEQUENCES)}, none for both training and test",
-                )
-        if not 0 <= self.validation_fraction < 1:
-            raise SettingError(
-                "data.validation_fraction",
-                found=self.validation_fraction,
-                expected="0 to below 1",
-            )
-
-    @property
-    def sequences(self) -> tuple[str, ...]:
-        """All of them."""
-        return self.train + self.test
-
-    def divide(self, items_of: Callable[[str], Sequence[_Item]]) -> dict[Split, list[_Item]]:
-        """What belongs to which split.
-
-        Args:
-            items_of: What a sequence holds, one item per frame, in order.
-
-        Raises:
-            DataError: A training sequence has a single frame, and validation wants some.
-        """
-        splits: dict[Split, list[_Item]] = {"train": [], "val": [], "test": []}
-        for sequence in self.train:
-            items = items_of(sequence)
-            held = self._held_out(sequence, len(items))
-            splits["train"] += items[: len(items) - held]
-            splits["val"] += items[len(items) - held :]
-        for sequence in self.test:
-            splits["test"] += items_of(sequence)
-        return splits
-
-    def _held_out(self, sequence: str, count: int) -> int:
-        if self.validation_fraction == 0:
-            return 0
-        if count == 1:
+    splits: dict[Split, list[ImageFiles]] = {"train": [], "val": [], "test": []}
+    for sequence, found in frames.items():
+        count = len(found)
+        if sequence in test:
+            splits["test"] += chain.from_iterable(found)
+            continue
+        if validation_fraction and count == 1:
             raise DataError(
                 f"SYNTHIA sequence {sequence}",
                 found="one frame",
                 expected="two or more, to keep some for validation",
                 remedy="Set data.validation_fraction=0, or use more frames.",
             )
-        return min(max(1, round(self.validation_fraction * count)), count - 1)
+        held = min(max(1, round(validation_fraction * count)), count - 1)
+        last = count - held if validation_fraction else count
+        splits["train"] += chain.from_iterable(found[:last])
+        splits["val"] += chain.from_iterable(found[last:])
+    return splits

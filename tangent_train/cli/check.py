@@ -9,7 +9,6 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from datamodules.core.data_check import check_all
 from tangent_train.registry import make
 
 if TYPE_CHECKING:
@@ -32,13 +31,13 @@ def check(settings: Mapping[str, Any]) -> None:
     representation = make(settings["representation"], "representation")
     data = make(settings["data"], "data", representation=representation)
     console = Console(highlight=False)
-    problems, count = check_all(data, progress=console.is_terminal)
+    problems, count = data.check(progress=console.is_terminal)
     listed = problems.listed()
     read = f"{count} {data.noun} of {_printable(str(data.root))} were read"
     if listed and console.is_terminal:
         console.print(_table(listed))
     for problem in () if console.is_terminal else listed:
-        sys.stdout.write("\t".join(map(_printable, problem[1:4])) + "\n")
+        sys.stdout.write("\t".join(map(_printable, problem[:3])) + "\n")
     found = f"{len(listed)} problem{'s' * (len(listed) > 1)}" if listed else "Nothing is wrong"
     told = console if console.is_terminal or not listed else Console(stderr=True, highlight=False)
     told.print(Text(f"{found}; {read}."), soft_wrap=True)
@@ -53,7 +52,7 @@ def _table(problems: Sequence[Problem]) -> Table:
     table.add_column("finding", overflow="fold", ratio=3)
     table.add_column("remedy", overflow="fold", ratio=3)
     for problem in problems:
-        table.add_row(*(Text(_printable(cell)) for cell in problem[1:4]))
+        table.add_row(*(Text(_printable(cell)) for cell in problem[:3]))
     return table
 
 

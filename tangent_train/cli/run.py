@@ -150,8 +150,9 @@ def prepare(settings: Settings) -> None:
     """
     representation = make(settings["representation"], "representation")
     data = make(settings["data"], "data", representation=representation)
-    data.prepare_all()
-    counts = ", ".join(f"{len(data.open_split(s))} {s}" for s in ("train", "val", "test"))
+    data.prepare_data()
+    data.setup()
+    counts = ", ".join(f"{data.count(s)} {s}" for s in ("train", "val", "test"))
     _console().print(f"{data.root} is ready. {data.noun.capitalize()}: {counts}.")
 
 

@@ -122,7 +122,8 @@ def test_the_same_images_are_shown_after_every_validation(
         steps = views.render(panorama.depth, "nearest").astype(np.float32) / 512
         depth = torch.from_numpy(steps).clamp(max=4)
         values = torch.cat([rgb, depth[:, None]], dim=1)
-        mean, std = (torch.tensor(v) for v in (data.normalization.mean, data.normalization.std))
+        normalization = data.samples.normalization
+        mean, std = (torch.tensor(v) for v in (normalization.mean, normalization.std))
         with torch.no_grad():
             scores = task.network((values - mean[:, None, None]) / std[:, None, None])
         labels = TANGENT.to_labels(scores[:, 1:], (32, 64)).numpy() + 1

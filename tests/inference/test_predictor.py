@@ -88,9 +88,7 @@ def test_labels_are_those_of_an_evaluation(
 ) -> None:
     trained = trained_network(representation, channels)
     made = make(representation, "representation")
-    data = Stanford2D3DS(
-        root=str(stanford_root), representation=made, inputs=trained.inputs, fold=1
-    )
+    data = Stanford2D3DS(root=stanford_root, representation=made, inputs=trained.inputs, fold=1)
     task = SegmentationTask(trained.network, made, trained.class_names, SGD)
     batch = next(iter(data.test_dataloader()))
     batch = data.on_after_batch_transfer(batch, 0)

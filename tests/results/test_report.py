@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from datamodules.modelnet40.shape_files import MODELNET40
-from datamodules.stanford2d3ds.panoramas import CLASSES
+from datamodules.stanford2d3ds.label_table import CLASSES
 from tangent_train.results.chart import report_png
 from tangent_train.results.comparisons import levels_report, runs_report, transfer_report
 from tangent_train.results.paper import published

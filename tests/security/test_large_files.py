@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from PIL import Image, ImageFile
 
-from datamodules.core.label_table import LabelTable
 from datamodules.folder.classes import read_classes
 from datamodules.images.gpano import area_of
 from datamodules.images.pixel_files import (
@@ -24,6 +23,7 @@ from datamodules.images.pixel_files import (
     read_rgb,
 )
 from datamodules.images.png import read_color_png, read_depth_png
+from datamodules.stanford2d3ds.label_table import LabelTable
 from tangent_train.errors import DataError
 from tangent_train.rendering.camera_files import read_cameras
 

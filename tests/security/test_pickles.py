@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 import torch
 
-from datamodules.core.store_files import open_stored
+from datamodules.core.store import Store
 from datamodules.images.pixel_files import read_array
-from datamodules.modelnet40.sphere_files import read_sphere
 from models.pretrained import read_tensors
 from tangent_train.checkpoints.content import read_checkpoint
 from tangent_train.checkpoints.trained import load_trained
@@ -129,6 +128,12 @@ def test_no_command_unpickles(
     assert "expected" in message
 
 
+def _read_store(path: Path) -> None:
+    copy = path.with_name("copy.npy")
+    copy.write_bytes(path.read_bytes())
+    Store(path.parent).read("copy", {})
+
+
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("make", CREATORS, ids=["archive", "legacy", "pickle", "array"])
 def test_no_reader_unpickles(make: Any, name: str, created: Path, tmp_path: Path) -> None:
@@ -139,8 +144,7 @@ def test_no_reader_unpickles(make: Any, name: str, created: Path, tmp_path: Path
         read_checkpoint,
         read_tensors,
         read_array,
-        open_stored,
-        lambda p: read_sphere(p, (4, 8)),
+        _read_store,
     )
     for read in readers:
         with pytest.raises(DataError):

@@ -13,16 +13,14 @@ from datamodules.core.samples import (
     RGB_NORMALIZATION,
     RGBD_NORMALIZATION,
     EvaluationImages,
-    EvaluationSample,
+    ImageSamples,
     Input,
     Normalization,
     TrainingImages,
-    TrainingSample,
     collate,
     normalize,
     render_inputs,
 )
-from datamodules.core.segmentation_module import checked_inputs
 from datamodules.images.colors import jitter_colors
 from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_directions
@@ -34,30 +32,28 @@ from tangent_train.rendering.representations.pinhole import (
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from datamodules.core.sources import ImageSource
     from tangent_train.rendering.representations.pinhole import Representation
 
 DEPTH: tuple[Input, ...] = ("rgb", "depth")
 IDENTITY = Normalization((0, 0, 0, 0), (1 / 255, 1 / 255, 1 / 255, 1))
 
 
-class Positions:
-    """Panoramas whose every pixel has its own red, depth and label."""
+def _positions(index: int) -> Panorama:
+    """A panorama whose every pixel has its own red, depth and label."""
+    place = np.arange(16 * 32).reshape(16, 32) % 251
+    labels = (place + index).astype(np.uint8)
+    return Panorama(np.stack([labels] * 3, axis=-1), labels.astype(np.uint16) * 4, labels)
 
+
+class _Positions:
     def __len__(self) -> int:
         return 3
 
-    def name(self, index: int) -> str:
-        return str(index)
-
     def read(self, index: int) -> Panorama:
-        place = np.arange(16 * 32).reshape(16, 32) % 251
-        labels = (place + index).astype(np.uint8)
-        rgb = np.stack([labels, labels, labels], axis=-1)
-        return Panorama(rgb, labels.astype(np.uint16) * 4, labels)
+        return _positions(index)
 
-    def label_counts(self, index: int) -> NDArray[np.int64]:
-        raise NotImplementedError
+
+POSITIONS: Any = _Positions()
 
 
 # --- normalization -----------------------------------------------------------------------------
@@ -77,12 +73,6 @@ def test_normalize_against_the_formula(depth: bool) -> None:
     for channel, (mean, std) in enumerate(zip(normalization.mean, normalization.std, strict=True)):
         value = rgb[..., channel] / 255 if channel < 3 else steps / 512
         np.testing.assert_allclose(images[:, :, channel], (value - mean) / std, atol=1e-5)
-
-
-def test_a_config_brings_lists() -> None:
-    from_list = Normalization([0.5490, 0.5306, 0.4779], [0.1992, 0.2005, 0.2129])
-    assert from_list == RGB_NORMALIZATION
-    assert (from_list.channels, RGBD_NORMALIZATION.channels) == (3, 4)
 
 
 @pytest.mark.parametrize(
@@ -141,13 +131,6 @@ def test_elevation_is_how_far_a_pixel_looks_up(
     assert 0.99 < elevation.max() <= 1
 
 
-def test_the_elevation_of_tangent_images_is_that_of_their_rays() -> None:
-    shape, representation = (128, 256), TangentRepresentation(0, 6)
-    image = Panorama(np.zeros((*shape, 3), np.uint8), None, np.zeros(shape, np.uint8))
-    elevation = render_inputs(image, representation.whole(), ("rgb", "elevation"))[1].numpy()
-    np.testing.assert_allclose(elevation, representation.grid.directions()[..., 2], atol=4e-4)
-
-
 def test_the_elevation_follows_the_measured_channels() -> None:
     rgb = torch.full((2, 3, 3, 3), 255, dtype=torch.uint8)
     depth = torch.tensor([[0, 1, 2048]] * 3, dtype=torch.int16).expand(2, 3, 3)
@@ -176,19 +159,19 @@ def test_the_elevation_follows_the_measured_channels() -> None:
 )
 def test_impossible_inputs(inputs: Any) -> None:
     with pytest.raises(SettingError, match=r"data\.inputs: found .* expected a list: rgb"):
-        checked_inputs(inputs)
+        ImageSamples(inputs, RGB_NORMALIZATION, 0)
 
 
 def test_inputs_come_in_the_order_of_the_channels() -> None:
-    assert checked_inputs(["elevation", "depth", "rgb"]) == ("rgb", "depth", "elevation")
+    samples = ImageSamples(["elevation", "depth", "rgb"], RGBD_NORMALIZATION, 0)
+    assert (samples.inputs, samples.in_channels) == (("rgb", "depth", "elevation"), 5)
 
 
 # --- samples -----------------------------------------------------------------------------------
 
 
 def _training(strips: Representation, seed: int = 0) -> TrainingImages:
-    source: ImageSource[Panorama] = Positions()
-    return TrainingImages(source, strips, seed, DEPTH)
+    return TrainingImages(POSITIONS, strips, seed, DEPTH)
 
 
 def test_training_sample(strips: Representation) -> None:
@@ -208,9 +191,9 @@ def test_depth_is_clipped_and_missing_is_zero(
     strips: Representation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     steps = np.tile(np.array([0, 1, 2047, 2048, 2049, 32768, 65535, 0], np.uint16), (16, 4))
-    panorama = Positions().read(0)._replace(depth=steps)
-    monkeypatch.setattr(Positions, "read", lambda *_: panorama)
-    images = EvaluationImages(Positions(), strips, DEPTH)[0, 0].images
+    panorama = _positions(0)._replace(depth=steps)
+    monkeypatch.setattr(_Positions, "read", lambda *_: panorama)
+    images = EvaluationImages(POSITIONS, strips, DEPTH)[0, 0].images
     assert images[1][0, 0].tolist() == [0, 1, 2047, 2048, 2048, 2048, 2048, 0]
     assert normalize(images, IDENTITY, DEPTH)[0, 3, 0, 3] == 4  # metres
 
@@ -223,13 +206,13 @@ def test_views_are_those_of_seed_epoch_and_index(strips: Representation) -> None
 
 
 def test_evaluation_sample(strips: Representation) -> None:
-    dataset = EvaluationImages(Positions(), strips, DEPTH)
+    dataset = EvaluationImages(POSITIONS, strips, DEPTH)
     sample = dataset[0, 2]
     assert len(dataset) == len(_training(strips)) == 3
     images = normalize(sample.images, IDENTITY, DEPTH)
     assert images.shape == (4, 4, 16, 8)
     assert sample.index == 2
-    np.testing.assert_array_equal(sample.target.numpy(), Positions().read(2).labels)
+    np.testing.assert_array_equal(sample.target.numpy(), _positions(2).labels)
     joined = torch.cat(list(images[:, 0]), dim=1)
     torch.testing.assert_close(joined, sample.target.float())
 
@@ -237,7 +220,7 @@ def test_evaluation_sample(strips: Representation) -> None:
 @pytest.mark.parametrize("count", [1, 2])
 def test_batches_are_those_of_torch(strips: Representation, count: int) -> None:
     training: Any = _training(strips)
-    evaluation: Any = EvaluationImages(Positions(), strips, DEPTH)
+    evaluation: Any = EvaluationImages(POSITIONS, strips, DEPTH)
     for samples in ([d[0, i] for i in range(count)] for d in (training, evaluation)):
         found, expected = collate(samples), default_collate(samples)
         assert type(found) is type(expected)
@@ -250,27 +233,15 @@ def test_batches_are_those_of_torch(strips: Representation, count: int) -> None:
 def test_samples_share_no_memory_with_panoramas(
     strips: Representation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    panorama = Positions().read(0)
-    monkeypatch.setattr(Positions, "read", lambda *_: panorama)
+    panorama = _positions(0)
+    monkeypatch.setattr(_Positions, "read", lambda *_: panorama)
     whole = EquirectRepresentation(level=3)
     for dataset in (
-        TrainingImages(Positions(), whole, 0, DEPTH),
-        EvaluationImages(Positions(), whole, DEPTH),
+        TrainingImages(POSITIONS, whole, 0, DEPTH),
+        EvaluationImages(POSITIONS, whole, DEPTH),
     ):
         for tensor in (*(sample := dataset[0, 0]).images, sample[1]):
             assert not any(np.shares_memory(tensor.numpy(), part) for part in panorama)
-
-
-def test_samples_collate(strips: Representation) -> None:
-    training = _training(strips)
-    batch = default_collate([training[0, 0], training[0, 2]])
-    assert isinstance(batch, TrainingSample)
-    assert [image.shape for image in batch.images] == [(2, 2, 16, 8, 3), (2, 2, 16, 8)]
-    assert batch.labels.dtype == torch.uint8
-    assert torch.as_tensor(batch.index).tolist() == [0, 2]
-    whole = default_collate([EvaluationImages(Positions(), strips, DEPTH)[0, 1]])
-    assert isinstance(whole, EvaluationSample)
-    assert whole.target.shape == (1, 16, 32)
 
 
 # --- colours -----------------------------------------------------------------------------------
@@ -278,8 +249,8 @@ def test_samples_collate(strips: Representation) -> None:
 
 def test_jitter_changes_the_colours_and_nothing_else(strips: Representation) -> None:
     plain, jittered = (
-        TrainingImages(Positions(), strips, 0, DEPTH),
-        TrainingImages(Positions(), strips, 0, DEPTH, 0.5),
+        TrainingImages(POSITIONS, strips, 0, DEPTH),
+        TrainingImages(POSITIONS, strips, 0, DEPTH, 0.5),
     )
     for epoch in range(3):
         before, after = plain[epoch, 1], jittered[epoch, 1]
@@ -307,13 +278,3 @@ def test_jitter_against_slow_formulas(strength: float) -> None:
         h, s, v = colorsys.rgb_to_hsv(*colors[place])
         expected = colorsys.hsv_to_rgb((h + hue) % 1, s, v)
         np.testing.assert_allclose(found[place] / 255, expected, atol=4 / 255)
-
-
-def test_jitter_of_neighbouring_images_agrees() -> None:
-    # The same colour in a dark and in a bright image stays the same colour.
-    rgb = torch.zeros((2, 4, 4, 3), dtype=torch.uint8)
-    rgb[1] = 200
-    rgb[:, 0] = torch.tensor([90, 120, 60], dtype=torch.uint8)
-    found = jitter_colors(rgb, 0.5, np.random.default_rng(3))
-    assert torch.equal(found[0, 0], found[1, 0])
-    assert not torch.equal(found[0, 0], rgb[0, 0])

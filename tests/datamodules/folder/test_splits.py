@@ -29,7 +29,7 @@ def own_root(root: Path, tmp_path: Path) -> Path:
 
 
 def _names(module: FolderPanoramas, split: Split) -> list[str]:
-    source = module.open_split(split)
+    source = module.source(split)
     return [source.name(index) for index in range(len(source))]
 
 

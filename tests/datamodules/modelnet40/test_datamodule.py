@@ -15,11 +15,11 @@ from datamodules.modelnet40.meshes import CHANNELS, clean_mesh, mesh_spheres, re
 from datamodules.modelnet40.shape_files import MODELNET40
 from datamodules.modelnet40.shape_samples import (
     SPHERE_NORMALIZATION,
+    STEPS,
     EvaluationShapes,
     ShapeSample,
     normalize_spheres,
 )
-from datamodules.modelnet40.sphere_files import STEPS
 from tangent_train.errors import DataError, SettingError
 from tangent_train.rendering import (
     EquirectRepresentation,
@@ -63,6 +63,10 @@ def _digest(batch: ShapeSample) -> str:
     return f"{batch.index.tolist()} {batch.label.tolist()} {content}"
 
 
+def _labels(module: ModelNet40, split: Split) -> list[int]:
+    return [module.class_names.index(mesh.label) for mesh in module.source(split).items]
+
+
 # --- splits ------------------------------------------------------------------------------------
 
 
@@ -81,7 +85,7 @@ def test_every_shape_is_in_one_split_with_the_class_of_its_folder(make_module: M
     names: list[str] = []
     for split in SPLITS:
         source = module.source(split)
-        for index, label in enumerate(source.labels):
+        for index, label in enumerate(_labels(module, split)):
             name = source.name(index)
             assert name.startswith(f"{module.class_names[label]}/")
             assert ("/test/" in name) is (split == "test")
@@ -93,7 +97,7 @@ def test_validation_is_drawn_from_every_class_alike(make_module: MakeModule) -> 
     drawn = set()
     for seed in range(4):
         module = make_module(validation_fraction=0.34, seed=seed)
-        labels = module.source("val").labels
+        labels = _labels(module, "val")
         # A third of 6, 4 and 5.
         assert [labels.count(k) for k in range(3)] == [2, 1, 2]
         drawn.add(tuple(module.source("val").name(i) for i in range(5)))
@@ -123,7 +127,7 @@ def test_validation_does_not_depend_on_what_can_be_used(tmp_path: Path) -> None:
 
 def test_both_layouts_give_the_same_samples(make_module: MakeModule, tmp_path: Path) -> None:
     other = ModelNet40(write_tree(tmp_path, "by split"), TangentRepresentation(0, LEVEL))
-    other.prepare_all()
+    other.prepare_data()
     for mine, theirs in zip(make_module().test_dataloader(), other.test_dataloader(), strict=True):
         assert _digest(mine) == _digest(theirs)
     assert other.class_names == make_module().class_names
@@ -132,7 +136,7 @@ def test_both_layouts_give_the_same_samples(make_module: MakeModule, tmp_path: P
 def test_classes_before_there_are_files(tmp_path: Path) -> None:
     module = ModelNet40(tmp_path / "ModelNet40", TangentRepresentation(0, LEVEL))
     assert module.class_names == MODELNET40
-    for use in (module.setup, module.prepare_data, module.prepare_all):
+    for use in (module.setup, module.prepare_data):
         with pytest.raises(DataError, match=r"no such folder.*princeton"):
             use()
 
@@ -142,10 +146,9 @@ def test_a_split_without_a_usable_shape(tmp_path: Path, part: str) -> None:
     root = write_tree(tmp_path, counts={"cup": (2, 2)})
     for path in (root / "cup" / part).iterdir():
         path.write_text("OFF")
-    module = ModelNet40(root, TangentRepresentation(0, LEVEL), validation_fraction=0)
-    module.prepare_data()
-    with pytest.raises(DataError, match=f"no usable {part} shape"):
-        module.setup()
+    settings: Any = {"validation_fraction": 0, "skip_broken": True}
+    with pytest.raises(DataError, match=f"no shapes for {part} that can be used"):
+        ModelNet40(root, TangentRepresentation(0, LEVEL), **settings).prepare_data()
 
 
 def test_spheres_elsewhere(root: Path, tmp_path: Path) -> None:
@@ -155,7 +158,11 @@ def test_spheres_elsewhere(root: Path, tmp_path: Path) -> None:
         made = (tmp_path / "store" / f"spheres_{size}/cup/train").glob("*.npy")
         assert len(list(made)) == COUNTS["cup"][0]
         assert not (root / f"spheres_{size}").exists()
-        assert module.source("train").read(0).shape == (2 ** (level + 1), 2 ** (level + 2), 6)
+        assert module.source("train").read(0).spheres.shape == (
+            2 ** (level + 1),
+            2 ** (level + 2),
+            6,
+        )
 
 
 def test_spheres_of_every_size_have_a_folder(root: Path) -> None:
@@ -178,7 +185,7 @@ def test_batches(make_module: MakeModule) -> None:
     seen = sorted(int(index) for batch in batches for index in batch.index)
     assert seen == list(range(TRAINING))
     labels = {int(i): int(c) for batch in batches for i, c in zip(batch.index, batch.label)}  # noqa: B905
-    assert [labels[i] for i in range(TRAINING)] == list(module.source("train").labels)
+    assert [labels[i] for i in range(TRAINING)] == _labels(module, "train")
 
 
 def test_evaluation_takes_all_in_order_several_at_once(make_module: MakeModule) -> None:
@@ -211,7 +218,7 @@ def test_views_are_those_of_the_float_spheres(make_module: MakeModule, root: Pat
 
 
 def _numbers(module: ModelNet40) -> tuple[list[float], list[float]]:
-    return list(module.normalization.mean), list(module.normalization.std)
+    return list(module.samples.normalization.mean), list(module.samples.normalization.std)
 
 
 @pytest.mark.parametrize("in_memory", [False, True])
@@ -335,7 +342,7 @@ def test_views_of_a_turned_shape_are_views_of_its_turned_mesh(
         )
         found = samples[0, index].images.numpy() / STEPS
         assert np.abs(found - expected / STEPS).mean() < 0.01  # facets have edges
-        upright = module.source("test").read(index)
+        upright = module.source("test").read(index).spheres
         before = views.render(np.ascontiguousarray(upright[..., :3]), "bilinear") / STEPS
         assert np.abs(before - expected[..., :3] / STEPS).mean() > 0.05
 
@@ -343,7 +350,7 @@ def test_views_of_a_turned_shape_are_views_of_its_turned_mesh(
 def test_yaw_and_so3_are_spread_over_all_turns(make_module: MakeModule) -> None:
     module = make_module()
     for rotation in ("yaw", "so3"):
-        samples = EvaluationShapes(module.source("test"), module.representation, rotation, 0)
+        samples = EvaluationShapes(module.source("test"), {}, module.representation, rotation, 0)
         up = np.array([samples.rotation(index)[:, 2] for index in range(400)])
         ahead = np.array([samples.rotation(index)[:, 0] for index in range(400)])
         assert np.abs(ahead.mean(axis=0)).max() < 0.12
@@ -469,7 +476,7 @@ def test_impossible_settings(make_module: MakeModule, name: str, value: Any) -> 
 
 def test_own_normalization(make_module: MakeModule) -> None:
     own = make_module(normalization={"mean": [0] * 6, "std": [1] * 6})
-    assert list(own.normalization.std) == [1.0] * 6
+    assert list(own.samples.normalization.std) == [1.0] * 6
     with pytest.raises(SettingError, match="normalization"):
         make_module(normalization={"mean": [0] * 6, "std": [1] * 5})
 

@@ -10,7 +10,7 @@ import pytest
 
 from datamodules import Stanford2D3DS, Stanford2D3DSPerspective, SynthRooms, SynthRoomsPerspective
 from datamodules.core.photos import distance_from_z_depth
-from datamodules.stanford2d3ds.perspective import read_camera_matrix
+from datamodules.stanford2d3ds.reader import read_camera_matrix
 from tangent_train.errors import DataError, SettingError
 from tangent_train.geometry import (
     FLIP_Y,

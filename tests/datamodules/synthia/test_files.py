@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 
+from datamodules.core.problems import Problems
+from datamodules.core.reading import ImageFiles, check_headers
 from datamodules.synthia.files import (
-    PANORAMA_FORMATS,
-    VIEW_FORMATS,
     VIEWS,
-    check_files,
     list_frames,
     list_panoramas,
     panorama_files,
@@ -19,21 +19,20 @@ from datamodules.synthia.files import (
     sequence_folder,
     view_files,
 )
-from datamodules.synthia.pixels import (
+from datamodules.synthia.reader import (
     CLASSES,
-    decode_labels,
-    default_normalization,
+    PANORAMA_FORMATS,
+    VIEW_FORMATS,
+    SynthiaReader,
     depth_steps,
     read_first_channel,
-    read_view_labels,
+    read_ids,
 )
-from datamodules.synthia.splits import SequenceSplits, choose_frames
+from datamodules.synthia.splits import checked_sequences, choose_frames, divide
 from tangent_train.errors import DataError, SettingError
 from tests.datamodules.synthia import synthia_format as synthia
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from numpy.typing import NDArray
 
 
@@ -48,15 +47,18 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_files_are_where_the_release_has_them(folder: Path) -> None:
-    assert sequence_folder(folder.parent, "05") == folder
+    root, problems = folder.parent, Problems()
+    assert sequence_folder(root, "05") == folder
     for view in VIEWS:
-        assert check_files(view_files(folder, view, "000001", with_depth=True), VIEW_FORMATS) == (
-            synthia.SIZE
-        )
-    files = panorama_files(folder, "000002", with_depth=True)
-    assert check_files(files, PANORAMA_FORMATS) == (32, 64)
-    assert list(files.parts) == ["rgb", "labels", "depth"]
-    assert list(panorama_files(folder, "000002", with_depth=False).parts) == ["rgb", "labels"]
+        files = view_files(root, "05", "000001", view, with_depth=True)
+        assert files.name == f"sequence_05/000001/{view}"
+        assert list(files.parts) == ["rgb", "labels", "depth", "camera"]
+        assert check_headers(files, SynthiaReader(VIEW_FORMATS), problems) == synthia.SIZE
+    files = panorama_files(root, "05", "000002", with_depth=True)
+    assert check_headers(files, SynthiaReader(PANORAMA_FORMATS), problems) == (32, 64)
+    assert not problems.listed()
+    without = panorama_files(root, "05", "000002", with_depth=False)
+    assert list(without.parts) == ["rgb", "labels"]
 
 
 def test_frames_are_those_of_any_view(tmp_path: Path) -> None:
@@ -138,33 +140,34 @@ def test_unknown_cameras_of_other_views(tmp_path: Path) -> None:
 # --- labels and depth ----------------------------------------------------------------------------
 
 
+def _labels(tmp_path: Path, image: NDArray[Any]) -> NDArray[np.uint8]:
+    path = tmp_path / "labels.png"
+    synthia.write_png(path, image)
+    return SynthiaReader(VIEW_FORMATS).labels(ImageFiles("a", path, path))
+
+
 def test_the_class_of_a_view_is_in_the_first_channel(tmp_path: Path) -> None:
     ids = np.arange(16, dtype=np.uint16).reshape(2, 8)
-    path = tmp_path / "labels.png"
-    synthia.write_png(path, np.stack([ids + 700, 15 - ids, ids], axis=-1))  # blue, green, red
-    labels = read_view_labels(path)
+    image = np.stack([ids + 700, 15 - ids, ids], axis=-1)  # blue, green, red
+    labels = _labels(tmp_path, image)
     assert labels.dtype == np.uint8
-    np.testing.assert_array_equal(labels, ids)
-
-
-@pytest.mark.parametrize("value", [16, 255, 256, 3000])
-def test_views_have_no_other_labels(tmp_path: Path, value: int) -> None:
-    path = tmp_path / "labels.png"
-    synthia.write_png(path, np.full((2, 2, 3), value, np.uint16))
-    with pytest.raises(DataError, match=rf"labels\.png: found labels {value}; expected 0 to 15"):
-        read_view_labels(path)
+    assert labels.ravel().tolist() == [*range(13), 0, 0, 13]
+    np.testing.assert_array_equal(read_ids(tmp_path / "labels.png"), ids)
 
 
 def test_classes(tmp_path: Path) -> None:
-    ids = np.array([[*range(16), 255]], np.uint8)
-    labels = decode_labels(ids, tmp_path)
+    labels = _labels(tmp_path, np.array([[*range(16), 255]], np.uint8))
     assert labels.tolist() == [[*range(13), 0, 0, 13, 0]]
     names = dict(zip(labels[0].tolist(), ["unknown", *CLASSES], strict=False))
     assert (names[1], names[3], names[12]) == ("sky", "road", "lane marking")
     assert CLASSES[13 - 1] == "traffic light"
-    for value in (16, 100, 254):
-        with pytest.raises(DataError, match=f"found labels {value};"):
-            decode_labels(np.array([[1, value, 255]], np.uint8), tmp_path)
+
+
+@pytest.mark.parametrize("value", [16, 254, 256, 3000])
+def test_there_are_no_other_labels(tmp_path: Path, value: int) -> None:
+    image = np.full((2, 2), value, np.uint16 if value > 255 else np.uint8)
+    with pytest.raises(DataError, match=rf"labels\.png: found labels {value}; expected 0 to 15"):
+        _labels(tmp_path, image)
 
 
 @pytest.mark.parametrize("channels", [1, 3, 4])
@@ -201,13 +204,6 @@ def test_steps_of_depth() -> None:
     assert np.flatnonzero(steps == 0).tolist() == [0]  # missing stays missing, and nothing else is
 
 
-def test_normalization_of_depth_is_that_of_the_other_set() -> None:
-    rgb, rgbd = default_normalization(("rgb",)), default_normalization(("rgb", "depth"))
-    assert (rgb.channels, rgbd.channels) == (3, 4)
-    assert rgbd.mean[:3] == rgb.mean == (0.4512, 0.4257, 0.3920)
-    assert rgbd.std[3] == 0.75536704
-
-
 # --- splits --------------------------------------------------------------------------------------
 
 
@@ -226,57 +222,38 @@ def test_no_frames() -> None:
         choose_frames(["000000"], 0)
 
 
+def _frames(name: str, count: int) -> list[list[ImageFiles]]:
+    return [[ImageFiles(f"{name}/{i}", Path(), Path())] for i in range(count)]
+
+
 @pytest.mark.parametrize(
     ("fraction", "held"), [(0.0, [0, 0]), (0.1, [1, 3]), (0.5, [2, 14]), (0.999, [3, 28])]
 )
 def test_validation_takes_the_end_of_every_sequence(fraction: float, held: list[int]) -> None:
-    lengths = {"01": 4, "02": 29, "04": 5}
-    splits = SequenceSplits(("01", "02"), ("04",), fraction)
-    divided = splits.divide(lambda name: [f"{name}/{i}" for i in range(lengths[name])])
-    kept = [4 - held[0], 29 - held[1]]
-    assert divided["train"] == [f"01/{i}" for i in range(kept[0])] + [
-        f"02/{i}" for i in range(kept[1])
-    ]
-    assert divided["val"] == [f"01/{i}" for i in range(kept[0], 4)] + [
-        f"02/{i}" for i in range(kept[1], 29)
-    ]
-    assert divided["test"] == [f"04/{i}" for i in range(5)]
+    frames = {name: _frames(name, count) for name, count in (("01", 4), ("02", 29), ("04", 5))}
+    divided = divide(frames, ["04"], fraction)
+    found = {split: [files.name for files in chosen] for split, chosen in divided.items()}
+    first, second = 4 - held[0], 29 - held[1]
+    train = [f"01/{i}" for i in range(first)] + [f"02/{i}" for i in range(second)]
+    val = [f"01/{i}" for i in range(first, 4)] + [f"02/{i}" for i in range(second, 29)]
+    assert found == {"train": train, "val": val, "test": [f"04/{i}" for i in range(5)]}
 
 
 def test_a_sequence_of_one_frame() -> None:
+    frames = {name: _frames(name, 1) for name in ("01", "04")}
     with pytest.raises(DataError, match="sequence 01: found one frame"):
-        SequenceSplits(("01",), ("04",), 0.1).divide(lambda _: ["000000"])
-    one = SequenceSplits(("01",), ("04",), 0).divide(lambda _: ["000000"])
+        divide(frames, ["04"], 0.1)
+    one = divide(frames, ["04"], 0)
     assert [len(one[split]) for split in ("train", "val", "test")] == [1, 0, 1]
 
 
-def test_numbers_are_sequences() -> None:
-    train: Any = (1, "2")
-    test: Any = [4]
-    splits = SequenceSplits(train, test, 0.1)
-    assert splits.sequences == ("01", "02", "04")
-
-
 @pytest.mark.parametrize(
-    ("train", "test", "fraction", "name"),
-    [
-        ((), ("04",), 0.1, "train_sequences"),
-        (("03",), ("04",), 0.1, "train_sequences"),
-        (("01",), (), 0.1, "test_sequences"),
-        (("01", "04"), ("04",), 0.1, "test_sequences"),
-        (("01",), ("04",), 1.0, "validation_fraction"),
-        (("01",), ("04",), -0.1, "validation_fraction"),
-    ],
-)
-def test_impossible_splits(
-    train: tuple[str, ...], test: tuple[str, ...], fraction: float, name: str
-) -> None:
-    with pytest.raises(SettingError, match=rf"data\.{name}"):
-        SequenceSplits(train, test, fraction)
-
-
-def test_the_fabricated_world_has_all_classes(folder: Path) -> None:
-    found: NDArray[np.uint8] = np.concatenate(
-        [read_view_labels(view_files(folder, v, "000000", with_depth=False).labels) for v in VIEWS]
-    )
-    assert set(found.ravel().tolist()) == set(synthia.IDS.tolist())
+    ("train", "test", "name"),
+    [((), ("04",), "train"), (("03",), ("04",), "train"), (("01",), (), "test"),
+     (("01", "04"), ("04",), "test")],
+)  # fmt: skip
+def test_impossible_sequences(train: tuple[str, ...], test: tuple[str, ...], name: str) -> None:
+    numbers: Any = ((1, "2"), [4])
+    assert checked_sequences(*numbers) == (("01", "02"), ("04",))
+    with pytest.raises(SettingError, match=rf"data\.{name}_sequences"):
+        checked_sequences(train, test)

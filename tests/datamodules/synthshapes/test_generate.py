@@ -163,16 +163,18 @@ def test_parts_are_where_they_should_be() -> None:
 def test_shapes_are_made_then_read_like_the_real_set(tmp_path: Path) -> None:
     settings = {"seed": 3, "train": 4, "test": 1}
     representation = TangentRepresentation(0, 3)
-    module = SynthShapes(tmp_path / "shapes", representation, settings, validation_fraction=0.25)
+    module = SynthShapes(
+        tmp_path / "shapes", representation, shapes=settings, validation_fraction=0.25
+    )
     assert module.class_names == CLASSES
     with pytest.raises(DataError, match="no such folder"):
         module.setup()
-    module.prepare_all()
+    module.prepare_data()
     splits: tuple[Split, ...] = ("train", "val", "test")
     assert [len(module.source(split)) for split in splits] == [30, 10, 10]
     assert next(iter(module.test_dataloader())).images.shape == (10, 20, 8, 8, 6)
     before = contents(tmp_path / "shapes")
-    again = SynthShapes(tmp_path / "shapes", representation, ShapeSettings(**settings))
+    again = SynthShapes(tmp_path / "shapes", representation, shapes=ShapeSettings(**settings))
     again.prepare_data()  # the spheres in the folder are no foreign files
     assert contents(tmp_path / "shapes") == before
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from datamodules.core.panoramas import Panorama
-from datamodules.core.turned_panoramas import TurnedPanoramas
+from datamodules.core.pipeline import RotatedPanoramas
 from datamodules.synthrooms.generate import generate_rooms
 from datamodules.synthrooms.settings import RoomSettings
 from tangent_train.rendering.upright.gravity import estimate_up
@@ -22,41 +22,23 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-class _Rooms:
-    """Panoramas of SynthRooms without labels."""
-
-    def __init__(self, images: list[NDArray[np.uint8]]) -> None:
-        self._images = images
-
-    def __len__(self) -> int:
-        return len(self._images)
-
-    def name(self, index: int) -> str:
-        return str(index)
-
-    def read(self, index: int) -> Panorama:
-        return Panorama(self._images[index], None, np.zeros((128, 256), np.uint8))
-
-    def label_counts(self, index: int) -> NDArray[np.int64]:
-        raise NotImplementedError
-
-
 @pytest.fixture(scope="module")
-def rooms(tmp_path_factory: pytest.TempPathFactory) -> _Rooms:
+def rooms(tmp_path_factory: pytest.TempPathFactory) -> list[NDArray[np.uint8]]:
     root: Path = tmp_path_factory.mktemp("rooms")
     settings = RoomSettings(seed=5, rooms={"1": 8}, height=128, supersample=2)
     generate_rooms(root, settings, workers=1, progress=False)
     paths = sorted(root.glob("area_1/pano/rgb/*.png"))
-    return _Rooms([cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB) for path in paths])
+    return [cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB) for path in paths]
 
 
 @pytest.mark.parametrize("rotation", [0.0, 10.0, 35.0, "so3"])
-def test_furnished_rooms(rooms: _Rooms, rotation: float | Literal["so3"]) -> None:
-    turned = TurnedPanoramas(rooms, rotation, seed=2)
-    assert len(turned) >= 8
-    for index in range(len(turned)):
-        up = turned.rotation(index)[:, 2]
-        gravity = estimate_up(turned.read(index).rgb, 180 if rotation == "so3" else 45)
+def test_furnished_rooms(rooms: list[NDArray[np.uint8]], rotation: float | Literal["so3"]) -> None:
+    rotated = RotatedPanoramas(rotation, seed=2)
+    assert len(rooms) >= 8
+    for index, rgb in enumerate(rooms):
+        panorama = Panorama(rgb, None, np.zeros((128, 256), np.uint8))
+        up = rotated.rotation(index)[:, 2]
+        gravity = estimate_up(rotated(panorama, index).rgb, 180 if rotation == "so3" else 45)
         # Held at any angle, up may be taken for another axis of the room.
         found = gravity.candidates if rotation == "so3" else gravity.up[None]
         assert (found @ up).max() > math.cos(math.radians(1.5)), index

@@ -16,6 +16,7 @@ from datamodules import (
     Stanford2D3DSPerspective,
     SynthiaPerspective,
 )
+from datamodules.core.split_module import SPLITS
 from tangent_train.rendering import EquirectRepresentation, PerspectiveRepresentation
 from tests.datamodules.folder.folder_format import write_data_set
 from tests.datamodules.modelnet40.shapes_format import write_tree
@@ -103,7 +104,7 @@ def partner(kind: str, path: Path, part: str) -> Path:
 
 def names(data: SplitDataModule[Any]) -> dict[str, list[str]]:
     """What is in every split."""
-    sources = {split: data.open_split(split) for split in ("train", "val", "test")}
+    sources = {split: data.source(split) for split in SPLITS}
     return {split: [s.name(index) for index in range(len(s))] for split, s in sources.items()}
 
 

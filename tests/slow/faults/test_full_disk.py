@@ -174,17 +174,20 @@ def test_a_store_keeps_what_is_whole_and_goes_on(stanford_root: Path, tmp_path: 
     store = tmp_path / "store"
     representation = TangentRepresentation(base_level=0, level=4)
     data = Stanford2D3DS(stanford_root, representation, store=store, inputs=["rgb"])
-    data.prepare_store(("test",))
-    before = {path: path.read_bytes() for path in store.rglob("*.panorama")}
-    assert len(before) == 5
+    data.prepare_data()
+    before = {path: path.read_bytes() for path in store.rglob("*.npy")}
+    assert len(before) == 14
+    for path in sorted(before)[:5]:
+        path.unlink()
+        del before[path]
     smaller = min(map(len, before.values())) - 1
-    with _small_files(smaller), pytest.raises(NoRoomError, match=r"\.panorama: found file too"):
-        data.prepare_store()
+    with _small_files(smaller), pytest.raises(NoRoomError, match=r"\.npy: found file too"):
+        data.prepare_data()
     files = {path for path in store.rglob("*") if path.is_file()}
     assert files == set(before)
     assert all(path.read_bytes() == content for path, content in before.items())
-    data.prepare_store(whole=("train", "val", "test"))
-    assert len(list(store.rglob("*.panorama"))) == 14
+    data.prepare_data()
+    assert len(list(store.rglob("*.npy"))) == 14
 
 
 def _results(figure: int) -> Record:

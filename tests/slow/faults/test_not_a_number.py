@@ -111,14 +111,14 @@ def test_nan_in_images_is_named(
     stanford_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     data = small_data(stanford_root)
-    normalized = data.normalized
+    normalized = data.samples.normalized
 
     def with_hole(batch: Any) -> Tensor:
         images = normalized(batch)
         images[0, 3, 1, 2, 5] = torch.nan
         return images
 
-    monkeypatch.setattr(data, "normalized", with_hole)
+    monkeypatch.setattr(data.samples, "normalized", with_hole)
     with pytest.raises(SettingError, match="from images with NaN or infinite values"):
         run_trainer(tmp_path, max_epochs=1).fit(small_task(Faulty()), datamodule=data)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +11,11 @@ import numpy as np
 import pytest
 from lightning.pytorch.trainer.states import TrainerFn
 
-from datamodules.core import data_check
+from datamodules import Stanford2D3DS
+from datamodules.core import split_module
+from datamodules.core.problems import Problems
+from datamodules.core.reading import ImageFiles
+from datamodules.core.split_module import Found
 from tangent_train.cli import main
 from tangent_train.errors import DataError, SettingError
 from tests.datamodules.folder.folder_format import write_classes
@@ -18,8 +23,6 @@ from tests.slow.faults import data_sets as sets
 from tests.slow.faults.data_sets import colors, module, names, partner, write
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from datamodules.core.split_module import SplitDataModule
     from tests.conftest import FabricateStanford
 
@@ -43,7 +46,8 @@ def _damage(kind: str, root: Path) -> tuple[Path, Path]:
 
 
 def _first_of(data: SplitDataModule[Any]) -> Any:
-    data.prepare_all()
+    data.prepare_data()
+    data.setup()
     return data.source("train").read(0)
 
 
@@ -65,7 +69,8 @@ def test_what_is_broken_is_left_out_and_counted(
     _damage(kind, root)
     capsys.readouterr()
     data = module(kind, root, skip_broken=True)
-    data.prepare_all()
+    data.prepare_data()
+    data.setup()
     after = names(data)
     printed = [line for line in capsys.readouterr().out.splitlines() if "left out" in line]
     assert printed == [
@@ -75,12 +80,12 @@ def test_what_is_broken_is_left_out_and_counted(
     assert sum(map(len, after.values())) == total - 2
     for split in before:
         assert [name for name in before[split] if name in after[split]] == after[split]
-        source: Any = data.open_split(split)  # type: ignore[arg-type]
+        source: Any = data.source(split)  # type: ignore[arg-type]
         for index, name in enumerate(after[split]):
             assert source.name(index) == name
             assert source.read(index).labels.shape == source.read(index).rgb.shape[:2]
     with pytest.raises(DataError, match="truncated"):
-        module(kind, root).prepare_all()
+        module(kind, root).prepare_data()
 
 
 @pytest.mark.parametrize("kind", sets.IMAGES)
@@ -89,7 +94,8 @@ def test_nothing_is_said_of_a_good_data_set(
 ) -> None:
     write(kind, root, fabricate_stanford)
     data = module(kind, root, skip_broken=True)
-    data.prepare_all()
+    data.prepare_data()
+    data.setup()
     assert names(data) == names(module(kind, root))
     assert "left out" not in capsys.readouterr().out
 
@@ -103,11 +109,12 @@ def test_broken_meshes_are_refused_or_left_out(
     for path in broken:
         sets.truncate(path)
     with pytest.raises(DataError, match="found 2 problems") as caught:
-        module("shapes", root).prepare_all()
+        module("shapes", root).prepare_data()
     assert all(str(path) in str(caught.value) for path in broken)
     capsys.readouterr()
     data = module("shapes", root, skip_broken=True)
-    data.prepare_all()
+    data.prepare_data()
+    data.setup()
     total = sum(map(len, before.values()))
     assert f"2 of {total} shapes are broken and left out" in capsys.readouterr().out
     gone = {str(path.relative_to(root).with_suffix("")) for path in broken}
@@ -153,10 +160,11 @@ def test_frames_of_synthia_whose_views_are_broken(
     sets.truncate(views[0])
     sets.corrupt(views[1])
     with pytest.raises(DataError, match="found 2 problems") as caught:
-        module("omnisynthia", root, panorama_height=32).prepare_all()
+        module("omnisynthia", root, panorama_height=32).prepare_data()
     assert all(str(view) in str(caught.value) for view in views[:2])
     data = module("omnisynthia", root, panorama_height=32, skip_broken=True)
-    data.prepare_all()
+    data.prepare_data()
+    data.setup()
     assert "2 of 9 panoramas are broken and left out" in capsys.readouterr().out
     assert sum(map(len, names(data).values())) == 7
 
@@ -176,11 +184,13 @@ def test_a_store_has_no_holes_unless_they_are_asked_for(
     store = tmp_path / "store"
     data = module(kind, root, store=store)
     with pytest.raises(DataError, match="found 2 problems") as caught:
-        data.prepare_all()
+        data.prepare_data()
+    data.setup()
     assert all(str(path) in str(caught.value) for path in broken), "not only the first"
-    assert len(list(store.rglob("*.panorama"))) == total - 2, "what can be made is made"
+    assert len(list(store.rglob("*.npy"))) == total - 2, "what can be made is made"
     data = module(kind, root, store=store, skip_broken=True)
-    data.prepare_all()
+    data.prepare_data()
+    data.setup()
     assert sum(map(len, names(data).values())) == total - 2
     for split in ("train", "val", "test"):
         source = data.source(split)
@@ -196,14 +206,15 @@ def test_a_store_that_is_made_is_not_read_again_for_what_is_broken(
 ) -> None:
     write("stanford", root, fabricate_stanford)
     settings: dict[str, Any] = {"store": tmp_path / "store", "skip_broken": True}
-    module("stanford", root, **settings).prepare_all()
+    module("stanford", root, **settings).prepare_data()
 
     def refuse(*_: Any) -> None:
         raise AssertionError("all of it is in the store")
 
-    monkeypatch.setattr("datamodules.stanford2d3ds.panoramas.read_color_png", refuse)
+    monkeypatch.setattr("datamodules.stanford2d3ds.reader.read_color_png", refuse)
     data = module("stanford", root, **settings)
-    data.prepare_all()
+    data.prepare_data()
+    data.setup()
     assert len(data.source("train")) > 0
 
 
@@ -243,7 +254,7 @@ def test_training_begins_with_a_look_at_some_images_of_all_splits(
     fabricate_stanford: FabricateStanford,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(data_check, "SAMPLED", 100)
+    monkeypatch.setattr(split_module, "SAMPLED", 100)
     write(kind, root, fabricate_stanford)
     _as_in_training(module(kind, root)).prepare_data()
     broken = [partner(kind, path, "labels") for path in colors(kind, root)[1::3]]
@@ -267,59 +278,36 @@ def test_labels_past_the_table_are_seen_as_training_begins(
         _as_in_training(module("folder", root)).prepare_data()
 
 
-class _Source:
-    """Images that note which of them are read."""
+class _Images(Stanford2D3DS):
+    """Two thousand images that note which of them are read."""
 
-    def __init__(self, split: str, length: int, seen: list[tuple[str, int]]) -> None:
-        self.split = split
-        self.length = length
-        self.seen = seen
+    def find(self, problems: Problems) -> Found[ImageFiles]:
+        def items(split: str, count: int) -> list[ImageFiles]:
+            return [ImageFiles(f"{split} {k}", Path(), Path()) for k in range(count)]
 
-    def __len__(self) -> int:
-        return self.length
-
-    def read(self, index: int) -> None:
-        self.seen.append((self.split, index))
+        self.seen: list[str] = []
+        splits: Any = {split: items(split, count) for split, count in LENGTHS.items()}
+        return Found(splits, lambda files: self.seen.append(files.name))
 
 
-def _seen(seed: int) -> list[tuple[str, int]]:
-    seen: list[tuple[str, int]] = []
-    lengths = {"train": 1000, "val": 100, "test": 400}
-    sources = {split: _Source(split, length, seen) for split, length in lengths.items()}
-    data: Any = SimpleNamespace(
-        find_splits=lambda: sources, skip_broken=False, seed=seed, root="data"
-    )
-    data_check.find_usable(data, ("train", "val", "test"))
-    return seen
+LENGTHS = {"train": 1000, "val": 100, "test": 400}
+
+
+def _seen(seed: int) -> list[str]:
+    data = _Images(Path(), sets.ERP, seed=seed)
+    _as_in_training(data).prepare_data()
+    return data.seen
 
 
 def test_the_look_is_short_and_goes_everywhere(monkeypatch: pytest.MonkeyPatch) -> None:
     first = _seen(seed=0)
-    assert len(first) == len(set(first)) == data_check.SAMPLED
-    counts = [sum(s == split for s, _ in first) for split in ("train", "val", "test")]
+    assert len(first) == len(set(first)) == split_module.SAMPLED
+    counts = [sum(name.startswith(split) for name in first) for split in LENGTHS]
     assert np.abs(np.array(counts) - np.array([1000, 100, 400]) * 32 / 1500).max() <= 1
     assert set(_seen(seed=1)) != set(first), "other runs look at others"
     assert set(_seen(seed=0)) == set(first)
-    monkeypatch.setattr(data_check, "_SECONDS", -1)
-    assert 0 < len(_seen(seed=0)) < data_check.SAMPLED, "images may be large, and disks slow"
-
-
-@pytest.mark.parametrize(
-    ("settings", "splits"),
-    [
-        ({}, ("train", "val", "test")),
-        ({"in_memory": True}, ("test",)),
-        ({"store": "store"}, ()),
-    ],
-)
-def test_what_is_read_anyway_is_not_read_twice(
-    settings: dict[str, Any],
-    splits: tuple[str, ...],
-    root: Path,
-    fabricate_stanford: FabricateStanford,
-) -> None:
-    write("stanford", root, fabricate_stanford)
-    assert tuple(module("stanford", root, **settings).sampled_splits()) == splits
+    monkeypatch.setattr(split_module, "_SECONDS", -1)
+    assert 0 < len(_seen(seed=0)) < split_module.SAMPLED, "images may be large, and disks slow"
 
 
 # --- the commands -------------------------------------------------------------------------------

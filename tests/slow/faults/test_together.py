@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from datamodules.core.made_folders import claim_folder
-from datamodules.core.store_files import write_stored
+from datamodules.core.store import Store
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 from datamodules.synthrooms.generate import generate_rooms
 from datamodules.synthrooms.settings import RoomSettings
@@ -62,7 +62,7 @@ def _prepare_and_read(root: Path, store: Path, barrier: Any) -> tuple[int, int]:
     data = _data(root, store)
     barrier.wait()
     data.prepare_data()
-    return len(list(store.rglob("[!.]*.panorama"))), _samples(data)
+    return len(list(store.rglob("[!.]*.npy"))), _samples(data)
 
 
 @pytest.mark.slow
@@ -79,23 +79,23 @@ def test_runs_that_prepare_the_same_store_at_once_see_the_same(
     assert found == [(PANORAMAS, _samples(_data(stanford_root, None)))] * PROCESSES
     assert not list(store.rglob(".partial*"))
     data = _data(stanford_root, store)
-    before = {path: path.stat().st_mtime_ns for path in store.rglob("*.panorama")}
-    data.prepare_store(whole=("train", "val", "test"))
+    before = {path: path.stat().st_mtime_ns for path in store.rglob("*.npy")}
+    data.prepare_data()
     assert {path: path.stat().st_mtime_ns for path in before} == before, "all are whole"
 
 
 def _prepare_and_die(root: Path, store: Path, barrier: Any) -> None:
-    write, paths = write_stored, []
+    make, names = Store.make, []
 
-    def fall(path: Path, *content: Any) -> None:
-        paths.append(path)
-        if len(paths) == 5:
+    def fall(self: Store, name: str, *content: Any) -> None:
+        names.append(name)
+        if len(names) == 5:
             barrier.wait()
             os.kill(os.getpid(), signal.SIGKILL)
-        write(path, *content)
+        make(self, name, *content)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("datamodules.core.store.write_stored", fall)
+        patch.setattr(Store, "make", fall)
         _data(root, store).prepare_data()
 
 
@@ -111,8 +111,8 @@ def test_a_run_that_is_killed_while_it_prepares_harms_no_other(
     killed.join()
     assert killed.exitcode == -signal.SIGKILL
     data = _data(stanford_root, store)
-    data.prepare_store(whole=("train", "val", "test"))
-    assert len(list(store.rglob("[!.]*.panorama"))) == PANORAMAS
+    data.prepare_data()
+    assert len(list(store.rglob("[!.]*.npy"))) == PANORAMAS
     assert _samples(data) == _samples(_data(stanford_root, None))
 
 

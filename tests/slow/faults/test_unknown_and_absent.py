@@ -105,7 +105,7 @@ def _predictions(
     task.eval()
     found = []
     for sample in data.test_dataloader():
-        (images,) = data.normalized(sample)
+        (images,) = data.samples.normalized(sample)
         (truth,) = sample.target
         labels = task.predict_labels(images, tuple(truth.shape))
         found.append((truth.numpy(), labels.numpy().astype(np.int64)))

@@ -14,14 +14,15 @@ import numpy as np
 import OpenEXR
 from PIL import Image
 
-from datamodules.core.label_table import CLASSES, LabelTable
+from datamodules.core.store import Store
 from datamodules.folder.classes import read_classes
 from datamodules.images.gpano import area_of, up_of
 from datamodules.images.pixel_files import read_depth_m, read_pixels
 from datamodules.images.png import check_png, read_color_png, read_depth_png
 from datamodules.modelnet40.meshes import read_off
-from datamodules.stanford2d3ds.perspective import read_camera_matrix
+from datamodules.stanford2d3ds.label_table import CLASSES, LabelTable
 from datamodules.stanford2d3ds.poses import read_panorama_pose
+from datamodules.stanford2d3ds.reader import read_camera_matrix
 from tangent_train.errors import DataError
 from tangent_train.geometry import TangentGrid, rotation_about
 from tangent_train.rendering.camera_files import CameraFile, read_cameras, write_cameras
@@ -92,7 +93,7 @@ def _class_seeds() -> list[bytes]:
 def _read_class_list(path: Path) -> None:
     classes = read_classes(path)
     assert 1 <= len(classes.names) <= 255
-    assert classes.decode(_RGB if classes.in_colors else _DEPTH).shape == _SHAPE
+    assert classes.decode(_RGB if classes.in_colors else _DEPTH * 0).shape == _SHAPE
 
 
 def _off_seeds() -> list[bytes]:
@@ -203,6 +204,21 @@ def _read_image(path: Path) -> None:
         assert 0 <= depth.min() <= depth.max() <= 1e4
 
 
+def _store_seeds() -> list[bytes]:
+    with TemporaryDirectory() as folder:
+        store, source = Store(Path(folder)), Path(folder) / "a.png"
+        source.touch()
+        store.make("a", {"rgb": source}, lambda: {"rgb": _RGB, "depth": _DEPTH})
+        return [store.path("a").read_bytes()]
+
+
+def _read_store(path: Path) -> None:
+    path.replace(path.with_suffix(".npy"))
+    for array in Store(path.parent).read(path.stem, {}).values():
+        assert array.dtype.kind != "O"
+        array.tobytes()  # every pixel can be looked at
+
+
 TARGETS: dict[str, tuple[Callable[[], list[bytes]], Callable[[Path], None]]] = {
     "label_table": (_table_seeds, _read_table),
     "classes": (_class_seeds, _read_class_list),
@@ -212,5 +228,6 @@ TARGETS: dict[str, tuple[Callable[[], list[bytes]], Callable[[Path], None]]] = {
     "label_image": (_label_image_seeds, _read_label_image),
     "gpano": (_gpano_seeds, _read_gpano),
     "pixels": (_pixel_seeds, _read_image),
+    "store": (_store_seeds, _read_store),
 }
 """By name: valid files, and a reader that asserts what comes out."""

@@ -8,34 +8,40 @@ views overlap, labels included.
 
 from __future__ import annotations
 
-import json
-import os
-from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import closing
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from functools import partial
+from typing import TYPE_CHECKING, Any, Literal
 
 import cv2
 import numpy as np
 
-from datamodules.core.problems import Noted, raised
+from datamodules.core.made_folders import claim_folder
+from datamodules.core.pipeline import in_threads
+from datamodules.core.problems import Problems
 from datamodules.core.progress import show_progress
+from datamodules.core.reading import check_headers
+from datamodules.core.split_module import at_least
 from datamodules.images.png import read_color_png
 from datamodules.synthia.files import (
     GET_IT,
-    PANORAMA_FORMATS,
-    VIEW_FORMATS,
     VIEWS,
-    check_files,
     list_frames,
     panorama_files,
     read_camera,
     sequence_folder,
     view_files,
 )
-from datamodules.synthia.pixels import INVALID, read_first_channel, read_view_labels
+from datamodules.synthia.reader import (
+    INVALID,
+    PANORAMA_FORMATS,
+    VIEW_FORMATS,
+    SynthiaReader,
+    read_first_channel,
+    read_ids,
+)
 from datamodules.synthia.splits import FRAMES, choose_frames
-from tangent_train.errors import DataError, SettingError
-from tangent_train.files import write_bytes, write_text
+from tangent_train.errors import DataError
+from tangent_train.files import write_bytes
 from tangent_train.geometry import (
     equirect_latitudes,
     equirect_to_lonlat,
@@ -43,14 +49,14 @@ from tangent_train.geometry import (
     perspective_directions,
     rotation_about,
 )
-from tangent_train.json_text import parse_json
 
 if TYPE_CHECKING:
-    from collections.abc import Generator, Sequence
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
 
+    from datamodules.core.reading import ImageFiles
 
 __all__ = ["HEIGHT", "MANIFEST", "ViewStitcher", "make_panoramas"]
 
@@ -153,23 +159,14 @@ def _view_positions(
     return owner, x, camera_matrix[1, 1] * down + camera_matrix[1, 2]
 
 
-class _Job(NamedTuple):
-    """A panorama to be made."""
-
-    folder: Path
-    frame: str
-    stitcher: ViewStitcher
-
-
 def make_panoramas(
     root: Path,
     sequences: Sequence[str],
+    problems: Problems,
     *,
     frames: int = FRAMES,
     height: int = HEIGHT,
-    workers: int | None = None,
     progress: bool = True,
-    noted: Noted = raised,
 ) -> int:
     """Write the panoramas of OmniSYNTHIA, as published, from the views of SYNTHIA.
 
@@ -179,134 +176,102 @@ def make_panoramas(
     Args:
         root: Folder of the sequences.
         sequences: Which, as ``01``.
+        problems: Where broken views are noted, under the name of the panorama.
         frames: About how many of each sequence, see `choose_frames`.
         height: Rows of the panoramas.
-        workers: Threads; by default one per CPU core.
         progress: Whether to show a progress bar.
-        noted: Where broken views go, to go on with the other panoramas.
 
     Returns:
-        How many were made.
+        How many were to be made.
 
     Raises:
-        DataError: A file is missing or broken; a sequence has neither views nor panoramas, or
-            panoramas that were made with other settings.
+        DataError: A sequence has neither views nor panoramas, or panoramas that were made with
+            other settings.
         SettingError: A number that cannot be.
     """
-    if height < 1:
-        raise SettingError("data.panorama_height", found=height, expected="1 or more")
-    if workers is not None and workers < 0:
-        raise SettingError("workers", found=workers, expected="0 or more, or None")
-    jobs: list[_Job] = []
+    at_least("data.panorama_height", height, 1)
+    jobs: list[Callable[[], None]] = []
     total = 0
     for sequence in sequences:
-        folder = sequence_folder(root, sequence)
-        if _claim(folder, frames, height):
-            chosen = choose_frames(list_frames(folder), frames)
-            jobs += _unfinished(folder, chosen, height, noted)
+        if _claim(sequence_folder(root, sequence), frames, height):
+            chosen = choose_frames(list_frames(sequence_folder(root, sequence)), frames)
+            jobs += _unfinished(root, sequence, chosen, height, problems)
             total += len(chosen)
     if jobs:
         # Threads: OpenCV leaves the GIL alone, and the tables are shared. As fast as processes.
-        with closing(_in_threads(jobs, workers, noted)) as done:
-            show_progress(
-                done,
-                "Making panoramas",
-                "panoramas",
-                total,
-                before=total - len(jobs),
-                show=progress,
-            )
+        # Closed: an interrupt drops what is queued.
+        with closing(in_threads(lambda make: make(), jobs)) as done:
+            bar: Any = {"before": total - len(jobs), "show": progress}
+            show_progress(done, "Making panoramas", "panoramas", total, **bar)
     return len(jobs)
 
 
 def _claim(folder: Path, frames: int, height: int) -> bool:
     """Whether there are panoramas for us to make; if so, the folder for them is marked."""
-    manifest = folder / "pano" / MANIFEST
-    ready = manifest.exists() or any((folder / "pano").glob("**/[!.]*.png"))
+    pano = folder / "pano"
+    ready = (pano / MANIFEST).exists() or any(pano.glob("**/[!.]*.png"))
     if not list_frames(folder):
         if ready:
             return False
         raise DataError(
             folder, found="neither views nor panoramas", expected="RGB, GT, Depth", remedy=GET_IT
         )
-    wanted = {"front view at longitude": 0, "frames": frames, "height": height}
-    if not manifest.exists():
-        if not ready:
-            write_text(manifest, json.dumps(wanted, indent=1) + "\n")
-        return not ready
-    try:
-        found = parse_json(manifest.read_text(encoding="utf-8"))
-    except ValueError:
-        found = "something else"
-    if found != wanted:
-        raise DataError(
-            manifest,
-            found=found,
-            expected=wanted,
-            remedy="Use the settings of before, or remove the folder to make all anew.",
-        )
+    if ready and not (pano / MANIFEST).exists():
+        return False
+    claim_folder(pano, MANIFEST, "OmniSYNTHIA", 1, {"frames": frames, "height": height})
     return True
 
 
-def _unfinished(folder: Path, frames: Sequence[str], height: int, noted: Noted) -> list[_Job]:
+def _unfinished(
+    root: Path, sequence: str, frames: Sequence[str], height: int, problems: Problems
+) -> list[Callable[[], None]]:
     """What is to be made, after a check of all that it will be made from."""
-    missing = [frame for frame in frames if not _is_whole(folder, frame, height)]
     size: tuple[int, int] | None = None
     whole = []
-    for frame in missing:
-        with noted((folder, frame)):
-            for view in VIEWS:
-                files = view_files(folder, view, frame, with_depth=True)
-                found = check_files(files, VIEW_FORMATS)
-                size = size or found
-                if found != size:
-                    raise DataError(
-                        files.rgb,
-                        found=f"{found[0]}×{found[1]} pixels",
-                        expected=f"{size[0]}×{size[1]}, as in the other views of the sequence",
-                        remedy="Extract the sequence again.",
-                    )
-            whole.append(frame)
+    for frame in frames:
+        target = panorama_files(root, sequence, frame, with_depth=True)
+        if _is_whole(target, height):
+            continue
+        views = [view_files(root, sequence, frame, view, with_depth=True) for view in VIEWS]
+        found = {_size_of(view, target.name, problems) for view in views}
+        size = size or next(iter(found))
+        with problems.noted(target.name):
+            if found - {size, None}:
+                raise DataError(
+                    views[0].rgb.parents[1],
+                    found=f"views of different sizes in frame {frame}",
+                    expected="one size in a sequence",
+                    remedy="Extract the sequence again.",
+                )
+        if target.name not in problems.items:
+            whole.append((views, target))
     if size is None or not whole:
         return []
-    stitcher = ViewStitcher(read_camera(folder, size), size, height)
-    return [_Job(folder, frame, stitcher) for frame in whole]
+    stitcher = ViewStitcher(read_camera(sequence_folder(root, sequence), size), size, height)
+    return [partial(_make, stitcher, views, target, problems) for views, target in whole]
 
 
-def _is_whole(folder: Path, frame: str, height: int) -> bool:
-    files = panorama_files(folder, frame, with_depth=True)
-    try:
-        return check_files(files, PANORAMA_FORMATS) == (height, 2 * height)
-    except DataError:
-        return False
+def _size_of(view: ImageFiles, name: str, problems: Problems) -> tuple[int, int] | None:
+    return check_headers(view._replace(name=name), SynthiaReader(VIEW_FORMATS), problems)
 
 
-def _in_threads(jobs: Sequence[_Job], workers: int | None, noted: Noted) -> Generator[None]:
-    """Make panoramas; after an interrupt those begun are finished."""
-    with ThreadPoolExecutor(max(1, os.cpu_count() or 1 if workers is None else workers)) as pool:
-        try:
-            futures = {pool.submit(_make, job): (job.folder, job.frame) for job in jobs}
-            for future in as_completed(futures):
-                try:
-                    future.result()
-                except DataError as error:  # of one frame; a disk that is full stops all
-                    with noted(futures[future]):
-                        raise error from None
-                yield
-        finally:
-            pool.shutdown(cancel_futures=True)
+def _is_whole(files: ImageFiles, height: int) -> bool:
+    problems = Problems()
+    size = check_headers(files, SynthiaReader(PANORAMA_FORMATS), problems)
+    return size == (height, 2 * height) and not problems.items
 
 
-def _make(job: _Job) -> None:
-    views = [view_files(job.folder, view, job.frame, with_depth=True).parts for view in VIEWS]
-    stitcher = job.stitcher
-    rgb = stitcher.rgb([read_color_png(view["rgb"]) for view in views])
-    parts = {
-        "depth": stitcher.depth([read_first_channel(view["depth"]) for view in views]),
-        "labels": stitcher.labels([read_view_labels(view["labels"]) for view in views]),
-        # The last one: panoramas are those that have this file.
-        "rgb": cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR),
-    }
-    paths = panorama_files(job.folder, job.frame, with_depth=True).parts
-    for part, image in parts.items():
-        write_bytes(paths[part], cv2.imencode(".png", image, _PNG)[1].tobytes())
+def _make(
+    stitcher: ViewStitcher, views: Sequence[ImageFiles], target: ImageFiles, problems: Problems
+) -> None:
+    with problems.noted(target.name):
+        rgb = stitcher.rgb([read_color_png(view.rgb) for view in views])
+        parts = {
+            "depth": stitcher.depth([read_first_channel(view.parts["depth"]) for view in views]),
+            "labels": stitcher.labels([read_ids(view.labels) for view in views]),
+            # The last one: panoramas are those that have this file.
+            "rgb": cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR),
+        }
+        for part, image in parts.items():
+            encoded = cv2.imencode(".png", image, _PNG)[1]
+            write_bytes(target.parts[part], encoded.tobytes())

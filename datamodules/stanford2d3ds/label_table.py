@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -44,9 +44,8 @@ class LabelTable:
     """Class of every instance of the data set.
 
     A pixel of a `semantic` image holds the index of an instance as the colour
-    R · 65536 + G · 256 + B. Missing labels are #0D0D0D = 855309, past the end of the table, so
-    every index past the end is unknown. (Leaving out R would turn them into instance 3341,
-    clutter.)
+    R · 65536 + G · 256 + B. Missing labels are #0D0D0D = 855309, past the end of the table.
+    (Leaving out R would turn them into instance 3341, clutter.)
 
     Attributes:
         class_ids: ``(entries,)`` uint8, 1 to 13 in the order of `CLASSES`, or `UNKNOWN`.
@@ -79,46 +78,37 @@ class LabelTable:
             raise DataError(path, found=f"class {strange[0]!r}", expected=expected, remedy=remedy)
         return cls(np.array([ids[name] for name in classes], np.uint8))
 
-    def check(self, colors: NDArray[np.uint8], path: Path) -> None:
-        """Make sure that all instances are in the table.
-
-        Args:
-            colors: As of `decode`.
-            path: Where they are from.
-
-        Raises:
-            DataError: There are others, not only the mark of missing labels.
-        """
-        index = _indices(colors)
-        past = index[(index >= len(self.class_ids)) & (index != _MISSING)]
-        if past.size:
-            raise DataError(
-                path,
-                found=f"instance {past.min()} in {past.size} pixel{'s' * (past.size > 1)}",
-                expected=f"0 to {len(self.class_ids) - 1}, the entries of the class table, or "
-                f"#{_MISSING:06X} where labels are missing",
-                remedy="Use the file and semantic_labels.json of one release.",
-            )
-
-    def decode(self, colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def decode(self, colors: NDArray[np.uint8], path: object = "labels") -> NDArray[np.uint8]:
         """Labels of a `semantic` image.
 
         Args:
             colors: ``(H, W, 3)`` uint8 in RGB order.
+            path: Where they are from.
 
         Returns:
             ``(H, W)`` uint8 labels.
+
+        Raises:
+            DataError: There are instances past the end of the table, other than the mark of missing
+                labels.
 
         >>> table = LabelTable(np.array([0, 1, 12], np.uint8))
         >>> table.decode(np.array([[[0, 0, 2], [0, 0, 3], [13, 13, 13]]], np.uint8)).tolist()
         [[12, 0, 0]]
         """
-        index = _indices(colors)
-        past_the_end = len(self.class_ids)
-        return np.append(self.class_ids, np.uint8(UNKNOWN))[np.minimum(index, past_the_end)]
-
-
-def _indices(colors: NDArray[np.uint8]) -> NDArray[Any]:
-    """Place in the table of every pixel, ``(H, W)`` int32."""
-    red, green, blue = np.moveaxis(colors.astype(np.int32), -1, 0)
-    return (red << 16) | (green << 8) | blue
+        red, green, blue = np.moveaxis(colors.astype(np.int32), -1, 0)
+        index = (red << 16) | (green << 8) | blue
+        end = len(self.class_ids)
+        past = index >= end
+        strange = past & (index != _MISSING)
+        if strange.any():
+            count = int(np.count_nonzero(strange))
+            raise DataError(
+                path,
+                found=f"instance {index[strange].min()} in {count} pixel{'s' * (count > 1)}",
+                expected=f"0 to {end - 1}, the entries of the class table, or #{_MISSING:06X} "
+                "where labels are missing",
+                remedy="Use the file and semantic_labels.json of one release.",
+            )
+        index[past] = 0
+        return np.where(past, np.uint8(UNKNOWN), self.class_ids[index])

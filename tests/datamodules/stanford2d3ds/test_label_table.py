@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from datamodules.stanford2d3ds.panoramas import CLASSES, LabelTable
+from datamodules.stanford2d3ds.label_table import CLASSES, LabelTable
 from tangent_train.errors import DataError
 
 REAL_DATA = os.environ.get("TANGENT_REAL_DATA")
@@ -35,10 +35,12 @@ def test_decode_uses_all_three_bytes() -> None:
     assert decoded.tolist() == [[1, 2, 3, 0]]
 
 
-def test_past_the_end_of_the_table_is_unknown() -> None:
+def test_what_is_past_the_end_of_the_table_is_missing_or_a_mistake() -> None:
     # #0D0D0D without its red byte would be entry 3341 of the table.
     table = LabelTable(np.full(9816, 6, np.uint8))
-    assert table.decode(_colors([0x0D0D0D, 9815, 9816, 0xFFFFFF])).tolist() == [[0, 6, 0, 0]]
+    assert table.decode(_colors([0x0D0D0D, 9815])).tolist() == [[0, 6]]
+    with pytest.raises(DataError, match="found instance 9816 in 2 pixels; expected 0 to 9815"):
+        table.decode(_colors([0x0D0D0D, 9815, 9816, 0xFFFFFF]))
 
 
 @pytest.mark.parametrize(

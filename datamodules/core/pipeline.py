@@ -1,0 +1,250 @@
+"""The images of a split: read from files or from a store, then rotated, then made upright."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Generator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Generic, Literal, Protocol, TypeVar
+
+import numpy as np
+
+from datamodules.core.panoramas import Panorama
+from datamodules.core.problems import Problems
+from datamodules.core.sampling import sample_rng
+from datamodules.images.gpano import up_of
+from tangent_train.geometry import random_rotation, rotation_about
+from tangent_train.rendering import rotate_equirect
+from tangent_train.rendering.upright.gravity import estimate_up
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from datamodules.core.reading import ImageFiles
+    from datamodules.core.store import Store
+
+__all__ = [
+    "EstimatedUp",
+    "Item",
+    "PosedUp",
+    "Reading",
+    "RotatedPanoramas",
+    "SplitItems",
+    "Transform",
+    "in_threads",
+]
+
+_Result = TypeVar("_Result")
+_Work = TypeVar("_Work")
+
+
+class Item(Protocol):
+    """What one image or shape is made of."""
+
+    @property
+    def name(self) -> str:
+        """A short name that no other of the data set has."""
+        ...
+
+    @property
+    def parts(self) -> Mapping[str, Path]:
+        """Its files by what they hold."""
+        ...
+
+
+_Item = TypeVar("_Item", bound=Item)
+_Image = TypeVar("_Image")
+
+Reading = Callable[[_Item], _Image]
+"""Reads an image from its files, a named tuple of arrays; may have a method `labels`."""
+
+Transform = Callable[[_Image, int, _Item], _Image]
+"""Changes an image, given its place in the split and its files."""
+
+
+class SplitItems(Generic[_Item, _Image]):
+    """The images of one split, by number.
+
+    Args:
+        items: Their files.
+        read: Reads one from its files.
+        store: Where they are prepared; what is read from there is mapped, not copied.
+        kind: The named tuple that `read` makes, to be made of stored arrays as well.
+        transforms: Changes to every image, in their order.
+
+    Attributes:
+        items: As given.
+    """
+
+    def __init__(
+        self,
+        items: Sequence[_Item],
+        read: Reading[_Item, _Image],
+        kind: type[_Image],
+        store: Store | None = None,
+        transforms: Sequence[Transform[_Image, _Item]] = (),
+    ) -> None:
+        self.items = items
+        self._decode = read
+        self._kind = kind
+        self._store = store
+        self._transforms = transforms
+        self._kept: list[_Image] = []
+
+    def __len__(self) -> int:
+        return len(self.items)
+
+    def name(self, index: int) -> str:
+        """A short name of one of them, which no other has; with ``/`` between groups."""
+        return self.items[index].name
+
+    def read(self, index: int) -> _Image:
+        """One image; its arrays may be shared or read-only.
+
+        Raises:
+            DataError: A file is broken, or what is prepared is missing or out of date.
+        """
+        if self._kept:
+            return self._kept[index]
+        item = self.items[index]
+        image = self._decode(item) if self._store is None else self._stored(self._store, item)
+        for transform in self._transforms:
+            image = transform(image, index, item)
+        return image
+
+    def labels(self, index: int) -> NDArray[np.uint8]:
+        """The labels of one image alone, which costs less than all of it."""
+        decode: Any = self._decode
+        image: Any = None
+        if self._kept or self._transforms or self._store is not None:
+            image = self.read(index)
+        labels: NDArray[np.uint8] = (
+            decode.labels(self.items[index]) if image is None else image.labels
+        )
+        return labels
+
+    def remember(self, root: object) -> None:
+        """Read all images now and keep them in memory.
+
+        Done before the loader's workers start, which then share the memory (on systems that fork);
+        every process of a distributed run keeps its own.
+
+        Args:
+            root: The data set, for messages.
+
+        Raises:
+            DataError: Some are broken; all of these are named.
+        """
+        problems = Problems()
+
+        def keep(index: int) -> list[_Image]:
+            kept: list[_Image] = []
+            with problems.noted(self.name(index)):
+                image: Any = self.read(index)
+                # Copies: arrays that are views of a file would keep it open.
+                kept.append(image._make(None if a is None else np.array(a) for a in image))
+            return kept
+
+        kept = [image for read in in_threads(keep, range(len(self))) for image in read]
+        problems.refuse(root)
+        self._kept = kept
+
+    def _stored(self, store: Store, item: _Item) -> _Image:
+        arrays = store.read(item.name, item.parts)
+        # Prepared with depth, they also serve runs without.
+        read = {key: a for key, a in arrays.items() if key != "depth" or "depth" in item.parts}
+        kind: Any = self._kind
+        image: _Image = kind(**{**dict.fromkeys(kind._fields), **read})
+        return image
+
+
+class PosedUp:
+    """Panoramas with the direction of up that their files say (GPano); None where they do not."""
+
+    def __init__(self) -> None:
+        self._ups: dict[int, NDArray[np.float64] | None] = {}
+
+    def __call__(self, panorama: Panorama, index: int, files: ImageFiles) -> Panorama:
+        """The panorama with `up`."""
+        if index not in self._ups:
+            self._ups[index] = up_of(files.rgb)
+        return panorama._replace(up=self._ups[index])
+
+
+class EstimatedUp:
+    """Panoramas with an estimate of the direction of up, where it is not known.
+
+    They are looked at upright, however the camera was held; pixels and labels stay where they are.
+
+    Args:
+        max_tilt_deg: The most they may be tilted, see `estimate_up`.
+    """
+
+    def __init__(self, max_tilt_deg: float) -> None:
+        self._max_tilt_deg = max_tilt_deg
+        self._ups: dict[int, NDArray[np.float64] | None] = {}
+
+    def __call__(self, panorama: Panorama, index: int, files: ImageFiles) -> Panorama:
+        """The panorama with `up`; None where the image does not show it."""
+        del files
+        if panorama.up is not None:
+            return panorama
+        if index not in self._ups:
+            self._ups[index] = estimate_up(panorama.rgb, self._max_tilt_deg).found
+        return panorama._replace(up=self._ups[index])
+
+
+class RotatedPanoramas:
+    """Panoramas as seen by a camera that is not upright.
+
+    Labels rotate with the image, so the score is that of the rotated panorama. The same panorama is
+    rotated the same way in every run with the same seed.
+
+    Args:
+        rotation: Tilt in degrees about a random horizontal axis, after a random rotation about the
+            vertical; or `so3`, uniform over all rotations.
+        seed: Seed of the rotations.
+        known: Whether the panoramas say where up is, as those of a camera with a sensor for it.
+    """
+
+    def __init__(self, rotation: float | Literal["so3"], seed: int, *, known: bool = False) -> None:
+        self._rotation = rotation
+        self._seed = seed
+        self._known = known
+
+    def rotation(self, index: int) -> NDArray[np.float64]:
+        """The rotation of one panorama, ``(3, 3)``: what was seen at d is now seen at R d."""
+        rng = sample_rng(self._seed, 0, index)
+        if self._rotation == "so3":
+            return random_rotation(rng)
+        yaw, azimuth = rng.uniform(0, 2 * math.pi, 2)
+        axis = (math.cos(azimuth), math.sin(azimuth), 0)
+        tilt = rotation_about(axis, math.radians(self._rotation))
+        return tilt @ rotation_about((0, 0, 1), yaw)
+
+    def __call__(self, panorama: Panorama, index: int, files: Any = None) -> Panorama:
+        """One rotated panorama: RGB bilinear, depth and labels nearest."""
+        del files
+        rgb, depth, labels, before = panorama
+        rotation = self.rotation(index)
+        up = rotation[:, 2] if before is None else rotation @ before
+        return Panorama(
+            rotate_equirect(rgb, rotation, "bilinear"),
+            None if depth is None else rotate_equirect(depth, rotation, "nearest"),
+            rotate_equirect(labels, rotation, "nearest"),
+            up if self._known else None,
+        )
+
+
+def in_threads(work: Callable[[_Work], _Result], items: Sequence[_Work]) -> Generator[_Result]:
+    """The results of some work on each item, in their order, on all cores.
+
+    OpenCV and zlib free the GIL.
+    """
+    workers = os.cpu_count() or 1
+    with ThreadPoolExecutor(workers) as pool:
+        # A few at a time: the reader is never far ahead of who consumes them.
+        for start in range(0, len(items), 4 * workers):
+            yield from pool.map(work, items[start : start + 4 * workers])

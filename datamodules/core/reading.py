@@ -1,0 +1,183 @@
+"""Labelled images on disk: their files, how a data set decodes them, and what is checked first."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from datamodules.core.panoramas import Panorama, resize_area, resize_depth
+from datamodules.core.photos import Photo, distance_from_z_depth
+from datamodules.images.png import check_panorama_size
+from tangent_train.errors import DataError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+    from pathlib import Path
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from datamodules.core.problems import Problems
+
+__all__ = ["ImageFiles", "ImageReader", "PanoramaReading", "PhotoReading", "check_headers"]
+
+
+class ImageFiles(NamedTuple):
+    """The files of one panorama or photo.
+
+    Attributes:
+        name: A short name that no other image of the data set has; ``/`` between groups.
+        rgb: Colours.
+        labels: Classes.
+        depth: Depth, where it is an input.
+        camera: What holds the camera matrix, of photos that have such a file each.
+    """
+
+    name: str
+    rgb: Path
+    labels: Path
+    depth: Path | None = None
+    camera: Path | None = None
+
+    @property
+    def parts(self) -> dict[str, Path]:
+        """All files by what they hold."""
+        return {part: path for part, path in self._asdict().items() if part != "name" and path}
+
+
+class ImageReader(ABC):
+    """How the files of a data set are decoded."""
+
+    @property
+    def settings(self) -> Mapping[str, str]:
+        """What decides the labels and depth besides the files: a store is made for each choice."""
+        return {}
+
+    @abstractmethod
+    def size(self, part: str, path: Path) -> tuple[int, int]:
+        """Rows and columns by the header of a file, which has to be as the data set promises.
+
+        Args:
+            part: ``rgb``, ``labels`` or ``depth``.
+            path: The file; it has to be whole.
+
+        Raises:
+            DataError: It is not.
+        """
+
+    @abstractmethod
+    def rgb(self, files: ImageFiles) -> NDArray[np.uint8]:
+        """Colours, ``(H, W, 3)``."""
+
+    @abstractmethod
+    def labels(self, files: ImageFiles, shape: tuple[int, int] | None = None) -> NDArray[np.uint8]:
+        """Classes, 0 where unknown.
+
+        Args:
+            files: Of the image.
+            shape: ``(h, w)`` of the result, see `resize_nearest`; by default that of the file.
+
+        Raises:
+            DataError: The file is broken, or holds what stands for no class.
+        """
+
+    @abstractmethod
+    def depth(self, files: ImageFiles) -> NDArray[np.uint16]:
+        """Depth ``(H, W)`` in steps of 1/512 m, 0 where missing; z-depth of photos."""
+
+    def camera(self, files: ImageFiles) -> NDArray[np.float64]:
+        """``(3, 3)`` K of a photo for integer pixel centres, without skew."""
+        raise NotImplementedError(files.name)
+
+
+@dataclass(frozen=True)
+class PanoramaReading:
+    """Reads panoramas at one size.
+
+    Attributes:
+        reader: Of the data set.
+        shape: Rows and columns of the result.
+    """
+
+    reader: ImageReader
+    shape: tuple[int, int]
+
+    def __call__(self, files: ImageFiles) -> Panorama:
+        """One panorama."""
+        depth = None
+        if files.depth is not None:
+            depth = resize_depth(self.reader.depth(files), self.shape)
+        rgb = resize_area(self.reader.rgb(files), self.shape)
+        return Panorama(rgb, depth, self.labels(files))
+
+    def labels(self, files: ImageFiles) -> NDArray[np.uint8]:
+        """Its labels alone."""
+        return self.reader.labels(files, self.shape)
+
+    def parts(self, files: ImageFiles) -> list[Callable[[], object]]:
+        """What decodes each of its files by itself."""
+        return [partial(getattr(self.reader, part), files) for part in files.parts]
+
+
+@dataclass(frozen=True)
+class PhotoReading:
+    """Reads photos; z-depth becomes distance from the centre of projection.
+
+    Attributes:
+        reader: Of the data set.
+    """
+
+    reader: ImageReader
+
+    def __call__(self, files: ImageFiles) -> Photo:
+        """One photo."""
+        camera_matrix = self.reader.camera(files)
+        depth = None
+        if files.depth is not None:
+            depth = distance_from_z_depth(self.reader.depth(files), camera_matrix)
+        return Photo(self.reader.rgb(files), depth, self.labels(files), camera_matrix)
+
+    def labels(self, files: ImageFiles) -> NDArray[np.uint8]:
+        """Its labels alone."""
+        return self.reader.labels(files)
+
+    def parts(self, files: ImageFiles) -> list[Callable[[], object]]:
+        """What decodes each of its files by itself."""
+        return [partial(getattr(self.reader, part), files) for part in files.parts]
+
+
+def check_headers(
+    files: ImageFiles, reader: ImageReader, problems: Problems, erp_height: int | None = None
+) -> tuple[int, int] | None:
+    """Check that all files of an image are there, whole and of one size; nothing is decoded.
+
+    Args:
+        files: Of the image.
+        reader: Of the data set.
+        problems: What is wrong is noted here, under the image's name.
+        erp_height: Rows that are wanted of a panorama; None of photos.
+
+    Returns:
+        Rows and columns; None where the colours cannot be used.
+    """
+    size: tuple[int, int] | None = None
+    for part in ("rgb", "labels", "depth"):
+        path: Any = getattr(files, part)
+        if path is None:
+            continue
+        with problems.noted(files.name, path):
+            found = reader.size(part, path)
+            if part == "rgb":
+                size = found
+                if erp_height is not None:
+                    check_panorama_size(path, size, erp_height)
+            elif size not in (None, found):
+                raise DataError(
+                    path,
+                    found=f"{found[0]}×{found[1]} pixels",
+                    expected=f"{size[0]}×{size[1]}, as {files.rgb}" if size else "",
+                    remedy="Copy or export both at one size.",
+                )
+    return size

@@ -1,0 +1,137 @@
+"""How the files of one's own panoramas are decoded."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from datamodules.core.panoramas import meters_to_steps, resize_nearest
+from datamodules.core.reading import ImageFiles, ImageReader
+from datamodules.images.image_files import find_depth, find_images
+from datamodules.images.pixel_files import read_depth_m, read_image_size, read_pixels, read_rgb
+from datamodules.images.png import PngHeader, read_png_header
+from tangent_train.errors import DataError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from datamodules.core.problems import Problems
+    from datamodules.folder.classes import FolderClasses
+
+__all__ = ["FolderReader", "list_panoramas", "read_codes"]
+
+# What label images may be. In grey of 1 to 4 bits the numbers may be meant, or the steps from black
+# to white that they stand for: better asked than guessed. 16 bits beside alpha are not decoded.
+_VALUES = ("8-bit grey", "16-bit grey", "8-bit grey with alpha", "palette")
+_COLORS = ("8-bit RGB", "8-bit RGBA", "8-bit grey", "8-bit grey with alpha", "palette")
+
+
+@dataclass(frozen=True)
+class FolderReader(ImageReader):
+    """Reads one's own panoramas.
+
+    Attributes:
+        classes: What their labels mean.
+        depth_units_per_m: Units in a metre of depth files of whole numbers.
+    """
+
+    classes: FolderClasses
+    depth_units_per_m: float
+
+    @property
+    def settings(self) -> dict[str, str]:
+        """The classes in short and the units."""
+        units = f"{self.depth_units_per_m:g}"
+        return {"classes": self.classes.fingerprint, "depth units per metre": units}
+
+    def size(self, part: str, path: Path) -> tuple[int, int]:
+        """See `ImageReader`, as all others."""
+        if part == "labels":
+            header = read_png_header(path)
+            _check_kind(path, header, in_colors=self.classes.in_colors)
+            return header.height, header.width
+        return read_image_size(path)
+
+    def rgb(self, files: ImageFiles) -> NDArray[np.uint8]:
+        """Colours, whatever the format."""
+        return read_rgb(files.rgb)
+
+    def labels(self, files: ImageFiles, shape: tuple[int, int] | None = None) -> NDArray[np.uint8]:
+        """Classes by ``classes.json``."""
+        codes = read_codes(files.labels, in_colors=self.classes.in_colors)
+        codes = codes if shape is None else resize_nearest(codes, shape)
+        return self.classes.decode(codes, files.labels)
+
+    def depth(self, files: ImageFiles) -> NDArray[np.uint16]:
+        """Depth in steps of 1/512 m."""
+        return meters_to_steps(read_depth_m(files.parts["depth"], self.depth_units_per_m))
+
+
+def list_panoramas(root: Path, problems: Problems, *, with_depth: bool) -> list[ImageFiles]:
+    """All panoramas of a data set, in the order of their names.
+
+    A name is the path of the image in ``images/`` without ending.
+
+    Args:
+        root: Folder with ``images/`` and ``labels/``.
+        problems: Where it is noted that two images have one name, or one has no depth, or several.
+        with_depth: Whether depth is wanted.
+
+    Raises:
+        DataError: A folder is missing, or there are no images.
+    """
+    for folder in (root, root / "images", root / "labels"):
+        if not folder.is_dir():
+            expected = "a data set: images/, labels/ and classes.json, see docs/own_data.md"
+            raise DataError(folder, found="no such folder", expected=expected)
+    found: dict[str, ImageFiles] = {}
+    for rgb in find_images(root / "images", problems.noted):
+        name = rgb.relative_to(root / "images").with_suffix("").as_posix()
+        depth = None
+        with problems.noted(name):
+            if name in found:
+                raise DataError(
+                    rgb,
+                    found=f"{found[name].rgb.name} beside it",
+                    expected="one image of each name: its labels have the same one",
+                    remedy="Rename or remove one of them.",
+                )
+            if with_depth:
+                without = "Or train without depth: data.inputs=[rgb]."
+                depth = find_depth(root / "depth", name, without)
+        found.setdefault(name, ImageFiles(name, rgb, root / "labels" / f"{name}.png", depth))
+    return [found[name] for name in sorted(found)]
+
+
+def _check_kind(path: Path, header: PngHeader, *, in_colors: bool) -> None:
+    kind = f"{header.bits}-bit {header.color}"
+    allowed = _COLORS if in_colors else _VALUES
+    if kind not in allowed and header.color not in allowed:
+        raise DataError(
+            path,
+            found=kind,
+            expected=f"{', '.join(allowed)}: "
+            f"classes.json names {'colours' if in_colors else 'values'}",
+            remedy="Convert the labels, or say in classes.json what they hold.",
+        )
+
+
+def read_codes(path: Path, *, in_colors: bool) -> NDArray[np.integer]:
+    """Decode a label image.
+
+    Args:
+        path: The PNG.
+        in_colors: Whether classes are told by colours, not values. Of palettes, values are the
+            numbers of the entries.
+
+    Returns:
+        ``(H, W)`` values, or ``(H, W, 3)`` colours; transparency is left out.
+
+    Raises:
+        DataError: The file is broken.
+    """
+    return read_rgb(path) if in_colors else read_pixels(path, indices=True)

@@ -1,0 +1,128 @@
+"""How the files of Stanford2D3DS are decoded."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from datamodules.core.panoramas import Mask, mask_black, resize_nearest
+from datamodules.core.reading import ImageReader
+from datamodules.images.png import check_png, read_color_png, read_depth_png
+from datamodules.stanford2d3ds.files import MISSING_DEPTH
+from datamodules.stanford2d3ds.label_table import LabelTable
+from tangent_train.errors import DataError
+from tangent_train.json_text import parse_json
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from datamodules.core.reading import ImageFiles
+
+__all__ = ["StanfordReader", "read_camera_matrix"]
+
+_FORMATS = {"rgb": (8, ("RGB", "RGBA")), "labels": (8, ("RGB", "RGBA")), "depth": (16, ("grey",))}
+_CENTERS_FROM_CORNERS = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
+_TABLE_NAME = "semantic_labels.json"
+
+
+@dataclass(frozen=True)
+class StanfordReader(ImageReader):
+    """Panoramas and photos alike.
+
+    Attributes:
+        table: The classes of the instances.
+        mask: Which pixels count as unknown, see `mask_black`.
+    """
+
+    table: LabelTable
+    mask: Mask = "labels"
+
+    @classmethod
+    def of(cls, root: Path, label_table: Path | None, mask: Mask = "labels") -> StanfordReader:
+        """The reader of a data set.
+
+        Args:
+            root: Its folder.
+            label_table: The class table, when it is not where the release has it.
+            mask: See `mask_black`.
+
+        Raises:
+            DataError: There is no class table.
+        """
+        places = [root / _TABLE_NAME, root / "assets" / _TABLE_NAME]
+        if label_table is not None:
+            places = [label_table]
+        table = next((place for place in places if place.is_file()), None)
+        if table is None:
+            raise DataError(
+                places[0],
+                found="no class table",
+                expected=f"it there or at {places[-1]}",
+                remedy="Copy it from the release (assets), or name it in data.label_table.",
+            )
+        return cls(LabelTable.from_json(table), mask)
+
+    @property
+    def settings(self) -> dict[str, str]:
+        """The mask and the class table in short."""
+        classes = hashlib.sha256(self.table.class_ids.tobytes()).hexdigest()
+        return {"mask": self.mask, "class table": classes}
+
+    def size(self, part: str, path: Path) -> tuple[int, int]:
+        """See `ImageReader`, as all others."""
+        header = check_png(path, *_FORMATS[part])
+        return header.height, header.width
+
+    def rgb(self, files: ImageFiles) -> NDArray[np.uint8]:
+        """Colours; alpha is dropped."""
+        return read_color_png(files.rgb)
+
+    def labels(self, files: ImageFiles, shape: tuple[int, int] | None = None) -> NDArray[np.uint8]:
+        """Classes by the class table, 0 where black pixels are masked."""
+        colors = read_color_png(files.labels)
+        shape = shape or (colors.shape[0], colors.shape[1])
+        labels = self.table.decode(resize_nearest(colors, shape), files.labels)
+        if self.mask == "labels":
+            return labels
+        return mask_black(labels, resize_nearest(self.rgb(files), shape), self.mask)
+
+    def depth(self, files: ImageFiles) -> NDArray[np.uint16]:
+        """Depth in steps of 1/512 m, as in the files."""
+        steps = read_depth_png(files.parts["depth"])
+        steps[steps == MISSING_DEPTH] = 0
+        return steps
+
+    def camera(self, files: ImageFiles) -> NDArray[np.float64]:
+        """From the pose file."""
+        return read_camera_matrix(files.parts["camera"])
+
+
+def read_camera_matrix(path: Path) -> NDArray[np.float64]:
+    """The camera matrix of a pose file.
+
+    Args:
+        path: ``camera_…_domain_pose.json``.
+
+    Returns:
+        ``(3, 3)`` K for integer pixel centres (the file counts from pixel corners).
+
+    Raises:
+        DataError: The file is missing or broken, or holds no such matrix.
+    """
+    expected = "a pose file with a camera_k_matrix of 3×3 numbers, without skew"
+    try:
+        matrix = np.array(parse_json(path.read_bytes())["camera_k_matrix"], np.float64)
+    except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:
+        found = f"{type(error).__name__}: {error}"
+        raise DataError(
+            path, found=found, expected=expected, remedy="Copy or extract the file again."
+        ) from error
+    pinhole = matrix.shape == (3, 3) and np.isfinite(matrix).all() and (np.diag(matrix) > 0).all()
+    if not pinhole or matrix[2].tolist() != [0, 0, 1] or matrix[0, 1] or matrix[1, 0]:
+        raise DataError(path, found=matrix.tolist(), expected=expected)
+    return _CENTERS_FROM_CORNERS @ matrix

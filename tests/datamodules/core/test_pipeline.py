@@ -1,0 +1,134 @@
+"""The images of a split: read, rotated, made upright, kept in memory."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+import pytest
+
+from datamodules.core.panoramas import Panorama
+from datamodules.core.pipeline import (
+    EstimatedUp,
+    PosedUp,
+    RotatedPanoramas,
+    SplitItems,
+    in_threads,
+)
+from datamodules.core.reading import ImageFiles
+from tangent_train.errors import DataError
+from tangent_train.geometry import equirect_directions
+from tangent_train.rendering.upright.gravity import Gravity
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+FILES = [ImageFiles(name, Path(name), Path("labels")) for name in ("0", "1")]
+UP = np.array([0.6, 0.0, 0.8])
+
+
+def _heights() -> Panorama:
+    """A panorama whose labels, colours and depth tell the direction's height z."""
+    z = np.round(100 + 100 * equirect_directions((32, 64))[..., 2])
+    labels = z.astype(np.uint8)
+    return Panorama(np.stack([labels] * 3, axis=-1), z.astype(np.uint16), labels)
+
+
+@pytest.mark.parametrize("tilt", [0.0, 30.0, 180.0])
+def test_tilt_is_exact_and_yaw_random(tilt: float) -> None:
+    rotations = [RotatedPanoramas(tilt, seed=1).rotation(index) for index in range(2)]
+    for rotation in rotations:
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+        assert np.degrees(np.arccos(np.clip(rotation[2, 2], -1, 1))) == pytest.approx(tilt)
+    assert not np.allclose(rotations[0], rotations[1])
+
+
+def test_rotations_are_those_of_seed_and_index() -> None:
+    first, again, other = (RotatedPanoramas("so3", seed) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first.rotation(0), again.rotation(0))
+    assert not np.allclose(first.rotation(0), first.rotation(1))
+    assert not np.allclose(first.rotation(0), other.rotation(0))
+
+
+@pytest.mark.parametrize("rotation", [40.0, "so3"])
+@pytest.mark.parametrize("up", [None, UP])
+def test_image_depth_labels_and_up_rotate_together(
+    rotation: float | Literal["so3"], up: NDArray[np.float64] | None
+) -> None:
+    rotated = RotatedPanoramas(rotation, seed=5, known=True)
+    rgb, depth, labels, found = rotated(_heights()._replace(up=up), 0)
+    R = rotated.rotation(0)
+    # The output direction d shows the input at Rᵀd, whose height is the third row of Rᵀ times d.
+    expected = 100 + 100 * equirect_directions((32, 64)) @ R[:, 2]
+    np.testing.assert_allclose(labels.astype(float), expected, atol=8)
+    np.testing.assert_allclose(rgb[..., 1].astype(float), expected, atol=8)
+    assert depth is not None
+    np.testing.assert_array_equal(depth, labels)  # both nearest: the same source pixels
+    assert found is not None
+    np.testing.assert_allclose(found, R @ ((0, 0, 1) if up is None else up), atol=1e-12)
+    unknown = RotatedPanoramas(rotation, seed=5)(_heights()._replace(depth=None, up=up), 0)
+    assert (unknown.depth, unknown.up) == (None, None)
+
+
+def test_files_are_asked_once_where_up_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+
+    def up_of(path: Path) -> NDArray[np.float64] | None:
+        asked.append(str(path))
+        return UP if str(path) == "1" else None
+
+    monkeypatch.setattr("datamodules.core.pipeline.up_of", up_of)
+    posed = PosedUp()
+    for _ in range(2):
+        assert posed(_heights(), 0, FILES[0]).up is None
+        np.testing.assert_array_equal(posed(_heights(), 1, FILES[1]).up, UP)
+    assert asked == ["0", "1"]
+
+
+@pytest.mark.parametrize("confidence", [0.0, 0.9])
+def test_only_what_nothing_says_is_estimated_and_only_once(
+    monkeypatch: pytest.MonkeyPatch, confidence: float
+) -> None:
+    asked: list[float] = []
+
+    def estimate(rgb: NDArray[np.uint8], max_tilt_deg: float) -> Gravity:
+        asked.append(max_tilt_deg)
+        return Gravity(UP if confidence else np.array([0.0, 0, 1]), confidence, UP[None])
+
+    monkeypatch.setattr("datamodules.core.pipeline.estimate_up", estimate)
+    upright = EstimatedUp(50)
+    for _ in range(2):
+        np.testing.assert_array_equal(upright(_heights()._replace(up=-UP), 1, FILES[1]).up, -UP)
+        np.testing.assert_array_equal(
+            upright(_heights(), 0, FILES[0]).up, UP if confidence else None
+        )
+    assert asked == [50]
+
+
+def test_what_is_remembered_is_read_once_and_what_is_broken_is_listed() -> None:
+    read: list[str] = []
+
+    def decode(files: ImageFiles) -> Panorama:
+        read.append(files.name)
+        if files.name == "broken":
+            raise DataError(files.rgb, found="nothing", expected="a panorama")
+        return _heights()._replace(depth=None)
+
+    def double(panorama: Panorama, index: int, files: Any) -> Panorama:
+        return panorama._replace(labels=panorama.labels * 0 + index)
+
+    items = SplitItems(FILES, decode, Panorama, transforms=[double])
+    items.remember("data")
+    for index in (0, 1):
+        np.testing.assert_array_equal(items.read(index).rgb, _heights().rgb)
+        assert np.unique(items.labels(index)).tolist() == [index]
+    assert (items.read(0).depth, items.name(1), len(items)) == (None, "1", 2)
+    assert sorted(read) == ["0", "1"]
+    broken = [file._replace(name="broken", rgb=Path(f"b{file.name}")) for file in FILES]
+    with pytest.raises(DataError, match=r"data: found 2 problems(.|\n)*b0(.|\n)*b1"):
+        SplitItems(broken, decode, Panorama).remember("data")
+
+
+def test_threads_keep_the_order() -> None:
+    assert list(in_threads(lambda n: 2 * n, range(100))) == list(range(0, 200, 2))
