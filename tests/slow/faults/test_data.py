@@ -160,7 +160,7 @@ _FAULTS = [
     _Fault("folder", "corrupted labels", "labels", sets.corrupt, "no image that can be decoded"),
     _Fault("folder", "truncated depth", "depth", sets.truncate, _TRUNCATED),
     _Fault("folder", "corrupted depth", "depth", sets.corrupt, "no image that can be decoded"),
-    _Fault("folder", "bit depth of depth", "depth", sets.to_8_bits, "an image of 8 bits"),
+    _Fault("folder", "bit depth of depth", "depth", sets.to_8_bits, "uint8 of shape"),
     _Fault("folder", "labels of another size", "labels", sets.smaller, "16×32 pixels; expected 32"),
     _Fault("folder", "depth of another size", "depth", sets.smaller, "16×32 pixels; expected 32"),
     _Fault("folder", "no labels", "labels", _REMOVE, "No such file"),
