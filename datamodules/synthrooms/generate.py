@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,9 +18,10 @@ from datamodules.synthrooms.render import Camera, draw_camera, draw_holes, rende
 from datamodules.synthrooms.scene import draw_room_type, furnish
 from datamodules.synthrooms.settings import RoomSettings
 from datamodules.synthrooms.writer import (
+    PANORAMA,
     SUFFIXES,
-    PictureName,
-    RoomName,
+    RoomPlan,
+    camera_identifier,
     encode_picture,
     label_indices,
     label_strings,
@@ -42,35 +43,21 @@ VERSION = 1
 _CAMERA_SHARES = (0.75, 0.15, 0.1)  # of rooms with one, two and three cameras
 
 
-class RoomPlan(NamedTuple):
-    """A room before it is made, and its panoramas."""
-
-    name: RoomName
-    cameras: tuple[PictureName, ...]
-
-
 def plan_rooms(settings: RoomSettings) -> list[RoomPlan]:
     """All rooms of a data set, in the order of the label table."""
     plans: list[RoomPlan] = []
     numbers = {area[0]: 0 for area in AREAS}
-    for area, count in settings.rooms.items():
-        for _ in range(count):
-            numbers[area[0]] += 1
-            plans.append(_begin(settings, area, numbers[area[0]], len(plans))[0])
+    for area in (area for area, count in settings.rooms.items() for _ in range(count)):
+        number = numbers[area[0]] = numbers[area[0]] + 1
+        rng = np.random.default_rng((settings.seed, AREAS.index(area), number))
+        kind = draw_room_type(rng)
+        drawn = 1 + int(rng.choice(len(_CAMERA_SHARES), p=_CAMERA_SHARES))
+        cameras = tuple(
+            camera_identifier(settings.seed, area, f"{kind}_{number}", k)
+            for k in range(max(settings.least_cameras, drawn))
+        )
+        plans.append(RoomPlan(area, kind, number, len(plans), cameras, rng))
     return plans
-
-
-def _begin(
-    settings: RoomSettings, area: str, number: int, order: int
-) -> tuple[RoomPlan, np.random.Generator]:
-    """A room's plan, and its generator of random numbers after the plan was drawn."""
-    rng = np.random.default_rng((settings.seed, AREAS.index(area), number))
-    room = RoomName(area, draw_room_type(rng), number, order)
-    drawn = 1 + int(rng.choice(len(_CAMERA_SHARES), p=_CAMERA_SHARES))
-    cameras = range(max(settings.least_cameras, drawn))
-    return RoomPlan(
-        room, tuple(PictureName.of_camera(settings.seed, room, k) for k in cameras)
-    ), rng
 
 
 def generate_rooms(
@@ -96,13 +83,13 @@ def generate_rooms(
     plans = plan_rooms(settings)
     labels = root / "semantic_labels.json"
     if not labels.exists():
-        write_text(labels, json.dumps(label_strings([plan.name for plan in plans])))
-    frames = (None, *range(settings.views_per_camera))
+        write_text(labels, json.dumps(label_strings(plans)))
+    frames = (PANORAMA, *map(str, range(settings.views_per_camera)))
     unfinished = [
         plan
         for plan in plans
         if not all(
-            (root / camera._replace(frame=frame).file(kind)).exists()
+            (root / plan.file(camera, frame, kind)).exists()
             for camera in plan.cameras
             for frame in frames
             for kind in SUFFIXES
@@ -110,39 +97,39 @@ def generate_rooms(
     ]
     if not unfinished:
         return
-    pieces = [(root, settings, plan.name) for plan in unfinished]
+    pieces = [(root, settings, plan) for plan in unfinished]
     making = in_processes(make_room, pieces, number_of_processes(workers, len(pieces)))
     before = len(plans) - len(unfinished)
     show_progress(making, "Rendering rooms", "rooms", len(plans), before=before, show=progress)
 
 
-def make_room(root: Path, settings: RoomSettings, name: RoomName) -> None:
+def make_room(root: Path, settings: RoomSettings, plan: RoomPlan) -> None:
     """Furnish a room, render its pictures and write their files.
 
     Args:
         root: Folder of the data set.
         settings: Settings of the data set.
-        name: Which room.
+        plan: Which room.
     """
-    plan, rng = _begin(settings, name.area, name.number, name.order)
-    room = furnish(rng, name.kind)
+    rng = plan.rng
+    room = furnish(rng, plan.kind)
     scene = RayScene(room)
     holes = draw_holes(rng, scene)
-    labels = label_indices(name, room.items)
+    labels = label_indices(plan, room.items)
     cameras: list[Camera] = []
-    for panorama in plan.cameras:
+    for identifier in plan.cameras:
         camera = draw_camera(rng, scene, room.plan, cameras)
         cameras.append(camera)
         original = Pose.looking(camera.location, camera.heading)
-        views: list[PanoramaView | PerspectiveView] = [PanoramaView(original, settings.height)]
-        views += [
-            draw_view(rng, settings.views, camera.location, settings.view_size)
-            for _ in range(settings.views_per_camera)
-        ]
-        for number, view in enumerate(views):
+        views: dict[str, PanoramaView | PerspectiveView] = {
+            PANORAMA: PanoramaView(original, settings.height)
+        }
+        for k in range(settings.views_per_camera):
+            views[str(k)] = draw_view(rng, settings.views, camera.location, settings.view_size)
+        for frame, view in views.items():
             picture = render(scene, view, camera, holes, settings.supersample, rng)
-            file = panorama._replace(frame=number - 1 if number else None)
-            for kind, content in encode_picture(picture, labels).items():
-                write_bytes(root / file.file(kind), content)
-            pose = json.dumps(pose_record(file, view, original)) + "\n"
-            write_text(root / file.file("pose"), pose)
+            files = encode_picture(picture, labels)
+            pose = pose_record(plan, identifier, frame, view, original)
+            files["pose"] = json.dumps(pose).encode() + b"\n"
+            for kind, content in files.items():
+                write_bytes(root / plan.file(identifier, frame, kind), content)

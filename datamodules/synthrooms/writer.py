@@ -29,14 +29,18 @@ if TYPE_CHECKING:
 
 __all__ = [
     "INSTANCES",
+    "PANORAMA",
     "SUFFIXES",
-    "PictureName",
-    "RoomName",
+    "RoomPlan",
+    "camera_identifier",
     "encode_picture",
     "label_indices",
     "label_strings",
     "pose_record",
 ]
+
+PANORAMA = "equirectangular"
+"""Frame of panoramas in file names and poses."""
 
 SUFFIXES = {"rgb": ".png", "depth": ".png", "semantic": ".png", "pose": ".json"}
 """Files of every picture by kind."""
@@ -68,69 +72,61 @@ _NAMESPACE = uuid.UUID("8f2b5b54-6d1f-4a3e-9a44-2d6d0c3f7a10")
 _PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 
 
-class RoomName(NamedTuple):
-    """Which room it is.
+class RoomPlan(NamedTuple):
+    """A room before it is made.
 
     Attributes:
         area: ``"1"`` to ``"6"``, with ``"5a"`` and ``"5b"``.
         kind: Room type, as ``office``.
         number: From 1, unique in the area; 5a and 5b count as one area here, as in the real set.
         order: Place of the room in the label table, from 0.
+        cameras: Identifier of each of its panoramas, 32 hexadecimal digits.
+        rng: Source of randomness of everything in it.
     """
 
     area: str
     kind: str
     number: int
     order: int
-
-    def __str__(self) -> str:
-        return f"{self.kind}_{self.number}"
-
-
-class PictureName(NamedTuple):
-    """Which picture it is.
-
-    Attributes:
-        room: Where.
-        camera: 32 hexadecimal digits.
-        frame: Number of a perspective view; None for the panorama.
-    """
-
-    room: RoomName
-    camera: str
-    frame: int | None = None
-
-    @classmethod
-    def of_camera(cls, seed: int, room: RoomName, number: int) -> PictureName:
-        """The panorama of a room's camera; its identifier follows from seed, room and number."""
-        text = f"{seed}/{room.area}/{room}/{number}"
-        return cls(room, uuid.uuid5(_NAMESPACE, text).hex)
+    cameras: tuple[str, ...]
+    rng: np.random.Generator
 
     @property
-    def frame_text(self) -> str:
-        """The frame as in file names and poses."""
-        return "equirectangular" if self.frame is None else str(self.frame)
+    def name(self) -> str:
+        """Room type and number, as in file names."""
+        return f"{self.kind}_{self.number}"
 
-    def file(self, kind: str) -> PurePosixPath:
-        """Path of a kind of `SUFFIXES`, relative to the data set's folder."""
-        name = f"camera_{self.camera}_{self.room}_frame_{self.frame_text}_domain_{kind}"
-        group = "pano" if self.frame is None else "data"
-        return PurePosixPath(f"area_{self.room.area}", group, kind, name + SUFFIXES[kind])
+    def file(self, camera: str, frame: str, kind: str) -> PurePosixPath:
+        """Path of a file, relative to the data set's folder.
+
+        Args:
+            camera: One of `cameras`.
+            frame: `PANORAMA`, or the number of a perspective view.
+            kind: One of `SUFFIXES`.
+        """
+        name = f"camera_{camera}_{self.name}_frame_{frame}_domain_{kind}{SUFFIXES[kind]}"
+        group = "pano" if frame == PANORAMA else "data"
+        return PurePosixPath(f"area_{self.area}", group, kind, name)
 
 
-def label_strings(rooms: Sequence[RoomName]) -> list[str]:
+def camera_identifier(seed: int, area: str, room: str, number: int) -> str:
+    """Identifier of a camera of a room, 32 hexadecimal digits."""
+    return uuid.uuid5(_NAMESPACE, f"{seed}/{area}/{room}/{number}").hex
+
+
+def label_strings(rooms: Sequence[RoomPlan]) -> list[str]:
     """The label table: ``class_instance_roomtype_roomnumber_area``, the unknown first."""
     labels = [f"{UNKNOWN}_0_{UNKNOWN}_0_0"]
     for room in rooms:
         labels += [
-            f"{name}_{instance}_{room}_{room.area[0]}"
+            f"{name}_{instance}_{room.name}_{room.area[0]}"
             for name, count in INSTANCES.items()
             for instance in range(1, count + 1)
         ]
     return labels
 
 
-def label_indices(room: RoomName, items: Sequence[str]) -> NDArray[np.uint32]:
+def label_indices(room: RoomPlan, items: Sequence[str]) -> NDArray[np.uint32]:
     """Index into the label table of every item of a room, ``(n,)``."""
     first = 1 + room.order * sum(INSTANCES.values())
     starts = dict(zip(INSTANCES, np.cumsum([first, *INSTANCES.values()]).tolist(), strict=False))
@@ -170,7 +166,11 @@ def _encode_png(image: NDArray[Any]) -> bytes:
 
 
 def pose_record(
-    name: PictureName, view: PanoramaView | PerspectiveView, original: Pose
+    room: RoomPlan,
+    camera: str,
+    frame: str,
+    view: PanoramaView | PerspectiveView,
+    original: Pose,
 ) -> dict[str, Any]:
     """Pose file of a picture, with all keys of the real set.
 
@@ -179,7 +179,9 @@ def pose_record(
     of 90° and the camera matrix of one face of the cube around it.
 
     Args:
-        name: The picture's name.
+        room: Where.
+        camera: One of its cameras.
+        frame: `PANORAMA`, or the number of a perspective view.
         view: How it was taken.
         original: Pose of the panorama of the same camera.
     """
@@ -195,11 +197,11 @@ def pose_record(
         "field_of_view_rads": fov,
         "camera_original_rotation": original.euler_angles.tolist(),
         "rotation_from_original_to_point": euler_angles(turn).tolist(),
-        "point_uuid": name.camera,
+        "point_uuid": camera,
         "camera_location": pose.location.tolist(),
-        "frame_num": name.frame_text,
+        "frame_num": frame,
         "camera_rt_matrix": pose.rt_matrix.tolist(),
         "final_camera_rotation": pose.euler_angles.tolist(),
-        "camera_uuid": name.camera,
-        "room": f"{name.room}_{name.room.area[0]}",
+        "camera_uuid": camera,
+        "room": f"{room.name}_{room.area[0]}",
     }

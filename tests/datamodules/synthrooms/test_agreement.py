@@ -79,7 +79,7 @@ def shots(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[list[Shot]
     assert len(plan.cameras) == 2
     generate_rooms(root, TRUE, workers=0, progress=False)
     files = [
-        [root / camera._replace(frame=frame).file("rgb") for frame in (None, 0, 1, 2)]
+        [root / plan.file(camera, frame, "rgb") for frame in ("equirectangular", "0", "1", "2")]
         for camera in plan.cameras
     ]
     return {"cameras": [[read(file) for file in camera] for camera in files]}

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from datamodules.synthrooms.camera import PanoramaView, PerspectiveView, Pose
 from datamodules.synthrooms.layout import FloorPlan, Frame
 from datamodules.synthrooms.materials import Palette, Pattern
-from datamodules.synthrooms.raycast import RayScene, even_directions
+from datamodules.synthrooms.raycast import RayScene
 from datamodules.synthrooms.render import MISSING, Camera, Holes, Picture, render
 from datamodules.synthrooms.room import Light, Room
 from datamodules.synthrooms.scene import shell
@@ -152,9 +152,3 @@ def test_caps_are_black_and_missing(caps: tuple[float, float], rows: list[int]) 
     missing = (picture.items == MISSING).all(axis=1) & np.isnan(picture.depth_m).all(axis=1)
     for row in (0, -1):
         assert black[row] == missing[row] == (row in rows)
-
-
-def test_even_directions_are_units_that_cancel() -> None:
-    directions = even_directions(500)
-    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-6)
-    np.testing.assert_allclose(directions.mean(axis=0), 0, atol=0.01)

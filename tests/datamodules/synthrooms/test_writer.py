@@ -12,16 +12,20 @@ from datamodules.synthrooms.camera import PanoramaView, PerspectiveView, Pose, e
 from datamodules.synthrooms.render import MISSING, Picture
 from datamodules.synthrooms.writer import (
     INSTANCES,
-    PictureName,
-    RoomName,
+    RoomPlan,
+    camera_identifier,
     encode_picture,
     label_indices,
     label_strings,
     pose_record,
 )
 
-ROOMS = [RoomName("1", "office", 1, 0), RoomName("5b", "WC", 17, 1)]
-NAME = PictureName.of_camera(0, ROOMS[1], 0)
+CAMERA = camera_identifier(0, "5b", "WC_17", 0)
+RNG = np.random.default_rng(0)
+ROOMS = [
+    RoomPlan("1", "office", 1, 0, (), RNG),
+    RoomPlan("5b", "WC", 17, 1, (CAMERA,), RNG),
+]
 
 
 def test_labels_name_class_instance_room_and_area() -> None:
@@ -51,13 +55,16 @@ def test_every_item_has_its_own_label_until_the_numbers_run_out() -> None:
 @pytest.mark.parametrize(
     ("frame", "expected"),
     [
-        (None, "area_5b/pano/rgb/camera_{}_WC_17_frame_equirectangular_domain_rgb.png"),
-        (3, "area_5b/data/rgb/camera_{}_WC_17_frame_3_domain_rgb.png"),
+        (
+            "equirectangular",
+            "area_5b/pano/rgb/camera_{}_WC_17_frame_equirectangular_domain_rgb.png",
+        ),
+        ("3", "area_5b/data/rgb/camera_{}_WC_17_frame_3_domain_rgb.png"),
     ],
 )
-def test_file_names(frame: int | None, expected: str) -> None:
-    assert re.fullmatch("[0-9a-f]{32}", NAME.camera)
-    assert str(NAME._replace(frame=frame).file("rgb")) == expected.format(NAME.camera)
+def test_file_names(frame: str, expected: str) -> None:
+    assert re.fullmatch("[0-9a-f]{32}", CAMERA)
+    assert str(ROOMS[1].file(CAMERA, frame, "rgb")) == expected.format(CAMERA)
 
 
 def test_pictures_survive_the_files() -> None:
@@ -85,24 +92,10 @@ def test_poses_have_every_key_and_agree_with_themselves(panorama: bool) -> None:
     original = Pose.looking(np.array([1.0, 2.0, 1.5]), 0.7)
     turned = Pose.looking(original.location, -1.2, 0.3, 0.1)
     view = PanoramaView(original, 64) if panorama else PerspectiveView(turned, 100, 1.0)
-    name = NAME if panorama else NAME._replace(frame=4)
-    record = pose_record(name, view, original)
-    assert set(record) == {
-        "camera_k_matrix",
-        "field_of_view_rads",
-        "camera_original_rotation",
-        "rotation_from_original_to_point",
-        "point_uuid",
-        "camera_location",
-        "frame_num",
-        "camera_rt_matrix",
-        "final_camera_rotation",
-        "camera_uuid",
-        "room",
-    }
-    assert record["camera_uuid"] == record["point_uuid"] == NAME.camera
-    assert record["room"] == "WC_17_5"
-    assert record["frame_num"] == ("equirectangular" if panorama else "4")
+    frame = "equirectangular" if panorama else "4"
+    record = pose_record(ROOMS[1], CAMERA, frame, view, original)
+    assert record["camera_uuid"] == record["point_uuid"] == CAMERA
+    assert (record["room"], record["frame_num"]) == ("WC_17_5", frame)
     # As the real set's: Blender's camera looks along -z with +y up.
     final = euler_rotation(np.array(record["final_camera_rotation"]))
     rt = np.array(record["camera_rt_matrix"])
