@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 from numpy.lib.format import open_memmap
@@ -21,28 +21,30 @@ from datamodules.images.pixel_files import (
 )
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import atomic_path, reserve
-from tangent_train.geometry.resized_grid import ResizedGrid
+from tangent_train.geometry import ResizedGrid
 from tangent_train.rendering import Blend, tangent_to_equirect
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence, Set
+    from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
     from tangent_train.geometry import PinholeGrid
     from tangent_train.rendering.camera_files import CameraFile
 
-__all__ = ["KINDS", "Kind", "TangentResults", "result_files"]
+__all__ = ["Kind", "TangentResults", "result_files"]
 
 Kind = Literal["color", "labels", "depth", "features"]
 """What pixels mean: colours and features are interpolated, labels and depth never mixed."""
 
-KINDS: tuple[Kind, ...] = ("color", "labels", "depth", "features")
+_TYPES = {"color": "uif", "labels": "bui", "depth": "uif", "features": "uif"}
+_CHANNELS = {"color": ((), (3,)), "labels": ((),), "depth": ((),)}
 
 _GROUP_BYTES = 2**28
 """Channels are rendered together while their images take no more than this."""
+
 _NO_DEPTH = 65535
-"""Marks missing depth in many files of 16 bits; 0 does in all."""
+"""Marks missing depth in many 16-bit files; 0 does in all."""
 
 
 def result_files(folder: Path, cameras: CameraFile) -> list[Path]:
@@ -56,7 +58,7 @@ def result_files(folder: Path, cameras: CameraFile) -> list[Path]:
         One file for every image of the grid, in its order.
 
     Raises:
-        DataError: Files are missing, stand there twice, or belong to no image.
+        DataError: Some are missing, or there are two of one name.
     """
     grid = cameras.grid
     if len(cameras.faces) < grid.num_images:
@@ -66,34 +68,21 @@ def result_files(folder: Path, cameras: CameraFile) -> list[Path]:
             expected="all of them, to cover the whole sphere",
             remedy="Render the panorama without faces=….",
         )
-    files: dict[str, list[Path]] = {}
-    for file in sorted(folder.iterdir() if folder.is_dir() else ()):
-        if file.suffix.lower() in READABLE_SUFFIXES and not file.name.startswith("."):
-            files.setdefault(file.stem, []).append(file)
-    stems = {Path(name).stem: face for name, face in zip(cameras.files, cameras.faces, strict=True)}
-    _check_names(folder, files, stems.keys())
-    by_face = {face: files[stem][0] for stem, face in stems.items()}
-    return [by_face[face] for face in range(grid.num_images)]
-
-
-def _check_names(folder: Path, files: Mapping[str, list[Path]], stems: Set[str]) -> None:
-    expected = f"one file for each of the {len(stems)} images of its cameras, named as these"
-    missing, unknown = sorted(stems - files.keys()), sorted(files.keys() - stems)
-    if missing:
-        found = f"no {_some(missing)}" + (f", but {_some(unknown)}" if unknown else "")
-        raise DataError(folder, found=found, expected=expected)
-    twice = [" and ".join(path.name for path in paths) for paths in files.values() if paths[1:]]
-    if unknown or twice:
+    there: dict[str, list[Path]] = {}
+    for file in sorted(folder.iterdir()):
+        if file.suffix.lower() in READABLE_SUFFIXES:
+            there.setdefault(file.stem, []).append(file)
+    stems = [Path(name).stem for _, name in sorted(zip(cameras.faces, cameras.files, strict=True))]
+    wrong = [stem for stem in stems if len(there.get(stem, [])) != 1]
+    if wrong:
+        files = " and ".join(file.name for file in there.get(wrong[0], []))
         raise DataError(
             folder,
-            found=f"{_some(unknown)} as well" if unknown else twice[0],
-            expected=expected,
+            found=files or f"no {wrong[0]}",
+            expected=f"one file for each of the {len(stems)} images of the cameras, named as these",
             remedy="Results go into a folder of their own; cameras= says where their cameras are.",
         )
-
-
-def _some(names: list[str]) -> str:
-    return ", ".join(names[:3]) + (f" … ({len(names)} in all)" if len(names) > 3 else "")
+    return [there[stem][0] for stem in stems]
 
 
 @dataclass(frozen=True)
@@ -119,9 +108,9 @@ class TangentResults:
         Args:
             files: One for every image, in the order of the grid; from `result_files`.
             grid: The images.
-            kind: ``auto`` decides by the first file: ``.npy`` of floats are features; 8-bit colours
-                are colours, one channel of whole numbers labels; images of one channel with 16 bits
-                or floats are depth.
+            kind: ``auto`` decides by the first file: ``.npy`` of floats are features; three
+                channels are colours, one channel of integers labels; images of one channel with 16
+                bits or floats are depth.
 
         Raises:
             DataError: A file cannot be read, is not square, differs from the others, or cannot be
@@ -130,19 +119,25 @@ class TangentResults:
         with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
             arrays = list(pool.map(partial(read_pixels, indices=kind != "color"), files))
         first = arrays[0]
-        if first.shape[0] != first.shape[1]:
-            raise DataError(
-                files[0], found=f"{first.shape[0]}×{first.shape[1]} pixels", expected="a square"
-            )
-        _check_alike(files, arrays)
+        square = f"{first.shape[0]}×{first.shape[0]} pixels of {first.dtype}"
+        for file, array in zip(files, arrays, strict=True):
+            if (array.shape, array.dtype) != (first.shape, first.dtype) or array.shape[
+                0
+            ] != array.shape[1]:
+                raise DataError(
+                    file,
+                    found=f"{'×'.join(map(str, array.shape))} of {array.dtype}",
+                    expected=f"squares, all alike: {square}",
+                )
         decided = _kind_of(files[0], first) if kind == "auto" else kind
-        if decided is None or not _possible(decided, first):
+        channels = _CHANNELS.get(decided, (first.shape[2:],))
+        if first.dtype.kind not in _TYPES[decided] or first.shape[2:] not in channels:
             raise DataError(
                 files[0],
-                found=_described(first),
-                expected=f"{kind} images" if kind != "auto" else "pixels that say what they are",
-                remedy=f"Say what they are with kind={', '.join(KINDS)}: labels and depth have one "
-                "channel, colours one or three.",
+                found=f"{'×'.join(map(str, first.shape))} of {first.dtype}",
+                expected=f"{decided}",
+                remedy=f"Say what they are with kind={', '.join(get_args(Kind))}: labels and depth "
+                "have one channel, colours one or three.",
             )
         return cls(arrays, grid, decided)
 
@@ -151,17 +146,7 @@ class TangentResults:
         """The suffix of a file that can hold the panorama as it is."""
         if self.kind == "features":
             return ".npy"
-        return ".tif" if self._dtype(".tif").kind == "f" else ".png"
-
-    def _dtype(self, suffix: str) -> np.dtype[Any]:
-        """Type of numbers of the panorama in a file: what images hold, where nothing is lost."""
-        dtype = self.arrays[0].dtype
-        if suffix == ".npy":
-            return dtype
-        if self.kind == "labels":
-            values = [int(value) for array in self.arrays for value in (array.min(), array.max())]
-            return np.result_type(*map(np.min_scalar_type, (min(values), max(values))))
-        return np.dtype(np.float32) if dtype.kind == "f" else dtype
+        return ".tif" if self.arrays[0].dtype.kind == "f" else ".png"
 
     def write(self, path: Path, shape: tuple[int, int], blend: Blend, *, z_depth: bool) -> None:
         """Render them back to a panorama.
@@ -169,44 +154,48 @@ class TangentResults:
         Results of another size than the images are taken to show the same, edge to edge.
 
         Args:
-            path: The panorama's file. Arrays (``.npy``) keep the type of numbers; in images, floats
-                are 32-bit and labels the smallest unsigned numbers that hold them.
+            path: The panorama's file. Arrays (``.npy``) keep the dtype; in images, floats are
+                32-bit and labels the smallest integers that hold them.
             shape: ``(H, W)`` of the panorama.
             blend: How overlapping images are joined, of colours and features.
-            z_depth: Whether depth is along the axes of the images' cameras, to be turned into
+            z_depth: Whether depth is along the axes of the images' cameras, to be converted to
                 distance from the centre.
 
         Raises:
             SettingError: Such a file cannot hold it, or `z_depth` is set for no depth.
-            DataError: Distances do not fit into the type of numbers.
+            DataError: Distances do not fit into the dtype.
         """
+        suffix, channels = path.suffix.lower(), self.arrays[0].shape[2:]
         if z_depth and self.kind != "depth":
             raise SettingError("z_depth", found=f"true for {self.kind}", expected="depth")
-        suffix = path.suffix.lower()
         if suffix in LOSSY_SUFFIXES and self.kind != "color":
-            raise SettingError(
-                "output",
-                found=path.name,
-                expected=f"png, tif or npy: {suffix} would change the {self.kind}",
-            )
-        channels = self.arrays[0].shape[2:]
-        check_writable(suffix, self._dtype(suffix), channels[0] if channels else 1)
+            expected = f"png, tif or npy: {suffix} would change the {self.kind}"
+            raise SettingError("output", found=path.name, expected=expected)
+        dtype = self._image_dtype() if suffix != ".npy" else self.arrays[0].dtype
+        check_writable(suffix, dtype, channels[0] if channels else 1)
         size = self.arrays[0].shape[0]
         grid = self.grid if size == self.grid.dim else ResizedGrid(self.grid, size)
-        arrays = (
-            [_distances(array, grid, path) for array in self.arrays] if z_depth else self.arrays
-        )
+        arrays = self.arrays
+        if z_depth:
+            arrays = [_distances(array, grid, path) for array in arrays]
         if suffix != ".npy":
             panorama = np.empty((*shape, *channels), arrays[0].dtype)
             self._render(arrays, grid, blend, panorama)
-            write_pixels(path, panorama.astype(self._dtype(suffix), copy=False))
+            write_pixels(path, panorama.astype(dtype, copy=False))
             return
         with atomic_path(path) as temporary:
-            mapped = open_memmap(temporary, "w+", arrays[0].dtype, (*shape, *channels))
+            mapped = open_memmap(temporary, "w+", dtype, (*shape, *channels))
             with temporary.open("r+b") as file:
                 reserve(file, temporary.stat().st_size)
             self._render(arrays, grid, blend, mapped)
             mapped.flush()
+
+    def _image_dtype(self) -> np.dtype[Any]:
+        dtype = self.arrays[0].dtype
+        if self.kind == "labels":
+            values = [int(value) for array in self.arrays for value in (array.min(), array.max())]
+            return np.result_type(*map(np.min_scalar_type, (min(values), max(values))))
+        return np.dtype(np.float32) if dtype.kind == "f" else dtype
 
     def _render(
         self, arrays: Sequence[NDArray[Any]], grid: PinholeGrid, blend: Blend, out: NDArray[Any]
@@ -223,37 +212,13 @@ class TangentResults:
                 out[..., start : start + step] = tangent_to_equirect(group, grid, shape, blend)
 
 
-def _check_alike(files: Sequence[Path], arrays: Sequence[NDArray[Any]]) -> None:
-    first = arrays[0]
-    for file, array in zip(files, arrays, strict=True):
-        if array.shape != first.shape or array.dtype != first.dtype:
-            raise DataError(
-                file,
-                found=_described(array),
-                expected=f"{_described(first)}, as {files[0].name}",
-                remedy="All results of a panorama have to be alike.",
-            )
-
-
-def _described(array: NDArray[Any]) -> str:
-    return f"{'×'.join(map(str, array.shape))} of {array.dtype}"
-
-
-def _kind_of(file: Path, array: NDArray[Any]) -> Kind | None:
+def _kind_of(file: Path, array: NDArray[Any]) -> Kind:
     is_array, kind = file.suffix.lower() == ".npy", array.dtype.kind
     if is_array and kind == "f":
         return "features"
     if array.ndim == 3:
-        return "color" if array.shape[2] == 3 and kind != "b" else None
-    if kind == "f" or (array.dtype == np.uint16 and not is_array):
-        return "depth"
-    return "labels"
-
-
-def _possible(kind: Kind, array: NDArray[Any]) -> bool:
-    types = {"labels": "bui", "depth": "uif", "color": "uif", "features": "uif"}[kind]
-    channels = {"labels": ((),), "depth": ((),), "color": ((), (3,))}.get(kind)
-    return array.dtype.kind in types and (channels is None or array.shape[2:] in channels)
+        return "color"
+    return "depth" if kind == "f" or (array.dtype == np.uint16 and not is_array) else "labels"
 
 
 def _distances(depth: NDArray[Any], grid: PinholeGrid, path: Path) -> NDArray[Any]:

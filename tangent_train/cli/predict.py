@@ -15,11 +15,11 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from datamodules.core.progress import progress_bar
 from datamodules.images.image_files import find_images
 from tangent_train.checkpoints.trained import load_trained
+from tangent_train.cli.each import each
 from tangent_train.cli.settings import typed
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import SettingError
 from tangent_train.inference.images import DepthFolder, read_panorama, read_photo
 from tangent_train.inference.predictor import Predictor
 from tangent_train.inference.views import PanoramaViews, PhotoViews
@@ -32,7 +32,7 @@ from tangent_train.results.predictions import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Mapping
 
     from datamodules.images.gpano import PanoramaArea
     from tangent_train.checkpoints.trained import TrainedNetwork
@@ -113,8 +113,9 @@ def predict(config: Mapping[str, Any]) -> None:
     _say(f"{len(images)} images, {len(entries)} of them done already.")
     saved = -math.inf
     try:
-        for entry in _label_all(missing, label):
-            entries.append(entry)
+        for name, entry, error in each("Predicting", missing, label):
+            file = {"file": str(missing[name]), "name": name}
+            entries.append(file | (entry or {"error": error}))
             if time.monotonic() - saved > _SAVED_EVERY_S:
                 _save(folder, settings, entries)
                 saved = time.monotonic()
@@ -161,7 +162,7 @@ class _Labeller:
         if len(self.shown) < self.settings.report:
             self.shown.append(self.folder.viewer_image(name, rgb, labels, area))
         rows, columns = labels.shape
-        entry = {"file": str(path), "name": name, "rows": rows, "columns": columns}
+        entry: Entry = {"rows": rows, "columns": columns}
         if image.up is not None:
             entry["tilt_deg"] = round(math.degrees(math.acos(np.clip(image.up[2], -1, 1))), 2)
         return entry | {"classes": class_shares(labels, self.folder.class_names, image, area)}
@@ -224,24 +225,6 @@ def _depth_folder(settings: Settings, trained: TrainedNetwork) -> DepthFolder | 
             f"takes {' and '.join(trained.inputs)}",
         )
     return None if folder is None else DepthFolder(folder, settings.depth_scale)
-
-
-def _label_all(
-    images: Mapping[str, Path], label: Callable[[str, Path, Callable[[float], object]], Entry]
-) -> Iterator[Entry]:
-    """What is known of each image, as soon as its files are written."""
-    begun = time.monotonic()
-    with progress_bar() as bar:
-        task = bar.add_task("Predicting", total=len(images), rate="")
-        for number, (name, path) in enumerate(images.items(), start=1):
-            try:
-                yield label(name, path, lambda share: bar.advance(task, share))
-            except (DataError, SettingError, MemoryError) as error:
-                message = f"{path}: {error}" if isinstance(error, MemoryError) else str(error)
-                bar.console.print(message, style="red", markup=False, soft_wrap=True)
-                yield {"file": str(path), "name": name, "error": message}
-            rate = f"{number / (time.monotonic() - begun):.2f} images/s"
-            bar.update(task, completed=number, rate=rate)
 
 
 def _shares_table(shares: Mapping[str, float]) -> Table:

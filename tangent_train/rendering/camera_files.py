@@ -1,8 +1,7 @@
 """The cameras of tangent images as files: ``cameras.json``, and COLMAP's text format.
 
-Files are for people who know nothing of this library, so their world is an ordinary right-handed
-one: x forward (to the middle column of the panorama), y left, z up. `FLIP_Y` changes between it
-and the frame of `tangent_train.geometry`.
+Their world is an ordinary right-handed one: x forward (to the middle column of the panorama),
+y left, z up. `FLIP_Y` converts between it and the frame of `tangent_train.geometry`.
 """
 
 from __future__ import annotations
@@ -12,14 +11,16 @@ import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
+import cv2
 import numpy as np
 
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError
 from tangent_train.files import write_text
 from tangent_train.geometry import FLIP_Y, TangentGrid, xyz_to_lonlat
 from tangent_train.json_text import parse_json
+from tangent_train.registry import Text, check_fields
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -30,7 +31,6 @@ CAMERAS_FILE = "cameras.json"
 """The name of the file in a folder of tangent images."""
 
 _FORMAT = "tangent images"
-_VERSION = 1
 _MOST_PIXELS = 2**20  # rows and columns of a panorama, which may be made of this size
 _CONVENTIONS = {
     "pixels": "Pixel centres are whole numbers: (0, 0) is the centre of the upper left pixel, "
@@ -51,7 +51,16 @@ _CONVENTIONS = {
 _NUMBERS = re.compile(r"\[[-+.,\d\se]+\]")
 """Rows of matrices, which are easier to read on one line."""
 
-_REMEDY = "Use the file as tangent-render wrote it."
+_EXPECTED = "the cameras of tangent images, as tangent-render writes them beside the images"
+_KINDS: dict[str, Any] = {
+    "format": Literal["tangent images"],
+    "source": dict,
+    "base_level": int,
+    "level": int,
+    "dim": int,
+    "icosahedron_rotation": list[list[float]] | None,
+    "images": list,
+}
 
 
 @dataclass(frozen=True)
@@ -81,10 +90,9 @@ def write_cameras(path: Path, cameras: CameraFile) -> None:
         cameras: What it says; see its own ``conventions`` for how.
     """
     grid = cameras.grid
-    rotation = None if grid.rotation is None else _in_room(grid.rotation).tolist()
+    rotation = None if grid.rotation is None else _in_world(grid.rotation).tolist()
     content = {
         "format": _FORMAT,
-        "version": _VERSION,
         "conventions": _CONVENTIONS,
         "source": {
             "file": cameras.source,
@@ -127,8 +135,8 @@ def _world_from_camera(grid: TangentGrid, face: int) -> NDArray[np.float64]:
     return np.asarray(FLIP_Y @ grid.world_from_camera[face])
 
 
-def _in_room(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A rotation of the frame of directions in the right-handed world, or back."""
+def _in_world(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A rotation of the library's frame in the right-handed world, or back."""
     return np.asarray(FLIP_Y @ rotation @ FLIP_Y)
 
 
@@ -139,81 +147,32 @@ def read_cameras(path: Path) -> CameraFile:
         path: The file.
 
     Raises:
-        DataError: It is missing, or cannot be what `write_cameras` wrote: its parts are missing or
-            contradict each other.
+        DataError: It is missing, or cannot be what `write_cameras` wrote.
     """
     try:
         content = parse_json(path.read_bytes())
     except (OSError, ValueError) as error:
-        found = "no such file" if isinstance(error, FileNotFoundError) else error
-        raise DataError(
-            path,
-            found=found,
-            expected="the cameras of tangent images",
-            remedy="tangent-render input=… output=… writes them beside the images.",
-        ) from error
-    if not isinstance(content, dict) or content.get("format") != _FORMAT:
-        raise DataError(
-            path, found="another kind of file", expected=f'"format": "{_FORMAT}"', remedy=_REMEDY
-        )
-    if content.get("version") != _VERSION:
-        raise DataError(
-            path,
-            found=f"version {content.get('version')}",
-            expected=f"version {_VERSION}",
-            remedy="It was written by another version of tangent-render.",
-        )
+        raise DataError(path, found=error, expected=_EXPECTED) from error
+    fields = check_fields(path, content, _KINDS, _EXPECTED)
+    kinds: dict[str, Any] = {"height": int, "width": int}
+    source = check_fields(path, fields["source"], kinds, _EXPECTED, "source")
+    kinds = {"file": Text, "face": int}
+    images = [check_fields(path, i, kinds, _EXPECTED, "images") for i in fields["images"]]
+    shape = source["height"], source["width"]
+    faces, files = (tuple(image[name] for image in images) for name in ("face", "file"))
+    if not 1 <= min(shape) <= max(shape) <= _MOST_PIXELS:
+        raise DataError(path, found=f"a source of {shape} pixels", expected=_EXPECTED)
+    if len(set(faces)) < len(faces) or len({Path(file).stem for file in files}) < len(files):
+        raise DataError(path, found="an image twice", expected=_EXPECTED)
     try:
-        with np.errstate(over="ignore", invalid="ignore"):  # huge numbers make no rotation
-            cameras = _parse(content)
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        missing = f"no {error}" if isinstance(error, KeyError) else error
-        raise DataError(path, found=missing, expected="a whole file", remedy=_REMEDY) from error
-    _check(path, cameras, content)
-    return cameras
-
-
-def _parse(content: dict[str, Any]) -> CameraFile:
-    source, images, rotation = (
-        content[key] for key in ("source", "images", "icosahedron_rotation")
-    )
-    numbers = [content[key] for key in ("base_level", "level", "dim")]
-    numbers += [source["height"], source["width"], *(image["face"] for image in images)]
-    if not all(type(number) is int for number in numbers):
-        raise SettingError("levels, dim, sizes and faces", found=numbers, expected="whole numbers")
-    base_level, level, dim, height, width, *faces = numbers
-    if not 1 <= min(height, width) <= max(height, width) <= _MOST_PIXELS:
-        raise SettingError(
-            "source", found=f"{height}×{width} pixels", expected=f"1 to {_MOST_PIXELS} each"
-        )
-    turn = None if rotation is None else _in_room(np.array(rotation, np.float64).reshape(3, 3))
-    grid = TangentGrid(base_level, level, dim, turn)
-    grid.face_indices(faces)
-    files = tuple(str(image["file"]) for image in images)
-    return CameraFile(str(source["file"]), (height, width), grid, tuple(faces), files)
-
-
-def _check(path: Path, cameras: CameraFile, content: dict[str, Any]) -> None:
-    """Compare the matrices with those of the levels: an edited file would put things elsewhere."""
-    stems = [Path(file).stem for file in cameras.files]
-    if len(set(cameras.faces)) < len(stems) or len(set(stems)) < len(stems):
-        raise DataError(path, found="an image twice", expected="every one once", remedy=_REMEDY)
-    try:
-        found = [content["camera"]["matrix"]]
-        found += [image["world_from_camera"] for image in content["images"]]
-        matrices = np.array(found, np.float64)
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise DataError(path, found=error, expected="3×3 matrices", remedy=_REMEDY) from error
-    grid = cameras.grid
-    expected = [grid.camera_matrix, *(_world_from_camera(grid, face) for face in cameras.faces)]
-    same = matrices.shape == (len(expected), 3, 3)
-    if not same or not np.allclose(matrices, expected, rtol=1e-6, atol=1e-6):
-        raise DataError(
-            path,
-            found="matrices that do not belong to base_level, level, dim and faces",
-            expected="those of its tangent images",
-            remedy=_REMEDY,
-        )
+        rotation = fields["icosahedron_rotation"]
+        with np.errstate(over="ignore", invalid="ignore"):  # huge numbers are no rotation
+            turn = rotation and _in_world(np.array(rotation, np.float64).reshape(3, 3))
+            grid = TangentGrid(fields["base_level"], fields["level"], fields["dim"], turn)
+        grid.face_indices(faces)
+    except (ValueError, OverflowError) as error:
+        raise DataError(path, found=error, expected=_EXPECTED) from error
+    return CameraFile(str(fields["source"].get("file")), shape, grid, faces, files)
 
 
 def write_colmap(folder: Path, cameras: CameraFile) -> None:
@@ -241,21 +200,9 @@ def write_colmap(folder: Path, cameras: CameraFile) -> None:
     write_text(folder / "points3D.txt", "# POINT3D_ID X Y Z R G B ERROR TRACK[]\n")
 
 
-def _quaternion(rotation: NDArray[np.float64]) -> tuple[float, float, float, float]:
-    """Unit quaternion (w, x, y, z), w ≥ 0, of a rotation matrix.
-
-    Its products with each other are sums of the matrix's entries (Shepperd 1978): the row of the
-    largest of them is the quaternion times its largest part.
-    """
-    ((a, b, c), (d, e, f), (g, h, i)) = rotation.tolist()
-    products = np.array(
-        [
-            [1 + a + e + i, h - f, c - g, d - b],
-            [h - f, 1 + a - e - i, b + d, c + g],
-            [c - g, b + d, 1 - a + e - i, f + h],
-            [d - b, c + g, f + h, 1 - a - e + i],
-        ]
-    )
-    row = products[np.diag(products).argmax()]
-    w, x, y, z = (row / np.linalg.norm(row) * (-1 if row[0] < 0 else 1)).tolist()
-    return w, x, y, z
+def _quaternion(rotation: NDArray[np.float64]) -> tuple[float, ...]:
+    """Unit quaternion (w, x, y, z), w ≥ 0, of a rotation matrix."""
+    rotation_vector = cv2.Rodrigues(rotation)[0].ravel()
+    half_angle = float(np.linalg.norm(rotation_vector)) / 2
+    xyz = rotation_vector / 2 * np.sinc(half_angle / np.pi)
+    return (math.cos(half_angle), *xyz.tolist())

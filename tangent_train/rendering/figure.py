@@ -1,130 +1,76 @@
-"""A panorama, its tangent images and the sphere they make, in one picture."""
+"""A panorama beside its tangent images, in one picture."""
 
 from __future__ import annotations
 
-import io
-import math
-from collections.abc import Iterator, Sequence
-from typing import NamedTuple
-
 import cv2
 import numpy as np
-from matplotlib import patheffects
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from tangent_train.errors import SettingError
-from tangent_train.geometry import TangentGrid, lonlat_to_equirect, xyz_to_lonlat
-from tangent_train.geometry.resized_grid import ResizedGrid
-from tangent_train.rendering.figure_views import (
-    FINER,
-    from_inside,
-    inside_positions,
-    with_borders,
+from tangent_train.geometry import (
+    ResizedGrid,
+    TangentGrid,
+    equirect_directions,
+    lonlat_to_equirect,
+    xyz_to_lonlat,
 )
 from tangent_train.rendering.forward import equirect_to_tangent
-from tangent_train.rendering.tables import owner_table
 
 __all__ = ["tangent_figure"]
 
 _Image = NDArray[np.uint8]
 
-_MOST_LEVELS = 3
-"""Highest base level: more images would be smaller than anything on them."""
-
-_DPI = 100
-_WIDTH = 1920
-_MARGIN, _GAP, _CAPTION = 16, 20, 30
-_PANORAMA = (740, 370)
-_LEAST_INSIDE = 380
-_MONTAGE_LEFT = _MARGIN + _PANORAMA[0] + _GAP
-_MOST_MONTAGE = 900
-_RING = 5
-_LEAST_FOR_CELLS = 80
-"""Side in pixels from which images show the cells they own."""
-_TEXT = "#404040"
+_PANORAMA = (370, 740)
+_MONTAGE_WIDTH = 1150
+_GAP = 4
+_LEAST_SIDE = 16
+_LEAST_WITH_CELLS = 80
+"""Smaller images show no cells."""
 
 
-class _Montage(NamedTuple):
-    """Where the tangent images are.
-
-    Attributes:
-        side: Of every image in pixels.
-        corners: ``(N, 2)`` column and row of their left upper corners.
-        height: Of all of them in pixels.
-    """
-
-    side: int
-    corners: NDArray[np.int64]
-    height: int
-
-
-def tangent_figure(panorama: NDArray[np.generic], grid: TangentGrid) -> bytes:
+def tangent_figure(panorama: NDArray[np.generic], grid: TangentGrid) -> _Image:
     """Draw the paper's teaser for one panorama.
 
-    On the left the panorama with the cells that the images own, and the polyhedron of their planes
-    from inside; on the right all tangent images with their cells: at base level 0 as the faces of
-    an unfolded icosahedron, above in rows by latitude.
+    On the left the panorama, on the right all tangent images, in rows of 5·2^b by latitude, sorted
+    by longitude; on both the borders of the cells that the images own, at base level 0 numbered.
 
     Args:
         panorama: ``(H, W)`` or ``(H, W, 3)``, uint8 or uint16.
         grid: The images.
 
     Returns:
-        A PNG file, 1920 pixels wide.
+        ``(h, w, 3)`` RGB.
 
     Raises:
-        SettingError: The panorama has no colours, or there are too many images.
+        SettingError: The panorama is no image in grey or colours, or there are too many images.
     """
-    if grid.base_level > _MOST_LEVELS:
-        raise SettingError(
-            "base_level", found=grid.base_level, expected=f"at most {_MOST_LEVELS} for a figure"
-        )
-    image = _colors(panorama)
-    montage = _montage(grid)
-    inside = _PANORAMA[0], max(_LEAST_INSIDE, montage.height - _PANORAMA[1] - _GAP - _CAPTION)
-    top, middle = _MARGIN + _CAPTION, _MARGIN + _CAPTION + _PANORAMA[1] + _GAP
-    height = max(middle + _CAPTION + inside[1], top + montage.height) + _MARGIN
-    page = np.full((height, _WIDTH, 3), 255, np.uint8)
-    _put(page, _panorama_view(image, grid), _MARGIN, top)
-    _put(page, from_inside(image, grid, inside), _MARGIN, middle + _CAPTION)
-    for thumbnail, (x, y) in zip(
-        _thumbnails(image, grid, montage.side), montage.corners, strict=True
-    ):
-        _put(page, thumbnail, x, y + top)
-    captions = [
-        (_MARGIN, _MARGIN, f"Panorama, {image.shape[0]} × {image.shape[1]}"),
-        (_MARGIN, middle, "The tangent images on their planes, from inside"),
-        (_MONTAGE_LEFT, _MARGIN, _caption(grid)),
-    ]
-    numbers = _numbers(grid, montage, inside, middle + _CAPTION) if grid.base_level == 0 else []
-    return _png(page, captions, numbers)
+    image = _rgb(panorama)
+    columns = 5 * 2**grid.base_level
+    side = _MONTAGE_WIDTH // columns - _GAP
+    if side < _LEAST_SIDE:
+        raise SettingError("base_level", found=grid.base_level, expected="less, for a figure")
+    shown = cv2.resize(image, _PANORAMA[::-1], interpolation=cv2.INTER_AREA)
+    left = _with_borders(shown, grid.owners(equirect_directions(_PANORAMA)))
+    centers = lonlat_to_equirect(xyz_to_lonlat(grid.centers_xyz), _PANORAMA)
+    small = ResizedGrid(grid, side)
+    level_rows = min(image.shape[0], round(np.pi / small.pitch))
+    source = cv2.resize(image, (2 * level_rows, level_rows), interpolation=cv2.INTER_AREA)
+    right = np.full((len(centers) // columns * (side + _GAP), _MONTAGE_WIDTH, 3), 255, np.uint8)
+    for place, face in enumerate(_reading_order(grid, columns)):
+        (thumbnail,) = equirect_to_tangent(source, small, [face])
+        if side >= _LEAST_WITH_CELLS:
+            thumbnail = _with_borders(thumbnail, small.owners(small.directions([face])[0]) == face)
+        if grid.base_level == 0:
+            _write_number(thumbnail, face, side / 2, side / 2)
+            _write_number(left, face, *centers[face])
+        y, x = (step * (side + _GAP) for step in divmod(place, columns))
+        right[y : y + side, x : x + side] = thumbnail
+    height = max(len(left), len(right))
+    gap = np.full((height, 2 * _GAP, 3), 255, np.uint8)
+    return np.hstack([_padded(left, height), gap, _padded(right, height)])
 
 
-def _caption(grid: TangentGrid) -> str:
-    number = f"{grid.num_images} tangent images of {grid.dim} × {grid.dim}"
-    return f"{number} (base level {grid.base_level}, level {grid.level})"
-
-
-def _numbers(
-    grid: TangentGrid, montage: _Montage, inside: tuple[int, int], inside_top: int
-) -> list[tuple[float, float, str]]:
-    """The images' numbers in their middles, in all three parts of the figure."""
-    top = _MARGIN + _CAPTION
-    shape = _PANORAMA[1], _PANORAMA[0]
-    on_panorama = lonlat_to_equirect(xyz_to_lonlat(grid.centers_xyz), shape)
-    seen = inside_positions(grid.centers_xyz, inside)
-    shown = np.all((seen > _GAP) & (seen < np.array(inside) - _GAP), axis=1)
-    in_montage = montage.corners + montage.side / 2
-    numbers = [(x + _MARGIN, y + top, str(face)) for face, (x, y) in enumerate(on_panorama)]
-    numbers += [(x, y + top, str(face)) for face, (x, y) in enumerate(in_montage)]
-    for face in np.flatnonzero(shown):
-        numbers.append((seen[face, 0] + _MARGIN, seen[face, 1] + inside_top, str(face)))
-    return numbers
-
-
-def _colors(panorama: NDArray[np.generic]) -> _Image:
+def _rgb(panorama: NDArray[np.generic]) -> _Image:
     if panorama.dtype not in (np.uint8, np.uint16) or panorama.shape[2:] not in ((), (3,)):
         found = f"{panorama.dtype} pixels of shape {panorama.shape}"
         raise SettingError("figure", found=found, expected="a panorama in grey or colours")
@@ -133,81 +79,30 @@ def _colors(panorama: NDArray[np.generic]) -> _Image:
     return np.ascontiguousarray(image, np.uint8)
 
 
-def _put(page: _Image, part: _Image, x: int, y: int) -> None:
-    page[y : y + part.shape[0], x : x + part.shape[1]] = part
+def _reading_order(grid: TangentGrid, columns: int) -> list[int]:
+    """Faces from north to south in rows, each row by longitude, as without the grid's rotation."""
+    longitude, latitude = xyz_to_lonlat(grid.with_rotation(None).centers_xyz).round(6).T
+    order = np.lexsort((longitude, -latitude)).reshape(-1, columns)
+    return [int(face) for row in order for face in row[np.argsort(longitude[row])]]
 
 
-def _panorama_view(image: _Image, grid: TangentGrid) -> _Image:
-    shown = cv2.resize(image, _PANORAMA, interpolation=cv2.INTER_AREA)
-    fine = FINER * _PANORAMA[1], FINER * _PANORAMA[0]
-    return with_borders(shown, owner_table(grid, fine, np.dtype(np.float32)).face[0])
+def _with_borders(image: _Image, owners: NDArray[np.generic]) -> _Image:
+    """White lines where the owner ``(h, w)`` of neighbouring pixels differs."""
+    change = np.zeros(owners.shape, np.uint8)
+    change[:, 1:] |= owners[:, 1:] != owners[:, :-1]
+    change[1:] |= owners[1:] != owners[:-1]
+    lined = image.copy()
+    lined[cv2.dilate(change, np.ones((2, 2), np.uint8)) > 0] = 255
+    return lined
 
 
-def _thumbnails(image: _Image, grid: TangentGrid, side: int) -> Iterator[_Image]:
-    """All images, small, with the borders of the cells they own where there is room."""
-    small, fine = ResizedGrid(grid, side), ResizedGrid(grid, FINER * side)
-    rows = min(image.shape[0], math.ceil(math.pi / small.pitch))
-    shrunk = cv2.resize(image, (2 * rows, rows), interpolation=cv2.INTER_AREA)
-    for face in range(grid.num_images):
-        (thumbnail,) = equirect_to_tangent(shrunk, small, [face])
-        if side >= _LEAST_FOR_CELLS:
-            near = fine.directions([face])[0] @ grid.centers_xyz[[face, *grid.neighbors[face]]].T
-            thumbnail = with_borders(thumbnail, near.argmax(axis=-1) == 0)
-        yield thumbnail
+def _write_number(image: _Image, number: int, x: float, y: float) -> None:
+    place = (round(x) - 8, round(y) + 5)
+    for color, width in (((0, 0, 0), 3), ((255, 255, 255), 1)):
+        cv2.putText(
+            image, str(number), place, cv2.FONT_HERSHEY_SIMPLEX, 0.5, color, width, cv2.LINE_AA
+        )
 
 
-def _montage(grid: TangentGrid) -> _Montage:
-    """Lay the images out in the width that is left for them."""
-    rows = _rows(grid)
-    places = np.zeros((grid.num_images, 2))
-    for row, faces in enumerate(rows):
-        # The lower faces of the icosahedron lie between the upper ones.
-        first = 0.5 if grid.base_level == 0 and row < 2 else 0
-        places[faces] = [(first + column, row) for column in range(len(faces))]
-    across, down = places.max(axis=0) + 1
-    width = _WIDTH - _MARGIN - _MONTAGE_LEFT
-    step = min(width / across, _MOST_MONTAGE / down)
-    gap = max(1, round(step / 40))
-    left = _MONTAGE_LEFT + (width + gap - across * step) / 2
-    corners = np.rint(places * step + (left, 0)).astype(np.int64)
-    return _Montage(int(step) - gap, corners, round(down * step) - gap)
-
-
-def _rows(grid: TangentGrid) -> list[list[int]]:
-    """Faces in 4·2^b rows from north to south, each from west to east, before the rotation.
-
-    Where a row ends within a ring of equal latitude, every second face of the ring comes first, so
-    that both rows go all around.
-    """
-    x, y, z = grid.with_rotation(None).centers_xyz.T
-    longitude = np.arctan2(y, x).round(6)
-    latitude = z.round(6)
-    order: list[int] = []
-    for ring in sorted(set(latitude.tolist()), reverse=True):
-        faces = sorted(np.flatnonzero(latitude == ring).tolist(), key=longitude.__getitem__)
-        order += faces[::2] + faces[1::2] if len(faces) > _RING else faces
-    columns = _RING * 2**grid.base_level
-    rows = [order[start : start + columns] for start in range(0, len(order), columns)]
-    return [sorted(row, key=longitude.__getitem__) for row in rows]
-
-
-def _png(
-    page: _Image,
-    captions: Sequence[tuple[float, float, str]],
-    numbers: Sequence[tuple[float, float, str]],
-) -> bytes:
-    height, width = page.shape[:2]
-    figure = Figure(figsize=(width / _DPI, height / _DPI), dpi=_DPI)
-    FigureCanvasAgg(figure)
-    figure.figimage(page, origin="upper")
-    for x, y, text in captions:
-        figure.text(x / width, 1 - y / height, text, va="top", color=_TEXT, size=13)
-    outline = [patheffects.withStroke(linewidth=2.5, foreground="black")]
-    for x, y, text in numbers:
-        figure.text(
-            x / width, 1 - y / height, text, ha="center", va="center", color="white", size=10,
-            path_effects=outline,
-        )  # fmt: skip
-    file = io.BytesIO()
-    figure.savefig(file, format="png", metadata={"Software": "tangent-render"})
-    return file.getvalue()
+def _padded(image: _Image, height: int) -> _Image:
+    return np.pad(image, ((0, height - len(image)), (0, 0), (0, 0)), constant_values=255)

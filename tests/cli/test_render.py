@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from omegaconf import OmegaConf
+from PIL import Image
 
 from datamodules.images import tangent_folders
 from datamodules.images.pixel_files import write_pixels
@@ -20,14 +22,11 @@ from tangent_train.cli import main
 from tangent_train.cli.compose import config_folder
 from tangent_train.cli.render import render
 from tangent_train.errors import DataError, SettingError
-from tangent_train.geometry import (
-    TangentGrid,
-    equirect_directions,
-    rotation_about,
-)
+from tangent_train.geometry import TangentGrid, equirect_directions
 from tangent_train.rendering import equirect_to_tangent, read_cameras, tangent_to_equirect
 
 HEIGHT = 64
+Refused = Callable[..., str]
 
 
 def _render(**settings: Any) -> None:
@@ -35,10 +34,22 @@ def _render(**settings: Any) -> None:
     texts = {
         key: str(value) if isinstance(value, Path) else value for key, value in settings.items()
     }
-    unknown = texts.keys() - set(config)
-    assert not unknown
+    assert not texts.keys() - set(config)
     plain: Any = OmegaConf.to_container(OmegaConf.merge(config, texts), resolve=True)
     render(plain)
+
+
+@pytest.fixture
+def refused(capsys: pytest.CaptureFixture[str]) -> Refused:
+    """What is said of a rendering that is refused, or of which some panoramas fail."""
+
+    def run(**settings: Any) -> str:
+        capsys.readouterr()
+        with pytest.raises((SystemExit, DataError, SettingError)) as ended:
+            _render(**settings)
+        return capsys.readouterr().out + str(ended.value)
+
+    return run
 
 
 def _smooth(height: int = HEIGHT) -> NDArray[np.uint8]:
@@ -64,12 +75,25 @@ def room(tmp_path: Path) -> Path:
     return _write(tmp_path / "in" / "room.png", _smooth())
 
 
+@pytest.fixture
+def rendered(room: Path, tmp_path: Path) -> Path:
+    _render(input=room, output=tmp_path / "tan", base_level=0)
+    return tmp_path / "tan" / "room"
+
+
+def _results(folder: Path, array: NDArray[Any], suffix: str = ".npy") -> Path:
+    """The same result for all 20 images."""
+    folder.mkdir(exist_ok=True)
+    for face in range(20):
+        write_pixels(folder / f"face_{face:03}{suffix}", array)
+    return folder
+
+
 # There and back.
 
 
-@pytest.mark.parametrize("base_level", [0, 1])
-@pytest.mark.parametrize("blend", ["nearest", "feather"])
-def test_colours_come_back(room: Path, tmp_path: Path, base_level: int, blend: str) -> None:
+@pytest.mark.parametrize(("base_level", "blend"), [(0, "nearest"), (1, "feather")])
+def test_colours_come_back(room: Path, tmp_path: Path, base_level: int, blend: Any) -> None:
     _render(input=room, output=tmp_path / "tan", base_level=base_level)
     cameras = read_cameras(tmp_path / "tan" / "room" / "cameras.json")
     grid = TangentGrid(base_level, 5)
@@ -79,14 +103,8 @@ def test_colours_come_back(room: Path, tmp_path: Path, base_level: int, blend: s
         np.testing.assert_array_equal(_read(tmp_path / "tan" / "room" / file), image)
     _render(back=tmp_path / "tan" / "room", output=tmp_path / "back.png", blend=blend)
     again = _read(tmp_path / "back.png")
-    assert again.shape == (64, 128, 3)
     assert np.abs(again.astype(int) - _smooth()).max() <= 4
-    np.testing.assert_array_equal(
-        again,
-        tangent_to_equirect(
-            expected, grid, (64, 128), "feather" if blend == "feather" else "nearest"
-        ),
-    )
+    np.testing.assert_array_equal(again, tangent_to_equirect(expected, grid, (64, 128), blend))
 
 
 def test_the_command_line_takes_any_path(
@@ -102,44 +120,37 @@ def test_the_command_line_takes_any_path(
         main.render()
     assert (tmp_path / "out [1]" / "a=b,c" / "sparse" / "images.txt").is_file()
     assert _read(tmp_path / "back, again.png").shape == (20, 40, 3)
-    shown = capsys.readouterr().out
-    assert "20 tangent images of 1 panorama: out [1]" in shown
-    assert "Panorama: back, again.png" in shown
+    assert "Written: back, again.png" in capsys.readouterr().out
     assert not list(tmp_path.glob("outputs")), "Hydra leaves nothing behind"
 
 
-def test_a_folder_of_panoramas_and_back(tmp_path: Path) -> None:
+def test_a_folder_of_panoramas_and_back(tmp_path: Path, refused: Refused) -> None:
     for name in ("a.png", "deeper/b.jpg", "deeper/c.v2.tif"):
         _write(tmp_path / "in" / name, _smooth(32))
     # Into the folder itself: the second run does not take the images for panoramas.
     for overwrite in (False, True):
         _render(input=tmp_path / "in", output=tmp_path / "in", base_level=0, overwrite=overwrite)
     names = ["a", "deeper/b", "deeper/c.v2"]
-    for name in names:
-        assert len(list((tmp_path / "in" / name).iterdir())) == 21
+    assert len(list((tmp_path / "in" / "a").iterdir())) == 21
     _render(back=tmp_path / "in", output=tmp_path / "back")
+    back = tmp_path / "back"
+    written = {path.relative_to(back).as_posix() for path in back.rglob("*.png")}
+    assert written == {f"{name}.png" for name in names}
     for name in names:
         again = _read(tmp_path / "back" / f"{name}.png")
         assert np.abs(again.astype(int) - _smooth(32)).max() <= 12
-    with pytest.raises(SettingError, match=r"a\.png \(and 2 more\), which exists"):
-        _render(back=tmp_path / "in", output=tmp_path / "back")
-    with pytest.raises(SettingError, match="expected a folder for the 3 panoramas"):
-        _render(back=tmp_path / "in", output=tmp_path / "back.png")
+    said = refused(back=tmp_path / "in", output=tmp_path / "back")
+    assert "a.png, which exists" in said
+    assert "3 of 3 panoramas could not be rendered" in said
 
 
-def test_results_apart_from_the_cameras(tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        _write(tmp_path / "in" / f"{name}.png", _smooth(32))
-        for face in range(20):
-            _write(
-                tmp_path / "results" / name / f"face_{face:03}.png", np.full((8, 8), 7, np.uint8)
-            )
-    _render(input=tmp_path / "in", output=tmp_path / "tan", base_level=0)
+def test_results_apart_from_the_cameras(room: Path, rendered: Path, tmp_path: Path) -> None:
+    (tmp_path / "results").mkdir()
+    _results(tmp_path / "results" / "room", np.full((8, 8), 7, np.uint8), ".png")
     _render(back=tmp_path / "results", cameras=tmp_path / "tan", output=tmp_path / "back")
-    for name in ("a", "b"):
-        labels = _read(tmp_path / "back" / f"{name}.png")
-        assert labels.shape == (32, 64)
-        assert (labels == 7).all()
+    labels = _read(tmp_path / "back" / "room.png")
+    assert labels.shape == (64, 128)
+    assert (labels == 7).all()
 
 
 def test_levels_follow_the_rows_and_large_panoramas_are_averaged(tmp_path: Path) -> None:
@@ -154,31 +165,22 @@ def test_levels_follow_the_rows_and_large_panoramas_are_averaged(tmp_path: Path)
     assert read_cameras(tmp_path / "tan" / "board" / "cameras.json").shape == (128, 256)
 
 
-@pytest.mark.parametrize("dtype", [np.uint16, np.float32, np.int64, np.float16])
-@pytest.mark.parametrize("channels", [(), (3,), (6,)])
-def test_averaging_keeps_the_type(dtype: Any, channels: tuple[int, ...]) -> None:
+@pytest.mark.parametrize(
+    ("dtype", "channels"),
+    [(np.uint16, ()), (np.float32, (3,)), (np.int64, (6,)), (np.float16, ())],
+)
+def test_averaging_keeps_the_dtype(dtype: Any, channels: tuple[int, ...]) -> None:
     blocks = np.random.default_rng(0).random((16, 32, *channels)) * 60000
     blocks = (blocks if np.dtype(dtype).kind in "ui" else blocks / 60000).astype(dtype)
-    panorama = blocks.repeat(3, axis=0).repeat(3, axis=1)
-    small = tangent_folders.shrink_to_level(panorama, 3)
+    small = tangent_folders.shrink_to_level(blocks.repeat(3, axis=0).repeat(3, axis=1), 3)
     assert small.dtype == dtype
     np.testing.assert_allclose(small, blocks, rtol=1e-6)
     assert tangent_folders.shrink_to_level(blocks, 3) is blocks
 
 
-def test_folders_whose_names_end_like_files_come_back_apart(tmp_path: Path) -> None:
-    for name in ("room.png", "room.png.png"):
-        _write(tmp_path / "in" / name, _smooth(16))
-    _render(input=tmp_path / "in", output=tmp_path / "tan", base_level=0)
-    _render(back=tmp_path / "tan", output=tmp_path / "back")
-    names = sorted(path.name for path in (tmp_path / "back").iterdir())
-    assert names == ["room.png", "room.png.png"]
-
-
-def test_depth_in_openexr_comes_back(room: Path, tmp_path: Path) -> None:
+def test_depth_in_openexr_comes_back(rendered: Path, tmp_path: Path) -> None:
     OpenEXR = pytest.importorskip("OpenEXR")
-    _render(input=room, output=tmp_path / "tan", base_level=0)
-    cameras = read_cameras(tmp_path / "tan" / "room" / "cameras.json")
+    cameras = read_cameras(rendered / "cameras.json")
     (tmp_path / "depth").mkdir()
     for face, file in enumerate(cameras.files):
         depth = np.full((cameras.grid.dim, cameras.grid.dim), face + 1, np.float32)
@@ -186,34 +188,29 @@ def test_depth_in_openexr_comes_back(room: Path, tmp_path: Path) -> None:
         path = tmp_path / "depth" / f"{Path(file).stem}.exr"
         OpenEXR.File(header, {"Z": depth}).write(str(path))
     output = tmp_path / "depth.npy"
-    _render(back=tmp_path / "depth", cameras=tmp_path / "tan" / "room", output=output, kind="depth")
+    _render(back=tmp_path / "depth", cameras=rendered, output=output, kind="depth")
     owners = cameras.grid.owners(equirect_directions(cameras.shape))
     assert (np.load(output, allow_pickle=False) == owners + 1).mean() > 0.999
 
 
-@pytest.mark.parametrize("suffix", [".png", ".tif"])
-def test_16_bits_stay(suffix: str, tmp_path: Path) -> None:
+def test_16_bits_stay(tmp_path: Path) -> None:
     image = _smooth().astype(np.uint16) * 257
-    _write(tmp_path / f"room{suffix}", image)
-    _render(
-        input=tmp_path / f"room{suffix}", output=tmp_path / "tan", base_level=0, format=suffix[1:]
-    )
-    assert _read(tmp_path / "tan" / "room" / f"face_000{suffix}").dtype == np.uint16
-    _render(back=tmp_path / "tan" / "room", output=tmp_path / f"back{suffix}")
-    again = _read(tmp_path / f"back{suffix}")
+    _write(tmp_path / "room.tif", image)
+    _render(input=tmp_path / "room.tif", output=tmp_path / "tan", base_level=0, format="png")
+    _render(back=tmp_path / "tan" / "room", output=tmp_path / "back.tif")
+    again = _read(tmp_path / "back.tif")
     assert again.dtype == np.uint16
     assert np.abs(again.astype(int) - image).max() < 4 * 257
 
 
-def test_labels_are_never_mixed(tmp_path: Path) -> None:
+def test_labels_are_never_mixed(tmp_path: Path, refused: Refused) -> None:
     labels = np.random.default_rng(0).choice([3, 90, 200], (8, 16)).astype(np.uint8)
     labels = labels.repeat(8, axis=0).repeat(8, axis=1)
     path = _write(tmp_path / "labels.png", labels)
     _render(input=path, output=tmp_path / "tan", interpolation="nearest", base_level=1)
-    for name in ("back.jpg", "back.webp"):
-        with pytest.raises(DataError, match="would change the labels"):
-            _render(back=tmp_path / "tan" / "labels", output=tmp_path / name)
-    _render(back=tmp_path / "tan" / "labels", output=tmp_path / "back.png")
+    results = tmp_path / "tan" / "labels"
+    assert "would change the labels" in refused(back=results, output=tmp_path / "back.jpg")
+    _render(back=results, output=tmp_path / "back.png")
     again = _read(tmp_path / "back.png")
     assert again.dtype == np.uint8
     assert set(np.unique(again)) == {3, 90, 200}
@@ -228,81 +225,64 @@ def test_labels_are_never_mixed(tmp_path: Path) -> None:
     ("value", "stored", "written"), [(300, np.int64, np.uint16), (1, np.bool_, np.uint8)]
 )
 def test_labels_from_arrays(
-    room: Path, tmp_path: Path, value: int, stored: Any, written: Any
+    rendered: Path, tmp_path: Path, value: int, stored: Any, written: Any
 ) -> None:
-    _render(input=room, output=tmp_path / "tan", base_level=0)
-    folder = tmp_path / "results"
-    folder.mkdir()
-    for face in range(20):
-        np.save(folder / f"face_{face:03}.npy", np.full((32, 32), value, stored))
+    folder = _results(tmp_path / "results", np.full((32, 32), value, stored))
     for suffix in (".png", ".npy"):
-        _render(back=folder, cameras=tmp_path / "tan" / "room", output=tmp_path / f"back{suffix}")
+        _render(back=folder, cameras=rendered, output=tmp_path / f"back{suffix}")
     image = _read(tmp_path / "back.png")
     assert image.dtype == written
     assert (image == value).all()
-    array = np.load(tmp_path / "back.npy")
-    assert array.dtype == stored
+    assert np.load(tmp_path / "back.npy").dtype == stored
 
 
-def _z_depth(grid: TangentGrid, radius: float) -> NDArray[np.float64]:
+def _z_depth(dim: int, radius: float) -> NDArray[np.float64]:
     """``(d, d)`` depth along the axis of a sphere around the camera, by similar triangles."""
-    line = (np.arange(grid.dim) - (grid.dim - 1) / 2) * grid.pitch
+    grid = TangentGrid(0, 5)
+    line = ((np.arange(dim) + 0.5) / dim - 0.5) * grid.dim * grid.pitch
     x, y = np.meshgrid(line, line)
     return np.asarray(radius / np.sqrt(x**2 + y**2 + 1))
 
 
 @pytest.mark.parametrize("dim", [32, 20])
-def test_z_depth_of_floats_becomes_distance(room: Path, tmp_path: Path, dim: int) -> None:
-    _render(input=room, output=tmp_path / "tan", base_level=0)
-    grid = TangentGrid(0, 5)
-    line = ((np.arange(dim) + 0.5) / dim - 0.5) * grid.dim * grid.pitch
-    x, y = np.meshgrid(line, line)
-    depth = (2.5 / np.sqrt(x**2 + y**2 + 1)).astype(np.float32)
+def test_z_depth_of_floats_becomes_distance(rendered: Path, tmp_path: Path, dim: int) -> None:
+    depth = _z_depth(dim, 2.5).astype(np.float32)
     depth[: dim // 2] = 0
-    for face in range(20):
-        _write(tmp_path / "depth" / f"face_{face:03}.tif", depth)
-    cameras = tmp_path / "tan" / "room" / "cameras.json"
-    output = tmp_path / "back.tif"
-    _render(back=tmp_path / "depth", cameras=cameras, output=output, z_depth=True)
+    folder, output = _results(tmp_path / "depth", depth, ".tif"), tmp_path / "back.tif"
+    _render(back=folder, cameras=rendered / "cameras.json", output=output, z_depth=True)
     distance = _read(output)
-    assert distance.dtype == np.float32
     measured = distance > 0
     assert 0.3 < measured.mean() < 0.7, "missing depth stays missing, and spreads nowhere"
     np.testing.assert_allclose(distance[measured], 2.5, rtol=1e-6)
-    _render(back=tmp_path / "depth", cameras=cameras, output=tmp_path / "plain.tif")
+    _render(back=folder, cameras=rendered, output=tmp_path / "plain.tif")
     plain = _read(tmp_path / "plain.tif")
     assert plain[measured].min() < 2.1
     assert set(np.unique(plain)) <= set(np.unique(depth))
 
 
-def test_z_depth_of_16_bits(room: Path, tmp_path: Path) -> None:
-    _render(input=room, output=tmp_path / "tan", base_level=0)
-    depth = np.rint(_z_depth(TangentGrid(0, 5), 5000)).astype(np.uint16)
+def test_z_depth_of_16_bits(rendered: Path, tmp_path: Path, refused: Refused) -> None:
+    depth = np.rint(_z_depth(32, 5000)).astype(np.uint16)
     depth[:10], depth[10:12] = 0, 65535
-    for face in range(20):
-        _write(tmp_path / "depth" / f"face_{face:03}.png", depth)
-    settings = {"back": tmp_path / "depth", "cameras": tmp_path / "tan" / "room", "z_depth": True}
+    folder = _results(tmp_path / "depth", depth, ".png")
+    settings = {"back": folder, "cameras": rendered, "z_depth": True}
     _render(output=tmp_path / "back.png", **settings)
     distance = _read(tmp_path / "back.png")
     assert distance.dtype == np.uint16
     valid = (distance != 0) & (distance != 65535)
     assert np.abs(distance[valid].astype(int) - 5000).max() <= 1
     assert (distance == 0).any()
-    _write(tmp_path / "depth" / "face_003.png", np.full((32, 32), 60000, np.uint16))
-    with pytest.raises(DataError, match="at most 65535, which uint16 holds"):
-        _render(output=tmp_path / "again.png", **settings)
+    _write(folder / "face_003.png", np.full((32, 32), 60000, np.uint16))
+    assert "at most 65535, which uint16" in refused(output=tmp_path / "again.png", **settings)
     assert not (tmp_path / "again.png").exists()
 
 
-@pytest.mark.parametrize("dim", [32, 16])
-@pytest.mark.parametrize("blend", ["nearest", "feather"])
+@pytest.mark.parametrize(("dim", "blend"), [(32, "nearest"), (16, "feather")])
 def test_features_of_another_resolution(
-    room: Path, tmp_path: Path, dim: int, blend: str, monkeypatch: pytest.MonkeyPatch
+    rendered: Path, tmp_path: Path, dim: int, blend: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Features that are the directions of their pixels, written by hand, come back in place."""
     monkeypatch.setattr("datamodules.images.tangent_results._GROUP_BYTES", 200_000)
-    _render(input=room, output=tmp_path / "tan", base_level=0)
-    content = json.loads((tmp_path / "tan" / "room" / "cameras.json").read_text())
+    content = json.loads((rendered / "cameras.json").read_text())
     (tmp_path / "features").mkdir()
     edge = np.tan(np.radians(content["camera"]["fov_deg"] / 2))
     line = ((np.arange(dim) + 0.5) / dim * 2 - 1) * edge
@@ -311,13 +291,8 @@ def test_features_of_another_resolution(
         world = planes @ np.array(image["world_from_camera"]).T
         features = np.concatenate([world, world[..., :2]], axis=-1).astype(np.float32)
         np.save(tmp_path / "features" / f"{Path(image['file']).stem}.npy", features)
-    _render(
-        back=tmp_path / "features",
-        cameras=tmp_path / "tan" / "room" / "cameras.json",
-        output=tmp_path / "back.npy",
-        blend=blend,
-        height=20,
-    )
+    settings = {"back": tmp_path / "features", "cameras": rendered / "cameras.json"}
+    _render(output=tmp_path / "back.npy", blend=blend, height=20, **settings)
     panorama = np.load(tmp_path / "back.npy")
     assert (panorama.shape, panorama.dtype) == ((20, 40, 5), np.float32)
     np.testing.assert_array_equal(panorama[..., :2], panorama[..., 3:])
@@ -329,14 +304,14 @@ def test_features_of_another_resolution(
 
 
 @pytest.mark.parametrize("rotation", [[30, -20, 75.5], "so3"])
-def test_turned_icosahedra_come_back(room: Path, tmp_path: Path, rotation: Any) -> None:
-    _render(input=room, output=tmp_path / "tan", base_level=0, rotation=rotation, seed=4)
+def test_rotated_icosahedra_come_back(room: Path, tmp_path: Path, rotation: Any) -> None:
+    for output in ("tan", "again"):
+        _render(input=room, output=tmp_path / output, base_level=0, rotation=rotation, seed=4)
     cameras = read_cameras(tmp_path / "tan" / "room" / "cameras.json")
     assert cameras.grid.rotation is not None
+    assert read_cameras(tmp_path / "again" / "room" / "cameras.json") == cameras
     _render(back=tmp_path / "tan" / "room", output=tmp_path / "back.png")
     assert np.abs(_read(tmp_path / "back.png").astype(int) - _smooth()).max() <= 5
-    _render(input=room, output=tmp_path / "again", base_level=0, rotation=rotation, seed=4)
-    assert read_cameras(tmp_path / "again" / "room" / "cameras.json") == cameras
 
 
 @pytest.mark.parametrize(
@@ -358,26 +333,22 @@ def test_yaw_pitch_roll(
     np.testing.assert_allclose(turn @ (0, 1, 0), right, atol=1e-12)
 
 
-def test_some_faces_with_a_margin(room: Path, tmp_path: Path) -> None:
+def test_some_faces_with_a_margin(room: Path, tmp_path: Path, refused: Refused) -> None:
     _render(input=room, output=tmp_path / "tan", base_level=0, faces=[5, 0], dim=40, format="npy")
     folder = tmp_path / "tan" / "room"
-    assert sorted(path.name for path in folder.iterdir()) == [
-        "cameras.json",
-        "face_000.npy",
-        "face_005.npy",
-    ]
+    names = sorted(path.name for path in folder.iterdir())
+    assert names == ["cameras.json", "face_000.npy", "face_005.npy"]
     expected = equirect_to_tangent(_smooth(), TangentGrid(0, 5, 40), [5])
     np.testing.assert_array_equal(np.load(folder / "face_005.npy"), expected[0])
-    with pytest.raises(DataError, match="cameras of 2 of the 20 images"):
-        _render(back=folder, output=tmp_path / "back.png")
+    assert "cameras of 2 of the 20 images" in refused(back=folder, output=tmp_path / "back.png")
 
 
-def test_depth_arrays_are_panoramas_too(tmp_path: Path) -> None:
+def test_depth_arrays_are_panoramas_too(tmp_path: Path, refused: Refused) -> None:
     distance = np.linspace(1, 5, 32)[:, None].repeat(64, axis=1).astype(np.float32)
     np.save(tmp_path / "depth.npy", distance)
     settings = {"input": tmp_path / "depth.npy", "base_level": 0, "interpolation": "nearest"}
-    with pytest.raises(DataError, match=r"depth\.npy: \.png files: found float32"):
-        _render(output=tmp_path / "png", **settings)
+    said = refused(output=tmp_path / "png", **settings)
+    assert "depth.npy: .png files: found float32" in said
     assert not list(tmp_path.glob("png/*"))
     _render(output=tmp_path / "tan", format="tif", **settings)
     _render(back=tmp_path / "tan" / "depth", output=tmp_path / "back.tif")
@@ -386,55 +357,44 @@ def test_depth_arrays_are_panoramas_too(tmp_path: Path) -> None:
     assert set(np.unique(again)) <= set(np.unique(distance))
 
 
-# A figure.
-
-
-def test_a_figure_alone_or_beside_the_images(room: Path, tmp_path: Path) -> None:
+def test_a_figure_alone_or_beside_the_images(room: Path, tmp_path: Path, refused: Refused) -> None:
     figure = tmp_path / "figure.png"
     _render(input=room, figure=figure, base_level=0)
-    assert _read(figure).shape[1] == 1920
-    with pytest.raises(SettingError, match=r"figure\.png, which exists"):
-        _render(input=room, figure=figure, output=tmp_path / "tan")
+    assert _read(figure).shape[1] > 1800
+    said = refused(input=room, figure=figure, output=tmp_path / "tan")
+    assert "figure.png, which exists" in said
     _write(room.with_name("second.png"), _smooth(32))
-    with pytest.raises(SettingError, match="figure: found 2 panoramas"):
-        _render(input=room.parent, figure=tmp_path / "other.png")
-    np.save(tmp_path / "depth.npy", np.ones((32, 64)))
-    with pytest.raises(DataError, match="grey or colours"):
-        _render(input=tmp_path / "depth.npy", figure=tmp_path / "other.png")
-    assert not (tmp_path / "other.png").exists()
+    assert "figure: found 2 panoramas" in refused(input=room.parent, figure=tmp_path / "b.png")
 
 
 # What exists, and what is interrupted.
 
 
-def test_earlier_images_are_kept_unless_told(room: Path, tmp_path: Path) -> None:
-    _render(input=room, output=tmp_path / "tan", base_level=1, colmap=True)
+def test_earlier_images_are_kept_unless_told(room: Path, tmp_path: Path, refused: Refused) -> None:
     folder = tmp_path / "tan" / "room"
-    with pytest.raises(SettingError, match=r"tan/room, which exists.*overwrite=true"):
-        _render(input=room, output=tmp_path / "tan")
+    folder.mkdir(parents=True)  # an empty folder is no earlier result
+    _render(input=room, output=tmp_path / "tan", base_level=1, colmap=True)
+    said = refused(input=room, output=tmp_path / "tan")
+    assert re.search(r"tan/room, which exists.*overwrite=true", said)
+    again = {"input": room, "output": tmp_path / "tan", "overwrite": True, "format": "jpg"}
     (folder / "notes.txt").write_text("mine")
-    (folder / "sparse" / "notes.txt").write_text("mine")
-    _render(input=room, output=tmp_path / "tan", base_level=0, format="jpg", overwrite=True)
+    before = sorted(folder.rglob("*"))
+    assert "notes.txt, which is no tangent image" in refused(base_level=0, **again)
+    assert sorted(folder.rglob("*")) == before
+    (folder / "notes.txt").unlink()
+    _render(base_level=0, **again)
     names = sorted(path.name for path in folder.iterdir())
-    jpegs = [f"face_{face:03}.jpg" for face in range(20)]
-    assert names == ["cameras.json", *jpegs, "notes.txt", "sparse"]
-    assert [path.name for path in (folder / "sparse").iterdir()] == ["notes.txt"]
+    assert names == ["cameras.json", *(f"face_{face:03}.jpg" for face in range(20))]
     assert not list(tmp_path.rglob(".partial*"))
     assert folder.stat().st_mode & 0o777 == 0o755
 
 
-def test_an_empty_folder_is_no_earlier_result(room: Path, tmp_path: Path) -> None:
-    (tmp_path / "tan" / "room").mkdir(parents=True)
-    _render(input=room, output=tmp_path / "tan", base_level=0)
-    assert (tmp_path / "tan" / "room" / "cameras.json").is_file()
-
-
-def test_earlier_panoramas_are_kept_unless_told(room: Path, tmp_path: Path) -> None:
-    _render(input=room, output=tmp_path / "tan", base_level=0)
-    back = {"back": tmp_path / "tan" / "room", "output": tmp_path / "back.png"}
+def test_earlier_panoramas_are_kept_unless_told(
+    rendered: Path, tmp_path: Path, refused: Refused
+) -> None:
     (tmp_path / "back.png").write_text("mine")
-    with pytest.raises(SettingError, match=r"back\.png, which exists"):
-        _render(**back)
+    back = {"back": rendered, "output": tmp_path / "back.png"}
+    assert "back.png, which exists" in refused(**back)
     assert (tmp_path / "back.png").read_text() == "mine"
     _render(overwrite=True, **back)
     assert _read(tmp_path / "back.png").shape == (64, 128, 3)
@@ -460,28 +420,23 @@ def test_an_interrupted_run_leaves_nothing_half_done(
     assert left == before
 
 
-def test_a_broken_panorama_does_not_stop_the_others(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_broken_panorama_does_not_stop_the_others(tmp_path: Path, refused: Refused) -> None:
     for name in ("a.png", "c.png"):
         _write(tmp_path / "in" / name, _smooth(32))
     (tmp_path / "in" / "b.png").write_bytes((tmp_path / "in" / "a.png").read_bytes()[:300])
     _write(tmp_path / "in" / "photo.jpg", np.zeros((30, 40, 3), np.uint8))
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["tangent-render", "input=in", "output=tan", "base_level=0"])
-    with pytest.raises(SystemExit) as ended:
-        main.render()
-    message = str(ended.value.code)
-    assert message.startswith("tangent-render: 2 of 4 panoramas could not be rendered:\n")
-    assert "in/b.png" in message
-    assert "in/photo.jpg: found 30×40 pixels; expected a panorama, twice as wide" in message
-    done = sorted(path.name for path in (tmp_path / "tan").iterdir())
-    assert done == ["a", "c"]
+    said = refused(input=tmp_path / "in", output=tmp_path / "tan", base_level=0)
+    assert "2 of 4 panoramas could not be rendered" in said
+    assert "in/b.png" in said
+    assert "in/photo.jpg: found 30×40 pixels; expected a whole panorama, twice as wide" in said
+    assert sorted(path.name for path in (tmp_path / "tan").iterdir()) == ["a", "c"]
+    (tmp_path / "tan" / "a" / "face_019.png").unlink()
+    said = refused(back=tmp_path / "tan", output=tmp_path / "back")
+    assert re.search(r"face_019.*1 of 2 panoramas could not", said, re.DOTALL)
+    assert [path.name for path in (tmp_path / "back").iterdir()] == ["c.png"]
 
 
 def test_parts_of_panoramas_by_their_tags(tmp_path: Path) -> None:
-    from PIL import Image
-
     tags = {
         "FullPanoWidthPixels": 128,
         "FullPanoHeightPixels": 64,
@@ -514,61 +469,36 @@ def test_parts_of_panoramas_by_their_tags(tmp_path: Path) -> None:
     [
         ({}, "input=<panoramas>, or back="),
         ({"input": "in"}, "output: found none"),
-        ({"input": "in", "output": "tan", "base_level": -1}, "base_level"),
         ({"input": "in", "output": "tan", "base_level": "one"}, "base_level"),
-        ({"input": "in", "output": "tan", "level": 0}, "level: found 0; expected .* 1 or more"),
-        ({"input": "in", "output": "tan", "dim": 1.5}, "dim"),
+        ({"input": "in", "output": "tan", "base_level": -1}, "base_level"),
         ({"input": "in", "output": "tan", "level": 5, "dim": 4}, "dim: found 4; expected at least"),
-        ({"input": "in", "output": "tan", "faces": [80]}, "0 to 79"),
-        ({"input": "in", "output": "tan", "faces": [1, 1]}, "different indices"),
-        ({"input": "in", "output": "tan", "faces": []}, "different indices"),
-        ({"input": "in", "output": "tan", "rotation": [1, 2]}, "yaw,pitch,roll"),
-        ({"input": "in", "output": "tan", "rotation": "up"}, "yaw,pitch,roll"),
-        ({"input": "in", "output": "tan", "rotation": [1, 2, float("nan")]}, "yaw,pitch,roll"),
-        ({"input": "in", "output": "tan", "rotation": "so3", "seed": -1}, "seed"),
-        ({"input": "in", "output": "tan", "format": "gif"}, "format: found gif; expected png"),
-        ({"input": "in", "output": "tan", "interpolation": "cubic"}, "interpolation"),
+        ({"input": "in", "output": "tan", "faces": [80]}, "80"),
+        ({"input": "in", "output": "tan", "rotation": [1, 2]}, "rotation: found"),
+        ({"input": "in", "output": "tan", "format": "gif"}, r"found '\.gif'.*expected \.png"),
         (
             {"input": "in", "output": "tan", "interpolation": "nearest", "format": "jpg"},
             "format: found jpg; .* others change pixels",
         ),
-        ({"input": "in", "output": "tan", "colmap": "yes"}, "colmap: found yes; expected true"),
-        ({"input": "in", "figure": "a.jpg"}, "figure"),
-        ({"input": "in", "back": "tan", "output": "a.png"}, "input= as well"),
-        ({"figure": "a.png", "back": "tan", "output": "a.png"}, "figure= as well"),
+        ({"input": "in", "figure": "a.jpg", "base_level": 6}, "base_level"),
+        ({"input": "in", "back": "tan", "output": "a.png"}, "input and back: found both"),
+        ({"input": "nowhere", "output": "tan"}, "nowhere"),
         ({"back": "in"}, "output: found none"),
+        ({"back": "nowhere", "output": "a.png"}, "no such folder"),
+        ({"back": "in", "output": "a.png"}, r"no cameras\.json"),
         ({"back": "in", "output": "a.png", "blend": "mean"}, "blend"),
-        ({"back": "in", "output": "a.png", "kind": "color?"}, "kind"),
-        ({"back": "in", "output": "a.png", "height": 0}, "height"),
     ],
 )
 def test_settings_that_cannot_work(
-    settings: dict[str, Any], message: str, room: Path, monkeypatch: pytest.MonkeyPatch
+    settings: dict[str, Any],
+    message: str,
+    room: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    refused: Refused,
 ) -> None:
     monkeypatch.chdir(room.parents[1])
-    with pytest.raises(SettingError, match=message):
-        _render(**settings)
-    assert sorted(path.name for path in room.parents[1].rglob("*")) == ["in", "room.png"]
-
-
-def test_names_that_would_share_a_folder(room: Path, tmp_path: Path) -> None:
-    _write(room.with_suffix(".jpg"), _smooth(32))
-    with pytest.raises(SettingError, match=r"room\.jpg and .*room\.png.*one by one"):
-        _render(input=room.parent, output=tmp_path / "tan")
-
-
-def test_nothing_to_render(room: Path, tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="nowhere"):
-        _render(input=tmp_path / "nowhere", output=tmp_path / "tan")
-    _render(input=room, output=tmp_path / "tan", base_level=0)
-    with pytest.raises(DataError, match="only tangent images"):
-        _render(input=tmp_path / "tan", output=tmp_path / "again")
-
-
-@pytest.fixture
-def rendered(room: Path, tmp_path: Path) -> Path:
-    _render(input=room, output=tmp_path / "tan", base_level=0)
-    return tmp_path / "tan" / "room"
+    assert re.search(message, refused(**settings), re.DOTALL)
+    left = {path.name for path in room.parents[1].rglob("*")}
+    assert left - {"tan"} == {"in", "room.png"}
 
 
 @pytest.mark.parametrize(
@@ -576,51 +506,37 @@ def rendered(room: Path, tmp_path: Path) -> Path:
     [
         (lambda f: (f / "face_003.png").unlink(), r"found no face_003; expected one file for each"),
         (
-            lambda f: (f / "face_003.png").rename(f / "face_3.png"),
-            r"no face_003, but face_3; expected",
-        ),
-        (lambda f: np.save(f / "face_020.npy", np.ones((4, 4))), "found face_020 as well"),
-        (
             lambda f: np.save(f / "face_003.npy", np.ones((4, 4))),
             r"face_003\.npy and face_003\.png; .*folder of their own",
         ),
         (
             lambda f: _write(f / "face_003.png", np.zeros((16, 16, 3), np.uint8)),
-            r"face_003\.png: found 16×16×3 of uint8; expected 32×32×3 of uint8, as face_000",
-        ),
-        (
-            lambda f: _write(f / "face_003.png", np.zeros((32, 32), np.uint8)),
-            r"face_003\.png: found 32×32 of uint8",
+            r"face_003\.png: found 16×16×3 of uint8; expected squares, all alike: 32×32",
         ),
         (
             lambda f: _write(f / "face_003.png", np.zeros((32, 32, 3), np.uint16)),
             "of uint16; expected",
         ),
-        (lambda f: _write(f / "face_000.png", np.zeros((9, 8, 3), np.uint8)), "expected a square"),
+        (lambda f: _write(f / "face_000.png", np.zeros((9, 8, 3), np.uint8)), "expected squares"),
         (lambda f: (f / "face_003.png").write_bytes(b"\x89PNG"), r"face_003\.png"),
-        (lambda f: (f / "cameras.json").unlink(), r"found no cameras\.json"),
-        (lambda f: (f / "cameras.json").write_text("{}"), r"cameras\.json: found another kind"),
+        (lambda f: (f / "cameras.json").write_text("{}"), r"cameras\.json: found no format"),
     ],
 )
 def test_results_that_cannot_be_used(
-    damage: Any, message: str, rendered: Path, tmp_path: Path
+    damage: Any, message: str, rendered: Path, tmp_path: Path, refused: Refused
 ) -> None:
     damage(rendered)
-    with pytest.raises(DataError, match=message):
-        _render(back=rendered, output=tmp_path / "back.png")
+    assert re.search(message, refused(back=rendered, output=tmp_path / "back.png"))
     assert not (tmp_path / "back.png").exists()
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"kind": "labels"}, "expected labels images.*one channel"),
-        ({"kind": "depth"}, "expected depth images"),
+        ({"kind": "labels"}, "expected labels.*one channel"),
         ({"z_depth": True}, "z_depth: found true for color"),
-        ({"output": "back.bmp"}, r"expected the name of a file that ends in \.png"),
-        ({"output": "folder"}, "expected the name of a file"),
-        ({"cameras": "nowhere.json"}, "no such file"),
-        ({"back": "nowhere"}, "no such folder"),
+        ({"output": "folder"}, r"expected a name ending in \.png"),
+        ({"cameras": "nowhere.json"}, r"no cameras\.json"),
     ],
 )
 def test_settings_that_do_not_fit_the_results(
@@ -629,10 +545,10 @@ def test_settings_that_do_not_fit_the_results(
     rendered: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
+    refused: Refused,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    with pytest.raises((DataError, SettingError), match=message):
-        _render(**{"back": rendered, "output": "back.png"} | settings)
+    assert re.search(message, refused(**{"back": rendered, "output": "back.png"} | settings))
     assert not list(tmp_path.glob("back*"))
 
 
@@ -640,39 +556,31 @@ def test_settings_that_do_not_fit_the_results(
     ("array", "suffix", "message"),
     [
         (np.ones((32, 32, 5), np.float32), ".png", r"\.png files: found float32 pixels of 5"),
-        (np.ones((32, 32, 5), np.int32), ".npy", "pixels that say what they are.*kind="),
+        (np.ones((32, 32, 5), np.int32), ".npy", "Say what they are with kind="),
         (np.full((32, 32), -1), ".png", r"\.png files: found int8"),
-        (np.ones((1, 1), np.float32), ".npy", "2 or more"),
     ],
 )
 def test_arrays_that_cannot_be_written(
-    array: NDArray[Any], suffix: str, message: str, rendered: Path, tmp_path: Path
+    array: NDArray[Any],
+    suffix: str,
+    message: str,
+    rendered: Path,
+    tmp_path: Path,
+    refused: Refused,
 ) -> None:
-    folder = tmp_path / "results"
-    folder.mkdir()
-    for face in range(20):
-        np.save(folder / f"face_{face:03}.npy", array)
-    with pytest.raises(DataError, match=message):
-        _render(back=folder, cameras=rendered, output=tmp_path / f"back{suffix}")
+    folder = _results(tmp_path / "results", array)
+    said = refused(back=folder, cameras=rendered, output=tmp_path / f"back{suffix}")
+    assert re.search(message, said)
     assert not list(tmp_path.glob("back*"))
 
 
-def test_one_panorama_s_broken_results_do_not_stop_the_others(tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        _write(tmp_path / "in" / f"{name}.png", _smooth(32))
-    _render(input=tmp_path / "in", output=tmp_path / "tan", base_level=0)
-    (tmp_path / "tan" / "a" / "face_019.png").unlink()
-    with pytest.raises(DataError, match=r"1 of 2 panoramas could not be rendered:\n.*face_019"):
-        _render(back=tmp_path / "tan", output=tmp_path / "back")
-    assert [path.name for path in (tmp_path / "back").iterdir()] == ["b.png"]
-
-
-def test_the_python_of_the_docs_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_python_of_the_docs_runs(
+    room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     page = Path(__file__).resolve().parents[2] / "docs" / "rendering.md"
     first, second = re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)
     monkeypatch.chdir(tmp_path)
-    _write(Path("room.png"), _smooth())
-    _render(input="room.png", output="tangent", base_level=0)
+    _render(input=room, output="tangent", base_level=0)
     Path("results/room").mkdir(parents=True)
     for face in range(20):
         np.save(f"results/room/face_{face:03}.npy", np.full((32, 32), face))
@@ -686,17 +594,3 @@ def test_the_python_of_the_docs_runs(tmp_path: Path, monkeypatch: pytest.MonkeyP
     exec(second, names)
     owners = TangentGrid(0, 5).owners(equirect_directions((64, 128)))
     assert (names["panorama"] == owners).mean() > 0.99
-
-
-def test_a_turn_about_the_vertical_moves_the_images_along(room: Path, tmp_path: Path) -> None:
-    """The figure of the convention: yaw turns the icosahedron, so its images show what is there."""
-    _render(input=room, output=tmp_path / "tan", base_level=0, faces=[4], rotation=[72, 0, 0])
-    _render(input=room, output=tmp_path / "plain", base_level=0)
-    turned = read_cameras(tmp_path / "tan" / "room" / "cameras.json").grid
-    plain = TangentGrid(0, 5)
-    target = rotation_about((0, 0, 1), np.radians(72)) @ plain.centers_xyz[4]
-    face = int(plain.owners(target))
-    np.testing.assert_allclose(turned.centers_xyz[4], target, atol=1e-12)
-    moved = _read(tmp_path / "tan" / "room" / "face_004.png").astype(int)
-    there = _read(tmp_path / "plain" / "room" / f"face_{face:03}.png")
-    assert np.abs(moved - there).max() <= 1

@@ -79,13 +79,6 @@ def test_what_is_written_is_read(grid: TangentGrid, tmp_path: Path) -> None:
     assert again.grid.dim == grid.dim
 
 
-def test_conventions_are_explained_in_the_file(tmp_path: Path) -> None:
-    write_cameras(tmp_path / "cameras.json", _cameras(GRIDS[0]))
-    conventions = json.loads((tmp_path / "cameras.json").read_text())["conventions"]
-    assert "Right-handed" in conventions["world_axes"]
-    assert "x right, y down, z forward" in conventions["camera_axes"]
-
-
 def _colmap_model(folder: Path) -> tuple[list[str], dict[str, list[str]]]:
     """The camera, and the images by name, by the rules of COLMAP's documentation."""
     (camera,) = _content(folder / "cameras.txt")
@@ -147,7 +140,7 @@ def _bilinear(
     return np.asarray((1 - down) * above + down * below)
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(5))
 def test_quaternions_of_any_rotation(seed: int, tmp_path: Path) -> None:
     grid = TangentGrid(0, 3, rotation=random_rotation(np.random.default_rng(seed)))
     write_colmap(tmp_path, _cameras(grid, tuple(range(20))))
@@ -161,53 +154,36 @@ def test_quaternions_of_any_rotation(seed: int, tmp_path: Path) -> None:
         np.testing.assert_allclose(camera_from_world.T, image["world_from_camera"], atol=1e-12)
 
 
-def _edited(tmp_path: Path, **changes: Any) -> Path:
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"format": "other"}, "found format='other'"),
+        ({"level": True}, "found level=True"),
+        ({"dim": 2}, "at least"),
+        ({"dim": "gone"}, "no dim"),
+        ({"source": {"file": "a.png", "height": 0, "width": 4}}, r"\(0, 4\) pixels"),
+        ({"source": {"file": "a.png"}}, "no height"),
+        ({"icosahedron_rotation": [[1, 0], [0, 1]]}, "reshape"),
+        ({"icosahedron_rotation": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}, "rotation"),
+        ({"images": [{"file": "a.png"}]}, "no face"),
+        ({"images": [{"file": "a.png", "face": 20}]}, "0 to 19"),
+        ({"images": [{"file": "a.png", "face": 1}, {"file": "a.jpg", "face": 2}]}, "twice"),
+        ({"images": [{"file": "a.png", "face": 1}, {"file": "b.png", "face": 1}]}, "twice"),
+        ({"images": 3}, "found images=3"),
+    ],
+)
+def test_files_that_cannot_be_right(changes: dict[str, Any], message: str, tmp_path: Path) -> None:
     path = tmp_path / "cameras.json"
     write_cameras(path, _cameras(GRIDS[0]))
     content = json.loads(path.read_text()) | changes
     path.write_text(json.dumps({key: value for key, value in content.items() if value != "gone"}))
-    return path
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"format": "other"}, "another kind of file"),
-        ({"version": 2}, "version 2"),
-        ({"base_level": 1}, "matrices that do not belong"),
-        ({"level": 5, "dim": 32}, "matrices that do not belong"),
-        ({"level": "4"}, "whole numbers"),
-        ({"level": True}, "whole numbers"),
-        ({"dim": 2}, "at least"),
-        ({"dim": "gone"}, "no 'dim'"),
-        ({"source": {"file": "a.png", "height": 0, "width": 4}}, "0×4"),
-        ({"source": {"file": "a.png"}}, "no 'height'"),
-        ({"camera": {}}, "3×3 matrices"),
-        ({"camera": {"matrix": [[1, 2], [3]]}}, "3×3 matrices"),
-        ({"icosahedron_rotation": [[1, 0], [0, 1]]}, "expected a whole file"),
-        ({"icosahedron_rotation": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}, "rotation"),
-        ({"images": [{"file": "a.png"}]}, "no 'face'"),
-        ({"images": [{"file": "a.png", "face": 20}]}, "0 to 19"),
-        ({"images": [{"file": "a.png", "face": 1}]}, "3×3 matrices"),
-        ({"images": [{"file": "a.png", "face": 1}, {"file": "a.jpg", "face": 2}]}, "twice"),
-        ({"images": [{"file": "a.png", "face": 1}, {"file": "b.png", "face": 1}]}, "twice"),
-        ({"images": 3}, "expected a whole file"),
-    ],
-)
-def test_files_that_cannot_be_right(changes: dict[str, Any], message: str, tmp_path: Path) -> None:
-    path = _edited(tmp_path, **changes)
-    with pytest.raises(DataError, match=message) as error:
+    with pytest.raises(DataError, match=rf"cameras\.json: .*{message}"):
         read_cameras(path)
-    assert str(path) in str(error.value)
 
 
-@pytest.mark.parametrize("content", [b"", b"[]", b"{", b"\xff\xfe\x00", b'"text"'])
-def test_files_that_are_no_json(content: bytes, tmp_path: Path) -> None:
-    (tmp_path / "cameras.json").write_bytes(content)
-    with pytest.raises(DataError, match=r"cameras\.json"):
-        read_cameras(tmp_path / "cameras.json")
-
-
-def test_no_file(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"no such file.*tangent-render"):
+@pytest.mark.parametrize("content", [None, b"", b"[]", b"\xff\xfe\x00"])
+def test_files_that_are_no_json(content: bytes | None, tmp_path: Path) -> None:
+    if content is not None:
+        (tmp_path / "cameras.json").write_bytes(content)
+    with pytest.raises(DataError, match=r"cameras\.json.*tangent-render"):
         read_cameras(tmp_path / "cameras.json")

@@ -1,1 +1,0 @@
-"""``tangent-render``: to tangent images, and back."""
