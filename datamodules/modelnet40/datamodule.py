@@ -1,8 +1,8 @@
 """ModelNet40 (Wu et al. 2015): 12,311 meshes of 40 classes, as spheres.
 
 The meshes are free for research: https://modelnet.cs.princeton.edu (``ModelNet40.zip``, 2 GB). See
-`shape_files` about the layouts, `off_files` about the files, `mesh_spheres` about what becomes of
-them. Any other tree of the same form does as well, as that of ModelNet10.
+`shape_files` about the layouts and `meshes` about spheres. Any other tree of the same form can be
+used, such as that of ModelNet10.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from datamodules.core.store import Store
 from datamodules.modelnet40.shape_files import MODELNET40, ShapeFile, find_shapes
 from datamodules.modelnet40.shape_samples import (
     SPHERE_NORMALIZATION,
-    EvaluationShapes,
     ShapeSamples,
+    ShapeViews,
     SphereReading,
     Spheres,
     TestRotation,
@@ -114,19 +114,18 @@ class ModelNet40(SplitDataModule[ShapeFile]):
     def in_parallel(
         self, work: Callable[[ShapeFile], _Result], items: Sequence[ShapeFile]
     ) -> Generator[_Result]:
-        """In processes: meshes are read and looked at under the GIL."""
+        """In processes: reading meshes holds the GIL."""
         processes = number_of_processes(None, len(items), _PER_PROCESS)
         return in_processes(work, [(mesh,) for mesh in items], processes)
 
-    def evaluation_samples(self, split: Split) -> EvaluationShapes:
+    def evaluation_samples(self, split: Split) -> ShapeViews:
         """Samples `ShapeSample`: those of the test split rotated, if asked for."""
         rotation = self.test_rotation if split == "test" else None
-        source = self.source(split)
         samples: Any = self.samples
-        shapes: EvaluationShapes = samples.evaluation(
-            source, self.representation, rotation, self.seed
+        views: ShapeViews = samples.evaluation(
+            self.source(split), self.representation, rotation, self.seed
         )
-        return shapes
+        return views
 
     def evaluation_size(self) -> int:
         """As many shapes as in training."""

@@ -1,4 +1,4 @@
-"""From spheres of shapes to what a network is trained and evaluated on."""
+"""Samples of shapes: views of their spheres, and the input of a network."""
 
 from __future__ import annotations
 
@@ -23,20 +23,18 @@ if TYPE_CHECKING:
 
     from datamodules.core.pipeline import SplitItems
     from datamodules.modelnet40.shape_files import ShapeFile
-    from tangent_train.rendering.representations.views import Views
 
     _Shapes = SplitItems[ShapeFile, Any]
 
 __all__ = [
     "SPHERE_NORMALIZATION",
     "STEPS",
-    "EvaluationShapes",
     "ShapeSample",
     "ShapeSamples",
+    "ShapeViews",
     "SphereReading",
     "Spheres",
     "TestRotation",
-    "TrainingShapes",
     "normalize_spheres",
 ]
 
@@ -47,7 +45,7 @@ SPHERE_NORMALIZATION = Normalization(
 """The six channels of `mesh_spheres` over ModelNet40 (the released code of the paper)."""
 
 TestRotation = Literal["yaw", "so3"] | None
-"""How test shapes are turned: about the vertical, any way, or not."""
+"""How test shapes are rotated: about the vertical, uniformly over all rotations, or not."""
 
 
 STEPS = 16384
@@ -60,7 +58,7 @@ coarse around 1, and OpenCV does not sample it.
 
 
 class Spheres(NamedTuple):
-    """What a mesh looks like from the sphere around it.
+    """A mesh as seen from the sphere around it.
 
     Attributes:
         spheres: ``(H, W, 6)`` uint16 in steps of `STEPS`, see `mesh_spheres`.
@@ -117,15 +115,15 @@ class ShapeSamples:
         self.normalization = Normalization.of(normalization, CHANNELS)
         self.in_channels = CHANNELS
 
-    def training(self, source: Any, representation: Any, seed: Seed) -> TrainingShapes:
-        """Samples `ShapeSample`, rotated as the representation says."""
-        return TrainingShapes(source, self._labels, representation, seed)
+    def training(self, source: _Shapes, representation: Any, seed: Seed) -> ShapeViews:
+        """Random views, drawn and rotated as the representation says."""
+        return ShapeViews(source, self._labels, representation, seed, random=True)
 
     def evaluation(
-        self, source: Any, representation: Any, rotation: TestRotation = None, seed: int = 0
-    ) -> EvaluationShapes:
-        """Samples `ShapeSample`, rotated if asked for."""
-        return EvaluationShapes(source, self._labels, representation, rotation, seed)
+        self, source: _Shapes, representation: Any, rotation: TestRotation = None, seed: int = 0
+    ) -> ShapeViews:
+        """All views, of shapes that are rotated if asked for."""
+        return ShapeViews(source, self._labels, representation, seed, rotation=rotation)
 
     def collate(self, samples: list[Any]) -> Any:
         """A batch of samples."""
@@ -136,85 +134,54 @@ class ShapeSamples:
         return normalize_spheres(batch.images, self.normalization)
 
 
-class TrainingShapes(Dataset[ShapeSample]):
-    """Random views of shapes, by (epoch, index).
+@dataclass(frozen=True)
+class ShapeViews(Dataset[ShapeSample]):
+    """Views of shapes, by (epoch, index).
 
-    Args:
+    Attributes:
         source: The shapes.
         labels: Of the classes, by name.
         representation: What the network sees of them.
-        seed: Seed of the run, 0 or more.
+        seed: Of the run, 0 or more.
+        random: Whether views are drawn for every epoch and index; else all are taken.
+        rotation: How shapes are rotated of which all views are taken, each in its own way.
     """
 
-    def __init__(
-        self, source: _Shapes, labels: Mapping[str, int], representation: Any, seed: Seed
-    ) -> None:
-        self._source = source
-        self._labels = labels
-        self._representation = representation
-        self._seed = seed
+    source: _Shapes
+    labels: Mapping[str, int]
+    representation: Any
+    seed: Seed
+    random: bool = False
+    rotation: TestRotation = None
 
     def __len__(self) -> int:
-        return len(self._source)
+        return len(self.source)
 
     def __getitem__(self, key: tuple[int, int]) -> ShapeSample:
         epoch, index = key
-        views = self._representation.sample(sample_rng(self._seed, epoch, index))
-        return _sample(self._source, self._labels, index, views)
+        views = self._views(epoch, index)
+        images = views.render(self.source.read(index).spheres, "bilinear")
+        # Torch hardly knows uint16; all values are below 2 · STEPS = 2¹⁵.
+        return ShapeSample(
+            torch.from_numpy(np.require(images, requirements="W").view(np.int16)),
+            torch.tensor(self.labels[self.source.items[index].label]),
+            torch.tensor(index),
+        )
 
+    def _views(self, epoch: int, index: int) -> Any:
+        if self.random:
+            return self.representation.sample(sample_rng(self.seed, epoch, index))
+        if self.rotation is None:
+            return self.representation.whole()
+        # Rotated back, it sees what a rotated shape shows.
+        return self.representation.turned(self.shape_rotation(index).T).whole()
 
-class EvaluationShapes(Dataset[ShapeSample]):
-    """All views of shapes, by (epoch, index); the epoch changes nothing.
-
-    Args:
-        source: The shapes.
-        labels: Of the classes, by name.
-        representation: What the network sees of them.
-        rotation: How they are turned, each its own way.
-        seed: Seed of the turns.
-    """
-
-    def __init__(
-        self,
-        source: _Shapes,
-        labels: Mapping[str, int],
-        representation: Any,
-        rotation: TestRotation = None,
-        seed: int = 0,
-    ) -> None:
-        self._source = source
-        self._labels = labels
-        self._representation = representation
-        self._rotation = rotation
-        self._seed = seed
-
-    def __len__(self) -> int:
-        return len(self._source)
-
-    def __getitem__(self, key: tuple[int, int]) -> ShapeSample:
-        _, index = key
-        representation = self._representation
-        if self._rotation is not None:  # turned back, it sees of the sphere what a turned one shows
-            representation = representation.turned(self.rotation(index).T)
-        views = representation.whole()
-        return _sample(self._source, self._labels, index, views)
-
-    def rotation(self, index: int) -> NDArray[np.float64]:
-        """The turn of one shape, ``(3, 3)``: its point x is now at R x."""
-        rng = sample_rng(self._seed, 0, index)
-        if self._rotation == "so3":
+    def shape_rotation(self, index: int) -> NDArray[np.float64]:
+        """The rotation of one shape, ``(3, 3)``: its point x is now at R x."""
+        rng = sample_rng(self.seed, 0, index)
+        if self.rotation == "so3":
             return random_rotation(rng)
         return rotation_about((0, 0, 1), rng.uniform(0, 2 * math.pi))
-
-
-def _sample(source: _Shapes, labels: Mapping[str, int], index: int, views: Views) -> ShapeSample:
-    images = views.render(source.read(index).spheres, "bilinear")
-    # Torch hardly knows uint16; all values are below 2 · STEPS = 2¹⁵.
-    return ShapeSample(
-        torch.from_numpy(np.require(images, requirements="W").view(np.int16)),
-        torch.tensor(labels[source.items[index].label]),
-        torch.tensor(index),
-    )
 
 
 def normalize_spheres(images: Tensor, normalization: Normalization) -> Tensor:

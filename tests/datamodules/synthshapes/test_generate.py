@@ -160,7 +160,10 @@ def test_parts_are_where_they_should_be() -> None:
 # --- as a data module --------------------------------------------------------------------------
 
 
-def test_shapes_are_made_then_read_like_the_real_set(tmp_path: Path) -> None:
+def test_shapes_are_generated_then_read_like_the_real_set(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("os.cpu_count", lambda: 1)  # in this process
     settings = {"seed": 3, "train": 4, "test": 1}
     representation = TangentRepresentation(0, 3)
     module = SynthShapes(
@@ -177,8 +180,3 @@ def test_shapes_are_made_then_read_like_the_real_set(tmp_path: Path) -> None:
     again = SynthShapes(tmp_path / "shapes", representation, shapes=ShapeSettings(**settings))
     again.prepare_data()  # the spheres in the folder are no foreign files
     assert contents(tmp_path / "shapes") == before
-
-
-def test_default_settings(tmp_path: Path) -> None:
-    module = SynthShapes(tmp_path, TangentRepresentation(0, 3))
-    assert module.shapes == ShapeSettings()

@@ -1,0 +1,36 @@
+"""Synthetic data sets are the same for any number of processes."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from datamodules.synthrooms.generate import generate_rooms
+from datamodules.synthrooms.settings import RoomSettings
+from datamodules.synthshapes import generate as shapes
+from datamodules.synthshapes.generate import ShapeSettings, generate_shapes
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+ROOMS = RoomSettings(
+    rooms={"1": 2, "5b": 1}, height=16, views_per_camera=1, view_size=8, supersample=1
+)
+
+
+def _contents(root: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(root)): p.read_bytes() for p in root.rglob("*") if p.is_file()}
+
+
+@pytest.mark.parametrize(
+    ("generate", "settings"),
+    [(generate_rooms, ROOMS), (generate_shapes, ShapeSettings(train=1, test=1))],
+)
+def test_the_same_bytes_for_any_number_of_processes(
+    generate: Any, settings: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(shapes, "_PER_PROCESS", 1)
+    for workers in (0, 2):
+        generate(tmp_path / f"{workers}", settings, workers=workers, progress=bool(workers))
+    assert _contents(tmp_path / "2") == _contents(tmp_path / "0")
