@@ -14,7 +14,6 @@ from tangent_train.registry import registered
 
 __all__ = ["SphereAttention", "angular_attention"]
 
-_USUAL_WIDTH = 128
 _KAPPAS = (0.1, 30.0)
 """Initial concentrations: from heads that see the whole sphere to ones that see about 15°."""
 
@@ -39,10 +38,7 @@ class SphereAttention(nn.Module):
     Args:
         channels: Channels C of the tokens.
         heads: Attention heads.
-        width: Channels of queries, keys and values, of all heads together; None for those of the
-            tokens, at most 128.
-        elevation: Add a learned function of the elevation (z of the direction) to every token. For
-            gravity-aligned spheres; the result is then not invariant to rotations.
+        width: Channels of queries, keys and values, of all heads together.
 
     Raises:
         SettingError: `width` is not a positive multiple of `heads`.
@@ -53,13 +49,9 @@ class SphereAttention(nn.Module):
         False
     """
 
-    def __init__(
-        self, channels: int, heads: int = 8, width: int | None = None, elevation: bool = False
-    ) -> None:
+    def __init__(self, channels: int, heads: int = 8, width: int = 128) -> None:
         super().__init__()
-        if width is None and heads > 0:
-            width = max(heads, min(channels, _USUAL_WIDTH) // heads * heads)
-        if heads < 1 or not width or width % heads:
+        if heads < 1 or width < 1 or width % heads:
             raise SettingError(
                 "heads and width of SphereAttention",
                 found=f"{heads} and {width}",
@@ -67,14 +59,11 @@ class SphereAttention(nn.Module):
             )
         self.heads = heads
         self.norm = nn.LayerNorm(channels)
-        self.elevation = nn.Linear(1, channels, bias=False) if elevation else None
         self.queries_keys_values = nn.Linear(channels, 3 * width)
         low, high = map(math.log, _KAPPAS)
         self.log_kappa = nn.Parameter(torch.linspace(low, high, heads))
         self.output = nn.Linear(width, channels, bias=False)
-        for layer in (self.elevation, self.output):
-            if layer is not None:
-                nn.init.zeros_(layer.weight)
+        nn.init.zeros_(self.output.weight)
 
     def forward(
         self,
@@ -88,11 +77,8 @@ class SphereAttention(nn.Module):
             directions: Unit vectors the tokens look along.
         """
         spheres, images, channels, rows, columns = tokens.shape
-        listed = tokens.movedim(2, -1).flatten(1, 3)
+        x = self.norm(tokens.movedim(2, -1).flatten(1, 3))
         along = directions.movedim(2, -1).flatten(1, 3)
-        x = self.norm(listed)
-        if self.elevation is not None:
-            x = x + self.elevation(along[..., 2:].to(x.dtype))
         queries, keys, values = (
             part.unflatten(-1, (self.heads, -1)).transpose(1, 2)
             for part in self.queries_keys_values(x).chunk(3, dim=-1)

@@ -57,7 +57,7 @@ def _write_png(path: Path, image: NDArray[Any]) -> None:
     assert cv2.imwrite(str(path), image)
 
 
-def _fabricate(
+def fabricate(
     root: Path,
     rooms: Mapping[str, Sequence[str]] = ROOMS,
     height: int = 32,
@@ -115,10 +115,10 @@ def _panorama(rng: np.random.Generator, height: int, *, alpha: bool) -> dict[str
 @pytest.fixture(scope="session")
 def fabricate_stanford() -> FabricateStanford:
     """Writes a small data set in the format of Stanford2D3DS."""
-    return _fabricate
+    return fabricate
 
 
 @pytest.fixture(scope="session")
 def stanford_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small data set in the format of Stanford2D3DS, 14 panoramas of 32×64; not to be changed."""
-    return _fabricate(tmp_path_factory.mktemp("stanford"))
+    return fabricate(tmp_path_factory.mktemp("stanford"))

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from models import SphereAttention, SphereContext, UNet
 from tangent_train.geometry import TangentGrid
 
-ATTENTION: Any = partial(SphereAttention, heads=2)
+ATTENTION: Any = partial(SphereAttention, heads=2, width=8)
 STAGE = "downs.1"
 
 

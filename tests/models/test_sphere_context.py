@@ -26,7 +26,7 @@ from tests.models.sphere_networks import (
 )
 
 
-@pytest.mark.parametrize("size", [(16, 16), (4, 20), (12, 28)])
+@pytest.mark.parametrize("size", [(16, 16), (4, 20)])
 def test_before_training_it_computes_what_the_network_computes(size: tuple[int, int]) -> None:
     network = small_unet()
     context = SphereContext(copy.deepcopy(network), STAGE, ATTENTION, in_channels=3)
@@ -128,10 +128,8 @@ def test_mirrored_images_give_mirrored_scores() -> None:
         assert not torch.allclose(context(images.flip(-1), rays).flip(-1), scores, atol=1e-3)
 
 
-@pytest.mark.parametrize("dim", [None, 15])
-def test_tokens_of_single_pixels_look_along_the_grid(dim: int | None) -> None:
-    rotation = random_rotation(np.random.default_rng(0))
-    grid = TangentGrid(0, 4, dim, rotation)
+def test_tokens_of_single_pixels_look_along_the_grid() -> None:
+    grid = TangentGrid(0, 4, 15, random_rotation(np.random.default_rng(0)))
     found = token_directions(tangent_rays(grid)[None], grid.dim, grid.dim)
     expected = torch.tensor(grid.directions()).movedim(-1, 1)[None]
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
@@ -159,38 +157,6 @@ def test_copies_are_on_their_own_and_the_network_by_itself_is_as_before() -> Non
     other = copy.deepcopy(context)
     awake(context)
     torch.testing.assert_close(other(images, rays), expected)
-
-
-def test_half_precision() -> None:
-    context = small_context().eval()
-    images, rays = torch.randn(4, 3, 16, 16), sphere_rays(4)
-    with torch.no_grad():
-        expected = context(images, rays)
-        with torch.autocast("cpu", torch.bfloat16):
-            for found in (context(images, rays), context(images, rays, 3)):
-                torch.testing.assert_close(found.float(), expected, rtol=0.1, atol=0.1)
-
-
-class Averaging(nn.Module):
-    """A mixer that adds the mean of all images' tokens, whatever they see."""
-
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        self.scale = nn.Parameter(torch.zeros(channels))
-
-    def forward(self, tokens: Tensor, directions: Tensor) -> Tensor:
-        mean = tokens.mean(dim=(1, 3, 4), keepdim=True).expand_as(tokens)
-        return mean * self.scale[:, None, None]
-
-
-def test_any_mixer_can_be_chosen() -> None:
-    context = SphereContext(small_unet(), STAGE, Averaging, in_channels=3)
-    awake(context.mixer)
-    context.eval()
-    images, rays = torch.randn(4, 3, 16, 16), sphere_rays(4)
-    with torch.no_grad():
-        scores = context(images, rays)
-        torch.testing.assert_close(context(images, rays, 3), scores, rtol=1e-4, atol=1e-5)
 
 
 def test_impossible_settings_are_refused() -> None:

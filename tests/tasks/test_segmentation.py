@@ -1,3 +1,5 @@
+"""Segmentation: what is minimised, and what is scored."""
+
 from __future__ import annotations
 
 from functools import partial
@@ -16,14 +18,17 @@ from tangent_train.rendering import TangentRepresentation
 from tangent_train.tasks import SegmentationTask
 from tests.tasks.shapes import quiet_trainer
 
+pytestmark = pytest.mark.filterwarnings("ignore:You defined a `validation_step`:UserWarning")
+
 NAMES = ("unknown", "a", "b")
-SHAPE = (32, 64)
+WEIGHTS = torch.tensor([0.0, 1.0, 3.0])
+TANGENT = TangentRepresentation(base_level=0, level=4)
 
 
 class Training(NamedTuple):
     images: Tensor
     labels: Tensor
-    index: int  # type: ignore[assignment]  # nobody needs tuple.index
+    rays: Tensor
 
 
 class Evaluation(NamedTuple):
@@ -31,28 +36,27 @@ class Evaluation(NamedTuple):
     target: Tensor
     rays: Tensor
     rotations: Tensor
-    index: int  # type: ignore[assignment]  # nobody needs tuple.index
 
 
 class Data(lightning.LightningDataModule):
     """Panoramas whose class is the sign of the first channel."""
 
-    def __init__(self, representation: TangentRepresentation, count: int = 3) -> None:
+    def __init__(self, count: int = 3) -> None:
         super().__init__()
         rng = np.random.default_rng(0)
         coarse = rng.normal(size=(count, 2, 4, 8, 1)).astype(np.float32)
         panoramas = coarse.repeat(8, axis=2).repeat(8, axis=3)
         self.train, self.test = [], []
-        for index, (signal, other) in enumerate(panoramas):
+        for signal, other in panoramas:
             truth = np.where(signal > 0, 2, 1).astype(np.uint8)[..., 0]
             truth[:2] = 0
-            whole = representation.whole()
+            whole = TANGENT.whole()
             images = np.concatenate([whole.render(x, "nearest") for x in (signal, other)], axis=-1)
             tensor = torch.from_numpy(images).permute(0, 3, 1, 2).contiguous()
             labels = torch.from_numpy(whole.render(truth, "nearest"))
-            self.train.append(Training(tensor, labels, index))
             where = torch.tensor(whole.rays()), torch.tensor(whole.rotations())
-            self.test.append(Evaluation(tensor, torch.from_numpy(truth), *where, index))
+            self.train.append(Training(tensor, labels, where[0]))
+            self.test.append(Evaluation(tensor, torch.from_numpy(truth), *where))
 
     def train_dataloader(self) -> DataLoader[Any]:
         return DataLoader(self.train, batch_size=2)  # type: ignore[arg-type]
@@ -63,7 +67,7 @@ class Data(lightning.LightningDataModule):
     test_dataloader = val_dataloader
 
     def class_weights(self, kind: str) -> Tensor:
-        return {"none": torch.ones(3), "log": torch.tensor([0.0, 1.0, 3.0])}[kind]
+        return {"none": torch.ones(3), "log": WEIGHTS}[kind]
 
 
 class SignNetwork(nn.Module):
@@ -74,24 +78,15 @@ class SignNetwork(nn.Module):
         return {"out": torch.cat([signal.abs() + 1, -signal, signal], dim=1)}
 
 
-@pytest.fixture(scope="module")
-def representation() -> TangentRepresentation:
-    return TangentRepresentation(base_level=0, level=4)
-
-
-def _task(
-    network: nn.Module, representation: TangentRepresentation, **settings: Any
-) -> SegmentationTask:
+def _task(network: nn.Module, **settings: Any) -> SegmentationTask:
     optimizer = partial(torch.optim.SGD, lr=0.1)
-    return SegmentationTask(network, representation, NAMES, optimizer, **settings)
+    return SegmentationTask(network, TANGENT, NAMES, optimizer, **settings)
 
 
-def test_evaluation_scores_every_panorama_against_its_own_labels(
-    representation: TangentRepresentation,
-) -> None:
-    task = _task(SignNetwork(), representation, images_per_forward=7)
+def test_evaluation_scores_every_panorama_against_its_own_labels() -> None:
+    task = _task(SignNetwork(), images_per_forward=7)
     trainer = quiet_trainer()
-    (figures,) = trainer.test(task, datamodule=Data(representation), verbose=False)
+    (figures,) = trainer.test(task, datamodule=Data(), verbose=False)
     assert task.matrices.images == 3
     assert task.matrices.pixels[0].sum() == 0, "unknown truth counts for nothing"
     assert task.matrices.pixels[:, 0].sum() == 0, "unknown is never predicted"
@@ -99,10 +94,10 @@ def test_evaluation_scores_every_panorama_against_its_own_labels(
     assert figures["test/miou"] > 0.75
 
 
-def test_the_batch_of_spheres_gives_one_gradient(representation: TangentRepresentation) -> None:
-    data = Data(representation, count=2)
+def test_the_batch_of_spheres_gives_one_gradient() -> None:
+    data = Data(count=2)
     network = nn.Conv2d(2, 3, 1)
-    task = _task(network, representation, class_weights=[0.0, 1.0, 3.0], label_smoothing=0.1)
+    task = _task(network, class_weights=[0.0, 1.0, 3.0], label_smoothing=0.1)
     images = torch.cat([sample.images for sample in data.train])
     labels = torch.cat([sample.labels for sample in data.train]).long()
     loss = functional.cross_entropy(
@@ -115,35 +110,110 @@ def test_the_batch_of_spheres_gives_one_gradient(representation: TangentRepresen
         torch.testing.assert_close((old - new) / 0.1, gradient, rtol=1e-4, atol=1e-6)
 
 
-def test_all_unknown_batches_leave_the_network_alone(
-    representation: TangentRepresentation,
-) -> None:
-    data = Data(representation, count=2)
+def test_all_unknown_batches_leave_the_network_alone() -> None:
+    data = Data(count=2)
     for sample in data.train:
         sample.labels.zero_()
     network = nn.Conv2d(2, 3, 1)
     before = [p.detach().clone() for p in network.parameters()]
-    quiet_trainer(max_steps=2, limit_val_batches=0).fit(
-        _task(network, representation), datamodule=data
-    )
+    quiet_trainer(max_steps=2, limit_val_batches=0).fit(_task(network), datamodule=data)
     for old, new in zip(before, network.parameters(), strict=True):
         torch.testing.assert_close(old, new.detach())
 
 
-def test_class_weights_come_from_the_data_or_the_settings(
-    representation: TangentRepresentation,
-) -> None:
-    data = Data(representation)
-    task = _task(nn.Conv2d(2, 3, 1), representation, class_weights="log")
+def test_class_weights_come_from_the_data_or_the_settings() -> None:
+    data = Data()
+    task = _task(nn.Conv2d(2, 3, 1), class_weights="log")
     quiet_trainer(max_steps=1, limit_val_batches=0).fit(task, datamodule=data)
     assert task.class_weights.tolist() == [0.0, 1.0, 3.0]
-    given = _task(nn.Conv2d(2, 3, 1), representation, class_weights=[0.0, 2.0, 1.0])
+    given = _task(nn.Conv2d(2, 3, 1), class_weights=[0.0, 2.0, 1.0])
     quiet_trainer(max_steps=1, limit_val_batches=0).fit(given, datamodule=data)
     assert given.class_weights.tolist() == [0.0, 2.0, 1.0]
 
 
-def test_scores_that_do_not_fit_are_refused(representation: TangentRepresentation) -> None:
-    task = _task(nn.Conv2d(2, 4, 1), representation)
+class TwoHeads(nn.Module):
+    """Scores of the pixels, and of cells of 4×4 pixels while training."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.pixels = nn.Conv2d(2, 3, 1)
+        self.cells = nn.Conv2d(2, 3, 4, stride=4)
+
+    def forward(self, images: Tensor) -> Any:
+        scores = self.pixels(images)
+        return {"out": scores, "aux": self.cells(images)} if self.training else scores
+
+
+def _batch(seed: int = 0) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    images = torch.randn(6, 2, 16, 16, generator=generator)
+    labels = torch.randint(0, 3, (6, 16, 16), generator=generator).to(torch.uint8)
+    labels[1] = 0
+    return images, labels
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.4])
+def test_the_auxiliary_head_adds_the_loss_of_its_cells(weight: float) -> None:
+    images, labels = _batch()
+    torch.manual_seed(0)
+    task = _task(TwoHeads(), auxiliary_weight=weight)
+    task.class_weights.copy_(WEIGHTS)
+    found = task.loss_sum((images,), labels) / task.loss_norm(labels)
+    outputs = task.network(images)
+    mean = partial(functional.cross_entropy, weight=WEIGHTS, ignore_index=0)
+    enlarged = outputs["aux"].repeat_interleave(4, 2).repeat_interleave(4, 3)
+    expected = mean(outputs["out"], labels.long()) + weight * mean(enlarged, labels.long())
+    torch.testing.assert_close(found, expected)
+
+
+class Looking(nn.Module):
+    """Says that what is above is `a` and what is below is `b`, by the rays alone."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.scale = nn.Parameter(torch.tensor(0.1))
+        self.told: list[tuple[tuple[int, ...], int | None]] = []
+
+    def forward(
+        self, images: Tensor, rays: Tensor | None = None, images_per_chunk: int | None = None
+    ) -> Tensor:
+        if rays is None:
+            rays = torch.eye(3).expand(len(images), 1, 3, 3)
+        self.told.append((tuple(rays.shape), images_per_chunk))
+        height, width = images.shape[-2:]
+        y, x = torch.meshgrid(_centers(height), _centers(width), indexing="ij")
+        pixels = torch.stack([x, y, torch.ones_like(x)], dim=-1)
+        up = torch.einsum("nwc,ijc->nijw", rays.flatten(0, 1), pixels)[..., 2]
+        return self.scale * torch.stack([up.abs() + 1, up, -up], dim=1)
+
+
+def _centers(count: int) -> Tensor:
+    return (2 * torch.arange(count) + 1) / count - 1
+
+
+def test_such_a_network_is_told_where_its_images_look_and_divides_them_itself() -> None:
+    network = Looking()
+    task = _task(network, class_weights=[0.0, 1.0, 1.0], images_per_chunk=3, images_per_forward=7)
+    quiet_trainer(max_steps=1, limit_val_batches=0).fit(task, datamodule=Data(2))
+    assert network.told == [((2, 20, 3, 3), 3)]
+    network.told.clear()
+    task.representation = TangentRepresentation(0, 4, average_rotations=2)
+    target = torch.ones(32, 64, dtype=torch.uint8)
+    target[16:] = 2
+    views = task.representation.whole()
+    where = torch.tensor(views.rays()), torch.tensor(views.rotations())
+    samples: Any = [Evaluation(torch.zeros(40, 2, 16, 16), target, *where)]
+    quiet_trainer().test(task, DataLoader(samples), verbose=False)
+    assert network.told == [((1, 20, 3, 3), 7)] * 2, "of every rotation"
+    pixels = task.matrices.pixels
+    assert pixels[1, 1] + pixels[2, 2] == pixels.sum() == 32 * 64
+    network.told.clear()
+    task(torch.zeros(2, 2, 16, 16))
+    assert network.told == [((2, 1, 3, 3), None)]
+
+
+def test_scores_that_do_not_fit_are_refused() -> None:
+    task = _task(nn.Conv2d(2, 4, 1))
     with pytest.raises(SettingError, match=r"scores of the network: found \(1, 4, 16, 16\)"):
         task(torch.zeros(1, 2, 16, 16))
 
@@ -160,8 +230,6 @@ def test_scores_that_do_not_fit_are_refused(representation: TangentRepresentatio
         ("class_weights", [1.0, 2.0]),
     ],
 )
-def test_impossible_settings_are_refused(
-    representation: TangentRepresentation, name: str, value: object
-) -> None:
+def test_impossible_settings_are_refused(name: str, value: object) -> None:
     with pytest.raises(SettingError, match=rf"task\.{name}"):
-        _task(nn.Conv2d(2, 3, 1), representation, **{name: value})
+        _task(nn.Conv2d(2, 3, 1), **{name: value})

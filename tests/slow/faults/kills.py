@@ -271,11 +271,11 @@ def _main() -> int:
     parser.add_argument("--moments", type=int, default=20, help="runs (20)")
     parser.add_argument("--seed", type=int, default=0, help="of the moments (0)")
     options = parser.parse_args()
-    from tests.conftest import _fabricate
+    from tests.conftest import fabricate
 
     kills = failures = 0
     with tempfile.TemporaryDirectory() as name:
-        root = _fabricate(Path(name) / "data")
+        root = fabricate(Path(name) / "data")
         runs = campaign(root, Path(name) / "runs", options.moments, options.seed)
         for number, outcome in enumerate(runs):
             kills += len(outcome.steps)

@@ -1,0 +1,170 @@
+"""Commands and files that README and docs show, and how a command is run on small data."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from tangent_train.cli.compose import config_folder
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+TIME = "2026-01-31_12-00-00"
+STAND_INS = {
+    "checkpoint": f"runs/demo/{TIME}/checkpoints/best.ckpt",
+    "data.root": "data/rooms_demo",
+    "experiment": "rooms/demo",
+    "input": "panoramas",
+    "resume": f"runs/demo/{TIME}",
+}
+"""What is typed for ``…`` and ``<what it is>``."""
+
+SMALL: dict[str, Any] = {
+    "level": 6,
+    "representation.erp_height": 128,
+    "representation.faces_per_panorama": 2,
+    "network.depth": 50,
+    "network.width": 2,
+    "data.num_workers": 0,
+    "data.panoramas_per_step": 2,
+    "data.photos_per_step": 2,
+    "data.shapes_per_step": 4,
+    "data.validation_fraction": 0.3,
+    "data.frames": 2,
+    "data.panorama_height": 128,
+    **{f"data.rooms.rooms.area_{area}": 2 for area in ("1", "2", "3", "4", "5a", "5b", "6")},
+    "data.rooms.height": 128,
+    "data.rooms.view_size": 64,
+    "data.rooms.views_per_camera": 2,
+    "data.rooms.supersample": 1,
+    "data.shapes.train": 3,
+    "data.shapes.test": 1,
+    "trainer.max_epochs": 1,
+    "trainer.check_val_every_n_epoch": 1,
+    "trainer.accelerator": "cpu",
+    "trainer.devices": 1,
+    "trainer.num_nodes": 1,
+    "panels": 1,
+    "photos.data.photos_per_step": 2,
+    "photos.data.num_workers": 0,
+    "compare": "[]",
+    "fine_tuning.epochs": "[]",
+    "seeds": "[0]",
+    "folds": "[1]",
+    "study_levels": "[5,6]",
+    "study_max_rows": 128,
+    "max_pairs": 2,
+}
+"""Appended to a command where its config has the setting and it is not null."""
+
+CONFIGS = {
+    "tangent-train": "train",
+    "tangent-transfer": "transfer",
+    "tangent-prepare": "prepare",
+    "tangent-check": "check",
+    "tangent-keypoints": "keypoints",
+}
+"""Programs that are made small."""
+
+_FENCE = re.compile(r"^( *)```+(\w*)\n(.*?)^\1```+$", re.MULTILINE | re.DOTALL)
+_SPAN = re.compile(r"(?<!`)`((?:tangent-|python |pip |make )[^`\n]* [^`\n]+|make \w+)`(?!`)")
+_FILE = re.compile(r"^# (\S+\.\w+)\n")
+_OPEN = re.compile(r"…|<[^<>]*>")
+
+
+@dataclass
+class Block:
+    """Commands that belong together, or a Python program.
+
+    Attributes:
+        place: Document and line.
+        commands: Lines of a shell, with what continues them.
+        python: The program.
+        files: What the document shows as files, by path.
+    """
+
+    place: str
+    commands: list[str] = field(default_factory=list)
+    python: str = ""
+    files: dict[str, str] = field(default_factory=dict)
+
+
+def blocks(name: str, text: str) -> Iterator[Block]:
+    """All that a Markdown text tells its reader to run."""
+    fences = [(m.start(), m[2], re.sub(rf"^{m[1]}", "", m[3], flags=re.M)) for m in
+              _FENCE.finditer(text)]  # fmt: skip
+    files = {found[1]: body for _, _, body in fences if (found := _FILE.match(body))}
+    for start, language, body in fences:
+        place = f"{name}:{text.count(chr(10), 0, start) + 1}"
+        if language in ("bash", "sh", "shell", "console"):
+            lines = body.replace("\\\n", " ").splitlines()
+            yield Block(place, [line.removeprefix("$ ") for line in lines], files=files)
+        elif language == "python" and not _FILE.match(body):
+            yield Block(place, python=body, files=files)
+    for span in _SPAN.finditer(_FENCE.sub(lambda m: "\n" * m[0].count("\n"), text)):
+        yield Block(f"{name}: {span[1]}", [span[1]], files=files)
+
+
+def words_of(line: str) -> tuple[dict[str, str], list[str]]:
+    """Variables and words of a command line as a shell reads them."""
+    together = _OPEN.sub(lambda found: found[0].replace(" ", "_"), line)
+    words = shlex.split(together, comments=True)
+    variables: dict[str, str] = {}
+    while words and (words[0] == "export" or re.match(r"\w+=", words[0])):
+        name, _, value = words.pop(0).partition("=")
+        variables |= {name: value} if value else {}
+    return variables, words
+
+
+def typed(words: list[str], world: Path) -> list[str]:
+    """The words with files of the world for placeholders and absolute paths; sweeps as one run."""
+    program, *given = [word for word in words if word != "…"]
+    sweep = "-m" in given
+    real = []
+    for word in given:
+        name, equals, value = word.replace("=/", "=").rpartition("=")
+        if _OPEN.fullmatch(value):
+            value = STAND_INS[name]
+        elif _OPEN.search(value):
+            parts = ("**" if _OPEN.fullmatch(p) else _OPEN.sub("*", p) for p in value.split("/"))
+            found = sorted(world.glob("/".join(parts)))
+            assert found, f"nothing stands in for {word}"
+            value = str(found[0].relative_to(world))
+        if sweep and not value.startswith(("[", "{")):
+            value = value.partition(",")[0]
+        real.append(f"{name}{equals}{value}")
+    if program == "tangent-predict" and not any(word.startswith("depth=") for word in given):
+        real = [word.replace("runs/demo", "runs/rgb") for word in real]
+    if "data=stanford2d3ds_pairs" in real:
+        real = [word.replace("data/2d3ds", "data/pairs") for word in real]
+    return [program, *(word for word in real if word != "-m")]
+
+
+def small(words: list[str], world: Path) -> list[str]:
+    """What is appended to a command so that it takes seconds."""
+    program, *given = words
+    if program == "python":
+        return ["--help"] if given[0] == "-m" else []
+    if "--help" in given or any(word.startswith("resume=") for word in given):
+        return []
+    config = CONFIGS.get(program, "train" if any(w.startswith("data=") for w in given) else None)
+    if config is None or any(word.startswith(("left=", "input=")) for word in given):
+        return []
+    own = [w for w in given if "=" in w and not w.startswith(("sweep=", "launcher=", "hydra."))]
+    if program == "tangent-evaluate":
+        own = [word for word in own if word.startswith(("data=", "representation="))]
+    folders = [world / given[given.index("--config-dir") + 1]] if "--config-dir" in given else []
+    search = ",".join(f"file://{folder}" for folder in folders)
+    with initialize_config_dir(str(config_folder()), version_base="1.3"):
+        composed = compose(config, [*own, f"hydra.searchpath=[{search}]"])
+    known = {n: v for n, v in SMALL.items() if OmegaConf.select(composed, n) is not None}
+    if program == "tangent-evaluate":
+        known = {n: v for n, v in known.items() if n.startswith(("data.rooms", "representation."))}
+    return [f"{name}={value}" for name, value in known.items()]

@@ -1,0 +1,82 @@
+"""Every command in README and docs is run, as it is written, on small files that it could mean.
+
+A command that names a file or placeholder that is not known here fails with its line: `world.py`
+has the files, `commands.py` what stands in for placeholders and the settings that make runs small.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+import tomllib
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.slow.documentation.commands import Block, blocks, words_of
+from tests.slow.documentation.world import ROOT, build_world, run
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+BLOCKS = [
+    block
+    for path in (ROOT / "README.md", *sorted((ROOT / "docs").glob("**/*.md")))
+    for block in blocks(path.relative_to(ROOT).as_posix(), path.read_text())
+]
+
+
+@pytest.fixture(scope="module")
+def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return build_world(tmp_path_factory.mktemp("documentation"))
+
+
+@pytest.mark.timeout(1500)
+@pytest.mark.parametrize("block", BLOCKS, ids=lambda block: block.place)
+def test_documented_commands_run(block: Block, template: Path, tmp_path: Path) -> None:
+    world = shutil.copytree(template, tmp_path / "world")
+    for name, content in block.files.items():
+        (world / name).parent.mkdir(parents=True, exist_ok=True)
+        (world / name).write_text(content)
+    if block.python:
+        (world / "documented.py").write_text(block.python)
+        run(["python", "documented.py"], {}, world)
+    exported: dict[str, str] = {}
+    for line in block.commands:
+        variables, words = words_of(line)
+        if not words:
+            exported |= variables
+        elif words[0] in ("make", "pip"):
+            _check_exists(words)
+        else:
+            run(words, exported | variables, world)
+
+
+def _check_exists(words: list[str]) -> None:
+    """CI runs targets of make; everybody who sets this up runs pip."""
+    if words[0] == "make":
+        targets = re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+        assert set(words[1:]) <= set(targets)
+    else:
+        project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+        wanted = re.fullmatch(rf"(?:{project['name']}|\.)(?:\[([a-z,]+)\])?", words[-1])
+        assert wanted, f"{words} is not this project, perhaps with extras"
+        assert set((wanted[1] or "dev").split(",")) <= set(project["optional-dependencies"])
+
+
+def test_all_commands_are_found() -> None:
+    """In blocks of other languages they would not be."""
+    text = (
+        "```text\ntangent-train a=1\n```\n```bash\n$ tangent-x a='b c' \\\n  d # no\n```\n`make x`"
+    )
+    found = list(blocks("x.md", text))
+    assert [words_of(b.commands[0])[1] for b in found] == [
+        ["tangent-x", "a=b c", "d"],
+        ["make", "x"],
+    ]
+    commands = sum(bool(words_of(line)[1]) for block in BLOCKS for line in block.commands)
+    written = sum(
+        len(re.findall(r"^(?:\w+=\S+ )?(?:\$ )?tangent-\w+ ", path.read_text(), re.MULTILINE))
+        for path in (ROOT / "README.md", *(ROOT / "docs").glob("**/*.md"))
+    )
+    assert commands >= written > 0
