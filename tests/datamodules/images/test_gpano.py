@@ -277,8 +277,6 @@ def test_edges_are_where_the_crop_says(seed: int) -> None:
         ((-180, 180, -90), r"found \[-180, 180, -90\]; expected \[west,east,south,north\]"),
         ((0, 181, -90, 90), "expected .*−180 to 180"),
         ((0, 90, 20, 20), "south below north"),
-        ((0, 90, -91, 10), "−90 to 90"),
-        ((30, 30, 0, 10), "east other than west"),
         ((180, -180, 0, 10), "east other than west"),
         ((0, float("nan"), 0, 10), "−180 to 180"),
         ((0, 40, 0, 10), r"pixels of 0\.4°×0\.1° in an image of 100×100; .* square"),

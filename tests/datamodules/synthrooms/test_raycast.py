@@ -83,20 +83,7 @@ def test_perspective_depth_is_along_the_optical_axis() -> None:
     np.testing.assert_allclose(depth[8:24, 8:24], 3.5, atol=1e-4)
 
 
-def test_light_follows_the_inverse_square_and_the_cosines() -> None:
-    room = lit_room(shade=False)
-    scene = RayScene(room)
-    targets = np.array([[2.5, 2.0, 0.0], [3.5, 2.0, 0.0]])
-    rays = targets - HERE
-    hits = scene.cast(HERE, (rays / np.linalg.norm(rays, axis=1)[:, None]).astype(np.float32))
-    lamp = room.lights[0]
-    lifted = hits.points + 1e-3 * hits.normals
-    direct = scene._direct(lamp, lifted, hits.normals, (0.0, 0.0))
-    away = np.array([2.9**2, 2.9**2 + 1])
-    np.testing.assert_allclose(direct, 2.0 * (2.9**2 / away) / away, rtol=1e-3)
-
-
-def test_things_throw_shadows_with_soft_rims_and_the_ceiling_gets_bounced_light() -> None:
+def test_shadows_and_bounced_light_on_the_ceiling() -> None:
     view = PanoramaView(Pose.looking(HERE, 0.0), 128)
     bright, shaded = (take(lit_room(shade=shade), view) for shade in (False, True))
     # The same floor pixels with and without the board in between.
@@ -106,14 +93,6 @@ def test_things_throw_shadows_with_soft_rims_and_the_ceiling_gets_bounced_light(
     assert after < 0.9 * before
     ceiling = bright.rgb[2].mean()
     assert 40 < ceiling < 255
-    scene = RayScene(lit_room(shade=True))
-    hits = scene.cast(HERE, view.rays().reshape(-1, 3))
-    corners = [(x, y) for x in (-0.5, 0.5) for y in (-0.5, 0.5)]
-    lamp = lit_room(shade=True).lights[0]
-    lifted = hits.points + 1e-3 * hits.normals
-    lit = [scene._direct(lamp, lifted, hits.normals, c) > 0 for c in corners]
-    share = np.mean(lit, axis=0)
-    assert ((share > 0) & (share < 1)).any()
 
 
 def test_what_was_not_scanned_has_neither_label_nor_depth_but_a_colour() -> None:
