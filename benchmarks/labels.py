@@ -26,7 +26,7 @@ from benchmarks.measuring import (
 )
 from tangent_train.geometry import TangentGrid, equirect_shape
 from tangent_train.rendering import set_table_cache_limit, tangent_to_labels
-from tangent_train.rendering.tables import forward_map, owner_table
+from tangent_train.rendering.tables import forward_map, image_table, owners
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -98,7 +98,7 @@ def _plain(
     scores: torch.Tensor, grid: TangentGrid, shape: tuple[int, int]
 ) -> Callable[[], torch.Tensor]:
     mosaic = scores.movedim(0, 1).reshape(1, NUM_CLASSES, -1, grid.dim)
-    face, u, v, _ = owner_table(grid, shape, _SINGLE)
+    face, u, v, _ = image_table(grid, shape, _SINGLE, "nearest", slice(0, shape[0]))
     rows = face[0].astype(np.float64) * grid.dim + v[0]
     place = np.stack([u[0] / (grid.dim - 1), rows / (mosaic.shape[2] - 1)], axis=-1) * 2 - 1
     places = torch.from_numpy(place.astype(np.float32))[None]
@@ -108,7 +108,7 @@ def _plain(
 def _careful(
     scores: torch.Tensor, grid: TangentGrid, shape: tuple[int, int]
 ) -> Callable[[], torch.Tensor]:
-    face, u, v, _ = owner_table(grid, shape, _SINGLE)
+    face, u, v, _ = image_table(grid, shape, _SINGLE, "nearest", slice(0, shape[0]))
     scale = 2 / (grid.dim - 1)
     inside = torch.from_numpy(np.stack([u[0].ravel(), v[0].ravel()], axis=-1) * scale - 1)
     pixels = [torch.from_numpy(np.flatnonzero(face[0] == n)) for n in range(grid.num_images)]
@@ -139,11 +139,11 @@ def _cold_tables(grid: TangentGrid, shape: tuple[int, int], options: Options) ->
         return run
 
     coordinates = np.random.default_rng(0).standard_normal((2, *shape))
-    owners = "owners of all pixels (to labels)"
+    owned = "owners of all pixels (to labels)"
     rows = measure(
         [
             Way("for scale: numpy.arctan2 of as many pixels", lambda: np.arctan2(*coordinates)),
-            Way(owners, cold(lambda: owner_table(grid, shape, _SINGLE)), ours=True),
+            Way(owned, cold(lambda: owners(grid, shape)), ours=True),
             Way(
                 "maps of all images (to images)",
                 cold(lambda: [forward_map(grid, shape, [f], _SINGLE) for f in grid.face_indices()]),
@@ -153,7 +153,7 @@ def _cold_tables(grid: TangentGrid, shape: tuple[int, int], options: Options) ->
         options.times(7),
     )
     table = Table("labels: tables", f"Tables of a new size, once ({shape[0]}×{shape[1]})", rows)
-    table.goals = [at_most("table of the owners", table.row(owners).median, 0.5, " s")]
+    table.goals = [at_most("table of the owners", table.row(owned).median, 0.5, " s")]
     return table
 
 

@@ -12,22 +12,19 @@ from torch import Tensor
 from tangent_train.errors import SettingError
 from tangent_train.geometry import PinholeGrid
 
-__all__ = [
-    "check_blend",
-    "check_images_array",
-    "check_interpolation",
-    "check_nearest",
-    "check_numpy_image",
-    "check_scores",
-    "check_shape",
-    "check_tangent_images",
-    "check_torch_image",
-]
+__all__ = ["check_blend", "check_images", "check_interpolation", "check_panorama", "check_shape"]
 
 
-def check_interpolation(interpolation: str) -> None:
-    """Raise SettingError unless the interpolation is known."""
+def check_interpolation(interpolation: str, blend: str = "nearest") -> None:
+    """Raise SettingError unless the interpolation is known and goes with the blend."""
     _check_choice("interpolation", interpolation, ("bilinear", "nearest"))
+    if interpolation == "nearest" and blend != "nearest":
+        raise SettingError(
+            "interpolation",
+            found=f"'nearest' with blend {blend!r}",
+            expected="blend='nearest'",
+            remedy="Pixels that are copied cannot be averaged.",
+        )
 
 
 def check_blend(blend: str, grid: PinholeGrid) -> None:
@@ -39,36 +36,6 @@ def check_blend(blend: str, grid: PinholeGrid) -> None:
             found="'feather'",
             expected="'nearest' for images that do not overlap",
             remedy="All weights are 0 on the edges where they meet.",
-        )
-
-
-def check_nearest(
-    images: Tensor | NDArray[np.generic], grid: PinholeGrid, blend: str, interpolation: str
-) -> None:
-    """Raise SettingError unless images of any dtype can be taken to a panorama pixel by pixel."""
-    check_interpolation(interpolation)
-    if blend != "nearest":
-        raise SettingError(
-            "interpolation",
-            found=f"'nearest' with blend {blend!r}",
-            expected="blend='nearest'",
-            remedy="What is taken pixel by pixel is not averaged.",
-        )
-    if isinstance(images, Tensor):
-        _check_stack("tangent images", images, grid)
-    else:
-        check_images_array(images, grid)
-
-
-def check_images_array(images: NDArray[np.generic], grid: PinholeGrid) -> None:
-    """Raise SettingError unless an array is ``(N, d, d[, C])`` and fits the grid."""
-    expected = (grid.num_images, grid.dim, grid.dim)
-    if images.ndim not in (3, 4) or images.shape[:3] != expected:
-        raise SettingError(
-            "tangent images",
-            found=f"shape {images.shape}",
-            expected="({}, {}, {}[, channels]) for this grid".format(*expected),
-            remedy="All images of the grid are needed, in its order.",
         )
 
 
@@ -85,60 +52,56 @@ def check_shape(shape: Sequence[int]) -> tuple[int, int]:
     return int(shape[0]), int(shape[1])
 
 
-def check_numpy_image(image: NDArray[np.generic], interpolation: str) -> None:
-    """Raise SettingError unless NumPy code can sample a panorama ``(H, W[, C])``."""
-    if image.ndim not in (2, 3) or 0 in image.shape:
-        raise SettingError("panorama", found=f"shape {image.shape}", expected="(H, W) or (H, W, C)")
-    kinds = "uif" if interpolation == "bilinear" else "buif"
-    if image.dtype.kind not in kinds:
-        raise SettingError(
-            "panorama",
-            found=f"dtype {image.dtype}",
-            expected=f"numbers that {interpolation} interpolation can use",
-            remedy="Convert it, or use interpolation='nearest' for labels and masks.",
-        )
+def check_panorama(image: Tensor | NDArray[np.generic], interpolation: str) -> None:
+    """Raise SettingError unless a panorama, array or tensor, can be sampled."""
+    check_interpolation(interpolation)
+    array = isinstance(image, np.ndarray)
+    fits = image.ndim in (2, 3) and 0 not in image.shape if array else image.ndim >= 3
+    if not fits or 0 in image.shape[-2:]:
+        expected = "(H, W) or (H, W, C)" if array else "(..., C, H, W)"
+        raise SettingError("panorama", found=f"shape {tuple(image.shape)}", expected=expected)
+    _check_numbers("panorama", image, interpolation)
 
 
-def check_torch_image(image: Tensor, interpolation: str) -> None:
-    """Raise SettingError unless torch code can sample a panorama ``(..., C, H, W)``."""
-    if image.ndim < 3 or 0 in image.shape[-2:]:
-        found = f"shape {tuple(image.shape)}"
-        raise SettingError("panorama", found=found, expected="(..., C, H, W)")
-    if interpolation == "bilinear":
-        _check_floating("panorama", image)
+def check_images(
+    name: str,
+    images: Tensor | NDArray[np.generic],
+    grid: PinholeGrid,
+    interpolation: str = "bilinear",
+) -> None:
+    """Raise SettingError unless images are all of a grid.
 
-
-def _check_floating(name: str, tensor: Tensor) -> None:
-    if not torch.is_floating_point(tensor):
-        raise SettingError(
-            name,
-            found=f"dtype {tensor.dtype}",
-            expected="a floating-point dtype",
-            remedy="Call .float() first.",
-        )
-
-
-def check_tangent_images(images: Tensor, grid: PinholeGrid) -> None:
-    """Raise SettingError unless images are ``(..., N, C, d, d)`` floats that fit the grid."""
-    _check_stack("tangent images", images, grid)
-    _check_floating("tangent images", images)
-
-
-def check_scores(scores: Tensor, grid: PinholeGrid) -> None:
-    """Raise SettingError unless scores are ``(..., N, K, d, d)`` floats that fit the grid."""
-    _check_stack("scores", scores, grid)
-    _check_floating("scores", scores)
-    if scores.shape[-3] == 0:
-        raise SettingError("scores", found="no class", expected="one class or more")
-
-
-def _check_stack(name: str, images: Tensor, grid: PinholeGrid) -> None:
-    shape = tuple(images.shape)
-    expected = (grid.num_images, grid.dim, grid.dim)
-    if len(shape) < 4 or (shape[-4], *shape[-2:]) != expected:
+    Args:
+        name: What they are, for the message.
+        images: Tensor ``(..., N, C, d, d)`` or array ``(N, d, d[, C])``.
+        grid: Their geometry.
+        interpolation: How they will be sampled.
+    """
+    shape, sides = tuple(images.shape), (grid.num_images, grid.dim, grid.dim)
+    if isinstance(images, np.ndarray):
+        fits, expected = len(shape) in (3, 4) and shape[:3] == sides, "({}, {}, {}[, channels])"
+    else:
+        fits = len(shape) >= 4 and (shape[-4], *shape[-2:]) == sides
+        expected = "(..., {}, channels, {}, {})"
+    if not fits:
         raise SettingError(
             name,
             found=f"shape {shape}",
-            expected="(..., {}, channels, {}, {}) for this grid".format(*expected),
+            expected=f"{expected.format(*sides)} for this grid",
             remedy="All images of the grid are needed, in its order.",
+        )
+    _check_numbers(name, images, interpolation)
+
+
+def _check_numbers(name: str, values: Tensor | NDArray[np.generic], interpolation: str) -> None:
+    if isinstance(values, Tensor):
+        usable = interpolation == "nearest" or torch.is_floating_point(values)
+    else:
+        usable = values.dtype.kind in ("uif" if interpolation == "bilinear" else "buif")
+    if not usable:
+        raise SettingError(
+            name,
+            found=f"dtype {values.dtype}",
+            expected=f"numbers that {interpolation} interpolation can use",
+            remedy="Convert them to floats, or use interpolation='nearest' for labels and masks.",
         )

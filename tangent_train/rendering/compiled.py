@@ -1,34 +1,62 @@
-"""Decorators for loops that numba compiles.
+"""Loops that numba compiles, and the threads they run on.
 
-Compiled loops are serial and release the GIL; `tangent_train.rendering.threads.over_rows` runs
-the ones that take ``(start, stop)`` rows on several threads. Numba's own parallel loops are not
-used: its OpenMP layer kills worker processes forked after its first use, its portable layer dies
-when two threads use it at once.
+Compiled loops are serial and release the GIL; `over_rows` runs them on several threads. Numba's own
+parallel loops are not used: its OpenMP layer kills worker processes forked after its first use, its
+portable layer dies when two threads use it at once.
 
-Compiled code is kept on disk beside each source file and checked against that file alone: a loop
-must not call compiled functions of another file.
+Compiled code is cached on disk beside each source file and checked against that file alone, so a
+loop must not call compiled functions of another file.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from typing import Any, TypeVar
 
+import torch
 from numba import njit
 
-__all__ = ["njit_exact", "njit_fast"]
+__all__ = ["njit_exact", "njit_fast", "over_rows"]
 
 Function = TypeVar("Function", bound=Callable[..., Any])
+
+_SMALLEST_SHARE = 2**15
+"""Pixels for which starting a thread pays."""
 
 
 def njit_exact(function: Function) -> Function:
     """Compile with IEEE arithmetic."""
-    compiled: Function = njit(cache=True, nogil=True, error_model="numpy")(function)
-    return compiled
+    return njit(cache=True, nogil=True, error_model="numpy")(function)
 
 
 def njit_fast(function: Function) -> Function:
     """Compile with reordered arithmetic; infinities and NaN keep their meaning."""
     flags = {"contract", "reassoc", "nsz", "arcp"}
-    compiled: Function = njit(cache=True, nogil=True, error_model="numpy", fastmath=flags)(function)
-    return compiled
+    return njit(cache=True, nogil=True, error_model="numpy", fastmath=flags)(function)
+
+
+def over_rows(kernel: Callable[..., None], rows: int, width: int, *arguments: Any) -> None:
+    """Run ``kernel(start, stop, *arguments)`` over all rows, in parallel blocks.
+
+    Uses as many threads as torch would (`torch.get_num_threads`: one inside a `DataLoader` worker),
+    and none for little work. They end with the call, so processes may fork before and after.
+
+    Args:
+        kernel: A compiled function that releases the GIL.
+        rows: How many there are.
+        width: Pixels in a row.
+        *arguments: What the kernel takes besides the rows.
+    """
+    threads = min(torch.get_num_threads(), rows, rows * width // _SMALLEST_SHARE)
+    if threads <= 1:
+        kernel(0, rows, *arguments)
+        return
+    # Several blocks per thread: rows near the poles take longer or shorter than others.
+    blocks = min(8 * threads, rows)
+    edges = [rows * block // blocks for block in range(blocks + 1)]
+    with ThreadPoolExecutor(threads) as pool:
+        runs = [pool.submit(kernel, start, stop, *arguments) for start, stop in pairwise(edges)]
+        for run in runs:
+            run.result()

@@ -11,12 +11,8 @@ from torch import Tensor
 
 from tangent_train.geometry import PinholeGrid
 from tangent_train.geometry.pinhole_grid import Faces
-from tangent_train.rendering.checks import (
-    check_interpolation,
-    check_numpy_image,
-    check_torch_image,
-)
-from tangent_train.rendering.sampling import map_dtype, sample_maps
+from tangent_train.rendering.checks import check_panorama
+from tangent_train.rendering.sampling import map_dtype, sample_map
 from tangent_train.rendering.tables import forward_map, tensors_on
 from tangent_train.rendering.taps import bilinear_equirect_taps, nearest_equirect_index, sample
 
@@ -30,9 +26,7 @@ _CHUNK = 2**20
 """Positions whose taps torch holds at once."""
 
 _TOGETHER = 2**16
-"""Pixels of small images that are rendered at once: tables of this size stay in a core's cache."""
-_HELD = 2**22
-"""Pixels whose tables are held at once, kept or not; threads are started once for all of them."""
+"""Pixels of small images that are sampled in one call: to call for each takes longer than that."""
 
 
 @overload
@@ -62,8 +56,8 @@ def equirect_to_tangent(
 
     Args:
         image: A tensor ``(..., C, H, W)`` on any device, differentiable; or an array
-            ``(H, W[, C])``: uint8, uint16 and float32 go through `cv2.remap` (see
-            `sample_maps` about its precision), other dtypes are slower.
+            ``(H, W[, C])``: uint8, uint16 and float32 go through `cv2.remap` (see `sample_map`
+            about its precision), other dtypes are slower.
         grid: The images, a `TangentGrid` or a `CubeGrid`.
         faces: Images asked for, default all; only they are rendered.
         interpolation: ``bilinear``, or ``nearest`` for labels and masks of any dtype.
@@ -74,28 +68,21 @@ def equirect_to_tangent(
     Raises:
         SettingError: The panorama, a face or the interpolation cannot be used.
     """
-    check_interpolation(interpolation)
+    check_panorama(image, interpolation)
     indices = grid.face_indices(faces)
     if isinstance(image, Tensor):
-        check_torch_image(image, interpolation)
         return _render_tensor(image, grid, indices, interpolation)
-    check_numpy_image(image, interpolation)
     image = np.ascontiguousarray(image)
+    shape = image.shape[0], image.shape[1]
     out = np.empty((len(indices) * grid.dim, grid.dim, *image.shape[2:]), image.dtype)
     dtype = map_dtype(image.dtype == np.float64, interpolation)
-    # Small images go together: to call for each takes longer than to render it. Random subsets do
-    # not, unless their tables are not kept anyway.
+    # Of random subsets the tables of single images are kept.
     together = faces is None or grid.rotation is not None
     step = max(1, _TOGETHER // max(grid.dim**2, 4 * grid.dim)) if together else 1
-    many = step * max(1, _HELD // (step * grid.dim**2))
-    for start in range(0, len(indices), many):
-        some = indices[start : start + many]
-        maps = [
-            forward_map(grid, image.shape[:2], some[first : first + step], dtype)
-            for first in range(0, len(some), step)
-        ]
-        part = out[start * grid.dim : (start + len(some)) * grid.dim]
-        sample_maps(maps, image, interpolation, part)
+    for start in range(0, len(indices), step):
+        table = forward_map(grid, shape, indices[start : start + step], dtype)
+        part = out[start * grid.dim : (start + step) * grid.dim]
+        sample_map(table, image, interpolation, part)
     return out.reshape(len(indices), grid.dim, *out.shape[1:])
 
 
@@ -129,12 +116,10 @@ def _positions(
     """Columns and rows of all pixels of some images, one after the other."""
 
     def tensors(face: int) -> tuple[Tensor, ...]:
-        def arrays() -> tuple[NDArray[np.floating], ...]:
-            table = forward_map(grid, shape, [face], dtype)
-            return table.u, table.v
+        # On the CPU they share the memory of the maps, which are kept already.
+        key = None if device.type == "cpu" else ("forward", shape, face, dtype)
+        return tensors_on(device, grid, key, lambda: forward_map(grid, shape, [face], dtype)[:2])
 
-        return tensors_on(device, grid, ("forward", shape, face, dtype), arrays)
-
-    tables = [tensors(int(face)) for face in indices]
+    tables = [tensors(face) for face in indices.tolist()]
     u, v = (torch.stack(lines).reshape(-1) for lines in zip(*tables, strict=True))
     return u, v

@@ -1,4 +1,4 @@
-"""Other views of a panorama: a pinhole camera's, and the whole sphere turned."""
+"""Other views of a panorama: a pinhole camera's, and the whole sphere rotated."""
 
 from __future__ import annotations
 
@@ -6,14 +6,19 @@ from functools import lru_cache
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, DTypeLike, NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from tangent_train.geometry import checked_rotation
-from tangent_train.rendering.checks import check_interpolation, check_numpy_image
+from tangent_train.rendering.checks import check_panorama
 from tangent_train.rendering.forward import Interpolation
-from tangent_train.rendering.kernels import directions_of_rows, rotation_map
-from tangent_train.rendering.sampling import EquirectMap, map_dtype, pinhole_equirect_map
-from tangent_train.rendering.threads import over_rows
+from tangent_train.rendering.kernels import sphere_rays
+from tangent_train.rendering.sampling import (
+    EquirectMap,
+    equirect_map,
+    map_dtype,
+    pinhole_equirect_map,
+    sample_map,
+)
 
 __all__ = ["equirect_to_perspective", "rotate_equirect"]
 
@@ -43,19 +48,19 @@ def equirect_to_perspective(
     Raises:
         SettingError: The panorama or the interpolation cannot be used.
     """
-    check_interpolation(interpolation)
-    check_numpy_image(image, interpolation)
+    check_panorama(image, interpolation)
     matrix = np.linalg.inv(np.asarray(camera_matrix, np.float64))
     world_from_pixel = np.asarray(world_from_camera, np.float64) @ matrix
     dtype = map_dtype(image.dtype == np.float64, interpolation)
-    table = pinhole_equirect_map(world_from_pixel, size, image.shape[:2], dtype)
+    shape = image.shape[0], image.shape[1]
+    table = pinhole_equirect_map(world_from_pixel, size, shape, dtype)
     return _sampled(image, table, interpolation)
 
 
 def rotate_equirect(
     image: NDArray[Scalar], rotation: ArrayLike, interpolation: Interpolation = "bilinear"
 ) -> NDArray[Scalar]:
-    """Turn what a panorama shows: direction d of the result shows the input at Rᵀd.
+    """Rotate what a panorama shows: direction d of the result shows the input at Rᵀd.
 
     Args:
         image: ``(H, W[, C])``, as `equirect_to_tangent` takes it.
@@ -68,26 +73,25 @@ def rotate_equirect(
     Raises:
         SettingError: The panorama, the rotation or the interpolation cannot be used.
     """
-    check_interpolation(interpolation)
-    check_numpy_image(image, interpolation)
-    shape = (image.shape[0], image.shape[1])
+    check_panorama(image, interpolation)
+    rotated = checked_rotation(rotation)
     dtype = map_dtype(image.dtype == np.float64, interpolation)
-    turned = checked_rotation(rotation)
-    return _sampled(image, _rotation_map(turned.tobytes(), shape, dtype), interpolation)
+    table = _rotation_map(rotated.tobytes(), (image.shape[0], image.shape[1]), dtype)
+    return _sampled(image, table, interpolation)
 
 
 @lru_cache(maxsize=1)
-def _rotation_map(rotation: bytes, shape: tuple[int, int], dtype: DTypeLike) -> EquirectMap:
+def _rotation_map(
+    rotation: bytes, shape: tuple[int, int], dtype: np.dtype[np.floating]
+) -> EquirectMap:
     """Where each direction comes from; kept for the other parts of the same panorama."""
-    u, v = np.empty((2, *shape), dtype)
-    inverse = np.ascontiguousarray(np.frombuffer(rotation).reshape(3, 3).T)
-    over_rows(rotation_map, shape, inverse, *directions_of_rows(*shape), u, v)
-    return EquirectMap(u, v, shape)
+    inverse = np.frombuffer(rotation).reshape(1, 3, 3).transpose(0, 2, 1)
+    return equirect_map(inverse, sphere_rays(shape), shape, dtype)
 
 
 def _sampled(
     image: NDArray[Scalar], table: EquirectMap, interpolation: Interpolation
 ) -> NDArray[Scalar]:
     out = np.empty((*table.u.shape, *image.shape[2:]), image.dtype)
-    table.sample(np.ascontiguousarray(image), interpolation, out)
+    sample_map(table, np.ascontiguousarray(image), interpolation, out)
     return out

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import threading
-from collections import OrderedDict
 from collections.abc import Callable, Hashable, Sequence
 from typing import Any, NamedTuple, TypeVar
 
@@ -14,58 +11,48 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tangent_train.errors import SettingError
-from tangent_train.geometry import PinholeGrid
-from tangent_train.rendering import feather_kernels, kernels
+from tangent_train.geometry import PinholeGrid, equirect_latitudes, xyz_to_lonlat
+from tangent_train.rendering import kernels
+from tangent_train.rendering.compiled import over_rows
 from tangent_train.rendering.sampling import EquirectMap, pinhole_equirect_map
-from tangent_train.rendering.threads import over_rows
 
 __all__ = [
-    "FEATHER_POWER",
+    "TABLES",
     "ImageTable",
     "TableCache",
-    "feather_arguments",
-    "feather_table",
     "forward_map",
-    "owner_arguments",
-    "owner_table",
+    "image_table",
+    "owners",
     "set_table_cache_limit",
+    "spans",
     "tensors_on",
+    "views_of_rays",
 ]
 
-FEATHER_POWER = 4
-"""Exponent p of the feather weights ((1 − a²)(1 − b²))^p at offsets a, b in half image sides."""
-
-Value = TypeVar("Value")
+Value = TypeVar("Value", bound=tuple[Any, ...])
 
 
 class ImageTable(NamedTuple):
-    """Where ERP pixels are in the tangent images that see them.
+    """Where ERP pixels are in the images that see them.
 
     Attributes:
         face: ``(R, H, W)`` images, uint8, int16 or int32.
         u: ``(R, H, W)`` columns in the images.
         v: ``(R, H, W)`` rows in the images.
-        weight: ``(R, H, W)`` weights that add up to 1, or None where R = 1.
+        weight: ``(R, H, W)`` weights that add up to 1.
     """
 
     face: NDArray[np.integer]
     u: NDArray[np.floating]
     v: NDArray[np.floating]
-    weight: NDArray[np.floating] | None
-
-    @property
-    def arrays(self) -> tuple[NDArray[Any], ...]:
-        """The tables that are there."""
-        return tuple(part for part in self if part is not None)
-
-    @property
-    def nbytes(self) -> int:
-        """Memory of the tables."""
-        return sum(part.nbytes for part in self.arrays)
+    weight: NDArray[np.floating]
 
 
 class TableCache:
-    """The most recently used values, as many as fit into a number of bytes. Thread-safe.
+    """The most recently used tables, as many as fit into a number of bytes.
+
+    Without a lock: every step is one operation on a dictionary. Two threads that miss a table at
+    once both build it.
 
     Args:
         limit: Most bytes held.
@@ -73,53 +60,44 @@ class TableCache:
 
     def __init__(self, limit: int) -> None:
         self.limit = limit
-        self.nbytes = 0
-        self._values: OrderedDict[Hashable, tuple[Any, int]] = OrderedDict()
-        self._renew_lock()
-        # Forked while another thread holds the lock, a child would wait for it for ever.
-        os.register_at_fork(after_in_child=self._renew_lock)
-
-    def _renew_lock(self) -> None:
-        self._lock = threading.Lock()
+        self._tables: dict[Hashable, tuple[Any, ...]] = {}
 
     def __len__(self) -> int:
-        return len(self._values)
+        return len(self._tables)
 
-    def get(
-        self, key: Hashable, build: Callable[[], Value], nbytes: Callable[[Value], int]
-    ) -> Value:
-        """The value of a key, built if it is not held.
+    @property
+    def nbytes(self) -> int:
+        """Memory of what is held."""
+        return sum(map(_nbytes, list(self._tables.values())))
+
+    def get(self, key: Hashable, build: Callable[[], Value]) -> Value:
+        """The table of a key, built if it is not held.
 
         Args:
-            key: What the value depends on.
-            build: Makes the value; may run twice when two threads miss at once.
-            nbytes: Size of the value.
+            key: What the table depends on.
+            build: Makes the table, a tuple of arrays or tensors.
         """
-        with self._lock:
-            entry = self._values.get(key)
-            if entry is not None:
-                self._values.move_to_end(key)
-                held: Value = entry[0]
-                return held
-        value = build()
-        size = nbytes(value)
-        with self._lock:
-            if key not in self._values and size <= self.limit:
-                self._values[key] = value, size
-                self.nbytes += size
-                self._shrink()
-        return value
+        table: Any = self._tables.pop(key, None)
+        if table is None:
+            table = build()
+            if _nbytes(table) > self.limit:
+                return table
+            self._shrink(self.limit - _nbytes(table))
+        self._tables[key] = table  # the last used is the last
+        return table
 
     def set_limit(self, limit: int) -> None:
         """Change the limit, dropping what no longer fits."""
-        with self._lock:
-            self.limit = limit
-            self._shrink()
+        self.limit = limit
+        self._shrink(limit)
 
-    def _shrink(self) -> None:
-        while self.nbytes > self.limit:
-            _, (_, size) = self._values.popitem(last=False)
-            self.nbytes -= size
+    def _shrink(self, room: int) -> None:
+        while self.nbytes > room:
+            self._tables.pop(next(iter(self._tables)), None)
+
+
+def _nbytes(table: tuple[Any, ...]) -> int:
+    return sum(part.nbytes for part in table)
 
 
 TABLES = TableCache(limit=512 * 2**20)
@@ -128,8 +106,8 @@ TABLES = TableCache(limit=512 * 2**20)
 def set_table_cache_limit(nbytes: int) -> None:
     """Bound the memory of the rendering tables of this process, 512 MiB at first.
 
-    At level 10 and base level 1 the tables take 168 MB for panorama to images and 76 MB back.
-    Tables on a GPU count too.
+    At level 10 and base level 1 the tables take 168 MB for panorama to images and, in PyTorch,
+    109 MB back. Tables on a GPU count too.
 
     Args:
         nbytes: Most bytes held; 0 keeps nothing.
@@ -142,16 +120,9 @@ def set_table_cache_limit(nbytes: int) -> None:
     TABLES.set_limit(nbytes)
 
 
-def _cached(
-    grid: PinholeGrid,
-    key: tuple[Hashable, ...],
-    build: Callable[[], Value],
-    nbytes: Callable[[Value], int],
-) -> Value:
+def _cached(grid: PinholeGrid, key: tuple[Hashable, ...], build: Callable[[], Value]) -> Value:
     """Tables of rotated grids are not kept: random rotations would push out all others."""
-    if grid.rotation is not None:
-        return build()
-    return TABLES.get((grid, *key), build, nbytes)
+    return build() if grid.rotation is not None else TABLES.get((grid, *key), build)
 
 
 def forward_map(
@@ -160,7 +131,7 @@ def forward_map(
     faces: Sequence[int] | NDArray[np.int64],
     dtype: np.dtype[np.floating],
 ) -> EquirectMap:
-    """Where the pixels of tangent images are in the ERP, one below the other.
+    """Where the pixels of tangent images are in the ERP, one image below the other.
 
     Args:
         grid: The images.
@@ -174,80 +145,90 @@ def forward_map(
         world_from_pixel = grid.world_from_camera[list(chosen)] @ np.linalg.inv(grid.camera_matrix)
         return pinhole_equirect_map(world_from_pixel, (grid.dim, grid.dim), shape, dtype)
 
-    return _cached(grid, ("forward", shape, chosen, dtype), build, lambda table: table.nbytes)
+    return _cached(grid, ("forward", shape, chosen, dtype), build)
 
 
-def owner_table(
-    grid: PinholeGrid, shape: tuple[int, int], dtype: np.dtype[np.floating]
+def owners(grid: PinholeGrid, shape: tuple[int, int]) -> NDArray[np.integer]:
+    """``(H, W)`` the owner of every ERP pixel, in the smallest dtype that torch can index with."""
+
+    def build() -> tuple[NDArray[np.integer]]:
+        kinds = (np.uint8, np.int16, np.int32)
+        face = np.empty(shape, next(k for k in kinds if grid.num_images <= np.iinfo(k).max + 1))
+        centers = np.ascontiguousarray(grid.centers_xyz)
+        rays = kernels.sphere_rays(shape)
+        mesh = (centers, grid.neighbors, _inner_cosine(grid))
+        over_rows(kernels.owners, *shape, *mesh, *rays, face)
+        return (face,)
+
+    return _cached(grid, ("owners", shape), build)[0]
+
+
+def image_table(
+    grid: PinholeGrid,
+    shape: tuple[int, int],
+    dtype: np.dtype[np.floating],
+    blend: str,
+    rows: slice,
 ) -> ImageTable:
-    """The owner of every ERP pixel, and where it is in the owner's image.
-
-    Args:
-        grid: The images.
-        shape: ``(H, W)`` of the ERP.
-        dtype: Of the positions, float32 or float64; computed in float64 either way.
-
-    Returns:
-        A table with R = 1.
-    """
-
-    def build() -> ImageTable:
-        face = np.empty((1, *shape), _face_dtype(grid))
-        u, v = np.empty((2, 1, *shape), dtype)
-        center = (grid.dim - 1) / 2
-        mesh = (_axes(grid), grid.neighbors, _inner_cosine(grid), 1 / grid.pitch, center)
-        rays = kernels.directions_of_rows(*shape)
-        over_rows(kernels.owner_table, shape, *mesh, *rays, face[0], u[0], v[0])
-        return ImageTable(face, u, v, None)
-
-    return _cached(grid, ("owner", shape, dtype), build, lambda table: table.nbytes)
-
-
-def feather_table(
-    grid: PinholeGrid, shape: tuple[int, int], dtype: np.dtype[np.floating], rows: slice
-) -> ImageTable:
-    """All images that see the ERP pixels of some rows; kept where they are all rows.
+    """The images that give something to the ERP pixels of some rows, and where they see them.
 
     Args:
         grid: The images.
         shape: ``(H, W)`` of the ERP.
         dtype: Of positions and weights, float32 or float64; computed in float64 either way.
+        blend: ``nearest``: the owner of every pixel, R = 1. ``feather``: R is the largest number of
+            images that see a pixel.
         rows: The rows, without a step.
+    """
+    columns, lines = kernels.sphere_rays(shape)
+    part = owners(grid, shape)[rows] if blend == "nearest" else np.empty((0, 0), np.uint8)
+    size = (rows.stop - rows.start, shape[1])
+    views = views_of_rays(grid, None), spans(grid, None, shape, rows), columns, lines[rows], part
+    count = np.zeros(size, np.int32)
+    for ranks in (0, None):
+        table = (int(count.max()) if ranks is None else 0, *size)
+        count[:] = 0
+        face = np.zeros(table, np.int16 if grid.num_images < 2**15 else np.int32)
+        u, v, weight = np.zeros((3, *table), dtype)
+        arguments = ((grid.dim, grid.dim), *views, count, face, u, v, weight)
+        over_rows(kernels.seen_table, *size, *arguments)
+    # Pixels that fewer images see take their first one again, with weight 0.
+    unused = np.arange(len(face))[:, None, None] >= count
+    face, u, v = (np.where(unused, line[:1], line) for line in (face, u, v))
+    return ImageTable(face, u, v, weight / weight.sum(axis=0))
+
+
+def views_of_rays(grid: PinholeGrid, faces: NDArray[np.int64] | None) -> NDArray[np.float64]:
+    """``(n, 3, 3)`` from directions to homogeneous pixels of images, default all."""
+    axes = grid.world_from_camera[grid.face_indices(faces)]
+    return np.ascontiguousarray(grid.camera_matrix @ axes.transpose(0, 2, 1))
+
+
+def spans(
+    grid: PinholeGrid, faces: NDArray[np.int64] | None, shape: tuple[int, int], rows: slice
+) -> NDArray[np.int32]:
+    """Columns of ERP rows that may see something of images: within their corners' angle.
+
+    Args:
+        grid: The images.
+        faces: Those asked for, default all.
+        shape: ``(H, W)`` of the ERP.
+        rows: Its rows.
 
     Returns:
-        A table of these rows, R the largest number of images that see one of its pixels.
+        ``(n, rows, 2)`` first column and number of columns, across ±180°.
     """
-
-    def build() -> ImageTable:
-        owners, near, axes, focal, power, columns, lines = feather_arguments(grid, shape)
-        part = owners[rows]
-        arguments = (part, near, axes, focal, grid.dim / 2, power, columns, lines[rows])
-        count = np.zeros(part.shape, np.int32)
-        for ranks in (0, None):
-            size = (count.max(initial=0) if ranks is None else ranks, *part.shape)
-            count[:] = 0
-            face, (u, v) = np.empty(size, owners.dtype), np.empty((2, *size), dtype)
-            weight = np.zeros(size, dtype)
-            over_rows(
-                feather_kernels.feather_table, part.shape, *arguments, count, face, u, v, weight
-            )
-        return ImageTable(face, u, v, weight)
-
-    if (rows.start, rows.stop) != (0, shape[0]):
-        return build()
-    return _cached(grid, ("feather", shape, dtype), build, lambda table: table.nbytes)
-
-
-def feather_arguments(grid: PinholeGrid, shape: tuple[int, int]) -> tuple[Any, ...]:
-    """Owners, near images, axes, focal length, power, columns and rows, for the kernels."""
-    owners, axes, focal, *rays = owner_arguments(grid, shape)
-    return owners, _near_images(grid), axes, focal, FEATHER_POWER, *rays
-
-
-def owner_arguments(grid: PinholeGrid, shape: tuple[int, int]) -> tuple[Any, ...]:
-    """Owners, axes, focal length, columns and rows, for the kernels."""
-    owners = owner_table(grid, shape, np.dtype(np.float32)).face[0]
-    return owners, _axes(grid), 1 / grid.pitch, *kernels.directions_of_rows(*shape)
+    width = shape[1]
+    reach = np.arctan(np.sqrt(2) * grid.dim / 2 * grid.pitch)
+    lon, lat = xyz_to_lonlat(grid.centers_xyz[grid.face_indices(faces)]).T[..., None]
+    row_lat = equirect_latitudes(shape[0])[rows]
+    # cos(reach) = sin φ sin φ₀ + cos φ cos φ₀ cos(λ − λ₀)
+    across = np.maximum(np.cos(row_lat) * np.cos(lat), 1e-12)
+    cosine = (np.cos(reach) - np.sin(row_lat) * np.sin(lat)) / across
+    spread = np.arccos(cosine.clip(-1, 1)) / (2 * np.pi) * width
+    first = np.floor((lon / (2 * np.pi) + 0.5) * width - spread) - 1
+    count = np.where(cosine > 1 + 1e-9, 0, np.minimum(width, np.ceil(2 * spread) + 3))
+    return np.stack([first % width, count], axis=-1).astype(np.int32)
 
 
 def tensors_on(
@@ -256,7 +237,7 @@ def tensors_on(
     key: tuple[Hashable, ...] | None,
     build: Callable[[], tuple[NDArray[Any], ...]],
 ) -> tuple[Tensor, ...]:
-    """Tables as tensors: shared with NumPy on the CPU, copied once to any other device.
+    """Tables as tensors, kept; on the CPU they share the memory of the arrays.
 
     Args:
         device: Where they are needed.
@@ -268,21 +249,7 @@ def tensors_on(
     def tensors() -> tuple[Tensor, ...]:
         return tuple(torch.from_numpy(part).to(device) for part in build())
 
-    if device.type == "cpu" or key is None:
-        return tensors()
-    key = ("tensors", device, *key)
-    return _cached(grid, key, tensors, lambda parts: sum(part.nbytes for part in parts))
-
-
-def _axes(grid: PinholeGrid) -> NDArray[np.float64]:
-    return np.ascontiguousarray(grid.world_from_camera)
-
-
-def _face_dtype(grid: PinholeGrid) -> type[np.integer]:
-    """The smallest integer for face indices that torch can convert (it hardly knows uint16)."""
-    return next(
-        kind for kind in (np.uint8, np.int16, np.int32) if grid.num_images <= np.iinfo(kind).max + 1
-    )
+    return tensors() if key is None else _cached(grid, ("tensors", device, *key), tensors)
 
 
 def _inner_cosine(grid: PinholeGrid) -> float:
@@ -291,21 +258,3 @@ def _inner_cosine(grid: PinholeGrid) -> float:
     cosines = np.einsum("nkc,nc->nk", centers[around], centers)
     others = around != np.arange(grid.num_images)[:, None]
     return float(np.cos(np.arccos(cosines[others].max()) / 2))
-
-
-def _near_images(grid: PinholeGrid) -> NDArray[np.int32]:
-    """``(N, M)`` images that can see something a face owns, filled up with −1.
-
-    What a face owns and what an image sees both lie inside an image's corners.
-    """
-
-    def build() -> NDArray[np.int32]:
-        corner = np.arctan(np.sqrt(2) * grid.dim / 2 * grid.pitch)
-        closest = np.cos(min(2 * corner, np.pi))
-        rows = [np.flatnonzero(grid.centers_xyz @ center >= closest) for center in grid.centers_xyz]
-        near = np.full((len(rows), max(map(len, rows))), -1, np.int32)
-        for face, images in enumerate(rows):
-            near[face, : len(images)] = images
-        return near
-
-    return _cached(grid, ("near",), build, lambda near: near.nbytes)

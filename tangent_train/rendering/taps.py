@@ -79,7 +79,7 @@ def nearest_equirect_index(u: Tensor, v: Tensor, shape: tuple[int, int]) -> Tens
 
 
 def image_taps(
-    face: Tensor, u: Tensor, v: Tensor, dim: int, weight: Tensor | None, image_size: int
+    face: Tensor, u: Tensor, v: Tensor, dim: int, weight: Tensor, image_size: int
 ) -> Taps:
     """Bilinear taps in tangent images; positions off the outermost pixel centres move onto them.
 
@@ -88,7 +88,7 @@ def image_taps(
         u: ``(R, P)`` columns in the images.
         v: ``(R, P)`` rows in the images.
         dim: Side d of the images.
-        weight: ``(R, P)`` weights of the images, or None for 1.
+        weight: ``(R, P)`` weights of the images.
         image_size: Values between the starts of two images in the flat source.
 
     Returns:
@@ -101,9 +101,7 @@ def image_taps(
     index = torch.cat([first, first + 1, first + dim, first + dim + 1])
     above, before = 1 - below, 1 - right
     weights = [above * before, above * right, below * before, below * right]
-    if weight is not None:
-        weights = [part * weight for part in weights]
-    return Taps(index, torch.cat(weights))
+    return Taps(index, torch.cat([part * weight for part in weights]))
 
 
 def nearest_image_index(face: Tensor, u: Tensor, v: Tensor, dim: int) -> Tensor:

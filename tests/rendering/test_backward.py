@@ -13,11 +13,9 @@ from tangent_train.geometry import CubeGrid, TangentGrid, equirect_directions, r
 from tangent_train.geometry.resized_grid import ResizedGrid
 from tangent_train.rendering import (
     equirect_to_tangent,
-    feathering,
     tangent_to_equirect,
     tangent_to_labels,
 )
-from tangent_train.rendering.taps import nearest_image_index
 from tests.rendering.reference import ReferenceGrid
 
 BLENDS: list[Any] = ["nearest", "feather"]
@@ -33,13 +31,6 @@ def test_arrays_that_float32_cannot_hold_are_exact(blend: Any, value: Any) -> No
     panorama = tangent_to_equirect(images, TangentGrid(0, 5), (32, 64), blend)
     assert panorama.dtype == value.dtype
     np.testing.assert_allclose(panorama, value, rtol=1e-12)
-
-
-def test_positions_off_the_outermost_centres_are_those_of_the_edge() -> None:
-    places = torch.tensor([-0.7, -0.5, 0.4, 1.5, 2.5, 3.4, 3.7])
-    index = nearest_image_index(torch.full((7,), 2), places, places.flip(0), 4)
-    columns, rows = [0, 0, 0, 2, 2, 3, 3], [3, 3, 2, 2, 0, 0, 0]
-    assert index.tolist() == [(2 * 4 + r) * 4 + c for r, c in zip(rows, columns, strict=True)]
 
 
 @pytest.mark.parametrize("blend", BLENDS)
@@ -245,7 +236,7 @@ def test_nearest_errors(images: Any, grid: Any, arguments: dict[str, Any], messa
 def test_feathered_arrays_are_the_reference_s(
     grid: TangentGrid, shape: tuple[int, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(feathering, "_BAND_PIXELS", 10 * shape[1] + 3)
+    monkeypatch.setattr("tangent_train.rendering.backward._BAND", 10 * shape[1] + 3)
     turn = np.eye(3) if grid.rotation is None else grid.rotation
     reference = ReferenceGrid(grid.base_level, grid.level, grid.dim, turn)
     images = np.random.default_rng(0).random((grid.num_images, grid.dim, grid.dim, 2))
@@ -329,8 +320,3 @@ def test_gradients(blend: Any) -> None:
 def test_errors(render: Any, images: Any, shape: Any, blend: Any, message: str) -> None:
     with pytest.raises(SettingError, match=message):
         render(images, TangentGrid(0, 4), shape, blend)
-
-
-def test_scores_need_a_class() -> None:
-    with pytest.raises(SettingError, match="no class"):
-        tangent_to_labels(np.zeros((20, 0, 16, 16), np.float32), TangentGrid(0, 4), (8, 16))

@@ -145,29 +145,19 @@ def test_labels_are_the_best_interpolated_scores(case: Case, num_classes: int) -
         np.testing.assert_array_equal(labels[certain], rendered.argmax(axis=-1)[certain])
 
 
-@pytest.mark.parametrize("case", [case for case in CASES if case.dim >= 16], ids=str)
-def test_compiled_labels_are_those_of_torch(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
-    """On the edges of the cube too, where either face may be the owner, but the same for both."""
-    scores = torch.from_numpy(noise(2, 6, 7, case.dim, case.dim)).float()
-    compiled = tangent_to_labels(scores, case.ours, case.shape)
-    monkeypatch.setattr("tangent_train.rendering.label_kernels.LANES", 10**6)
-    plain = tangent_to_labels(scores, case.ours, case.shape)
-    assert (compiled == plain).double().mean() > 0.999, "all but ties of rounding"
-
-
-@pytest.mark.parametrize("shape", [(6, 12), (10, 20), (33, 67), (64, 128)])
-@pytest.mark.parametrize("dim", [2, 9, 16, 25])
+@pytest.mark.parametrize("shape", [(6, 12), (33, 67)])
+@pytest.mark.parametrize("dim", [2, 9, 16])
 def test_up_to_the_edge_a_pixel_takes_the_values_of_its_owner_alone(
     dim: int, shape: tuple[int, int]
 ) -> None:
     """Beyond the outermost pixel centres, the outermost pixels go on: no mixing, no NaN."""
     grid = CubeGrid(dim)
-    table = tables.owner_table(grid, shape, np.dtype(np.float64))
+    table = tables.image_table(grid, shape, np.dtype(np.float64), "nearest", slice(0, shape[0]))
     reach = np.abs(np.stack([table.u, table.v]) - (dim - 1) / 2).max()
     assert (dim - 1) / 2 < reach <= dim / 2 + 1e-9, "some are between centre and edge"
     images = torch.arange(1.0, 7.0)[:, None, None, None].expand(6, 1, dim, dim)
     panorama = tangent_to_equirect(images, grid, shape)[0].numpy()
-    np.testing.assert_allclose(panorama, table.face[0] + 1, atol=1e-5)
+    np.testing.assert_allclose(panorama, table.face[0] + 1.0, atol=1e-5)
     scores = torch.eye(6)[:, :, None, None].expand(6, 6, dim, dim)
     for kind in (torch.float32, torch.float64):  # compiled and torch
         labels = tangent_to_labels(scores.to(kind), grid, shape).numpy()
@@ -191,7 +181,7 @@ def test_smooth_panorama_survives_the_round_trip(
     between = 30 * np.hypot(2 * np.pi / shape[1], grid.pitch) ** 2 / 8
     # Within half a pixel of an edge the outermost pixel is repeated: f′ up to 3 each way.
     assert error.max() < between + 6 * grid.pitch / 2
-    table = tables.owner_table(grid, shape, np.dtype(np.float64))
+    table = tables.image_table(grid, shape, np.dtype(np.float64), "nearest", slice(0, shape[0]))
     inner = (np.abs(np.stack([table.u, table.v]) - (dim - 1) / 2) < (dim - 1) / 2).all(axis=(0, 1))
     assert inner.mean() > 0.9
     assert error[inner].max() < between

@@ -99,6 +99,14 @@ def test_nearest_takes_the_nearest_pixel(dtype: Any) -> None:
     np.testing.assert_array_equal(tensor.movedim(1, -1).numpy(), found)
 
 
+def _sampled(image: Array, u: Any, v: Any, interpolation: Any = "bilinear") -> Array:
+    u, v = (np.atleast_2d(np.asarray(line, np.float32)) for line in (u, v))
+    out = np.empty((*u.shape, *image.shape[2:]), image.dtype)
+    polar = np.flatnonzero((v < 0) | (v > len(image) - 1))
+    sampling.sample_map(sampling.EquirectMap(u, v, polar), image, interpolation, out)
+    return out
+
+
 @pytest.mark.parametrize("dtype", [np.uint8, np.float32])
 @pytest.mark.parametrize("shape", [(1, 2), (2, 3), (5, 11), (64, 128)])
 def test_colors_equal_exact_values_everywhere(shape: tuple[int, int], dtype: Any) -> None:
@@ -106,39 +114,20 @@ def test_colors_equal_exact_values_everywhere(shape: tuple[int, int], dtype: Any
     image = _random((*shape, 3), dtype)
     image.flags.writeable = False
     rng = np.random.default_rng(0)
-    u = rng.uniform(-0.5, width - 0.5, (50, 40)).astype(np.float32)
-    v = rng.uniform(-0.5, height - 0.5, (50, 40)).astype(np.float32)
+    u = rng.uniform(-0.5, width - 0.5, (50, 40))
+    v = rng.uniform(-0.5, height - 0.5, (50, 40))
     u[:2] = np.resize([-0.5, 0, width - 1, width - 0.5], 40)
     v[:2] = np.resize([-0.5, 0, 0.25, height - 1, height - 0.5], 40)
-    table = sampling.EquirectMap(u, v, shape)
-    found, exact = np.empty((50, 40, 3), dtype), np.empty((50, 40, 3))
-    table.sample(image, "bilinear", found)
-    table.sample(image.astype(np.float64), "bilinear", exact)
-    assert np.abs(found - exact).max() <= (0.5 + 1e-4 if dtype == np.uint8 else 1e-5)
+    error = _sampled(image, u, v) - _sampled(image.astype(np.float64), u, v)
+    assert np.abs(error).max() <= (0.5 + 1e-4 if dtype == np.uint8 else 1e-5)
 
 
-def test_infinite_colors_stay_where_they_are() -> None:
-    image = np.zeros((8, 16, 3), np.float32)
-    image[3, 5:7], image[3, 9, 1] = np.inf, np.nan
-    u = np.array([[5.5, 4.5, 8.5, 7.5, 2]], np.float32)
-    out = np.empty((1, 5, 3), np.float32)
-    sampling.EquirectMap(u, np.full_like(u, 3), (8, 16)).sample(image, "bilinear", out)
-    np.testing.assert_array_equal(out[0, :, 0], [np.inf, np.inf, 0, 0, 0])
-    np.testing.assert_array_equal(out[0, :, 1], [np.inf, np.inf, np.nan, 0, 0])
-
-
-@pytest.mark.parametrize("kernels", [2**31, 0])
 @pytest.mark.parametrize("remap", [32767, 0])
-def test_nearest_wraps_at_the_seam(
-    monkeypatch: pytest.MonkeyPatch, kernels: int, remap: int
-) -> None:
-    monkeypatch.setattr(sampling, "_KERNEL_LIMIT", kernels)
+def test_nearest_wraps_at_the_seam(monkeypatch: pytest.MonkeyPatch, remap: int) -> None:
     monkeypatch.setattr(sampling, "_REMAP_LIMIT", remap)
-    u = np.array([[-0.6, -0.4, 31.4, 31.6]], np.float32)
-    table = sampling.EquirectMap(u, np.array([[-0.5, 0, 3, 3.5]], np.float32), (4, 32))
-    out = np.empty((1, 4), np.int16)
-    table.sample(np.arange(128, dtype=np.int16).reshape(4, 32), "nearest", out)
-    np.testing.assert_array_equal(out, [[31, 0, 127, 96]])
+    image = np.arange(128, dtype=np.int16).reshape(4, 32)
+    found = _sampled(image, [-0.6, -0.4, 31.4, 31.6], [-0.5, 0, 3, 3.5], "nearest")
+    np.testing.assert_array_equal(found, [[31, 0, 127, 96]])
 
 
 def test_rows_beyond_a_pole_reflect_with_a_half_turn() -> None:
@@ -146,16 +135,11 @@ def test_rows_beyond_a_pole_reflect_with_a_half_turn() -> None:
     # and its reflection.
     image = np.zeros((8, 4))
     image[0] = [1, 2, 4, 8]
-    overhead = sampling.EquirectMap(np.array([[0.0, 1.0]]), np.array([[-0.5, -0.25]]), (8, 4))
-    out = np.empty((1, 2))
-    overhead.sample(image, "bilinear", out)
-    np.testing.assert_allclose(out, [[(1 + 4) / 2, 0.75 * 2 + 0.25 * 8]])
-    odd = sampling.EquirectMap(np.array([[0.0]]), np.array([[7.5]]), (8, 5))
+    found = _sampled(image, [0.0, 1.0], [-0.5, -0.25])
+    np.testing.assert_allclose(found, [[(1 + 4) / 2, 0.75 * 2 + 0.25 * 8]])
     image = np.zeros((8, 5))
     image[7] = [1, 2, 4, 8, 16]
-    out = np.empty((1, 1))
-    odd.sample(image, "bilinear", out)
-    np.testing.assert_allclose(out, [[(1 + (4 + 8) / 2) / 2]])
+    np.testing.assert_allclose(_sampled(image, 0, 7.5), [[(1 + (4 + 8) / 2) / 2]])
 
 
 @pytest.mark.parametrize("interpolation", ["bilinear", "nearest"])
@@ -167,20 +151,9 @@ def test_panoramas_too_large_for_opencv(
     expected = equirect_to_tangent(image, grid, interpolation=interpolation)
     monkeypatch.setattr(sampling, "_REMAP_LIMIT", 64)
     monkeypatch.setattr(sampling, "_BLOCK", 100)
+    monkeypatch.setattr("cv2.remap", None)
     found = equirect_to_tangent(image, grid, interpolation=interpolation)
     np.testing.assert_allclose(found, expected, atol=1 if dtype == np.uint8 else 1e-5)
-
-
-@pytest.mark.parametrize("interpolation", ["bilinear", "nearest"])
-def test_opencv_is_not_asked_at_its_limit(
-    monkeypatch: pytest.MonkeyPatch, interpolation: Any
-) -> None:
-    image, place = np.arange(128, dtype=np.uint8).reshape(4, 32), np.ones((1, 1), np.float32)
-    monkeypatch.setattr(sampling, "_REMAP_LIMIT", 32)
-    monkeypatch.setattr("cv2.remap", None)
-    out = np.empty((1, 1), np.uint8)
-    sampling.EquirectMap(place, place, (4, 32)).sample(image, interpolation, out)
-    assert out.item() == 33
 
 
 def test_a_smaller_dim_is_the_centre_crop() -> None:
@@ -244,20 +217,11 @@ def test_errors(image: Any, arguments: dict[str, Any], message: str) -> None:
         equirect_to_tangent(image, TangentGrid(0, 4), **arguments)
 
 
-@pytest.mark.parametrize("channels", [1, 2, 3, 5, 6, 7])
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
-def test_small_images_together_are_those_rendered_one_by_one(channels: int, dtype: Any) -> None:
-    rng = np.random.default_rng(0)
-    image = (rng.random((32, 64, channels)) * 250).astype(dtype)
-    turn = random_rotation(rng)
-    for grid in (TangentGrid(0, 4), TangentGrid(2, 4), TangentGrid(1, 5, rotation=turn)):
+@pytest.mark.parametrize("channels", [1, 6])
+def test_small_images_together_are_those_rendered_one_by_one(channels: int) -> None:
+    image = _random((32, 64, channels), np.uint8)
+    for grid in (TangentGrid(2, 4), TURNED):
         together = equirect_to_tangent(image, grid)
-        for face in range(grid.num_images):
-            alone = equirect_to_tangent(image, grid.with_rotation(grid.rotation), [face])[0]
+        for face in range(0, grid.num_images, 7):
+            alone = equirect_to_tangent(image, grid, [face])[0]
             np.testing.assert_array_equal(together[face], alone)
-        for channel in range(channels):
-            plain = equirect_to_tangent(image[..., channel], grid)
-            tolerance = 1 if dtype != np.float32 else 1e-3
-            np.testing.assert_allclose(
-                together[..., channel].astype(float), plain.astype(float), atol=tolerance
-            )

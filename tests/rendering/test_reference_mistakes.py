@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from tangent_train.geometry import TangentGrid, equirect_shape, xyz_to_lonlat
 from tangent_train.rendering import (
     equirect_to_tangent,
-    tables,
-    tangent_to_equirect,
     tangent_to_labels,
 )
 from tests.rendering.reference import panorama_lonlat, to_xyz
@@ -96,24 +94,3 @@ def test_7_scores_rendered_back_are_finer_than_label_maps() -> None:
     )
     assert wrong_scores < 0.25 * wrong_maps
     assert wrong_scores < 0.01
-
-
-def test_8_tables_are_made_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    def render(shape: tuple[int, int]) -> list[NDArray[np.generic]]:
-        grid = TangentGrid(0, 4, 15)  # a new, equal grid every time
-        panorama = np.random.default_rng(0).random((*shape, 3), np.float32)
-        images = torch.from_numpy(equirect_to_tangent(panorama, grid)).permute(0, 3, 1, 2)
-        labels = [tangent_to_labels(images, grid, shape, blend) for blend in ("nearest", "feather")]
-        both = [tangent_to_equirect(images, grid, shape, blend) for blend in ("nearest", "feather")]
-        return [images.numpy(), *(result.numpy() for result in labels + both)]
-
-    def made_again(*_: object) -> None:
-        pytest.fail("a table was made again")
-
-    first = render((40, 80))
-    for maker in ("over_rows", "pinhole_equirect_map"):
-        monkeypatch.setattr(tables, maker, made_again)
-    for result, before in zip(render((40, 80)), first, strict=True):
-        np.testing.assert_array_equal(result, before)
-    with pytest.raises(pytest.fail.Exception, match="made again"):
-        render((40, 82))

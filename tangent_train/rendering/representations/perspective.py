@@ -83,6 +83,15 @@ class PhotoCrops:
         )
         return down[:, :, None] & across[:, None, :]
 
+    def owners(self, shape: tuple[int, int]) -> NDArray[np.int32]:
+        """Which crop's centre is nearest to each pixel of the photo, ``(H, W)``."""
+        height, width = shape
+        edges = np.ceil(self.cells() - 0.5).clip(0, (width, height, width, height)).astype(int)
+        owner = np.zeros(shape, np.int32)
+        for number, (left, top, right, bottom) in enumerate(edges):
+            owner[top:bottom, left:right] = number
+        return owner
+
     def cells(self) -> NDArray[np.float64]:
         """The part of the photo that lies nearer to a crop's centre than to any other's.
 
@@ -219,11 +228,11 @@ class PerspectiveRepresentation:
                 "representation.fov_deg", found=fov_deg, expected="more than 0 and less than 180"
             )
         wider = math.tan(math.radians(fov_deg) / 2) / math.tan(math.radians(_PAPER_FOV_DEG) / 2)
-        dim = max(1, round(2 ** (level - 1) * wider)) if dim is None else dim
+        dim = max(2, round(2 ** (level - 1) * wider)) if dim is None else dim
         sides = (dim, dim) if isinstance(dim, int) else tuple(dim)
-        if len(sides) != 2 or min(sides) < 1:
+        if len(sides) != 2 or min(sides) < 2:
             raise SettingError(
-                "representation.dim", found=dim, expected="1 or more, or [height, width]"
+                "representation.dim", found=dim, expected="2 or more, or [height, width]"
             )
         self.image_size = sides[0], sides[1]
         if crops_per_photo < 1:
