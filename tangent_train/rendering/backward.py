@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from typing import Literal, TypeVar, overload
 
 import numpy as np
@@ -219,9 +220,8 @@ def _bands(
         # Tables of feathering are large: those of many bands are not kept.
         kept = blend == "nearest" or step == height
         key = (blend, shape, dtype, rows.start, rows.stop) if kept else None
-        table = tensors_on(
-            device, grid, key, lambda rows=rows: image_table(grid, shape, dtype, blend, rows)
-        )
+        build = partial(image_table, grid, shape, dtype, blend, rows)
+        table = tensors_on(device, grid, key, build)
         yield tuple(part.reshape(len(part), -1) for part in table)
 
 

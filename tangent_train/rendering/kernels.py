@@ -252,7 +252,7 @@ def _split(
         first = min(np.int32(place), np.int32(count - 2))
         whole[p], share[p] = first, place - first
         least, greatest = min(least, first), max(greatest, first)
-    return least, greatest
+    return int(least), int(greatest)
 
 
 @njit_fast

@@ -125,8 +125,9 @@ class ScoreMosaic:
 
     def probabilities(self, rows: slice | NDArray[np.intp]) -> NDArray[np.float32]:
         """``(h, W, K)`` probabilities of some rows, which add up to 1; only where averaged."""
-        total = self._total[rows]
-        return total[..., :-1] / np.maximum(total[..., -1:], np.finfo(np.float32).tiny)
+        total: NDArray[np.float32] = self._total[rows]
+        weight: NDArray[np.float32] = np.maximum(total[..., -1:], np.float32(1e-37))
+        return total[..., :-1] / weight
 
     def _prepared(self, scores: Tensor) -> NDArray[np.float32]:
         """``(n, K, h, w)`` on the CPU; feathered are probabilities, as in evaluation."""
