@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from http.client import HTTPException
 from pathlib import Path
 from typing import Any
@@ -20,9 +20,7 @@ _PREFIX = "network."
 """Begins the names of the network's tensors in a checkpoint of this package."""
 
 _COUNTER = "num_batches_tracked"
-"""Of batch normalization. Files from before it was introduced lack it; nothing here uses it."""
-
-_NAMED = 3
+"""Of batch normalization; older files lack it, and nothing here uses it."""
 
 
 def read_tensors(path: Path) -> dict[str, Tensor]:
@@ -36,14 +34,15 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
         DataError: There is no such file, or it holds something else.
     """
     expected = "a state dict of tensors, or a checkpoint with one"
-    if not path.is_file():
-        raise DataError(path, found="no such file", expected=expected)
     try:
-        content = _read(path)
+        if path.suffix == ".safetensors":
+            content: Any = load_file(path)
+        else:
+            content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:
-        first_line = str(error).partition("\n")[0]
+        found = f"an unreadable file ({str(error).partition(chr(10))[0]})"
         raise DataError(
-            path, found=f"an unreadable file ({first_line})", expected=expected
+            path, found=found if path.is_file() else "no such file", expected=expected
         ) from error
     if isinstance(content, dict) and isinstance(content.get("state_dict"), dict):
         inside = content["state_dict"]
@@ -56,12 +55,6 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
     ):
         raise DataError(path, found="something else", expected=expected)
     return dict(content)
-
-
-def _read(path: Path) -> Any:
-    if path.suffix == ".safetensors":
-        return load_file(path)
-    return torch.load(path, map_location="cpu", weights_only=True)
 
 
 def fetch_tensors(weights: WeightsEnum) -> dict[str, Tensor]:
@@ -87,39 +80,24 @@ def fetch_tensors(weights: WeightsEnum) -> dict[str, Tensor]:
 def load_tensors(
     network: nn.Module, tensors: Mapping[str, Tensor], source: object, fresh: str
 ) -> None:
-    """Load a network's tensors: every one must be there and fit, or none is loaded.
+    """Load a network's tensors; every one must be there and fit.
 
     Args:
         network: Into which.
         tensors: Names and values.
         source: Where they come from, for the message.
-        fresh: What the names of those tensors begin with that are not loaded.
+        fresh: Prefix of the names of tensors that are not loaded.
 
     Raises:
-        DataError: Tensors are missing, unexpected or of another shape; they are named.
+        DataError: Tensors are missing, unexpected or of another shape.
     """
-    own = network.state_dict()
-    wanted = {n: t for n, t in own.items() if not n.startswith(fresh)}
-    problems = {
-        "missing": [n for n in wanted if n not in tensors and not n.endswith(_COUNTER)],
-        "unexpected": [n for n in tensors if n not in wanted],
-        "of another shape": [
-            f"{n} {tuple(tensors[n].shape)} instead of {tuple(t.shape)}"
-            for n, t in wanted.items()
-            if n in tensors and tensors[n].shape != t.shape
-        ],
-    }
-    found = [f"{kind}: {_listed(names)}" for kind, names in problems.items() if names]
-    if found:
+    own = {n: t for n, t in network.state_dict().items() if n.startswith(fresh) or _COUNTER in n}
+    try:
+        network.load_state_dict({**own, **tensors})
+    except RuntimeError as error:
         raise DataError(
             source,
-            found="; ".join(found),
+            found=error,
             expected=f"the tensors of {type(network).__name__}",
             remedy="Are they of the same network with the same settings, its depth for example?",
-        )
-    network.load_state_dict({**own, **tensors})
-
-
-def _listed(names: Sequence[str]) -> str:
-    more = len(names) - _NAMED
-    return ", ".join(names[:_NAMED]) + (f" and {more} more" if more > 0 else "")
+        ) from error

@@ -5,14 +5,13 @@ from __future__ import annotations
 import math
 import sys
 import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
 
 from datamodules.images.image_files import find_images
@@ -27,7 +26,6 @@ from tangent_train.results.predictions import (
     Entry,
     PredictionFolder,
     class_shares,
-    mean_shares,
     output_names,
 )
 
@@ -41,8 +39,12 @@ if TYPE_CHECKING:
 
 __all__ = ["predict"]
 
-_OF_PANORAMAS = {"crop": None, "rotations": 1, "upright": None}
-_OF_PHOTOS = {"fov": None}
+_DECISIVE = (
+    "checkpoint", "depth_scale", "projection", "crop", "fov", "level", "base_level", "blend",
+    "rotations", "upright", "max_tilt_deg",
+)  # fmt: skip
+"""Settings that labels depend on: those of resumed predictions must be the same."""
+
 _SAVED_EVERY_S = 10.0
 """So much work is done again after a process was killed."""
 
@@ -73,19 +75,6 @@ class Settings:
     device: str
     trust: tuple[str, ...]
 
-    @property
-    def of_photos(self) -> bool:
-        """Whether the images are photos."""
-        return self.projection == "perspective"
-
-    def kept(self) -> dict[str, Any]:
-        """What decides the labels, as plain values: resumed predictions must agree in it."""
-        others = {"input", "output", "report", "overwrite", "resume", "images_per_forward"}
-        others |= {"device", "trust", "probabilities"}
-        values = {name: value for name, value in asdict(self).items() if name not in others}
-        plain = {n: str(v) if isinstance(v, Path) else v for n, v in values.items()}
-        return plain | {"crop": self.crop and list(self.crop)}
-
 
 def predict(config: Mapping[str, Any]) -> None:
     """Predict the labels of images and write what was found.
@@ -98,14 +87,14 @@ def predict(config: Mapping[str, Any]) -> None:
         DataError: The checkpoint cannot be read, or there are no images.
     """
     settings = typed(Settings, config)
-    _check_projection(settings)
+    decisive = {name: config[name] for name in _DECISIVE}
     images = _find_images(settings)
     trained = load_trained(settings.checkpoint, settings.trust)
     folder = PredictionFolder(settings.output, trained.class_names, settings.probabilities)
     label = _Labeller(
         settings, _predictor(settings, trained), _depth_folder(settings, trained), folder
     )
-    earlier = folder.earlier(settings.kept()) if settings.resume else {}
+    earlier = folder.earlier(decisive) if settings.resume else {}
     if not (settings.overwrite or earlier):
         folder.check(images)
     entries = [entry for name, entry in earlier.items() if name in images]
@@ -117,16 +106,16 @@ def predict(config: Mapping[str, Any]) -> None:
             file = {"file": str(missing[name]), "name": name}
             entries.append(file | (entry or {"error": error}))
             if time.monotonic() - saved > _SAVED_EVERY_S:
-                _save(folder, settings, entries)
+                _save(folder, decisive, entries)
                 saved = time.monotonic()
     except KeyboardInterrupt:
         _say(f"{len(entries)} of {len(images)} images are done. resume=true goes on.")
         raise
     finally:
-        _save(folder, settings, entries)
+        _save(folder, decisive, entries)
     if label.shown:
         folder.write_page(entries, label.shown)
-    _say(_shares_table(mean_shares(entries, trained.class_names)))
+    _say(folder.mean_shares(entries).terminal())
     _say(f"Results are in {settings.output}.")
     failed = sum("error" in entry for entry in entries)
     if failed:
@@ -169,24 +158,14 @@ class _Labeller:
 
     def _read(self, name: str, path: Path) -> tuple[InputImage, PanoramaArea | None]:
         given = self.settings
-        if given.of_photos:
+        if given.projection == "perspective":
             return read_photo(path, name, self.depth, given.fov), None
         return read_panorama(path, name, self.depth, given.crop, given.upright, given.max_tilt_deg)
 
 
-def _save(folder: PredictionFolder, settings: Settings, entries: list[Entry]) -> None:
+def _save(folder: PredictionFolder, settings: Mapping[str, Any], entries: list[Entry]) -> None:
     if any("classes" in entry for entry in entries):  # else nothing is in the way of another try
-        folder.write_summary(settings.kept(), entries)
-
-
-def _check_projection(settings: Settings) -> None:
-    for name, default in (_OF_PANORAMAS if settings.of_photos else _OF_PHOTOS).items():
-        if getattr(settings, name) != default:
-            raise SettingError(
-                name,
-                found=getattr(settings, name),
-                expected=f"{default or 'null'} with projection={settings.projection}",
-            )
+        folder.write_summary(settings, entries)
 
 
 def _find_images(settings: Settings) -> dict[str, Path]:
@@ -205,7 +184,7 @@ def _find_images(settings: Settings) -> dict[str, Path]:
 def _predictor(settings: Settings, trained: TrainedNetwork) -> Predictor:
     how = trained, settings.level, settings.base_level, settings.blend
     views: PhotoViews | PanoramaViews
-    if settings.of_photos:
+    if settings.projection == "perspective":
         views = PhotoViews(*how)
     else:
         views = PanoramaViews(*how, settings.rotations, upright=settings.upright is not None)
@@ -225,13 +204,6 @@ def _depth_folder(settings: Settings, trained: TrainedNetwork) -> DepthFolder | 
             f"takes {' and '.join(trained.inputs)}",
         )
     return None if folder is None else DepthFolder(folder, settings.depth_scale)
-
-
-def _shares_table(shares: Mapping[str, float]) -> Table:
-    table = Table("class", "solid angle %", title="Mean over the images")
-    for name, share in sorted(shares.items(), key=lambda item: -item[1]):
-        table.add_row(escape(name), f"{100 * share:.1f}")
-    return table
 
 
 def _say(content: str | Table) -> None:

@@ -20,19 +20,18 @@ __all__ = ["tangent_figure"]
 
 _Image = NDArray[np.uint8]
 
-_PANORAMA = (370, 740)
-_MONTAGE_WIDTH = 1150
+_WIDTH = 1600
 _GAP = 4
-_LEAST_SIDE = 16
-_LEAST_WITH_CELLS = 80
+_LEAST_SIDE = 12
+_LEAST_WITH_CELLS = 70
 """Smaller images show no cells."""
 
 
 def tangent_figure(panorama: NDArray[np.generic], grid: TangentGrid) -> _Image:
     """Draw the paper's teaser for one panorama.
 
-    On the left the panorama, on the right all tangent images, in rows of 5·2^b by latitude, sorted
-    by longitude; on both the borders of the cells that the images own, at base level 0 numbered.
+    Above the panorama, below all tangent images, in rows of 10·2^b by latitude, sorted by
+    longitude; on both the borders of the cells that the images own, at base level 0 numbered.
 
     Args:
         panorama: ``(H, W)`` or ``(H, W, 3)``, uint8 or uint16.
@@ -45,29 +44,28 @@ def tangent_figure(panorama: NDArray[np.generic], grid: TangentGrid) -> _Image:
         SettingError: The panorama is no image in grey or colours, or there are too many images.
     """
     image = _rgb(panorama)
-    columns = 5 * 2**grid.base_level
-    side = _MONTAGE_WIDTH // columns - _GAP
-    if side < _LEAST_SIDE:
+    columns, shape = 10 * 2**grid.base_level, (_WIDTH // 2, _WIDTH)
+    step = _WIDTH // columns
+    if step - _GAP < _LEAST_SIDE:
         raise SettingError("base_level", found=grid.base_level, expected="less, for a figure")
-    shown = cv2.resize(image, _PANORAMA[::-1], interpolation=cv2.INTER_AREA)
-    left = _with_borders(shown, grid.owners(equirect_directions(_PANORAMA)))
-    centers = lonlat_to_equirect(xyz_to_lonlat(grid.centers_xyz), _PANORAMA)
-    small = ResizedGrid(grid, side)
-    level_rows = min(image.shape[0], round(np.pi / small.pitch))
-    source = cv2.resize(image, (2 * level_rows, level_rows), interpolation=cv2.INTER_AREA)
-    right = np.full((len(centers) // columns * (side + _GAP), _MONTAGE_WIDTH, 3), 255, np.uint8)
+    shown = cv2.resize(image, shape[::-1], interpolation=cv2.INTER_AREA)
+    above = _with_borders(shown, grid.owners(equirect_directions(shape)))
+    below = np.full((grid.num_images // columns * step + _GAP, _WIDTH, 3), 255, np.uint8)
+    small = ResizedGrid(grid, step - _GAP)
+    rows = min(image.shape[0], round(np.pi / small.pitch))
+    source = cv2.resize(image, (2 * rows, rows), interpolation=cv2.INTER_AREA)
+    centers = lonlat_to_equirect(xyz_to_lonlat(grid.centers_xyz), shape)
     for place, face in enumerate(_reading_order(grid, columns)):
         (thumbnail,) = equirect_to_tangent(source, small, [face])
-        if side >= _LEAST_WITH_CELLS:
+        if small.dim >= _LEAST_WITH_CELLS:
             thumbnail = _with_borders(thumbnail, small.owners(small.directions([face])[0]) == face)
         if grid.base_level == 0:
-            _write_number(thumbnail, face, side / 2, side / 2)
-            _write_number(left, face, *centers[face])
-        y, x = (step * (side + _GAP) for step in divmod(place, columns))
-        right[y : y + side, x : x + side] = thumbnail
-    height = max(len(left), len(right))
-    gap = np.full((height, 2 * _GAP, 3), 255, np.uint8)
-    return np.hstack([_padded(left, height), gap, _padded(right, height)])
+            _write_number(thumbnail, face, small.dim / 2, small.dim / 2)
+            _write_number(above, face, *centers[face])
+        row, column = divmod(place, columns)
+        y, x = row * step + _GAP, column * step + _GAP // 2
+        below[y : y + small.dim, x : x + small.dim] = thumbnail
+    return np.vstack([above, below])
 
 
 def _rgb(panorama: NDArray[np.generic]) -> _Image:
@@ -102,7 +100,3 @@ def _write_number(image: _Image, number: int, x: float, y: float) -> None:
         cv2.putText(
             image, str(number), place, cv2.FONT_HERSHEY_SIMPLEX, 0.5, color, width, cv2.LINE_AA
         )
-
-
-def _padded(image: _Image, height: int) -> _Image:
-    return np.pad(image, ((0, height - len(image)), (0, 0), (0, 0)), constant_values=255)

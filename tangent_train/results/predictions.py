@@ -19,7 +19,7 @@ from tangent_train.geometry import equirect_solid_angles
 from tangent_train.json_text import parse_json
 from tangent_train.results.html import EncodedImage, ViewerImage, encode_image, write_report
 from tangent_train.results.pictures import colorize, overlay_picture
-from tangent_train.results.tables import Table
+from tangent_train.results.tables import Table, percent
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from tangent_train.inference.views import InputImage
     from tangent_train.rendering.mosaic import ScoreMosaic
 
-__all__ = ["Entry", "PredictionFolder", "class_shares", "mean_shares", "output_names"]
+__all__ = ["Entry", "PredictionFolder", "class_shares", "output_names"]
 
 _ROWS_AT_ONCE = 64
 _SUMMARY = "summary.json"
@@ -100,12 +100,6 @@ def _solid_angles(
     x = (np.arange(shape[1]) - cx) / fx
     for row in range(shape[0]):
         yield (1 + x**2 + ((row - cy) / fy) ** 2) ** -1.5
-
-
-def mean_shares(entries: Iterable[Entry], class_names: Sequence[str]) -> dict[str, float]:
-    """Mean over the images of `class_shares`."""
-    shares = [entry["classes"] for entry in entries if "classes" in entry]
-    return {name: sum(s[name] for s in shares) / max(1, len(shares)) for name in class_names[1:]}
 
 
 @dataclass(frozen=True)
@@ -219,7 +213,7 @@ class PredictionFolder:
         names = self.class_names[1:]
         values = {name: value for value, name in enumerate(names, start=1)}
         write_text(self.path / "classes.json", json.dumps(values, indent=1) + "\n")
-        content = {**settings, "classes": mean_shares(entries, self.class_names), "images": entries}
+        content = {**settings, "images": entries}
         write_text(self.path / _SUMMARY, json.dumps(content, indent=1) + "\n")
         columns = ("file", "rows", "columns")
         rows = [
@@ -227,6 +221,14 @@ class PredictionFolder:
             for e in entries
         ]
         write_text(self.path / "summary.csv", csv_text([*columns, *names, "error"], rows))
+
+    def mean_shares(self, entries: Sequence[Entry]) -> Table:
+        """Mean over the images of `class_shares`, the largest first."""
+        shares = [entry["classes"] for entry in entries if "classes" in entry]
+        count = max(1, len(shares))
+        mean = {name: sum(of[name] for of in shares) / count for name in self.class_names[1:]}
+        rows = [[n, percent(mean[n])] for n in sorted(mean, key=mean.__getitem__, reverse=True)]
+        return Table("Mean over the images", ["class", "solid angle, %"], rows)
 
     def viewer_image(
         self,
@@ -248,11 +250,7 @@ class PredictionFolder:
             entries: Of all images.
             shown: Some of them, to look at.
         """
-        names = self.class_names[1:]
-        rows = [(entry["name"], entry["classes"]) for entry in entries if "classes" in entry]
-        rows.append(("mean", mean_shares(entries, self.class_names)))
-        shares = [[name, *(f"{100 * classes[n]:.1f}" for n in names)] for name, classes in rows]
-        tables = [Table("Solid angle of the classes, %", ["image", *names], shares)]
+        tables = [self.mean_shares(entries)]
         failed = [[entry["name"], entry["error"]] for entry in entries if "error" in entry]
         if failed:
             tables.append(
@@ -264,5 +262,5 @@ class PredictionFolder:
             tables=tables,
             images=shown,
             class_names=self.class_names,
-            notes=[f"{len(shown)} of {len(rows) - 1} images are shown."],
+            notes=[f"{len(shown)} of {len(entries)} images are shown."],
         )

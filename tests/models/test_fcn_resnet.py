@@ -154,16 +154,19 @@ def _reshaped(state: State) -> State:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (_without, r"missing: backbone\.layer4\.2\.conv1\.weight, .* and 12 more; expected the te"),
-        (_with_more, r"found unexpected: backbone\.layer4\.3\.conv1\.weight; expected"),
-        (_reshaped, r"shape: classifier\.0\.weight \(5, 3\) instead of \(512, 2048, 3, 3\); exp"),
+        (_without, r'Missing key.*"backbone\.layer4\.2\.conv1\.weight"'),
+        (
+            _with_more,
+            r'Unexpected key.*"backbone\.layer4\.3\.conv1\.weight".*; expected the tensors',
+        ),
+        (_reshaped, r"size mismatch for classifier\.0\.weight"),
     ],
 )
 def test_tensors_that_do_not_fit_are_named(
     published: nn.Module, change: Callable[[State], State], message: str, tmp_path: Path
 ) -> None:
     torch.save(change(dict(published.state_dict())), tmp_path / "x.pth")
-    with pytest.raises(DataError, match=message):
+    with pytest.raises(DataError, match=f"(?s){message}"):
         FCNResNet(3, 14, 50, weights=tmp_path / "x.pth")
 
 
