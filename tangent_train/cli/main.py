@@ -37,7 +37,7 @@ _MODULES = {
     "keypoints": "keypoints",
     "predict": "predict",
     "render": "render",
-    "transfer": "transfer.command",
+    "transfer": "transfer",
 }
 """Where a command is, if not in `run`."""
 

@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from datamodules.synthshapes.generate import ShapeSettings, generate_shapes
 from tangent_train.cli.build import build
 from tangent_train.cli.compose import config_folder
-from tangent_train.cli.transfer.stages import folds_and_seeds, plan
+from tangent_train.cli.transfer_stages import Stage, plan
 from tangent_train.registry import make
 from tests.datamodules.synthia.synthia_format import write_panoramas, write_views
 
@@ -188,13 +188,18 @@ def _shrunk_transfer(config: DictConfig, roots: dict[str, Path]) -> dict[str, An
     return settings | photos
 
 
+def _first_stages(config: DictConfig, folder: Path) -> dict[str, Stage]:
+    stages = plan(config, folder, {})
+    return {stage.name: stage for stage in stages if stage.fold == stages[0].fold}
+
+
 @pytest.mark.parametrize("experiment", TRANSFERS)
 def test_every_transfer_composes_and_its_stages_take_a_step(
     experiment: str, photo_roots: dict[str, Path], tmp_path: Path
 ) -> None:
     config = _composed(experiment, "transfer")
     assert config.name == experiment
-    full = {stage.name: stage for stage in plan(config, tmp_path, *folds_and_seeds(config)[0], {})}
+    full = _first_stages(config, tmp_path)
     last = list(full)[-1]
     assert last.startswith("S-FT-")
     names = [_builds_at_full_size(OmegaConf.create(full[s].config)) for s in ("P", last)]
@@ -204,7 +209,7 @@ def test_every_transfer_composes_and_its_stages_take_a_step(
         config.data.frames = 2
     for setting, value in _shrunk_transfer(config, photo_roots).items():
         OmegaConf.update(config, setting, value)
-    small = {stage.name: stage for stage in plan(config, tmp_path, *folds_and_seeds(config)[0], {})}
+    small = _first_stages(config, tmp_path)
     for name in ("P", last):
         stage = OmegaConf.create(small[name].config)
         if "weights" in stage.network:

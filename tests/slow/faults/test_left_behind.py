@@ -163,7 +163,7 @@ sys.modules["fcntl"] = None
 del os.posix_fallocate
 import numpy as np
 from pathlib import Path
-from tangent_train.cli.transfer import stage_runs
+from tangent_train.cli import transfer_stages
 from tangent_train.files import reserve, write_text
 write_text(Path("a.txt"), "x")
 array = np.lib.format.open_memmap("a.npy", "w+", np.float32, (100_000,))

@@ -1,4 +1,4 @@
-"""Runs of a transfer that are pretended: what real ones would leave, at once."""
+"""Stages of a transfer that are only pretended: what real ones would leave, at once."""
 
 from __future__ import annotations
 

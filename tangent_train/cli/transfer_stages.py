@@ -1,0 +1,326 @@
+"""The stages of a transfer (paper, section "Network transfer"), planned and run as ordinary runs.
+
+===========  ===============================================================================
+P            trained on photos, tested on photos
+S            P's network, tested on panoramas
+S-<name>     the same, the panoramas seen through another representation
+P-FT-n       P's network, fine-tuned for n epochs on photos, tested on photos
+S-FT-n       P's network, fine-tuned for n epochs on panoramas, tested on panoramas
+S-level-n    P's network, tested on panoramas of level n (study of the angular resolution)
+===========  ===============================================================================
+
+Beside what a run leaves, a stage's folder holds ``stage.yaml``, its config for ``tangent-train`` or
+``tangent-evaluate``, and ``stage.json``, a digest of the checkpoint it starts from.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from filelock import FileLock, Timeout
+from omegaconf import ListConfig, OmegaConf
+
+from tangent_train.checkpoints.content import read_settings
+from tangent_train.cli.processes import command_line, run_environment, run_process
+from tangent_train.errors import DataError, SettingError
+from tangent_train.files import write_text
+from tangent_train.json_text import parse_json
+from tangent_train.setting_rules import differing_settings
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from omegaconf import DictConfig
+
+__all__ = ["STUDY", "Stage", "State", "plan", "run_stage", "stage_command", "stage_state"]
+
+STUDY = "angular_resolution"
+"""The one study there is."""
+
+State = Literal["new", "begun", "finished"]
+"""What is in a stage's folder. A stage that only evaluates is either new or finished."""
+
+_OF_THE_TRANSFER = (
+    *("photos", "fine_tuning", "compare", "folds", "seeds", "checkpoint"),
+    *("study", "study_levels", "study_max_rows"),
+)
+"""Settings that a stage's config does not have."""
+
+_SLOWER = 10  # fine-tuning: 1e-5 after 1e-4 (paper, supplement, "Transfer learning")
+_REMEDY = "Give another name=, or delete the folder to run it again."
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One run of a transfer.
+
+    Attributes:
+        name: As above.
+        fold: The tested fold; None for data without folds.
+        seed: Of all its randomness.
+        folder: Of the run.
+        command: train or evaluate.
+        config: All its settings, resolved, but for where its weights come from.
+        weights: Its network: a checkpoint, or the folder of the run that leaves it; None to start
+            from scratch.
+        level: Of a study.
+    """
+
+    name: str
+    fold: int | None
+    seed: int
+    folder: Path
+    command: Literal["train", "evaluate"]
+    config: dict[str, Any]
+    weights: Path | None
+    level: int | None = None
+
+
+def plan(
+    config: DictConfig, folder: Path, compared: Mapping[str, Mapping[str, Any]]
+) -> list[Stage]:
+    """All stages, those of one fold and seed after those of the other.
+
+    Args:
+        config: The composed ``transfer.yaml``; ``checkpoint``, if any, an absolute path.
+        folder: The transfer's.
+        compared: Sections ``representation`` of the further ways to see panoramas, by name.
+
+    Raises:
+        SettingError: A setting of the transfer cannot work.
+    """
+    if config.study not in (None, STUDY):
+        raise SettingError("study", found=repr(config.study), expected=f"{STUDY}, or null")
+    own_fold = config.data.get("fold")
+    if config.folds is not None and own_fold is None:
+        raise SettingError("folds", found=config.folds, expected="null: this data has no folds")
+    folds = [own_fold] if config.folds is None else _numbers(config, "folds", 0)
+    seeds = [config.seed] if config.seeds is None else _numbers(config, "seeds", 0)
+    planners = [_Planner(config, folder, fold, seed) for fold in folds for seed in seeds]
+    return [stage for p in planners for stage in (p.study() if config.study else p.all(compared))]
+
+
+class _Planner:
+    """Plans the stages of one fold and seed."""
+
+    def __init__(self, config: DictConfig, folder: Path, fold: int | None, seed: int) -> None:
+        self._config, self._fold, self._seed = config, fold, seed
+        self._folder = (folder if fold is None else folder / f"fold_{fold}") / f"seed_{seed}"
+        self._given = config.checkpoint
+
+    def all(self, compared: Mapping[str, Mapping[str, Any]]) -> Iterator[Stage]:
+        settings = self._settings()
+        yield self._first(settings)
+        yield self._stage("S", settings)
+        rows = self._config.representation.get("erp_height")
+        for name, section in compared.items():
+            seen = {**section, **({"erp_height": rows} if "erp_height" in section else {})}
+            yield self._stage(f"S-{name}", self._settings({"representation": seen}))
+        for epochs in _numbers(self._config, "fine_tuning.epochs", 1):
+            tuned = self._settings({"optimizer": self._slower(settings)})
+            tuned["scheduler"] = tuned["fine_tuning"]["scheduler"]
+            tuned["trainer"]["max_epochs"] = epochs
+            # Other crops than those of P's first epochs.
+            tuned["photos"]["data"]["stream"] = 1
+            for on in "PS":
+                yield self._stage(f"{on}-FT-{epochs}", tuned, "train")
+
+    def study(self) -> Iterator[Stage]:
+        settings = self._settings()
+        if not self._given:
+            yield self._first(settings)
+        most = self._config.study_max_rows
+        dim = self._config.representation.get("dim")
+        for level in _numbers(self._config, "study_levels", 0):
+            rows = 2 ** (level + 1)
+            changes = {"level": level, "representation.level": level}
+            changes["representation.erp_height"] = rows if most is None else min(rows, most)
+            if dim is not None:  # a side in pixels
+                scale = 2.0 ** (level - self._config.level)
+                changes["representation.dim"] = max(1, round(dim * scale))
+            settings = self._settings(changes)
+            yield self._stage(f"S-level-{level}", settings, level=level)
+
+    def _settings(self, changes: Mapping[str, Any] | None = None) -> dict[str, Any]:
+        """All settings, resolved after some were changed."""
+        config: Any = OmegaConf.create(OmegaConf.to_container(self._config))
+        config.seed = self._seed
+        for data in (config.data, config.photos.data):
+            if self._fold is not None and "fold" in data:
+                data.fold = self._fold
+        for name, value in (changes or {}).items():
+            OmegaConf.update(config, name, value, merge=False, force_add=True)
+        resolved: Any = OmegaConf.to_container(config, resolve=True)
+        return dict(resolved)
+
+    def _slower(self, settings: dict[str, Any]) -> dict[str, Any]:
+        """The optimizer of fine-tuning: what it does not say is as in P's training."""
+        own, before = settings["fine_tuning"]["optimizer"], settings["optimizer"]
+        optimizer = own if "_target_" in own else before | own
+        if optimizer.get("lr") is None:
+            if before.get("lr") is None:
+                raise SettingError(
+                    "fine_tuning.optimizer.lr",
+                    found="null, a tenth of optimizer.lr, which is null",
+                    expected="a learning rate",
+                )
+            # 3e-4 of 3e-3, not 3.0000000000000003e-4
+            optimizer = optimizer | {"lr": float(f"{before['lr'] / _SLOWER:.12g}")}
+        return dict(optimizer)
+
+    def _first(self, settings: dict[str, Any]) -> Stage:
+        return self._stage("P", settings, "evaluate" if self._given else "train")
+
+    def _stage(
+        self,
+        name: str,
+        settings: dict[str, Any],
+        command: Literal["train", "evaluate"] = "evaluate",
+        level: int | None = None,
+    ) -> Stage:
+        own = {key: value for key, value in settings.items() if key not in _OF_THE_TRANSFER}
+        own |= {"name": f"{settings['name']}/{name}", "init_from": None, "resume": None}
+        if name[0] == "P":
+            own |= {key: settings["photos"][key] for key in ("data", "representation")}
+        weights = Path(self._given) if self._given else self._folder / "P"
+        scratch = name == "P" and not self._given
+        return Stage(
+            name=name,
+            fold=self._fold,
+            seed=self._seed,
+            folder=self._folder / name,
+            command=command,
+            config=own,
+            weights=None if scratch else weights,
+            level=level,
+        )
+
+
+def _numbers(config: DictConfig, setting: str, least: int) -> list[int]:
+    found = OmegaConf.select(config, setting)
+    numbers: list[Any] = list(found) if isinstance(found, list | ListConfig) else [None]
+    if not all(type(n) is int and n >= least for n in numbers) or len(set(numbers)) < len(numbers):
+        raise SettingError(
+            setting, found=found, expected=f"a list of different whole numbers from {least}"
+        )
+    return numbers
+
+
+def stage_state(stage: Stage) -> State:
+    """What there is of a stage.
+
+    Raises:
+        SettingError: Its folder holds something else, or the same stage with other settings.
+        DataError: A file of the stage cannot be read.
+    """
+    record = stage.folder / "stage.json"
+    if not record.is_file():
+        if stage.folder.exists() and any(p.name[0] != "." for p in stage.folder.iterdir()):
+            raise SettingError(
+                stage.folder,
+                found="files that tangent-transfer did not write",
+                expected="a new folder, or that of this stage",
+                remedy=_REMEDY,
+            )
+        return "new"
+    finished = (stage.folder / "results.json").is_file()
+    begun = stage.command == "train" and (stage.folder / "checkpoints" / "last.ckpt").is_file()
+    if not finished and not begun:
+        return "new"
+    before = read_settings(stage.folder / "config.yaml")
+    purpose: Any = "transfer" if stage.command == "train" else "evaluation"
+    differing = differing_settings(stage.config, before, purpose)
+    if differing:
+        named = [f"{name}={then!r} (now {now!r})" for name, now, then in differing]
+        raise SettingError(
+            stage.folder,
+            found=f"stage {stage.name} with {', '.join(named)}",
+            expected="the settings of this command",
+            remedy=_REMEDY,
+        )
+    weights = stage.weights and _checkpoint_in(stage.weights)
+    # A network that was trained again is another one; one that is gone is not missed.
+    if weights is not None and _weights_in(record) != _digest(weights):
+        raise SettingError(
+            stage.folder,
+            found=f"stage {stage.name} of another network",
+            expected=f"the one in {weights}",
+            remedy=_REMEDY,
+        )
+    return "finished" if finished else "begun"
+
+
+def run_stage(stage: Stage, state: State) -> int:
+    """Start a stage, or go on with it, and wait for it.
+
+    Args:
+        stage: Not finished.
+        state: What there is of it.
+
+    Returns:
+        The exit status, as a shell says it.
+
+    Raises:
+        DataError: The checkpoint it starts from is missing.
+        SettingError: Another command is running it.
+    """
+    config, digest = dict(stage.config), None
+    if state == "begun":
+        config["resume"] = str(stage.folder)
+    elif stage.weights is not None:
+        weights = _checkpoint_in(stage.weights)
+        if weights is None:
+            raise DataError(
+                stage.weights,
+                found="no checkpoints/best.ckpt or last.ckpt",
+                expected=f"the network that {stage.name} starts from",
+                remedy="Delete the stages of this seed to run it all again.",
+            )
+        config["init_from" if stage.command == "train" else "checkpoint"] = str(weights)
+        digest = _digest(weights)
+    stage.folder.mkdir(parents=True, exist_ok=True)
+    try:
+        with FileLock(stage.folder / ".lock", blocking=False):
+            if state == "new":
+                write_text(stage.folder / "stage.json", json.dumps({"weights": digest}) + "\n")
+            write_text(stage.folder / "stage.yaml", OmegaConf.to_yaml(OmegaConf.create(config)))
+            status, _ = run_process(stage_command(stage), run_environment())
+    except Timeout as error:
+        raise SettingError(
+            stage.folder,
+            found=f"another tangent-transfer that runs stage {stage.name}",
+            expected="none",
+            remedy="Wait for it; other seeds and folds can run beside it.",
+        ) from error
+    return status if status >= 0 else 128 - status
+
+
+def stage_command(stage: Stage) -> list[str]:
+    """The command line of the stage's run."""
+    config = (f"--config-dir={stage.folder}", "--config-name=stage")
+    return command_line(stage.command, config, stage.folder)
+
+
+def _checkpoint_in(weights: Path) -> Path | None:
+    """The checkpoint: a file itself, of a run the one that it has tested; None if missing."""
+    folder = weights / "checkpoints"
+    places = (weights, folder / "best.ckpt", folder / "last.ckpt")
+    return next((path for path in places if path.is_file()), None)
+
+
+def _weights_in(record: Path) -> Any:
+    try:
+        return dict(parse_json(record.read_bytes())).get("weights")
+    except (TypeError, ValueError) as error:
+        raise DataError(
+            record, found=error, expected="what tangent-transfer wrote", remedy=_REMEDY
+        ) from error
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "blake2b").hexdigest()[:32]

@@ -1,0 +1,227 @@
+"""``tangent-transfer`` from the command line to the tables, with pretended runs."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from filelock import FileLock
+from omegaconf import OmegaConf
+
+from tangent_train.cli import compose, transfer, transfer_stages
+from tangent_train.results import report
+from tests.cli.pretended_runs import HERE, OF_SEED_0, PretendedRuns, run_transfer
+
+STAGES = ["P", "S", "S-erp", "S-cubemap", "P-FT-1", "S-FT-1"]
+SHORT = ("compare=[]", "fine_tuning.epochs=[]")
+
+
+@pytest.fixture
+def runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> PretendedRuns:
+    """In place of the stages of a transfer, in an empty folder."""
+    pretended = PretendedRuns()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(transfer_stages, "run_process", pretended)
+    # Tested by themselves, and slow.
+    monkeypatch.setattr(transfer, "_check_data", lambda _: None)
+    monkeypatch.setattr(compose, "check_overrides", lambda *_: None)
+    monkeypatch.setattr(report, "report_png", lambda *_: b"a picture")
+    return pretended
+
+
+def test_all_stages_run_in_order_and_the_tables_are_written(
+    runs: PretendedRuns, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run_transfer(monkeypatch)
+    trained = ("P", "P-FT-1", "S-FT-1")
+    assert runs.started == [("train" if s in trained else "evaluate", s) for s in STAGES]
+    weights = str(Path(OF_SEED_0 / "P" / "checkpoints" / "last.ckpt").absolute())
+    first, *others = runs.configs
+    assert first.init_from is None
+    for (command, _), config in zip(runs.started[1:], others, strict=True):
+        assert config["init_from" if command == "train" else "checkpoint"] == weights
+    out = capsys.readouterr().out
+    for number, stage in enumerate(STAGES, start=1):
+        folder = (OF_SEED_0 / stage).absolute()
+        assert f"Stage {number} of 6, {stage} in {folder}: tangent-" in out
+        assert f"--config-dir={folder} --config-name=stage hydra.run.dir={folder}" in out
+    assert {path.name for path in HERE.glob("transfer.*")} == {
+        f"transfer.{suffix}" for suffix in ("md", "csv", "json", "png")
+    }
+    table = (HERE / "transfer.md").read_text()
+    assert "| S-FT-1 | SynthRooms | 1 | 100.0 | +100.0 % | 100.0 | +100.0 % |" in table
+    assert "| P | SynthRoomsPerspective | photos | 50.0 | – | 50.0 | – |" in table
+
+
+def test_finished_stages_are_not_run_again(
+    runs: PretendedRuns, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run_transfer(monkeypatch, *SHORT)
+    runs.started.clear()
+    capsys.readouterr()
+    free = ("panels=9", "+trainer.strategy=ddp", "data.root=other", "task.images_per_forward=3")
+    run_transfer(monkeypatch, *SHORT, *free)
+    assert not runs.started
+    assert capsys.readouterr().out.count("finished before") == 2
+    run_transfer(monkeypatch, "seeds=[0,1]", "compare=[erp]", "fine_tuning.epochs=[]")
+    assert [s for _, s in runs.started] == ["S-erp", "P", "S", "S-erp"]
+    assert [config.seed for config in runs.configs[-3:]] == [1] * 3
+    rows = json.loads((HERE / "transfer.json").read_text())["rows"]
+    assert [[run["seed"] for run in row["runs"]] for row in rows] == [[0, 1]] * 3
+
+
+def test_a_failing_stage_leaves_the_others_and_the_command_goes_on(
+    runs: PretendedRuns, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    runs.failing = "P-FT-1"
+    with pytest.raises(SystemExit) as stopped:
+        run_transfer(monkeypatch)
+    assert stopped.value.code == 7
+    error = capsys.readouterr().err
+    folder = (OF_SEED_0 / "P-FT-1").absolute()
+    assert f"stage P-FT-1 in {folder} ended with status 7" in error
+    assert "the same command goes on" in error
+    assert not (HERE / "transfer.md").exists()
+
+    shutil.move("runs", "elsewhere")
+    runs.failing, runs.started = None, []
+    run_transfer(monkeypatch, "hydra.run.dir=elsewhere/transfer/mine")
+    assert [stage for _, stage in runs.started] == ["P-FT-1", "S-FT-1"]
+    resumed = runs.configs[-2]
+    assert resumed.resume == str(Path("elsewhere/transfer/mine/fold_1/seed_0/P-FT-1").absolute())
+    assert resumed.init_from is None, "its own checkpoint has the tensors"
+
+
+def test_a_folder_of_other_settings_or_files_is_refused(
+    runs: PretendedRuns, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run_transfer(monkeypatch, *SHORT)
+    before = len(runs.started)
+    for override, message in {
+        "optimizer.lr=1": r"seed_0/P: found stage P with optimizer\.lr=0\.003 \(now 1\), sch",
+        "representation.blend=feather": r"/S: found stage S with representation\.blend='nearest'",
+    }.items():
+        with pytest.raises(SystemExit, match=rf"^tangent-transfer: .*{message}"):
+            run_transfer(monkeypatch, override)
+    (OF_SEED_0 / "S-FT-1").mkdir(parents=True)
+    (OF_SEED_0 / "S-FT-1" / "thesis.tex").touch()
+    with pytest.raises(SystemExit, match="S-FT-1: found files that tangent-transfer did not write"):
+        run_transfer(monkeypatch)
+    assert len(runs.started) == before, "said before anything is run"
+
+
+def test_stages_of_a_network_that_was_trained_again_are_refused(
+    runs: PretendedRuns, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run_transfer(monkeypatch, *SHORT)
+    record = OF_SEED_0 / "S" / "stage.json"
+    before = record.read_text()
+    record.write_text("[1]")
+    with pytest.raises(SystemExit, match=r"S/stage\.json: found .*delete the folder"):
+        run_transfer(monkeypatch, *SHORT)
+    record.write_text(before)
+    network = OF_SEED_0 / "P" / "checkpoints" / "last.ckpt"
+    network.write_text("another network, longer")
+    with pytest.raises(SystemExit, match=r"seed_0/S: found stage S of another network; expected"):
+        run_transfer(monkeypatch, *SHORT)
+    network.unlink()  # to save space: what was found stays found
+    run_transfer(monkeypatch, *SHORT)
+    with pytest.raises(SystemExit, match=r"seed_0/P: found no checkpoints/best\.ckpt or last"):
+        run_transfer(monkeypatch, "compare=[erp]", "fine_tuning.epochs=[]")
+
+
+def test_two_commands_never_run_the_same_stage(
+    runs: PretendedRuns, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (OF_SEED_0 / "P").mkdir(parents=True)
+    with (
+        FileLock(OF_SEED_0 / "P" / ".lock"),
+        pytest.raises(SystemExit, match="another tangent-transfer that runs stage P"),
+    ):
+        run_transfer(monkeypatch, *SHORT)
+    assert not runs.started
+
+
+def test_the_study_of_the_angular_resolution(
+    runs: PretendedRuns, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run_transfer(monkeypatch, "study=angular_resolution", "study_levels=[3,4,6]")
+    names = ["P", "S-level-3", "S-level-4", "S-level-6"]
+    assert [stage for _, stage in runs.started] == names
+    seen = [config.representation.erp_height for config in runs.configs[1:]]
+    assert seen == [16, 32, 32]
+    files = {path.name for path in HERE.glob("angular_resolution.*")}
+    assert files == {f"angular_resolution.{suffix}" for suffix in ("md", "csv", "json", "png")}
+    assert "against level 4" in (HERE / "angular_resolution.md").read_text()
+
+
+def test_a_given_network_is_not_trained(
+    runs: PretendedRuns, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = tmp_path / "given.ckpt"
+    torch.save({"config": {"data": {"fold": 1}}}, given)
+    arguments = ("checkpoint=given.ckpt", "compare=[]")
+    run_transfer(monkeypatch, *arguments)
+    assert runs.started[:2] == [("evaluate", "P"), ("evaluate", "S")]
+    assert runs.configs[0].checkpoint == runs.configs[2].init_from == str(given)
+    with pytest.raises(SystemExit, match=r"testing on fold 1.*; expected folds=\[1\]"):
+        run_transfer(monkeypatch, *arguments, "folds=[1,2]")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["data.fold=2", "folds=[1]"], r"data\.fold=2: found folds=\[1\] beside it"),
+        (["compare=[erb]"], "unknown representation: found 'erb'.*Did you mean erp"),
+        (["compare=erp"], "compare: found erp; expected a list"),
+    ],
+)
+def test_what_cannot_work_is_refused(
+    runs: PretendedRuns, arguments: list[str], message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(SystemExit, match=rf"^tangent-transfer: .*{message}"):
+        run_transfer(monkeypatch, *arguments)
+    assert not runs.started
+
+
+def test_a_killed_stage_ends_the_command(
+    monkeypatch: pytest.MonkeyPatch, runs: PretendedRuns, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(transfer_stages, "run_process", lambda *_: (-9, []))
+    with pytest.raises(SystemExit) as stopped:
+        run_transfer(monkeypatch)
+    assert stopped.value.code == 137, "as a shell says it"
+    assert "Finished stages stay; the same command goes on" in capsys.readouterr().err
+
+
+def test_the_level_of_the_photos() -> None:
+    """f' = 128 / (2 tan 22.5°) = 154.5 pixels; at level 8, b = 1, p = 1.10715 / 128."""
+    photos = {"_target_": "tangent_train.rendering.PerspectiveRepresentation", "level": 8}
+    tangent = {
+        "_target_": "tangent_train.rendering.TangentRepresentation",
+        "base_level": 1,
+        "level": 8,
+    }
+    config = OmegaConf.create(
+        {"level": 8, "photos": {"representation": photos}, "representation": tangent}
+    )
+    expected = 8 + np.log2(128 / (2 * np.tan(np.pi / 8)) * 1.1071487 / 128)
+    assert transfer.trained_level(config) == pytest.approx(expected, abs=1e-6)
+    assert expected == pytest.approx(8.418, abs=1e-3)
+    # A crop with the focal length of tangent images is as fine as they are.
+    config.photos.representation.dim = 128
+    config.photos.representation.fov_deg = float(np.degrees(2 * np.arctan(1.1071487 / 2)))
+    assert transfer.trained_level(config) == pytest.approx(8, abs=1e-6)
+    config.representation = {
+        "_target_": "tangent_train.rendering.EquirectRepresentation",
+        "level": 8,
+        "erp_height": 512,
+    }
+    focal = 128 / 1.1071487
+    assert transfer.trained_level(config) == pytest.approx(
+        8 + np.log2(focal * np.pi / 512), abs=1e-6
+    )
