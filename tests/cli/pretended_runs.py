@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from hydra import compose, initialize_config_dir
+from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from tangent_train.checkpoints.content import write_settings
 from tangent_train.cli import main
+from tangent_train.cli.compose import config_folder
+from tangent_train.cli.transfer import transfer
 from tangent_train.metrics.segmentation import ConfusionMatrices
 from tangent_train.results.evaluation import segmentation_record, write_results
 
@@ -82,7 +87,25 @@ class PretendedRuns:
         return 0, []
 
 
-def run_transfer(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None:
-    """``tangent-transfer`` with the settings above, and these."""
+def run_command(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None:
+    """The command ``tangent-transfer`` with the settings above, and these."""
     monkeypatch.setattr(sys, "argv", ["tangent-transfer", *SETTINGS, *arguments])
     main.transfer()
+
+
+@lru_cache
+def _composed() -> Any:
+    return compose("transfer", SETTINGS, return_hydra_config=True)
+
+
+def run_transfer(*arguments: str) -> None:
+    """What it does once its config is composed, which takes Hydra a second."""
+    with initialize_config_dir(str(config_folder()), version_base="1.3"):
+        config = _composed().copy()
+        OmegaConf.set_struct(config, value=False)
+        config.merge_with_dotlist(list(arguments))
+        config.hydra.overrides.task = list(arguments)
+        config.hydra.runtime.output_dir = str(Path(config.hydra.run.dir).absolute())
+        HydraConfig.instance().set_config(config)  # type: ignore[no-untyped-call]
+        del config["hydra"]
+        transfer(config)

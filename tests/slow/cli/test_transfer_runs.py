@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.cli.pretended_runs import HERE, OF_SEED_0, run_transfer
+from tests.cli.pretended_runs import HERE, OF_SEED_0, run_command
 
 
 def test_real_runs_from_photos_to_panoramas(
@@ -24,7 +24,7 @@ def test_real_runs_from_photos_to_panoramas(
     (tmp_path / "models").mkdir()
     (tmp_path / "models" / "__init__.py").write_text("raise ImportError('the wrong models')\n")
     network = ("network=plain", "compare=[]", "trainer.max_epochs=2", "--config-dir=my")
-    run_transfer(monkeypatch, *network)
+    run_command(monkeypatch, *network)
     stages = ["P", "S", "P-FT-1", "S-FT-1"]
     found = {name: json.loads((OF_SEED_0 / name / "results.json").read_text()) for name in stages}
     assert [found[name]["images"] for name in stages] == [4, 2, 4, 2], "photos, panoramas"
@@ -44,7 +44,7 @@ def test_real_runs_from_photos_to_panoramas(
     (OF_SEED_0 / "S-FT-1" / "results.json").unlink()
     shutil.rmtree(OF_SEED_0 / "S")
     capsys.readouterr()
-    run_transfer(monkeypatch, *network)
+    run_command(monkeypatch, *network)
     out = capsys.readouterr().out
     assert out.count("finished before") == 2
     assert (HERE / "transfer.csv").read_text() == before, "the same figures again"
@@ -59,16 +59,16 @@ def test_what_no_stage_can_do_is_said_before_the_first(
     with pytest.raises(
         SystemExit, match=r"^tangent-transfer: stage P, in photos: image size for the "
     ):
-        run_transfer(monkeypatch)
+        run_command(monkeypatch)
     dims = ("level=6", "representation.base_level=2", "compare=[]")
     wrong = "representation.faces_per_panorama=9999"
     with pytest.raises(
         SystemExit, match=r"stage S: representation\.faces_per_panorama: found 9999"
     ):
-        run_transfer(monkeypatch, *dims, wrong)
+        run_command(monkeypatch, *dims, wrong)
     alike = (
         r"stage S: data\.inputs: found \('rgb', 'depth'\); expected \('rgb',\), as in the stages"
     )
     with pytest.raises(SystemExit, match=alike):
-        run_transfer(monkeypatch, *dims, "photos.data.inputs=[rgb]")
+        run_command(monkeypatch, *dims, "photos.data.inputs=[rgb]")
     assert not (tmp_path / "data").exists()
