@@ -95,7 +95,7 @@ def run_command(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None:
 
 @lru_cache
 def _composed() -> Any:
-    return compose("transfer", SETTINGS, return_hydra_config=True)
+    return compose("transfer", list(SETTINGS), return_hydra_config=True)
 
 
 def run_transfer(*arguments: str) -> None:
@@ -106,6 +106,6 @@ def run_transfer(*arguments: str) -> None:
         config.merge_with_dotlist(list(arguments))
         config.hydra.overrides.task = list(arguments)
         config.hydra.runtime.output_dir = str(Path(config.hydra.run.dir).absolute())
-        HydraConfig.instance().set_config(config)  # type: ignore[no-untyped-call]
+        HydraConfig.instance().set_config(config)
         del config["hydra"]
         transfer(config)
