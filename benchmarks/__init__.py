@@ -1,1 +1,1 @@
-"""Side-by-side speed and memory: ``python -m benchmarks``."""
+"""Speed and memory beside what users could take instead: ``python -m benchmarks --help``."""

@@ -1,62 +1,57 @@
-"""From scores to labels of the panorama, beside `grid_sample` and `argmax`.
-
-Their positions are ready-made. The plain way samples a mosaic of all images in one call; the
-careful way samples every image only where it owns the panorama, which is kinder to the caches.
-"""
+"""From scores to labels beside `grid_sample` and `argmax`; growth with the level."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 
 import numpy as np
 import torch
 from torch.nn import functional
 
-from benchmarks.measuring import (
-    Options,
-    Row,
-    Table,
-    Way,
-    at_least,
-    at_most,
-    in_process,
-    measure,
-    memory_kib,
-    peak_kib,
+from benchmarks.measuring import Goal, Row, Table, Way, added_mib, measure
+from tangent_train.geometry import TangentGrid, equirect_directions, equirect_shape
+from tangent_train.rendering import (
+    equirect_to_tangent,
+    set_table_cache_limit,
+    tangent_to_labels,
 )
-from tangent_train.geometry import TangentGrid, equirect_shape
-from tangent_train.rendering import set_table_cache_limit, tangent_to_labels
-from tangent_train.rendering.tables import forward_map, image_table, owners
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-__all__ = ["tables"]
+__all__ = ["growth", "labels"]
 
 NUM_CLASSES = 13
 PLAIN = "grid_sample of a mosaic, argmax"
-CAREFUL = "grid_sample of the owned pixels, argmax"
 OURS = "tangent_to_labels"
-SCORES = "the scores"
-
-_SINGLE = np.dtype(np.float32)
-_AGREEMENT = 0.995
 
 
-def tables(options: Options) -> Iterator[Table]:
-    """Time, tables, memory; and time on a GPU where there is one."""
-    level = 6 if options.quick else 10
+def labels(quick: bool) -> Iterator[Table]:
+    """Time, memory, and the first call; on a GPU where there is one."""
+    level = 6 if quick else 10
     grid, shape = TangentGrid(1, level), equirect_shape(level)
-    yield _times(grid, shape, options)
-    yield _cold_tables(grid, shape, options)
-    yield _memory(level, options)
+    scores = random_scores(grid)
+    plain = _plain(scores, grid, shape)
+    array = scores.numpy()
+    agree = np.mean(plain().numpy() == tangent_to_labels(array, grid, shape))
+    if agree < 0.995:
+        raise RuntimeError(f"{PLAIN} gives other labels: {agree:.1%} agree")
+
+    def first() -> None:
+        set_table_cache_limit(0)
+        tangent_to_labels(array, grid, shape)
+        set_table_cache_limit(512 * 2**20)
+
+    ways = [
+        Way(PLAIN, plain),
+        Way(OURS, lambda: tangent_to_labels(array, grid, shape), ours=True),
+        Way(f"{OURS}, feather", lambda: tangent_to_labels(array, grid, shape, "feather"), True),
+        Way(f"{OURS}, first call", first, ours=True, rounds=3),
+    ]
+    table = Table("labels: time", measure(ways, 2 if quick else 7))
+    table.goals = [Goal("as fast as grid_sample", 1 / table.ratio(OURS), 15, True)]
+    yield table
+    yield _memory(level, scores.nbytes / 2**20)
     if torch.cuda.is_available():
-        yield _on_gpu(grid, shape, options)
-
-
-def _title(grid: TangentGrid, shape: tuple[int, int]) -> str:
-    images = f"{grid.num_images} images of {grid.dim}²"
-    return f"{NUM_CLASSES} scores of {images} to {shape[0]}×{shape[1]} labels"
+        yield _on_gpu(scores.cuda(), grid, shape)
 
 
 def random_scores(grid: TangentGrid, classes: int = NUM_CLASSES) -> torch.Tensor:
@@ -65,151 +60,77 @@ def random_scores(grid: TangentGrid, classes: int = NUM_CLASSES) -> torch.Tensor
     return torch.randn(size, generator=torch.Generator().manual_seed(0))
 
 
-def _times(grid: TangentGrid, shape: tuple[int, int], options: Options) -> Table:
-    scores = random_scores(grid)
-    array = scores.numpy()
-    plain, careful = _plain(scores, grid, shape), _careful(scores, grid, shape)
-    labels = tangent_to_labels(array, grid, shape)
-    for name, way in ((PLAIN, plain), (CAREFUL, careful)):
-        share = np.mean(way().numpy() == labels)
-        if share < _AGREEMENT:
-            raise RuntimeError(f"{name} gives other labels: {share:.1%} agree")
-    rows = measure(
-        [
-            Way(PLAIN, plain),
-            Way(CAREFUL, careful),
-            Way(OURS, lambda: tangent_to_labels(array, grid, shape), ours=True),
-            Way(
-                f"{OURS}, feather",
-                lambda: tangent_to_labels(array, grid, shape, "feather"),
-                ours=True,
-                rounds=options.times(3),
-            ),
-        ],
-        options.times(7),
-    )
-    table = Table("labels: time", f"{_title(grid, shape)}, tables warm", rows)
-    for name in (PLAIN, CAREFUL):
-        table.goals.append(at_least(f"as fast as {name}", 1 / table.ratio(OURS, name).median, 20))
-    return table
-
-
 def _plain(
     scores: torch.Tensor, grid: TangentGrid, shape: tuple[int, int]
 ) -> Callable[[], torch.Tensor]:
+    """The owner's bilinear scores of every pixel in one call, positions ready-made."""
     mosaic = scores.movedim(0, 1).reshape(1, NUM_CLASSES, -1, grid.dim)
-    face, u, v, _ = image_table(grid, shape, _SINGLE, "nearest", slice(0, shape[0]))
-    rows = face[0].astype(np.float64) * grid.dim + v[0]
-    place = np.stack([u[0] / (grid.dim - 1), rows / (mosaic.shape[2] - 1)], axis=-1) * 2 - 1
-    places = torch.from_numpy(place.astype(np.float32))[None]
-    return lambda: _grid_sample(mosaic, places)[0].argmax(dim=0)
+    directions, places = equirect_directions(shape), np.empty((*shape, 2), np.float32)
+    for row in range(shape[0]):  # all at once takes gigabytes
+        owners = grid.owners(directions[row])
+        u, v = grid.project(directions[row], owners).T
+        place = u / (grid.dim - 1), (owners * grid.dim + v) / (mosaic.shape[2] - 1)
+        places[row] = np.stack(place, axis=-1) * 2 - 1
+    positions = torch.from_numpy(places)[None]
+    sample = partial(functional.grid_sample, padding_mode="border", align_corners=True)
+    return lambda: sample(mosaic, positions)[0].argmax(dim=0)
 
 
-def _careful(
-    scores: torch.Tensor, grid: TangentGrid, shape: tuple[int, int]
-) -> Callable[[], torch.Tensor]:
-    face, u, v, _ = image_table(grid, shape, _SINGLE, "nearest", slice(0, shape[0]))
-    scale = 2 / (grid.dim - 1)
-    inside = torch.from_numpy(np.stack([u[0].ravel(), v[0].ravel()], axis=-1) * scale - 1)
-    pixels = [torch.from_numpy(np.flatnonzero(face[0] == n)) for n in range(grid.num_images)]
-    owned = [inside[pixel][None, None] for pixel in pixels]
-
-    def run() -> torch.Tensor:
-        panorama = torch.empty(NUM_CLASSES, shape[0] * shape[1])
-        for image, position, pixel in zip(scores, owned, pixels, strict=True):
-            panorama[:, pixel] = _grid_sample(image[None], position)[0, :, 0]
-        return panorama.argmax(dim=0).reshape(shape)
-
-    return run
-
-
-def _grid_sample(images: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
-    return functional.grid_sample(images, places, padding_mode="border", align_corners=True)
-
-
-def _cold_tables(grid: TangentGrid, shape: tuple[int, int], options: Options) -> Table:
-    """Making the tables, the cache emptied before."""
-
-    def cold(build: Callable[[], object]) -> Callable[[], None]:
-        def run() -> None:
-            set_table_cache_limit(0)
-            build()
-            set_table_cache_limit(512 * 2**20)
-
-        return run
-
-    coordinates = np.random.default_rng(0).standard_normal((2, *shape))
-    owned = "owners of all pixels (to labels)"
-    rows = measure(
-        [
-            Way("for scale: numpy.arctan2 of as many pixels", lambda: np.arctan2(*coordinates)),
-            Way(owned, cold(lambda: owners(grid, shape)), ours=True),
-            Way(
-                "maps of all images (to images)",
-                cold(lambda: [forward_map(grid, shape, [f], _SINGLE) for f in grid.face_indices()]),
-                ours=True,
-            ),
-        ],
-        options.times(7),
-    )
-    table = Table("labels: tables", f"Tables of a new size, once ({shape[0]}×{shape[1]})", rows)
-    table.goals = [at_most("table of the owners", table.row(owned).median, 0.5, " s")]
+def _memory(level: int, scores_mib: float) -> Table:
+    """The peak of a new process, scores included."""
+    added = added_mib(_labels_of, level)
+    with_ours = "with tangent_to_labels, at most"
+    rows = [Row("the scores", [scores_mib]), Row(with_ours, [scores_mib + added], ours=True)]
+    table = Table("labels: memory", rows, "MiB")
+    table.goals = [Goal("memory, of the scores'", table.ratio(with_ours), 1.3)]
     return table
 
 
-def _memory(level: int, options: Options) -> Table:
-    """The peak of a new process, scores included, in each way."""
-    grid, shape = TangentGrid(1, level), equirect_shape(level)
-    ways = {PLAIN: False, OURS: True}
-    rounds = options.times(1)
-    scores_mib = grid.num_images * NUM_CLASSES * grid.dim**2 * 4 / 2**20
-    rows = [Row(SCORES, [scores_mib] * rounds)]
-    for name, ours in ways.items():
-        added = [in_process(_added_mib, level, ours) for _ in range(rounds)]
-        rows.append(Row(f"with {name}, at most", [scores_mib + mib for mib in added], ours))
-    table = Table("labels: memory", f"Memory: {_title(grid, shape)}, tables included", rows, "MiB")
-    found = table.ratio(f"with {OURS}, at most").median
-    table.goals = [at_most("memory, of the scores'", found, 1.3)]
-    return table
+def _labels_of(level: int, classes: int = NUM_CLASSES) -> Callable[[], object]:
+    small, grid = TangentGrid(1, 5), TangentGrid(1, level)
+    tangent_to_labels(random_scores(small, classes), small, equirect_shape(5))  # compiles
+    return partial(tangent_to_labels, random_scores(grid, classes), grid, equirect_shape(level))
 
 
-def _added_mib(level: int, ours: bool) -> float:
-    """What one rendering adds to the scores, the code compiled before at a low level."""
-    small, (grid, shape) = TangentGrid(1, 6), (TangentGrid(1, level), equirect_shape(level))
-    tangent_to_labels(random_scores(small), small, equirect_shape(6))
-    scores = random_scores(grid)
-    before = memory_kib("VmRSS")
-    labels = tangent_to_labels(scores, grid, shape) if ours else _plain(scores, grid, shape)()
-    added = peak_kib() - before
-    del labels
-    return max(0, added) / 2**10
+def _images_of(level: int) -> Callable[[], object]:
+    equirect_to_tangent(np.zeros((64, 128, 3), np.uint8), TangentGrid(1, 5))
+    shape = equirect_shape(level)
+    panorama = np.random.default_rng(0).integers(0, 256, (*shape, 3), np.uint8)
+    return partial(equirect_to_tangent, panorama, TangentGrid(1, level))
 
 
-def _on_gpu(grid: TangentGrid, shape: tuple[int, int], options: Options) -> Table:
+def _on_gpu(scores: torch.Tensor, grid: TangentGrid, shape: tuple[int, int]) -> Table:
     """Beside reading the scores once."""
-    device = torch.device("cuda")
-    scores = random_scores(grid).to(device)
 
-    def read() -> None:
-        scores.sum()
-        torch.cuda.synchronize()
+    def way(name: str, call: Callable[[], object], *, ours: bool = False) -> Way:
+        def run() -> None:
+            call()
+            torch.cuda.synchronize()
 
-    def render() -> None:
-        tangent_to_labels(scores, grid, shape)
-        torch.cuda.synchronize()
+        return Way(name, run, ours)
 
-    reading = "reading the scores once (their sum)"
-    rows = measure(
-        [
-            Way(reading, read),
-            Way(OURS, render, ours=True),
-        ],
-        options.times(21),
-    )
-    own = torch.from_numpy(tangent_to_labels(scores.cpu().numpy(), grid, shape))
-    share = (tangent_to_labels(scores, grid, shape).cpu() == own).double().mean().item()
-    if share < _AGREEMENT:
-        raise RuntimeError(f"the GPU gives other labels: {share:.1%} agree")
-    table = Table("labels: on a GPU", f"{_title(grid, shape)}, on a GPU", rows)
-    table.goals = [at_most("of the time of reading the scores once", table.ratio(OURS).median, 2)]
-    return table
+    render = partial(tangent_to_labels, scores, grid, shape)
+    ways = [way("reading the scores once", scores.sum), way(OURS, render, ours=True)]
+    return Table("labels: on a GPU", measure(ways, 21))
+
+
+def growth(quick: bool) -> Iterator[Table]:
+    """Time and memory over levels, which should be linear in pixels."""
+    levels = (5, 6, 7) if quick else (7, 8, 9, 10, 11)
+    for what, work in (("to images", _images_of), ("to labels", partial(_labels_of, classes=4))):
+        names = [f"level {level}, b = 1" for level in levels]
+        set_table_cache_limit(2**31)  # the tables of level 11 need more than the default
+        ways = [Way(n, work(level), ours=True) for n, level in zip(names, levels, strict=True)]
+        rows = measure(ways, 2 if quick else 5)
+        set_table_cache_limit(512 * 2**20)
+        yield _linear(f"growth: time {what} over levels", rows, levels, "s")
+        memory = [added_mib(work, level) for level in levels]
+        rows = [Row(n, [mib], ours=True) for n, mib in zip(names, memory, strict=True)]
+        yield _linear(f"growth: memory {what} over levels", rows, levels, "MiB")
+
+
+def _linear(name: str, rows: list[Row], levels: Sequence[int], unit: str) -> Table:
+    """The slope of a line through the logarithms of pixels and medians is at most 1.15."""
+    medians = np.log([row.median for row in rows])
+    slope = float(np.polyfit(np.array(levels) * np.log(4), medians, 1)[0])
+    return Table(name, rows, unit, [Goal("grows with pixels to the power", slope, 1.15)])

@@ -1,0 +1,223 @@
+"""The training loader, a training step and an evaluation, beside doing the least by hand.
+
+All read a few synthetic rooms in Stanford2D3DS's format.
+"""
+
+from __future__ import annotations
+
+import copy
+import io
+import logging
+import tempfile
+import time
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, redirect_stdout
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import lightning
+import torch
+from hydra import compose, initialize_config_dir
+from lightning.pytorch.callbacks import Callback
+from omegaconf import OmegaConf
+from torch import Tensor, nn
+from torch.nn import functional
+
+from benchmarks.measuring import Goal, Row, Table, Way, measure
+from tangent_train.callbacks.checkpoints import LastCheckpoint
+from tangent_train.cli.build import build
+from tangent_train.cli.compose import config_folder
+
+__all__ = ["evaluation", "loader", "step"]
+
+OURS = "tangent-train"
+_WARM_UP = 3
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
+    with warnings.catch_warnings(), redirect_stdout(io.StringIO()):
+        warnings.simplefilter("ignore")
+        yield
+
+
+def _built(overrides: Sequence[str], root: str, rows: int, rooms: int = 3) -> tuple[Any, Any]:
+    """Data and task of an experiment on a few rooms, the data ready."""
+    areas = ("1", "2", "3", "4", "5a", "5b", "6")
+    counts = dict.fromkeys(areas, 0) | {"1": rooms, "5a": 1}
+    settings = [f"data.rooms.rooms.area_{area}={number}" for area, number in counts.items()]
+    settings += [f"data.rooms.height={rows}", "data.rooms.supersample=1", f"data.root={root}"]
+    settings += ["data.validation_fraction=0", "trainer.accelerator=cpu", "seed=0"]
+    with initialize_config_dir(str(config_folder()), version_base="1.3"):
+        config = compose("train", ["data=synthrooms", *settings, *overrides])
+    plain: Any = OmegaConf.to_container(config, resolve=True)
+    lightning.seed_everything(0, verbose=False)
+    data, task = build(plain)
+    data.prepare_data()
+    data.setup("fit")
+    return data, task
+
+
+def loader(quick: bool) -> Iterator[Table]:
+    """Samples of 4 of 80 RGB-D images from the prepared store, beside decoding PNGs; one worker."""
+    level = 6 if quick else 10
+    settings = [f"level={level}", "representation.base_level=1", "data.num_workers=1"]
+    settings += ["representation.faces_per_panorama=4", "data.panoramas_per_step=1"]
+    with tempfile.TemporaryDirectory() as root, _quiet():
+        ways = []
+        stores = {"PNG files": "null", "prepared store": f"{root}/store"}
+        for name, store in stores.items():
+            overrides = ["experiment=rooms/standard", *settings, f"data.store={store}"]
+            data, _ = _built(overrides, f"{root}/rooms", 2 ** (level + 1))
+            epochs = 1 if store == "null" or quick else 20
+            ways.append(_loading(name, data, epochs, ours=store != "null"))
+        table = Table("loader: time", measure(ways, 2 if quick else 5))
+    faster = 1 / table.ratio("prepared store")
+    table.goals = [Goal("as fast as from PNG files", faster, 20, True)]
+    yield table
+
+
+def _loading(name: str, data: Any, epochs: int, *, ours: bool) -> Way:
+    batches, epoch = data.train_dataloader(), count()
+
+    def load() -> None:
+        for _ in range(epochs):
+            batches.sampler.set_epoch(next(epoch))
+            for _batch in batches:
+                pass
+
+    return Way(name, load, ours, 1 / (epochs * len(batches)))
+
+
+def step(quick: bool) -> Iterator[Table]:
+    """A training step of ``rooms/standard`` beside one of a bare loop, with the same images.
+
+    After each step of the one the other takes one, with a copy of the network and a loader of its
+    own; they end with the same weights, or the comparison is void.
+    """
+    small = ["level=5", "network=unet_small"] if quick else []
+    settings = ("data.panoramas_per_step=3", "task.class_weights=none", "optimizer=adam")
+    overrides = ["experiment=rooms/standard", *settings, "scheduler=constant", *small]
+    with tempfile.TemporaryDirectory() as root, _quiet():
+        rows = 64 if quick else 256
+        data, task = _built(overrides, f"{root}/rooms", rows, rooms=24)
+        clock = _StepClock(data, task)
+        trainer = lightning.Trainer(
+            accelerator="cpu",
+            max_steps=_WARM_UP + (2 if quick else 41),
+            max_epochs=-1,
+            callbacks=[clock, LastCheckpoint(Path(root) / "checkpoints", 1000)],
+            default_root_dir=root,
+            limit_val_batches=0,
+        )
+        trainer.fit(task, datamodule=data)
+    clock.check_same(task.network)
+    bare, ours = clock.bare_s[_WARM_UP:], clock.ours_s[_WARM_UP:]
+    table = Table("step: time", [Row("bare loop", bare), Row(OURS, ours, ours=True)])
+    table.goals = [Goal("overhead, percent", 100 * (table.ratio(OURS) - 1), 3)]
+    yield table
+
+
+class _StepClock(Callback):
+    """Takes a step of PyTorch's tutorials after each one of a training, and both times."""
+
+    def __init__(self, data: Any, task: Any) -> None:
+        self._data = data
+        self._network = copy.deepcopy(task.network).train()
+        self._format = task.memory_format
+        self._batches = self._all_batches()
+        self._optimizer: Any = None
+        self._start = 0.0
+        self.bare_s: list[float] = []
+        self.ours_s: list[float] = []
+
+    def _all_batches(self) -> Iterator[Any]:
+        batches = self._data.train_dataloader()
+        for epoch in count():
+            batches.sampler.set_epoch(epoch)
+            yield from batches
+
+    def on_train_start(self, trainer: lightning.Trainer, *_: Any) -> None:
+        """Begin with the same learning rate."""
+        rate = trainer.optimizers[0].param_groups[0]["lr"]
+        self._optimizer = torch.optim.Adam(self._network.parameters(), rate)
+        self._start = time.perf_counter()
+
+    def on_train_batch_end(self, *_: Any) -> None:
+        """Take the other step."""
+        now = time.perf_counter()
+        self.ours_s.append(now - self._start)
+        self._step()
+        self._start = time.perf_counter()
+        self.bare_s.append(self._start - now)
+
+    def _step(self) -> None:
+        batch = next(self._batches)
+        images = self._data.normalized(batch).flatten(0, 1)
+        labels = batch.labels.flatten(0, 1).long()
+        self._optimizer.zero_grad()
+        scores = self._network(images.contiguous(memory_format=self._format))
+        loss = functional.cross_entropy(scores, labels, ignore_index=0)
+        torch.autograd.backward(loss)
+        self._optimizer.step()
+        loss.item()  # as whoever watches a training does
+
+    def check_same(self, network: nn.Module) -> None:
+        """Refuse a comparison of two trainings that are not the same.
+
+        Raises:
+            RuntimeError: The weights of the network differ by more than rounding.
+        """
+        pairs = list(
+            zip(self._network.state_dict().values(), network.state_dict().values(), strict=True)
+        )
+        difference = sum((a.double() - b.double()).square().sum().item() for a, b in pairs)
+        if not difference <= 1e-6 * sum(a.double().square().sum().item() for a, _ in pairs):
+            raise RuntimeError("the two trainings end with other weights; the comparison is void")
+
+
+def evaluation(quick: bool) -> Iterator[Table]:
+    """All of an evaluation but the network, beside FCN-ResNet50 on a CPU.
+
+    The network is timed on 16 of the 80 images; all else is an evaluation with scores that cost
+    nothing: reading, rendering, labels, confusion matrix.
+    """
+    level = 6 if quick else 10
+    overrides = ["experiment=paper/semseg_s10_b1_rgb", f"level={level}", "data=synthrooms"]
+    overrides += ["network.depth=50", "network.weights=null"]
+    with tempfile.TemporaryDirectory() as root, _quiet():
+        data, task = _built(overrides, f"{root}/rooms", 2 ** (level + 1), rooms=1)
+        network, grid = task.network.eval(), data.representation.grid
+        images = torch.randn(16, 3, grid.dim, grid.dim)
+        task.network = _Constant(len(data.class_names))
+        trainer = lightning.Trainer(accelerator="cpu", logger=False, default_root_dir=root)
+        data.setup("test")
+        panoramas = len(data.test_dataloader())
+
+        def infer() -> None:
+            with torch.inference_mode():
+                network(images)
+
+        ways = [
+            Way("the network", infer, scale=grid.num_images / 16),
+            Way("all else", lambda: trainer.test(task, data, verbose=False), True, 1 / panoramas),
+        ]
+        table = Table("evaluation: time", measure(ways, 2 if quick else 3))
+    share = table.ratio("all else")
+    table.goals = [Goal("outside the network, percent", 100 * share / (1 + share), 10)]
+    yield table
+
+
+class _Constant(nn.Module):
+    """Scores at no cost."""
+
+    def __init__(self, classes: int) -> None:
+        super().__init__()
+        self._classes = classes
+
+    def forward(self, images: Tensor) -> Tensor:
+        """``(B, classes, h, w)``."""
+        return images[:, :1].expand(-1, self._classes, -1, -1)
