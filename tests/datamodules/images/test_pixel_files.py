@@ -154,7 +154,7 @@ def test_broken_files(name: str, content: bytes, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("suffix", [".png", ".tif", ".webp"])
 def test_lossless_formats_give_the_pixels_written(tmp_path: Path, suffix: str) -> None:
-    rgb = _noise((301, 7, 3))  # more rows than are converted at once, odd sizes
+    rgb = _noise((301, 7, 3))  # odd sizes
     path = tmp_path / f"image{suffix}"
     Image.fromarray(rgb).save(path, lossless=True)
     read = read_rgb(path)
@@ -170,12 +170,6 @@ def test_jpeg_gives_the_pixels_of_another_decoder(tmp_path: Path) -> None:
     other = cv2.imread(str(path))
     assert other is not None
     np.testing.assert_array_equal(read_rgb(path), other[..., ::-1])
-
-
-def test_the_content_counts_not_the_name(tmp_path: Path) -> None:
-    path = tmp_path / "image.jpg"
-    Image.fromarray(_noise((4, 8, 3))).save(path, "PNG")
-    np.testing.assert_array_equal(read_rgb(path), _noise((4, 8, 3)))
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tif"])
@@ -258,7 +252,7 @@ def test_cut_files_are_explained(tmp_path: Path, image_format: str, kept: float)
     content = _encoded(image_format)
     path = tmp_path / "image.jpg"
     path.write_bytes(content[: int(kept * len(content)) if isinstance(kept, float) else kept])
-    with pytest.raises(DataError, match=r"image\.jpg: found .*.*again\."):
+    with pytest.raises(DataError, match=r"image\.jpg: found .*again\."):
         read_rgb(path)
 
 
@@ -266,6 +260,9 @@ def test_cut_files_are_explained(tmp_path: Path, image_format: str, kept: float)
 def test_files_that_are_no_images(tmp_path: Path, read: Any) -> None:
     (tmp_path / "notes.jpg").write_text("no picture at all")
     (tmp_path / "folder.jpg").mkdir()
+    Image.fromarray(np.ones((4, 8), np.float32)).save(tmp_path / "depth.tif")
+    with pytest.raises(DataError, match=r"depth\.tif: found float32"):
+        read_rgb(tmp_path / "depth.tif")
     for name, found in [
         ("notes.jpg", "cannot identify image"),
         ("folder.jpg", "Is a directory"),
@@ -273,13 +270,6 @@ def test_files_that_are_no_images(tmp_path: Path, read: Any) -> None:
     ]:
         with pytest.raises(DataError, match=rf"{name}: found .*{found}"):
             read(tmp_path / name)
-
-
-def test_floats_are_no_colors(tmp_path: Path) -> None:
-    path = tmp_path / "depth.tif"
-    Image.fromarray(np.ones((4, 8), np.float32)).save(path)
-    with pytest.raises(DataError, match=r"depth\.tif: found float32"):
-        read_rgb(path)
 
 
 # Field of view
@@ -331,7 +321,7 @@ _METERS = np.array([[0.5, np.nan, np.inf, -np.inf], [0, -1, 1e10, 9999]], np.flo
 _KNOWN = np.array([[0.5, 0, 0, 0], [0, 0, 0, 9999]], np.float32)
 
 
-@pytest.mark.parametrize("compression", [None, "tiff_lzw", "tiff_adobe_deflate"])
+@pytest.mark.parametrize("compression", [None, "tiff_lzw"])
 def test_depth_in_meters_tiff(tmp_path: Path, compression: Any) -> None:
     path = tmp_path / "depth.TIFF"
     Image.fromarray(_METERS).save(path, compression=compression)

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from lightning import LightningModule, Trainer
 
 from datamodules.core.split_module import Split
 from datamodules.modelnet40.datamodule import ModelNet40
@@ -200,24 +199,6 @@ def _numbers(module: ModelNet40) -> tuple[list[float], list[float]]:
     return list(module.samples.normalization.mean), list(module.samples.normalization.std)
 
 
-@pytest.mark.parametrize("in_memory", [False, True])
-def test_the_same_samples_for_any_number_of_workers(
-    make_module: MakeModule, in_memory: bool
-) -> None:
-    def two_epochs(num_workers: int) -> list[list[str]]:
-        module = make_module("so3", num_workers=num_workers, in_memory=in_memory, seed=3)
-        loader = module.train_dataloader()
-        epochs = []
-        for epoch in (0, 1):
-            loader.sampler.set_epoch(epoch)  # type: ignore[attr-defined]
-            epochs.append([_digest(batch) for batch in loader])
-        return epochs
-
-    alone = two_epochs(0)
-    assert two_epochs(2) == alone
-    assert alone[0] != alone[1]
-
-
 def test_training_is_turned_anew_every_time_and_evaluation_is_not(make_module: MakeModule) -> None:
     plain, turned = make_module(), make_module("so3")
     first = plain.training_samples()
@@ -301,93 +282,6 @@ def test_views_of_a_turned_shape_are_views_of_its_turned_mesh(
         upright = module.source("test").read(index).spheres
         before = views.render(np.ascontiguousarray(upright[..., :3]), "bilinear") / STEPS
         assert np.abs(before - expected[..., :3] / STEPS).mean() > 0.05
-
-
-def test_yaw_and_so3_are_spread_over_all_turns(make_module: MakeModule) -> None:
-    module = make_module()
-    for rotation in ("yaw", "so3"):
-        samples = ShapeViews(module.source("test"), {}, None, 0, rotation=rotation)
-        up = np.array([samples.shape_rotation(index)[:, 2] for index in range(400)])
-        ahead = np.array([samples.shape_rotation(index)[:, 0] for index in range(400)])
-        assert np.abs(ahead.mean(axis=0)).max() < 0.12
-        if rotation == "yaw":
-            np.testing.assert_allclose(up, np.broadcast_to([0, 0, 1.0], up.shape), atol=1e-12)
-        else:
-            assert np.abs(up.mean(axis=0)).max() < 0.12
-            np.testing.assert_allclose((up**2).mean(axis=0), 1 / 3, atol=0.06)
-
-
-# --- with a trainer, and on several processes --------------------------------------------------
-
-
-class Recorder(LightningModule):
-    """Trains one number and writes down what it is shown."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.weight = torch.nn.Parameter(torch.zeros(()))
-        self.seen: dict[int, list[str]] = {}
-        self.dtypes: set[torch.dtype] = set()
-        self.tested: list[int] = []
-
-    def training_step(self, batch: ShapeSample, batch_idx: int) -> torch.Tensor:
-        self.seen.setdefault(self.current_epoch, []).append(_digest(batch))
-        return self.weight * batch.images.mean()
-
-    def validation_step(self, batch: ShapeSample, batch_idx: int) -> None:
-        pass
-
-    def test_step(self, batch: ShapeSample, batch_idx: int) -> None:
-        self.tested += batch.index.tolist()
-        self.dtypes.add(batch.images.dtype)
-
-    def configure_optimizers(self) -> torch.optim.Optimizer:
-        return torch.optim.SGD(self.parameters(), lr=0.1)
-
-
-def _trainer(folder: Path, epochs: int = 1, precision: Any = None) -> Trainer:
-    return Trainer(
-        precision=precision,
-        default_root_dir=folder,
-        accelerator="cpu",
-        max_epochs=epochs,
-        logger=False,
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        use_distributed_sampler=False,
-        log_every_n_steps=1,
-    )
-
-
-# Lightning 2.6 with torch 2.15.
-@pytest.mark.filterwarnings("ignore:.*LeafSpec:FutureWarning")
-def test_a_resumed_run_sees_what_the_whole_run_sees(
-    make_module: MakeModule, tmp_path: Path
-) -> None:
-    def module() -> ModelNet40:
-        return make_module("so3", shapes_per_step=4)
-
-    whole, first, second = Recorder(), Recorder(), Recorder()
-    _trainer(tmp_path / "whole", 3).fit(whole, datamodule=module())
-    trainer = _trainer(tmp_path / "parts", 1)
-    trainer.fit(first, datamodule=module())
-    trainer.save_checkpoint(tmp_path / "last.ckpt")
-    resumed = _trainer(tmp_path / "parts", 3)
-    resumed.fit(second, datamodule=module(), ckpt_path=tmp_path / "last.ckpt", weights_only=True)
-    assert list(whole.seen) == [0, 1, 2]
-    assert len({tuple(epoch) for epoch in whole.seen.values()}) == 3
-    assert first.seen | second.seen == whole.seen
-
-
-@pytest.mark.filterwarnings("ignore:.*LeafSpec:FutureWarning")
-def test_an_evaluation_prepares_the_test_shapes_only(tmp_path: Path) -> None:
-    root = write_tree(tmp_path / "shapes", counts={"cup": (2, 3)})
-    module, recorder = ModelNet40(root, TangentRepresentation(0, LEVEL)), Recorder()
-    _trainer(tmp_path, precision="bf16-true").test(recorder, datamodule=module, verbose=False)
-    assert recorder.tested == [0, 1, 2]
-    assert recorder.dtypes == {torch.bfloat16}
-    assert {path.parent.name for path in root.rglob("*.npy")} == {"test"}
 
 
 # --- settings ----------------------------------------------------------------------------------
