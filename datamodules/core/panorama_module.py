@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar, Literal
 
+from datamodules.core.found import Found, Split
 from datamodules.core.panoramas import Panorama, Turn
 from datamodules.core.pipeline import (
     EstimatedUp,
@@ -26,7 +27,7 @@ from datamodules.core.samples import (
     Input,
     Normalization,
 )
-from datamodules.core.split_module import Found, Split, SplitDataModule
+from datamodules.core.split_module import SplitDataModule
 from datamodules.core.store import Store
 from tangent_train.errors import SettingError
 
@@ -110,10 +111,9 @@ class PanoramaDataModule(SplitDataModule[ImageFiles]):
         height, width = shape = self.erp_height, 2 * self.erp_height
         read = PanoramaReading(reader, shape)
         store = Store.of(self.store, f"{height}x{width}", reader.settings)
-        found = Found(splits, read, store)
-        files = found.of(list(splits))
+        found = Found(self.noun, splits, read, store)
         check = partial(check_headers, reader=reader, problems=problems, erp_height=height)
-        for _ in in_threads(check, files):
+        for _ in in_threads(check, found.of()):
             pass
         return found
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar
 
+from datamodules.core.found import Found, Split
 from datamodules.core.photos import Photo
 from datamodules.core.pipeline import SplitItems, in_threads
 from datamodules.core.problems import Problems
@@ -19,7 +20,7 @@ from datamodules.core.samples import (
     Input,
     Normalization,
 )
-from datamodules.core.split_module import Found, Split, SplitDataModule
+from datamodules.core.split_module import SplitDataModule
 from datamodules.core.store import Store
 from tangent_train.errors import DataError, SettingError
 from tangent_train.geometry import shift_range
@@ -87,9 +88,9 @@ class PhotoDataModule(SplitDataModule[ImageFiles]):
         """See `SplitDataModule`."""
         reader, splits = self.find_images(problems)
         store = Store.of(self.store, "photos", reader.settings)
-        found = Found(splits, PhotoReading(reader), store)
-        files = found.of(list(splits))
-        for _ in in_threads(partial(self._check, reader=reader, problems=problems), files):
+        found = Found(self.noun, splits, PhotoReading(reader), store)
+        check = partial(self._check, reader=reader, problems=problems)
+        for _ in in_threads(check, found.of()):
             pass
         return found
 

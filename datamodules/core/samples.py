@@ -6,12 +6,12 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, Protocol, TypeVar, get_args
+from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, TypeVar, get_args
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.data import Dataset, default_collate
+from torch.utils.data import Dataset
 
 from datamodules.core.panoramas import STEPS_PER_M
 from datamodules.core.sampling import Seed, sample_rng
@@ -36,11 +36,9 @@ __all__ = [
     "Input",
     "Inputs",
     "Normalization",
-    "ShownImage",
     "TrainingImages",
     "TrainingSample",
     "channel_names",
-    "collate",
     "normalize",
     "render_inputs",
     "world_rays",
@@ -65,29 +63,6 @@ Inputs = Sequence[Tensor]
 """RGB, perhaps depth and elevation as they were rendered, see `TrainingSample`."""
 
 _Images = TypeVar("_Images", Inputs, Tensor)
-_Sample = TypeVar("_Sample", "TrainingSample[Inputs]", "EvaluationSample[Inputs]")
-
-
-class ShownImage(Protocol):
-    """What a network is shown views of."""
-
-    @property
-    def rgb(self) -> NDArray[np.uint8]:
-        """``(H, W, 3)`` colours."""
-        ...
-
-    @property
-    def depth(self) -> NDArray[np.uint16] | None:
-        """``(H, W)`` distance from the centre of projection in steps of 1/512 m, 0 where missing.
-
-        None where depth is no input.
-        """
-        ...
-
-    @property
-    def up(self) -> NDArray[np.float64] | None:
-        """``(3,)`` direction of the zenith in a panorama; None where that is z, and in photos."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -193,12 +168,6 @@ def normalize(
     """
     parts = dict(zip([name for name in INPUTS if name in inputs], rendered, strict=True))
     measured = 3 + ("depth" in parts)
-    if normalization.channels != measured:
-        raise SettingError(
-            "normalization",
-            found=f"{normalization.channels} channels",
-            expected=f"{measured}, as the inputs have",
-        )
     rgb = parts["rgb"]
     *batch, height, width, _ = rgb.shape
     channels = len(channel_names(inputs))
@@ -292,19 +261,16 @@ class ImageSamples:
         """Samples `EvaluationSample`."""
         return EvaluationImages(source, representation, self.inputs)
 
-    def collate(self, samples: list[Any]) -> Any:
-        """A batch of samples, see `collate`."""
-        return collate(samples)
-
     def normalized(self, batch: Any) -> Tensor:
         """The images of a batch as the network takes them."""
         return normalize(batch.images, self.normalization, self.inputs)
 
 
+@dataclass(frozen=True)
 class TrainingImages(Dataset[TrainingSample[Inputs]]):
     """Random views of images, by (epoch, index).
 
-    Args:
+    Attributes:
         source: The images.
         representation: What the network sees of them.
         seed: Seed of the run, 0 or more.
@@ -312,65 +278,52 @@ class TrainingImages(Dataset[TrainingSample[Inputs]]):
         color_jitter: Strength of the colour augmentation, 0 to 1, see `jitter_colors`.
     """
 
-    def __init__(
-        self,
-        source: SplitItems[Any, Any],
-        representation: Any,
-        seed: Seed,
-        inputs: Sequence[Input],
-        color_jitter: float = 0.0,
-    ) -> None:
-        self._source = source
-        self._representation = representation
-        self._seed = seed
-        self._inputs = inputs
-        self._color_jitter = color_jitter
+    source: SplitItems[Any, Any]
+    representation: Any
+    seed: Seed
+    inputs: Sequence[Input]
+    color_jitter: float = 0.0
 
     def __len__(self) -> int:
-        return len(self._source)
+        return len(self.source)
 
     def __getitem__(self, key: tuple[int, int]) -> TrainingSample[Inputs]:
         epoch, index = key
-        image = self._source.read(index)
-        rng = sample_rng(self._seed, epoch, index)
-        views = image.sampler(self._representation).sample(rng)
-        rgb, *others = render_inputs(image, views, self._inputs)
-        if self._color_jitter:
-            rgb = jitter_colors(rgb, self._color_jitter, rng)
-        return TrainingSample(
-            (rgb, *others),
-            _tensor(views.render(image.labels, "nearest")),
-            torch.from_numpy(world_rays(views, image.up)),
-            index,
-        )
+        image = self.source.read(index)
+        rng = sample_rng(self.seed, epoch, index)
+        views = image.sampler(self.representation).sample(rng)
+        rgb, *others = render_inputs(image, views, self.inputs)
+        if self.color_jitter:
+            rgb = jitter_colors(rgb, self.color_jitter, rng)
+        labels = _tensor(views.render(image.labels, "nearest"))
+        rays = torch.from_numpy(world_rays(views, image.up))
+        return TrainingSample((rgb, *others), labels, rays, index)
 
 
+@dataclass(frozen=True)
 class EvaluationImages(Dataset[EvaluationSample[Inputs]]):
     """Whole images, by (epoch, index); the epoch changes nothing.
 
-    Args:
+    Attributes:
         source: The images.
         representation: What the network sees of them.
         inputs: What it is shown, see `Input`.
     """
 
-    def __init__(
-        self, source: SplitItems[Any, Any], representation: Any, inputs: Sequence[Input]
-    ) -> None:
-        self._source = source
-        self._representation = representation
-        self._inputs = inputs
+    source: SplitItems[Any, Any]
+    representation: Any
+    inputs: Sequence[Input]
 
     def __len__(self) -> int:
-        return len(self._source)
+        return len(self.source)
 
     def __getitem__(self, key: tuple[int, int]) -> EvaluationSample[Inputs]:
         _, index = key
-        image = self._source.read(index)
-        views = image.sampler(self._representation).whole()
+        image = self.source.read(index)
+        views = image.sampler(self.representation).whole()
         return EvaluationSample(
-            render_inputs(image, views, self._inputs),
-            torch.tensor(image.target(self._representation)),
+            render_inputs(image, views, self.inputs),
+            torch.tensor(image.target(self.representation)),
             torch.from_numpy(world_rays(views, image.up)),
             torch.from_numpy(views.rotations().astype(np.float32)),
             index,
@@ -390,24 +343,11 @@ def _checked_inputs(inputs: Sequence[Input]) -> tuple[Input, ...]:
     return ordered
 
 
-def collate(samples: list[_Sample]) -> _Sample:
-    """A batch of `TrainingSample` or `EvaluationSample`, with a leading dimension.
-
-    As torch's own function, but one sample alone is not copied.
-    """
-    if len(samples) > 1:
-        return default_collate(samples)
-    images, *tensors, index = samples[0]
-    kind: Any = type(samples[0])
-    batched = [tensor[None] for tensor in tensors]
-    return kind([image[None] for image in images], *batched, torch.tensor([index]))
-
-
-def render_inputs(image: ShownImage, views: Views, inputs: Sequence[Input]) -> tuple[Tensor, ...]:
+def render_inputs(image: Any, views: Views, inputs: Sequence[Input]) -> tuple[Tensor, ...]:
     """What a network is shown of an image, before `normalize`.
 
     Args:
-        image: It, with depth where that is an input.
+        image: What has `rgb`, `depth` where that is an input, and `up`, as `Panorama` and `Photo`.
         views: Where it looks.
         inputs: See `Input`.
 

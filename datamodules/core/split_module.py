@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import re
-import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Generator, Mapping, Sequence
-from contextlib import closing
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, Generic, Literal, NamedTuple, Protocol, TypeVar
+from typing import Any, ClassVar, Generic, Literal, TypeVar
 
 import cv2
 import numpy as np
@@ -23,29 +20,18 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from datamodules.core.class_weights import ClassWeights, class_weights
+from datamodules.core.found import SPLITS, Found, Split
 from datamodules.core.pipeline import Item, SplitItems, in_threads
 from datamodules.core.problems import Problems
-from datamodules.core.progress import show_progress
 from datamodules.core.samples import Normalization
-from datamodules.core.sampling import EpochSampler, Seed
-from datamodules.core.store import Store
+from datamodules.core.sampling import EpochSampler
 from tangent_train.errors import DataError, SettingError
 
 __all__ = ["SPLITS", "Found", "Kind", "Split", "SplitDataModule", "at_least"]
 
-Split = Literal["train", "val", "test"]
-"""A part of a data set."""
-
-SPLITS: tuple[Split, ...] = ("train", "val", "test")
-"""All of them."""
-
 Kind = Literal["segmentation", "classification"]
 """What a data set is labelled for: classes of pixels, or of whole shapes."""
 
-SAMPLED = 32
-"""How many images are decoded as training begins, at most."""
-
-_SECONDS = 2.0
 _GO_ON = (
     "tangent-check with the same data settings lists all there are; data.skip_broken=true goes on "
     "without what is broken."
@@ -58,55 +44,6 @@ _FEWER = (
 _CAUGHT = re.compile(r"\ACaught \w+ in DataLoader worker.*\.(?:Data|Setting)Error: ", re.DOTALL)
 
 _Item = TypeVar("_Item", bound=Item)
-_Result = TypeVar("_Result")
-
-
-class Samples(Protocol):
-    """How the images of a split become what a network is trained and evaluated on."""
-
-    @property
-    def in_channels(self) -> int:
-        """Number of input channels."""
-        ...
-
-    @property
-    def normalization(self) -> Normalization:
-        """Of those that are measured."""
-        ...
-
-    def training(self, source: Any, representation: Any, seed: Seed) -> Dataset[Any]:
-        """Random views, by (epoch, index)."""
-        ...
-
-    def evaluation(self, source: Any, representation: Any) -> Dataset[Any]:
-        """All of every image, by (epoch, index); the epoch changes nothing."""
-        ...
-
-    def collate(self, samples: list[Any]) -> Any:
-        """A batch of samples."""
-        ...
-
-    def normalized(self, batch: Any) -> Tensor:
-        """The images of a batch as the network takes them, float32, on the device they are on."""
-        ...
-
-
-class Found(NamedTuple, Generic[_Item]):
-    """What there is of a data set.
-
-    Attributes:
-        splits: The files of every image or shape.
-        read: Reads one from its files, see `pipeline.Reading`.
-        store: Where they are prepared, if anywhere.
-    """
-
-    splits: Mapping[Split, Sequence[_Item]]
-    read: Callable[[_Item], Any]
-    store: Store | None = None
-
-    def of(self, splits: Sequence[Split]) -> list[_Item]:
-        """What some splits have."""
-        return [item for split in splits for item in self.splits[split]]
 
 
 @dataclass(kw_only=True, eq=False, repr=False)
@@ -137,7 +74,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
         class_names: Name of every class.
         kind: What its labels say.
         noun: What the data set consists of, in the plural.
-        samples: Makes the samples of a split and the input of the network.
+        samples: Makes the samples of a split and the input of the network, see `ImageSamples`.
         is_made: Whether `make_files` makes all of it.
 
     Raises:
@@ -159,7 +96,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
     in_memory: bool = False
     skip_broken: bool = False
     class_names: tuple[str, ...] = field(init=False)
-    samples: Samples = field(init=False)
+    samples: Any = field(init=False)
 
     def __post_init__(self) -> None:
         super().__init__()
@@ -172,7 +109,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
         for name in ("num_workers", "seed", "stream"):
             at_least(f"data.{name}", getattr(self, name), 0)
         at_least(f"data.{self._per_step}", self.per_step, 1)
-        self._found: Any = None
+        self._found: Found[_Item] | None = None
         self._sources: dict[Split, SplitItems[_Item, Any]] = {}
         self._start = (0, 0)
 
@@ -196,12 +133,6 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
     def make_files(self) -> None:
         """Make the files of the data set, where it is one that is made."""
 
-    def in_parallel(
-        self, work: Callable[[_Item], _Result], items: Sequence[_Item]
-    ) -> Generator[_Result]:
-        """The results of some work on each of several images or shapes, as they come."""
-        return in_threads(work, items)
-
     # --- checks --------------------------------------------------------------------------------
 
     def setup(self, stage: str | None = None) -> None:
@@ -214,8 +145,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
             DataError: Something is broken: all that was found is named.
             SettingError: A setting does not suit the data.
         """
-        if self._found is None:
-            self._found = self._usable()
+        self.found()
 
     def prepare_data(self) -> None:
         """Make the files, and what the store lacks; before training, decode some images.
@@ -227,16 +157,17 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
         """
         self.make_files()
         stage = None if self.trainer is None else self.trainer.state.fn
-        self._found = self._usable(sample=stage == TrainerFn.FITTING)
-        if self._found.store is not None and not self.skip_broken:
+        self._found = found = self._usable(sample=stage == TrainerFn.FITTING)
+        if not self.skip_broken and found.store is not None:
             problems = Problems()
-            splits: Sequence[Split] = ("test",) if stage == TrainerFn.TESTING else SPLITS
-            self._read_all(self._found, splits, problems)
+            found.read_all(("test",) if stage == TrainerFn.TESTING else SPLITS, problems)
             problems.refuse(self.root, _GO_ON)
 
-    def count(self, split: Split) -> int:
-        """How many images or shapes a split has."""
-        return len(self._all_found().splits[split])
+    def found(self) -> Found[_Item]:
+        """What there is, see `setup`."""
+        if self._found is None:
+            self._found = self._usable()
+        return self._found
 
     def check(self, *, progress: bool = True) -> tuple[Problems, int]:
         """Read all of the data set; nothing is made or written.
@@ -247,8 +178,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
         Returns:
             All that is wrong, and how many images or shapes were read.
         """
-        problems = Problems()
-        found: Any = Found(dict.fromkeys(SPLITS, ()), _nothing)
+        problems, count = Problems(), 0
         with problems.noted():
             if self.is_made and not self.root.is_dir():
                 raise DataError(
@@ -257,16 +187,8 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
                     expected="the data set",
                     remedy="Run tangent-prepare with the same settings: it makes it.",
                 )
-            found = self.find(problems)
-        usable = problems.without(found.of(SPLITS))
-        parts = getattr(found.read, "parts", lambda item: [partial(found.read, item)])
-        work = self.in_parallel(partial(_failures, parts), usable)
-        self._note(work, problems, "Checking", len(usable), show=progress)
-        return problems, len(usable)
-
-    def _all_found(self) -> Found[_Item]:
-        self.setup()
-        return self._found
+            count = self.find(problems).check(problems, progress=progress)
+        return problems, count
 
     def _usable(self, *, sample: bool = False) -> Found[_Item]:
         """What can be used; all is refused if something cannot, unless that is to be left out."""
@@ -276,92 +198,42 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
             found = self.find(problems)
         if problems.fatal:
             problems.refuse(self.root)
-        if self.skip_broken:
-            self._read_all(found, SPLITS, problems)
-            return self._without(found, problems)
-        if sample and self.store is None:
-            self._read_some(found, problems)
-        problems.refuse(self.root, _GO_ON)
-        return found
-
-    def _read_all(self, found: Found[_Item], splits: Sequence[Split], problems: Problems) -> None:
-        """Read everything once, into the store if there is one; note what is broken."""
-        items, store = problems.without(found.of(splits)), found.store
-        total = len(items)
-        work = partial(_read_failures, found.read)
-        if store is not None:
-            items = [item for item in items if not store.is_current(item.name, item.parts)]
-            work = partial(_make_failures, found.read, store)
-        done = 0
-        if items and store is not None:  # the first one tells how large they are
-            done = 1
-            self._note(in_threads(work, items[:1]), problems, "", 1, show=False)
-            store.check_room(items[0].name, len(items) - 1)
-        if items[done:]:
-            what = "Checking the data" if store is None else f"Preparing {self.noun}"
-            before = total - len(items) + done
-            self._note(self.in_parallel(work, items[done:]), problems, what, total, before=before)
-
-    def _note(
-        self, work: Generator[_Failures], problems: Problems, what: str, total: int, **bar: Any
-    ) -> None:
-        """Follow some work on images, and note what it finds to be broken."""
-
-        def failed() -> Generator[None]:
-            for item, errors in work:
-                for error in errors:
-                    with problems.noted(item.name, next(iter(item.parts.values()))):
-                        raise error
-                yield
-
-        with closing(work):  # an interrupt drops what is queued
-            show_progress(failed(), what, self.noun, total, **bar)
-
-    def _read_some(self, found: Found[_Item], problems: Problems) -> None:
-        """Decode some images from all over the data set, other ones for other seeds."""
-        items = problems.without(found.of(SPLITS))
-        rng = np.random.default_rng(self.seed)
-        strata = np.array_split(np.arange(len(items)), min(SAMPLED, len(items)) or 1)
-        chosen = rng.permutation([rng.choice(stratum) for stratum in strata if len(stratum)])
-        until = time.monotonic() + _SECONDS
-
-        def until_late() -> Generator[_Failures]:
-            read = partial(_read_failures, found.read)
-            for failures in in_threads(read, [items[place] for place in chosen]):
-                yield failures
-                if time.monotonic() > until:
-                    return
-
-        self._note(until_late(), problems, "", 0, show=False)
-
-    def _without(self, found: Found[_Item], problems: Problems) -> Found[_Item]:
-        broken = problems.items
-        splits = {split: problems.without(items) for split, items in found.splits.items()}
-        for split, items in splits.items():
-            if found.splits[split] and not items:
+        if not self.skip_broken:
+            if sample and self.store is None:
+                found.read_some(self.seed, problems)
+            problems.refuse(self.root, _GO_ON)
+            return found
+        found.read_all(SPLITS, problems)
+        left = found.without(problems)
+        for split in SPLITS:
+            if found.splits[split] and not left.splits[split]:
                 raise DataError(
                     self.root,
                     found=f"no {self.noun} for {split} that can be used",
                     expected="one or more",
                     remedy="tangent-check lists what is wrong with them.",
                 )
-        if broken:
-            total = len(broken.union(item.name for item in found.of(SPLITS)))
+        if problems.items:
+            total = len(problems.items.union(item.name for item in found.of()))
             _tell(
-                f"{len(broken)} of {total} {self.noun} are broken and left out "
+                f"{len(problems.items)} of {total} {self.noun} are broken and left out "
                 "(data.skip_broken=true); tangent-check lists them."
             )
-        return found._replace(splits=splits)
+        return left
 
     # --- samples and loaders -------------------------------------------------------------------
 
     def training_samples(self) -> Dataset[Any]:
         """Samples of the training split, by (epoch, index)."""
-        return self.samples.training(self.source("train"), self.representation, self.drawn_from)
+        samples: Dataset[Any] = self.samples.training(
+            self.source("train"), self.representation, self.drawn_from
+        )
+        return samples
 
     def evaluation_samples(self, split: Split) -> Dataset[Any]:
         """Samples of a whole split, by (epoch, index); the epoch changes nothing."""
-        return self.samples.evaluation(self.source(split), self.representation)
+        samples: Dataset[Any] = self.samples.evaluation(self.source(split), self.representation)
+        return samples
 
     def class_weights(self, kind: ClassWeights) -> Tensor:
         """Weights of the classes in the loss, from the labels of the training split.
@@ -382,7 +254,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
     def source(self, split: Split) -> SplitItems[_Item, Any]:
         """The images of one split: in memory, if asked for."""
         if split not in self._sources:
-            source = self.pipeline(self._all_found(), split)
+            source = self.pipeline(self.found(), split)
             if self.in_memory:
                 source.remember(self.root)
             self._sources[split] = source
@@ -400,7 +272,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
     @property
     def in_channels(self) -> int:
         """Number of input channels."""
-        return self.samples.in_channels
+        return int(self.samples.in_channels)
 
     @property
     def drawn_from(self) -> tuple[int, int]:
@@ -531,45 +403,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
             persistent_workers=self.num_workers > 0,
             pin_memory=torch.cuda.is_available(),
             worker_init_fn=_opencv_without_threads,
-            collate_fn=self.samples.collate,
         )
-
-
-_Failures = tuple[Item, list[Exception]]
-"""An image or shape, and what is wrong with it."""
-
-
-def _failures(parts: Callable[[Any], Sequence[Callable[[], object]]], item: Item) -> _Failures:
-    """Decode the files of one image, each by itself."""
-    errors: list[Exception] = []
-    for read in parts(item):
-        try:
-            read()
-        except (DataError, SettingError, OSError) as error:
-            errors.append(error)
-    return item, errors
-
-
-def _read_failures(read: Callable[[Any], object], item: Item) -> _Failures:
-    return _failures(lambda one: [partial(read, one)], item)
-
-
-def _make_failures(read: Callable[[Any], object], store: Store, item: Item) -> _Failures:
-    """Write the prepared file of one image."""
-
-    def make() -> None:
-        store.make(item.name, item.parts, lambda: _arrays(read(item)))
-
-    return _failures(lambda _: [make], item)
-
-
-def _nothing(item: Any) -> None:
-    del item
-
-
-def _arrays(image: Any) -> dict[str, Any]:
-    """Those of a named tuple that are there."""
-    return {name: array for name, array in image._asdict().items() if array is not None}
 
 
 @rank_zero_only

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shutil
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -122,28 +121,6 @@ class Store:
         except (DataError, OSError):
             return False
         return True
-
-    def check_room(self, made: str, others: int) -> None:
-        """Make sure that further files will fit on the disk.
-
-        Args:
-            made: An item that was to be written first.
-            others: How many more are to be written, each of about its size.
-
-        Raises:
-            DataError: They will not.
-        """
-        if not self.path(made).exists():  # it was broken
-            return
-        needed = others * self.path(made).stat().st_size
-        free = shutil.disk_usage(self.folder).free
-        if needed > free:
-            raise DataError(
-                self.folder,
-                found=f"{free / 1e9:.1f} GB free",
-                expected=f"{needed / 1e9:.1f} GB for the {others} files that are still to be made",
-                remedy="Free some space, or name a folder on another disk in data.store.",
-            )
 
 
 def _stamps(files: Mapping[str, Path]) -> dict[str, str]:

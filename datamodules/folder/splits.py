@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from datamodules.core.found import SPLITS, Split
 from datamodules.core.group_drawing import draw_groups
-from datamodules.core.split_module import SPLITS, Split
 from tangent_train.errors import DataError, SettingError
 
 if TYPE_CHECKING:

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
+from datamodules.core.found import Found, Split
 from datamodules.core.group_drawing import draw_groups
 from datamodules.core.pipeline import SplitItems
 from datamodules.core.processes import in_processes, number_of_processes
-from datamodules.core.split_module import Found, Kind, Split, SplitDataModule
+from datamodules.core.split_module import Kind, SplitDataModule
 from datamodules.core.store import Store
 from datamodules.modelnet40.shape_files import MODELNET40, ShapeFile, find_shapes
 from datamodules.modelnet40.shape_samples import (
@@ -34,7 +35,6 @@ if TYPE_CHECKING:
 __all__ = ["ModelNet40"]
 
 _PER_PROCESS = 40
-_Result = TypeVar("_Result")
 
 
 @registered
@@ -105,18 +105,11 @@ class ModelNet40(SplitDataModule[ShapeFile]):
                 raise DataError(self.root, found=f"no {split} shape", expected="some")
         shape = self.erp_height, 2 * self.erp_height
         folder = (self.store or self.root) / f"spheres_{shape[0]}x{shape[1]}"
-        return Found(splits, SphereReading(shape), Store(folder))
+        return Found(self.noun, splits, SphereReading(shape), Store(folder), _in_processes)
 
     def pipeline(self, found: Found[ShapeFile], split: Split) -> SplitItems[ShapeFile, Spheres]:
         """From the store."""
         return SplitItems(found.splits[split], found.read, Spheres, found.store)
-
-    def in_parallel(
-        self, work: Callable[[ShapeFile], _Result], items: Sequence[ShapeFile]
-    ) -> Generator[_Result]:
-        """In processes: reading meshes holds the GIL."""
-        processes = number_of_processes(None, len(items), _PER_PROCESS)
-        return in_processes(work, [(mesh,) for mesh in items], processes)
 
     def evaluation_samples(self, split: Split) -> ShapeViews:
         """Samples `ShapeSample`: those of the test split rotated, if asked for."""
@@ -141,3 +134,9 @@ class ModelNet40(SplitDataModule[ShapeFile]):
             names = [m.name for m in meshes if m.label == label and m.part == "train"]
             chosen |= draw_groups(names, self.validation_fraction, (self.seed, number))
         return chosen
+
+
+def _in_processes(work: Callable[[ShapeFile], Any], meshes: Sequence[ShapeFile]) -> Generator[Any]:
+    # Not threads: reading meshes holds the GIL.
+    processes = number_of_processes(None, len(meshes), _PER_PROCESS)
+    return in_processes(work, [(mesh,) for mesh in meshes], processes)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.data import Dataset, default_collate
+from torch.utils.data import Dataset
 
 from datamodules.core.samples import Normalization
 from datamodules.core.sampling import Seed, sample_rng
@@ -124,10 +124,6 @@ class ShapeSamples:
     ) -> ShapeViews:
         """All views, of shapes that are rotated if asked for."""
         return ShapeViews(source, self._labels, representation, seed, rotation=rotation)
-
-    def collate(self, samples: list[Any]) -> Any:
-        """A batch of samples."""
-        return default_collate(samples)
 
     def normalized(self, batch: ShapeSample) -> Tensor:
         """The views of a `ShapeSample`, ``(B, N, 6, h, w)`` float32."""

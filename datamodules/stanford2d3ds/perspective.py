@@ -26,9 +26,9 @@ from datamodules.stanford2d3ds.splits import check_choice, find_pictures
 from tangent_train.registry import registered
 
 if TYPE_CHECKING:
+    from datamodules.core.found import Split
     from datamodules.core.problems import Problems
     from datamodules.core.reading import ImageFiles
-    from datamodules.core.split_module import Split
 
 __all__ = ["Stanford2D3DSPerspective"]
 

@@ -12,9 +12,9 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
+    from datamodules.core.found import Split
     from datamodules.core.problems import Problems
     from datamodules.core.reading import ImageFiles
-    from datamodules.core.split_module import Split
 
 __all__ = ["check_choice", "find_pictures"]
 

@@ -32,9 +32,9 @@ from tangent_train.errors import DataError
 from tangent_train.registry import registered
 
 if TYPE_CHECKING:
+    from datamodules.core.found import Split
     from datamodules.core.problems import Problems
     from datamodules.core.reading import ImageFiles
-    from datamodules.core.split_module import Split
 
 __all__ = ["SynthiaPerspective"]
 

@@ -11,8 +11,8 @@ from tangent_train.errors import DataError, SettingError
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from datamodules.core.found import Split
     from datamodules.core.reading import ImageFiles
-    from datamodules.core.split_module import Split
 
 __all__ = ["FRAMES", "SEQUENCES", "TEST", "TRAIN", "checked_sequences", "choose_frames", "divide"]
 

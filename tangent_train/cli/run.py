@@ -152,7 +152,7 @@ def prepare(settings: Settings) -> None:
     data = make(settings["data"], "data", representation=representation)
     data.prepare_data()
     data.setup()
-    counts = ", ".join(f"{data.count(s)} {s}" for s in ("train", "val", "test"))
+    counts = ", ".join(f"{len(data.found().splits[s])} {s}" for s in ("train", "val", "test"))
     _console().print(f"{data.root} is ready. {data.noun.capitalize()}: {counts}.")
 
 

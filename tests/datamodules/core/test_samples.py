@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 import torch
-from torch.utils.data import default_collate
 
 from datamodules.core.panoramas import Panorama
 from datamodules.core.samples import (
@@ -17,7 +16,6 @@ from datamodules.core.samples import (
     Input,
     Normalization,
     TrainingImages,
-    collate,
     normalize,
     render_inputs,
 )
@@ -89,14 +87,6 @@ def test_normalize_against_the_formula(depth: bool) -> None:
 def test_impossible_normalization(mean: Any, std: Any) -> None:
     with pytest.raises(SettingError, match="normalization"):
         Normalization(mean, std)
-
-
-@pytest.mark.parametrize(("depth", "normalization"), [(True, RGB_NORMALIZATION), (False, IDENTITY)])
-def test_normalization_of_other_channels(depth: bool, normalization: Normalization) -> None:
-    inputs = [torch.zeros((1, 2, 2, 3), dtype=torch.uint8)]
-    inputs += [torch.zeros((1, 2, 2), dtype=torch.int16)] * depth
-    with pytest.raises(SettingError, match="channels"):
-        normalize(inputs, normalization, DEPTH if depth else ("rgb",))
 
 
 # --- other inputs -------------------------------------------------------------------------------
@@ -215,19 +205,6 @@ def test_evaluation_sample(strips: Representation) -> None:
     np.testing.assert_array_equal(sample.target.numpy(), _positions(2).labels)
     joined = torch.cat(list(images[:, 0]), dim=1)
     torch.testing.assert_close(joined, sample.target.float())
-
-
-@pytest.mark.parametrize("count", [1, 2])
-def test_batches_are_those_of_torch(strips: Representation, count: int) -> None:
-    training: Any = _training(strips)
-    evaluation: Any = EvaluationImages(POSITIONS, strips, DEPTH)
-    for samples in ([d[0, i] for i in range(count)] for d in (training, evaluation)):
-        found, expected = collate(samples), default_collate(samples)
-        assert type(found) is type(expected)
-        assert torch.equal(found[1], expected[1])
-        assert torch.equal(torch.as_tensor(found.index), torch.as_tensor(expected.index))
-        for image, wanted in zip(found.images, expected.images, strict=True):
-            assert torch.equal(image, wanted)
 
 
 def test_samples_share_no_memory_with_panoramas(

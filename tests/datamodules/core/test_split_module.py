@@ -11,6 +11,7 @@ import pytest
 import torch
 from lightning import LightningModule, Trainer
 
+from datamodules.core.found import Split
 from datamodules.core.panoramas import Panorama
 from datamodules.core.samples import (
     RGB_NORMALIZATION,
@@ -18,7 +19,6 @@ from datamodules.core.samples import (
     EvaluationSample,
     normalize,
 )
-from datamodules.core.split_module import Split
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 from tangent_train.errors import SettingError
 from tangent_train.rendering import TangentRepresentation

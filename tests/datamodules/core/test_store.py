@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 from collections import namedtuple
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from datamodules.core.split_module import Split
+    from datamodules.core.found import Split
     from tests.conftest import FabricateStanford
 
     MakeModule = Callable[..., Stanford2D3DS]
@@ -271,16 +270,3 @@ def test_an_interrupt_leaves_whole_files_and_work_goes_on(
     assert len(before) == 3
     make_module().prepare_data()
     assert len(_made(store, before)) == PANORAMAS - 3
-
-
-def test_a_full_disk_is_found_when_the_first_file_is_made(
-    make_module: MakeModule, monkeypatch: pytest.MonkeyPatch, store: Path
-) -> None:
-    make_module().prepare_data()
-    others = sum(sorted(path.stat().st_size for path in _times(store))[1:])
-    shutil.rmtree(store)
-    usage = namedtuple("usage", "total used free")
-    monkeypatch.setattr("shutil.disk_usage", lambda _: usage(others, 1, others - 99))
-    with pytest.raises(DataError, match=r"found 0\.0 GB free; expected .* for the 7 files"):
-        make_module().prepare_data()
-    assert len(_times(store)) == 1

@@ -26,7 +26,7 @@ from tests.datamodules.folder.folder_format import (
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from datamodules.core.panorama_module import Split
+    from datamodules.core.found import Split
 
 _SPLITS: tuple[Split, ...] = ("train", "val", "test")
 

@@ -11,7 +11,7 @@ from tangent_train.errors import DataError
 from tests.datamodules.folder.folder_format import write_classes, write_data_set, write_panorama
 
 if TYPE_CHECKING:
-    from datamodules.core.panorama_module import Split
+    from datamodules.core.found import Split
 
 _SPLITS: tuple[Split, ...] = ("train", "val", "test")
 

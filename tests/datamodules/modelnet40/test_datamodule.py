@@ -8,7 +8,7 @@ import pytest
 import torch
 import trimesh
 
-from datamodules.core.split_module import Split
+from datamodules.core.found import Split
 from datamodules.modelnet40.datamodule import ModelNet40
 from datamodules.modelnet40.meshes import CHANNELS, clean_mesh, mesh_spheres, read_off
 from datamodules.modelnet40.shape_files import MODELNET40

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from datamodules import SynthRooms
-from datamodules.core.split_module import Split
+from datamodules.core.found import Split
 from tangent_train.errors import DataError, SettingError
 
 if TYPE_CHECKING:

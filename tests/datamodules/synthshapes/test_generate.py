@@ -23,7 +23,7 @@ from tangent_train.geometry import rotation_about
 from tangent_train.rendering import TangentRepresentation
 
 if TYPE_CHECKING:
-    from datamodules.core.split_module import Split
+    from datamodules.core.found import Split
 
 TINY = ShapeSettings(seed=3, train=2, test=1)
 

@@ -16,7 +16,7 @@ from datamodules import (
     Stanford2D3DSPerspective,
     SynthiaPerspective,
 )
-from datamodules.core.split_module import SPLITS
+from datamodules.core.found import SPLITS
 from tangent_train.rendering import EquirectRepresentation, PerspectiveRepresentation
 from tests.datamodules.folder.folder_format import write_data_set
 from tests.datamodules.modelnet40.shapes_format import write_tree

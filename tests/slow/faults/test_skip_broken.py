@@ -12,10 +12,10 @@ import pytest
 from lightning.pytorch.trainer.states import TrainerFn
 
 from datamodules import Stanford2D3DS
-from datamodules.core import split_module
+from datamodules.core import found as found_module
+from datamodules.core.found import Found
 from datamodules.core.problems import Problems
 from datamodules.core.reading import ImageFiles
-from datamodules.core.split_module import Found
 from tangent_train.cli import main
 from tangent_train.errors import DataError, SettingError
 from tests.datamodules.folder.folder_format import write_classes
@@ -254,7 +254,7 @@ def test_training_begins_with_a_look_at_some_images_of_all_splits(
     fabricate_stanford: FabricateStanford,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(split_module, "SAMPLED", 100)
+    monkeypatch.setattr(found_module, "SAMPLED", 100)
     write(kind, root, fabricate_stanford)
     _as_in_training(module(kind, root)).prepare_data()
     broken = [partner(kind, path, "labels") for path in colors(kind, root)[1::3]]
@@ -287,7 +287,7 @@ class _Images(Stanford2D3DS):
 
         self.seen: list[str] = []
         splits: Any = {split: items(split, count) for split, count in LENGTHS.items()}
-        return Found(splits, lambda files: self.seen.append(files.name))
+        return Found(self.noun, splits, lambda files: self.seen.append(files.name))
 
 
 LENGTHS = {"train": 1000, "val": 100, "test": 400}
@@ -301,13 +301,13 @@ def _seen(seed: int) -> list[str]:
 
 def test_the_look_is_short_and_goes_everywhere(monkeypatch: pytest.MonkeyPatch) -> None:
     first = _seen(seed=0)
-    assert len(first) == len(set(first)) == split_module.SAMPLED
+    assert len(first) == len(set(first)) == found_module.SAMPLED
     counts = [sum(name.startswith(split) for name in first) for split in LENGTHS]
     assert np.abs(np.array(counts) - np.array([1000, 100, 400]) * 32 / 1500).max() <= 1
     assert set(_seen(seed=1)) != set(first), "other runs look at others"
     assert set(_seen(seed=0)) == set(first)
-    monkeypatch.setattr(split_module, "_SECONDS", -1)
-    assert 0 < len(_seen(seed=0)) < split_module.SAMPLED, "images may be large, and disks slow"
+    monkeypatch.setattr(found_module, "_SECONDS", -1)
+    assert 0 < len(_seen(seed=0)) < found_module.SAMPLED, "images may be large, and disks slow"
 
 
 # --- the commands -------------------------------------------------------------------------------

@@ -1,0 +1,159 @@
+"""What there is of a data set, and finding out what of it is broken."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, Generic, Literal, TypeVar
+
+import numpy as np
+
+from datamodules.core.pipeline import Item, in_threads
+from datamodules.core.problems import Problems
+from datamodules.core.progress import show_progress
+from datamodules.core.store import Store
+from tangent_train.errors import DataError, SettingError
+
+__all__ = ["SAMPLED", "SPLITS", "Found", "Split"]
+
+Split = Literal["train", "val", "test"]
+"""A part of a data set."""
+
+SPLITS: tuple[Split, ...] = ("train", "val", "test")
+"""All of them."""
+
+SAMPLED = 32
+"""How many images `Found.read_some` decodes, at most."""
+
+_SECONDS = 2.0
+_Item = TypeVar("_Item", bound=Item)
+_Failures = tuple[Item, list[Exception]]
+"""An image or shape, and what is wrong with it."""
+
+
+@dataclass(frozen=True)
+class Found(Generic[_Item]):
+    """The images or shapes of a data set.
+
+    Attributes:
+        noun: What they are, in the plural.
+        splits: Their files.
+        read: Reads one from its files, see `pipeline.Reading`; may have a method `parts` that gives
+            what decodes each of its files by itself.
+        store: Where they are prepared, if anywhere.
+        in_parallel: The results of some work on each, as they come.
+    """
+
+    noun: str
+    splits: Mapping[Split, Sequence[_Item]]
+    read: Callable[[_Item], Any]
+    store: Store | None = None
+    in_parallel: Callable[[Callable[[_Item], Any], Sequence[_Item]], Generator[Any]] = in_threads
+
+    def of(self, splits: Sequence[Split] = SPLITS) -> list[_Item]:
+        """What some splits have."""
+        return [item for split in splits for item in self.splits[split]]
+
+    def check(self, problems: Problems, *, progress: bool) -> int:
+        """Decode every file by itself and note what is broken; nothing is written.
+
+        Args:
+            problems: What is known to be broken, and where more is noted.
+            progress: Whether to show a progress bar.
+
+        Returns:
+            How many images or shapes were read.
+        """
+        items = problems.without(self.of())
+        parts = getattr(self.read, "parts", partial(_whole, self.read))
+        self._note(problems, parts, items, "Checking", show=progress)
+        return len(items)
+
+    def read_all(self, splits: Sequence[Split], problems: Problems) -> None:
+        """Read everything once, into the store if there is one; note what is broken."""
+        items, store = problems.without(self.of(splits)), self.store
+        if store is None:
+            self._note(problems, partial(_whole, self.read), items, "Checking the data")
+            return
+        missing = [item for item in items if not store.is_current(item.name, item.parts)]
+        if missing:
+            before = len(items) - len(missing)
+            make = partial(_stored, self.read, store)
+            self._note(problems, make, missing, f"Preparing {self.noun}", before=before)
+
+    def read_some(self, seed: int, problems: Problems) -> None:
+        """Decode some images from all over the data set, for a second or two; note what is broken.
+
+        Args:
+            seed: Others for other seeds.
+            problems: What is known to be broken, and where more is noted.
+        """
+        items = problems.without(self.of())
+        rng = np.random.default_rng(seed)
+        strata = np.array_split(np.arange(len(items)), min(SAMPLED, len(items)) or 1)
+        chosen = rng.permutation([rng.choice(stratum) for stratum in strata if len(stratum)])
+        until = time.monotonic() + _SECONDS
+        check = partial(_failures, partial(_whole, self.read))
+        for failed in in_threads(check, [items[place] for place in chosen]):
+            _add(problems, *failed)
+            if time.monotonic() > until:
+                return
+
+    def without(self, problems: Problems) -> Found[_Item]:
+        """The same without what is broken."""
+        splits = {split: problems.without(items) for split, items in self.splits.items()}
+        return replace(self, splits=splits)
+
+    def _note(
+        self,
+        problems: Problems,
+        reads: Callable[[Any], Iterable[Callable[[], object]]],
+        items: Sequence[_Item],
+        what: str,
+        *,
+        before: int = 0,
+        show: bool = True,
+    ) -> None:
+        """Do what is to be done with every image, and note what is broken."""
+
+        def noted() -> Generator[None]:
+            for failed in work:
+                _add(problems, *failed)
+                yield
+
+        with closing(self.in_parallel(partial(_failures, reads), items)) as work:
+            total = before + len(items)
+            show_progress(noted(), what, self.noun, total, before=before, show=show)
+
+
+def _add(problems: Problems, item: Item, errors: Iterable[Exception]) -> None:
+    for error in errors:
+        with problems.noted(item.name, next(iter(item.parts.values()))):
+            raise error
+
+
+def _failures(reads: Callable[[Any], Iterable[Callable[[], object]]], item: Item) -> _Failures:
+    """What is wrong with one image; another process may call this."""
+    errors: list[Exception] = []
+    for read in reads(item):
+        try:
+            read()
+        except (DataError, SettingError, OSError) as error:
+            errors.append(error)
+    return item, errors
+
+
+def _whole(read: Callable[[Any], object], item: Item) -> list[Callable[[], object]]:
+    return [partial(read, item)]
+
+
+def _stored(read: Callable[[Any], object], store: Store, item: Item) -> list[Callable[[], object]]:
+    return [partial(store.make, item.name, item.parts, partial(_arrays, read, item))]
+
+
+def _arrays(read: Callable[[Any], Any], item: Item) -> dict[str, Any]:
+    """The arrays of a named tuple that are there."""
+    return {name: array for name, array in read(item)._asdict().items() if array is not None}
