@@ -50,13 +50,6 @@ def test_iou_equals_torchmetrics() -> None:
     np.testing.assert_allclose(scores.iou, reference.compute()[1:].numpy(), rtol=1e-6)
 
 
-def test_the_mean_is_over_the_data_set_not_over_panoramas() -> None:
-    pairs = _panoramas()
-    single = [segmentation_scores(_counted([pair]).compute().pixels).miou for pair in pairs]
-    whole = segmentation_scores(_counted(pairs).compute().pixels).miou
-    assert abs(whole - np.mean(single)) > 1e-3
-
-
 @pytest.mark.parametrize(("absent", "mean"), [("skip", (1 + 0.5) / 2), ("zero", (1 + 0.5 + 0) / 3)])
 def test_absent_classes(absent: str, mean: float) -> None:
     confusion = np.zeros((4, 4))
@@ -76,7 +69,7 @@ def test_nothing_labelled() -> None:
     assert segmentation_scores(empty.astype(int)).share.dtype == np.float64
 
 
-@pytest.mark.parametrize("scale", [1e-9, 1e-3, 1.0, 1e9])
+@pytest.mark.parametrize("scale", [1e-9, 1e9])
 def test_scores_are_of_shares_however_little_there_is(scale: float) -> None:
     # One pixel of class 3; as solid angles, pixels are small fractions of a steradian.
     confusion = np.array([[0, 5, 0, 0], [1, 8, 1, 0], [0, 2, 6, 0], [0, 0, 0, 1.0]])
@@ -106,19 +99,6 @@ def test_latitude_bands_go_from_north_to_south() -> None:
     for k, band in enumerate(bands):
         assert band[k + 1, k + 1] == 5 * 60
         assert band.sum() == 5 * 60
-
-
-def test_matrices_add_up_over_processes_and_reset() -> None:
-    pairs = _panoramas()
-    one, other = _counted(pairs[:1]).compute(), _counted(pairs[1:]).compute()
-    whole = _counted(pairs)
-    matrices = whole.compute()
-    np.testing.assert_array_equal(matrices.pixels, one.pixels + other.pixels)
-    np.testing.assert_array_equal(matrices.bands, one.bands + other.bands)
-    np.testing.assert_allclose(matrices.solid_angle, one.solid_angle + other.solid_angle)
-    assert matrices.images == 3
-    whole.reset()
-    assert int(whole.pixels.sum()) == int(whole.images) == 0
 
 
 def test_large_counts_stay_exact() -> None:
@@ -165,14 +145,6 @@ def test_bad_input_is_refused() -> None:
     assert metric.compute().images == 0
 
 
-def test_an_all_unknown_panorama_counts_as_seen_and_adds_nothing() -> None:
-    metric = ConfusionMatrix(3)
-    unknown = torch.zeros(4, 8, dtype=torch.int64)
-    metric.update(unknown + 1, unknown)
-    assert metric.compute().pixels.sum() == 0
-    assert metric.compute().images == 1
-
-
 def test_photos_are_counted_like_panoramas_without_latitudes_and_solid_angles() -> None:
     rng = np.random.default_rng(5)
     prediction, truth = rng.integers(1, CLASSES, (3, 8, 8)), rng.integers(0, CLASSES, (3, 8, 8))
@@ -183,12 +155,3 @@ def test_photos_are_counted_like_panoramas_without_latitudes_and_solid_angles() 
     assert not photo.solid_angle.any()
     assert not photo.bands.any()
     assert as_one.solid_angle.any()
-
-
-def test_photos_add_up_whatever_classes_they_show() -> None:
-    first, last = np.full((1, 2, 2), 1), np.full((1, 2, 2), CLASSES - 1)
-    expected = np.zeros((CLASSES, CLASSES), np.int64)
-    expected[1, 1], expected[CLASSES - 1, 1] = 8, 4
-    found = _counted([(first, first), (first, last), (first, first)]).compute()
-    np.testing.assert_array_equal(found.pixels, expected)
-    assert found.images == 3
