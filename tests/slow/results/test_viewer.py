@@ -19,7 +19,6 @@ from tests.slow.results.reference import (
     rays,
 )
 from tests.slow.results.scene import (
-    BARE_PANORAMA,
     COLORS,
     EDGE,
     FLAT_PHOTO,
@@ -57,15 +56,6 @@ def test_dragging_moves_the_scene_with_the_pointer(report: OpenReport) -> None:
     report.drag(-60, 40)
     close(report.pixels(), colors_of(view_of(report, 60 * step, 40 * step, START_DEG)))
     assert report.text(".looking").startswith(f"Looking at longitude {60 * step:.1f}°")
-
-
-def test_nothing_is_mirrored(report: OpenReport) -> None:
-    report.layer("input")
-    pixels = report.pixels()
-    row, column = pixels.shape[0] // 2, pixels.shape[1] // 2
-    # Green grows with y, towards longitude 90°, to the right; blue with z, upwards.
-    assert pixels[row, column + 100, 1] > pixels[row, column - 100, 1] + 40
-    assert pixels[row - 100, column, 2] > pixels[row + 100, column, 2] + 40
 
 
 @pytest.mark.parametrize("projection", ["inside", "planet"])
@@ -159,22 +149,6 @@ def test_layers_show_the_colours_of_their_classes(report: OpenReport) -> None:
     assert report.text(".errors").split() == ["right", "wrong", "unlabelled"]
 
 
-def test_the_slider_sets_the_opacity_of_the_overlay(report: OpenReport) -> None:
-    report.drag(150, 0)
-    longitude = -math.degrees(150 * step_rad(report))
-    (direction,) = rays((1, 1), longitude, 0, 1, "inside")[0]
-    slider = report.page.locator(".opacity input")
-    for share in (100, 0, 30):
-        slider.fill(str(share))
-        report.drawn()
-        color = COLORS[classes_of(direction)] * share / 100 + colors_of(direction) * (
-            1 - share / 100
-        )
-        close(report.center(), color)
-    report.layer("truth")
-    assert not slider.is_visible()
-
-
 def test_photos_are_flat_with_pan_and_zoom(report: OpenReport) -> None:
     report.choose(FLAT_PHOTO)
     report.layer("input")
@@ -203,15 +177,6 @@ def test_photos_are_flat_with_pan_and_zoom(report: OpenReport) -> None:
     shown = factor * scale
     corner = report.pixels()[20, 20]
     close(corner, color(20.5 / PHOTO[1] / shown, 20.5 / PHOTO[0] / shown))
-
-
-def test_views_stay_when_another_panorama_is_chosen(report: OpenReport) -> None:
-    report.layer("input")
-    report.drag(-80, 20)
-    before = report.pixels()
-    report.choose(BARE_PANORAMA)
-    assert report.text(".caption") == "bare"
-    close(report.pixels(), before)
 
 
 def test_a_lost_context_comes_back(report: OpenReport) -> None:
