@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +15,7 @@ from rich.progress import track
 
 from datamodules.core.panorama_pairs import ImagePairs, PanoramaPairs
 from datamodules.images.pixel_files import read_image_size
-from tangent_train.cli import values
+from tangent_train.cli.settings import typed
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import write_bytes
 from tangent_train.json_text import parse_json
@@ -36,6 +38,25 @@ _NOT_DECIDING = ("output", "max_pairs", *_OF_IMAGES)
 """Settings that may differ when a run is continued; those of the images are part of ``data``."""
 
 
+@dataclass(frozen=True)
+class Settings:
+    """See ``configs/keypoints.yaml``, where ``data`` and one's own images are besides."""
+
+    output: Path
+    base_level: tuple[int, ...]
+    level: int | None
+    detector: str
+    margin: int
+    ratio: float
+    mutual: bool
+    max_error_deg: float
+    seed: int
+    controls: bool
+    max_pairs: int | None
+    pictures: int
+    export: bool
+
+
 def keypoints(config: Mapping[str, Any]) -> None:
     """Compare keypoints of panoramas and of tangent images on pairs, and write the figures.
 
@@ -46,17 +67,15 @@ def keypoints(config: Mapping[str, Any]) -> None:
         SettingError: A setting is missing or cannot work.
         DataError: There are no pairs.
     """
-    output = values.path(config, "output")
-    if output is None:
-        raise SettingError("output", found="none", expected="a folder for the results")
-    comparer = _comparer(config)
+    given = typed(Settings, config)
+    comparer, output = _comparer(given), given.output
     colmap()  # pycolmap is missed now rather than after minutes
     data, pairs = _pairs(config)
     deciding = {name: config[name] for name in config if name not in _NOT_DECIDING}
     settings = {**deciding, "data": data}
     done = earlier_results(output, settings)
     pairs.make_files()
-    names = pairs.names[: values.optional_whole(config, "max_pairs", 1)]
+    names = pairs.names[: given.max_pairs]
     console = Console(soft_wrap=True, highlight=False)
     missing = [(k, name) for k, name in enumerate(names) if name not in done]
     if len(missing) < len(names):
@@ -66,12 +85,12 @@ def keypoints(config: Mapping[str, Any]) -> None:
         try:
             pair = pairs.read(index)
             comparison = comparer.compare(pair)
-            if config["export"]:
+            if given.export:
                 _export(output / "export", pairs.files, pair, comparison)
         except (DataError, MemoryError) as error:  # of this pair; a SettingError is of all
             console.print(f"Pair {name}: {error or 'too little memory'}", markup=False)
             continue
-        if index < values.whole(config, "pictures", 0):
+        if index < given.pictures:
             for condition in comparison.images:
                 write_bytes(
                     output / "matches" / f"{index:03}_{file_name(name)}_{condition}.png",
@@ -82,19 +101,22 @@ def keypoints(config: Mapping[str, Any]) -> None:
     _tell(console, output, pairs, _report(pairs, done, comparer, settings), names)
 
 
-def _comparer(config: Mapping[str, Any]) -> Comparer:
-    given = config["base_level"]
-    levels = given if isinstance(given, list) else [given]
+def _comparer(given: Settings) -> Comparer:
+    ranges = {"margin": (0, math.inf), "ratio": (1e-9, 1), "max_error_deg": (1e-9, 20)}
+    for name, (least, most) in ranges.items():
+        if not least <= getattr(given, name) <= most:
+            expected = f"{least:g} to {most:g}"
+            raise SettingError(name, found=getattr(given, name), expected=expected)
     return Comparer(
-        base_levels=tuple(values.whole({"base_level": b}, "base_level", 0) for b in levels),
-        detector=Detector(config["detector"]),
-        margin=values.whole(config, "margin", 0),
-        level=values.optional_whole(config, "level", 2),
-        ratio=values.number(config, "ratio", 0, 1.001),
-        mutual=values.flag(config, "mutual"),
-        max_error_deg=values.number(config, "max_error_deg", 0, 20),
-        seed=values.whole(config, "seed", 0),
-        controls=values.flag(config, "controls"),
+        base_levels=given.base_level,
+        detector=Detector(given.detector),
+        margin=given.margin,
+        level=given.level,
+        ratio=given.ratio,
+        mutual=given.mutual,
+        max_error_deg=given.max_error_deg,
+        seed=given.seed,
+        controls=given.controls,
     )
 
 

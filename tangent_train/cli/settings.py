@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from tangent_train.errors import SettingError
 
-__all__ = ["typed"]
+__all__ = ["Trust", "typed"]
 
 _Settings = TypeVar("_Settings")
 
@@ -23,6 +24,13 @@ _SAID = {
     Path: "a file or folder",
     NoneType: "null",
 }
+
+
+@dataclass(frozen=True)
+class Trust:
+    """What settings in files may name besides what is registered."""
+
+    trust: tuple[str, ...]
 
 
 def typed(kind: type[_Settings], config: Mapping[str, Any]) -> _Settings:

@@ -19,8 +19,8 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from tangent_train.checkpoints.content import INPUTS, NORMALIZATION, read_checkpoint
-from tangent_train.cli import values
 from tangent_train.cli.compose import STORED, options_of, search_path
+from tangent_train.cli.settings import Trust, typed
 from tangent_train.errors import DataError, SettingError
 from tangent_train.registry import Text, accept, check_fields, check_plain, named_targets
 from tangent_train.setting_rules import flat_settings
@@ -96,7 +96,7 @@ class StoredRun:
             DataError: The file gives settings that files must not give.
             SettingError: A setting of this machine has to be said.
         """
-        trust = (*values.names(said, "trust"), *named_targets(said))
+        trust = (*typed(Trust, said).trust, *named_targets(said))
         of_run = check_fields(self.path, self.config, _RUN, _EXPECTED)
         needed = {name: dict for name in _SECTIONS if name != "scheduler" and name not in chosen}
         check_fields(self.path, self.config, needed, _EXPECTED)
