@@ -9,16 +9,13 @@ import pytest
 import torch
 from torch import Tensor, nn
 from torchvision.models import ResNet50_Weights, resnet50
-from torchvision.models.segmentation import FCN_ResNet50_Weights, fcn_resnet50
+from torchvision.models.segmentation import fcn_resnet50
 
 from models import FCNResNet
 from tangent_train.errors import DataError, SettingError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from pathlib import Path
-
-    from torchvision.models import WeightsEnum
 
 LAST = ("classifier.4.weight", "classifier.4.bias")
 State = dict[str, Tensor]
@@ -59,35 +56,24 @@ def _checkpoint(published: nn.Module) -> dict[str, Any]:
     return {"epoch": 3, "config": {"level": 8}, "state_dict": {"class_weights": 1, **tensors}}
 
 
-@pytest.mark.parametrize("num_classes", [14, 21])
-def test_all_but_the_last_layer_is_loaded_and_computes_what_torchvision_does(
-    published: nn.Module, fcn_file: Path, num_classes: int
+@pytest.mark.parametrize("form", ["fcn", "resnet", "checkpoint"])
+def test_all_that_the_file_has_but_the_last_layer_is_loaded(
+    published: nn.Module, form: str, tmp_path: Path
 ) -> None:
-    network = FCNResNet(3, num_classes, 50, weights=fcn_file).eval()
     state = published.state_dict()
-    own = network.state_dict()
-    assert set(own) == {n for n in state if not n.startswith("aux")}
-    assert all(torch.equal(tensor, state[n]) for n, tensor in own.items() if n not in LAST)
-    assert num_classes != 21 or not torch.equal(own[LAST[0]], state[LAST[0]])
-    network.classifier[4] = published.get_submodule("classifier.4")  # type: ignore[operator]
-    images = torch.randn(2, 3, 64, 96)
-    with torch.no_grad():
-        assert torch.equal(network(images), published(images)["out"])
-
-
-@pytest.mark.parametrize(("make", "head"), [(_resnet, False), (_checkpoint, True)])
-def test_the_form_of_the_file_is_found_out(
-    published: nn.Module, make: Callable[[nn.Module], Any], head: bool, tmp_path: Path
-) -> None:
-    torch.save(make(published), tmp_path / "x.pth")
-    network = FCNResNet(3, 14, 50, weights=tmp_path / "x.pth")
-    state = published.state_dict()
-    for name, tensor in network.state_dict().items():
-        if name.startswith("backbone.") and "num_batches_tracked" not in name:
-            assert torch.equal(tensor, state[name]), name
-    assert torch.equal(
-        network.state_dict()["classifier.0.weight"], state["classifier.0.weight"]
-    ) is (head)
+    forms = {"fcn": state, "resnet": _resnet(published), "checkpoint": _checkpoint(published)}
+    torch.save(forms[form], tmp_path / "x.pth")
+    network = FCNResNet(3, 21, 50, weights=tmp_path / "x.pth").eval()
+    own = {n: t for n, t in network.state_dict().items() if "num_batches_tracked" not in n}
+    same = {name for name, tensor in own.items() if torch.equal(tensor, state[name])}
+    head = set() if form == "resnet" else {n for n in own if n.startswith("classifier.")}
+    assert same >= {n for n in own if n.startswith("backbone.")} | head - set(LAST)
+    assert not same & {LAST[0]}
+    if head:
+        network.load_state_dict({n: state[n] for n in LAST}, strict=False)
+        images = torch.randn(2, 3, 64, 96)
+        with torch.no_grad():
+            assert torch.equal(network(images), published(images)["out"])
 
 
 def test_depth_changes_no_bit_before_the_first_step(fcn_file: Path) -> None:
@@ -107,66 +93,34 @@ def test_depth_changes_no_bit_before_the_first_step(fcn_file: Path) -> None:
     assert gradient[:, 3].abs().min() > 0, "depth is learned"
 
 
-@pytest.mark.parametrize(
-    ("weights", "enum"),
-    [
-        ("coco", FCN_ResNet50_Weights.COCO_WITH_VOC_LABELS_V1),
-        ("imagenet", ResNet50_Weights.IMAGENET1K_V1),
-    ],
-)
 def test_published_weights_come_from_the_cache_or_the_internet(
-    published: nn.Module,
-    weights: str,
-    enum: WeightsEnum,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    published: nn.Module, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    url = ResNet50_Weights.IMAGENET1K_V1.url
 
-    def refuse(url: str, *_: Any, **__: Any) -> None:
-        assert url == enum.url
+    def refuse(asked: str, *_: Any, **__: Any) -> None:
+        assert asked == url
         raise URLError("no route to host")
 
     with monkeypatch.context() as patch:
         patch.setattr(torch.hub, "download_url_to_file", refuse)
         message = r"pth: found no way to fetch it .*no route.* set network\.weights to its path"
         with pytest.raises(DataError, match=message):
-            FCNResNet(3, 14, 50, weights=weights)
-    cached = tmp_path / "hub" / "checkpoints" / enum.url.rpartition("/")[2]
-    torch.save(published.state_dict() if weights == "coco" else _resnet(published), cached)
-    network = FCNResNet(4, 14, 50, weights=weights)
+            FCNResNet(3, 14, 50, weights="imagenet")
+    torch.save(_resnet(published), tmp_path / "hub" / "checkpoints" / url.rpartition("/")[2])
     stem = published.get_parameter("backbone.conv1.weight")
+    network = FCNResNet(4, 14, 50, weights="imagenet")
     assert torch.equal(network.get_parameter("backbone.conv1.weight")[:, :3], stem)
 
 
-def _without(state: State) -> State:
-    return {n: t for n, t in state.items() if not n.startswith("backbone.layer4.2")}
-
-
-def _with_more(state: State) -> State:
-    return {**state, "backbone.layer4.3.conv1.weight": torch.zeros(1)}
-
-
-def _reshaped(state: State) -> State:
-    return {**state, "classifier.0.weight": torch.zeros(5, 3)}
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (_without, r'Missing key.*"backbone\.layer4\.2\.conv1\.weight"'),
-        (
-            _with_more,
-            r'Unexpected key.*"backbone\.layer4\.3\.conv1\.weight".*; expected the tensors',
-        ),
-        (_reshaped, r"size mismatch for classifier\.0\.weight"),
-    ],
-)
-def test_tensors_that_do_not_fit_are_named(
-    published: nn.Module, change: Callable[[State], State], message: str, tmp_path: Path
-) -> None:
-    torch.save(change(dict(published.state_dict())), tmp_path / "x.pth")
-    with pytest.raises(DataError, match=f"(?s){message}"):
+def test_tensors_that_do_not_fit_are_named(published: nn.Module, tmp_path: Path) -> None:
+    state = published.state_dict() | {"classifier.0.weight": torch.zeros(5, 3)}
+    torch.save(state, tmp_path / "x.pth")
+    with pytest.raises(DataError, match=r"classifier\.0\.weight"):
+        FCNResNet(3, 14, 50, weights=tmp_path / "x.pth")
+    torch.save({n: t for n, t in state.items() if "layer4.2" not in n}, tmp_path / "x.pth")
+    with pytest.raises(DataError, match=r"backbone\.layer4\.2\.conv1\.weight"):
         FCNResNet(3, 14, 50, weights=tmp_path / "x.pth")
 
 

@@ -39,24 +39,29 @@ def test_before_training_it_computes_what_the_network_computes(size: tuple[int, 
     assert torch.equal(context(images, sphere_rays(3, 2), 4), expected)
 
 
+class Averaging(nn.Module):
+    """A mixer that adds the mean of all images' tokens, and what they look along."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.scale = nn.Parameter(torch.ones(channels))
+
+    def forward(self, tokens: Tensor, directions: Tensor) -> Tensor:
+        mean = tokens.mean(dim=(1, 3, 4), keepdim=True) + directions.sum(2, keepdim=True)
+        return mean.expand_as(tokens) * self.scale[:, None, None]
+
+
 def test_features_get_what_the_mixer_says() -> None:
-    context, images = small_context().double().eval(), torch.randn(3, 3, 24, 20).double()
-    rays = sphere_rays(3).double()
-    seen: dict[str, Tensor] = {}
-    stage, last, following = map(context.network.get_submodule, (STAGE, f"{STAGE}.1", "ups.0"))
-    handles = [
-        stage.register_forward_hook(lambda _m, _i, result: seen.update(after=result)),
-        last.register_forward_hook(lambda _m, _i, result: seen.update(before=result)),
-        following.register_forward_pre_hook(lambda _m, inputs: seen.update(next=inputs[0])),
-    ]
-    with torch.no_grad():
-        context(images, rays)
-        tokens = functional.adaptive_avg_pool2d(seen["before"], 2)[None]
-        mixed = context.mixer(tokens, token_directions(rays, 2, 2))[0]
-        enlarged = functional.interpolate(mixed, seen["before"].shape[-2:], mode="bilinear")
-    assert len(handles) == 3
-    torch.testing.assert_close(seen["after"], seen["before"] + enlarged)
-    assert seen["next"] is seen["after"]
+    """At the stage: here all that the network does."""
+    network = nn.Sequential(nn.Conv2d(3, 4, 3, padding=1))
+    context = SphereContext(network, "0", Averaging, in_channels=3, tokens=2)
+    images, rays = torch.randn(3, 3, 12, 10), sphere_rays(3)
+    features = network[0](images)
+    tokens = functional.adaptive_avg_pool2d(features, 2)[None]
+    mixed = context.mixer(tokens, token_directions(rays, 2, 2))[0]
+    expected = features + functional.interpolate(mixed, (12, 10), mode="bilinear")
+    torch.testing.assert_close(context(images, rays), expected)
+    torch.testing.assert_close(context(images, rays, 2), expected)
 
 
 def test_turning_the_sphere_changes_nothing_and_looking_elsewhere_does() -> None:

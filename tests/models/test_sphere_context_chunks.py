@@ -100,25 +100,18 @@ def test_statistics_take_every_chunk_in_once(momentum: float | None) -> None:
         torch.testing.assert_close(buffer, expected[name], msg=name)
         if name.endswith("num_batches_tracked"):
             assert int(buffer) == 4
-    assert all(
-        module.momentum == momentum
-        for module in context.modules()
-        if isinstance(module, nn.BatchNorm2d)
-    )
 
 
-def test_statistics_are_left_alone_in_evaluation_and_after_an_error() -> None:
+def test_evaluation_and_errors_leave_no_traces() -> None:
     context = small_context().eval()
     before = {name: buffer.clone() for name, buffer in context.named_buffers()}
     state = torch.get_rng_state()
     context(torch.ones(4, 3, 16, 16), sphere_rays(4), 3)
     assert torch.equal(torch.get_rng_state(), state), "evaluation draws nothing"
-    torch.testing.assert_close(dict(context.named_buffers()), before, rtol=0, atol=0)
     context.train()
     with pytest.raises(RuntimeError):
         context(torch.randn(4, 5, 16, 16), sphere_rays(4), 3)
-    norms = [m for m in context.modules() if isinstance(m, nn.BatchNorm2d)]
-    assert all(norm.momentum == 0.1 for norm in norms)
+    assert all(m.momentum == 0.1 for m in context.modules() if isinstance(m, nn.BatchNorm2d))
     torch.testing.assert_close(dict(context.named_buffers()), before, rtol=0, atol=0)
 
 

@@ -31,6 +31,7 @@ SMALL: dict[str, Any] = {
     "representation.erp_height": 128,
     "representation.faces_per_panorama": 2,
     "network.depth": 50,
+    "network.weights": "null",
     "network.width": 2,
     "data.num_workers": 0,
     "data.panoramas_per_step": 2,
@@ -126,7 +127,7 @@ def words_of(line: str) -> tuple[dict[str, str], list[str]]:
 def typed(words: list[str], world: Path) -> list[str]:
     """The words with files of the world for placeholders and absolute paths; sweeps as one run."""
     program, *given = [word for word in words if word != "…"]
-    sweep = "-m" in given
+    sweep = program != "python" and "-m" in given
     real = []
     for word in given:
         name, equals, value = word.replace("=/", "=").rpartition("=")
@@ -144,7 +145,7 @@ def typed(words: list[str], world: Path) -> list[str]:
         real = [word.replace("runs/demo", "runs/rgb") for word in real]
     if "data=stanford2d3ds_pairs" in real:
         real = [word.replace("data/2d3ds", "data/pairs") for word in real]
-    return [program, *(word for word in real if word != "-m")]
+    return [program, *(word for word in real if word != "-m" or not sweep)]
 
 
 def small(words: list[str], world: Path) -> list[str]:
