@@ -50,6 +50,7 @@ def test_the_wheel_holds_the_packages_and_the_configs(wheel: Path) -> None:
         "tangent_train/configs/train.yaml",
         "tangent_train/configs/experiment/rooms/demo.yaml",
         "tangent_train/py.typed",
+        "tangent_train/results/paper.csv",
         "datamodules/stanford2d3ds/panoramas.py",
         "datamodules/stanford2d3ds/pairs.csv",
         "datamodules/synthrooms/generate.py",
