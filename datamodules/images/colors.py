@@ -20,8 +20,8 @@ def jitter_colors(rgb: Tensor, strength: float, rng: np.random.Generator) -> Ten
 
     Args:
         rgb: ``(n, h, w, 3)`` uint8, views of one panorama or photo.
-        strength: 0 to 1. The factors of the first three are uniform in 1 ± strength, hue turns by
-            up to strength / 10 of the whole circle either way.
+        strength: 0 to 1. The factors of the first three are uniform in 1 ± strength, hue is
+            rotated by up to strength / 10 of the circle either way.
         rng: Where four numbers are drawn from.
 
     Returns:

@@ -42,9 +42,9 @@ _PER_PROCESS = 40
 class ModelNet40(SplitDataModule[ShapeFile]):
     """Shapes as spheres, to be classified.
 
-    The spheres are made once, on all cores, before the first run (`prepare_data`): in a folder for
-    their size, ``spheres_<height>x<width>``, of `store`, by default of `root`. Validation takes the
-    same share of the training shapes of every class, drawn from the seed.
+    The spheres are computed once, on all cores, before the first run (`prepare_data`), into a
+    folder for their size, ``spheres_<height>x<width>``, of `store`, by default of `root`.
+    Validation takes the same share of the training shapes of every class, drawn from the seed.
 
     Args:
         shapes_per_step: Shapes per training step and process, and in every step of evaluation.
@@ -58,7 +58,7 @@ class ModelNet40(SplitDataModule[ShapeFile]):
 
     Raises:
         SettingError: A setting that cannot work.
-        DataError: There is something else than meshes in `root`.
+        DataError: `root` holds no tree of meshes.
     """
 
     noun: ClassVar[str] = "shapes"

@@ -61,7 +61,7 @@ def euler_rotation(angles_rad: NDArray[np.float64]) -> NDArray[np.float64]:
 def euler_angles(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
     """XYZ Euler angles in radians; inverse of `euler_rotation` with b in [−π/2, π/2]."""
     b = math.asin(np.clip(-rotation[2, 0], -1, 1))
-    if abs(rotation[2, 0]) > 1 - 1e-12:  # a and c turn about the same axis: give all to c
+    if abs(rotation[2, 0]) > 1 - 1e-12:  # a and c rotate about the same axis: give all to c
         return np.array([0, b, math.atan2(-rotation[0, 1], rotation[1, 1])])
     a = math.atan2(rotation[2, 1], rotation[2, 2])
     return np.array([a, b, math.atan2(rotation[1, 0], rotation[0, 0])])

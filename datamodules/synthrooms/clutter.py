@@ -29,7 +29,7 @@ def _new(room: Room, frame: Frame) -> Item:
 
 
 def add_desk_things(room: Room, frame: Frame, size: tuple[float, float, float]) -> None:
-    """Put up to four things on a table top of ``(width, depth, height)`` metres."""
+    """Put up to four items on a table top of ``(width, depth, height)`` metres."""
     wide, deep, high = size
     number = room.count(0, 4)
     for k in range(number):
@@ -69,7 +69,7 @@ def _build_desk_thing(room: Room, thing: Item) -> None:
 
 
 def add_floor_clutter(room: Room) -> None:
-    """Add a thing on the floor: boxes, a plant, a bin, a cabinet, a standing lamp, or a ball."""
+    """Add an item on the floor: boxes, a plant, a bin, a cabinet, a standing lamp, or a ball."""
     rng = room.rng
     size = rng.uniform(0.4, 0.65)
     if room.chance(0.6):
@@ -134,7 +134,7 @@ _FLOOR_SHARES = (0.25, 0.2, 0.1, 0.25, 0.1, 0.1)
 
 
 def add_wall_clutter(room: Room) -> None:
-    """Hang something on a wall: a picture, a screen, a wall cupboard, or a clock."""
+    """Hang an item on a wall: a picture, a screen, a wall cupboard, or a clock."""
     rng = room.rng
     wide, high = rng.uniform(0.5, 1.3), rng.uniform(0.45, 0.9)
     kind = room.pick((0.4, 0.25, 0.2, 0.15))

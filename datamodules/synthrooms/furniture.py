@@ -24,17 +24,16 @@ __all__ = [
 
 
 def add_chair(room: Room) -> None:
-    """Add a chair somewhere in the open, turned anyhow."""
+    """Add a chair in the open with a random heading."""
     frame = room.plan.in_the_open(room.rng, 0.6, 0.6)
     if frame is not None:
         _build_chair(room, frame.at(0, 0, yaw=room.rng.uniform(0, 2 * np.pi)))
 
 
 def add_chair_at(room: Room, frame: Frame) -> None:
-    """Add a chair at a place if nothing is in the way."""
+    """Add a chair at a place unless it is occupied."""
     area = Rectangle.around(Frame(frame.x, frame.y), (-0.24, 0.24), (-0.24, 0.24))
-    if room.plan.contains(area, margin=0.2) and room.plan.is_free(area):
-        room.plan.take(area)
+    if room.plan.claim(area, margin=0.2):
         _build_chair(room, frame)
 
 
@@ -128,7 +127,7 @@ def add_sofa(room: Room) -> None:
 def _add_arms(
     room: Room, sofa: Item, cover: Material, design: int, size: tuple[float, float, float]
 ) -> float:
-    """Arms of a sofa; returns how wide one is."""
+    """Add the arms of a sofa; returns the width of one."""
     wide, deep, seat = size
     if design == 1:
         return 0.0
@@ -150,12 +149,12 @@ def add_table(room: Room) -> None:
     wide, deep = rng.uniform(1.2, 2.4), rng.uniform(0.75, 1.2)
     if design == 1:
         wide = deep = rng.uniform(1.0, 1.5)
-    turned = room.chance(0.5)
-    footprint = (deep, wide) if turned else (wide, deep)
+    rotated = room.chance(0.5)
+    footprint = (deep, wide) if rotated else (wide, deep)
     frame = room.plan.in_the_open(rng, *footprint, gap=0.35)
     if frame is None:
         return
-    frame = frame.at(0, 0, yaw=np.pi / 2 if turned else 0)
+    frame = frame.at(0, 0, yaw=np.pi / 2 if rotated else 0)
     _build_table(room, frame, design, wide, deep)
     seats = 1 + int(wide > 1.6)
     for side in (-1, 1):

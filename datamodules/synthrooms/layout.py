@@ -1,4 +1,4 @@
-"""Floor plans: rectangles and L-shapes, their walls, and what is still free.
+"""Floor plans: rectangles and L-shapes, their walls, and free space.
 
 Room coordinates are right-handed, in metres, z up; the floor is z = 0.
 """
@@ -14,20 +14,20 @@ import numpy as np
 __all__ = ["FloorPlan", "Frame", "Rectangle", "Wall", "Zone"]
 
 Zone = Literal["low", "high", "full"]
-"""Part of a wall's height that something takes: up to about a metre, above it, or all of it."""
+"""Part of a wall's height that an item occupies: up to about a metre, above it, or all of it."""
 
 _TRIES = 24
 _GAP = 0.06
 
 
 class Frame(NamedTuple):
-    """A place: an origin in the room and a turn about the vertical.
+    """A coordinate frame: an origin in the room and a rotation about the vertical.
 
     Attributes:
         x: Origin in metres.
         y: Origin in metres.
         z: Origin in metres.
-        yaw: Counterclockwise turn seen from above, in radians.
+        yaw: Counterclockwise rotation seen from above, in radians.
     """
 
     x: float
@@ -36,7 +36,7 @@ class Frame(NamedTuple):
     yaw: float = 0.0
 
     def at(self, x: float, y: float, z: float = 0.0, yaw: float = 0.0) -> Frame:
-        """The frame at (x, y, z) of this one, turned by `yaw` more."""
+        """The frame at (x, y, z) of this one, rotated by `yaw` more."""
         cos, sin = math.cos(self.yaw), math.sin(self.yaw)
         return Frame(
             self.x + cos * x - sin * y, self.y + sin * x + cos * y, self.z + z, self.yaw + yaw
@@ -75,22 +75,19 @@ class Wall:
     Attributes:
         frame: At the wall's start; x runs along it, y into the room.
         length: In metres.
+        taken: Occupied stretches: start and end along the wall, and zone.
     """
 
     frame: Frame
     length: float
-    _taken: list[tuple[float, float, Zone]] = field(default_factory=list)
+    taken: list[tuple[float, float, Zone]] = field(default_factory=list)
 
     def is_free(self, start: float, end: float, zone: Zone) -> bool:
         """Whether nothing hangs or stands between two positions along the wall."""
         return not any(
             start < b + _GAP and a < end + _GAP and (zone == other or "full" in (zone, other))
-            for a, b, other in self._taken
+            for a, b, other in self.taken
         )
-
-    def take(self, start: float, end: float, zone: Zone) -> None:
-        """Mark a stretch as taken."""
-        self._taken.append((start, end, zone))
 
 
 class FloorPlan:
@@ -143,13 +140,19 @@ class FloorPlan:
         )
         return inside and not (self.notch is not None and area.meets(self.notch, margin))
 
-    def is_free(self, area: Rectangle, gap: float = 0.0) -> bool:
-        """Whether nothing stands within `gap` metres of a rectangle."""
-        return not any(area.meets(other, gap) for other in self._taken)
+    def claim(self, area: Rectangle, margin: float = 0.0, gap: float = 0.0) -> bool:
+        """Take a rectangle of the floor if it is inside and free.
 
-    def take(self, area: Rectangle) -> None:
-        """Mark a rectangle of the floor as taken."""
+        Args:
+            area: The rectangle.
+            margin: Metres from every wall.
+            gap: Metres from everything else.
+        """
+        free = not any(area.meets(other, gap) for other in self._taken)
+        if not (free and self.contains(area, margin)):
+            return False
         self._taken.append(area)
+        return True
 
     def against_wall(
         self, rng: np.random.Generator, width: float, depth: float, zone: Zone
@@ -174,23 +177,20 @@ class FloorPlan:
             start, end = middle - width / 2, middle + width / 2
             frame = wall.frame.at(middle, 0)
             area = Rectangle.around(frame, (-width / 2, width / 2), (0.005, max(depth, 0.01)))
-            fits = room > 0 and wall.is_free(start, end, zone) and self.contains(area)
-            if fits and (depth == 0 or self.is_free(area)):
-                wall.take(start, end, zone)
-                if depth > 0:
-                    self.take(area)
+            fits = self.claim if depth else self.contains
+            if room > 0 and wall.is_free(start, end, zone) and fits(area):
+                wall.taken.append((start, end, zone))
                 return frame
         return None
 
     def in_the_open(
         self, rng: np.random.Generator, width: float, depth: float, gap: float = 0.12
     ) -> Frame | None:
-        """Find and take a place away from the walls, ``width × depth`` metres, not turned."""
+        """Find and take a place away from the walls, ``width × depth`` metres, axis-aligned."""
         for _ in range(_TRIES):
             frame = Frame(rng.uniform(0, self.width), rng.uniform(0, self.depth))
             area = Rectangle.around(frame, (-width / 2, width / 2), (-depth / 2, depth / 2))
-            if self.contains(area, margin=0.1) and self.is_free(area, gap):
-                self.take(area)
+            if self.claim(area, 0.1, gap):
                 return frame
         return None
 

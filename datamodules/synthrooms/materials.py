@@ -53,8 +53,8 @@ class Material:
         frequency: Repetitions per metre.
         contrast: Strength of the fine mottling that every surface has.
         offset: Shift of the texture in metres.
-        emission: Light the surface gives by itself, relative to its colour; 0 for most.
-        unscanned: Whether a depth camera gets nothing back from it, as from some window glass.
+        emission: Light that the surface emits, relative to its colour; 0 for most.
+        unscanned: Whether depth cameras get no return from it, as from some window glass.
     """
 
     color: NDArray[np.float64]
@@ -73,7 +73,7 @@ class Material:
 
 
 class Palette:
-    """Ten colours of a room, and materials made from them.
+    """Ten colours of a room, and materials drawn from them.
 
     Args:
         rng: The room's source of randomness.

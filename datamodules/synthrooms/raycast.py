@@ -1,4 +1,4 @@
-"""Ray casting with Embree, and the light that comes back."""
+"""Ray casting with Embree, and shading."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ if TYPE_CHECKING:
 __all__ = ["Hits", "RayScene", "even_directions"]
 
 _LIFT = 1e-3  # metres off the surface where secondary rays begin
-_REACH = 0.8  # metres within which things keep ambient light away
-_NEAREST = 0.3  # square metres: lamps do not get brighter closer than this
+_REACH = 0.8  # metres within which surfaces occlude ambient light
+_NEAREST = 0.3  # square metres: lamps are not brighter closer than this
 
 
 class Hits(NamedTuple):
     """Where rays end.
 
     Attributes:
-        found: ``(n,)`` whether the ray hit anything; the other fields mean nothing where not.
+        found: ``(n,)`` whether the ray hit a surface; the other fields are undefined where not.
         distance: ``(n,)`` metres along the unit direction.
         part: ``(n,)`` position in `Room.parts`.
         points: ``(n, 3)`` metres.
@@ -99,16 +99,16 @@ class RayScene:
         return np.einsum("nk,nkd->nd", weights, self._triangles[chosen])
 
     def radiance(self, hits: Hits, place: tuple[float, float], spread: Floats) -> Floats:
-        """Light that comes back along rays.
+        """Radiance along rays.
 
         Lambertian surfaces under the lamps with their shadows, plus light bounced between the
-        surfaces, which things within 0.8 m keep away.
+        surfaces, which surfaces within 0.8 m occlude.
 
         Args:
             hits: Where the rays ended.
             place: Point of every lamp that lights these rays, in [−1, 1]² of its half sides: rays
                 of one pixel that use different points make soft shadows.
-            spread: ``(3,)`` unit vector added to the normal to look for things nearby.
+            spread: ``(3,)`` unit vector added to the normal for ambient occlusion.
 
         Returns:
             ``(n, 3)`` linear values; 0 where nothing was hit.
@@ -123,7 +123,7 @@ class RayScene:
         return light
 
     def _openness(self, points: Floats, normals: Floats, spread: Floats) -> Floats:
-        """How much ambient light arrives: less close to other things, and a little by direction."""
+        """Share of ambient light: less close to other surfaces, and slightly by direction."""
         ahead = np.float32(1.001) * normals + spread  # never zero
         ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
         limit = np.full(len(points), _REACH, np.float32)
@@ -153,7 +153,7 @@ class RayScene:
 
 
 def _bounced_light(room: Room) -> Floats:
-    """Irradiance by light that was thrown back once or more, the same everywhere.
+    """Irradiance by light that was reflected once or more, the same everywhere.
 
     The integrating sphere's law: flux Φ in an enclosure of area A and reflectance ρ gives
     Φρ / (A(1 − ρ)); a Lambertian lamp of intensity I along its normal sends out Φ = πI.

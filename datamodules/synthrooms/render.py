@@ -1,4 +1,4 @@
-"""Taking pictures: exposure, noise, anti-aliasing, and what a scanner misses."""
+"""Rendering: exposure, noise, anti-aliasing, and holes in the scan."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ if TYPE_CHECKING:
 __all__ = ["MISSING", "Camera", "Holes", "Picture", "draw_camera", "draw_holes", "render"]
 
 MISSING = -1
-"""Item number where nothing was scanned."""
+"""Item number of pixels without a scan."""
 
 _RAYS_AT_ONCE = 1 << 17  # keeps a 2048 × 4096 panorama within 200 MB, and the caches warm
-_GRAZING = 0.04  # cosine below which a depth camera gets nothing back
+_GRAZING = 0.04  # cosine below which a depth camera gets no return
 _WHITE = 9.0  # square of the light, in units of exposure, that becomes white
 _HEIGHTS = (1.3, 1.7)
 _CLEAR = 0.55  # metres around a camera that should be free
@@ -72,7 +72,7 @@ class Holes(NamedTuple):
 
 @dataclass(frozen=True)
 class Camera:
-    """A place to take pictures from, and how the sensor there behaves in all of them.
+    """The place of a camera, and its sensor, the same in all of its pictures.
 
     Attributes:
         location: ``(3,)`` metres.
@@ -141,7 +141,7 @@ def render(
     supersample: int,
     rng: np.random.Generator,
 ) -> Picture:
-    """Take a picture.
+    """Render a view.
 
     Colours are the mean of ``supersample²`` rays per pixel, spread evenly over it, each through the
     tone curve; labels and depth come from one ray through the pixel's centre.
@@ -150,7 +150,7 @@ def render(
         scene: The room.
         view: The picture's pixels; it must look from the camera's place.
         camera: The sensor.
-        holes: What the scan misses.
+        holes: Of the scan.
         supersample: Rays per pixel side.
         rng: Source of the sensor's noise.
     """

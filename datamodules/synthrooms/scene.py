@@ -1,4 +1,4 @@
-"""Which room it is, how large, and what stands in it."""
+"""Room types, sizes and furnishing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Families of furniture. Chairs, stools, benches and tables have much in common, as in life."""
+"""Families of furniture; chairs, stools, benches and tables share seats, supports and backs."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def _plate(
 def _support(
     parts: Parts, width: float, depth: float, height: float, *, pedestal: float, solid: float
 ) -> None:
-    """What carries a plate: the shares of pedestals and of boards or blocks, else legs."""
+    """The support of a plate: given shares of pedestals and of boards or blocks, else legs."""
     drawn = parts.between(0, 1)
     if drawn < pedestal:
         _pedestal(parts, min(width, depth), height)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zlib
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from trimesh.exchange.off import export_off
@@ -73,23 +73,14 @@ class ShapeSettings:
                 raise SettingError(f"data.shapes.{name}", found=repr(value), expected=expected)
 
 
-class ShapePlan(NamedTuple):
-    """A shape before it is made: its class, ``train`` or ``test``, its number from 1."""
-
-    label: str
-    part: str
-    number: int
-
-    @property
-    def file(self) -> str:
-        """Its path in the data set, as in ModelNet40."""
-        return f"{self.label}/{self.part}/{self.label}_{self.number:04d}.off"
-
-
-def plan_shapes(settings: ShapeSettings) -> list[ShapePlan]:
-    """All shapes of a data set: of each class those for training, then those for the test."""
+def plan_shapes(settings: ShapeSettings) -> dict[str, tuple[str, int]]:
+    """Class and number of every shape by its file in ModelNet40's tree, test shapes last."""
     parts = ["train"] * settings.train + ["test"] * settings.test
-    return [ShapePlan(c, part, number) for c in CLASSES for number, part in enumerate(parts, 1)]
+    return {
+        f"{label}/{part}/{label}_{number:04d}.off": (label, number)
+        for label in CLASSES
+        for number, part in enumerate(parts, start=1)
+    }
 
 
 def generate_shapes(
@@ -114,15 +105,18 @@ def generate_shapes(
     plans = plan_shapes(settings)
     processes = number_of_processes(workers, len(plans), _PER_PROCESS)
     claim_folder(root, MANIFEST, "SynthShapes", _VERSION, asdict(settings))
-    missing = [plan for plan in plans if not (root / plan.file).exists()]
+    missing = [file for file in plans if not (root / file).exists()]
     if missing:
-        making = in_processes(_write, [(root, settings.seed, plan) for plan in missing], processes)
+        pieces = [(root / file, settings.seed, *plans[file]) for file in missing]
+        making = in_processes(_write, pieces, processes)
         before = len(plans) - len(missing)
-        show_progress(making, "Making shapes", "shapes", len(plans), before=before, show=progress)
+        show_progress(
+            making, "Generating shapes", "shapes", len(plans), before=before, show=progress
+        )
 
 
-def _write(root: Path, seed: int, plan: ShapePlan) -> None:
-    write_text(root / plan.file, export_off(make_shape(seed, plan.label, plan.number)))
+def _write(path: Path, seed: int, label: str, number: int) -> None:
+    write_text(path, export_off(make_shape(seed, label, number)))
 
 
 def make_shape(seed: int, label: str, number: int) -> Trimesh:

@@ -1,4 +1,4 @@
-"""Families of vessels: outlines on a lathe that pass into each other; and airplanes."""
+"""Families of vessels, surfaces of revolution of similar outlines; and airplanes."""
 
 from __future__ import annotations
 
