@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tangent_train.geometry import PinholeGrid
 from tangent_train.rendering import kernels
 from tangent_train.rendering.compiled import over_rows
-from tangent_train.rendering.tables import spans, views_of_rays
+from tangent_train.rendering.tables import sight_of
 
 __all__ = ["NO_LABELS", "NO_OWNERS", "NO_TOTAL", "add_to_panorama"]
 
@@ -57,14 +57,10 @@ def add_to_panorama(
             all images at once.
         softmax: Whether scores become probabilities after they are interpolated.
     """
-    columns, lines = kernels.sphere_rays(shape)
-    views = views_of_rays(grid, faces)
     step = max(64, _SPANS // max(1, len(faces)))
     for start in range(rows.start, rows.stop, step):
         band = slice(start, min(rows.stop, start + step))
         own = slice(band.start - rows.start, band.stop - rows.start)
-        over_rows(
-            kernels.add_images, band.stop - band.start, shape[1],
-            np.ascontiguousarray(scores), faces, views, spans(grid, faces, shape, band),
-            columns, lines[band], owner[own], softmax, total[own], labels[own],
-        )  # fmt: skip
+        sight = sight_of(grid, faces, shape, band, owner[own])
+        arguments = (np.ascontiguousarray(scores), sight, softmax, total[own], labels[own])
+        over_rows(kernels.add_images, band.stop - band.start, shape[1], *arguments)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import partial
-from typing import Literal, TypeVar, overload
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ from tangent_train.rendering.checks import (
     check_interpolation,
     check_shape,
 )
-from tangent_train.rendering.forward import Interpolation
+from tangent_train.rendering.forward import Interpolation, Pixels
 from tangent_train.rendering.sampling import map_dtype
 from tangent_train.rendering.tables import image_table, owners, tensors_on
 from tangent_train.rendering.taps import Taps, image_taps, nearest_image_index, sample
@@ -28,35 +28,17 @@ __all__ = ["Blend", "tangent_to_equirect", "tangent_to_labels"]
 
 Blend = Literal["nearest", "feather"]
 
-Scalar = TypeVar("Scalar", bound=np.generic)
-
 _BAND = 2**20
 """Pixels whose taps or sums are held at once."""
 
 
-@overload
 def tangent_to_equirect(
-    images: Tensor,
+    images: Pixels,
     grid: PinholeGrid,
     shape: tuple[int, int],
     blend: Blend = "nearest",
     interpolation: Interpolation = "bilinear",
-) -> Tensor: ...
-@overload
-def tangent_to_equirect(
-    images: NDArray[Scalar],
-    grid: PinholeGrid,
-    shape: tuple[int, int],
-    blend: Blend = "nearest",
-    interpolation: Interpolation = "bilinear",
-) -> NDArray[Scalar]: ...
-def tangent_to_equirect(
-    images: Tensor | NDArray[Scalar],
-    grid: PinholeGrid,
-    shape: tuple[int, int],
-    blend: Blend = "nearest",
-    interpolation: Interpolation = "bilinear",
-) -> Tensor | NDArray[Scalar]:
+) -> Pixels:
     """Render tangent images back to a panorama.
 
     Args:
@@ -95,23 +77,9 @@ def tangent_to_equirect(
     return torch.cat(bands, dim=1).reshape(*images.shape[:-4], images.shape[-3], *shape)
 
 
-@overload
 def tangent_to_labels(
-    logits: Tensor, grid: PinholeGrid, shape: tuple[int, int], blend: Blend = "nearest"
-) -> Tensor: ...
-@overload
-def tangent_to_labels(
-    logits: NDArray[np.floating],
-    grid: PinholeGrid,
-    shape: tuple[int, int],
-    blend: Blend = "nearest",
-) -> NDArray[np.unsignedinteger]: ...
-def tangent_to_labels(
-    logits: Tensor | NDArray[np.floating],
-    grid: PinholeGrid,
-    shape: tuple[int, int],
-    blend: Blend = "nearest",
-) -> Tensor | NDArray[np.unsignedinteger]:
+    logits: Pixels, grid: PinholeGrid, shape: tuple[int, int], blend: Blend = "nearest"
+) -> Pixels:
     """Class of the largest bilinear score at every pixel of the panorama.
 
     Rendering and argmax are one step: the scores of the panorama, ``(K, H, W)``, are never held. On
@@ -166,12 +134,12 @@ def _tensor(array: NDArray[np.generic]) -> Tensor:
 
 
 def _from_arrays(
-    images: NDArray[Scalar],
+    images: NDArray[Any],
     grid: PinholeGrid,
     shape: tuple[int, int],
     blend: Blend,
     interpolation: Interpolation,
-) -> NDArray[Scalar]:
+) -> NDArray[Any]:
     """`tangent_to_equirect` of arrays ``(N, d, d[, C])``; integers are rounded."""
     if interpolation == "nearest":
         pixels = images.reshape(-1, *images.shape[3:])

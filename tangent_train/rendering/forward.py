@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, TypeVar, overload
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -16,11 +16,12 @@ from tangent_train.rendering.sampling import map_dtype, sample_map
 from tangent_train.rendering.tables import forward_map, tensors_on
 from tangent_train.rendering.taps import bilinear_equirect_taps, nearest_equirect_index, sample
 
-__all__ = ["Interpolation", "equirect_to_tangent"]
+__all__ = ["Interpolation", "Pixels", "equirect_to_tangent"]
 
 Interpolation = Literal["bilinear", "nearest"]
 
-Scalar = TypeVar("Scalar", bound=np.generic)
+Pixels = TypeVar("Pixels", Tensor, NDArray[Any])
+"""What is rendered from tensors is a tensor, and from arrays an array."""
 
 _CHUNK = 2**20
 """Positions whose taps torch holds at once."""
@@ -29,26 +30,12 @@ _TOGETHER = 2**16
 """Pixels of small images that are sampled in one call: to call for each takes longer than that."""
 
 
-@overload
 def equirect_to_tangent(
-    image: Tensor,
+    image: Pixels,
     grid: PinholeGrid,
     faces: Faces | None = None,
     interpolation: Interpolation = "bilinear",
-) -> Tensor: ...
-@overload
-def equirect_to_tangent(
-    image: NDArray[Scalar],
-    grid: PinholeGrid,
-    faces: Faces | None = None,
-    interpolation: Interpolation = "bilinear",
-) -> NDArray[Scalar]: ...
-def equirect_to_tangent(
-    image: Tensor | NDArray[Scalar],
-    grid: PinholeGrid,
-    faces: Faces | None = None,
-    interpolation: Interpolation = "bilinear",
-) -> Tensor | NDArray[Scalar]:
+) -> Pixels:
     """Render tangent images from a panorama (paper, section 3.2).
 
     Longitude wraps and rows reflect at the poles, for every interpolation. A panorama that is not

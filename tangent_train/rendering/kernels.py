@@ -10,6 +10,7 @@ positive.
 from __future__ import annotations
 
 import math
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,7 @@ from tangent_train.rendering.compiled import njit_exact, njit_fast
 
 __all__ = [
     "FEATHER_POWER",
+    "Sight",
     "add_images",
     "best_classes",
     "equirect_map",
@@ -36,8 +38,49 @@ _LANES = 16
 _TILE = 64
 """Rows and columns added to at once, so that their sums stay in the cache."""
 
-Rays = tuple[NDArray[np.float64], NDArray[np.float64]]
-"""``(W, 2)`` factors of the columns and ``(H, 2)`` factors of the rows."""
+Array = NDArray[Any]
+Rays = tuple[Array, Array]
+"""``(W, 2)`` factors of the columns and ``(H, 2)`` factors of the rows, float64."""
+Tile = tuple[int, int, int, int]
+"""First row and the one after the last, first column and the one after the last."""
+
+
+class Sight(NamedTuple):
+    """How n images see a canvas of ``(H, W)`` pixels.
+
+    Attributes:
+        images: ``(n,)`` their numbers, as they stand in `owner`.
+        matrices: ``(n, 3, 3)`` from rays to homogeneous pixels.
+        spans: ``(n, H, 2)`` in every row the first column that may see something of an image, and
+            how many may, across the seam.
+        columns: ``(W, 2)`` factors of the rays.
+        rows: ``(H, 2)`` factors of the rays.
+        owner: ``(H, W)``: an image has weight 1 where it is the owner, else 0. Empty for feather
+            weights: 1 in the middle of an image, 0 at the outer edges of its outermost pixels.
+    """
+
+    images: Array
+    matrices: Array
+    spans: Array
+    columns: Array
+    rows: Array
+    owner: Array
+
+
+class _Seen(NamedTuple):
+    """What an image gives to a tile.
+
+    Attributes:
+        pixel: Flat indices in the tile.
+        u: Columns in the image.
+        v: Rows in the image.
+        weight: Weights.
+    """
+
+    pixel: Array
+    u: Array
+    v: Array
+    weight: Array
 
 
 def sphere_rays(shape: tuple[int, int]) -> Rays:
@@ -57,24 +100,17 @@ def plane_rays(shape: tuple[int, int]) -> Rays:
 
 @njit_exact
 def equirect_map(
-    start: int,
-    stop: int,
-    matrices: NDArray[np.float64],
-    columns: NDArray[np.float64],
-    rows: NDArray[np.float64],
-    height: int,
-    width: int,
-    u: NDArray[np.floating],
-    v: NDArray[np.floating],
-) -> None:
+    start: int, stop: int, matrices: Array, columns: Array, rows: Array,
+    height: int, width: int, u: Array, v: Array,
+) -> None:  # fmt: skip
     """ERP positions of the rays of canvases, one below the other, rows ``start:stop``.
 
     Args:
         start: First row.
         stop: One past the last row.
         matrices: ``(n, 3, 3)`` from each canvas's rays to directions of any length.
-        columns: ``(w, 2)`` of the rays.
-        rows: ``(h, 2)`` of the rays.
+        columns: ``(w, 2)`` factors of the rays.
+        rows: ``(h, 2)`` factors of the rays.
         height: Rows H of the ERP.
         width: Columns W of the ERP.
         u: ``(n h, w)`` columns in the ERP, written.
@@ -95,15 +131,9 @@ def equirect_map(
 
 @njit_exact
 def owners(
-    start: int,
-    stop: int,
-    centers: NDArray[np.float64],
-    neighbors: NDArray[np.integer],
-    inner: float,
-    columns: NDArray[np.float64],
-    rows: NDArray[np.float64],
-    face: NDArray[np.integer],
-) -> None:
+    start: int, stop: int, centers: Array, neighbors: Array, inner: float,
+    columns: Array, rows: Array, face: Array,
+) -> None:  # fmt: skip
     """The image with the nearest centre, for the ERP rows ``start:stop``.
 
     Walks to ever nearer centres, from the owner of the pixel before.
@@ -138,88 +168,40 @@ def owners(
 
 
 @njit_fast
-def _project(
-    side: tuple[int, int],
-    m: NDArray[np.float64],
-    feather: bool,
-    u: NDArray[np.floating],
-    v: NDArray[np.floating],
-    weight: NDArray[np.floating],
-) -> None:
-    """Where an image sees rays ``(u, v, weight)``, which become columns, rows and weights."""
+def _project(side: tuple[int, int], m: Array, feather: bool, u: Array, v: Array, w: Array) -> None:
+    """Where an image sees rays ``(u, v, w)``, which become columns, rows and weights."""
     for p in range(len(u)):
-        x, y, z = u[p], v[p], weight[p]
+        x, y, z = u[p], v[p], w[p]
         depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z
         u[p] = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z) / depth
         v[p] = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z) / depth
-        weight[p] = 1.0
+        w[p] = 1.0
         if feather:
             across, down = (2 * u[p] + 1) / side[1] - 1, (2 * v[p] + 1) / side[0] - 1
             seen = depth > 0 and abs(across) < 1 and abs(down) < 1
-            weight[p] = ((1 - across**2) * (1 - down**2)) ** FEATHER_POWER if seen else 0.0
+            w[p] = ((1 - across**2) * (1 - down**2)) ** FEATHER_POWER if seen else 0.0
 
 
 @njit_fast
-def _list_seen(
-    tile: tuple[int, int, int, int],
-    image: int,
-    side: tuple[int, int],
-    matrix: NDArray[np.float64],
-    spans: NDArray[np.integer],
-    columns: NDArray[np.float64],
-    rows: NDArray[np.float64],
-    owner: NDArray[np.integer],
-    pixel: NDArray[np.integer],
-    u: NDArray[np.floating],
-    v: NDArray[np.floating],
-    weight: NDArray[np.floating],
-) -> int:
-    """List the pixels of a tile to which an image gives something.
-
-    Args:
-        tile: First row and the one after the last, first column and the one after the last.
-        image: Its number, as it stands in `owner`.
-        side: Its rows and columns.
-        matrix: ``(3, 3)`` from rays to its pixels.
-        spans: ``(H, 2)`` in every row the first column that may see something of the image, and how
-            many may, across the seam.
-        columns: ``(W, 2)`` of the rays.
-        rows: ``(H, 2)`` of the rays.
-        owner: ``(H, W)``: weight 1 where the image is the owner. Empty: feather weights, 1 in the
-            middle of the image and 0 at the outer edges of its outermost pixels.
-        pixel: Flat indices in the tile, written.
-        u: Columns in the image, written.
-        v: Rows in the image, written.
-        weight: Weights, written.
-
-    Returns:
-        Number of pixels.
-    """
+def _list_seen(tile: Tile, m: int, side: tuple[int, int], sight: Sight, seen: _Seen) -> int:
+    """List what image m, of so many rows and columns, gives to a tile; returns its length."""
     top, bottom, left, right = tile
+    columns, owner, (pixel, u, v, weight) = sight.columns, sight.owner, seen
     count = 0
     for i in range(top, bottom):
-        span = spans[i, 1]
-        ahead = left - spans[i, 0] if left >= spans[i, 0] else left - spans[i, 0] + len(columns)
+        begin, span = sight.spans[m, i, 0], sight.spans[m, i, 1]
+        ahead = left - begin if left >= begin else left - begin + len(columns)
         if span == 0 or (ahead >= span and ahead + right - left <= len(columns)):
             continue
         at = (i - top) * (right - left) - left
-        x, z = rows[i, 0], rows[i, 1]
+        x, z = sight.rows[i, 0], sight.rows[i, 1]
         for back in range(0, len(columns) + 1, len(columns)):
-            first = max(left, spans[i, 0] - back)
-            last = min(right, spans[i, 0] + span - back)
-            if len(owner) == 0:
-                for j in range(first, last):
-                    p = count + j - first
-                    pixel[p], u[p], v[p] = at + j, x * columns[j, 0], x * columns[j, 1]
-                    weight[p] = z
-                count += max(0, last - first)
-                continue
-            for j in range(first, last):
-                if owner[i, j] == image:
+            for j in range(max(left, begin - back), min(right, begin + span - back)):
+                if len(owner) == 0 or owner[i, j] == sight.images[m]:
                     pixel[count], u[count], v[count] = at + j, x * columns[j, 0], x * columns[j, 1]
                     weight[count] = z
                     count += 1
-    _project(side, matrix, len(owner) == 0, u[:count], v[:count], weight[:count])
+    _project(side, sight.matrices[m], len(owner) == 0, u[:count], v[:count], weight[:count])
     kept = 0
     for p in range(count):
         if weight[p] > 0:
@@ -229,12 +211,7 @@ def _list_seen(
 
 
 @njit_fast
-def _split(
-    places: NDArray[np.floating],
-    count: int,
-    whole: NDArray[np.integer],
-    share: NDArray[np.floating],
-) -> tuple[int, int]:
+def _split(places: Array, count: int, whole: Array, share: Array) -> tuple[int, int]:
     """Split positions along an axis of `count` pixels, clamped to them, for interpolation.
 
     Args:
@@ -257,13 +234,7 @@ def _split(
 
 @njit_fast
 def _copy_patch(
-    scores: NDArray[np.float32],
-    left: int,
-    top: int,
-    height: int,
-    width: int,
-    lanes: int,
-    patch: NDArray[np.float32],
+    scores: Array, left: int, top: int, height: int, width: int, lanes: int, patch: Array
 ) -> None:
     """Copy a part of ``(K, h, w)`` scores so that those of a pixel lie together, and a 1."""
     for y in range(height):
@@ -281,16 +252,9 @@ def _copy_patch(
 
 @njit_fast
 def _add_patch(
-    patch: NDArray[np.float32],
-    corner: NDArray[np.uint64],
-    below: np.uint64,
-    lanes: np.uint64,
-    right_share: NDArray[np.float32],
-    below_share: NDArray[np.float32],
-    weight: NDArray[np.floating],
-    pixel: NDArray[np.integer],
-    sums: NDArray[np.float32],
-) -> None:
+    patch: Array, corner: Array, below: np.uint64, lanes: np.uint64,
+    right_share: Array, below_share: Array, weight: Array, pixel: Array, sums: Array,
+) -> None:  # fmt: skip
     """Add weighted bilinear samples of a patch to the sums of a tile.
 
     Unsigned indices spare numba's test for negative ones.
@@ -321,7 +285,7 @@ def _add_patch(
 
 
 @njit_fast
-def _best_class(sums: NDArray[np.float32], num_classes: int) -> int:
+def _best_class(sums: Array, num_classes: int) -> int:
     """Of the largest sum: the first of equal ones, and NaN never wins."""
     best, found = np.float32(-np.inf), 0
     for k in range(num_classes):
@@ -331,13 +295,20 @@ def _best_class(sums: NDArray[np.float32], num_classes: int) -> int:
 
 
 @njit_fast
+def _softmax(sums: Array, num_classes: int) -> None:
+    """Of the first K numbers, in place."""
+    highest = sums[_best_class(sums, num_classes)]
+    whole = np.float32(0)
+    for k in range(num_classes):
+        sums[k] = math.exp(sums[k] - highest)
+        whole += sums[k]
+    for k in range(num_classes):
+        sums[k] /= whole
+
+
+@njit_fast
 def _finish(
-    tile: tuple[int, int, int, int],
-    num_classes: int,
-    softmax: bool,
-    sums: NDArray[np.float32],
-    total: NDArray[np.float32],
-    labels: NDArray[np.integer],
+    tile: Tile, num_classes: int, softmax: bool, sums: Array, total: Array, labels: Array
 ) -> None:
     """Of the pixels of a tile that got something, add the sums to the totals or write the label."""
     top, bottom, left, right = tile
@@ -345,55 +316,31 @@ def _finish(
     for i in range(top, bottom):
         for j in range(left, right):
             p += 1
-            found = sums[p]
-            if not found[num_classes] > 0:
+            if not sums[p, num_classes] > 0:
                 continue
             if len(total) == 0:
-                labels[i, j] = _best_class(found, num_classes)
+                labels[i, j] = _best_class(sums[p], num_classes)
                 continue
             if softmax:
-                highest = found[_best_class(found, num_classes)]
-                whole = np.float32(0)
-                for k in range(num_classes):
-                    found[k] = math.exp(found[k] - highest)
-                    whole += found[k]
-                for k in range(num_classes):
-                    found[k] /= whole
+                _softmax(sums[p], num_classes)
             for k in range(num_classes + 1):
-                total[i, j, k] += found[k]
+                total[i, j, k] += sums[p, k]
 
 
 @njit_fast
 def add_images(
-    start: int,
-    stop: int,
-    scores: NDArray[np.float32],
-    images: NDArray[np.integer],
-    matrices: NDArray[np.float64],
-    spans: NDArray[np.integer],
-    columns: NDArray[np.float64],
-    rows: NDArray[np.float64],
-    owner: NDArray[np.integer],
-    softmax: bool,
-    total: NDArray[np.float32],
-    labels: NDArray[np.integer],
+    start: int, stop: int, scores: Array, sight: Sight, softmax: bool, total: Array, labels: Array
 ) -> None:
     """Add images to rows ``start:stop`` of a canvas: weighted scores, or at once the best class.
 
     Works tile by tile. The part of an image that a tile sees is copied so that the scores of a
-    pixel lie together, those of all classes are interpolated at once.
+    pixel lie together, and those of all classes are interpolated at once.
 
     Args:
         start: First row.
         stop: One past the last row.
-        scores: ``(n, K, h, w)``, h and w at least 2.
-        images: ``(n,)`` their numbers, as they stand in `owner`.
-        matrices: ``(n, 3, 3)`` from rays to their pixels.
-        spans: ``(n, H, 2)`` in every row the first column that may see something of an image, and
-            how many may, across the seam.
-        columns: ``(W, 2)`` of the rays.
-        rows: ``(H, 2)`` of the rays.
-        owner: ``(H, W)`` owner of every pixel; empty for feather weights.
+        scores: ``(n, K, h, w)`` float32, h and w at least 2.
+        sight: How these images see the canvas.
         softmax: Whether scores become probabilities after they are interpolated; not feathered.
         total: ``(H, W, K + 1)`` weighted sums, and the sum of the weights, changed. Empty where
             only labels are wanted, for which all images of a pixel have to come at once.
@@ -402,22 +349,19 @@ def add_images(
     num_classes = scores.shape[1]
     side = scores.shape[2], scores.shape[3]
     lanes = (num_classes // _LANES + 1) * _LANES
-    pixel = np.empty(_TILE**2, np.int32)
     u, v, weight = np.empty((3, _TILE**2))
+    seen = _Seen(np.empty(_TILE**2, np.int32), u, v, weight)
     column, row = np.empty((2, _TILE**2), np.int32)
     right, below = np.empty((2, _TILE**2), np.float32)
-    begin = np.empty(_TILE**2, np.uint64)
+    corner = np.empty(_TILE**2, np.uint64)
     sums = np.empty((_TILE**2, lanes), np.float32)
     patch = np.empty(0, np.float32)
     for top in range(start, stop, _TILE):
-        for left in range(0, len(columns), _TILE):
-            tile = top, min(stop, top + _TILE), left, min(len(columns), left + _TILE)
+        for left in range(0, len(sight.columns), _TILE):
+            tile = top, min(stop, top + _TILE), left, min(len(sight.columns), left + _TILE)
             sums[:] = 0
-            for m in range(len(images)):
-                n = _list_seen(
-                    tile, images[m], side, matrices[m], spans[m], columns, rows, owner,
-                    pixel, u, v, weight,
-                )  # fmt: skip
+            for m in range(len(scores)):
+                n = _list_seen(tile, m, side, sight, seen)
                 if n == 0:
                     continue
                 first, last = _split(u[:n], side[1], column, right)
@@ -427,19 +371,16 @@ def add_images(
                     patch = np.empty(height * width * lanes, np.float32)
                 _copy_patch(scores[m], first, upper, height, width, lanes, patch)
                 for p in range(n):
-                    index = (row[p] - upper) * width + column[p] - first
-                    begin[p] = np.uint64(index * lanes)
+                    corner[p] = np.uint64(((row[p] - upper) * width + column[p] - first) * lanes)
                 _add_patch(
-                    patch, begin[:n], np.uint64(width * lanes), np.uint64(lanes), right, below,
-                    weight, pixel, sums.reshape(-1),
+                    patch, corner[:n], np.uint64(width * lanes), np.uint64(lanes),
+                    right, below, weight, seen.pixel, sums.reshape(-1),
                 )  # fmt: skip
             _finish(tile, num_classes, softmax, sums, total, labels)
 
 
 @njit_exact
-def best_classes(
-    start: int, stop: int, total: NDArray[np.float32], labels: NDArray[np.integer]
-) -> None:
+def best_classes(start: int, stop: int, total: Array, labels: Array) -> None:
     """Best class of the ``(H, W, K + 1)`` totals of `add_images`, rows ``start:stop``."""
     for i in range(start, stop):
         for j in range(labels.shape[1]):
@@ -448,48 +389,29 @@ def best_classes(
 
 @njit_exact
 def seen_table(
-    start: int,
-    stop: int,
-    side: tuple[int, int],
-    matrices: NDArray[np.float64],
-    spans: NDArray[np.integer],
-    columns: NDArray[np.float64],
-    rows: NDArray[np.float64],
-    owner: NDArray[np.integer],
-    count: NDArray[np.integer],
-    face: NDArray[np.integer],
-    u: NDArray[np.floating],
-    v: NDArray[np.floating],
-    weight: NDArray[np.floating],
-) -> None:
+    start: int, stop: int, side: tuple[int, int], sight: Sight,
+    count: Array, face: Array, u: Array, v: Array, weight: Array,
+) -> None:  # fmt: skip
     """All images that give something to a pixel, for the rows ``start:stop``.
 
     Args:
         start: First row.
         stop: One past the last row.
         side: Rows and columns of the images.
-        matrices: ``(N, 3, 3)``; this and the next four as in `add_images`.
-        spans: ``(N, H, 2)``.
-        columns: ``(W, 2)``.
-        rows: ``(H, 2)``.
-        owner: ``(H, W)`` or empty.
+        sight: How they see the canvas.
         count: ``(H, W)`` how many images there are, 0 before, written.
         face: ``(R, H, W)`` images, written; with R = 0 they are only counted.
         u: ``(R, H, W)`` columns in the images, written.
         v: ``(R, H, W)`` rows in the images, written.
         weight: ``(R, H, W)`` weights, written.
     """
-    pixel = np.empty(len(columns), np.int32)
-    line_u, line_v, line_w = np.empty((3, len(columns)))
+    width = len(sight.columns)
+    line_u, line_v, line_w = np.empty((3, width))
+    seen = _Seen(np.empty(width, np.int32), line_u, line_v, line_w)
     for i in range(start, stop):
-        for m in range(len(matrices)):
-            tile = i, i + 1, 0, len(columns)
-            n = _list_seen(
-                tile, m, side, matrices[m], spans[m], columns, rows, owner,
-                pixel, line_u, line_v, line_w,
-            )  # fmt: skip
-            for p in range(n):
-                j = pixel[p]
+        for m in range(len(sight.matrices)):
+            for p in range(_list_seen((i, i + 1, 0, width), m, side, sight, seen)):
+                j = seen.pixel[p]
                 rank = count[i, j]
                 count[i, j] += 1
                 if rank < len(face):

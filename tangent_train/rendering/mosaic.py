@@ -110,12 +110,12 @@ class ScoreMosaic:
             ]
             first, last = max(0, math.floor(left)), min(width, math.ceil(right))
             spans[number, max(0, math.floor(top)) : math.ceil(bottom)] = first, last - first
-        over_rows(
-            kernels.add_images, height, width,
-            prepared, which, views, spans, *kernels.plane_rays(self.shape),
-            self._owners(crops, lambda: crops.owners(self.shape)),
-            self.blend == "nearest", self._total, self._labels,
-        )  # fmt: skip
+        rays = kernels.plane_rays(self.shape)
+        owner = self._owners(crops, lambda: crops.owners(self.shape))
+        sight = kernels.Sight(which, views, spans, *rays, owner)
+        softmax = self.blend == "nearest"
+        arguments = (prepared, sight, softmax, self._total, self._labels)
+        over_rows(kernels.add_images, height, width, *arguments)
 
     def labels(self) -> NDArray[np.unsignedinteger]:
         """``(H, W)`` place of the best class of every pixel; of equal ones the first."""

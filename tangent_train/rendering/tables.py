@@ -24,9 +24,8 @@ __all__ = [
     "image_table",
     "owners",
     "set_table_cache_limit",
-    "spans",
+    "sight_of",
     "tensors_on",
-    "views_of_rays",
 ]
 
 Value = TypeVar("Value", bound=tuple[Any, ...])
@@ -180,17 +179,16 @@ def image_table(
             images that see a pixel.
         rows: The rows, without a step.
     """
-    columns, lines = kernels.sphere_rays(shape)
     part = owners(grid, shape)[rows] if blend == "nearest" else np.empty((0, 0), np.uint8)
+    sight = sight_of(grid, grid.face_indices(), shape, rows, part)
     size = (rows.stop - rows.start, shape[1])
-    views = views_of_rays(grid, None), spans(grid, None, shape, rows), columns, lines[rows], part
     count = np.zeros(size, np.int32)
     for ranks in (0, None):
         table = (int(count.max()) if ranks is None else 0, *size)
         count[:] = 0
         face = np.zeros(table, np.int16 if grid.num_images < 2**15 else np.int32)
         u, v, weight = np.zeros((3, *table), dtype)
-        arguments = ((grid.dim, grid.dim), *views, count, face, u, v, weight)
+        arguments = ((grid.dim, grid.dim), sight, count, face, u, v, weight)
         over_rows(kernels.seen_table, *size, *arguments)
     # Pixels that fewer images see take their first one again, with weight 0.
     unused = np.arange(len(face))[:, None, None] >= count
@@ -198,30 +196,35 @@ def image_table(
     return ImageTable(face, u, v, weight / weight.sum(axis=0))
 
 
-def views_of_rays(grid: PinholeGrid, faces: NDArray[np.int64] | None) -> NDArray[np.float64]:
-    """``(n, 3, 3)`` from directions to homogeneous pixels of images, default all."""
-    axes = grid.world_from_camera[grid.face_indices(faces)]
-    return np.ascontiguousarray(grid.camera_matrix @ axes.transpose(0, 2, 1))
-
-
-def spans(
-    grid: PinholeGrid, faces: NDArray[np.int64] | None, shape: tuple[int, int], rows: slice
-) -> NDArray[np.int32]:
-    """Columns of ERP rows that may see something of images: within their corners' angle.
+def sight_of(
+    grid: PinholeGrid,
+    faces: NDArray[np.int64],
+    shape: tuple[int, int],
+    rows: slice,
+    owner: NDArray[np.integer],
+) -> kernels.Sight:
+    """How images of a grid see rows of a panorama.
 
     Args:
         grid: The images.
-        faces: Those asked for, default all.
-        shape: ``(H, W)`` of the ERP.
-        rows: Its rows.
-
-    Returns:
-        ``(n, rows, 2)`` first column and number of columns, across ±180°.
+        faces: ``(n,)`` those meant.
+        shape: ``(H, W)`` of the panorama.
+        rows: Rows of it, without a step.
+        owner: Of these rows; empty to feather.
     """
-    width = shape[1]
+    axes = grid.world_from_camera[faces]
+    matrices = np.ascontiguousarray(grid.camera_matrix @ axes.transpose(0, 2, 1))
+    columns, lines = kernels.sphere_rays(shape)
+    seen_columns = _spans(grid, faces, shape[1], equirect_latitudes(shape[0])[rows])
+    return kernels.Sight(faces, matrices, seen_columns, columns, lines[rows], owner)
+
+
+def _spans(
+    grid: PinholeGrid, faces: NDArray[np.int64], width: int, row_lat: NDArray[np.float64]
+) -> NDArray[np.int32]:
+    """Columns of ERP rows that may see something of images: within their corners' angle."""
     reach = np.arctan(np.sqrt(2) * grid.dim / 2 * grid.pitch)
-    lon, lat = xyz_to_lonlat(grid.centers_xyz[grid.face_indices(faces)]).T[..., None]
-    row_lat = equirect_latitudes(shape[0])[rows]
+    lon, lat = xyz_to_lonlat(grid.centers_xyz[faces]).T[..., None]
     # cos(reach) = sin φ sin φ₀ + cos φ cos φ₀ cos(λ − λ₀)
     across = np.maximum(np.cos(row_lat) * np.cos(lat), 1e-12)
     cosine = (np.cos(reach) - np.sin(row_lat) * np.sin(lat)) / across
