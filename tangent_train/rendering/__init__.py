@@ -12,14 +12,16 @@ from tangent_train.rendering.camera_files import (
     write_colmap,
 )
 from tangent_train.rendering.forward import Interpolation, equirect_to_tangent
-from tangent_train.rendering.representations.cubemap import CubemapRepresentation
+from tangent_train.rendering.representations.equirect import EquirectRepresentation
 from tangent_train.rendering.representations.perspective import PerspectiveRepresentation
 from tangent_train.rendering.representations.pinhole import (
+    CubemapRepresentation,
+    TangentRepresentation,
+)
+from tangent_train.rendering.representations.views import (
     Assembler,
-    EquirectRepresentation,
     Representation,
     RotationAugmentation,
-    TangentRepresentation,
     Views,
 )
 from tangent_train.rendering.rotate import equirect_to_perspective, rotate_equirect

@@ -12,12 +12,19 @@ from torch import Tensor
 from tangent_train.errors import SettingError
 from tangent_train.geometry import PinholeGrid
 
-__all__ = ["check_blend", "check_images", "check_interpolation", "check_panorama", "check_shape"]
+__all__ = [
+    "check_blend",
+    "check_choice",
+    "check_images",
+    "check_interpolation",
+    "check_panorama",
+    "check_shape",
+]
 
 
 def check_interpolation(interpolation: str, blend: str = "nearest") -> None:
     """Raise SettingError unless the interpolation is known and goes with the blend."""
-    _check_choice("interpolation", interpolation, ("bilinear", "nearest"))
+    check_choice("interpolation", interpolation, ("bilinear", "nearest"))
     if interpolation == "nearest" and blend != "nearest":
         raise SettingError(
             "interpolation",
@@ -29,7 +36,7 @@ def check_interpolation(interpolation: str, blend: str = "nearest") -> None:
 
 def check_blend(blend: str, grid: PinholeGrid) -> None:
     """Raise SettingError unless the blend is known and the images can be blended so."""
-    _check_choice("blend", blend, ("nearest", "feather"))
+    check_choice("blend", blend, ("nearest", "feather"))
     if blend == "feather" and not grid.overlapping:
         raise SettingError(
             "blend",
@@ -39,7 +46,8 @@ def check_blend(blend: str, grid: PinholeGrid) -> None:
         )
 
 
-def _check_choice(name: str, value: str, allowed: tuple[str, ...]) -> None:
+def check_choice(name: str, value: str, allowed: tuple[str, ...]) -> None:
+    """Raise SettingError unless a word is one of those allowed."""
     if value not in allowed:
         raise SettingError(name, found=repr(value), expected=" or ".join(map(repr, allowed)))
 

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float, Integer
 from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
@@ -22,6 +21,7 @@ from torch import Tensor
 from tangent_train.errors import SettingError
 from tangent_train.geometry import normalize_camera, shift_range
 from tangent_train.registry import registered
+from tangent_train.rendering.checks import check_choice
 from tangent_train.rendering.forward import Interpolation
 from tangent_train.rendering.representations.views import NO_RAYS, UNTURNED
 
@@ -223,10 +223,6 @@ class PerspectiveRepresentation:
         mirror: bool = False,
         evaluation: Crops = "grid",
     ) -> None:
-        if not 0 < fov_deg < 180:
-            raise SettingError(
-                "representation.fov_deg", found=fov_deg, expected="more than 0 and less than 180"
-            )
         wider = math.tan(math.radians(fov_deg) / 2) / math.tan(math.radians(_PAPER_FOV_DEG) / 2)
         dim = max(2, round(2 ** (level - 1) * wider)) if dim is None else dim
         sides = (dim, dim) if isinstance(dim, int) else tuple(dim)
@@ -235,14 +231,7 @@ class PerspectiveRepresentation:
                 "representation.dim", found=dim, expected="2 or more, or [height, width]"
             )
         self.image_size = sides[0], sides[1]
-        if crops_per_photo < 1:
-            raise SettingError(
-                "representation.crops_per_photo", found=crops_per_photo, expected="1 or more"
-            )
-        if evaluation not in ("grid", "center"):
-            raise SettingError(
-                "representation.evaluation", found=repr(evaluation), expected="grid or center"
-            )
+        check_choice("representation.evaluation", evaluation, ("grid", "center"))
         self.fov_deg = fov_deg
         self.crops_per_photo = crops_per_photo
         self.mirror = mirror
@@ -258,17 +247,14 @@ class PerspectiveRepresentation:
         return PhotoSampler(camera_matrix, size, self)
 
     def to_labels(
-        self,
-        scores: Float[Tensor, "images classes height width"],
-        shape: tuple[int, ...],
-        rotation: NDArray[np.floating] | None = None,
-    ) -> Integer[Tensor, "images height width"]:
+        self, scores: Tensor, shape: tuple[int, ...], rotation: NDArray[np.float64] | None = None
+    ) -> Tensor:
         """The best class of every pixel of every crop.
 
         Args:
             scores: Of all crops.
             shape: Of the truth, ``(n, h, w)``.
-            rotation: Ignored: photos are not turned.
+            rotation: Ignored: photos are not rotated.
 
         Raises:
             SettingError: The scores are not those of the crops.

@@ -1,27 +1,21 @@
-"""What a network sees of a panorama, and how its scores become labels of the panorama again.
-
-A *representation* turns panoramas into images a network can take: tangent images, or, as honest
-baselines, the faces of a cube, the equirectangular image itself or crops of it. It draws the
-*views* of one training sample (which images, turned and mirrored how), gives the views of the whole
-sphere for evaluation, and assembles the scores of the latter. Data modules and tasks know nothing
-else about it.
-"""
+"""Pinhole images around the centre as representations: tangent images and cube maps."""
 
 from __future__ import annotations
 
 import copy
 import math
 from collections.abc import Iterable
-from typing import Any, Literal, Protocol, Self, TypeVar, runtime_checkable
+from itertools import chain
+from typing import Self, TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Float, Integer
 from numpy.typing import NDArray
 from torch import Tensor
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry import (
+    CubeGrid,
     PinholeGrid,
     TangentGrid,
     equirect_shape,
@@ -30,93 +24,33 @@ from tangent_train.geometry import (
 )
 from tangent_train.registry import registered
 from tangent_train.rendering.backward import Blend, tangent_to_labels
+from tangent_train.rendering.checks import check_choice
 from tangent_train.rendering.mosaic import ScoreMosaic
 from tangent_train.rendering.representations.views import (
-    EquirectViews,
     ManyViews,
     PinholeViews,
+    Representation,
+    RotationAugmentation,
+    Sampler,
     Views,
 )
-from tangent_train.rendering.rotate import rotate_equirect
 
 __all__ = [
-    "Assembler",
-    "EquirectRepresentation",
+    "CubemapRepresentation",
     "PinholeRepresentation",
     "Representation",
-    "RotationAugmentation",
     "Sampler",
     "TangentRepresentation",
     "Views",
     "spun",
     "turns",
+    "unless_identity",
 ]
 
-RotationAugmentation = Literal["none", "yaw", "so3"]
-"""How training panoramas are turned: not, about the vertical, or any way."""
-
 _SYMMETRY_DEG = 72.0
-"""The icosahedron looks the same after this turn about the vertical."""
+"""The icosahedron looks the same after this rotation about the vertical."""
 
-_Choice = TypeVar("_Choice", bound=str)
 _Grid = TypeVar("_Grid", bound=PinholeGrid)
-
-
-class Sampler(Protocol):
-    """What draws views."""
-
-    def sample(self, rng: np.random.Generator) -> Views:
-        """Views of one training sample: a random subset, augmented."""
-        ...
-
-    def whole(self) -> Views:
-        """Views of the whole panorama or photo, in a fixed order."""
-        ...
-
-
-@runtime_checkable
-class Assembler(Protocol):
-    """What becomes of scores: all that a task knows of a representation."""
-
-    @property
-    def image_size(self) -> tuple[int, int]:
-        """Rows and columns of the images."""
-        ...
-
-    def to_labels(
-        self, scores: Tensor, shape: Any, rotation: NDArray[np.float64] | None = None
-    ) -> Tensor:
-        """Class indices of the shape of the truth, from the scores of all images."""
-        ...
-
-
-@runtime_checkable
-class Representation(Sampler, Assembler, Protocol):
-    """What a network sees of a panorama."""
-
-    @property
-    def erp_height(self) -> int:
-        """Rows of the panorama it reads and is scored on."""
-        ...
-
-    def turned(self, rotation: NDArray[np.float64]) -> Self:
-        """The same, looking in turned directions R·d: what panoramas that are not upright need."""
-        ...
-
-    def to_labels(
-        self,
-        scores: Float[Tensor, "images classes height width"],
-        shape: tuple[int, int],
-        rotation: NDArray[np.float64] | None = None,
-    ) -> Integer[Tensor, "rows columns"]:
-        """Class index of every pixel of the panorama.
-
-        Args:
-            scores: Of all images of `whole`, those of one turn.
-            shape: ``(H, W)`` of the panorama.
-            rotation: Of the views, one of `Views.rotations`; None where they are not turned.
-        """
-        ...
 
 
 class PinholeRepresentation:
@@ -146,10 +80,12 @@ class PinholeRepresentation:
         faces_per_panorama: int | None = None,
     ) -> None:
         self.grid = grid
-        self.rotation = _checked_choice("rotation", rotation, ("none", "yaw", "so3"))
+        check_choice("representation.rotation", rotation, ("none", "yaw", "so3"))
+        check_choice("representation.blend", blend, ("nearest", "feather"))
+        self.rotation = rotation
         self.mirror = mirror
-        self.erp_height = _erp_height(erp_height, level)
-        self.blend = _checked_choice("blend", blend, ("nearest", "feather"))
+        self.erp_height = equirect_shape(level)[0] if erp_height is None else erp_height
+        self.blend = blend
         self.faces_per_panorama = faces_per_panorama
 
     @property
@@ -160,7 +96,7 @@ class PinholeRepresentation:
     def turned(self, rotation: NDArray[np.float64]) -> Self:
         """The same with the images turned as a whole, R·d; instead of a turn before."""
         turned = copy.copy(self)
-        turned.grid = self.grid.with_rotation(_unless_identity(rotation))
+        turned.grid = self.grid.with_rotation(unless_identity(rotation))
         return turned
 
     def sample(self, rng: np.random.Generator) -> Views:
@@ -181,17 +117,13 @@ class PinholeRepresentation:
         return PinholeViews(self.grid)
 
     def to_labels(
-        self,
-        scores: Float[Tensor, "images classes height width"],
-        shape: tuple[int, int],
-        rotation: NDArray[np.float64] | None = None,
-    ) -> Integer[Tensor, "rows columns"]:
+        self, scores: Tensor, shape: tuple[int, int], rotation: NDArray[np.float64] | None = None
+    ) -> Tensor:
         """Render the scores (not labels) back to the panorama, then take the best class."""
         if self.blend == "feather":
             scores = scores.softmax(dim=1)
-        grid = self.grid.with_rotation(_unless_identity(rotation))
-        labels: Tensor = tangent_to_labels(scores, grid, shape, self.blend)
-        return labels
+        grid = self.grid.with_rotation(unless_identity(rotation))
+        return tangent_to_labels(scores, grid, shape, self.blend)
 
 
 @registered
@@ -233,7 +165,6 @@ class TangentRepresentation(PinholeRepresentation):
         average_rotations: int = 1,
     ) -> None:
         if crop_multiple is not None:
-            _at_least("crop_multiple", crop_multiple, 1)
             if dim is not None:
                 raise SettingError(
                     "representation.dim", found=dim, expected="null beside crop_multiple"
@@ -258,7 +189,7 @@ class TangentRepresentation(PinholeRepresentation):
 
     def to_averaged_labels(
         self, scores: Iterable[Tensor], shape: tuple[int, int], rotations: NDArray[np.float64]
-    ) -> Integer[Tensor, "rows columns"]:
+    ) -> Tensor:
         """The class with the highest mean probability over several turns, as in prediction.
 
         Args:
@@ -269,97 +200,47 @@ class TangentRepresentation(PinholeRepresentation):
         Returns:
             Class indices, on the CPU.
         """
-        mosaic: ScoreMosaic | None = None
-        for of_turn, rotation in zip(scores, rotations, strict=True):
-            mosaic = mosaic or ScoreMosaic(shape, of_turn.shape[1], self.blend, averaged=True)
-            grid = self.grid.with_rotation(_unless_identity(rotation))
+        parts = iter(scores)
+        first = next(parts)
+        mosaic = ScoreMosaic(shape, first.shape[1], self.blend, averaged=True)
+        for of_turn, rotation in zip(chain([first], parts), rotations, strict=True):
+            grid = self.grid.with_rotation(unless_identity(rotation))
             mosaic.add(of_turn, grid, np.arange(grid.num_images))
-        if mosaic is None:
-            raise SettingError("rotations", found=0, expected="one or more")
         return torch.from_numpy(mosaic.labels().astype(np.int64))
 
 
 @registered
-class EquirectRepresentation:
-    """The baseline without tangent images: the equirectangular image, or random crops of it.
+class CubemapRepresentation(PinholeRepresentation):
+    """The baseline between panorama and tangent images: the six faces of a cube.
 
-    Evaluation always sees the whole image.
+    Training and evaluation see all six. They do not overlap, so every pixel of the panorama takes
+    the scores of the one face that sees it.
 
     Args:
         level: Level s of the panorama.
-        crop_deg: Width of the training crops in degrees of longitude, full height, at a random
-            longitude and across the seam; the whole image by default.
-        rotation: Rotation of the panorama while training; about the vertical by whole columns.
-        mirror: Mirror half of the training samples left to right.
+        dim: Side of the faces in pixels, default 2^s: 90° over as many pixels as on the
+            panorama's equator.
+        rotation: Rotation of the cube while training.
+        mirror: Mirror half of the training samples left to right, every face by itself.
         erp_height: Rows of the panorama, default `equirect_shape(level)`.
 
     Raises:
-        SettingError: The crop is no part of the panorama.
+        SettingError: A value is impossible.
     """
+
+    grid: CubeGrid
 
     def __init__(
         self,
         level: int,
-        crop_deg: float | None = None,
+        dim: int | None = None,
         rotation: RotationAugmentation = "none",
         mirror: bool = False,
         erp_height: int | None = None,
     ) -> None:
-        if crop_deg is not None and not 0 < crop_deg <= 360:
-            raise SettingError("representation.crop_deg", found=crop_deg, expected="0 to 360")
-        self.erp_height = _erp_height(erp_height, level)
-        self.crop_deg = crop_deg
-        self.rotation = _checked_choice("rotation", rotation, ("none", "yaw", "so3"))
-        self.mirror = mirror
-        self._turn: NDArray[np.float64] | None = None
-
-    def turned(self, rotation: NDArray[np.float64]) -> Self:
-        """The same of panoramas looked at turned, R·d; instead of a turn before."""
-        turned = copy.copy(self)
-        turned._turn = _unless_identity(rotation)
-        return turned
-
-    @property
-    def image_size(self) -> tuple[int, int]:
-        """Rows and columns of the panorama, which evaluation sees."""
-        return self.erp_height, 2 * self.erp_height
-
-    def sample(self, rng: np.random.Generator) -> Views:
-        """The panorama or one crop of it, (perhaps) turned."""
-        columns = None
-        if self.crop_deg is not None or self.rotation == "yaw":
-            width = round(2 * self.erp_height * (self.crop_deg or 360) / 360)
-            columns = (rng.random(), width)
-        rotation = self._turn
-        if self.rotation == "so3":
-            turn = random_rotation(rng).T
-            rotation = turn if rotation is None else rotation @ turn
-        return EquirectViews(rotation, columns, self.mirror and bool(rng.random() < 0.5))
-
-    def whole(self) -> Views:
-        """The whole panorama."""
-        return EquirectViews(self._turn)
-
-    def to_labels(
-        self,
-        scores: Float[Tensor, "images classes height width"],
-        shape: tuple[int, int],
-        rotation: NDArray[np.float64] | None = None,
-    ) -> Integer[Tensor, "rows columns"]:
-        """The best class of every pixel; the scores are already those of the (turned) panorama."""
-        if scores.shape[0] != 1 or tuple(scores.shape[-2:]) != tuple(shape):
-            raise SettingError(
-                "scores of an equirectangular network",
-                found=tuple(scores.shape),
-                expected=f"one image of {shape[0]}×{shape[1]}",
-            )
-        labels = scores[0].argmax(dim=0)
-        turn = _unless_identity(rotation)
-        if turn is None:
-            return labels
-        small = labels.to(torch.int32).cpu().numpy().astype(np.uint16)
-        back = rotate_equirect(small, turn, "nearest").astype(np.int64)
-        return torch.from_numpy(back).to(labels.device)
+        quarter = equirect_shape(level)[1] // 4
+        grid = CubeGrid(quarter if dim is None else dim)
+        super().__init__(grid, level, rotation, mirror, erp_height)
 
 
 def turns(count: int, setting: str) -> list[NDArray[np.float64]]:
@@ -388,27 +269,9 @@ def spun(grid: _Grid, turn: NDArray[np.float64]) -> _Grid:
         turn: ``(3, 3)`` rotation.
     """
     rotation = turn if grid.rotation is None else grid.rotation @ turn
-    return grid.with_rotation(_unless_identity(rotation))
+    return grid.with_rotation(unless_identity(rotation))
 
 
-def _unless_identity(rotation: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+def unless_identity(rotation: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
     """None for no turn at all: the tables of grids that are not turned are those kept."""
     return None if rotation is None or np.array_equal(rotation, np.eye(3)) else rotation
-
-
-def _erp_height(rows: int | None, level: int) -> int:
-    return equirect_shape(level)[0] if rows is None else _at_least("erp_height", rows, 2)
-
-
-def _at_least(name: str, value: int, least: int) -> int:
-    if value < least:
-        raise SettingError(f"representation.{name}", found=value, expected=f"{least} or more")
-    return value
-
-
-def _checked_choice(name: str, value: _Choice, allowed: tuple[str, ...]) -> _Choice:
-    if value not in allowed:
-        raise SettingError(
-            f"representation.{name}", found=repr(value), expected=f"one of {', '.join(allowed)}"
-        )
-    return value

@@ -1,18 +1,38 @@
-"""Ways to look at a panorama: which images, turned and mirrored how."""
+"""What a network sees of a panorama, and how its scores become labels of the panorama again.
+
+A *representation* turns panoramas into images a network can take: tangent images, or, as
+baselines, the faces of a cube, the equirectangular image itself or crops of it. It draws the
+*views* of one training sample (which images, rotated and mirrored how), gives the views of the
+whole sphere for evaluation, and assembles the scores of the latter. Data modules and tasks know
+nothing else about it.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol, Self, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from tangent_train.geometry import PinholeGrid
 from tangent_train.rendering.forward import Interpolation, equirect_to_tangent
-from tangent_train.rendering.rotate import rotate_equirect
 
-__all__ = ["NO_RAYS", "UNTURNED", "EquirectViews", "ManyViews", "PinholeViews", "Views"]
+__all__ = [
+    "NO_RAYS",
+    "UNTURNED",
+    "Assembler",
+    "ManyViews",
+    "PinholeViews",
+    "Representation",
+    "RotationAugmentation",
+    "Sampler",
+    "Views",
+]
+
+RotationAugmentation = Literal["none", "yaw", "so3"]
+"""How training panoramas are rotated: not, about the vertical, or uniformly over SO(3)."""
 
 Image = NDArray[Any]
 
@@ -20,7 +40,7 @@ NO_RAYS: NDArray[np.float32] = np.empty((0, 3, 3), np.float32)
 """Of views that are no pinhole images of a sphere."""
 
 UNTURNED: NDArray[np.float64] = np.eye(3)[None]
-"""Rotations of views that nobody turned."""
+"""Rotations of views that are not rotated."""
 
 
 class Views(Protocol):
@@ -39,7 +59,55 @@ class Views(Protocol):
         ...
 
     def rotations(self) -> NDArray[np.float64]:
-        """Turns of the whole representation that they are of, ``(K, 3, 3)``: directions are R·d."""
+        """``(K, 3, 3)`` rotations of the whole representation they are of: directions are R·d."""
+        ...
+
+
+class Sampler(Protocol):
+    """Draws views."""
+
+    def sample(self, rng: np.random.Generator) -> Views:
+        """Views of one training sample: a random subset, augmented."""
+        ...
+
+    def whole(self) -> Views:
+        """Views of the whole panorama or photo, in a fixed order."""
+        ...
+
+
+@runtime_checkable
+class Assembler(Protocol):
+    """Turns scores into labels: all that a task knows of a representation."""
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """Rows and columns of the images."""
+        ...
+
+    def to_labels(
+        self, scores: Tensor, shape: Any, rotation: NDArray[np.float64] | None = None
+    ) -> Tensor:
+        """Class index of every pixel of the panorama or photo.
+
+        Args:
+            scores: ``(n, K, h, w)`` of all images of `Sampler.whole`; of one rotation.
+            shape: Of the truth.
+            rotation: Of the views, one of `Views.rotations`; None where they are not rotated.
+        """
+        ...
+
+
+@runtime_checkable
+class Representation(Sampler, Assembler, Protocol):
+    """What a network sees of a panorama."""
+
+    @property
+    def erp_height(self) -> int:
+        """Rows of the panorama it reads and is scored on."""
+        ...
+
+    def turned(self, rotation: NDArray[np.float64]) -> Self:
+        """The same, looking in rotated directions R·d: for panoramas that are not upright."""
         ...
 
 
@@ -95,38 +163,3 @@ class ManyViews:
     def rotations(self) -> NDArray[np.float64]:
         """Those of all parts."""
         return np.concatenate([part.rotations() for part in self.parts])
-
-
-@dataclass(frozen=True)
-class EquirectViews:
-    """The panorama itself.
-
-    Attributes:
-        rotation: ``(3, 3)`` rotation of the directions it looks in; None for none.
-        columns: Where a crop starts, as a share of the columns, and its width; None for no crop.
-        mirrored: Whether it is mirrored left to right.
-    """
-
-    rotation: NDArray[np.float64] | None = None
-    columns: tuple[float, int] | None = None
-    mirrored: bool = False
-
-    def render(self, image: Image, interpolation: Interpolation) -> Image:
-        """Render a panorama ``(H, W[, C])`` to one image ``(1, H, w[, C])``, dtype kept."""
-        if self.rotation is not None:
-            image = rotate_equirect(image, self.rotation.T, interpolation)
-        if self.columns is not None:
-            start, width = self.columns
-            first = int(start * image.shape[1])
-            image = image.take(np.arange(first, first + width), axis=1, mode="wrap")
-        if self.mirrored:
-            image = image[:, ::-1]
-        return np.ascontiguousarray(image[None])
-
-    def rays(self) -> NDArray[np.float32]:
-        """None: this is no pinhole image."""
-        return NO_RAYS
-
-    def rotations(self) -> NDArray[np.float64]:
-        """That of the panorama."""
-        return UNTURNED if self.rotation is None else self.rotation[None]

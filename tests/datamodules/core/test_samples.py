@@ -22,7 +22,7 @@ from datamodules.core.samples import (
 from datamodules.images.colors import jitter_colors
 from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_directions
-from tangent_train.rendering.representations.pinhole import (
+from tangent_train.rendering import (
     EquirectRepresentation,
     TangentRepresentation,
 )

@@ -25,8 +25,8 @@ from tangent_train.rendering import (
     TangentRepresentation,
     equirect_to_tangent,
 )
-from tangent_train.rendering.representations.cubemap import CubemapRepresentation
 from tangent_train.rendering.representations.perspective import PerspectiveRepresentation
+from tangent_train.rendering.representations.pinhole import CubemapRepresentation
 from tests.datamodules.modelnet40.shapes_format import COUNTS, write_tree
 
 if TYPE_CHECKING:
