@@ -168,13 +168,6 @@ def test_what_is_validated_is_the_average(tmp_path: Path) -> None:
     assert figures["val/miou"] == pytest.approx(float(trainer.checkpoint_callback.best_model_score))  # type: ignore[union-attr]
 
 
-def test_the_training_itself_does_not_change(tmp_path: Path) -> None:
-    with_average, without = Reference(), Reference()
-    _trainer(tmp_path / "with", with_average).fit(Learner())
-    _trainer(tmp_path / "without", without, decay=None).fit(Learner())
-    torch.testing.assert_close(with_average.trained, without.trained, rtol=0, atol=0)
-
-
 @pytest.mark.parametrize("step", [1, STEPS + 2])
 def test_a_run_cut_short_goes_on_as_if_nothing_had_happened(tmp_path: Path, step: int) -> None:
     _trainer(tmp_path / "whole").fit(Learner())

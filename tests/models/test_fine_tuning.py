@@ -137,7 +137,7 @@ def _kinds(names: Iterable[str]) -> set[str]:
 
 
 @pytest.mark.parametrize(("saved", "wanted"), [("", "ac"), ("ac", ""), ("a", "ac"), ("ac", "c")])
-@pytest.mark.parametrize("save", [torch.save, _save_checkpoint, _save_lightning])
+@pytest.mark.parametrize("save", [_save_checkpoint, _save_lightning])
 def test_networks_fit_into_each_others_wrappers(
     save: Callable[[dict[str, Tensor], Path], None], saved: str, wanted: str, tmp_path: Path
 ) -> None:
@@ -156,14 +156,6 @@ def test_networks_fit_into_each_others_wrappers(
     ):
         modules = [[m for m in n.modules() if isinstance(m, kind)][-1] for n in (other, network)]
         torch.testing.assert_close(modules[0].state_dict(), modules[1].state_dict(), rtol=0, atol=0)
-
-
-def test_the_first_convolution_is_that_of_the_network_inside(tmp_path: Path) -> None:
-    torch.save(_wrapped("").state_dict(), tmp_path / "rgb.pt")
-    rgbd = AuxiliaryHead(UNet(4, 4, (4, 6, 8)), STAGE, in_channels=4, num_classes=4)
-    context = SphereContext(rgbd, f"network.{STAGE}", ATTENTION, in_channels=4)
-    origins = initialize(context, tmp_path / "rgb.pt")
-    assert origins.adapted == {"network.network.stem.weight": "starts at zero: channel 3"}
 
 
 def test_part_of_a_network_can_be_given(tmp_path: Path) -> None:

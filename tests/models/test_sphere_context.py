@@ -64,40 +64,6 @@ def test_features_get_what_the_mixer_says() -> None:
     torch.testing.assert_close(context(images, rays, 2), expected)
 
 
-def test_turning_the_sphere_changes_nothing_and_looking_elsewhere_does() -> None:
-    context, images, rays = (
-        small_context().double().eval(),
-        torch.randn(5, 3, 16, 16, dtype=torch.float64),
-        sphere_rays(5).double(),
-    )
-    turn = torch.tensor(random_rotation(np.random.default_rng(5)))
-    with torch.no_grad():
-        scores = context(images, rays)
-        torch.testing.assert_close(context(images, turn @ rays), scores)
-        torch.testing.assert_close(context(images, 3 * rays), scores)
-        assert not torch.allclose(context(images, rays.flip(1)), scores, rtol=0, atol=1e-5)
-
-
-def test_images_see_those_of_their_sphere_and_no_others() -> None:
-    context, images = (
-        small_context().double().eval(),
-        torch.randn(8, 3, 16, 16, dtype=torch.float64),
-    )
-    turn = torch.tensor(random_rotation(np.random.default_rng(6)))
-    rays = torch.cat([sphere_rays(4).double(), turn @ sphere_rays(4).double()])
-    with torch.no_grad():
-        together = context(images, rays)
-        for sphere in range(2):
-            part = slice(4 * sphere, 4 * sphere + 4)
-            alone = context(images[part], rays[sphere : sphere + 1])
-            torch.testing.assert_close(alone, together[part])
-        order = torch.tensor([2, 0, 3, 1])
-        shuffled = context(images[:4][order], rays[:1, order])
-        torch.testing.assert_close(shuffled, together[:4][order])
-        fewer = context(images[:2], rays[:1, :2])
-        assert not torch.allclose(fewer, together[:2], rtol=0, atol=1e-5)
-
-
 def test_what_is_trained_on_photos_is_the_same_on_spheres() -> None:
     """The way from photos to panoramas: the context has learned nothing, and changes nothing."""
     torch.manual_seed(0)

@@ -110,17 +110,6 @@ def test_the_batch_of_spheres_gives_one_gradient() -> None:
         torch.testing.assert_close((old - new) / 0.1, gradient, rtol=1e-4, atol=1e-6)
 
 
-def test_all_unknown_batches_leave_the_network_alone() -> None:
-    data = Data(count=2)
-    for sample in data.train:
-        sample.labels.zero_()
-    network = nn.Conv2d(2, 3, 1)
-    before = [p.detach().clone() for p in network.parameters()]
-    quiet_trainer(max_steps=2, limit_val_batches=0).fit(_task(network), datamodule=data)
-    for old, new in zip(before, network.parameters(), strict=True):
-        torch.testing.assert_close(old, new.detach())
-
-
 def test_class_weights_come_from_the_data_or_the_settings() -> None:
     data = Data()
     task = _task(nn.Conv2d(2, 3, 1), class_weights="log")
