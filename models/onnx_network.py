@@ -15,24 +15,24 @@ from tangent_train.errors import DataError, SettingError
 __all__ = ["OnnxNetwork"]
 
 _ERRORS_ONLY = 3
-"""Of onnxruntime's levels of logging: its warnings are about speed, for makers of networks."""
+"""Of onnxruntime's log levels: its warnings are about speed."""
 
 
 class OnnxNetwork(nn.Module):
     """Runs an ONNX file with onnxruntime, on as many threads as torch uses.
 
-    For images on a GPU its CUDA provider is used where onnxruntime has one (package
-    onnxruntime-gpu); the scores come back to the device of the images in any case. It has no
-    parameters and no gradients.
+    Its CUDA provider is used where torch and onnxruntime have CUDA (package onnxruntime-gpu); the
+    scores are on the device of the images in any case. It has no parameters and no gradients.
 
     Args:
         path: The file; one input ``(B, C, h, w)`` float32, one output.
 
     Attributes:
-        metadata: What the file says about itself, text by key.
+        metadata: The file's own, text by key.
 
     Raises:
-        DataError: There is no such file, it is no network of this kind, or onnxruntime is missing.
+        DataError: There is no such file, it is no network of this kind, it needs other files, or
+            onnxruntime is missing.
     """
 
     def __init__(self, path: Path) -> None:
@@ -40,10 +40,37 @@ class OnnxNetwork(nn.Module):
         self._path = path
         if not path.is_file():
             raise DataError(path, found="no such file", expected="an ONNX file")
-        _check_alone(path)
-        self._sessions = {"CPU": self._open("CPU")}
-        session = self._sessions["CPU"]
-        inputs, outputs = session.get_inputs(), session.get_outputs()
+        try:
+            import onnx
+            import onnxruntime
+        except ImportError as error:
+            raise DataError(
+                path,
+                found="an ONNX file",
+                expected="the packages onnx and onnxruntime, to run it",
+                remedy="Run: pip install 'tangent-train[export]'",
+            ) from error
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = torch.get_num_threads()
+        options.log_severity_level = _ERRORS_ONLY
+        usable = {"CPUExecutionProvider"}
+        usable |= {"CUDAExecutionProvider"} if torch.cuda.is_available() else set()
+        providers = [name for name in onnxruntime.get_available_providers() if name in usable]
+        try:
+            graph = onnx.load(path, load_external_data=False)
+            if not any(tensor.data_location for tensor in _tensors(graph)):
+                self._session = onnxruntime.InferenceSession(path, options, providers=providers)
+        except Exception as error:  # whatever the parser of protocol buffers raises
+            found = f"an unreadable file ({str(error).partition(chr(10))[0]})"
+            raise DataError(path, found=found, expected="an ONNX file") from error
+        if not hasattr(self, "_session"):
+            raise DataError(
+                path,
+                found="tensors in other files",
+                expected="a network with all that belongs to it inside",
+                remedy="Save it with its weights in the file.",
+            )
+        inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
         if [len(i.shape) for i in inputs] != [4] or len(outputs) != 1:
             raise DataError(
                 path,
@@ -51,7 +78,7 @@ class OnnxNetwork(nn.Module):
                 expected="images (B, C, h, w) as the only input, scores as the only output",
             )
         self._input = inputs[0]
-        self.metadata: dict[str, str] = dict(session.get_modelmeta().custom_metadata_map)
+        self.metadata: dict[str, str] = dict(self._session.get_modelmeta().custom_metadata_map)
 
     def forward(
         self, images: Float[Tensor, "batch channels height width"]
@@ -61,12 +88,9 @@ class OnnxNetwork(nn.Module):
         Raises:
             SettingError: The file was made for images of another shape.
         """
-        kind = self._provider(images)
-        if kind not in self._sessions:
-            self._sessions[kind] = self._open(kind)
         array = images.detach().to("cpu", torch.float32).contiguous().numpy()
         try:
-            (scores,) = self._sessions[kind].run(None, {self._input.name: array})
+            (scores,) = self._session.run(None, {self._input.name: array})
         except Exception as error:
             raise SettingError(
                 f"images for {self._path.name}",
@@ -75,53 +99,6 @@ class OnnxNetwork(nn.Module):
                 remedy=f"onnxruntime says: {str(error).partition(chr(10))[0]}",
             ) from error
         return torch.from_numpy(scores).to(images.device)
-
-    def _provider(self, images: Tensor) -> str:
-        import onnxruntime
-
-        with_cuda = "CUDAExecutionProvider" in onnxruntime.get_available_providers()
-        return "CUDA" if images.is_cuda and with_cuda else "CPU"
-
-    def _open(self, kind: str) -> Any:
-        """A session whose first choice is the CPU, or CUDA."""
-        try:
-            import onnxruntime
-        except ImportError as error:
-            raise _missing(self._path) from error
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = torch.get_num_threads()
-        options.log_severity_level = _ERRORS_ONLY
-        providers = list(dict.fromkeys((f"{kind}ExecutionProvider", "CPUExecutionProvider")))
-        try:
-            return onnxruntime.InferenceSession(self._path, options, providers=providers)
-        except Exception as error:
-            first_line = str(error).partition("\n")[0]
-            raise DataError(
-                self._path, found=f"an unreadable file ({first_line})", expected="an ONNX file"
-            ) from error
-
-
-def _check_alone(path: Path) -> None:
-    """Refuse a network whose tensors are in other files, which its own would name.
-
-    Raises:
-        DataError: It is such a network, or no ONNX file.
-    """
-    try:
-        import onnx
-    except ImportError as error:
-        raise _missing(path) from error
-    try:
-        graph = onnx.load(path, load_external_data=False)
-    except Exception as error:  # whatever the parser of protocol buffers raises
-        raise DataError(path, found="an unreadable file", expected="an ONNX file") from error
-    if any(tensor.data_location for tensor in _tensors(graph)):
-        raise DataError(
-            path,
-            found="tensors in other files",
-            expected="a network with all that belongs to it inside",
-            remedy="Save it with its weights in the file.",
-        )
 
 
 def _tensors(message: Any) -> Iterator[Any]:
@@ -133,12 +110,3 @@ def _tensors(message: Any) -> Iterator[Any]:
                     yield inner
                 else:
                     yield from _tensors(inner)
-
-
-def _missing(path: Path) -> DataError:
-    return DataError(
-        path,
-        found="an ONNX file",
-        expected="the packages onnx and onnxruntime, to run it",
-        remedy="Run: pip install 'tangent-train[export]'",
-    )

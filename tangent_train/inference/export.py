@@ -124,15 +124,6 @@ def _check(
         raise SettingError(
             "image_size and opset", found=(image_size, opset), expected="null for .safetensors"
         )
-    step, fixed = trained.size_multiple, trained.fixed_size
-    if image_size is not None and (
-        any(side < 1 or side % step for side in image_size) or fixed not in (None, image_size)
-    ):
-        raise SettingError(
-            "image_size",
-            found=list(image_size),
-            expected=f"{list(fixed)}" if fixed else f"[height, width], multiples of {step}",
-        )
 
 
 def _write_onnx(trained: TrainedNetwork, path: Path, opset: int | None) -> None:

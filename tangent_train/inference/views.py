@@ -240,18 +240,15 @@ def _photo_representation(
 
 def _check_size(trained: TrainedNetwork, size: tuple[int, int]) -> None:
     fixed, multiple = trained.fixed_size, trained.size_multiple
-    if fixed in (None, size) and not any(side % multiple for side in size):
-        return
-    raise SettingError(
-        "level and base_level",
-        found="images of {}×{}".format(*size),
-        expected="those of {}×{} that the network takes".format(*fixed)
-        if fixed
-        else f"multiples of {multiple}, as the network needs",
-        remedy="Leave level and base_level as trained, or use the network's checkpoint."
-        if fixed
-        else "Choose a higher level or a lower base level.",
-    )
+    if fixed not in (None, size) or any(side % multiple for side in size):
+        raise SettingError(
+            "level and base_level",
+            found="images of {}×{}".format(*size),
+            expected="those of {}×{} of the network's file".format(*fixed)
+            if fixed
+            else f"multiples of {multiple}, as the network needs",
+            remedy="Choose other levels, or leave both as trained.",
+        )
 
 
 def _grid_set(image: InputImage, grid: PinholeGrid) -> ViewSet:

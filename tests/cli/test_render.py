@@ -178,21 +178,6 @@ def test_averaging_keeps_the_dtype(dtype: Any, channels: tuple[int, ...]) -> Non
     assert tangent_folders.shrink_to_level(blocks, 3) is blocks
 
 
-def test_depth_in_openexr_comes_back(rendered: Path, tmp_path: Path) -> None:
-    OpenEXR = pytest.importorskip("OpenEXR")
-    cameras = read_cameras(rendered / "cameras.json")
-    (tmp_path / "depth").mkdir()
-    for face, file in enumerate(cameras.files):
-        depth = np.full((cameras.grid.dim, cameras.grid.dim), face + 1, np.float32)
-        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-        path = tmp_path / "depth" / f"{Path(file).stem}.exr"
-        OpenEXR.File(header, {"Z": depth}).write(str(path))
-    output = tmp_path / "depth.npy"
-    _render(back=tmp_path / "depth", cameras=rendered, output=output, kind="depth")
-    owners = cameras.grid.owners(equirect_directions(cameras.shape))
-    assert (np.load(output, allow_pickle=False) == owners + 1).mean() > 0.999
-
-
 def test_16_bits_stay(tmp_path: Path) -> None:
     image = _smooth().astype(np.uint16) * 257
     _write(tmp_path / "room.tif", image)
@@ -343,20 +328,6 @@ def test_some_faces_with_a_margin(room: Path, tmp_path: Path, refused: Refused) 
     assert "cameras of 2 of the 20 images" in refused(back=folder, output=tmp_path / "back.png")
 
 
-def test_depth_arrays_are_panoramas_too(tmp_path: Path, refused: Refused) -> None:
-    distance = np.linspace(1, 5, 32)[:, None].repeat(64, axis=1).astype(np.float32)
-    np.save(tmp_path / "depth.npy", distance)
-    settings = {"input": tmp_path / "depth.npy", "base_level": 0, "interpolation": "nearest"}
-    said = refused(output=tmp_path / "png", **settings)
-    assert "depth.npy: .png files: found float32" in said
-    assert not list(tmp_path.glob("png/*"))
-    _render(output=tmp_path / "tan", format="tif", **settings)
-    _render(back=tmp_path / "tan" / "depth", output=tmp_path / "back.tif")
-    again = _read(tmp_path / "back.tif")
-    assert np.abs(again - distance).max() < 0.3
-    assert set(np.unique(again)) <= set(np.unique(distance))
-
-
 def test_a_figure_alone_or_beside_the_images(room: Path, tmp_path: Path, refused: Refused) -> None:
     figure = tmp_path / "figure.png"
     _render(input=room, figure=figure, base_level=0)
@@ -437,15 +408,9 @@ def test_a_broken_panorama_does_not_stop_the_others(tmp_path: Path, refused: Ref
 
 
 def test_parts_of_panoramas_by_their_tags(tmp_path: Path) -> None:
-    tags = {
-        "FullPanoWidthPixels": 128,
-        "FullPanoHeightPixels": 64,
-        "CroppedAreaImageWidthPixels": 128,
-        "CroppedAreaImageHeightPixels": 32,
-        "CroppedAreaLeftPixels": 0,
-        "CroppedAreaTopPixels": 16,
-    }
-    attributes = " ".join(f'GPano:{name}="{value}"' for name, value in tags.items())
+    tags = {"FullPanoWidth": 128, "FullPanoHeight": 64, "CroppedAreaLeft": 0, "CroppedAreaTop": 16}
+    tags |= {"CroppedAreaImageWidth": 128, "CroppedAreaImageHeight": 32}
+    attributes = " ".join(f'GPano:{name}Pixels="{value}"' for name, value in tags.items())
     xmp = (
         '<x:xmpmeta xmlns:x="adobe:ns:meta/">'
         '<rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#"><rdf:Description '
@@ -469,11 +434,9 @@ def test_parts_of_panoramas_by_their_tags(tmp_path: Path) -> None:
     [
         ({}, "input=<panoramas>, or back="),
         ({"input": "in"}, "output: found none"),
-        ({"input": "in", "output": "tan", "base_level": "one"}, "base_level"),
         ({"input": "in", "output": "tan", "base_level": -1}, "base_level"),
         ({"input": "in", "output": "tan", "level": 5, "dim": 4}, "dim: found 4; expected at least"),
         ({"input": "in", "output": "tan", "faces": [80]}, "80"),
-        ({"input": "in", "output": "tan", "rotation": [1, 2]}, "rotation: found"),
         ({"input": "in", "output": "tan", "format": "gif"}, r"\.gif.*expected .*\.png"),
         (
             {"input": "in", "output": "tan", "interpolation": "nearest", "format": "jpg"},
@@ -481,11 +444,8 @@ def test_parts_of_panoramas_by_their_tags(tmp_path: Path) -> None:
         ),
         ({"input": "in", "figure": "a.jpg", "base_level": 6}, "base_level"),
         ({"input": "in", "back": "tan", "output": "a.png"}, "input and back: found both"),
-        ({"input": "nowhere", "output": "tan"}, "nowhere"),
-        ({"back": "in"}, "output: found none"),
         ({"back": "nowhere", "output": "a.png"}, "no such folder"),
         ({"back": "in", "output": "a.png"}, r"no cameras\.json"),
-        ({"back": "in", "output": "a.png", "blend": "mean"}, "blend"),
     ],
 )
 def test_settings_that_cannot_work(
@@ -517,8 +477,6 @@ def test_settings_that_cannot_work(
             lambda f: _write(f / "face_003.png", np.zeros((32, 32, 3), np.uint16)),
             "of uint16; expected",
         ),
-        (lambda f: _write(f / "face_000.png", np.zeros((9, 8, 3), np.uint8)), "expected squares"),
-        (lambda f: (f / "face_003.png").write_bytes(b"\x89PNG"), r"face_003\.png"),
         (lambda f: (f / "cameras.json").write_text("{}"), r"cameras\.json: found no format"),
     ],
 )
@@ -536,7 +494,6 @@ def test_results_that_cannot_be_used(
         ({"kind": "labels"}, "expected labels.*one channel"),
         ({"z_depth": True}, "z_depth: found true for color"),
         ({"output": "folder"}, r"expected a name ending in \.png"),
-        ({"cameras": "nowhere.json"}, r"no cameras\.json"),
     ],
 )
 def test_settings_that_do_not_fit_the_results(

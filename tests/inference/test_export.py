@@ -200,8 +200,7 @@ def test_nan_is_refused(tmp_path: Path) -> None:
     [
         ("net.pt", {}, r"output: found net\.pt; expected a name ending in \.onnx or"),
         ("net.safetensors", {"opset": 18}, "image_size and opset: .*expected null"),
-        ("net.onnx", {"image_size": (32, 30)}, r"image_size: found \[32, 30\]; .* of 4"),
-        ("net.onnx", {"image_size": (0, 32)}, r"image_size: found \[0, 32\]"),
+        ("net.onnx", {"image_size": (32, 30)}, r"output: .*cannot be written .*multiples of 4"),
     ],
 )
 def test_settings_that_do_not_fit(
@@ -210,9 +209,6 @@ def test_settings_that_do_not_fit(
     with pytest.raises(SettingError, match=f"^{message}"):
         export_network(trained, tmp_path / name, **settings)
     assert list(tmp_path.iterdir()) == []
-    fixed = small_trained(own("OneSize"), image_size=(24, 40))
-    with pytest.raises(SettingError, match=r"found \[24, 48\]; expected \[24, 40\]"):
-        export_network(fixed, tmp_path / "net.onnx", image_size=(24, 48))
 
 
 def test_packages_for_onnx_are_named(
