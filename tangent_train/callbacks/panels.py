@@ -67,28 +67,19 @@ class PredictionPanels(Callback):
             batch.index.tolist(), outputs, batch.target, strict=True
         ):
             if index in chosen:
-                rgb = shown_image(source.read(index), target, pl_module.representation)
-                truth, labels = (side_by_side(x.cpu().numpy()) for x in (target, prediction))
-                sphere = target.ndim == _PANORAMA_DIMENSIONS
-                self._keep(index, source.name(index), rgb, truth, labels, pl_module, sphere)
+                self._show(source, index, target, prediction, pl_module)
 
-    def _keep(
-        self,
-        index: int,
-        name: str,
-        rgb: Any,
-        truth: Any,
-        labels: Any,
-        task: Any,
-        sphere: bool,
-    ) -> None:
+    def _show(self, source: Any, index: int, target: Any, prediction: Any, task: Any) -> None:
+        name, classes = source.name(index), len(task.class_names)
+        rgb = shown_image(source.read(index), target, task.representation)
+        truth, labels = (side_by_side(x.cpu().numpy()) for x in (target, prediction))
         panel = prediction_panel(rgb, truth, labels, task.class_names)
         encoded = cv2.imencode(".png", cv2.cvtColor(panel, cv2.COLOR_RGB2BGR))[1]
         write_bytes(self.folder / f"{name.replace('/', '_')}.png", encoded.tobytes())
-        classes = len(task.class_names)
         pairs = truth.astype(np.int64).ravel() * classes + labels.ravel()
         counts = np.bincount(pairs, minlength=classes**2).reshape(classes, classes)
         note = f"mIoU {percent(segmentation_scores(counts).miou)}\u00a0%" if truth.any() else ""
+        sphere = target.ndim == _PANORAMA_DIMENSIONS
         viewed = ViewerImage(name, rgb, labels, truth, sphere=sphere, note=note)
         self._encoded[index] = encode_image(viewed, classes)
 

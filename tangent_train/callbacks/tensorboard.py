@@ -103,31 +103,21 @@ class ValidationConfusion(Callback):
 
 
 class TrainingSpeed(Callback):
-    """Logs how fast training is, once an epoch.
+    """Logs ``speed/images_per_s`` once an epoch.
 
-    * ``speed/images_per_s``: images (tangent images, crops, whatever the network sees) trained per
-      second by all processes, over the whole epoch without its validation.
-    * ``speed/epoch_s``: seconds of the epoch without its validation; not for the rest of an epoch
-      that a resumed run begins with.
-    * ``speed/validation_s``: seconds of its validation, where it had one.
+    Images (tangent images, crops, whatever the network sees) that all processes trained on per
+    second of the epoch, its validation left out.
     """
 
     def __init__(self) -> None:
-        self._begin(0.0, whole=False)
-
-    def _begin(self, now: float, *, whole: bool) -> None:
-        self._began, self._whole = now, whole
-        self._images, self._validation = 0, 0.0
-
-    def on_train_start(  # noqa: D102 - a hook of Lightning; within an epoch if resumed there
-        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
-    ) -> None:
-        self._begin(_now(pl_module), whole=False)
+        self._since, self._paused, self._images = 0.0, 0.0, 0
 
     def on_train_epoch_start(  # noqa: D102 - a hook of Lightning
         self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
     ) -> None:
-        self._begin(_now(pl_module), whole=True)
+        self._since, self._images = _now(pl_module), 0
+
+    on_train_start = on_train_epoch_start  # a resumed epoch has no other
 
     def on_train_batch_end(  # noqa: D102 - a hook of Lightning
         self,
@@ -142,25 +132,21 @@ class TrainingSpeed(Callback):
     def on_validation_start(  # noqa: D102 - a hook of Lightning
         self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
     ) -> None:
-        self._validation -= _now(pl_module)
+        self._paused = _now(pl_module)
 
     def on_validation_end(  # noqa: D102 - a hook of Lightning
         self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
     ) -> None:
-        self._validation += _now(pl_module)
+        self._since += _now(pl_module) - self._paused
 
     def on_train_epoch_end(  # noqa: D102 - a hook of Lightning
         self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
     ) -> None:
-        if not trainer.is_global_zero or not self._images:
-            return
-        seconds = _now(pl_module) - self._began - self._validation
-        # Every process has as many images.
-        figures = {"images_per_s": self._images * trainer.world_size / seconds}
-        figures |= {"epoch_s": seconds} if self._whole else {}
-        figures |= {"validation_s": self._validation} if self._validation else {}
-        for name, value in figures.items():
-            pl_module.log(f"speed/{name}", value, rank_zero_only=True)
+        if trainer.is_global_zero and self._images:
+            seconds = _now(pl_module) - self._since
+            # Every process has as many images.
+            speed = self._images * trainer.world_size / seconds
+            pl_module.log("speed/images_per_s", speed, rank_zero_only=True)
 
 
 def _smaller(image: NDArray[Any]) -> NDArray[Any]:

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import weakref
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -12,7 +11,6 @@ from tangent_train.results.html import EncodedImage, ViewerImage, encode_image, 
 from tangent_train.results.html.images import BUDGET_BYTES
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -96,16 +94,6 @@ def test_a_larger_panorama_is_shrunk_by_area_and_its_labels_to_the_nearest() -> 
     assert np.count_nonzero(_decoded(image.prediction)) == 1000 * 1500
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (1, 2), (3, 2), (101, 203)])
-def test_odd_sizes(shape: tuple[int, int]) -> None:
-    rng = np.random.default_rng(1)
-    labels = rng.integers(0, CLASSES, shape)  # as int64
-    rgb = rng.integers(0, 256, (*shape, 3), np.uint8)
-    image = encode_image(ViewerImage("odd", rgb, labels, sphere=False), CLASSES)
-    assert _decoded(image.jpeg).shape == rgb.shape
-    np.testing.assert_array_equal(_decoded(image.prediction), labels)
-
-
 def test_shares_are_of_the_solid_angle_on_panoramas_and_of_the_pixels_on_photos() -> None:
     labels = np.ones((90, 180), np.uint8)
     labels[:15] = 2  # the cap above 60°: (1 - sin 60°) / 2 of the sphere, 1/6 of the pixels
@@ -139,23 +127,6 @@ def test_labels_that_cannot_be_shown_are_named(labels: NDArray[Any], found: str)
 def test_images_that_cannot_be_shown_are_named(rgb: NDArray[Any]) -> None:
     with pytest.raises(DataError, match=r"image a room: found .*; expected uint8"):
         encode_image(ViewerImage("a room", rgb), CLASSES)
-
-
-def test_only_one_image_is_in_memory_at_a_time(tmp_path: Path) -> None:
-    earlier: list[weakref.ref[NDArray[np.uint8]]] = []
-
-    def images() -> Iterator[ViewerImage]:
-        for number in range(4):
-            assert not any(reference() is not None for reference in earlier), number
-            rgb = np.full((8, 16, 3), number, np.uint8)
-            earlier.append(weakref.ref(rgb))
-            image = ViewerImage(str(number), rgb)
-            del rgb
-            yield image
-            del image
-
-    write_report(tmp_path / "report.html", "", images=images(), class_names=NAMES)
-    assert len(earlier) == 4
 
 
 def test_a_report_that_fails_leaves_the_old_one(tmp_path: Path) -> None:

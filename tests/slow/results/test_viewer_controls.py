@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from tangent_train.results.html import ViewerImage, write_report
 from tests.slow.results.browser import OpenReport, opened
 from tests.slow.results.reference import (
     classes_of,
@@ -92,25 +91,6 @@ def test_the_class_under_the_pointer_is_named(report: OpenReport) -> None:
     assert report.text(".readout").startswith("in the middle · truth: unknown")
 
 
-def test_every_class_index_survives_the_browser(browser: Browser, tmp_path: Path) -> None:
-    """256 classes, one column each: no colour management, no premultiplied alpha."""
-    path = tmp_path / "report.html"
-    labels = np.arange(256, dtype=np.uint8)[None].repeat(128, axis=0)
-    rgb = np.zeros((128, 256, 3), np.uint8)
-    names = [f"class number {k}" for k in range(256)]
-    image = ViewerImage("all", rgb, labels, sphere=False)
-    write_report(path, "t", images=[image], class_names=names)
-    with opened(browser, path) as report:
-        report.layer("prediction")
-        x, y, width, height = report.box()
-        scale = min(width / 256, height / 128)
-        left = x + (width - 256 * scale) / 2
-        for index in [*range(0, 256, 15), 1, 127, 128, 254]:
-            report.page.mouse.move(left + (index + 0.5) * scale, y + height / 2)
-            report.page.evaluate("() => new Promise(requestAnimationFrame)")
-            assert report.text(".readout").endswith(f"prediction: class number {index}")
-
-
 def test_keys_turn_zoom_reset_and_switch(report: OpenReport) -> None:
     report.press("1")
     half = max(report.box()[2:]) / 2
@@ -133,25 +113,6 @@ def test_keys_turn_zoom_reset_and_switch(report: OpenReport) -> None:
     assert report.text(".caption") == "bare"
     report.press("PageUp", "PageUp")
     assert report.text(".caption") == "a photo"
-
-
-def test_wheel_buttons_and_double_click_zoom(report: OpenReport) -> None:
-    report.layer("input")
-    x, y = report.middle()
-    report.page.mouse.move(x, y)
-    report.page.mouse.wheel(0, -100)
-    report.drawn()
-    close(report.pixels(), colors_of(view_of(report, 0, 0, START_DEG * math.exp(-0.2))))
-    report.page.get_by_label("Reset the view").click()
-    report.page.get_by_label("Zoom in").click()
-    report.drawn()
-    close(report.pixels(), colors_of(view_of(report, 0, 0, START_DEG / 1.3)))
-    report.page.get_by_label("Zoom out").click()
-    step = math.tan(math.radians(START_DEG) / 2) / (max(report.box()[2:]) / 2)
-    report.page.mouse.dblclick(x + 200, y)
-    report.drawn()
-    longitude = math.degrees(math.atan(200 * step))
-    close(report.pixels(), colors_of(view_of(report, longitude, 0, START_DEG / 2)))
 
 
 def test_missing_layers_are_not_offered(report: OpenReport) -> None:
