@@ -162,13 +162,6 @@ def test_tags_of_a_whole_panorama(tmp_path: Path) -> None:
         assert area.is_whole
 
 
-@pytest.mark.parametrize("left", [300, 330, 359])
-def test_tags_across_the_seam(tmp_path: Path, left: int) -> None:
-    path = _save(tmp_path / "image.jpg", _attributes(_TAGS | {"CroppedAreaLeftPixels": f"{left}"}))
-    area = area_of(path, (40, 60))
-    assert area == PanoramaArea((180, 360), (30, 70), (left, left + 60), (40, 60))
-
-
 # Placing and cutting
 
 

@@ -25,11 +25,6 @@ def test_a_folder_is_searched_for_images_only(tmp_path: Path) -> None:
     assert find_images(str(tmp_path)) == found
 
 
-def test_a_hidden_folder_that_is_asked_for_is_searched(tmp_path: Path) -> None:
-    _touch(tmp_path / ".secret" / "a.png")
-    assert find_images(tmp_path / ".secret") == [tmp_path / ".secret" / "a.png"]
-
-
 def test_linked_folders_are_searched_once(tmp_path: Path) -> None:
     _touch(tmp_path / "here" / "a.png", tmp_path / "there" / "deep" / "b.png")
     (tmp_path / "here" / "link").symlink_to(tmp_path / "there")

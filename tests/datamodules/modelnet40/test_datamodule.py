@@ -17,7 +17,6 @@ from datamodules.modelnet40.shape_samples import (
     STEPS,
     ShapeSample,
     ShapeViews,
-    normalize_spheres,
 )
 from tangent_train.errors import DataError, SettingError
 from tangent_train.rendering import (
@@ -164,22 +163,6 @@ def test_batches(make_module: MakeModule) -> None:
     assert seen == list(range(TRAINING))
     labels = {int(i): int(c) for batch in batches for i, c in zip(batch.index, batch.label)}  # noqa: B905
     assert [labels[i] for i in range(TRAINING)] == _labels(module, "train")
-
-
-def test_evaluation_takes_all_in_order_several_at_once(make_module: MakeModule) -> None:
-    module = make_module(shapes_per_step=4)
-    batches = list(module.test_dataloader())
-    assert [batch.index.tolist() for batch in batches] == [[0, 1, 2, 3], [4, 5]]
-    assert torch.cat([batch.label for batch in batches]).tolist() == [0, 0, 1, 1, 1, 2]
-
-
-def test_normalization_against_the_formula() -> None:
-    rng = np.random.default_rng(0)
-    steps = rng.integers(0, 2**15, (2, 3, 4, 5, 6)).astype(np.int16)
-    images = normalize_spheres(torch.from_numpy(steps), SPHERE_NORMALIZATION).numpy()
-    mean, std = np.array(SPHERE_NORMALIZATION.mean), np.array(SPHERE_NORMALIZATION.std)
-    expected = np.moveaxis((steps / STEPS - mean) / std, -1, 2)
-    np.testing.assert_allclose(images, expected, atol=1e-5)
 
 
 def test_views_are_those_of_the_float_spheres(make_module: MakeModule, root: Path) -> None:

@@ -81,20 +81,6 @@ def test_perspective_rays_project_to_their_pixels() -> None:
     assert math.acos(float(edges[0] @ edges[1])) == pytest.approx(math.radians(60), abs=1e-3)
 
 
-@pytest.mark.parametrize(
-    "view",
-    [
-        PanoramaView(Pose.looking(HERE, 0.7), 8),
-        PerspectiveView(Pose.looking(HERE, 0.7, 0.3), 8, 1.0),
-    ],
-)
-def test_rays_moved_by_a_pixel_are_those_of_the_next_pixel(
-    view: PanoramaView | PerspectiveView,
-) -> None:
-    np.testing.assert_allclose(view.rays(dx=1)[:, :-1], view.rays()[:, 1:], atol=1e-6)
-    np.testing.assert_allclose(view.rays(dy=-1)[1:], view.rays()[:-1], atol=1e-6)
-
-
 def test_views_look_around_as_asked() -> None:
     rng = np.random.default_rng(0)
     up = {

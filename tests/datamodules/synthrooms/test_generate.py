@@ -10,7 +10,7 @@ import cv2
 import pytest
 from numpy.typing import NDArray
 
-from datamodules.synthrooms.generate import MANIFEST, generate_rooms, make_room, plan_rooms
+from datamodules.synthrooms.generate import MANIFEST, generate_rooms, plan_rooms
 from datamodules.synthrooms.settings import RoomSettings
 from tangent_train.errors import DataError, SettingError
 
@@ -117,9 +117,3 @@ def test_folders_of_other_settings_and_of_others_are_left_alone(copy: Path, tmp_
     (tmp_path / "real" / "area_1").mkdir(parents=True)
     with pytest.raises(DataError, match=r"not SynthRooms' .*area_1"):
         generate_rooms(tmp_path / "real", TINY)
-
-
-def test_a_room_is_made_the_same_alone(tiny: Path, tmp_path: Path) -> None:
-    plan = plan_rooms(TINY)[2]
-    make_room(tmp_path, TINY, plan)
-    assert contents(tmp_path).items() <= contents(tiny).items()

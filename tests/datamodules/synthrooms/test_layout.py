@@ -1,11 +1,9 @@
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 
-from datamodules.synthrooms.layout import FloorPlan, Frame, Rectangle
+from datamodules.synthrooms.layout import FloorPlan, Rectangle
 
 L_SHAPE = FloorPlan((6.0, 5.0, 2.8), notch=(2.0, 1.5))
 
@@ -26,11 +24,6 @@ def test_walls_go_around_the_floor_once_with_the_room_on_their_left(
         inside, outside = (wall.frame.at(wall.length / 2, y) for y in (0.1, -0.1))
         assert plan.contains(Rectangle.around(inside, (0, 0), (0, 0)))
         assert not plan.contains(Rectangle.around(outside, (0, 0), (0, 0)))
-
-
-def test_a_frame_within_a_frame() -> None:
-    frame = Frame(1, 2, 3, math.pi / 2).at(1, 0, 0.5, yaw=0.25)
-    np.testing.assert_allclose(frame, (1, 3, 3.5, math.pi / 2 + 0.25))
 
 
 def test_the_missing_corner_is_outside() -> None:
@@ -66,10 +59,3 @@ def test_a_wall_holds_something_low_below_something_high_but_no_two_of_a_kind() 
     assert not wall.is_free(1.9, 2.5, "low")
     assert not wall.is_free(1.9, 2.5, "full")
     assert wall.is_free(2.2, 2.5, "full")
-
-
-def test_nothing_is_found_where_nothing_fits() -> None:
-    rng = np.random.default_rng(0)
-    plan = FloorPlan((2.0, 2.0, 2.5))
-    assert plan.against_wall(rng, 3.0, 0.5, "low") is None
-    assert plan.in_the_open(rng, 3.0, 0.5) is None

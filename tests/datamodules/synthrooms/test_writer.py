@@ -52,21 +52,6 @@ def test_every_item_has_its_own_label_until_the_numbers_run_out() -> None:
     assert names[-3:] == [f"board_{INSTANCES['board']}_{tail}"] * 3
 
 
-@pytest.mark.parametrize(
-    ("frame", "expected"),
-    [
-        (
-            "equirectangular",
-            "area_5b/pano/rgb/camera_{}_WC_17_frame_equirectangular_domain_rgb.png",
-        ),
-        ("3", "area_5b/data/rgb/camera_{}_WC_17_frame_3_domain_rgb.png"),
-    ],
-)
-def test_file_names(frame: str, expected: str) -> None:
-    assert re.fullmatch("[0-9a-f]{32}", CAMERA)
-    assert str(ROOMS[1].file(CAMERA, frame, "rgb")) == expected.format(CAMERA)
-
-
 def test_pictures_survive_the_files() -> None:
     rgb = np.random.default_rng(0).integers(0, 256, (2, 3, 3)).astype(np.uint8)
     depth = np.array([[1.0, np.nan, 2.5], [0.002, 100.0, np.nan]], np.float32)
