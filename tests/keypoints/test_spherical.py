@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -87,9 +89,8 @@ def test_there_and_back_from_a_panorama() -> None:
     diameters, angles = rng.uniform(1, 9, 300), rng.uniform(-np.pi, np.pi, 300)
     directions = direction(pixels)
     sizes, orientations = local_to_sphere(equirect_jacobian(directions, SHAPE), diameters, angles)
-    base = keypoints(300)
-    found = SphericalKeypoints(
-        directions, sizes, orientations, base.responses, base.descriptors, base.images
+    found = replace(
+        keypoints(300), directions_xyz=directions, sizes_rad=sizes, orientations_xyz=orientations
     )
     np.testing.assert_allclose((orientations * directions).sum(axis=1), 0, atol=1e-12)
     np.testing.assert_allclose(found.equirect_pixels(SHAPE), pixels, atol=1e-9)
@@ -98,14 +99,10 @@ def test_there_and_back_from_a_panorama() -> None:
 
 
 def test_sizes_and_angles_at_the_poles_are_finite() -> None:
-    base = keypoints(2)
-    poles = SphericalKeypoints(
-        np.array([[0, 0, 1.0], [0, 0, -1]]),
-        base.sizes_rad,
-        np.array([[1, 0, 0.0], [0, 1, 0]]),
-        base.responses,
-        base.descriptors,
-        base.images,
+    poles = replace(
+        keypoints(2),
+        directions_xyz=np.array([[0, 0, 1.0], [0, 0, -1]]),
+        orientations_xyz=np.array([[1, 0, 0.0], [0, 1, 0]]),
     )
     np.testing.assert_allclose(poles.equirect_pixels(SHAPE)[:, 1], [-0.5, SHAPE[0] - 0.5])
     np.testing.assert_array_equal(poles.equirect_sizes(SHAPE), SHAPE[0])
@@ -118,14 +115,3 @@ def test_angles_are_precise_from_0_to_180_degrees() -> None:
     ends = np.array([rotation_about(axis, angle) @ start for angle in angles])
     np.testing.assert_allclose(angles_between(start, ends), angles, rtol=1e-9, atol=1e-15)
     assert angles_between(ends[:0], start).shape == (0,)
-
-
-def test_parts_are_put_together_and_selected_in_order() -> None:
-    parts = [keypoints(3, 1), keypoints(0, 2), keypoints(4, 3)]
-    whole = SphericalKeypoints.concatenated(parts)
-    assert len(whole) == 7
-    again = whole.select(np.arange(3, 7)), whole.select(np.arange(7) > 2)
-    for selected in again:
-        for name, values in vars(selected).items():
-            np.testing.assert_array_equal(values, vars(parts[2])[name])
-            assert values.dtype == vars(parts[2])[name].dtype

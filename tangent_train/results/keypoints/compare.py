@@ -232,7 +232,7 @@ class Comparer:
         }
 
 
-_TRUTH = ("rotation_error_deg", "translation_error_deg", "judged", "correct")
+_TRUTH = ("rotation_error_deg", "translation_error_deg", "judged", "correct", "correct_share")
 
 
 def _truth(
@@ -251,7 +251,8 @@ def _truth(
     judged = correct_matches(left_xyz[first], right_xyz[second], left, right, max_error_deg)
     rotated = PanoramaPose(right.pose.world_from_panorama @ rotation.T, right.pose.location_m)
     errors = found.geometry.pose_error_deg(left.pose, rotated)
-    figures = (*map(_defined, errors), int(judged.known.sum()), int(judged.correct.sum()))
+    known, correct = int(judged.known.sum()), int(judged.correct.sum())
+    figures = (*map(_defined, errors), known, correct, correct / known if known else None)
     counts = int(visible[0].sum()), int(visible[1].sum())
     return counts, dict(zip(_TRUTH, figures, strict=True))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,11 +23,18 @@ if TYPE_CHECKING:
 __all__ = ["KeypointReport", "matches_png", "with_splits"]
 
 _CONDITIONS = {AS_GIVEN: "As they are", ROTATED: "Right panorama randomly rotated"}
-_SCORES = {"pmr": "PMR %", "ms": "MS %", "p": "P %"}
-_MEDIANS = {
-    "rotation_error_deg": "rotation error °, median",
-    "translation_error_deg": "translation error °, median",
+_SCORES = {"PMR %": "pmr", "MS %": "ms", "P %": "p"}
+_METRICS = {
+    **_SCORES,
+    "right matches %": "correct_share",
+    "keypoints, left": "keypoints_left",
+    "inliers": "inliers",
+    "overlap of the fields of view %": "fov_overlap",
+    "rotation error °, median": "rotation_error_deg",
+    "translation error °, median": "translation_error_deg",
 }
+"""Columns of the rows by what tables call them."""
+
 _BY_DEPTH = (
     "n_L and n_R are the keypoints visible to the other panorama, by depth and pose and with "
     "occlusion."
@@ -73,7 +80,7 @@ class KeypointReport:
         head += [
             f"{text}\n" for known, text in ((True, _BY_DEPTH), (False, _ALL)) if known in by_depth
         ]
-        tables = [self._splits(), *self.means(), *map(self._per_pair, self._conditions())]
+        tables = [*self.means(), *map(self._per_pair, self._conditions())]
         return "\n".join([*head, *(table.markdown() for table in tables)])
 
     def means(self) -> list[Table]:
@@ -93,45 +100,30 @@ class KeypointReport:
         return [c for c in _CONDITIONS if any(row["condition"] == c for row in self.rows)]
 
     def _mean_rows(self, condition: str) -> Iterator[Sequence[str]]:
+        """Means over the pairs of which a figure is defined; the paper's below them."""
         for split, rows in _by_split(self.rows).items():
-            chosen = [
-                [r for r in rows if (r["condition"], r["representation"]) == (condition, name)]
-                for name in self.representations
-            ]
-            printed = self._printed(split) if condition == AS_GIVEN else {}
+            printed = _paper().get(split, {}) if self.published and condition == AS_GIVEN else {}
             title = f"{split} ({len({row['pair'] for row in rows})})"
-            for key, metric in _SCORES.items():
-                yield (title, metric, *(percent(_mean(part, key)) for part in chosen))
+            for metric, key in _METRICS.items():
+                values = [
+                    [
+                        r[key]
+                        for r in rows
+                        if (r["condition"], r["representation"]) == (condition, n)
+                    ]
+                    for n in self.representations
+                ]
+                known = [[value for value in column if value is not None] for column in values]
+                if not any(known) and key not in _SCORES.values():
+                    continue
+                average = np.median if metric.endswith("median") else np.mean
+                means = (float(average(column)) if column else None for column in known)
+                yield (title, metric, *(_text(mean, metric) for mean in means))
                 title = ""
                 if key in printed:
-                    shares = (printed[key].get(name) for name in self.representations)
-                    yield ("", f"{metric}, paper", *(percent(_number(share)) for share in shares))
-            if any(row["judged"] is not None for part in chosen for row in part):
-                shares_ = (_mean_of(map(_correct_share, part)) for part in chosen)
-                yield ("", "right matches %", *map(percent, shares_))
-            counts = (_mean_of(map(_keypoints, part)) for part in chosen)
-            yield ("", "keypoints", *(_text(count, 0) for count in counts))
-            yield ("", "inliers", *(_text(_mean(part, "inliers"), 0) for part in chosen))
-            for key, metric in _MEDIANS.items():
-                medians = [_median(part, key) for part in chosen]
-                if any(median is not None for median in medians):
-                    yield ("", metric, *(_text(median, 2) for median in medians))
-
-    def _splits(self) -> Table:
-        rows: list[Sequence[str]] = []
-        for split, found in _by_split(self.rows).items():
-            erp = [r for r in found if (r["condition"], r["representation"]) == (AS_GIVEN, "ERP")]
-            overlap, inliers = _mean(erp, "fov_overlap"), _mean(erp, "inliers")
-            rows.append((split, str(len(erp)), percent(overlap), _text(inliers, 0)))
-            if printed := self._printed(split):
-                share = 100 * float(printed["fov_overlap"]["ERP"])
-                rows.append(("paper", "30", f"{share:.2f}", printed["inliers"]["ERP"]))
-        header = ("split", "pairs", "overlap of the fields of view %", "inliers on ERP")
-        return Table("Pairs", header, rows)
-
-    def _printed(self, split: str) -> Mapping[str, Mapping[str, str]]:
-        """The paper's figures of a split by name and representation, if the pairs are its own."""
-        return _paper().get(split, {}) if self.published else {}
+                    figures = (printed[key].get(name) for name in self.representations)
+                    paper = (_text(float(figure) if figure else None, metric) for figure in figures)
+                    yield ("", f"{metric}, paper", *paper)
 
     def _per_pair(self, condition: str) -> Table:
         header = ("pair", "split", "overlap %", *self.representations)
@@ -139,7 +131,9 @@ class KeypointReport:
         for name, found in _grouped(with_splits(self.rows), "pair").items():
             of = {r["representation"]: r for r in found if r["condition"] == condition}
             one = found[0]
-            cells = [_triple([of[n][key] for key in _SCORES]) for n in self.representations]
+            cells = [
+                _triple([of[n][key] for key in _SCORES.values()]) for n in self.representations
+            ]
             rows.append((name, one["split"] or "–", percent(one["fov_overlap"]), *cells))
             printed = self.published.get(name)
             if printed is not None and condition == AS_GIVEN:
@@ -190,35 +184,8 @@ def _paper() -> dict[str, dict[str, dict[str, str]]]:
     return found
 
 
-def _correct_share(row: Row) -> float | None:
-    return row["correct"] / row["judged"] if row["judged"] else None
-
-
-def _keypoints(row: Row) -> float:
-    return (row["keypoints_left"] + row["keypoints_right"]) / 2
-
-
-def _mean(rows: Sequence[Row], key: str) -> float | None:
-    return _mean_of(row[key] for row in rows)
-
-
-def _mean_of(values: Iterable[float | None]) -> float | None:
-    """Mean over the pairs of which the figure is defined."""
-    known = [value for value in values if value is not None]
-    return sum(known) / len(known) if known else None
-
-
-def _median(rows: Sequence[Row], key: str) -> float | None:
-    known = [row[key] for row in rows if row[key] is not None]
-    return float(np.median(known)) if known else None
-
-
-def _number(text: str | None) -> float | None:
-    return float(text) if text else None
-
-
-def _text(value: float | None, digits: int) -> str:
-    return "–" if value is None else f"{value:.{digits}f}"
+def _text(value: float | None, metric: str) -> str:
+    return percent(value) if metric.endswith("%") or value is None else f"{value:.3g}"
 
 
 def _triple(scores: Sequence[float | None]) -> str:
