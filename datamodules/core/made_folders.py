@@ -33,22 +33,20 @@ def claim_folder(
     """
     wanted = {"generator": generator, "version": version, "settings": dict(settings)}
     path = root / manifest
-    remedy = "Name another folder, or remove this one to make it anew."
     # Before the manifest: whoever makes the same at the same time writes that first.
     foreign = sorted(p.name for p in root.iterdir() if p.name[0] != ".") if root.is_dir() else []
     if path.exists():
-        found = _read_manifest(path, generator)
+        found = _read(path)
         if found != wanted:
+            one, other = _flat(found), _flat(wanted)
             raise DataError(
                 path,
-                found=_differences(found, wanted),
-                expected=_differences(wanted, found),
-                remedy=remedy,
+                found=", ".join(f"{k}={one.get(k)}" for k in other if one.get(k) != other[k]),
+                expected=", ".join(f"{k}={v}" for k, v in other.items() if one.get(k) != v),
+                remedy="Name another folder, or remove this one to make it anew.",
             )
         return
-    if root.exists() and not root.is_dir():
-        raise DataError(root, found="a file", expected="a folder", remedy=remedy)
-    if foreign:
+    if foreign or (root.exists() and not root.is_dir()):
         raise DataError(
             root,
             found=f"files that are not {generator}' ({', '.join(foreign[:3])}, …)",
@@ -58,27 +56,16 @@ def claim_folder(
     write_text(path, json.dumps(wanted, indent=1) + "\n")
 
 
-def _read_manifest(manifest: Path, generator: str) -> dict[str, Any]:
+def _read(manifest: Path) -> Any:
     try:
-        found = parse_json(manifest.read_text(encoding="utf-8"))
+        return parse_json(manifest.read_bytes())
     except ValueError:
-        found = None
-    if not isinstance(found, dict):
-        raise DataError(
-            manifest,
-            found="something else",
-            expected=f"the settings of {generator} as JSON",
-            remedy="Remove the folder to make it anew.",
-        )
-    return found
+        return None
 
 
-def _differences(one: dict[str, Any], other: dict[str, Any]) -> str:
-    """What `one` says that `other` does not."""
-    flat, others = _flatten(one), _flatten(other)
-    return ", ".join(f"{k}={v}" for k, v in flat.items() if others.get(k) != v) or "nothing more"
-
-
-def _flatten(manifest: dict[str, Any]) -> dict[str, Any]:
-    settings = manifest.get("settings")
-    return {**manifest, **(settings if isinstance(settings, dict) else {}), "settings": ""}
+def _flat(manifest: Any) -> dict[str, Any]:
+    """Generator, version and settings; nothing of what is no manifest."""
+    if not isinstance(manifest, dict) or not isinstance(manifest.get("settings"), dict):
+        return {}
+    return {"generator": manifest.get("generator"), "version": manifest.get("version"),
+            **manifest["settings"]}  # fmt: skip

@@ -58,7 +58,7 @@ class EpochSampler(Sampler[tuple[int, int]]):
             goes on behind them. The length stays that of a whole epoch.
 
     Raises:
-        SettingError: Fewer samples than processes, or an impossible rank.
+        SettingError: Fewer samples than processes.
     """
 
     def __init__(
@@ -70,8 +70,6 @@ class EpochSampler(Sampler[tuple[int, int]]):
         world_size: int = 1,
         start: tuple[int, int] = (0, 0),
     ) -> None:
-        if not 0 <= rank < world_size:
-            raise SettingError("rank", found=rank, expected=f"0 to {world_size - 1}")
         if length < world_size:
             raise SettingError(
                 "trainer.devices",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -129,10 +129,10 @@ def read_classes(path: Path) -> FolderClasses:
         path: The file.
 
     Raises:
-        DataError: It cannot be read, is in another form, names something twice or nothing.
+        DataError: It cannot be read, is in another form, gives a value twice, or nothing.
     """
     try:
-        content = parse_json(path.read_bytes(), object_pairs_hook=_Pairs)
+        content = parse_json(path.read_bytes())
     except FileNotFoundError as error:
         raise DataError(
             path,
@@ -143,19 +143,22 @@ def read_classes(path: Path) -> FolderClasses:
     except (OSError, ValueError) as error:
         remedy = "docs/own_data.md shows how to bring your own data."
         raise DataError(path, found=error, expected=_EXPECTED, remedy=remedy) from error
-    if isinstance(content, _Pairs):
-        codes = content
-    elif isinstance(content, list):
-        codes = _Pairs((name, place) for place, name in enumerate(content) if name is not None)
+    if isinstance(content, list):
+        named = [(name, [place]) for place, name in enumerate(content) if name is not None]
+    elif isinstance(content, dict):
+        named = [(n, given if isinstance(given, list) else [given]) for n, given in content.items()]
     else:
         raise DataError(path, found=json.dumps(content), expected=_EXPECTED)
-    _check_names(path, [name for name, _ in codes])
-    classes = _classes(path, codes)
-    return replace(classes, length=None if isinstance(content, _Pairs) else len(content))
-
-
-class _Pairs(list[tuple[Any, Any]]):
-    """An object in JSON: names and what belongs to them; names may come twice, as in no dict."""
+    _check_names(path, [name for name, _ in named])
+    codes = _codes(path, named)
+    ordered = sorted(codes)
+    return FolderClasses(
+        names=tuple(name for name, _ in named),
+        codes=np.array(ordered, np.int32),
+        labels=np.array([codes[code] for code in ordered], np.uint8),
+        in_colors=isinstance(named[0][1][0], str),
+        length=len(content) if isinstance(content, list) else None,
+    )
 
 
 def _check_names(path: Path, names: list[Any]) -> None:
@@ -178,42 +181,27 @@ def _check_names(path: Path, names: list[Any]) -> None:
         raise DataError(path, found=f"class {twice[0]!r} twice", expected="every name once")
 
 
-def _classes(path: Path, codes: _Pairs) -> FolderClasses:
-    owners: dict[int, int] = {}
-    kinds = set()
-    for place, (name, listed) in enumerate(codes):
-        for value in _listed(path, name, listed):
-            code, kind = _code(path, name, value)
-            kinds.add(kind)
-            if code in owners and len(kinds) == 1:
-                both = " and ".join(repr(codes[owner][0]) for owner in (owners[code], place))
-                raise DataError(
-                    path, found=f"{value} for {both}", expected="every value or colour once"
-                )
-            owners[code] = place
-    if len(kinds) > 1:
+def _codes(path: Path, named: list[tuple[str, list[Any]]]) -> dict[int, int]:
+    """The label of every value or colour."""
+    if len({isinstance(value, str) for _, values in named for value in values}) > 1:
         raise DataError(path, found="values and colours", expected="either values or colours")
-    ordered = sorted(owners)
-    return FolderClasses(
-        names=tuple(name for name, _ in codes),
-        codes=np.array(ordered, np.int32),
-        labels=np.array([owners[code] + 1 for code in ordered], np.uint8),
-        in_colors=kinds == {"color"},
-    )
+    labels: dict[int, int] = {}
+    for label, (name, values) in enumerate(named, start=1):
+        if not values:
+            raise DataError(path, found=f"nothing for {name!r}", expected="a value or a colour")
+        for value in values:
+            other = named[labels.setdefault(_code(path, name, value), label) - 1][0]
+            if other != name:
+                found = f"{value} for {other!r} and {name!r}"
+                raise DataError(path, found=found, expected="every value or colour once")
+    return labels
 
 
-def _listed(path: Path, name: str, listed: Any) -> list[Any]:
-    """One or several values or colours."""
-    if listed == []:
-        raise DataError(path, found=f"nothing for {name!r}", expected="a value or a colour")
-    return listed if isinstance(listed, list) else [listed]
-
-
-def _code(path: Path, name: str, value: Any) -> tuple[int, str]:
+def _code(path: Path, name: str, value: Any) -> int:
     if isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= _MOST_VALUE:
-        return value, "value"
+        return value
     if isinstance(value, str) and _COLOR.fullmatch(value):
-        return int(value[1:], 16), "color"
+        return int(value[1:], 16)
     raise DataError(
         path,
         found=f"{json.dumps(value)} for {name!r}",

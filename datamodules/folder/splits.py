@@ -115,7 +115,7 @@ class FolderSplits:
                 self.root / "images",
                 found=f"{len(scenes)} scenes to draw those of {split} from",
                 expected="two or more: first folders, or images that are in none",
-                remedy=f"Have more of them, or {_named_in(split)}.",
+                remedy=f"Have more of them, or name some in {split}.txt.",
             )
         return {files.name for files in panoramas if _scene(files) in drawn}
 
@@ -126,7 +126,8 @@ class FolderSplits:
                 self.root,
                 found=f"no panoramas for {split}",
                 expected="one or more",
-                remedy=f"{_named_in(split).capitalize()}.",
+                remedy=f"Name some in {split}.txt; without validation, set "
+                "data.validation_fraction=0.",
             )
         return names
 
@@ -153,11 +154,6 @@ def _listed_name(path: Path, line: str, names: dict[str, str], owners: dict[str,
         )
     owners[name] = path
     return name
-
-
-def _named_in(split: Split) -> str:
-    also = ", or set data.validation_fraction=0" if split == "val" else ""
-    return f"name some in {split}.txt{also}"
 
 
 def _lines(path: Path) -> list[str]:

@@ -22,49 +22,33 @@ Understanding", arXiv:1702.01105, 2017.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING
 
 from datamodules.core.panorama_module import PanoramaDataModule
 from datamodules.core.panoramas import Mask
-from datamodules.stanford2d3ds.files import AREAS
-from datamodules.stanford2d3ds.label_table import CLASSES
 from datamodules.stanford2d3ds.reader import StanfordReader
-from datamodules.stanford2d3ds.splits import check_choice, find_pictures
+from datamodules.stanford2d3ds.splits import StanfordAreas
 from tangent_train.errors import SettingError
 from tangent_train.registry import registered
-
-if TYPE_CHECKING:
-    from datamodules.core.found import Split
-    from datamodules.core.problems import Problems
-    from datamodules.core.reading import ImageFiles
 
 __all__ = ["Stanford2D3DS"]
 
 
 @registered
 @dataclass(kw_only=True, eq=False, repr=False)
-class Stanford2D3DS(PanoramaDataModule):
+class Stanford2D3DS(StanfordAreas, PanoramaDataModule):
     """Stanford2D3DS, 13 classes, in the three folds of its authors.
 
     Args:
-        fold: 1, 2 or 3, see `FOLDS`.
-        areas: Areas to use, all of which must be there; by default all.
         mask: Which pixels count as unknown, see `mask_black`.
-        label_table: The class table, when it is not where the release has it.
 
     Raises:
         SettingError: A setting that cannot work.
     """
 
-    class_names = ("unknown", *CLASSES)
+    group = "pano"
 
-    fold: int = 1
-    areas: Sequence[str] = AREAS
     mask: Mask = "labels"
-    label_table: Path | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -72,21 +56,8 @@ class Stanford2D3DS(PanoramaDataModule):
             raise SettingError(
                 "data.mask", found=repr(self.mask), expected="labels, any_black or all_black"
             )
-        self.label_table = None if self.label_table is None else Path(self.label_table)
-        check_choice(self.fold, self.areas)
 
-    def find_images(
-        self, problems: Problems
-    ) -> tuple[StanfordReader, dict[Split, list[ImageFiles]]]:
-        """See `PanoramaDataModule`."""
-        splits = find_pictures(
-            self.root,
-            "pano",
-            problems,
-            fold=self.fold,
-            areas=self.areas,
-            with_depth="depth" in self.inputs,
-            validation_fraction=self.validation_fraction,
-            seed=self.seed,
-        )
-        return StanfordReader.of(self.root, self.label_table, self.mask), splits
+    @property
+    def reader(self) -> StanfordReader:
+        """With the class table and the mask."""
+        return StanfordReader.of(self.root, self.label_table, self.mask)

@@ -1,119 +1,104 @@
-"""Which pictures of Stanford2D3DS are for training, validation and test."""
+"""What panoramas and photos of Stanford2D3DS have in common: areas, folds, the class table."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 from datamodules.core.group_drawing import draw_groups
-from datamodules.stanford2d3ds.files import AREAS, FOLDS, GET_IT, PictureFiles, list_pictures
+from datamodules.core.reading import ImageFiles
+from datamodules.core.split_module import SplitDataModule
+from datamodules.stanford2d3ds.files import AREAS, FOLDS, GET_IT, list_pictures
+from datamodules.stanford2d3ds.label_table import CLASSES
+from datamodules.stanford2d3ds.reader import StanfordReader
 from tangent_train.errors import DataError, SettingError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
     from datamodules.core.found import Split
     from datamodules.core.problems import Problems
-    from datamodules.core.reading import ImageFiles
 
-__all__ = ["check_choice", "find_pictures"]
-
-
-def check_choice(fold: int, areas: Sequence[str]) -> None:
-    """Make sure that there are areas for training and for testing.
-
-    Raises:
-        SettingError: There are not.
-    """
-    if fold not in FOLDS:
-        raise SettingError("data.fold", found=repr(fold), expected="1, 2 or 3")
-    testing = set(FOLDS[fold])
-    if not set(areas) <= set(AREAS) or not testing & set(areas) or set(areas) <= testing:
-        raise SettingError(
-            "data.areas",
-            found=list(areas),
-            expected=f"some of {', '.join(AREAS)}: for testing (fold {fold}: "
-            f"{', '.join(FOLDS[fold])}) and for training (others)",
-        )
+__all__ = ["StanfordAreas"]
 
 
-def find_pictures(
-    root: Path,
-    group: Literal["pano", "data"],
-    problems: Problems,
-    *,
-    fold: int,
-    areas: Sequence[str],
-    with_depth: bool,
-    validation_fraction: float,
-    seed: int,
-) -> dict[Split, list[ImageFiles]]:
-    """The panoramas or photos of every split.
+@dataclass(kw_only=True, eq=False, repr=False)
+class StanfordAreas(SplitDataModule[ImageFiles]):
+    """The three folds of the authors, with rooms for validation.
 
     Validation pictures are those of whole rooms drawn from the training areas, so that nothing is
-    ever chosen by the test areas.
+    ever chosen by the test areas: at least one room, never all.
 
     Args:
-        root: Folder with ``area_1`` … ``area_6``.
-        group: Panoramas or photos.
-        problems: Where it is noted what is missing or there twice.
         fold: 1, 2 or 3, see `FOLDS`.
-        areas: Areas to use, all of which must be there.
-        with_depth: Whether depth is an input.
-        validation_fraction: Share of the training rooms: at least one room, never all.
-        seed: Chooses the validation rooms.
+        areas: Areas to use, all of which must be there; by default all.
+        label_table: The class table, when it is not where the release has it.
+
+    Attributes:
+        group: Which pictures.
 
     Raises:
-        DataError: There is no data set, or only one room to train on, and one is wanted for
-            validation.
+        SettingError: A setting that cannot work.
     """
-    if not root.is_dir():
-        raise DataError(root, found="no such folder", expected="the data set", remedy=GET_IT)
-    there = [area for area in areas if (root / f"area_{area}").is_dir()]
-    with problems.noted():
-        if len(there) < len(areas):
-            raise DataError(
-                root,
-                found="no " + ", ".join(f"area_{area}" for area in areas if area not in there),
-                expected="all of " + ", ".join(f"area_{area}" for area in areas),
-                remedy=GET_IT,
+
+    class_names = ("unknown", *CLASSES)
+    group: ClassVar[Literal["pano", "data"]]
+
+    fold: int = 1
+    areas: Sequence[str] = AREAS
+    label_table: Path | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.label_table = None if self.label_table is None else Path(self.label_table)
+        if self.fold not in FOLDS:
+            raise SettingError("data.fold", found=repr(self.fold), expected="1, 2 or 3")
+        areas, testing = set(self.areas), set(FOLDS[self.fold])
+        if not areas <= set(AREAS) or not testing & areas or areas <= testing:
+            raise SettingError(
+                "data.areas",
+                found=list(self.areas),
+                expected=f"some of {', '.join(AREAS)}: for testing (fold {self.fold}: "
+                f"{', '.join(FOLDS[self.fold])}) and for training (others)",
             )
-    listed = [list_pictures(root, area, group, with_depth, problems) for area in there]
-    pictures = [picture for pictures in listed for picture in pictures]
-    _check_cameras(pictures, problems)
-    training = [picture for picture in pictures if picture.area not in FOLDS[fold]]
-    rooms: set[tuple[str, str, int]] = set()
-    if validation_fraction:
-        rooms = draw_groups((picture.room for picture in training), validation_fraction, seed)
-        if training and not rooms:
-            raise DataError(
-                root,
-                found="one training room",
-                expected="two or more, to keep some for validation",
-                remedy="Set data.validation_fraction=0, or use more rooms.",
-            )
-    return {
-        "train": [picture.image for picture in training if picture.room not in rooms],
-        "val": [picture.image for picture in training if picture.room in rooms],
-        "test": [picture.image for picture in pictures if picture.area in FOLDS[fold]],
-    }
 
+    @property
+    def reader(self) -> StanfordReader:
+        """With the class table."""
+        return StanfordReader.of(self.root, self.label_table)
 
-def _check_cameras(pictures: Sequence[PictureFiles], problems: Problems) -> None:
-    """Note pictures that are there twice, as a copy in another room or area.
-
-    The two parts of area 5 share rooms, and are always in the same split: a camera may be in both.
-    """
-    seen: dict[tuple[str, str], list[PictureFiles]] = {}
-    for picture in pictures:
-        before = seen.setdefault((picture.name.camera, picture.name.frame), [])
-        for other in before:
-            with problems.noted(picture.image.name):
-                if other.area == picture.area or other.room[0] != picture.room[0]:
-                    raise DataError(
-                        picture.rgb,
-                        found=f"the camera of {other.rgb}",
-                        expected="every camera in one room of one area",
-                        remedy="Remove the copy, with its depth, labels and pose.",
-                    )
-        before.append(picture)
+    def find_images(
+        self, problems: Problems
+    ) -> tuple[StanfordReader, dict[Split, list[ImageFiles]]]:
+        """See `PanoramaDataModule`."""
+        root, areas = self.root, self.areas
+        if not root.is_dir():
+            raise DataError(root, found="no such folder", expected="the data set", remedy=GET_IT)
+        there = [area for area in areas if (root / f"area_{area}").is_dir()]
+        with problems.noted():
+            if len(there) < len(areas):
+                raise DataError(
+                    root,
+                    found="no " + ", ".join(f"area_{area}" for area in areas if area not in there),
+                    expected="all of " + ", ".join(f"area_{area}" for area in areas),
+                    remedy=GET_IT,
+                )
+        with_depth = "depth" in self.samples.inputs
+        listed = [list_pictures(root, area, self.group, with_depth, problems) for area in there]
+        pictures = [picture for pictures in listed for picture in pictures]
+        training = [picture for picture in pictures if picture.area not in FOLDS[self.fold]]
+        rooms: set[tuple[str, str, int]] = set()
+        if self.validation_fraction:
+            rooms = draw_groups((p.room for p in training), self.validation_fraction, self.seed)
+            if training and not rooms:
+                raise DataError(
+                    root,
+                    found="one training room",
+                    expected="two or more, to keep some for validation",
+                    remedy="Set data.validation_fraction=0, or use more rooms.",
+                )
+        return self.reader, {
+            "train": [picture.image for picture in training if picture.room not in rooms],
+            "val": [picture.image for picture in training if picture.room in rooms],
+            "test": [picture.image for picture in pictures if picture.area in FOLDS[self.fold]],
+        }

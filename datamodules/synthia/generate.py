@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 
 from datamodules.core.made_folders import claim_folder
+from datamodules.core.photos import distance_from_z_depth
 from datamodules.core.pipeline import in_threads
 from datamodules.core.problems import Problems
 from datamodules.core.progress import show_progress
@@ -46,7 +47,6 @@ from tangent_train.geometry import (
     equirect_latitudes,
     equirect_to_lonlat,
     lonlat_to_xyz,
-    perspective_directions,
     rotation_about,
 )
 
@@ -67,7 +67,6 @@ MANIFEST = "tangent_train.json"
 """File in ``pano`` that says that the panoramas there were made here, and how."""
 
 _NOWHERE = -2  # a position outside all images, whatever interpolation reads around it
-_MOST = np.iinfo(np.uint16).max
 _PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 
 
@@ -97,7 +96,7 @@ class ViewStitcher:
             "bilinear": cv2.convertMaps(map_x, map_y, cv2.CV_16SC2),
             "nearest": cv2.convertMaps(map_x, map_y, cv2.CV_16SC2, nninterpolation=True),
         }
-        self._distance_per_depth = 1 / perspective_directions(camera_matrix, size)[..., 2]
+        self._camera_matrix = camera_matrix
 
     def rgb(self, views: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
         """Panorama ``(H, W, 3)`` of colour images in the order of `VIEWS`, bilinear; else black."""
@@ -116,8 +115,8 @@ class ViewStitcher:
         Returns:
             In the same unit, rounded, at most 65535.
         """
-        far = [np.minimum(view * self._distance_per_depth + 0.5, _MOST) for view in views]
-        return self._stitch([view.astype(np.uint16) for view in far], "nearest", 0)
+        far = [distance_from_z_depth(view, self._camera_matrix) for view in views]
+        return self._stitch(far, "nearest", 0)
 
     def _stitch(
         self,

@@ -14,27 +14,20 @@ Icosahedron Spheres", ICCV 2019.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from datamodules.core.panorama_module import PanoramaDataModule
 from datamodules.core.problems import Problems
-from datamodules.core.samples import Input
 from datamodules.synthia.files import GET_IT, list_panoramas, panorama_files, sequence_folder
 from datamodules.synthia.generate import HEIGHT, make_panoramas
-from datamodules.synthia.reader import (
-    CLASSES,
-    NORMALIZATIONS,
-    PANORAMA_FORMATS,
-    SynthiaReader,
-)
-from datamodules.synthia.splits import FRAMES, TEST, TRAIN, checked_sequences, divide
+from datamodules.synthia.reader import PANORAMA_FORMATS
+from datamodules.synthia.splits import SynthiaSequences
 from tangent_train.errors import DataError
 from tangent_train.registry import registered
 
 if TYPE_CHECKING:
-    from datamodules.core.found import Split
+    from datamodules.core.found import Found
     from datamodules.core.reading import ImageFiles
 
 __all__ = ["OmniSynthia"]
@@ -42,36 +35,26 @@ __all__ = ["OmniSynthia"]
 
 @registered
 @dataclass(kw_only=True, eq=False, repr=False)
-class OmniSynthia(PanoramaDataModule):
+class OmniSynthia(SynthiaSequences, PanoramaDataModule):
     """OmniSYNTHIA, 13 classes, with the training and test sequences of its authors.
 
-    `root` holds ``SYNTHIA-SEQS-01-SUMMER`` …, each with the four views or with panoramas. Depth is
-    clipped to 4 m, which is little in a street; the published panoramas have the z-depth of the
-    views instead of distance. Validation takes the last panoramas of each training sequence.
+    `root` holds ``SYNTHIA-SEQS-01-SUMMER`` …, each with the four views or with panoramas, which
+    are made of `frames` frames where there are none. The published panoramas have the z-depth of
+    the views instead of distance.
 
     Args:
-        train_sequences: As ``01``.
-        test_sequences: As ``04``.
-        frames: About how many panoramas of each sequence to make, see `choose_frames`.
-        panorama_height: Rows of those that are made.
+        panorama_height: Rows of the panoramas that are made.
 
     Raises:
         SettingError: A setting that cannot work.
     """
 
-    class_names = ("unknown", *CLASSES)
-    normalizations = NORMALIZATIONS
+    formats = PANORAMA_FORMATS
 
-    inputs: Sequence[Input] = ("rgb",)
-    train_sequences: Sequence[str] = TRAIN
-    test_sequences: Sequence[str] = TEST
-    frames: int = FRAMES
     panorama_height: int = HEIGHT
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        chosen = checked_sequences(self.train_sequences, self.test_sequences)
-        self.train_sequences, self.test_sequences = chosen
         self._not_made = Problems()
 
     def make_files(self) -> None:
@@ -81,36 +64,32 @@ class OmniSynthia(PanoramaDataModule):
             DataError: There is nothing to make them from, or it is broken.
         """
         self._not_made = Problems()
-        sequences = (*self.train_sequences, *self.test_sequences)
         make_panoramas(
-            self.root, sequences, self._not_made, frames=self.frames, height=self.panorama_height
+            self.root,
+            self.sequences,
+            self._not_made,
+            frames=self.frames,
+            height=self.panorama_height,
         )
         if not self.skip_broken:
             self._not_made.refuse(self.root, "data.skip_broken=true leaves out these frames.")
 
-    def find_images(
-        self, problems: Problems
-    ) -> tuple[SynthiaReader, dict[Split, list[ImageFiles]]]:
-        """See `PanoramaDataModule`."""
+    def find(self, problems: Problems) -> Found[ImageFiles]:
+        """See `SplitDataModule`; panoramas that could not be made are broken."""
         problems.add_all(self._not_made)
-        sequences = (*self.train_sequences, *self.test_sequences)
-        found = {sequence: self._panoramas(sequence, problems) for sequence in sequences}
-        splits = divide(found, self.test_sequences, self.validation_fraction)
-        return SynthiaReader(PANORAMA_FORMATS), splits
+        return super().find(problems)
 
-    def _panoramas(self, sequence: str, problems: Problems) -> list[list[ImageFiles]]:
+    def list_images(self, sequence: str, *, with_depth: bool) -> list[list[ImageFiles]]:
+        """See `SynthiaSequences`."""
         folder = sequence_folder(self.root, sequence)
-        frames: list[str] = []
-        with problems.noted():
-            frames = list_panoramas(folder)
-            if not frames:
-                raise DataError(
-                    folder / "pano" / "RGB",
-                    found="no panoramas",
-                    expected="000000.png and others",
-                    remedy=f"Run tangent-prepare to make them from the views. {GET_IT}",
-                )
-        with_depth = "depth" in self.inputs
+        frames = list_panoramas(folder)
+        if not frames:
+            raise DataError(
+                folder / "pano" / "RGB",
+                found="no panoramas",
+                expected="000000.png and others",
+                remedy=f"Run tangent-prepare to make them from the views. {GET_IT}",
+            )
         return [
             [panorama_files(self.root, sequence, frame, with_depth=with_depth)] for frame in frames
         ]

@@ -3,18 +3,31 @@
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import chain
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
+from datamodules.core.reading import ImageFiles
+from datamodules.core.samples import Input
+from datamodules.core.split_module import SplitDataModule
+from datamodules.synthia.reader import CLASSES, NORMALIZATIONS, Formats, SynthiaReader
 from tangent_train.errors import DataError, SettingError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
     from datamodules.core.found import Split
-    from datamodules.core.reading import ImageFiles
+    from datamodules.core.problems import Problems
 
-__all__ = ["FRAMES", "SEQUENCES", "TEST", "TRAIN", "checked_sequences", "choose_frames", "divide"]
+__all__ = [
+    "FRAMES",
+    "SEQUENCES",
+    "TEST",
+    "TRAIN",
+    "SynthiaSequences",
+    "choose_frames",
+    "divide",
+]
 
 SEQUENCES: tuple[str, ...] = ("01", "02", "04", "05", "06")
 """The sequences there are; OmniSYNTHIA has their summers."""
@@ -45,24 +58,72 @@ def choose_frames(frames: Sequence[str], count: int = FRAMES) -> list[str]:
     return list(frames[::step])
 
 
-def checked_sequences(
-    train: Sequence[str], test: Sequence[str]
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Names of the sequences for training and for the test; numbers are made such names.
+@dataclass(kw_only=True, eq=False, repr=False)
+class SynthiaSequences(SplitDataModule[ImageFiles]):
+    """The training and test sequences of OmniSYNTHIA's authors.
+
+    Validation takes the last frames of each training sequence. Depth is clipped to 4 m, which is
+    little in a street.
+
+    Args:
+        train_sequences: As ``01``.
+        test_sequences: As ``04``.
+        frames: About how many frames of each sequence to use, see `choose_frames`.
+
+    Attributes:
+        formats: Of the files.
 
     Raises:
-        SettingError: There are none of a kind, or some are for both.
+        SettingError: A setting that cannot work.
     """
-    # YAML reads 01 as a number.
-    names = tuple(tuple(str(sequence).zfill(2) for sequence in some) for some in (train, test))
-    for kind, some, others in (("train", names[0], ()), ("test", names[1], names[0])):
-        if not some or not set(some) <= set(SEQUENCES) - set(others):
-            raise SettingError(
-                f"data.{kind}_sequences",
-                found=list(some),
-                expected=f"some of {', '.join(SEQUENCES)}, none for both training and test",
-            )
-    return names[0], names[1]
+
+    class_names = ("unknown", *CLASSES)
+    normalizations = NORMALIZATIONS
+    formats: ClassVar[Formats]
+
+    inputs: Sequence[Input] = ("rgb",)
+    train_sequences: Sequence[str] = TRAIN
+    test_sequences: Sequence[str] = TEST
+    frames: int = FRAMES
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, others in (("train_sequences", ()), ("test_sequences", self.train_sequences)):
+            # YAML reads 01 as a number.
+            some = tuple(str(sequence).zfill(2) for sequence in getattr(self, name))
+            setattr(self, name, some)
+            if not some or not set(some) <= set(SEQUENCES) - {str(o).zfill(2) for o in others}:
+                raise SettingError(
+                    f"data.{name}",
+                    found=list(some),
+                    expected=f"some of {', '.join(SEQUENCES)}, none for both training and test",
+                )
+
+    @property
+    def sequences(self) -> tuple[str, ...]:
+        """Those of training, then those of the test."""
+        return (*self.train_sequences, *self.test_sequences)
+
+    @abstractmethod
+    def list_images(self, sequence: str, *, with_depth: bool) -> list[list[ImageFiles]]:
+        """The images of every frame of a sequence.
+
+        Raises:
+            DataError: There are none.
+        """
+
+    def find_images(
+        self, problems: Problems
+    ) -> tuple[SynthiaReader, dict[Split, list[ImageFiles]]]:
+        """See `PanoramaDataModule`."""
+        found: dict[str, list[list[ImageFiles]]] = {}
+        for sequence in self.sequences:
+            found[sequence] = []
+            with problems.noted():
+                with_depth = "depth" in self.inputs
+                found[sequence] = self.list_images(sequence, with_depth=with_depth)
+        splits = divide(found, self.test_sequences, self.validation_fraction)
+        return SynthiaReader(self.formats), splits
 
 
 def divide(

@@ -79,7 +79,6 @@ def test_normalize_against_the_formula(depth: bool) -> None:
         ((0, 0, 0), (1, 1, 0)),
         ((0, 0, 0), (1, 1, 1, 1)),
         ((0, 0), (1, 1)),
-        ((), ()),
         ((0, 0, float("nan")), (1, 1, 1)),
         ((0, 0, 0), (1, 1, float("nan"))),
     ],
@@ -143,18 +142,12 @@ def test_the_elevation_follows_the_measured_channels() -> None:
         ("depth",),
         ("rgb", "rgb"),
         ("rgb", "heat"),
-        ("rgb", "elevation") * 2,
         "rgb",
     ],
 )
 def test_impossible_inputs(inputs: Any) -> None:
     with pytest.raises(SettingError, match=r"data\.inputs: found .* expected a list: rgb"):
         ImageSamples(inputs, RGB_NORMALIZATION, 0)
-
-
-def test_inputs_come_in_the_order_of_the_channels() -> None:
-    samples = ImageSamples(["elevation", "depth", "rgb"], RGBD_NORMALIZATION, 0)
-    assert (samples.inputs, samples.in_channels) == (("rgb", "depth", "elevation"), 5)
 
 
 # --- samples -----------------------------------------------------------------------------------
@@ -237,7 +230,7 @@ def test_jitter_changes_the_colours_and_nothing_else(strips: Representation) -> 
         assert torch.equal(after.images[0], jittered[epoch, 1].images[0])
 
 
-@pytest.mark.parametrize("strength", [0.1, 0.4])
+@pytest.mark.parametrize("strength", [0.4])
 def test_jitter_against_slow_formulas(strength: float) -> None:
     rgb = np.random.default_rng(1).integers(40, 160, (2, 3, 5, 3), np.uint8)
     found = jitter_colors(torch.from_numpy(rgb), strength, np.random.default_rng(7)).numpy()

@@ -177,16 +177,6 @@ def test_photos_have_a_store_as_well(root: Path, store: Path) -> None:
     assert len(_times(store)) == PANORAMAS
 
 
-def test_samples_need_no_decoding(make_module: MakeModule, monkeypatch: pytest.MonkeyPatch) -> None:
-    make_module().prepare_data()
-    for name in ("read_color_png", "read_depth_png"):
-        monkeypatch.setattr(f"datamodules.stanford2d3ds.reader.{name}", None)
-    module = make_module()
-    module.prepare_data()
-    assert len(_samples(module)) > 0
-    module.class_weights("log")
-
-
 def test_what_is_there_is_kept_and_what_is_not_is_made(
     make_module: MakeModule, store: Path, root: Path, strips: Any
 ) -> None:

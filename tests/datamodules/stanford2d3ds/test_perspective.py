@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import json
 import math
 from typing import TYPE_CHECKING, Any
 
@@ -8,16 +7,11 @@ import cv2
 import numpy as np
 import pytest
 
-from datamodules import Stanford2D3DS, Stanford2D3DSPerspective, SynthRooms, SynthRoomsPerspective
+from datamodules import Stanford2D3DS, Stanford2D3DSPerspective, SynthRoomsPerspective
 from datamodules.core.photos import distance_from_z_depth
-from datamodules.stanford2d3ds.reader import read_camera_matrix
 from tangent_train.errors import DataError, SettingError
 from tangent_train.geometry import (
-    FLIP_Y,
     camera_matrix_from_fov,
-    lonlat_to_equirect,
-    perspective_directions,
-    xyz_to_lonlat,
 )
 from tangent_train.rendering import PerspectiveRepresentation, TangentRepresentation
 
@@ -78,47 +72,6 @@ def test_distances_saturate_and_holes_stay_holes() -> None:
     np.testing.assert_array_equal(distance_from_z_depth(z, camera), [[0, 65535], [65535, 627]])
 
 
-def test_depth_means_the_same_in_photos_and_panoramas_of_a_room(tmp_path: Path) -> None:
-    rooms = {"rooms": {"1": 1, "5a": 1}, "height": 256, "views_per_camera": 3, "view_size": 64}
-    settings: Any = {"rooms": {**rooms, "views": "uniform"}, "validation_fraction": 0}
-    photos = SynthRoomsPerspective(tmp_path / "rooms", CROPS, **settings)
-    photos.prepare_data()
-    panoramas = SynthRooms(tmp_path / "rooms", TangentRepresentation(0, 7), **settings)
-    panorama, of = panoramas.source("test").read(0), panoramas.sample_name("test", 0)
-    found = []
-    for index in range(len(photos.source("test"))):
-        name = photos.sample_name("test", index)
-        if not name.startswith(of):
-            continue
-        photo = photos.source("test").read(index)
-        rows = _panorama_pixels(tmp_path / "rooms", name, photo.camera_matrix)
-        same = panorama.labels[rows] == photo.labels
-        assert panorama.depth is not None
-        assert photo.depth is not None
-        both = same & (panorama.depth[rows] > 0) & (photo.depth > 0)
-        found += [(photo.depth[both] / panorama.depth[rows][both]).ravel()]
-        assert same.mean() > 0.9
-    ratios = np.concatenate(found)
-    assert len(found) == 3
-    assert abs(np.median(ratios) - 1) < 0.002
-    assert (abs(ratios - 1) < 0.03).mean() > 0.95, "z-depth would be up to 30 % less"
-
-
-def _panorama_pixels(root: Path, name: str, camera_matrix: Any) -> Any:
-    """Where the panorama shows what a photo shows, from the pose files alone."""
-    area, room, camera, frame = name.split("/")
-    rotations = []
-    for group, of in (("data", frame), ("pano", "equirectangular")):
-        path = root / area / group / "pose" / f"camera_{camera}_{room}_frame_{of}_domain_pose.json"
-        rotations.append(np.array(json.loads(path.read_text())["camera_rt_matrix"])[:, :3])
-    rays = perspective_directions(camera_matrix, (64, 64)) @ rotations[0]  # in the room
-    x, y, z = np.moveaxis(rays @ rotations[1].T, -1, 0)  # in the upright camera of the panorama
-    sphere = np.stack([z, x, -y], axis=-1)
-    pixels = lonlat_to_equirect(xyz_to_lonlat(sphere), (256, 512))
-    column, row = np.moveaxis(np.rint(pixels).astype(int), -1, 0)
-    return row.clip(0, 255), column % 512
-
-
 # --- splits ------------------------------------------------------------------------------------
 
 
@@ -155,19 +108,6 @@ def test_samples(photo_root: Path) -> None:
     assert (quarter < 0.75).all(), "what another crop owns does not count"
 
 
-def test_training_draws_other_crops_each_epoch_and_the_same_again(photo_root: Path) -> None:
-    def labels(epoch: int, workers: int, stream: int = 0) -> Any:
-        settings: Any = {"num_workers": workers, "stream": stream, "photos_per_step": 2}
-        module = Stanford2D3DSPerspective(photo_root, CROPS, validation_fraction=0, **settings)
-        loader = module.train_dataloader()
-        loader.sampler.set_epoch(epoch)  # type: ignore[attr-defined]
-        return next(iter(loader)).labels.numpy()
-
-    np.testing.assert_array_equal(labels(1, 0), labels(1, 2))
-    assert (labels(0, 0) != labels(1, 0)).any()
-    assert (labels(0, 0) != labels(0, 0, stream=1)).any(), "fine-tuning sees others"
-
-
 def test_rgb_alone_needs_no_depth_files(broken_root: Path) -> None:
     _file(broken_root, "5a", "depth").unlink()
     module = Stanford2D3DSPerspective(broken_root, CROPS, inputs=["rgb"])
@@ -189,11 +129,8 @@ def test_a_photo_that_sees_less_than_a_crop_is_named(broken_root: Path) -> None:
 POSES = {
     "no JSON": ("{", "JSONDecodeError"),
     "no matrix": ("{}", "KeyError: 'camera_k_matrix'"),
-    "no numbers": ('{"camera_k_matrix": "f"}', "ValueError"),
-    "a list": ("[]", "TypeError"),
     "skew": ('{"camera_k_matrix": [[9, 1, 4], [0, 9, 4], [0, 0, 1]]}', "9.0, 1.0"),
     "no focal length": ('{"camera_k_matrix": [[0, 0, 4], [0, 9, 4], [0, 0, 1]]}', "0.0"),
-    "not finite": ('{"camera_k_matrix": [[NaN, 0, 4], [0, 9, 4], [0, 0, 1]]}', "nan"),
     "of 2×3": ('{"camera_k_matrix": [[9, 0, 4], [0, 9, 4]]}', "9.0"),
 }
 
@@ -204,15 +141,6 @@ def test_broken_poses_are_found_before_training(broken_root: Path, damage: str) 
     path = _file(broken_root, "5b", "pose")
     path.write_text(content)
     with pytest.raises(DataError, match=rf"pose\.json: found .*{found}.*camera_k_matrix"):
-        Stanford2D3DSPerspective(broken_root, CROPS).setup()
-
-
-def test_missing_pose(broken_root: Path) -> None:
-    path = _file(broken_root, "5b", "pose")
-    path.unlink()
-    with pytest.raises(DataError, match=rf"{path.name}: found FileNotFoundError"):
-        read_camera_matrix(path)
-    with pytest.raises(DataError, match=path.name):
         Stanford2D3DSPerspective(broken_root, CROPS).setup()
 
 
@@ -230,8 +158,3 @@ def test_representations_of_the_other_kind(photo_root: Path) -> None:
     crops: Any = CROPS
     with pytest.raises(SettingError, match="PerspectiveRepresentation; expected one for panoramas"):
         Stanford2D3DS(photo_root, crops)
-
-
-def test_flip_y_is_a_mirror() -> None:
-    # The pose test above relies on it: the sphere's frame is the camera's, axes renamed.
-    assert np.linalg.det(FLIP_Y) == pytest.approx(-1)

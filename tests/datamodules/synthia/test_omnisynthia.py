@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from datamodules.core.samples import Normalization
 from datamodules.synthia.omnisynthia import OmniSynthia
 from tangent_train.errors import DataError, SettingError
 from tests.datamodules.synthia import synthia_format as synthia
@@ -61,27 +60,10 @@ def test_splits(root: Path, strips: Any) -> None:
     assert not list(root.rglob("*.json"))
 
 
-def test_without_validation(root: Path, strips: Any) -> None:
-    module = two(root, strips, validation_fraction=0)
-    assert [len(names(module, split)) for split in SPLITS] == [5, 0, 2]
-    assert module.val_dataloader() == []
-
-
-def test_classes(root: Path, strips: Any) -> None:
-    module = two(root, strips)
-    assert len(module.class_names) == 14
-    assert module.class_names[0] == "unknown"
-    assert (module.class_names[8], module.class_names[13]) == ("car", "traffic light")
-    weights = module.class_weights("log")
-    assert weights.shape == (14,)
-    assert weights[0] == 0
-    assert (weights > 0).sum() > 8
-
-
 # --- reading -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("erp_height", [32, 16, 8])
+@pytest.mark.parametrize("erp_height", [32, 8])
 def test_reads_what_was_written(root: Path, strips: Any, erp_height: int) -> None:
     module = OmniSynthia(root, type(strips)(erp_height), inputs=("rgb", "depth"))
     source = module.source("test")
@@ -121,47 +103,6 @@ def test_reserved_labels_are_unknown(broken_root: Path, strips: Any) -> None:
             read(0)
 
 
-def test_without_depth_its_files_are_not_needed(broken_root: Path, strips: Any) -> None:
-    for path in broken_root.glob("*/pano/Depth/*.png"):
-        path.unlink()
-    module = two(broken_root, strips)
-    assert module.in_channels == 3
-    assert module.source("test").read(0).depth is None
-    with pytest.raises(DataError, match=r"Depth/000000\.png"):
-        two(broken_root, strips, inputs=("rgb", "depth")).setup()
-
-
-def test_a_store_gives_the_same(root: Path, strips: Any, tmp_path: Path) -> None:
-    settings = {"inputs": ("rgb", "depth")}
-    plain = two(root, strips, **settings).source("test")
-    module = two(root, strips, store=tmp_path / "store", **settings)
-    module.prepare_data()
-    stored = module.source("test")
-    for index in range(len(plain)):
-        for one, other in zip(plain.read(index), stored.read(index), strict=True):
-            np.testing.assert_array_equal(one, other)
-    (prepared,) = (tmp_path / "store").glob("*/sequence_04/000001.npy")
-    assert prepared.parts[-3].startswith("16x32")
-
-
-def test_batches(root: Path, strips: Any) -> None:
-    module = two(root, strips, inputs=("rgb", "depth"), panoramas_per_step=2)
-    batch = next(iter(module.train_dataloader()))
-    images = module.on_after_batch_transfer(batch, 0).images
-    assert images.shape == (2, 2, 4, 16, 8)
-    rgb = batch.images[0].double() / 255
-    np.testing.assert_allclose(
-        images[:, :, 0].numpy(), (rgb[..., 0].numpy() - 0.4512) / 0.2601, atol=1e-5
-    )
-
-
-def test_normalization(root: Path, strips: Any) -> None:
-    assert two(root, strips).samples.normalization.mean == (0.4512, 0.4257, 0.3920)
-    assert two(root, strips, inputs=["rgb", "depth"]).samples.normalization.mean[3] == 1.0961773
-    own = Normalization((0, 0, 0), (1, 1, 1))
-    assert two(root, strips, normalization=own).normalization == own
-
-
 # --- making --------------------------------------------------------------------------------------
 
 
@@ -192,11 +133,6 @@ def test_missing_root(tmp_path: Path, strips: Any) -> None:
             step()
 
 
-def test_neither_views_nor_panoramas(broken_root: Path, strips: Any) -> None:
-    with pytest.raises(DataError, match=r"SEQS-02-SUMMER: found neither .*synthia-dataset"):
-        OmniSynthia(broken_root, strips).make_files()
-
-
 # --- what cannot be used -------------------------------------------------------------------------
 
 
@@ -209,10 +145,8 @@ def _rewrite(shape: tuple[int, ...], dtype: Any) -> Callable[[Path], None]:
 
 
 DAMAGES: dict[str, tuple[str, Callable[[Path], object], str]] = {
-    "no labels": ("GT/LABELS_Correct", lambda p: p.unlink(), "No such file"),
     "cut off": ("RGB", _cut_off, "truncated"),
     "labels of 16 bits": ("GT/LABELS_Correct", _rewrite((32, 64), np.uint16), "16-bit grey"),
-    "coloured labels": ("GT/LABELS_Correct", _rewrite((32, 64, 3), np.uint8), "8-bit RGB"),
     "8-bit depth": ("Depth", _rewrite((32, 64), np.uint8), "8-bit grey; expected 16-bit grey"),
     "other size": ("Depth", _rewrite((16, 32), np.uint16), "found 16×32 pixels; expected 32×64"),
 }
@@ -227,26 +161,11 @@ def test_damage_is_found_before_training(broken_root: Path, strips: Any, damage:
         two(broken_root, strips, inputs=("rgb", "depth")).setup("fit")
 
 
-def test_no_panorama(broken_root: Path, strips: Any) -> None:
-    pano = synthia.sequence(broken_root, "01") / "pano"
-    _rewrite((32, 32, 3), np.uint8)(pano / "RGB" / "000000.png")
-    _rewrite((32, 32), np.uint8)(pano / "GT" / "LABELS_Correct" / "000000.png")
-    with pytest.raises(DataError, match="found 32×32 pixels; expected twice as wide"):
-        two(broken_root, strips).setup()
-
-
-def test_more_rows_than_the_files_have(root: Path, strips: Any) -> None:
-    with pytest.raises(SettingError, match="found 64; expected at most the 32 rows"):
-        two(root, type(strips)(64)).setup()
-
-
 @pytest.mark.parametrize(
     ("name", "value"),
     [
         ("train_sequences", ["03"]),
         ("test_sequences", ["01"]),
-        ("validation_fraction", 1.0),
-        ("inputs", ["depth"]),
     ],
 )
 def test_impossible_settings(tmp_path: Path, strips: Any, name: str, value: Any) -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from datamodules.synthia.omnisynthia import OmniSynthia
 from datamodules.synthia.perspective import SynthiaPerspective
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError
 from tangent_train.rendering import PerspectiveRepresentation
 from tests.datamodules.synthia import synthia_format as synthia
 
@@ -89,14 +89,6 @@ def test_batches(root: Path) -> None:
     assert module.class_weights("log").shape == (14,)
 
 
-def test_without_depth_its_files_are_not_needed(broken_root: Path) -> None:
-    for path in broken_root.glob("*/Depth/Stereo_Left/*/*.png"):
-        path.unlink()
-    assert two(broken_root).source("test").read(0).depth is None
-    with pytest.raises(DataError, match=r"Depth/.*000000\.png"):
-        two(broken_root, inputs=("rgb", "depth")).setup()
-
-
 def test_a_broken_view_is_named(broken_root: Path) -> None:
     path = synthia.sequence(broken_root, "04") / "GT/LABELS/Stereo_Left/Omni_B/000000.png"
     content = path.read_bytes()
@@ -114,18 +106,3 @@ def test_nothing_there(tmp_path: Path, broken_root: Path) -> None:
         two(tmp_path / "nowhere").setup()
     with pytest.raises(DataError, match=r"02-SUMMER.*Omni_F: found no views.*synthia-dataset"):
         two(broken_root, train_sequences=["02"]).setup()
-
-
-def test_views_that_see_less_than_a_crop(broken_root: Path) -> None:
-    camera = synthia.sequence(broken_root, "04") / "CameraParams" / "intrinsics.txt"
-    camera.write_text("80 32 19")
-    with pytest.raises(DataError, match=r"Omni_F/000000\.png: found 45.*fov_deg"):
-        two(broken_root).setup()
-
-
-@pytest.mark.parametrize(
-    ("name", "value"), [("train_sequences", ["04"]), ("validation_fraction", -1), ("inputs", [])]
-)
-def test_impossible_settings(tmp_path: Path, name: str, value: Any) -> None:
-    with pytest.raises(SettingError, match=r"data\."):
-        two(tmp_path, **{name: value})

@@ -18,7 +18,6 @@ from datamodules.core.problems import Problems
 from datamodules.core.reading import ImageFiles
 from tangent_train.cli import main
 from tangent_train.errors import DataError, SettingError
-from tests.datamodules.folder.folder_format import write_classes
 from tests.slow.faults import data_sets as sets
 from tests.slow.faults.data_sets import colors, module, names, partner, write
 
@@ -43,12 +42,6 @@ def _damage(kind: str, root: Path) -> tuple[Path, Path]:
     sets.truncate(cut)
     sets.corrupt(corrupted)
     return cut, corrupted
-
-
-def _first_of(data: SplitDataModule[Any]) -> Any:
-    data.prepare_data()
-    data.setup()
-    return data.source("train").read(0)
 
 
 @pytest.fixture
@@ -86,18 +79,6 @@ def test_what_is_broken_is_left_out_and_counted(
             assert source.read(index).labels.shape == source.read(index).rgb.shape[:2]
     with pytest.raises(DataError, match="truncated"):
         module(kind, root).prepare_data()
-
-
-@pytest.mark.parametrize("kind", sets.IMAGES)
-def test_nothing_is_said_of_a_good_data_set(
-    kind: str, root: Path, fabricate_stanford: FabricateStanford, capsys: pytest.CaptureFixture[str]
-) -> None:
-    write(kind, root, fabricate_stanford)
-    data = module(kind, root, skip_broken=True)
-    data.prepare_data()
-    data.setup()
-    assert names(data) == names(module(kind, root))
-    assert "left out" not in capsys.readouterr().out
 
 
 def test_broken_meshes_are_refused_or_left_out(
@@ -198,52 +179,6 @@ def test_a_store_has_no_holes_unless_they_are_asked_for(
             assert source.read(index).rgb.shape == (16, 32, 3)
 
 
-def test_a_store_that_is_made_is_not_read_again_for_what_is_broken(
-    root: Path,
-    fabricate_stanford: FabricateStanford,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    write("stanford", root, fabricate_stanford)
-    settings: dict[str, Any] = {"store": tmp_path / "store", "skip_broken": True}
-    module("stanford", root, **settings).prepare_data()
-
-    def refuse(*_: Any) -> None:
-        raise AssertionError("all of it is in the store")
-
-    monkeypatch.setattr("datamodules.stanford2d3ds.reader.read_color_png", refuse)
-    data = module("stanford", root, **settings)
-    data.prepare_data()
-    data.setup()
-    assert len(data.source("train")) > 0
-
-
-def test_labels_past_the_table_do_not_get_into_a_store_or_memory(
-    root: Path, fabricate_stanford: FabricateStanford, tmp_path: Path
-) -> None:
-    write("stanford", root, fabricate_stanford)
-    path = partner("stanford", colors("stanford", root)[0], "labels")
-    sets.set_pixel(path, [521 & 255, 521 >> 8, 0])
-    for settings in ({"store": tmp_path / "store"}, {"in_memory": True}):
-        data = module("stanford", root, validation_fraction=0, **settings)
-        with pytest.raises(DataError, match="instance 521"):
-            _first_of(data)
-
-
-def test_all_that_is_broken_is_told_when_it_is_read_into_memory(
-    root: Path, fabricate_stanford: FabricateStanford
-) -> None:
-    write("folder", root, fabricate_stanford)
-    (root / "test.txt").write_text("scene_0/view.0")
-    broken = [root / "labels" / f"scene_{scene}" / "view.1.png" for scene in (1, 2)]
-    for path in broken:
-        sets.corrupt(path)
-    data = module("folder", root, in_memory=True, validation_fraction=0)
-    with pytest.raises(DataError, match="found 2 problems") as caught:
-        data.source("train")
-    assert all(str(path) in str(caught.value) for path in broken)
-
-
 # --- as training begins -------------------------------------------------------------------------
 
 
@@ -267,15 +202,6 @@ def test_training_begins_with_a_look_at_some_images_of_all_splits(
     assert all(str(path) in text for path in broken), "all of these are looked at"
     assert "tangent-check" in text
     assert "data.skip_broken=true" in text
-
-
-def test_labels_past_the_table_are_seen_as_training_begins(
-    root: Path, fabricate_stanford: FabricateStanford
-) -> None:
-    write("folder", root, fabricate_stanford)
-    write_classes(root, [None, "wall", "floor", "floor 2"])
-    with pytest.raises(DataError, match="value 4 in"):
-        _as_in_training(module("folder", root)).prepare_data()
 
 
 class _Images(Stanford2D3DS):

@@ -6,9 +6,8 @@ import multiprocessing
 import os
 import signal
 import zlib
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
-from threading import Barrier
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -19,7 +18,6 @@ from datamodules.core.store import Store
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 from datamodules.synthrooms.generate import generate_rooms
 from datamodules.synthrooms.settings import RoomSettings
-from tangent_train.errors import DataError
 from tangent_train.rendering import TangentRepresentation
 
 if TYPE_CHECKING:
@@ -65,7 +63,6 @@ def _prepare_and_read(root: Path, store: Path, barrier: Any) -> tuple[int, int]:
     return len(list(store.rglob("[!.]*.npy"))), _samples(data)
 
 
-@pytest.mark.slow
 def test_runs_that_prepare_the_same_store_at_once_see_the_same(
     stanford_root: Path, tmp_path: Path, processes: ForkServerContext
 ) -> None:
@@ -99,7 +96,6 @@ def _prepare_and_die(root: Path, store: Path, barrier: Any) -> None:
         _data(root, store).prepare_data()
 
 
-@pytest.mark.slow
 def test_a_run_that_is_killed_while_it_prepares_harms_no_other(
     stanford_root: Path, tmp_path: Path, processes: ForkServerContext
 ) -> None:
@@ -142,28 +138,11 @@ def _claim(root: Path) -> None:
     claim_folder(root, "manifest.json", "SynthRooms", 1, {"seed": 0})
 
 
-@pytest.mark.parametrize("number", range(20))
-def test_many_may_claim_a_folder_at_the_same_moment(tmp_path: Path, number: int) -> None:
-    root, barrier = tmp_path / str(number), Barrier(4)
-
-    def claim(who: int) -> None:
-        barrier.wait()
-        _claim(root)
-        (root / f"area_{who}").mkdir()
-
-    with ThreadPoolExecutor(4) as pool:
-        list(pool.map(claim, range(4)))
-    (root / "manifest.json").unlink()
-    with pytest.raises(DataError, match="files that are not SynthRooms"):
-        _claim(root)
-
-
 def _make(root: Path, barrier: Any) -> None:
     barrier.wait()
     generate_rooms(root, RoomSettings(rooms={"area_1": 2, "area_5a": 1}, height=32), workers=0)
 
 
-@pytest.mark.slow
 def test_runs_that_make_the_same_rooms_at_once(
     tmp_path: Path, processes: ForkServerContext
 ) -> None:

@@ -66,12 +66,7 @@ class Steps(lightning.Callback):
 
 
 @WITHOUT_VALIDATION
-@pytest.mark.parametrize(
-    "settings",
-    [{}, {"images_per_chunk": 7}],
-    ids=str,
-)
-@pytest.mark.parametrize("half", [False, True], ids=["float32", "float16"])
+@pytest.mark.parametrize(("settings", "half"), [({}, False), ({"images_per_chunk": 7}, True)])
 def test_a_batch_without_labels_changes_nothing(
     root: Path, tmp_path: Path, settings: dict[str, Any], half: bool
 ) -> None:
