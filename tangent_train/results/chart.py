@@ -69,6 +69,7 @@ def _bars(
     axes: Axes, rows: Sequence[Row], ticks: Sequence[str], scores: Sequence[Sequence[Statistic]]
 ) -> None:
     width = 0.8 / len(rows)
+    names = list(dict.fromkeys(row.label.removesuffix(" (paper)") for row in rows))
     for k, (row, found) in enumerate(zip(rows, scores, strict=True)):
         spreads = [s.over_seeds if s.over_folds is None else s.over_folds for s in found]
         axes.bar(
@@ -76,7 +77,7 @@ def _bars(
             _percents([score.mean for score in found]),
             0.92 * width,
             yerr=_percents(spreads),
-            color=COLORS[k % len(COLORS)],
+            color=COLORS[names.index(row.label.removesuffix(" (paper)")) % len(COLORS)],
             hatch="//" if row.published else "",
             label=_short(row.label),
             error_kw={"elinewidth": 1.2, "capsize": min(4.0, 14 * width), "ecolor": "#333333"},
@@ -94,6 +95,7 @@ def _band_lines(axes: Axes, rows: Sequence[Row]) -> None:
     axes.set_xticks(range(-90, 91, 30), [f"{k}°" for k in range(-90, 91, 30)])
     axes.legend(frameon=False, fontsize=8)
     _percent_axis(axes)
+    axes.set_xlim(-90, 90)
 
 
 def _percents(shares: Sequence[float | None]) -> list[float]:

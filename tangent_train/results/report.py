@@ -13,7 +13,7 @@ from datamodules.stanford2d3ds.files import FOLDS
 from tangent_train.csv_text import csv_text
 from tangent_train.files import write_bytes, write_text
 from tangent_train.results.chart import report_png
-from tangent_train.results.record import SCORES, Band, Record
+from tangent_train.results.record import SCORES, Band, Record, Scores
 from tangent_train.results.rows import Row, Statistic
 from tangent_train.results.tables import Table, percent
 
@@ -103,7 +103,7 @@ class Report:
 
     def losses(self) -> list[str]:
         """For every row its worst class, or that which loses most against the partner."""
-        found = (_loss(row, SCORES[self.kind].worst, self.classes) for row in self.rows)
+        found = (_loss(row, SCORES[self.kind], self.classes) for row in self.rows)
         return [sentence for sentence in found if sentence]
 
     def all_notes(self) -> list[str]:
@@ -193,24 +193,23 @@ class Report:
         return json.dumps(content, indent=1) + "\n"
 
 
-def _loss(row: Row, score: str, classes: Sequence[str]) -> str:
-    """The class that takes most from the mean; those that no label names do not count."""
+def _loss(row: Row, scores: Scores, classes: Sequence[str]) -> str:
+    """The class that takes most from the mean; classes without labels do not count."""
     found = []
     for name in classes:
-        labelled = [r for r in row.records if _is_labelled(r, name)]
-        own = replace(row, records=tuple(labelled)).score(score, name).mean if labelled else None
-        base = row.partner.score(score, name).mean if row.partner else 0.0
+        labelled = tuple(r for r in row.records if _is_labelled(r, name))
+        own = replace(row, records=labelled).score(scores.worst, name).mean
+        base = row.partner.score(scores.worst, name).mean if row.partner else 0.0
         if own is not None and base is not None:
             found.append((own - base, name, base, own))
     if not found or row.published:
         return ""
     _, name, base, own = min(found)
+    heading = scores.per_class[scores.worst]
     if row.partner is None:
-        return f"{row.label}: largest loss: {name}, {percent(own)} % {score}."
-    return (
-        f"{row.label}: largest loss against {row.partner.label}: {name}, "
-        f"{percent(base)} % to {percent(own)} % {score}."
-    )
+        return f"{row.label}: largest loss: {name}, {percent(own)} % {heading}."
+    change = f"{percent(base)} % to {percent(own)} % {heading}"
+    return f"{row.label}: largest loss against {row.partner.label}: {name}, {change}."
 
 
 def _is_labelled(record: Record, name: str) -> bool:

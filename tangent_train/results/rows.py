@@ -58,8 +58,9 @@ class Row:
 
     @property
     def folds(self) -> tuple[int | None, ...]:
-        """The folds it has."""
-        return tuple(dict.fromkeys(record.fold for record in self.records))
+        """The folds it has; None alone for data without folds."""
+        found = dict.fromkeys(record.fold for record in self.records)
+        return tuple(fold for fold in found if fold is not None) or (None,)
 
     @property
     def bands(self) -> tuple[Band, ...]:

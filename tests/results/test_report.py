@@ -65,7 +65,7 @@ def test_the_tables_show_means_spreads_and_what_is_missing() -> None:
         }
     )
     assert report.all_notes() == [
-        "mine: largest loss: wall, 20.0 % iou.",
+        "mine: largest loss: wall, 20.0 % IoU.",
         "mine: fold 2 missing; not a mean of 3 folds.",
         "mine: fold 3, seed 1 more than once, also in /runs/3_1.",
         "a note",
@@ -181,7 +181,7 @@ def test_the_papers_transfer_is_the_mean_of_its_printed_folds(
     name: str, macc: float, miou: float
 ) -> None:
     row = _paper()[name]
-    assert row.folds[:3] == (1, 2, 3)
+    assert row.folds == (1, 2, 3)
     assert row.score("macc").mean == pytest.approx(macc / 100, abs=5e-4)
     assert row.score("miou").mean == pytest.approx(miou / 100, abs=5e-4)
     if "FT-1" not in name or "FT-10" in name:  # the per-class table is over all folds
@@ -248,7 +248,7 @@ def test_a_transfer_compares_panoramas_with_photos_of_as_much_fine_tuning() -> N
     table = report.tables()[0]
     change = table.header.index("change", table.header.index("mIoU %"))
     assert [row[change] for row in table.rows] == ["–", "−16.7 %", "+33.3 %", "–"]
-    assert "S: largest loss against P: sofa, 60.0 % to 40.0 % iou." in report.all_notes()
+    assert "S: largest loss against P: sofa, 60.0 % to 40.0 % IoU." in report.all_notes()
     assert [row.partner and row.partner.label for row in report.rows] == [None, "P", "P", None]
 
 
@@ -284,7 +284,7 @@ def test_shapes_are_told_apart_by_how_they_were_rotated() -> None:
 def test_the_class_that_no_label_names_is_not_the_largest_loss() -> None:
     record = made_record([0.5, 0.4, 0.0])
     record.classes[2]["share"] = 0.0  # type: ignore[index]  # absent, counted as 0
-    assert _runs_report(record).losses() == ["mine: largest loss: floor, 40.0 % iou."]
+    assert _runs_report(record).losses() == ["mine: largest loss: floor, 40.0 % IoU."]
 
 
 def test_the_chart_shows_a_bar_of_the_right_height() -> None:
