@@ -1,1 +1,22 @@
-"""Train and evaluate ordinary networks on 360° panoramas through tangent images."""
+"""Train and evaluate ordinary networks on 360° panoramas through tangent images.
+
+The names below are imported when they are first used, so that ``import tangent_train`` is fast.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from tangent_train.geometry import TangentGrid
+    from tangent_train.rendering import equirect_to_tangent, tangent_to_equirect, tangent_to_labels
+
+__all__ = ["TangentGrid", "equirect_to_tangent", "tangent_to_equirect", "tangent_to_labels"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    home = "geometry" if name == "TangentGrid" else "rendering"
+    return getattr(import_module(f"tangent_train.{home}"), name)

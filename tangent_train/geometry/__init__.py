@@ -29,10 +29,10 @@ from tangent_train.geometry.equirect import (
     equirect_solid_angles,
     equirect_to_lonlat,
     lonlat_to_equirect,
+    nearest_level,
 )
 from tangent_train.geometry.grid import TangentGrid
 from tangent_train.geometry.icosphere import Icosphere, icosphere, vertex_resolution
-from tangent_train.geometry.levels import nearest_level
 from tangent_train.geometry.panorama_pose import PanoramaPose
 from tangent_train.geometry.pinhole_grid import PinholeGrid
 from tangent_train.geometry.resized_grid import ResizedGrid

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -16,6 +18,7 @@ __all__ = [
     "equirect_solid_angles",
     "equirect_to_lonlat",
     "lonlat_to_equirect",
+    "nearest_level",
 ]
 
 
@@ -37,6 +40,25 @@ def equirect_shape(level: int) -> tuple[int, int]:
     if level < 0:
         raise SettingError("level", found=level, expected="0 or more")
     return 2 ** (level + 1), 2 ** (level + 2)
+
+
+def nearest_level(height: int) -> int:
+    """The level s whose panoramas, of 2^(s+1) rows, are nearest in size.
+
+    Nearest in ratio: 724 rows are nearer to 512 than to 1024, 725 nearer to 1024.
+
+    Args:
+        height: Rows of the panorama, 2 or more.
+
+    Raises:
+        SettingError: There are fewer rows.
+
+    >>> [nearest_level(rows) for rows in (512, 724, 725, 1024, 2688)]
+    [8, 8, 9, 9, 10]
+    """
+    if height < 2:
+        raise SettingError("panorama", found=f"{height} rows", expected="2 or more")
+    return max(0, round(math.log2(height)) - 1)
 
 
 def equirect_to_lonlat(pixels_xy: ArrayLike, shape: tuple[int, int]) -> NDArray[np.float64]:

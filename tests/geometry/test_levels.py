@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from tangent_train.errors import SettingError
-from tangent_train.geometry import TangentGrid, equirect_shape
-from tangent_train.geometry.levels import nearest_level
+from tangent_train.geometry import TangentGrid, equirect_shape, nearest_level
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "levels.md"
 
@@ -69,13 +68,3 @@ def test_the_page_s_tables() -> None:
                     assert cell == f"{grid_there.dim} ({least})"
                 else:
                     assert cell == f"{math.degrees(grid_there.pitch):.4f}"
-
-
-def test_the_page_s_sentences() -> None:
-    equator = 2 * math.pi / equirect_shape(10)[1]
-    assert TangentGrid(0, 10).pitch / equator == pytest.approx(1.41, abs=0.005)
-    assert TangentGrid(4, 10).pitch / equator == pytest.approx(1.53, abs=0.005)
-    for base_level in range(5):
-        grid = TangentGrid(base_level, 8)
-        height, width = equirect_shape(8)
-        assert grid.num_images * grid.dim**2 == 2.5 * height * width

@@ -48,13 +48,6 @@ def test_least_dim_covers_the_voronoi_cells_exactly(base_level: int, finer: int)
 
 
 @pytest.mark.parametrize("base_level", BASE_LEVELS)
-@pytest.mark.parametrize("finer", [0, 1])
-def test_default_images_of_one_or_two_pixels_do_not_cover(base_level: int, finer: int) -> None:
-    with pytest.raises(SettingError, match=f"dim: found {2**finer}; expected at least"):
-        TangentGrid(base_level, base_level + finer)
-
-
-@pytest.mark.parametrize("base_level", BASE_LEVELS)
 @pytest.mark.parametrize("finer", [2, 3, 5])
 def test_default_images_cover_the_sphere(base_level: int, finer: int) -> None:
     grid = TangentGrid(base_level, base_level + finer)
@@ -81,14 +74,6 @@ def test_owner_has_the_nearest_centre(rotation: NDArray[np.float64] | None) -> N
     np.testing.assert_array_equal(
         grid.owners(3 * directions.reshape(20, 30, 3)), expected.reshape(20, 30)
     )
-
-
-def test_owners_of_many_directions_are_found_in_parts() -> None:
-    grid = TangentGrid(4, 7)  # 5120 faces: more than one part of 2^24 products
-    directions = random_directions(3500)
-    pixels = grid.owners(directions)
-    np.testing.assert_array_equal(pixels[3300:], grid.owners(directions[3300:]))
-    np.testing.assert_array_equal(grid.owners(grid.centers_xyz), np.arange(5120))
 
 
 @pytest.mark.parametrize("base_level", BASE_LEVELS)

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from tangent_train.errors import SettingError
 from tangent_train.geometry import CubeGrid, equirect_directions, rotation_about
 from tangent_train.rendering import (
-    CubemapRepresentation,
     Interpolation,
     equirect_to_tangent,
     tables,
@@ -105,20 +104,6 @@ def test_faces_of_noise(case: Case, interpolation: Interpolation) -> None:
     assert np.abs(array - expected)[certain].max() < 1e-9
 
 
-def test_faces_of_8_bit_images_and_labels(case: Case) -> None:
-    image = np.round(255 * waves(case.shape)).astype(np.uint8)
-    expected = case.theirs.forward(image.astype(np.float64))
-    steps = sum(np.abs(np.diff(image.astype(float), axis=axis)).max() for axis in (0, 1))
-    certain = certain_pixels(case, "bilinear")
-    error = np.abs(equirect_to_tangent(image, case.ours) - expected)[certain]
-    assert error.max() < 0.501 + steps / 64  # OpenCV 4 rounds positions to 1/32 px
-    labels = (noise(*case.shape) * 256).astype(np.uint8)
-    nearest = case.theirs.forward(labels[..., None].astype(np.float64), "nearest")[..., 0]
-    certain = certain_pixels(case, "nearest")
-    found = equirect_to_tangent(labels, case.ours, interpolation="nearest")
-    np.testing.assert_array_equal(found[certain], nearest[certain])
-
-
 def test_panorama_of_noise(case: Case) -> None:
     images = noise(6, case.dim, case.dim, 3)
     clear = case.theirs.clear(case.shape)
@@ -168,34 +153,6 @@ def test_up_to_the_edge_a_pixel_takes_the_values_of_its_owner_alone(
     np.testing.assert_allclose(owned, coordinates.max(axis=0), atol=1e-12)
 
 
-@pytest.mark.parametrize("rotation", [None, TURN])
-@pytest.mark.parametrize("dim", [31, 32])
-def test_smooth_panorama_survives_the_round_trip(
-    dim: int, rotation: NDArray[np.float64] | None
-) -> None:
-    shape = (64, 128)
-    image = waves(shape)
-    grid = CubeGrid(dim, rotation)
-    error = np.abs(tangent_to_equirect(equirect_to_tangent(image, grid), grid, shape) - image)
-    # Linear interpolation errs by f″h²/8: f″ up to 15 both ways, h of either image.
-    between = 30 * np.hypot(2 * np.pi / shape[1], grid.pitch) ** 2 / 8
-    # Within half a pixel of an edge the outermost pixel is repeated: f′ up to 3 each way.
-    assert error.max() < between + 6 * grid.pitch / 2
-    table = tables.image_table(grid, shape, np.dtype(np.float64), "nearest", slice(0, shape[0]))
-    inner = (np.abs(np.stack([table.u, table.v]) - (dim - 1) / 2) < (dim - 1) / 2).all(axis=(0, 1))
-    assert inner.mean() > 0.9
-    assert error[inner].max() < between
-    for part in (error[:, [0, -1]], error[[0, -1]]):  # seam and poles are inside of faces
-        assert rotation is not None or np.median(part) < 1e-2
-
-
-def test_the_back_face_looks_at_the_seam() -> None:
-    columns = np.tile(np.arange(128, dtype=np.uint8), (64, 1))
-    back = equirect_to_tangent(columns, CubeGrid(4), [2], "nearest")[0]
-    # tan of the angle to the back is ∓3/4 and ∓1/4: 36.87° is 13.1 columns of 2.8125°, 14.04° 5.0.
-    assert (back == [114, 123, 4, 13]).all()
-
-
 def test_the_pole_is_in_the_middle_of_the_up_face() -> None:
     rows = np.repeat(np.arange(64, dtype=np.float32)[:, None], 128, axis=1)
     up, down = equirect_to_tangent(rows, CubeGrid(5), [4, 5])
@@ -207,70 +164,9 @@ def test_the_pole_is_in_the_middle_of_the_up_face() -> None:
         assert face[2, 3] == pytest.approx(np.degrees(np.arctan(0.4)) / 180 * 64 - 0.5, abs=1e-3)
 
 
-@pytest.mark.parametrize("shape", [(32, 64), (31, 63)])
-@pytest.mark.parametrize("dim", [3, 16, 21])
-def test_one_class_everywhere(dim: int, shape: tuple[int, int]) -> None:
-    """No other value anywhere: not at the poles, not at the seam, not between faces."""
-    grid = CubeGrid(dim)
-    panorama = np.full(shape, 3, np.uint8)
-    for interpolation in ("nearest", "bilinear"):
-        images = equirect_to_tangent(panorama, grid, interpolation=interpolation)
-        assert (images == 3).all()
-    scores = np.eye(5, dtype=np.float32)[images].transpose(0, 3, 1, 2)
-    assert (tangent_to_labels(scores, grid, shape) == 3).all()
-
-
-def test_gradients() -> None:
-    images = torch.rand(6, 1, 4, 4, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(
-        lambda x: tangent_to_equirect(x, CubeGrid(4), (6, 12)), images, fast_mode=True
-    )
-    panorama = torch.rand(1, 6, 12, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(
-        lambda x: equirect_to_tangent(x, CubeGrid(4), [0, 2, 4]), panorama, fast_mode=True
-    )
-
-
 @pytest.mark.parametrize("render", [tangent_to_equirect, tangent_to_labels])
 @pytest.mark.parametrize("kind", [np.asarray, torch.as_tensor])
 def test_faces_cannot_be_feathered(render: Any, kind: Any) -> None:
     images = kind(np.zeros((6, 16, 16, 16), np.float32))
     with pytest.raises(SettingError, match="blend: found 'feather'; expected 'nearest' for images"):
         render(images, CubeGrid(16), (32, 64), "feather")
-
-
-@pytest.mark.parametrize("dim", [None, 25])
-def test_labels_of_the_representation(dim: int | None) -> None:
-    representation = CubemapRepresentation(level=4, dim=dim)
-    reference, shape = ReferenceCube(dim or 16), (32, 64)
-    scores = noise(6, reference.dim, reference.dim, 13)
-    tensor = torch.from_numpy(scores).movedim(-1, 1).float()
-    labels = representation.to_labels(tensor, shape).numpy()
-    rendered = reference.backward(scores, shape)
-    certain = reference.clear(shape) & certain_labels(rendered, 4e-5)
-    assert certain.mean() > 0.95
-    np.testing.assert_array_equal(labels[certain], rendered.argmax(axis=-1)[certain])
-    image = noise(*shape, 3)
-    views = representation.whole().render(image, "bilinear")
-    sure = certain_pixels(Case(reference.dim, shape), "bilinear")
-    np.testing.assert_allclose(views[sure], reference.forward(image)[sure], atol=1e-9)
-
-
-def test_training_samples_are_all_faces_turned_and_mirrored() -> None:
-    image = noise(32, 64)
-    plain = CubemapRepresentation(4).sample(np.random.default_rng(0)).render(image, "bilinear")
-    np.testing.assert_array_equal(plain, equirect_to_tangent(image, CubeGrid(16)))
-    angle = np.random.default_rng(0).uniform(0, 2 * np.pi)
-    turned = CubeGrid(16, rotation_about((0, 0, 1), angle))
-    views = CubemapRepresentation(4, rotation="yaw").sample(np.random.default_rng(0))
-    np.testing.assert_array_equal(
-        views.render(image, "bilinear"), equirect_to_tangent(image, turned)
-    )
-    mirrored = 0
-    for seed in range(40):
-        sampled = CubemapRepresentation(4, mirror=True).sample(np.random.default_rng(seed))
-        found = sampled.render(image, "bilinear")
-        flipped = np.array_equal(found, plain[:, :, ::-1])
-        assert flipped or np.array_equal(found, plain)
-        mirrored += flipped
-    assert 10 < mirrored < 30

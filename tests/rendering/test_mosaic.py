@@ -129,15 +129,6 @@ def test_large_sums_live_in_a_file_and_are_the_same(monkeypatch: pytest.MonkeyPa
     np.testing.assert_array_equal(result.probabilities(slice(None)), expected)
 
 
-def test_nan_never_wins_and_the_first_of_equals_does() -> None:
-    grid = TangentGrid(0, 4)
-    scores = torch.zeros(20, 3, 16, 16)
-    scores[:, 0] = torch.nan
-    result = ScoreMosaic((16, 32), 3, "nearest")
-    result.add(scores, grid, np.arange(20))
-    assert (result.labels() == 1).all()
-
-
 def _photo_crops(blend: Blend) -> tuple[PhotoCrops, tuple[int, int]]:
     size = (45, 70)
     camera = PerspectiveRepresentation(level=5, fov_deg=30.0, dim=(20, 24))
@@ -167,28 +158,3 @@ def test_crops_of_a_smooth_field_give_the_field(blend: Blend) -> None:
     )
     decided = np.abs(truth) > 0.05
     assert ((result.labels() == 1) == (truth > 0))[inside, inside][decided[inside, inside]].all()
-
-
-def test_cells_of_crops_tile_the_photo() -> None:
-    crops, (height, width) = _photo_crops("feather")
-    counts = np.zeros((height, width), int)
-    for left, top, right, bottom in crops.cells():
-        y, x = np.mgrid[:height, :width] + 0.5
-        counts += (left <= x) & (x < right) & (top <= y) & (y < bottom)
-    assert (counts == 1).all()
-    inner = crops.cells()[np.isfinite(crops.cells()).all(axis=1)]
-    assert len(inner) > 0
-
-
-def test_covering_crops_overlap_as_asked() -> None:
-    size = (60, 90)
-    camera = PerspectiveRepresentation(level=5, fov_deg=20.0, dim=16)
-    sampler = camera.of_camera(camera_matrix_from_fov(60.0, size), size)
-    for overlap in (0.0, 0.25, 0.5):
-        boxes = sampler.cover(overlap).boxes
-        for axis in (0, 1):
-            starts = np.unique(boxes[:, axis].round(6))
-            side = boxes[0, axis + 2] - boxes[0, axis]
-            assert np.diff(starts).max() <= side * (1 - overlap) + 1e-6
-            assert starts[0] == pytest.approx(0, abs=1e-6)
-            assert starts[-1] + side == pytest.approx(size[1 - axis], abs=1e-6)

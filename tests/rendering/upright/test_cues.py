@@ -55,16 +55,6 @@ def test_light_comes_from_above() -> None:
         assert up_probabilities(_lit(np.eye(3)[axis]), _NO_SEGMENTS, np.eye(3)).argmax() == axis
 
 
-def test_missing_parts_are_not_dark() -> None:
-    image = _lit(np.array([0.0, 0, 1]))
-    image[:30] = 0
-    image[34:] = 40
-    _, odd = cues(image, _NO_SEGMENTS, np.eye(3))
-    assert odd[2, 2] > 0  # the little that is seen above is bright
-    _, odd = cues(np.zeros((64, 128, 3), np.uint8), _NO_SEGMENTS, np.eye(3))
-    np.testing.assert_allclose(odd, 0, atol=1e-12)
-
-
 def test_what_is_measured_of_segments() -> None:
     level = np.radians([0, 90, 180, 270])
     around = np.stack([np.cos(level), np.sin(level), np.zeros(4)], axis=-1)

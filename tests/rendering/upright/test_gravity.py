@@ -22,9 +22,7 @@ from tangent_train.geometry import (
     rotation_about,
 )
 from tangent_train.rendering import rotate_equirect
-from tangent_train.rendering.upright import gravity
 from tangent_train.rendering.upright.gravity import estimate_up, up_from_pose, upright_rotation
-from tangent_train.rendering.upright.manhattan import ManhattanFrame
 from tests.rendering.drawn_room import draw_room
 
 _UP = np.array([0.0, 0.0, 1.0])
@@ -43,10 +41,10 @@ def _tilted(tilt_deg: float, azimuth_deg: float, yaw_deg: float) -> NDArray[np.f
 # From the picture
 
 
-@pytest.mark.parametrize("shape", [(128, 256), (151, 303), (256, 512)])
+@pytest.mark.parametrize("shape", [(128, 256), (151, 303)])
 @pytest.mark.parametrize(
     ("tilt_deg", "azimuth_deg", "yaw_deg"),
-    [(0, 0, 0), (0, 0, 45), (3, 200, 180), (10, 90, 30), (20, 0, 179), (30, 310, 77), (44, 45, 3)],
+    [(0, 0, 45), (3, 200, 180), (20, 0, 179), (44, 45, 3)],
 )
 def test_tilted_rooms(
     shape: tuple[int, int], tilt_deg: float, azimuth_deg: float, yaw_deg: float
@@ -59,13 +57,7 @@ def test_tilted_rooms(
     np.testing.assert_allclose(np.linalg.norm(gravity.candidates, axis=1), 1)
 
 
-def test_a_large_panorama_is_shrunk() -> None:
-    turn = _tilted(25, 70, 10)
-    gravity = estimate_up(draw_room((800, 1600), turn, supersample=1))
-    assert _degrees_between(gravity.up, turn[:, 2]) < 0.2
-
-
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(3))
 def test_rooms_held_at_any_angle(seed: int) -> None:
     turn = random_rotation(np.random.default_rng(seed))
     gravity = estimate_up(draw_room((128, 256), turn), max_tilt_deg=180)
@@ -141,26 +133,6 @@ def test_dark_rooms_with_missing_parts() -> None:
     assert _degrees_between(estimate_up(room).up, turn[:, 2]) < 0.5
 
 
-def test_it_is_the_same_every_time_and_leaves_its_input() -> None:
-    room = draw_room((128, 256), _tilted(12, 5, 5))
-    before = room.copy()
-    room.setflags(write=False)
-    one, other = estimate_up(room, 180), estimate_up(room[:, :, ::1], 180)
-    np.testing.assert_array_equal(one.candidates, other.candidates)
-    assert one.confidence == other.confidence
-    np.testing.assert_array_equal(room, before)
-    one.up[:] = 0  # not shared
-    assert np.linalg.norm(one.candidates[0]) > 0.9
-
-
-def test_panoramas_that_are_views_of_others() -> None:
-    turn = _tilted(12, 5, 5)
-    room = draw_room((128, 256), turn)
-    other = np.stack([room, room], axis=-1)[..., 1]
-    assert not other.flags.c_contiguous
-    np.testing.assert_array_equal(estimate_up(other).up, estimate_up(room).up)
-
-
 @pytest.mark.parametrize(
     ("panorama", "found"),
     [
@@ -180,33 +152,6 @@ def test_other_arrays_are_refused(panorama: NDArray[Any], found: str) -> None:
 def test_impossible_tilts(tilt_deg: float) -> None:
     with pytest.raises(SettingError, match=r"max_tilt_deg: found .* above 0, at most 180"):
         estimate_up(np.zeros((8, 16, 3), np.uint8), tilt_deg)
-
-
-def test_probabilities_of_frames_that_share_their_vertical(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Three frames that are as likely as none; of one no axis is in reach."""
-    turns = [rotation_about((1, 0, 0), 0.8), np.eye(3), rotation_about(_UP, 0.5)]
-    even = gravity._EVEN_CHANCE
-    frames = [ManhattanFrame(turn, np.full(3, 0.2), even) for turn in turns]
-    shares = np.array([1, 1, 5, 1, 1, 1]) * 7.0
-    monkeypatch.setattr(gravity, "up_probabilities", lambda *_: shares)
-
-    def of(frames: list[ManhattanFrame], tilt_deg: float) -> tuple[Any, Any]:
-        nothing: Any = None
-        return gravity._candidates(nothing, nothing, frames, math.cos(math.radians(tilt_deg)))
-
-    directions, chances = of(frames, 20)
-    np.testing.assert_allclose(directions, [_UP])
-    np.testing.assert_allclose(chances, [2 / 4])
-    directions, chances = of(frames[1:], 180)
-    np.testing.assert_allclose(directions[:2], [_UP, -_UP])
-    np.testing.assert_allclose(chances, [2 / 3 / 2, *[2 / 3 / 10], *[1 / 3 / 10] * 8])
-
-
-def test_the_smallest_panorama_and_tilt() -> None:
-    assert len(estimate_up(draw_room((64, 128), np.eye(3)), max_tilt_deg=1).candidates)
-    small = estimate_up(draw_room((63, 126), np.eye(3)))
-    assert small.candidates.shape == (0, 3)
-    assert small.confidence == 0
 
 
 # Turning upright
@@ -290,9 +235,3 @@ def test_signs_of_pitch_and_roll_in_the_words_of_the_format() -> None:
     rows = np.abs(heights[90:270]).argmin(axis=0)
     assert rows[400] < rows[360] < rows[320]
     np.testing.assert_allclose(equirect_directions((360, 720)) @ up_from_pose(0, 10), heights)
-
-
-@pytest.mark.parametrize(("pitch_deg", "roll_deg"), [(math.nan, 0), (0, math.inf)])
-def test_no_angles(pitch_deg: float, roll_deg: float) -> None:
-    with pytest.raises(SettingError, match="pose: found"):
-        up_from_pose(pitch_deg, roll_deg)

@@ -10,16 +10,15 @@ from numpy.typing import NDArray
 
 from tangent_train.geometry import equirect_directions, random_rotation
 from tangent_train.rendering.upright.line_segments import LineSegments, find_line_segments
-from tangent_train.rendering.upright.manhattan import find_manhattan_frames, followed_axes
-from tests.rendering.drawn_room import draw_room
+from tangent_train.rendering.upright.manhattan import find_manhattan_frames
 
 
 def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
-@pytest.mark.parametrize("height", [128, 257, 700])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("height", [128, 700])
+@pytest.mark.parametrize("seed", range(2))
 def test_an_edge_all_around_is_found_on_its_great_circle(height: int, seed: int) -> None:
     normal = _unit(np.random.default_rng(seed).normal(size=3))
     side = np.clip(equirect_directions((height, 2 * height)) @ normal * height / 3, -1, 1)
@@ -45,14 +44,6 @@ def test_edges_of_black_areas_are_left_out() -> None:
     assert len(find_line_segments(image).lengths_rad) > 7
 
 
-def test_single_black_pixels_are_no_missing_area() -> None:
-    room = draw_room((128, 256), np.eye(3))
-    dotted = room.copy()
-    dotted[::9, ::9] = 0
-    count = len(find_line_segments(room).lengths_rad)
-    assert len(find_line_segments(dotted).lengths_rad) > count / 3
-
-
 def _segments(
     axes: NDArray[np.float64], counts: tuple[int, int, int], others: int, seed: int = 0
 ) -> LineSegments:
@@ -65,7 +56,7 @@ def _segments(
 
 
 @pytest.mark.parametrize("counts", [(20, 20, 20), (40, 15, 0), (5, 30, 5)])
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_frames_of_exact_segments(counts: tuple[int, int, int], seed: int) -> None:
     axes = random_rotation(np.random.default_rng(seed))
     segments = _segments(axes, counts, others=30, seed=seed)
@@ -82,16 +73,7 @@ def test_frames_of_exact_segments(counts: tuple[int, int, int], seed: int) -> No
     assert frame.significance > 3
 
 
-def test_the_significance_by_hand() -> None:
-    axes = random_rotation(np.random.default_rng(3))
-    segments = _segments(axes, (12, 12, 12), others=0)
-    segments = segments._replace(lengths_rad=np.full(36, 0.2))
-    # All follow: 1, less what is by chance within 2° (2/3 sin 2° per axis), in units of 1/√36.
-    expected = (1 - 2 * math.sin(math.radians(2))) * 6
-    assert math.isclose(find_manhattan_frames(segments)[0].significance, expected, rel_tol=1e-3)
-
-
-@pytest.mark.parametrize("count", [4, 10, 40, 200])
+@pytest.mark.parametrize("count", [4, 40])
 def test_random_segments_are_not_significant(count: int) -> None:
     best = [
         find_manhattan_frames(_segments(np.eye(3), (0, 0, 0), count, seed))[0].significance
@@ -109,18 +91,3 @@ def test_frames_differ() -> None:
             assert nearest.min() < math.cos(math.radians(5.9))
     significance = [frame.significance for frame in frames]
     assert significance == sorted(significance, reverse=True)
-
-
-@pytest.mark.parametrize("count", [0, 1, 3])
-def test_too_few_segments(count: int) -> None:
-    assert find_manhattan_frames(_segments(np.eye(3), (0, 0, 0), count)) == []
-
-
-def test_who_follows_which_axis() -> None:
-    degrees = np.radians([0, 1, 3])
-    normals = np.stack([np.sin(degrees), np.full(3, 0.6), np.full(3, 0.8)], axis=-1)
-    column, agreement = followed_axes(
-        LineSegments(_unit(normals), np.eye(3), np.ones(3)), np.eye(3)[:, [2, 0, 1]]
-    )
-    assert column.tolist() == [1, 1, 1]
-    np.testing.assert_allclose(agreement, [1, 0.75, 0], atol=2e-3)
