@@ -90,16 +90,6 @@ def test_every_direction_is_seen_by_its_owner_alone(
     np.testing.assert_array_equal(grid.owners(directions), largest)
 
 
-def test_neighbours_are_the_faces_that_share_an_edge() -> None:
-    expected: dict[int, set[int]] = {face: set() for face in range(6)}
-    for (one, *_), (other, *_) in EDGES:
-        expected[one].add(other)
-        expected[other].add(one)
-    neighbors = CubeGrid(4).neighbors
-    assert neighbors.shape == (6, 4)
-    assert {face: set(around) for face, around in enumerate(neighbors.tolist())} == expected
-
-
 @pytest.mark.parametrize("start", range(6))
 def test_greedy_walk_over_neighbours_ends_at_the_owner(start: int) -> None:
     grid = CubeGrid(4, TURN)

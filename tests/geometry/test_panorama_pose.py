@@ -68,19 +68,6 @@ def test_relative_poses_are_those_of_homogeneous_matrices(mirrored: bool) -> Non
     np.testing.assert_allclose(again.location_m, right.location_m, atol=1e-12)
 
 
-def test_what_a_relative_pose_means() -> None:
-    left = PanoramaPose(np.eye(3), (0, 0, 0))
-    # The right one stands 1 m ahead of the left one and is turned by 30° to the right.
-    right = PanoramaPose(rotation_about((0, 0, 1), np.radians(30)), (1, 0, 0))
-    rotation, shift_m = right.relative_to(left)
-    # What is far away ahead of the left one is 30° to the left of the right one's middle,
-    seen = np.degrees(xyz_to_lonlat(rotation @ np.array([1.0, 0, 0])))
-    np.testing.assert_allclose(seen, (-30, 0), atol=1e-12)
-    # and the left one itself is behind, 1 m away.
-    np.testing.assert_allclose(np.degrees(xyz_to_lonlat(shift_m)), (150, 0), atol=1e-12)
-    assert np.linalg.norm(shift_m) == pytest.approx(1)
-
-
 @pytest.mark.parametrize(
     ("matrix", "place", "message"),
     [

@@ -28,16 +28,6 @@ def test_only_the_pixels_are_others(original: PinholeGrid, dim: int) -> None:
     np.testing.assert_allclose((edges + 0.5) * dim / original.dim, 0.5, atol=1e-9)
 
 
-@pytest.mark.parametrize("original", GRIDS)
-def test_another_rotation_replaces_its_own(original: PinholeGrid) -> None:
-    turned = ResizedGrid(original, 9).with_rotation(OTHER)
-    assert type(turned) is ResizedGrid
-    assert turned == ResizedGrid(original.with_rotation(OTHER), 9)
-    assert turned != ResizedGrid(original, 9)
-    np.testing.assert_array_equal(turned.rotation, OTHER)
-    assert turned.with_rotation(None).rotation is None
-
-
 @pytest.mark.parametrize("dim", [1, 0, -8])
 def test_less_than_two_pixels_are_refused(dim: int) -> None:
     with pytest.raises(SettingError, match=f"dim: found {dim}; expected 2 or more"):

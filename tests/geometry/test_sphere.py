@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry import (
-    FLIP_Y,
     checked_rotation,
     lonlat_to_xyz,
     random_rotation,
@@ -90,13 +89,6 @@ def test_random_rotations_are_proper_and_uniform() -> None:
     np.testing.assert_allclose((rotations**2).mean(axis=0), 1 / 3, atol=0.03)
     angle = np.arccos(np.clip((np.trace(rotations, axis1=1, axis2=2) - 1) / 2, -1, 1))
     assert angle.mean() == pytest.approx(math.pi / 2 + 2 / math.pi, abs=0.05)
-
-
-def test_flip_y_mirrors_left_and_right_only() -> None:
-    np.testing.assert_array_equal(FLIP_Y @ [1, 2, 3], [1, -2, 3])
-    np.testing.assert_array_equal(FLIP_Y @ FLIP_Y, np.eye(3))
-    with pytest.raises(ValueError, match="read-only"):
-        FLIP_Y[0, 0] = 2
 
 
 def test_rotations_written_with_seven_digits_are_taken() -> None:

@@ -13,9 +13,7 @@ from tangent_train.errors import SettingError
 from tangent_train.geometry import (
     TangentGrid,
     equirect_directions,
-    lonlat_to_equirect,
     random_rotation,
-    xyz_to_lonlat,
 )
 from tangent_train.rendering import equirect_to_tangent, sampling
 
@@ -46,20 +44,6 @@ def test_a_smooth_function_is_rendered_within_the_bilinear_bound(
     np.testing.assert_allclose(images, _smooth(grid.directions()), rtol=0, atol=bound)
 
 
-@pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize("interpolation", ["bilinear", "nearest"])
-def test_numpy_and_torch_agree(shape: tuple[int, int], interpolation: Any) -> None:
-    image = _random((*shape, 3))
-    for grid in (TangentGrid(0, 5), TURNED):
-        tensor = torch.from_numpy(image).movedim(-1, 0)
-        expected = equirect_to_tangent(tensor, grid, [0, 7, 19], interpolation)
-        for dtype, tolerance in ((np.float64, 1e-12), (np.float32, 2e-5)):
-            array: Array = image.astype(dtype)
-            found = equirect_to_tangent(array, grid, [0, 7, 19], interpolation)
-            exact = 1e-7 if interpolation == "nearest" else tolerance
-            np.testing.assert_allclose(found, expected.movedim(1, -1).numpy(), atol=exact)
-
-
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int32])
 @pytest.mark.parametrize("channels", [(), (1,), (2,), (3,), (4,), (5,), (7,)])
 def test_integers_are_the_rounded_exact_values(dtype: Any, channels: tuple[int, ...]) -> None:
@@ -70,20 +54,6 @@ def test_integers_are_the_rounded_exact_values(dtype: Any, channels: tuple[int, 
     assert found.dtype == dtype
     assert found.shape == (20, 32, 32, *channels)
     assert np.abs(found - exact).max() <= 0.5 + 1e-2
-
-
-@pytest.mark.parametrize("dtype", [bool, np.int8, np.uint16, np.int32, np.int64, np.float64])
-def test_nearest_takes_the_nearest_pixel(dtype: Any) -> None:
-    shape, grid = (16, 32), TangentGrid(0, 4)
-    image = _random((*shape, 3), np.int8).astype(dtype)
-    pixels = lonlat_to_equirect(xyz_to_lonlat(grid.directions()), shape).astype(np.float32)
-    columns, rows = np.moveaxis(np.rint(pixels).astype(int), -1, 0)
-    found = equirect_to_tangent(image, grid, interpolation="nearest")
-    np.testing.assert_array_equal(found, image[rows.clip(0, 15), columns % 32])
-    tensor = equirect_to_tangent(
-        torch.from_numpy(image).movedim(-1, 0), grid, interpolation="nearest"
-    )
-    np.testing.assert_array_equal(tensor.movedim(1, -1).numpy(), found)
 
 
 def _sampled(image: Array, u: Any, v: Any, interpolation: Any = "bilinear") -> Array:

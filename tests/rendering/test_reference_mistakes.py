@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 from numpy.typing import NDArray
 
 from tangent_train.geometry import TangentGrid, equirect_shape, xyz_to_lonlat
 from tangent_train.rendering import (
     equirect_to_tangent,
-    tangent_to_labels,
 )
-from tests.rendering.reference import panorama_lonlat, to_xyz
 
 CLASSES = 13
 Labels = NDArray[np.uint8]
@@ -33,17 +30,3 @@ def test_1_labels_at_the_seam_are_never_unknown(base_level: int) -> None:
     np.testing.assert_array_equal(images == 1, lon < -np.pi + step)
     np.testing.assert_array_equal(images == 2, lon >= np.pi - step)
     assert (images == 1).any(axis=(1, 2)).sum() >= 4
-
-
-def test_7_scores_rendered_back_are_finer_than_label_maps() -> None:
-    grid, shape = TangentGrid(0, 4), (128, 256)
-    planes = np.random.default_rng(0).normal(size=(CLASSES, 3))
-    truth = (to_xyz(panorama_lonlat(shape)) @ planes.T).argmax(axis=-1)
-    scores = torch.from_numpy(grid.directions() @ planes.T).permute(0, 3, 1, 2)
-    label_maps = torch.nn.functional.one_hot(scores.argmax(dim=1), CLASSES).permute(0, 3, 1, 2)
-    wrong_scores, wrong_maps = (
-        (tangent_to_labels(images, grid, shape).numpy() != truth).mean()
-        for images in (scores, label_maps.double())
-    )
-    assert wrong_scores < 0.25 * wrong_maps
-    assert wrong_scores < 0.01

@@ -21,7 +21,6 @@ from tangent_train.rendering import (
     tangent_to_labels,
 )
 from tangent_train.rendering.compiled import over_rows
-from tangent_train.rendering.kernels import FEATHER_POWER
 
 FLOAT64 = np.dtype(np.float64)
 TURN = random_rotation(np.random.default_rng(2))
@@ -49,22 +48,6 @@ def test_owners_are_the_nearest_centres(
     places = grid.project(directions, table.face[0])
     np.testing.assert_allclose(np.stack([table.u[0], table.v[0]], axis=-1), places, atol=1e-9)
     assert (table.weight == 1).all()
-
-
-@pytest.mark.parametrize("grid", [TangentGrid(0, 5), TangentGrid(1, 6, dim=40, rotation=TURN)])
-def test_feathering_knows_every_image_that_sees_a_pixel(grid: TangentGrid) -> None:
-    shape = (40, 81)
-    table = tables.image_table(grid, shape, FLOAT64, "feather", slice(0, 40))
-    found = np.zeros((grid.num_images, *shape))
-    for face, weight in zip(table.face.astype(int), table.weight, strict=True):
-        previous = np.take_along_axis(found, face[None], axis=0)
-        np.put_along_axis(found, face[None], previous + weight, axis=0)
-    faces = np.arange(grid.num_images)[:, None, None]
-    places = grid.project(equirect_directions(shape), np.broadcast_to(faces, found.shape))
-    offset = np.abs(places - (grid.dim - 1) / 2) / (grid.dim / 2)
-    seen = (offset < 1).all(axis=-1)
-    raw = np.where(seen, ((1 - offset**2) ** FEATHER_POWER).prod(axis=-1), 0)
-    np.testing.assert_allclose(found, raw / raw.sum(axis=0), atol=1e-12)
 
 
 @pytest.mark.parametrize("blend", ["feather", "nearest"])

@@ -8,13 +8,12 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from tangent_train.errors import SettingError
-from tangent_train.geometry import camera_matrix_from_fov, normalize_camera
+from tangent_train.geometry import normalize_camera
 from tangent_train.rendering import PerspectiveRepresentation
 
 SIZE = (90, 140)
@@ -87,15 +86,6 @@ def test_crops_that_are_not_square(size: tuple[int, int]) -> None:
     np.testing.assert_allclose(grid.boxes[:, 2:].max(axis=0), SIZE[::-1], atol=0.01)
     shares = grid.owned().mean(axis=(1, 2)).sum() * np.prod(grid.boxes[0, 2:] - grid.boxes[0, :2])
     assert abs(shares / np.prod(SIZE) - 1) < 0.1, "each place once"
-
-
-def test_fine_stripes_become_grey_not_moire() -> None:
-    stripes = np.zeros((512, 512, 3), np.uint8)
-    stripes[:, ::2] = 255
-    camera = camera_matrix_from_fov(60, (512, 512))
-    crop = PerspectiveRepresentation(7, dim=64).of_camera(camera, (512, 512)).whole()
-    grey = crop.render(stripes, "bilinear")
-    assert 115 < grey.min() <= grey.max() < 140
 
 
 def test_labels_come_from_the_pixel_at_the_centre() -> None:
@@ -171,33 +161,11 @@ def test_as_few_crops_as_overlap_enough(overlap: float) -> None:
         assert fewer > side * (1 - overlap)
 
 
-def test_mirrored_crops() -> None:
-    photo = _photo()
-    representation = PerspectiveRepresentation(6, 30.0, 16, mirror=True)
-    sampler = representation.of_camera(K, SIZE)
-    drawn = [sampler.sample(np.random.default_rng(seed)) for seed in range(20)]
-    assert {crops.mirrored for crops in drawn} == {True, False}
-    mirrored = next(crops for crops in drawn if crops.mirrored)
-    plain = type(mirrored)(mirrored.boxes, mirrored.size)
-    np.testing.assert_array_equal(
-        mirrored.render(photo, "bilinear"), plain.render(photo, "bilinear")[:, :, ::-1]
-    )
-
-
 def test_the_side_follows_from_the_level() -> None:
     sides = {level: PerspectiveRepresentation(level).image_size for level in (6, 7, 8)}
     assert sides == {6: (32, 32), 7: (64, 64), 8: (128, 128)}, "paper: 128 for level 8"
     wide = PerspectiveRepresentation(8, fov_deg=90).image_size[0]
     assert wide == round(128 / math.tan(math.pi / 8)), "the same focal length"
-
-
-def test_labels_of_crops() -> None:
-    scores = torch.randn(3, 5, 8, 8)
-    representation = PerspectiveRepresentation(4)
-    labels = representation.to_labels(scores, (3, 8, 8))
-    np.testing.assert_array_equal(labels.numpy(), scores.numpy().argmax(axis=1))
-    with pytest.raises(SettingError, match="scores of crops"):
-        representation.to_labels(scores, (2, 8, 8))
 
 
 @pytest.mark.parametrize(

@@ -67,13 +67,6 @@ def test_image_size_is_that_of_the_whole_views(representation: Representation) -
     assert views.shape[1:] == (*representation.image_size, 3)
 
 
-def test_the_equirectangular_view_is_the_panorama() -> None:
-    image = _rng().integers(0, 256, (*SHAPE, 3), np.uint8)
-    np.testing.assert_array_equal(
-        EquirectRepresentation(5).whole().render(image, "bilinear"), image[None]
-    )
-
-
 @pytest.mark.parametrize(
     "representation",
     [
@@ -216,11 +209,6 @@ def test_averaged_turns_have_the_highest_mean_probability(blend: Blend, least: f
     assert (labels == mean.argmax(dim=0)).double().mean() > least
 
 
-def test_averaging_over_no_turn_is_refused() -> None:
-    with pytest.raises(SettingError, match=r"representation\.average_rotations: found 0"):
-        TangentRepresentation(0, 5, average_rotations=0)
-
-
 @pytest.mark.parametrize("mirrored", [False, True])
 def test_rays_say_where_the_pixels_look(mirrored: bool) -> None:
     grid = TangentGrid(1, 5, 20, TILT)
@@ -232,7 +220,3 @@ def test_rays_say_where_the_pixels_look(mirrored: bool) -> None:
     seen /= np.linalg.norm(seen, axis=-1, keepdims=True)
     expected = grid.directions(faces)
     np.testing.assert_allclose(seen, expected[:, :, ::-1] if mirrored else expected, atol=1e-6)
-
-
-def test_what_is_no_pinhole_image_has_no_rays() -> None:
-    assert EquirectRepresentation(5).whole().rays().shape == (0, 3, 3)

@@ -80,14 +80,3 @@ def test_random_segments_are_not_significant(count: int) -> None:
         for seed in range(10)
     ]
     assert max(best) < 2.2
-
-
-def test_frames_differ() -> None:
-    frames = find_manhattan_frames(_segments(np.eye(3), (10, 10, 10), 60))
-    assert 1 < len(frames) <= 8
-    for i, frame in enumerate(frames):
-        for other in frames[:i]:
-            nearest = np.abs(frame.axes_xyz.T @ other.axes_xyz).max(axis=0)
-            assert nearest.min() < math.cos(math.radians(5.9))
-    significance = [frame.significance for frame in frames]
-    assert significance == sorted(significance, reverse=True)
