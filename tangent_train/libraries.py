@@ -1,4 +1,4 @@
-"""What settings in files may name of other libraries, and with which settings.
+"""What settings in files may name of other libraries, and with which arguments.
 
 All are numbers, words and lists of these: whatever would read, fetch or run something (weights,
 addresses, files, plugins) is not among them.
@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import inspect
 from importlib import import_module
+from types import NoneType
 from typing import Any
 
-from tangent_train.registry import Local, Weights, import_named
+from tangent_train.registry import Weights, import_named
 from tangent_train.setting_rules import from_file
 
 __all__ = ["find"]
@@ -26,18 +27,18 @@ _BY_SIGNATURE = {
     "segmentation_models_pytorch": "DPT DeepLabV3 DeepLabV3Plus FPN Linknet MAnet PAN PSPNet "
     "Segformer UPerNet Unet UnetPlusPlus",
 }
-"""Classes all of whose named settings may be given, but for these."""
+"""Classes all of whose named arguments may be given, except of this machine and weights."""
 
 _NETWORKS = (
     "aux_logits aux_loss drop_path_rate drop_rate dropout dynamic_img_size features_only "
     "global_pool image_size img_size in_chans init_weights model_name num_classes out_indices "
     "patch_size stochastic_depth_prob transform_input width_mult"
 )
-"""Settings of torchvision's makers of networks, and of timm's, which have files besides."""
+"""Arguments of torchvision's makers of networks, and of timm's, which take files besides."""
 
 
 def find(module: str, name: str) -> tuple[Any, dict[str, Any]] | None:
-    """A class or function and the kinds of its settings, see `registry.accept`.
+    """A class or function and the kinds of its arguments in a file, see `registry.make`.
 
     Args:
         module: Its full name.
@@ -49,20 +50,17 @@ def find(module: str, name: str) -> tuple[Any, dict[str, Any]] | None:
     Raises:
         SettingError: Its package is not installed.
     """
-    if name in _BY_SIGNATURE.get(module, "").split():
-        made = import_named(f"{module}.{name}", "_target_")
-        arguments = inspect.signature(made).parameters.values()
-        named = [a.name for a in arguments if a.kind is not a.VAR_KEYWORD]
-        trainer = module == "lightning"
-        local = {n for n in named if trainer and not from_file(f"trainer.{n}")}
-        kinds = {n: Local if n in local else _SIMPLE for n in named}
-    elif (module, name) == ("timm", "create_model") or _is_of_torchvision(module, name):
-        made = import_named(f"{module}.{name}", "_target_")
-        named = list(inspect.signature(made).parameters)
-        kinds = dict.fromkeys(_NETWORKS.split(), _SIMPLE)
-    else:
+    simple = name in _BY_SIGNATURE.get(module, "").split()
+    timm = (module, name) == ("timm", "create_model")
+    if not (simple or timm or _is_of_torchvision(module, name)):
         return None
-    return made, kinds | {n: Weights for n in named if "weights" in n or n == "pretrained"}
+    made = import_named(f"{module}.{name}", "network")
+    parameters = inspect.signature(made).parameters.values()
+    named = [p.name for p in parameters if p.kind is not p.VAR_KEYWORD]
+    kinds = dict.fromkeys(named if simple else _NETWORKS.split(), _SIMPLE)
+    weights = [n for n in named if "weights" in n or n == "pretrained"]
+    local = [n for n in named if module == "lightning" and not from_file(f"trainer.{n}")]
+    return made, kinds | dict.fromkeys(local, NoneType) | dict.fromkeys(weights, Weights)
 
 
 def _is_of_torchvision(module: str, name: str) -> bool:

@@ -1,11 +1,10 @@
-"""Objects made of settings, and which of them the settings inside a file may name.
+"""Objects made from settings, and which of them the settings inside a file may name.
 
-A section of a config says by ``_target_`` what is made of it. In a config folder or on the command
-line its owner wrote that, and any class or function may be named. Settings inside a file may be
-anybody's. They are plain data: `accept` compares them with the registered classes that they name
-and with the types of those classes' own arguments, and nothing in them is ever interpreted: no
-interpolations, no positional arguments, no paths and no addresses. `make` is the only code that
-turns settings into objects.
+A section of a config says by ``_target_`` what is made from it. What stands in a config folder or
+on the command line is the user's own, and may name any class or function. What stands in a file may
+be anybody's: it is plain data, and may name registered classes and give their arguments, as far as
+the types of these allow, and nothing in it is ever interpreted: no interpolations, no positional
+arguments, no paths, no addresses. `make` is the only code that turns settings into objects.
 
 This module imports nothing heavy: networks and data sets import it.
 """
@@ -16,31 +15,26 @@ import builtins
 import inspect
 import re
 import sys
-import traceback
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from functools import partial
 from importlib import import_module
 from pathlib import Path
 from pkgutil import resolve_name
 from types import NoneType, SimpleNamespace, UnionType
-from typing import Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from tangent_train.errors import DataError, SettingError, printable
 
 __all__ = [
-    "Accepted",
-    "Local",
-    "Object",
+    "SettingsFile",
     "Text",
     "Weights",
-    "accept",
     "check_fields",
     "check_plain",
     "import_named",
     "make",
     "maker_of",
-    "named_targets",
     "registered",
 ]
 
@@ -48,34 +42,24 @@ _HOMES = ("datamodules", "models", "tangent_train.rendering", "tangent_train.tas
 """Packages whose public names files may give, where they are registered."""
 
 _WORD = re.compile(r"([A-Za-z0-9][\w.+ -]{0,99})?", re.ASCII)
-"""A text in settings: no path, no address, no name of Hydra's, nothing to interpret."""
-
-_LINE = re.compile(r"[^\x00-\x1f\x7f-\x9f]*")
-"""A text without commands for terminals."""
+"""A text among the arguments in a file: no path, no address, nothing to interpret."""
 
 _DEEPEST = 12
-_PLAIN = (bool, int, float, str, NoneType, dict)
+_PLAIN = (bool, int, float, str, NoneType)
 _CALLED_LATER = ("mixer", "optimizer", "scheduler")
-"""Settings that are functions which still take something."""
-
-_EXTRAS = {"segmentation_models_pytorch": "networks", "timm": "networks"}
-"""Packages that an extra of this one installs."""
-
-
-class Local:
-    """A kind of setting: of this machine, never taken from a file, as paths and compilers are."""
-
-
-class Object:
-    """A kind of setting: another registered object."""
+"""Sections of a file that may be ``_partial_``: functions that still take an argument."""
 
 
 class Text:
-    """A kind of setting: any line that is only ever shown, as names of classes."""
+    """A kind of value: any line that is only ever shown, as names of classes."""
 
 
 class Weights:
-    """A kind of setting: names trained weights. Null in a file, whose own tensors are used."""
+    """A kind of argument: names trained weights. Null for a file, whose own tensors are used."""
+
+
+class _Object:
+    """A kind of argument: an object, made from a section of its own."""
 
 
 _registered: set[Any] = set()
@@ -86,105 +70,95 @@ def registered(made: _Registered) -> _Registered:
     """Let settings in files name a class or function.
 
     They may give its arguments by name, as the annotations say: numbers, words (`Literal` or
-    ``str``), sequences and mappings of these, other registered objects. An argument that may be a
-    `Path` or `Any` is not taken from files.
+    ``str``), sequences and mappings of these, and other registered objects. An argument that may be
+    a `Path` or `Any` is not taken from files.
     """
     _registered.add(made)
     return made
 
 
-class Accepted(NamedTuple):
-    """Settings of a file that may be used.
+@dataclass(frozen=True)
+class SettingsFile:
+    """The file that settings come from, and what the user says about it.
 
     Attributes:
-        settings: Without those of kind `Local`.
-        local: Those, by their place.
+        path: The file, for messages.
+        trust: Full names of classes and functions that it may name besides the registered ones;
+            their arguments may be any plain values.
+        own: Places (``data.fold``) where the values, with all below them, are the user's own.
     """
 
-    settings: dict[str, Any]
-    local: dict[str, Any]
+    path: Path
+    trust: Collection[str] = ()
+    own: Collection[str] = ()
+
+    def owns(self, place: str) -> bool:
+        """Whether the value at a place comes from the file, not from the user."""
+        return not any(f"{place}.".startswith(f"{own}.") for own in self.own)
+
+    def refused(self, place: str, value: Any, expected: str) -> DataError:
+        """The error that a value of the file is not usable."""
+        remedy = f"On the command line {place}=… may be anything."
+        return DataError(self.path, found=f"{place}={value!r}", expected=expected, remedy=remedy)
 
 
-def accept(
-    path: Path,
-    sections: Mapping[str, Any],
-    trust: Collection[str] = (),
-    own: Collection[str] = (),
-) -> Accepted:
-    """Check the sections of a config from a file.
+def make(settings: Any, place: str, file: SettingsFile | None = None, **given: Any) -> Any:
+    """The object that a section of a config describes.
 
     Args:
-        path: The file, for the message.
-        sections: Each with a ``_target_``.
-        trust: Full names of further classes and functions that the user trusts. Their settings
-            may be any plain values.
-        own: Places (``data.fold``) whose values are the user's own, with all below them.
+        settings: ``_target_``, its arguments by name, which may be such sections themselves, and
+            perhaps ``_partial_: true`` for a function that still takes further ones.
+        place: Of the section, for messages.
+        file: Where the settings come from; None for the user's own, which may name anything.
+        **given: Further arguments, handed on as they are.
 
     Raises:
-        DataError: There is a setting that a file must not give; which, and how to allow it.
+        SettingError: The class or function cannot be imported.
+        DataError: The file gives what files must not give, or what cannot be made.
     """
-    check = _Check(path, trust, own)
-    plain = {name: check_plain(path, section, name) for name, section in sections.items()}
-    settings = {name: check.object(section, name) for name, section in plain.items()}
-    return Accepted(settings, check.local)
+    maker, kinds = _maker(settings, place, file)
+    arguments = {name: None for name, kind in kinds.items() if kind is Weights} | {
+        name: _argument(value, f"{place}.{name}", file, kinds.get(name, kinds.get("**")), kinds)
+        for name, value in settings.items()
+        if name != "_target_"
+    }
+    if arguments.pop("_partial_", False):
+        return partial(maker, **arguments, **given)
+    try:
+        return maker(**arguments | given)
+    except (DataError, SettingError):
+        raise
+    except Exception as error:
+        if file is None:
+            raise
+        raise DataError(
+            file.path,
+            found=f"{place}: {settings['_target_']} cannot be made ({type(error).__name__}: "
+            f"{str(error).partition(chr(10))[0]})",
+            expected="settings that it takes",
+        ) from error
 
 
-class _Check:
-    """The settings of one file."""
+def maker_of(settings: Any, place: str, file: SettingsFile | None = None) -> Any:
+    """The class or function that a section names; see `make`."""
+    return _maker(settings, place, file)[0]
 
-    def __init__(self, path: Path, trust: Collection[str], own: Collection[str]) -> None:
-        self.local: dict[str, Any] = {}
-        self._path = path
-        self._trust = trust
-        self._own = own
 
-    def object(self, settings: Any, place: str) -> dict[str, Any]:
-        if not isinstance(settings, Mapping) or "_target_" not in settings:
-            raise self._refused(place, settings, "a section with a _target_")
-        target = settings["_target_"]
-        trust = (*self._trust, target) if self._is_own(f"{place}._target_") else self._trust
-        _, kinds = _find(target, trust)
-        if kinds is None:
-            raise DataError(
-                self._path,
-                found=f"{place}._target_={target}, which would be called",
-                expected="networks, data and tasks that are registered here",
-                remedy=f"If you know it, and trust who made the file: trust={target}",
-            )
-        made: dict[str, Any] = {n: None for n, kind in kinds.items() if kind is Weights}
-        made["_target_"] = target
-        for name, value in settings.items():
-            here = f"{place}.{name}"
-            kind = kinds.get(name, kinds.get("**"))
-            if name == "_partial_" and place.rpartition(".")[2] in _CALLED_LATER:
-                kind = bool
-            if self._is_own(here):
-                made[name] = value
-            elif kind is None and name != "_target_":
-                raise self._refused(here, value, f"a setting of {target} ({', '.join(kinds)})")
-            elif kind is Local:
-                self.local[here] = value
-            elif name not in made:
-                made[name] = self._value(value, kind, here)
-        return made
+def import_named(target: Any, place: str) -> Any:
+    """Import what a full name names.
 
-    def _value(self, value: Any, kind: Any, place: str) -> Any:
-        if kind is Any and isinstance(value, Mapping) and "_target_" not in value:
-            return {name: self._value(v, Any, f"{place}.{name}") for name, v in value.items()}
-        if kind is Any and isinstance(value, list):
-            return [self._value(v, Any, f"{place}.{k}") for k, v in enumerate(value)]
-        if isinstance(value, Mapping) and kind in (Any, Object):
-            return self.object(value, place)
-        if value is not None and kind is not Any and (kind is Object or not _fits(value, kind)):
-            raise self._refused(place, value, f"{inspect.formatannotation(kind)} in a file")
-        return value
-
-    def _is_own(self, place: str) -> bool:
-        return any(place == own or place.startswith(f"{own}.") for own in self._own)
-
-    def _refused(self, place: str, value: Any, expected: str) -> DataError:
-        remedy = f"On the command line {place}=… may be anything."
-        return DataError(self._path, found=f"{place}={value!r}", expected=expected, remedy=remedy)
+    Raises:
+        SettingError: It cannot be imported.
+    """
+    try:
+        return resolve_name(str(target))
+    except (ImportError, AttributeError, ValueError) as error:
+        raise SettingError(
+            f"{place}._target_",
+            found=f"{target}, which cannot be imported ({error})",
+            expected="the full name of a class or function",
+            remedy="Install its package, or add the folder it is in to PYTHONPATH.",
+        ) from error
 
 
 def check_fields(
@@ -224,7 +198,7 @@ def check_plain(path: Path, value: Any, place: str, depth: int = 0) -> Any:
         path: The file, for the message.
         value: The values.
         place: Of them in the file, for the message.
-        depth: In what they are already.
+        depth: In how many others they are.
 
     Raises:
         DataError: There is something else, or they are nested without end.
@@ -242,84 +216,65 @@ def check_plain(path: Path, value: Any, place: str, depth: int = 0) -> Any:
     raise DataError(path, found=f"{place}={value!r}", expected=expected)
 
 
-def make(
-    settings: Mapping[str, Any], place: str, trust: Collection[str] | None = None, **given: Any
-) -> Any:
-    """What a section of a config describes.
-
-    Args:
-        settings: ``_target_``, named settings for it, which may be such sections themselves, and
-            perhaps ``_partial_: true`` for a function that still takes further ones.
-        place: Of the section, for messages.
-        trust: For settings of a file, after `accept`: what it may name besides what is registered.
-            None for the user's own, which may name anything.
-        **given: Further arguments, handed on as they are.
-
-    Raises:
-        SettingError: There is no such class or function, or it does not take these settings.
-        DataError: What is made says that a file cannot be used.
-    """
-    maker = maker_of(settings, place, trust)
-    own = {name: value for name, value in settings.items() if name not in ("_target_", "_partial_")}
-    arguments = {n: _made(v, f"{place}.{n}", trust) for n, v in own.items()} | given
-    if settings.get("_partial_"):
-        return partial(maker, **arguments)
-    try:
-        return maker(**arguments)
-    except (DataError, SettingError):
-        raise
-    except Exception as error:
-        raise SettingError(
-            place,
-            found=f"{settings['_target_']}, which cannot be made ({_said(error)})",
-            expected="settings that it takes",
-            remedy=_missing_package(error),
-        ) from error
-
-
-def maker_of(settings: Mapping[str, Any], place: str, trust: Collection[str] | None = None) -> Any:
-    """The class or function that a section names; see `make`."""
-    target = settings.get("_target_")
-    found = import_named(target, f"{place}._target_") if trust is None else _find(target, trust)[0]
+def _maker(settings: Any, place: str, file: SettingsFile | None) -> tuple[Any, Mapping[str, Any]]:
+    """The class or function that a section names, with the kinds of its arguments in a file."""
+    target = settings.get("_target_") if isinstance(settings, Mapping) else None
+    if file is None:
+        return import_named(target, place), {"**": Any}
+    if not isinstance(target, str):
+        raise file.refused(place, settings, "a section with a _target_")
+    found = _find(target)
+    if found is None and (target in file.trust or not file.owns(f"{place}._target_")):
+        return import_named(target, place), {"**": Any}
     if found is None:
-        raise SettingError(f"{place}._target_", found=target, expected="a registered name")
+        raise DataError(
+            file.path,
+            found=f"{place}._target_={target}, which would be called",
+            expected="networks, data and tasks that are registered here",
+            remedy=f"If you know it, and trust who made the file: trust={target}",
+        )
     return found
 
 
-def named_targets(settings: Any) -> set[str]:
-    """All that settings name as ``_target_``."""
-    inner = settings.values() if isinstance(settings, Mapping) else settings
-    listed = isinstance(settings, Mapping | list)
-    named = {str(settings["_target_"])} if listed and "_target_" in settings else set()
-    return named.union(*map(named_targets, inner)) if listed else named
-
-
-def _made(value: Any, place: str, trust: Collection[str] | None) -> Any:
+def _argument(
+    value: Any, place: str, file: SettingsFile | None, kind: Any, kinds: Collection[str] = ()
+) -> Any:
+    """A value from settings, with the objects in it made."""
+    if file is not None and file.owns(place):
+        _check_argument(value, place, file, kind, kinds)
+    if isinstance(value, Mapping) and "_target_" in value:
+        return make(value, place, file)
     if isinstance(value, Mapping):
-        if "_target_" in value:
-            return make(value, place, trust)
-        return {name: _made(inner, f"{place}.{name}", trust) for name, inner in value.items()}
+        return {name: _argument(v, f"{place}.{name}", file, Any) for name, v in value.items()}
     if isinstance(value, list):
-        return [_made(inner, f"{place}.{k}", trust) for k, inner in enumerate(value)]
+        return [_argument(v, f"{place}.{k}", file, Any) for k, v in enumerate(value)]
     return value
 
 
-def _find(target: Any, trust: Collection[str]) -> tuple[Any, Mapping[str, Any] | None]:
-    """What a file may name, with the kinds of its settings; of a trusted one all are `Any`."""
-    if not isinstance(target, str):
-        return None, None
+def _check_argument(
+    value: Any, place: str, file: SettingsFile, kind: Any, kinds: Collection[str]
+) -> None:
+    section, _, name = place.rpartition(".")
+    if name == "_partial_" and section.rpartition(".")[2] in _CALLED_LATER:
+        kind = bool
+    if kind is None:
+        raise file.refused(place, value, f"one of its settings ({', '.join(kinds)})")
+    if kind is _Object and isinstance(value, Mapping) and "_target_" in value:
+        return  # `make` looks at it
+    if value is not None and kind is not Any and not _fits(value, kind):
+        raise file.refused(place, value, f"{inspect.formatannotation(kind)} in a file")
+
+
+def _find(target: str) -> tuple[Any, Mapping[str, Any]] | None:
+    """What every file may name, with the kinds of its arguments."""
     module, _, name = target.rpartition(".")
     if module in _HOMES:
         home = import_module(module)
         made = getattr(home, name) if name in home.__all__ else None
-        if made in _registered:
-            return made, _kinds(made)
+        return (made, _kinds(made)) if made in _registered else None
     from tangent_train import libraries
 
-    found = libraries.find(module, name)
-    if found is None and target in trust:
-        return import_named(target, "_target_"), {"**": Any}
-    return found or (None, None)
+    return libraries.find(module, name)
 
 
 class _Names(dict[str, Any]):
@@ -330,14 +285,14 @@ class _Names(dict[str, Any]):
         super().__init__(known | dict(names))
 
     def __missing__(self, name: str) -> Any:
-        return getattr(builtins, name, Object)
+        return getattr(builtins, name, _Object)
 
 
 def _kinds(made: Any) -> dict[str, Any]:
     """By the name of an argument what a file may give for it; also those handed on to bases."""
-    kinds: dict[str, Any] = {}
     if is_dataclass(made):
         return _kinds_of_fields(made)
+    kinds: dict[str, Any] = {}
     for base in inspect.getmro(made) if inspect.isclass(made) else (made,):
         function = vars(base).get("__init__") if inspect.isclass(base) else base
         if function is None:
@@ -367,9 +322,9 @@ def _kinds_of_fields(made: Any) -> dict[str, Any]:
 def _kind(hint: Any) -> Any:
     members = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
     if any(m in (Any, Path, object) or Any in get_args(m) for m in members):
-        return Local
+        return NoneType
     plain = [member for member in members if _is_plain(member)]
-    return Union[tuple(plain)] if set(plain) - {NoneType} else Object  # noqa: UP007 - of a list
+    return Union[tuple(plain)] if set(plain) - {NoneType} else _Object  # noqa: UP007 - of a list
 
 
 def _is_plain(hint: Any) -> bool:
@@ -380,15 +335,12 @@ def _is_plain(hint: Any) -> bool:
 
 
 def _fits(value: Any, kind: Any) -> bool:
-    """Whether a value is of a kind: a plain type, or one of the kinds of this module."""
+    """Whether a value is of a kind: a type of plain values, or `Text`."""
     origin, arguments = get_origin(kind), get_args(kind)
     if origin in (Union, UnionType):
         return any(_fits(value, one) for one in arguments)
     if origin is Literal:
         return any(type(value) is type(one) and value == one for one in arguments)
-    if origin is tuple:
-        fits = isinstance(value, list | tuple) and len(value) == len(arguments)
-        return fits and all(map(_fits, value, arguments))
     if origin in (Sequence, list):
         return isinstance(value, list | tuple) and all(_fits(v, arguments[0]) for v in value)
     if origin in (Mapping, dict):
@@ -398,45 +350,7 @@ def _fits(value: Any, kind: Any) -> bool:
     if kind is str:
         return isinstance(value, str) and _WORD.fullmatch(value) is not None
     if kind is Text:
-        return isinstance(value, str) and _LINE.fullmatch(value) is not None
+        return isinstance(value, str) and "\n" not in value and printable(value) == value
     if kind is dict:
         return isinstance(value, Mapping)
     return type(value) in (int, float) if kind is float else type(value) is kind
-
-
-def import_named(target: Any, place: str) -> Any:
-    """What a full name names.
-
-    Raises:
-        SettingError: It cannot be imported.
-    """
-    try:
-        return resolve_name(str(target))
-    except (ImportError, AttributeError, ValueError) as error:
-        raise SettingError(
-            place,
-            found=f"{target}, of which something cannot be imported ({_said(error)})",
-            expected="the full name of a class or function",
-            remedy=_missing_package(error)
-            or "Install its package, or add the folder it is in to PYTHONPATH.",
-        ) from error
-
-
-def _said(error: BaseException) -> str:
-    """The first line of an error, and where it was raised: own networks fail in their own words."""
-    frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename != __file__]
-    first_line = str(error).strip().partition("\n")[0]
-    place = f", {Path(frames[-1].filename).name} line {frames[-1].lineno}" if frames else ""
-    return f"{type(error).__name__}: {first_line}{place}"
-
-
-def _missing_package(error: BaseException | None) -> str:
-    """How to install the package that is missing; empty if none is."""
-    while error is not None and not (isinstance(error, ModuleNotFoundError) and error.name):
-        error = error.__cause__ or error.__context__
-    if error is None:
-        return ""
-    package = str(error.name).partition(".")[0]
-    if package in _EXTRAS:
-        return f"Run: pip install 'tangent-train[{_EXTRAS[package]}]'"
-    return f"Install {package}, or add the folder it is in to PYTHONPATH."

@@ -9,7 +9,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any, Literal
 
-__all__ = ["Purpose", "differing_settings", "flat_settings", "from_file", "may_differ"]
+__all__ = [
+    "OF_THIS_MACHINE",
+    "Purpose",
+    "differing_settings",
+    "flat_settings",
+    "from_file",
+    "may_differ",
+]
 
 Purpose = Literal["resume", "report", "transfer", "evaluation"]
 """A run and itself when it is resumed; runs of one group of a report (folds and seeds); a stage of
@@ -31,6 +38,7 @@ _MAY_DIFFER: dict[str, frozenset[Purpose]] = {
     "data.store": _ALWAYS,
     "panels": _ALWAYS,
     "resume": _ALWAYS,
+    "trust": _ALWAYS,
     "task.channels_last": _ALWAYS,
     "task.compile": _ALWAYS,
     "task.images_per_forward": _ALWAYS,
@@ -75,7 +83,7 @@ _OF_THE_TRAINER = (
     "inference_mode limit_predict_batches limit_test_batches logger max_time model_registry "
     "num_nodes plugins profiler strategy"
 )
-_OF_THIS_MACHINE = (
+OF_THIS_MACHINE = (
     *("data.label_table", "data.root", "data.store", "task.compile"),
     *(f"trainer.{name}" for name in _OF_THE_TRAINER.split()),
 )
@@ -96,7 +104,7 @@ def may_differ(name: str, purpose: Purpose) -> bool:
 
 def from_file(name: str) -> bool:
     """Whether the settings in a file may give a setting, ``section.setting``."""
-    return not any(f"{name}.".startswith(f"{own}.") for own in _OF_THIS_MACHINE)
+    return not any(f"{name}.".startswith(f"{own}.") for own in OF_THIS_MACHINE)
 
 
 def flat_settings(config: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

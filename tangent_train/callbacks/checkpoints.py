@@ -17,15 +17,14 @@ from lightning.pytorch.callbacks import Callback, Checkpoint, ModelCheckpoint
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 from rich.console import Console
 
-from tangent_train.errors import DataError, SettingError
-from tangent_train.files import NoRoomError, atomic_path
+from tangent_train.errors import SettingError
+from tangent_train.files import atomic_path
 
 __all__ = [
     "AtomicCheckpointIO",
     "BestCheckpoint",
     "CheckpointContents",
     "LastCheckpoint",
-    "best_checkpoint",
 ]
 
 
@@ -198,23 +197,12 @@ class LastCheckpoint(Checkpoint):
         pl_module: lightning.LightningModule,
         exception: BaseException,
     ) -> None:
-        """Say how to go on after SIGTERM, Ctrl-C and what the machine does to a run.
-
-        An error says for itself what to do.
-        """
-        terminated = isinstance(exception, SIGTERMException)
-        interrupted = terminated or isinstance(exception, KeyboardInterrupt)
-        if not interrupted and not _is_of_the_machine(exception):
-            return
-        if trainer.is_global_zero and self.path.exists():
+        """Say how to resume the run."""
+        if trainer.is_global_zero and self.has_begun:
+            saved = "here" if isinstance(exception, SIGTERMException) else "the last checkpoint"
             command = shlex.join([f"resume={self.path.parent.parent}", *self.typed])
-            Console(stderr=True).print(
-                f"{'Interrupted' if interrupted else 'Stopped'}. {self.path} has all up to "
-                f"{'here' if terminated else 'the last checkpoint'}; go on with\n"
-                f"  tangent-train {command}",
-                soft_wrap=True,
-                highlight=False,
-            )
+            text = f"{self.path} has all up to {saved}; resume with\n  tangent-train {command}"
+            Console(stderr=True).print(text, soft_wrap=True, highlight=False)
 
     def _any_told_to_end(self, trainer: lightning.Trainer) -> bool:
         """Whether some process got SIGTERM: all end after the same step."""
@@ -227,14 +215,23 @@ class LastCheckpoint(Checkpoint):
         trainer.save_checkpoint(self.path, weights_only=False)
 
 
-def _is_of_the_machine(exception: BaseException) -> bool:
-    """A full disk, a file that cannot be read, a worker that died: the run can go on later."""
-    of_worker = isinstance(exception, RuntimeError) and str(exception).startswith("DataLoader")
-    return of_worker or isinstance(exception, DataError | NoRoomError | OSError | EOFError)
-
-
 class BestCheckpoint(ModelCheckpoint):
-    """Keeps the best epoch so far when the run's folder was moved before it is resumed."""
+    """Keeps ``best.ckpt``, the epoch with the highest figure of the validation split.
+
+    Args:
+        folder: Where to, also of a resumed run whose folder was moved.
+        monitor: The figure.
+    """
+
+    def __init__(self, folder: Path | str, monitor: str = "val/miou") -> None:
+        super().__init__(
+            dirpath=folder,
+            filename="best",
+            monitor=monitor,
+            mode="max",
+            auto_insert_metric_name=False,
+            enable_version_counter=False,
+        )
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Take how good the best epoch was; where its file is does not come out of a file."""
@@ -246,20 +243,3 @@ class BestCheckpoint(ModelCheckpoint):
         self.best_model_score = self.kth_value = self.current_score = score
         self.best_model_path = self.kth_best_model_path = path
         self.best_k_models = {path: score}
-
-
-def best_checkpoint(folder: Path | str, monitor: str = "val/miou") -> ModelCheckpoint:
-    """Keeps ``best.ckpt``, the epoch with the highest figure of the validation split.
-
-    Args:
-        folder: Where to.
-        monitor: The figure.
-    """
-    return BestCheckpoint(
-        dirpath=folder,
-        filename="best",
-        monitor=monitor,
-        mode="max",
-        auto_insert_metric_name=False,
-        enable_version_counter=False,
-    )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from typing import TYPE_CHECKING, Any, Literal
 
 import yaml  # type: ignore[import-untyped]
@@ -15,13 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
     from pathlib import Path
 
-__all__ = [
-    "INPUTS",
-    "NORMALIZATION",
-    "read_checkpoint",
-    "read_settings",
-    "write_settings",
-]
+__all__ = ["INPUTS", "NORMALIZATION", "read_checkpoint", "read_settings", "write_settings"]
 
 INPUTS = list[Literal["rgb", "depth", "elevation"]]
 """What a network is shown, see `datamodules.core.samples.Input`, which is slow to import."""
@@ -45,7 +38,7 @@ def read_checkpoint(path: Path, needed: Collection[str] = tuple(_FIELDS)) -> dic
 
     Args:
         path: The file. Tensors stay in it until they are used.
-        needed: Which of its fields: ``config`` (the resolved settings of the run, unchecked),
+        needed: Which of its fields: ``config`` (the resolved settings of the run, plain values),
             ``class_names``, ``inputs``, ``kind``, ``normalization``, ``state_dict``.
 
     Raises:
@@ -54,27 +47,19 @@ def read_checkpoint(path: Path, needed: Collection[str] = tuple(_FIELDS)) -> dic
     import torch
 
     if not path.is_file():
-        found = "a folder" if path.is_dir() else "no such file"
+        what = "a folder" if path.is_dir() else "no such file"
         remedy = "Give its checkpoints/best.ckpt." if path.is_dir() else ""
-        raise DataError(path, found=found, expected=_EXPECTED, remedy=remedy)
-    if not zipfile.is_zipfile(path):
-        raise DataError(path, found="an unreadable file", expected=_EXPECTED)
+        raise DataError(path, found=what, expected=_EXPECTED, remedy=remedy)
     try:
         content = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
     except Exception as error:
-        first_line = str(error).partition("\n")[0]
-        if "TorchScript" in first_line:
-            raise DataError(
-                path,
-                found="a TorchScript program",
-                expected=f"{_EXPECTED}, or an ONNX or safetensors file of tangent-export",
-                remedy="TorchScript cannot be read safely; export the network to ONNX.",
-            ) from error
-        raise DataError(
-            path, found=f"an unreadable file ({first_line})", expected=_EXPECTED
-        ) from error
+        what = f"an unreadable file ({str(error).partition(chr(10))[0]})"
+        raise DataError(path, found=what, expected=_EXPECTED) from error
     kinds = {name: kind for name, kind in _FIELDS.items() if name in needed}
-    return check_fields(path, content, kinds, _EXPECTED)
+    found = check_fields(path, content, kinds, _EXPECTED)
+    if "config" in found:
+        found["config"] = check_plain(path, found["config"], "config")
+    return found
 
 
 def read_settings(path: Path) -> dict[str, Any]:
@@ -89,16 +74,15 @@ def read_settings(path: Path) -> dict[str, Any]:
     expected = "the settings of a run"
     try:
         text = path.read_text(encoding="utf-8")
-        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, yaml.SafeLoader)):
-            raise DataError(path, found="an alias", expected=f"{expected}, which have none")
-        content = yaml.safe_load(text)
+        events = yaml.parse(text, yaml.SafeLoader)
+        aliased = any(isinstance(event, yaml.AliasEvent) for event in events)
+        content = None if aliased else yaml.safe_load(text)
     except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
-        if isinstance(error, DataError):
-            raise
         first_line = f"{type(error).__name__}: {error}".partition("\n")[0]
         raise DataError(path, found=first_line, expected=expected) from error
     if not isinstance(content, dict):
-        raise DataError(path, found=type(content).__name__, expected=expected)
+        found = "an alias" if aliased else type(content).__name__
+        raise DataError(path, found=found, expected=f"{expected}, without aliases")
     settings: dict[str, Any] = check_plain(path, content, "settings")
     return settings
 

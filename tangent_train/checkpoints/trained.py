@@ -19,7 +19,7 @@ from tangent_train.checkpoints.content import INPUTS, NORMALIZATION, read_checkp
 from tangent_train.checkpoints.image_sizes import size_multiple_of
 from tangent_train.errors import DataError, SettingError
 from tangent_train.json_text import parse_json
-from tangent_train.registry import Text, accept, check_fields, make
+from tangent_train.registry import SettingsFile, Text, check_fields, check_plain, make
 
 __all__ = [
     "METADATA_KEY",
@@ -37,8 +37,8 @@ METADATA_KEY = "tangent_train"
 _PREFIX = "network."
 """Begins the names of the network's tensors in a checkpoint."""
 
-_PRETRAINED = ("weights", "weights_backbone", "encoder_weights")
-"""Settings that name trained weights, in models, torchvision and segmentation-models-pytorch."""
+_PRETRAINED = ("weights", "weights_backbone", "encoder_weights", "pretrained")
+"""Settings that name trained weights, in models, torchvision, segmentation-models-pytorch, timm."""
 
 _EXPORTED = "a network written by tangent-export"
 _TRAINED = "a checkpoint written by tangent-train"
@@ -61,7 +61,7 @@ class TrainedNetwork:
         fixed_size: The only rows and columns it takes; None where it takes others.
         settings: The section of the config that makes it, complete; None where only the computation
             is known (ONNX).
-        trust: What its settings may name besides registered classes.
+        source: The file that `representation` and `settings` come from.
     """
 
     network: nn.Module
@@ -74,7 +74,7 @@ class TrainedNetwork:
     size_multiple: int = 1
     fixed_size: tuple[int, int] | None = None
     settings: Mapping[str, Any] | None = None
-    trust: tuple[str, ...] = ()
+    source: SettingsFile | None = None
 
     @property
     def in_channels(self) -> int:
@@ -88,9 +88,9 @@ _KINDS = {
     "normalization": NORMALIZATION,
     "level": int,
     "representation": dict,
-    "image_size": tuple[int, int],
+    "image_size": list[int],
     "size_multiple": int,
-    "fixed_size": tuple[int, int] | None,
+    "fixed_size": list[int] | None,
     "settings": dict | None,
 }
 """What the metadata of an exported network say."""
@@ -152,18 +152,18 @@ def load_trained(path: Path, trust: Collection[str] = ()) -> TrainedNetwork:
         DataError: There is no such file, it holds something else, it names other code, its network
             cannot be made, or a package to read it is missing.
     """
-    suffix = path.suffix.lower()
+    source = SettingsFile(path, trust)
     try:
-        if suffix == ".onnx":
+        if path.suffix.lower() == ".onnx":
             network = OnnxNetwork(path)
             described = _described(path, network.metadata.get(METADATA_KEY))
-            return _trained(path, described | {"settings": None}, network, trust)
-        if suffix == ".safetensors":
+            return _trained(described | {"settings": None}, network, source)
+        if path.suffix.lower() == ".safetensors":
             with _safetensors(path) as file:
                 described = _described(path, (file.metadata() or {}).get(METADATA_KEY))
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-            return _trained(path, described, tensors, trust)
-        return _from_checkpoint(path, trust)
+            return _trained(described, _network(described, tensors, source), source)
+        return _from_checkpoint(source)
     except DataError:
         raise
     except SettingError as error:
@@ -178,18 +178,16 @@ def inputs_in(path: Path) -> tuple[Input, ...] | None:
     try:
         if path.suffix.lower() == ".safetensors":
             with _safetensors(path) as file:
-                text = (file.metadata() or {}).get(METADATA_KEY)
-            return tuple(_described(path, text)["inputs"])
-        found = read_checkpoint(path, ("inputs",))["inputs"]
+                return tuple(_described(path, (file.metadata() or {}).get(METADATA_KEY))["inputs"])
+        return tuple(read_checkpoint(path, ("inputs",))["inputs"] or ()) or None
     except DataError:
         return None
-    return None if found is None else tuple(found)
 
 
 def metadata_json(trained: TrainedNetwork) -> str:
     """All that is known of a network besides its numbers, as JSON.
 
-    The fields of `TrainedNetwork`, but ``network`` and ``trust``, under their names;
+    The fields of `TrainedNetwork`, but ``network`` and ``source``, under their names;
     ``normalization`` with ``mean`` and ``std``; ``tangent_train_version``.
     """
     content = {f.name: getattr(trained, f.name) for f in fields(trained) if f.name in _KINDS}
@@ -198,7 +196,9 @@ def metadata_json(trained: TrainedNetwork) -> str:
     return json.dumps(content | {"tangent_train_version": version("tangent-train")})
 
 
-def _from_checkpoint(path: Path, trust: Collection[str]) -> TrainedNetwork:
+def _from_checkpoint(source: SettingsFile) -> TrainedNetwork:
+    """A network with the sizes of images it takes, found by trying."""
+    path = source.path
     content = read_checkpoint(path)
     if content["kind"] != "segmentation":
         raise DataError(
@@ -209,73 +209,36 @@ def _from_checkpoint(path: Path, trust: Collection[str]) -> TrainedNetwork:
         )
     kinds = {"network": dict, "representation": dict, "level": int}
     config = check_fields(path, content["config"], kinds, _TRAINED, "its config")
-    content["inputs"] = content["inputs"] or []
-    described = {name: content[name] for name in ("class_names", "inputs", "normalization")} | {
-        "level": config["level"],
-        "representation": config["representation"],
-        "settings": config["network"],
-        "image_size": None,
-        "size_multiple": None,
-        "fixed_size": None,
-    }
+    config["settings"] = config.pop("network")
+    names = ("class_names", "inputs", "normalization")
+    described = config | {name: content[name] or [] for name in names}
     tensors = {
         name.removeprefix(_PREFIX): tensor
         for name, tensor in content["state_dict"].items()
         if str(name).startswith(_PREFIX)
     }
-    return _trained(path, described, tensors, trust)
+    size = make(config["representation"], "representation", source).image_size
+    network = _network(described, tensors, source)
+    multiple = size_multiple_of(network, len(channel_names(described["inputs"])))
+    described |= {"image_size": size, "size_multiple": multiple or 1}
+    return _trained(described | {"fixed_size": None if multiple else size}, network, source)
 
 
-def _trained(
-    path: Path,
-    described: dict[str, Any],
-    content: OnnxNetwork | Mapping[str, Tensor],
-    trust: Collection[str],
-) -> TrainedNetwork:
-    """A network as it is described, with the tensors or the computation of a file."""
-    sections = {"network": described["settings"], "representation": described["representation"]}
-    given = {name: settings for name, settings in sections.items() if settings is not None}
-    settings = accept(path, given, trust).settings
-    representation = make(settings["representation"], "representation", trust)
-    channels = len(channel_names(described["inputs"]))
-    if isinstance(content, OnnxNetwork):
-        network: nn.Module = content
-    elif described["settings"] is None:
-        raise DataError(path, found="no settings of the network inside", expected=_EXPORTED)
-    else:
-        classes = len(described["class_names"])
-        complete = completed_settings(settings["network"], channels, classes, restored=True)
-        settings["network"] = complete
-        network = _with_tensors(path, complete, content, trust)
-    if described["image_size"] is None:
-        multiple, size = size_multiple_of(network, channels), representation.image_size
-        described |= {"size_multiple": multiple or 1, "image_size": size}
-        described["fixed_size"] = None if multiple else size
-    normalization, fixed = described["normalization"], described["fixed_size"]
-    return TrainedNetwork(
-        network=network.eval(),
-        class_names=tuple(described["class_names"]),
-        inputs=tuple(described["inputs"]),
-        normalization=Normalization(normalization.get("mean", ()), normalization.get("std", ())),
-        level=described["level"],
-        representation=settings["representation"],
-        image_size=tuple(described["image_size"]),
-        size_multiple=described["size_multiple"],
-        fixed_size=None if fixed is None else tuple(fixed),
-        settings=settings.get("network"),
-        trust=tuple(trust),
-    )
-
-
-def _with_tensors(
-    path: Path, settings: Mapping[str, Any], tensors: Mapping[str, Tensor], trust: Collection[str]
+def _network(
+    described: dict[str, Any], tensors: Mapping[str, Tensor], source: SettingsFile
 ) -> nn.Module:
-    network: nn.Module = make(settings, "network", trust)
+    """A network with the tensors of its file; its settings are completed in place."""
+    if described["settings"] is None:
+        raise DataError(source.path, found="no settings of the network", expected=_EXPORTED)
+    channels, classes = len(channel_names(described["inputs"])), len(described["class_names"])
+    settings = completed_settings(described["settings"], channels, classes, restored=True)
+    described["settings"] = settings
+    network: nn.Module = make(settings, "network", source)
     try:
         network.load_state_dict(dict(tensors))
     except (RuntimeError, TypeError, AttributeError) as error:
         raise DataError(
-            path,
+            source.path,
             found=f"other tensors than those of its network ({error})",
             expected=f"the tensors of {settings['_target_']}",
             remedy="Is the package of the network of another version than in training?",
@@ -283,22 +246,40 @@ def _with_tensors(
     return Scores(network).eval()
 
 
+def _trained(
+    described: Mapping[str, Any], network: nn.Module, source: SettingsFile
+) -> TrainedNetwork:
+    make(described["representation"], "representation", source)  # refused now, not when it is used
+    normalization, fixed = described["normalization"], described["fixed_size"]
+    rows, columns = described["image_size"]
+    return TrainedNetwork(
+        network=network.eval(),
+        class_names=tuple(described["class_names"]),
+        inputs=tuple(described["inputs"]),
+        normalization=Normalization(normalization.get("mean", ()), normalization.get("std", ())),
+        level=described["level"],
+        representation=described["representation"],
+        image_size=(rows, columns),
+        size_multiple=described["size_multiple"],
+        fixed_size=None if fixed is None else (fixed[0], fixed[1]),
+        settings=described["settings"],
+        source=source,
+    )
+
+
 def _described(path: Path, text: str | bytes | None) -> dict[str, Any]:
     """The metadata of a file."""
-    if not text:
-        raise DataError(
-            path,
-            found=f"no '{METADATA_KEY}' in its metadata",
-            expected=_EXPORTED,
-            remedy="The file must say which classes and which normalization its network has; "
-            "write it with tangent-export.",
-        )
     where = f"'{METADATA_KEY}' of its metadata"
     try:
-        content = parse_json(text)
+        content = parse_json(text or "")
     except ValueError as error:
-        raise DataError(path, found=f"no JSON in {where} ({error})", expected=_EXPORTED) from error
-    return check_fields(path, content, _KINDS, _EXPORTED, where)
+        raise DataError(
+            path,
+            found=f"no JSON in {where} ({error})",
+            expected=_EXPORTED,
+            remedy="It says which classes and which normalization the network has.",
+        ) from error
+    return check_fields(path, check_plain(path, content, where), _KINDS, _EXPORTED, where)
 
 
 @contextmanager
@@ -308,12 +289,10 @@ def _safetensors(path: Path) -> Iterator[Any]:
     Raises:
         DataError: It is no such file.
     """
-    if not path.is_file():
-        raise DataError(path, found="no such file", expected=_EXPORTED)
     try:
         with safe_open(path, framework="pt") as file:
             yield file
     except (SafetensorError, OSError) as error:
         first_line = str(error).strip().partition("\n")[0]
-        found = f"an unreadable file ({first_line})"
+        found = f"an unreadable file ({first_line})" if path.is_file() else "no such file"
         raise DataError(path, found=found, expected=_EXPORTED) from error

@@ -1,40 +1,34 @@
-"""Starting from the settings inside a checkpoint: to go on with a run, or to evaluate it.
+"""Starting from the settings inside a checkpoint: to resume a run, or to evaluate it.
 
-Hydra composes what the user says and nothing else: an option here, a single setting there. What the
-file says is laid under that as plain data, checked, and never reaches Hydra.
+Hydra composes the user's own config, with the options of the run where the user has options of
+these names. The settings of the file are plain data: they are laid over the composed ones, except
+for what is typed and what concerns this machine, and never reach Hydra.
 """
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hydra import compose
-from hydra._internal.utils import get_args_parser
-from hydra.core.config_store import ConfigStore
-from hydra.core.global_hydra import GlobalHydra
-from hydra.errors import HydraException
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
-
 from tangent_train.checkpoints.content import INPUTS, NORMALIZATION, read_checkpoint
-from tangent_train.cli.compose import STORED, options_of, search_path
+from tangent_train.cli.compose import config_folder, quoted
 from tangent_train.cli.settings import Trust, typed
 from tangent_train.errors import DataError, SettingError
-from tangent_train.registry import Text, accept, check_fields, check_plain, named_targets
-from tangent_train.setting_rules import flat_settings
+from tangent_train.registry import SettingsFile, Text, check_fields
+from tangent_train.setting_rules import OF_THIS_MACHINE, from_file
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
-__all__ = ["CHOOSABLE", "StoredRun", "stored_arguments", "stored_run"]
+__all__ = ["GROUPS", "StoredRun", "stored_run"]
 
-CHOOSABLE = ("data", "representation", "trainer")
-"""Sections that an evaluation may take from a group: all else belongs to the network."""
+_SECTIONS = ("data", "representation", "network", "task", "optimizer", "scheduler", "trainer")
+GROUPS = ("experiment", *_SECTIONS)
+"""Config groups whose chosen options a checkpoint keeps, as ``choices``."""
 
-_CHOSEN = ("data", "experiment", "trainer")
-_SECTIONS = (*CHOOSABLE, "network", "task", "optimizer", "scheduler")
+_OPTION = re.compile(r"\w+(/\w+)*", re.ASCII)
 _RUN = {
     "choices": dict[str, Text] | None,
     "name": Text,
@@ -52,204 +46,152 @@ _EXPECTED = "the settings of a run"
 
 @dataclass(frozen=True)
 class StoredRun:
-    """The settings inside a checkpoint, on which those of the command line are laid.
+    """The settings inside a checkpoint, and the command line.
 
     Attributes:
         path: The checkpoint.
-        config: Its settings, unchecked.
-        name: Of the config to compose; of the user's own words alone.
-        arguments: The command line without what only says which checkpoint it is.
-        search: Where Hydra looks for options besides.
+        config: Its settings, plain values.
+        typed: What the user typed, without the checkpoint.
+        added: The options of the run among the user's own, its level and seed.
+        place: Overrides that say which checkpoint it is, and where to go on.
     """
 
     path: Path
     config: Mapping[str, Any]
-    name: str
-    arguments: Sequence[str]
-    search: Sequence[str]
+    typed: Sequence[str]
+    added: Sequence[str]
+    place: Sequence[str]
 
     @property
-    def known(self) -> list[str]:
-        """The names of all settings."""
-        sections = _only(self.config, _SECTIONS)
-        inside = [name.split(".") for name, _ in flat_settings(sections)]
-        dotted = {".".join(parts[: k + 1]) for parts in inside for k in range(len(parts))}
-        return [*_RUN, *sorted(dotted)]
+    def arguments(self) -> list[str]:
+        """The command line for Hydra: options, then overrides, of which the last one counts."""
+        options = [a for a in self.typed if "=" not in a or a[0] == "-"]
+        overrides = [a for a in self.typed if a not in options]
+        return [*options, *self.added, *overrides, *self.place]
 
-    def additions(self) -> list[str]:
-        """The command line for Hydra: every override adds to an empty config."""
-        return [_addition(argument) for argument in self.arguments]
-
-    def settings(
-        self, said: Mapping[str, Any], chosen: Collection[str]
-    ) -> tuple[dict[str, Any], tuple[str, ...]]:
+    def settings(self, said: Mapping[str, Any]) -> tuple[dict[str, Any], SettingsFile]:
         """All settings of the run that goes on.
 
         Args:
-            said: The composed config of `additions`, resolved.
-            chosen: Groups of which it holds an option.
+            said: The composed config, resolved.
 
         Returns:
-            The settings, and what they may name besides what is registered.
+            The settings, and where they come from.
 
         Raises:
-            DataError: The file gives settings that files must not give.
-            SettingError: A setting of this machine has to be said.
+            DataError: The file lacks settings.
+            SettingError: A setting of this machine has to be typed.
         """
-        trust = (*typed(Trust, said).trust, *named_targets(said))
+        own = {a.lstrip("+~").partition("=")[0] for a in self.typed if a[0] != "-"}
+        own = {name for name in own if not name.startswith("hydra")}
+        own |= {"representation.level"} if "level" in own else set()
+        own |= {"data.seed"} if "seed" in own else set()
         of_run = check_fields(self.path, self.config, _RUN, _EXPECTED)
-        needed = {name: dict for name in _SECTIONS if name != "scheduler" and name not in chosen}
-        check_fields(self.path, self.config, needed, _EXPECTED)
-        said = {name: value for name, value in said.items() if name != "trust"}
-        own = {n for n, value in flat_settings(said) if n not in of_run or value != of_run[n]}
-        sections = _only(self.config, set(_SECTIONS) - set(chosen))
-        sections = {name: section for name, section in sections.items() if section is not None}
-        for name, section in (("level", "representation"), ("seed", "data")):
-            if name in own and section not in chosen:  # in every config it is the same
-                said[section] = {name: said[name]} | said.get(section, {})
-                own.add(f"{section}.{name}")
-        accepted = accept(self.path, _merged(sections, _only(said, sections)), trust, own)
-        settings = _merged(of_run | accepted.settings, said)
-        if "data" in chosen:
-            settings["data"] |= self._of_the_network(settings["data"])
-        choices = of_run["choices"] or {}
-        if "resume" not in said:  # how many processes evaluate is said anew
-            choices = _only(choices, ("data", "experiment"))
-        _fill_local(settings, accepted.local, _composed_here(choices, self.search))
-        return {"init_from": None, "resume": None, "checkpoint": None} | settings, trust
+        sections = {name: dict | None if name == "scheduler" else dict for name in _SECTIONS}
+        of_run |= check_fields(self.path, self.config, sections, _EXPECTED)
+        settings = dict(said)
+        settings |= {name: value for name, value in of_run.items() if name not in own}
+        for name in sections.keys() - own:
+            if settings[name] is not None:
+                settings[name] = self._section(name, said.get(name) or {}, own)
+        for name in own:
+            _lay(settings, said, name.split("."))
+        if "data" in own:
+            settings["data"] |= self._of_the_network(settings["data"], own)
+        trust = typed(Trust, said).trust
+        return settings, SettingsFile(self.path, trust, own.union(OF_THIS_MACHINE))
 
-    def _of_the_network(self, data: Mapping[str, Any]) -> dict[str, Any]:
-        """What belongs to the network whatever the data: the fold it left out, and its inputs."""
-        kinds = {"fold": int | None, "inputs": INPUTS | None, "normalization": NORMALIZATION | None}
-        before = check_fields(self.path, self.config.get("data"), kinds, _EXPECTED, "data")
-        typed = {argument.lstrip("+").partition("=")[0] for argument in self.arguments}
-        known = {*data, "normalization"} - {name for name in kinds if f"data.{name}" in typed}
-        return {n: value for n, value in before.items() if value is not None and n in known}
-
-
-def _fill_local(
-    settings: dict[str, Any], local: Mapping[str, Any], here: Mapping[str, Any]
-) -> None:
-    """Give settings that only concern this machine the values they have here."""
-    for place, theirs in local.items():
-        section, _, name = place.partition(".")
-        own = here.get(section) or {}
-        same = own.get("_target_") == settings[section]["_target_"]
-        value = own.get(name) if same else None
-        if place == "data.root" and value != theirs:
+    def _section(self, name: str, here: Mapping[str, Any], own: set[str]) -> dict[str, Any]:
+        """A section of the file; what is this machine's is as the user's own config says it."""
+        theirs = self.config[name]
+        section = {n: v for n, v in theirs.items() if from_file(f"{name}.{n}")}
+        if here.get("_target_") == theirs.get("_target_"):
+            section |= {n: v for n, v in here.items() if not from_file(f"{name}.{n}")}
+        root = theirs.get("root")
+        if name == "data" and "data.root" not in own and section.get("root") != root:
             raise SettingError(
-                place,
+                "data.root",
                 found="no folder, as checkpoints do not say where data lie",
                 expected="that of the data set on this machine",
-                remedy=f"The run had data.root={theirs!r}: add that if it is right here.",
+                remedy=f"The run had data.root={root!r}: add that if it is right here.",
             )
-        if value is not None:
-            settings[section][name] = value
+        return section
+
+    def _of_the_network(self, data: Mapping[str, Any], own: set[str]) -> dict[str, Any]:
+        """What belongs to the network whatever the data: the fold it left out, and its inputs."""
+        kinds = {"fold": int | None, "inputs": INPUTS | None, "normalization": NORMALIZATION | None}
+        before = check_fields(self.path, self.config["data"], kinds, _EXPECTED, "data")
+        known = {name for name in (*data, "normalization") if f"data.{name}" not in own}
+        return {n: value for n, value in before.items() if value is not None and n in known}
 
 
 def stored_run(command: str, arguments: Sequence[str]) -> StoredRun | None:
     """Start from a stored config where the command goes on from one.
 
     ``tangent-train resume=<run folder>`` takes the settings inside the run's last checkpoint,
-    ``tangent-evaluate checkpoint=<file>`` those inside that, with other sections where
-    ``data=<option>``, ``representation=<option>`` or ``trainer=<option>`` says so.
+    ``tangent-evaluate checkpoint=<file>`` those inside that; ``data=<option>`` (or another section)
+    takes an option of one's own in place of the stored section.
 
     Args:
-        command: train, evaluate, prepare or transfer.
+        command: Any command.
         arguments: The command line after the program's name.
 
     Raises:
         DataError: There are no usable settings where the argument points.
-        SettingError: A run is to be resumed elsewhere.
+        SettingError: A resumed run would become another one.
     """
-    given = dict(argument.partition("=")[::2] for argument in arguments)
-    if command == "train" and given.get("resume") not in (None, "", "null"):
-        folder = _resumed_folder(given, arguments)
-        path, base = _last_checkpoint(folder), {"resume": str(folder)}
-        run_dir = str(folder).replace("${", r"\${")
-    elif command == "evaluate" and given.get("checkpoint") not in (None, "", "null"):
-        path = Path(given["checkpoint"].strip("'\"")).absolute()
-        base, run_dir = {"checkpoint": str(path)}, "runs/evaluate/${now:%Y-%m-%d_%H-%M-%S}"
-    else:
+    setting = {"train": "resume", "evaluate": "checkpoint"}.get(command, "")
+    given = [a.partition("=")[2] for a in arguments if a.startswith(f"{setting}=")]
+    if not setting or not given or given[-1] in ("", "null"):
         return None
-    config = check_plain(path, read_checkpoint(path, ("config",))["config"], "config")
-    # The user's options refer to these two.
-    numbers = check_fields(path, config, {"level": int, "seed": int}, _EXPECTED)
-    base = {name: text.replace("${", r"\${") for name, text in base.items()}
-    hydra = {"run": {"dir": run_dir}, "sweep": {"dir": run_dir}}
-    name = STORED + command
-    ConfigStore.instance().store(name, {**base, **numbers, "trust": [], "hydra": hydra})
-    used = ("checkpoint=", "resume=")
-    left = [a for a in arguments if not a.startswith(used)]
-    search = search_path(get_args_parser().parse_args(left))
-    return StoredRun(path, config, name, left, search)
+    path = Path(given[-1].strip("'\"")).absolute()
+    place = [f"{setting}={path}"]
+    left = [a for a in arguments if not a.startswith(f"{setting}=")]
+    if command == "train":
+        chosen = [a for a in left if a.partition("=")[0] in GROUPS]
+        if chosen:
+            raise SettingError(
+                f"resume={path}",
+                found=f"{chosen[0]} beside it",
+                expected="single settings (data.root=…): a run that is resumed has its options",
+            )
+        place.append(f"hydra.run.dir={quoted(str(path))}")
+        path = path / "checkpoints" / "last.ckpt"
+        if not path.is_file():
+            raise DataError(
+                path.parents[1],
+                found="no checkpoints/last.ckpt",
+                expected="the folder of a run that has begun",
+                remedy="Give resume= the folder that tangent-train printed.",
+            )
+    config = read_checkpoint(path, ("config",))["config"]
+    kinds = {name: _RUN[name] for name in ("choices", "level", "seed")}
+    known = check_fields(path, config, kinds, _EXPECTED)
+    choices = {g: name for g, name in (known["choices"] or {}).items() if _is_own(g, name)}
+    own = {a.partition("=")[0] for a in left}.intersection(GROUPS)
+    if own:  # what an experiment sets of a section is not meant for another option of it
+        choices.pop("experiment", None)
+    added = [f"level={known['level']}", f"seed={known['seed']}"]
+    added += [f"{group}={name}" for group, name in choices.items() if group not in own]
+    return StoredRun(path, config, left, added, place)
 
 
-def _composed_here(choices: Mapping[str, str], search: Sequence[str]) -> Any:
-    """The user's own settings of the options a run began with, those that there are here."""
-    loader = GlobalHydra.instance().config_loader()
-    own = [
-        f"{group}={choices[group]}"
-        for group in _CHOSEN
-        if choices.get(group) in options_of(loader, group, list(search))
-    ]
-    try:
-        return OmegaConf.to_container(compose("train", [*search, *own]), resolve=True)
-    except (HydraException, OmegaConfBaseException):  # options that are nothing together
-        return {}
+def _is_own(group: str, option: str) -> bool:
+    """Whether it is an option of this program's configs: a name, and no path."""
+    if group not in GROUPS or not _OPTION.fullmatch(option):
+        return False
+    return (config_folder() / group / f"{option}.yaml").is_file()
 
 
-def stored_arguments(command: str, arguments: Sequence[str]) -> list[str]:
-    """The arguments that say which stored run it is, for a process that goes on with it."""
-    found = ["checkpoint=", "resume="] if command in ("train", "evaluate") else []
-    return [a for a in arguments if a.startswith(tuple(found))]
-
-
-def _addition(argument: str) -> str:
-    name, equals, value = argument.lstrip("+").partition("=")
-    if not equals or argument[0] in "-~" or name.startswith("hydra"):
-        return argument
-    if name in CHOOSABLE and value[:1] not in "{[":
-        return f"+{name}={value}"
-    return f"++{name}={value}"
-
-
-def _resumed_folder(given: Mapping[str, str], arguments: Sequence[str]) -> Path:
-    folder = Path(given["resume"].strip("'\"")).absolute()
-    # Lightning starts further processes with the run's own folder.
-    its_own = Path(given.get("hydra.run.dir", str(folder)).strip("'\"")).absolute() == folder
-    elsewhere = [a for a in arguments if a in ("-m", "--multirun")]
-    elsewhere += [] if its_own else [f"hydra.run.dir={given['hydra.run.dir']}"]
-    if elsewhere:
-        raise SettingError(
-            f"resume={given['resume']}",
-            found=f"{elsewhere[0]} beside it",
-            expected="neither a sweep nor another folder: a run goes on in its own",
-        )
-    return folder
-
-
-def _last_checkpoint(folder: Path) -> Path:
-    path = folder / "checkpoints" / "last.ckpt"
-    if not path.is_file():
-        raise DataError(
-            folder,
-            found="no checkpoints/last.ckpt",
-            expected="the folder of a run that has begun",
-            remedy="Give resume= the folder that tangent-train printed.",
-        )
-    return path
-
-
-def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
-    """Nested settings with others laid over them."""
-    merged = dict(below)
-    for name, value in above.items():
-        before = merged.get(name)
-        both = isinstance(before, dict) and isinstance(value, dict)
-        merged[name] = _merged(before, value) if both else value  # type: ignore[arg-type]
-    return merged
-
-
-def _only(settings: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
-    return {name: value for name, value in settings.items() if name in names}
+def _lay(settings: dict[str, Any], said: Any, place: Sequence[str]) -> None:
+    """Put what is said at a place into settings."""
+    *sections, name = place
+    for section in sections:
+        said = said.get(section) if isinstance(said, dict) else None
+        inner = settings.get(section)
+        settings[section] = dict(inner) if isinstance(inner, dict) else {}
+        settings = settings[section]
+    if isinstance(said, dict) and name in said:
+        settings[name] = said[name]
+    else:
+        settings.pop(name, None)

@@ -107,7 +107,7 @@ def _check_given(config: DictConfig, stages: Sequence[Stage]) -> None:
 
 def _check_data(stages: Sequence[Stage]) -> None:
     """Build what stages are made of: what cannot work is said before hours of training."""
-    from tangent_train.cli.run import build
+    from tangent_train.cli.build import build
 
     built: list[tuple[Stage, Any]] = []
     tried: list[Any] = []

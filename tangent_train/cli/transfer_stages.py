@@ -25,7 +25,7 @@ from filelock import FileLock, Timeout
 from omegaconf import ListConfig, OmegaConf
 
 from tangent_train.checkpoints.content import read_settings
-from tangent_train.cli.processes import command_line, run_environment, run_process
+from tangent_train.cli.processes import command_line, run_process
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import write_text
 from tangent_train.json_text import parse_json
@@ -50,6 +50,7 @@ _OF_THE_TRANSFER = (
 )
 """Settings that a stage's config does not have."""
 
+_HEAD = {"defaults": ["_self_", {"override hydra/job_logging": "none"}]}
 _SLOWER = 10  # fine-tuning: 1e-5 after 1e-4 (paper, supplement, "Transfer learning")
 _REMEDY = "Give another name=, or delete the folder to run it again."
 
@@ -287,8 +288,10 @@ def run_stage(stage: Stage, state: State) -> int:
         with FileLock(stage.folder / ".lock", blocking=False):
             if state == "new":
                 write_text(stage.folder / "stage.json", json.dumps({"weights": digest}) + "\n")
-            write_text(stage.folder / "stage.yaml", OmegaConf.to_yaml(OmegaConf.create(config)))
-            status, _ = run_process(stage_command(stage), run_environment())
+            write_text(
+                stage.folder / "stage.yaml", OmegaConf.to_yaml(OmegaConf.create(_HEAD | config))
+            )
+            status = run_process(stage_command(stage))
     except Timeout as error:
         raise SettingError(
             stage.folder,

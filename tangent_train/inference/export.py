@@ -184,7 +184,7 @@ def _write_safetensors(trained: TrainedNetwork, path: Path) -> None:
 @torch.no_grad()
 def _verified(trained: TrainedNetwork, path: Path) -> Export:
     """Read the file as any user does and compare."""
-    exported = load_trained(path, trained.trust)
+    exported = load_trained(path, trained.source.trust if trained.source else ())
     rows, columns = trained.image_size
     step = trained.size_multiple
     rows, columns = (max(step, side // step * step) for side in (rows, columns))

@@ -215,7 +215,7 @@ def _panorama_representation(
     if level not in (None, trained.level):
         settings |= {"erp_height": None} | ({"dim": None} if "dim" in settings else {})
     settings["level"] = trained.level if level is None else level
-    made: Any = make(settings, "representation", trained.trust)
+    made: Any = make(settings, "representation", trained.source)
     _check_size(trained, made.image_size)
     return made
 

@@ -15,9 +15,9 @@ from torch.utils.data import DataLoader
 from tangent_train.callbacks.averaging import averaged_weights
 from tangent_train.callbacks.checkpoints import (
     AtomicCheckpointIO,
+    BestCheckpoint,
     CheckpointContents,
     LastCheckpoint,
-    best_checkpoint,
 )
 from tangent_train.errors import SettingError
 
@@ -125,7 +125,7 @@ def _trainer(
         "num_sanity_val_steps": 0,
         "plugins": [AtomicCheckpointIO()],
         "callbacks": [
-            *averaging, best_checkpoint(folder), last, Ending(last, end), contents, *callbacks
+            *averaging, BestCheckpoint(folder), last, Ending(last, end), contents, *callbacks
         ],
     }  # fmt: skip
     return lightning.Trainer(**(quiet | settings))

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import pytest
 import torch
 
-from tangent_train.callbacks.checkpoints import AtomicCheckpointIO, LastCheckpoint, best_checkpoint
+from tangent_train.callbacks.checkpoints import AtomicCheckpointIO, BestCheckpoint, LastCheckpoint
 from tangent_train.errors import SettingError
 
 if TYPE_CHECKING:
@@ -13,12 +13,11 @@ if TYPE_CHECKING:
 
 
 def test_the_best_epoch_is_kept_when_the_folder_moves(tmp_path: Path) -> None:
-    before = best_checkpoint(tmp_path / "before")
+    before, after = BestCheckpoint(tmp_path / "before"), BestCheckpoint(tmp_path / "after")
     path = str(tmp_path / "before" / "best.ckpt")
     before.best_model_path, before.best_model_score = path, torch.tensor(0.6)
     before.best_k_models = {path: torch.tensor(0.6)}
     before.kth_best_model_path = path
-    after = best_checkpoint(tmp_path / "after")
     after.load_state_dict(before.state_dict())
     here = str(tmp_path / "after" / "best.ckpt")
     assert after.best_model_path == after.kth_best_model_path == here

@@ -81,7 +81,6 @@ def test_a_file_is_overwritten_only_when_told(
         (["checkpoint={}", "output=x.onnx", "image_size=[15,16]"], "output: .* multiples of 2"),
         (["checkpoint={}", "output=x.onnx", "opset=new"], "opset: found new; expected a whole"),
         (["checkpoint=none.ckpt", "output=x.onnx"], r"none\.ckpt: found no such file"),
-        (["checkpoints=x"], "unknown setting: found 'checkpoints'; .*Did you mean checkpoint"),
     ],
 )
 def test_errors(

@@ -56,7 +56,7 @@ def test_the_stages_in_their_order(rooms: DictConfig, compared: dict[str, Any]) 
         ("S-FT-10", "train", "P"),
     ]
     assert all(s.folder == FOLDER / "fold_2" / "seed_3" / s.name for s in stages)
-    ordinary = set(_composed(name="train")) - {"sweep", "launcher"}
+    ordinary = set(_composed(name="train")) - {"sweep", "launcher", "trust"}
     for stage in stages:
         config, photos = stage.config, stage.name[0] == "P"
         assert set(config) == ordinary

@@ -15,7 +15,7 @@ from tangent_train.checkpoints.image_sizes import size_multiple_of
 from tangent_train.checkpoints.trained import Scores, TrainedNetwork, completed_settings
 from tangent_train.cli.build import build
 from tangent_train.cli.compose import config_folder
-from tangent_train.registry import make, named_targets
+from tangent_train.registry import SettingsFile, make
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -34,6 +34,11 @@ def with_statistics(network: nn.Module, seed: int = 0) -> nn.Module:
             module.running_mean.normal_(0, 0.2, generator=generator)  # type: ignore[operator]
             module.running_var.uniform_(0.5, 2, generator=generator)  # type: ignore[operator]
     return network
+
+
+def _targets(settings: Mapping[str, Any]) -> set[str]:
+    inner = [value for value in settings.values() if isinstance(value, Mapping)]
+    return {str(settings["_target_"])}.union(*map(_targets, inner))
 
 
 def small_trained(
@@ -64,7 +69,7 @@ def small_trained(
         size_multiple=multiple or 1,
         fixed_size=None if multiple else image_size,
         settings=settings,
-        trust=tuple(named_targets(settings)),
+        source=SettingsFile(Path("x.ckpt"), trust=_targets(settings)),
     )
 
 

@@ -108,7 +108,7 @@ def run(words: list[str], variables: dict[str, str], world: Path) -> None:
     with tempfile.NamedTemporaryFile() as log, pytest.MonkeyPatch.context() as patch:
         patch.setenv("OMP_NUM_THREADS", "1")  # forked processes have no threads
         patch.setenv("NUMBA_NUM_THREADS", "1")
-        context.set_forkserver_preload(["tangent_train.cli.run", "tangent_train.cli.transfer"])
+        context.set_forkserver_preload(["tangent_train.cli.train", "tangent_train.cli.transfer"])
         process = context.Process(target=_child, args=(words, variables, str(world), log.name))
         process.start()
         process.join(300)

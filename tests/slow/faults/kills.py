@@ -173,7 +173,7 @@ def _started(
 ) -> BaseProcess:
     """Start a run in a process that has imported all it needs."""
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["tangent_train.cli.run", "tensorboard", "hydra.main"])
+    context.set_forkserver_preload(["tangent_train.cli.train", "tensorboard", "hydra.main"])
     if not any(argument.startswith("resume=") for argument in arguments):
         arguments = [*arguments, f"hydra.run.dir={run}"]
     log = run.with_suffix(".log")

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -21,28 +19,16 @@ PREDICT = ("predict", "checkpoint=x.ckpt", "input=image.png", "output=labels")
     ("arguments", "message"),
     [
         # Misspelt.
-        (("train", "levl=5"), r"unknown setting: found 'levl'; .*Did you mean level\?"),
-        (("train", "optimizer.rl=1"), r"unknown setting: found 'optimizer.rl'; .*optimizer\.lr"),
-        (("train", "data=stanford"), r"unknown data: found 'stanford'; .*stanford2d3ds"),
-        (("train", "representation=tangents"), r"unknown representation: .*Did you mean tangent"),
-        (("train", "experiment=rooms/dmo"), r"unknown experiment: .*Did you mean rooms/demo"),
-        (("train", "level"), r"override 'level': found no override; expected setting=value"),
-        (("predict", "inputs=a"), r"unknown setting: found 'inputs'; .*Did you mean input"),
         # Levels and images.
         (("train", "level=2", "representation.base_level=2"), r"dim: found 1; expected at least 2"),
         (("train", "level=2", "representation.base_level=3"), r"base_level: found 3; .* level = 2"),
-        (("train", "level=20"), r"level: found 20; expected a whole number from 0 to 13"),
-        (("train", "level=5.5"), r"level: found 5\.5; expected a whole number"),
-        (("train", "representation.base_level=-1"), r"base_level: found -1; expected 0 to"),
         (("train", "representation.dim=3"), r"dim: found 3; expected at least 24"),
         (("train", "level=4"), r"image size for the UNet: found 16×16; .*multiples of 32"),
-        (("train", "network=hexunet", "level=3"), r"size for the HexUNet: found 8×8; .*of 16"),
         (
             (*ROOMS, "representation.faces_per_panorama=99"),
             r"representation\.faces_per_panorama: found 99; expected 1 to 20",
         ),
         ((*ROOMS, "representation.faces_per_panorama=0"), r"faces_per_panorama: found 0; exp"),
-        (("train", "representation.blend=soft"), r"\.blend: found 'soft'; .*nearest, feather"),
         (("train", "representation.rotation=any"), r"\.rotation: found 'any'; .*none, yaw, so3"),
         # Classes, inputs and networks.
         ((*ROOMS, "network.num_classes=5"), r"scores of the network: found .*5.*; expected .*14"),
@@ -54,7 +40,7 @@ PREDICT = ("predict", "checkpoint=x.ckpt", "input=image.png", "output=labels")
         ((*ROOMS, "data.inputs=[depth,rgbd]"), r"data\.inputs: found .*; expected a list: rgb"),
         ((*ROOMS, "task.class_weights=[1,2]"), r"class_weights: found 2 numbers; expected 14"),
         ((*ROOMS, "task.class_weights=logg"), r"class_weights: found logg; expected .*log, sqrt"),
-        ((*ROOMS, "task=classification"), r"task: found classification, .*; expected segment"),
+        ((*ROOMS, "task=classification"), r"task: found classification, .*; expected segm"),
         (
             ("train", "experiment=shapes/default", "task=segmentation"),
             r"task: found segmentation, .*; expected classification",
@@ -65,37 +51,14 @@ PREDICT = ("predict", "checkpoint=x.ckpt", "input=image.png", "output=labels")
         ((*ROOMS, "data.fold=4"), r"data\.fold: found 4; expected 1, 2 or 3"),
         ((*ROOMS, "data.panoramas_per_step=0"), r"panoramas_per_step: found 0; expected 1 or"),
         ((*ROOMS, "data.validation_fraction=1"), r"validation_fraction: found 1; expected 0 to b"),
-        ((*ROOMS, "data.num_workers=-1"), r"num_workers: found -1; expected 0 or more"),
-        ((*ROOMS, "data.max_tilt_deg=400"), r"max_tilt_deg: found 400; expected .*180"),
         ((*ROOMS, "data.rooms.height=7"), r"height: found 7; expected"),
         # Training.
-        ((*ROOMS, "optimizer.lr=-1"), r"optimizer: found optimizer\.lr=-1, .*AdamW takes"),
-        ((*ROOMS, "optimizer.lr=fast"), r"optimizer: found optimizer\.lr=fast, .*; expected"),
-        ((*ROOMS, "+optimizer.speed=1"), r"optimizer: found .*optimizer\.speed=1.*; expected"),
-        ((*ROOMS, "scheduler.pct_start=7"), r"scheduler: found .*scheduler\.pct_start=7.*; exp"),
-        ((*ROOMS, "optimizer.lrr=1"), r"unknown setting: found 'optimizer\.lrr'; .*optimizer\.lr"),
-        ((*ROOMS, "trainer.max_epochs=0"), r"trainer\.max_epochs: found 0; expected .* from 1"),
-        ((*ROOMS, "trainer.max_epochs=two"), r"trainer\.max_epochs: found two; expected"),
-        ((*ROOMS, "trainer.precision=8"), r"trainer: found .*Precision 8.*; expected settings"),
-        ((*ROOMS, "trainer.accelerator=quantum"), r"trainer: found .*'quantum'.*; expected"),
-        ((*ROOMS, "trainer.devices=0"), r"trainer: found .*devices=0.*; expected"),
-        ((*ROOMS, "trainer.gradient_clip_val=-1"), r"gradient_clip_val: found -1; expected"),
-        ((*ROOMS, "trainer.accumulate_grad_batches=0"), r"accumulate_grad_batches: found 0; exp"),
         ((*ROOMS, "task.label_smoothing=2"), r"label_smoothing: found 2; expected 0 to 1"),
         ((*ROOMS, "task.images_per_chunk=0"), r"images_per_chunk: found 0; expected .* from 1"),
         ((*ROOMS, "ema=2"), r"ema: found 2; expected a decay"),
         ((*ROOMS, "panels=-1"), r"panels: found -1; expected 0 or more"),
         ((*ROOMS, "checkpoint_every_n_steps=0"), r"checkpoint_every_n_steps: found 0; expected"),
-        ((*ROOMS, "seed=-1"), r"seed: found -1; expected a whole number from 0"),
-        ((*ROOMS, "seed=x"), r"seed: found x; expected a whole number"),
-        (
-            (*ROOMS, "trainer=ddp", "trainer.accelerator=cpu", "trainer.sync_batchnorm=true"),
-            r"trainer\.sync_batchnorm: found true, on a CPU; expected false",
-        ),
         # Files.
-        ((*ROOMS, "hydra.run.dir=image.png/run"), r"image\.png/run: found not a directory; expec"),
-        ((*ROOMS, "hydra.run.dir=/sys/run"), r"/sys/run: found operation not permitted; expected"),
-        ((*ROOMS, "data.rooms=${nothing}"), r"Interpolation key 'nothing' not found"),
         (("evaluate", "checkpoint=nowhere.ckpt"), r"nowhere\.ckpt: found no such file; expected"),
         (("evaluate",), r"checkpoint: found none; expected a checkpoint"),
         (("evaluate", "checkpoint=."), r"found a folder; .*checkpoints/best\.ckpt"),
@@ -106,11 +69,9 @@ PREDICT = ("predict", "checkpoint=x.ckpt", "input=image.png", "output=labels")
         (("predict", "checkpoint=x.ckpt", "input=image.png"), r"output: found none; expected"),
         (("predict", "checkpoint=x.ckpt", "input=nothing", "output=o"), r"nothing: found nothing"),
         ((*PREDICT, "blend=soft"), r"blend: found soft; expected feather or nearest"),
-        ((*PREDICT, "rotations=0"), r"rotations: found 0; expected a whole number, 1 or more"),
         ((*PREDICT, "fov=65"), r"fov: found 65; .*Add projection=perspective"),
         ((*PREDICT, "depth=."), r"depth: found \.; expected none, for a network that takes RGB"),
         (("export", "checkpoint=x.ckpt", "output=net.doc"), r"output: found net\.doc; expected"),
-        (("transfer", "-m", "seed=0,1"), r"-m: found a sweep; expected folds="),
         (("report", "nowhere"), r"nowhere: found no such folder; expected a run"),
         (("render", "input=image.png", "output=o", "level=2", "base_level=5"), r"level: found 2"),
         ((*PREDICT, "device=quantum"), r"device: found quantum .*; expected cpu, or a device"),
@@ -131,22 +92,6 @@ def test_impossible_settings(
     with pytest.raises(SystemExit, match=rf"(?s)^tangent-{command}: .*{message}"):
         getattr(main, command)()
     assert not (tmp_path / "data").exists(), "nothing is made"
-
-
-def test_a_typing_mistake_is_answered_before_anything_heavy_is_imported(tmp_path: Path) -> None:
-    code = (
-        "import sys; from tangent_train.cli.main import train\n"
-        "sys.argv = ['tangent-train', 'levl=5']\n"
-        "try:\n    train()\nexcept SystemExit as refused:\n    print(refused)\n"
-        "assert not {'torch', 'lightning', 'cv2', 'numba'} & set(sys.modules), 'heavy import'"
-    )
-    start = time.monotonic()
-    done = subprocess.run(
-        [sys.executable, "-c", code], check=False, cwd=tmp_path, capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
-    assert "Did you mean level?" in done.stdout
-    assert time.monotonic() - start < 20
 
 
 def test_a_network_for_more_inputs_than_the_data_has(

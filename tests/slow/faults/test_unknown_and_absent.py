@@ -16,10 +16,10 @@ import torch
 from lightning.pytorch.plugins import MixedPrecision
 
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
-from tangent_train.callbacks.checkpoints import best_checkpoint
+from tangent_train.callbacks.checkpoints import BestCheckpoint
 from tangent_train.callbacks.panels import PredictionPanels
 from tangent_train.callbacks.results import evaluated, write_evaluation
-from tangent_train.cli.run import best_on_validation
+from tangent_train.cli.train import best_on_validation
 from tests.slow.faults.small_runs import Faulty, run_trainer, small_data, small_task
 
 if TYPE_CHECKING:
@@ -201,7 +201,7 @@ def test_a_validation_split_without_a_labelled_pixel_has_no_best_figure(
     for name in names:
         (path,) = root.glob(f"area_*/pano/semantic/camera_{Path(name).name}_*")
         _without_labels(path)
-    best = best_checkpoint(tmp_path / "checkpoints")
+    best = BestCheckpoint(tmp_path / "checkpoints")
     task = small_task(Faulty())
     trainer = run_trainer(tmp_path, max_epochs=2, limit_val_batches=1.0, callbacks=[best])
     trainer.fit(task, datamodule=data)

@@ -110,12 +110,11 @@ def test_the_papers_shape_classifiers_have_their_numbers_of_parameters() -> None
     [
         (
             ["data=modelnet40", "data.root=nowhere"],
-            r"task: found segmentation, with the shapes of ModelNet40; expected classification\. "
-            r"Choose task=classification .*experiment=shapes/default",
+            r"task: found segmentation, with shapes; expected classification",
         ),
         (
             ["task=classification", "network=shape_classifier"],
-            r"task: found classification, with the panoramas of SynthRooms; .*task=segmentation",
+            r"task: found classification, with panoramas; expected segmentation",
         ),
     ],
 )
@@ -128,29 +127,11 @@ def test_networks_for_single_images_are_refused_for_shapes() -> None:
     settings = _composed(*SHAPES)
     settings["network"] = {"_target_": "torchvision.models.resnet18", "num_classes": None}
     message = (
-        r"network: found ResNet, which does not take \(1, 20, 6, 32, 32\) \(resnet\.py, line .*: .*"
+        r"network: found ResNet, which does not take \(1, 20, 6, 32, 32\) \(.*"
         r"expected one that maps views of shapes"
     )
     with pytest.raises(SettingError, match=message):
         build(settings)
-
-
-def test_the_place_of_an_error_in_ones_own_network_is_said() -> None:
-    settings = _composed()
-    settings["network"] = {"_target_": f"{__name__}.Broken"}
-    message = r"network: found Broken, .* \(test_networks\.py, line \d+: .*4096"
-    with pytest.raises(SettingError, match=message):
-        build(settings)
-
-
-class Broken(torch.nn.Linear):
-    """A network for something else."""
-
-    def __init__(self) -> None:
-        super().__init__(3, 3)
-
-    def forward(self, images: torch.Tensor) -> torch.Tensor:
-        return super().forward(images.flatten(1))
 
 
 def test_timm_encoders_come_with_segmentation_models_pytorch() -> None:

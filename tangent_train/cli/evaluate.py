@@ -1,0 +1,145 @@
+"""``tangent-evaluate``: a checkpoint on the test fold of its data; also the end of a training."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import lightning
+from hydra.core.hydra_config import HydraConfig
+from lightning.pytorch.callbacks import Callback
+from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.utilities import rank_zero_only
+from rich.console import Console
+
+from tangent_train.callbacks.checkpoints import AtomicCheckpointIO, CheckpointContents
+from tangent_train.callbacks.panels import ProgressBar
+from tangent_train.callbacks.results import evaluated, pictures, write_evaluation
+from tangent_train.callbacks.tensorboard import TrainingSpeed
+from tangent_train.checkpoints.content import read_checkpoint, write_settings
+from tangent_train.cli.build import Settings, build
+from tangent_train.cli.machine import machine_faults
+from tangent_train.cli.stored import GROUPS
+from tangent_train.errors import SettingError
+from tangent_train.registry import SettingsFile, make
+from tangent_train.results.evaluation import headline, result_tables
+from tangent_train.results.record import Record
+
+__all__ = ["Run", "evaluate"]
+
+
+def evaluate(settings: Settings, source: SettingsFile | None = None) -> None:
+    """Evaluate a checkpoint on the test fold of its data.
+
+    Args:
+        settings: Of the run, and ``checkpoint``.
+        source: The file they come from, see `registry.make`.
+
+    Raises:
+        SettingError: No checkpoint is given.
+    """
+    if settings["checkpoint"] is None:
+        raise SettingError("checkpoint", found="none", expected="checkpoints/best.ckpt of a run")
+    run = Run.begin(settings, source)
+    with machine_faults(run.folder, run.data):
+        run.test(run.trainer([]), Path(settings["checkpoint"]))
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run with its objects.
+
+    Attributes:
+        folder: Where all of it is written.
+        settings: What its checkpoints keep.
+        source: Where they come from; None for the user's own.
+        data: The data module.
+        task: The task.
+    """
+
+    folder: Path
+    settings: Settings
+    source: SettingsFile | None
+    data: Any
+    task: Any
+
+    @staticmethod
+    def begin(settings: Settings, source: SettingsFile | None) -> Run:
+        """Build the objects, and write the settings to the run's folder."""
+        folder = Path(HydraConfig.get().runtime.output_dir)
+        lightning.seed_everything(settings["seed"], workers=True, verbose=False)
+        data, task = build(settings, source)
+        chosen = HydraConfig.get().runtime.choices
+        choices = {group: chosen[group] for group in GROUPS if chosen.get(group)}
+        kept = {name: value for name, value in settings.items() if name != "trust"}
+        run = Run(folder, {"choices": choices, **kept}, source, data, task)
+        write_settings(folder / "config.yaml", run.settings)
+        return run
+
+    def shown(self) -> dict[str, Any]:
+        """What the network is shown, and what its scores are of, as plain values."""
+        mean, std = list(self.data.normalization.mean), list(self.data.normalization.std)
+        inputs = {"inputs": list(self.data.inputs)} if hasattr(self.data, "inputs") else {}
+        names = list(self.data.class_names)
+        return {"class_names": names, **inputs, "normalization": {"mean": mean, "std": std}}
+
+    def trainer(self, callbacks: Sequence[Callback]) -> lightning.Trainer:
+        """The trainer of the config, with callbacks besides those of every run."""
+        contents = {"kind": self.task.kind, "config": self.settings, **self.shown()}
+        common = [CheckpointContents(contents), TrainingSpeed(), ProgressBar()]
+        section = self.settings["trainer"]
+        every, epochs = section.get("check_val_every_n_epoch"), section.get("max_epochs")
+        trainer: lightning.Trainer = make(
+            section,
+            "trainer",
+            self.source,
+            # A run shorter than that is validated at its end.
+            check_val_every_n_epoch=min(every, epochs) if every and (epochs or -1) > 0 else every,
+            default_root_dir=str(self.folder),
+            callbacks=[*callbacks, *common, *pictures(self.task.kind, self.folder, self.settings)],
+            logger=TensorBoardLogger(self.folder, name="", version="tensorboard"),
+            plugins=[AtomicCheckpointIO()],
+            # The data module's samplers count every image once on any number of processes.
+            use_distributed_sampler=False,
+        )
+        return trainer
+
+    def test(self, trainer: lightning.Trainer, checkpoint: Path) -> None:
+        """Evaluate weights on the test fold, and write the results.
+
+        Raises:
+            SettingError: The data or the network are not those of the weights.
+        """
+        content = read_checkpoint(checkpoint)
+        for name, value in self.shown().items():
+            if content[name] != value:
+                raise SettingError(
+                    f"data, for {checkpoint}",
+                    found=f"{name.replace('_', ' ')} {value}",
+                    expected=f"{content[name]}, which the network was trained with",
+                )
+        try:
+            self.task.load_state_dict(content["state_dict"])
+        except RuntimeError as error:
+            raise SettingError(
+                "network",
+                found=f"other tensors than in {checkpoint} ({error})",
+                expected="the network and inputs of the checkpoint",
+            ) from error
+        trainer.test(self.task, datamodule=self.data, verbose=False)
+        record = evaluated(self.task, self.data.noun)
+        total = len(self.data.source("test"))
+        if record.images != total:
+            raise RuntimeError(f"{record.images} of {total} test {self.data.noun} were counted")
+        self._report(record, checkpoint)
+
+    @rank_zero_only
+    def _report(self, record: Record, checkpoint: Path) -> None:
+        write_evaluation(self.task, record, checkpoint, self.folder)
+        console = Console(soft_wrap=True, highlight=False)
+        console.print(headline(record), markup=False)
+        console.print(result_tables(record)[0].terminal())
+        told = f"Results, pictures and logs: {self.folder}; report.html opens in a browser."
+        console.print(told, markup=False)

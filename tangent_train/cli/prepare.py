@@ -1,0 +1,25 @@
+"""``tangent-prepare``: make or check a data set, and its prepared store if one is set."""
+
+from __future__ import annotations
+
+from rich.console import Console
+
+from tangent_train.cli.build import Settings
+from tangent_train.registry import make
+
+__all__ = ["prepare"]
+
+
+def prepare(settings: Settings) -> None:
+    """Make or check the data set.
+
+    Args:
+        settings: The composed ``prepare.yaml``.
+    """
+    representation = make(settings["representation"], "representation")
+    data = make(settings["data"], "data", representation=representation)
+    data.prepare_data()
+    data.setup()
+    counts = ", ".join(f"{len(data.found().splits[s])} {s}" for s in ("train", "val", "test"))
+    console = Console(soft_wrap=True, highlight=False)
+    console.print(f"{data.root} is ready. {data.noun.capitalize()}: {counts}.")

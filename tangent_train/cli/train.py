@@ -1,0 +1,146 @@
+"""``tangent-train``: train a network, then evaluate it."""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import lightning
+import torch
+from hydra.core.hydra_config import HydraConfig
+from lightning.fabric.utilities.exceptions import MisconfigurationException
+from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint
+from lightning.pytorch.utilities import rank_zero_only
+from lightning.pytorch.utilities.exceptions import SIGTERMException
+from rich.console import Console
+
+from datamodules.core.samples import channel_names
+from models import initialize
+from tangent_train.callbacks.averaging import averaged_weights
+from tangent_train.callbacks.checkpoints import BestCheckpoint, LastCheckpoint
+from tangent_train.checkpoints.content import read_checkpoint
+from tangent_train.checkpoints.trained import inputs_in
+from tangent_train.cli.build import Settings
+from tangent_train.cli.evaluate import Run
+from tangent_train.cli.machine import machine_faults
+from tangent_train.cli.sweep import OBJECTIVE_FILE
+from tangent_train.errors import DataError, SettingError
+from tangent_train.files import write_text
+from tangent_train.registry import SettingsFile
+from tangent_train.setting_rules import differing_settings, from_file
+
+__all__ = ["best_on_validation", "train"]
+
+# lightning 2.6 asks torch's tree library in a way torch ≥ 2.13 deprecates: nothing to do about it.
+warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)`", FutureWarning)
+
+
+def train(settings: Settings, source: SettingsFile | None = None) -> float | None:
+    """Train, then evaluate the best epoch of the validation split (else the last) on the test fold.
+
+    Args:
+        settings: Of the run: the composed ``train.yaml``, or of a run that is resumed.
+        source: The file they come from, see `registry.make`.
+
+    Returns:
+        The best figure on the validation split, what sweeps compare; None without such a split.
+    """
+    resumed = None
+    if settings["resume"] is not None:
+        resumed = Path(settings["resume"]) / "checkpoints" / "last.ckpt"
+        _check_resumed(settings, read_checkpoint(resumed, ("config",))["config"])
+    run = Run.begin(settings, source)
+    if settings["init_from"] is not None and resumed is None:
+        start = Path(settings["init_from"])
+        origins = initialize(run.task.network, start, _channels(start, run.data))
+        console = Console(soft_wrap=True, highlight=False)
+        rank_zero_only(console.print)(f"Tensors from {start}\n{origins}", markup=False)
+    checkpoints = run.folder / "checkpoints"
+    last = LastCheckpoint(checkpoints, settings["checkpoint_every_n_steps"], _typed_local())
+    callbacks = [last, LearningRateMonitor()]
+    if run.data.validation_fraction:
+        callbacks.append(BestCheckpoint(checkpoints, run.task.monitor))
+    trainer = run.trainer(callbacks)
+    if settings["ema"] is not None:  # first: the last step is in the average that is saved
+        average = averaged_weights(settings["ema"], trainer.strategy.root_device)
+        trainer.callbacks.insert(0, average)  # type: ignore[attr-defined]
+    with machine_faults(run.folder, run.data):
+        _fit(run, trainer, resumed, last)
+        # First: an error in the test must not cost a sweep its figure.
+        score = best_on_validation(trainer, run.folder)
+        best = checkpoints / "best.ckpt"
+        run.test(trainer, best if best.exists() else last.path)
+    return score
+
+
+def best_on_validation(trainer: lightning.Trainer, folder: Path) -> float | None:
+    """The best figure on the validation split, kept for sweeps; None if there is none.
+
+    Args:
+        trainer: Of the run.
+        folder: Of the run.
+    """
+    best = next((c for c in trainer.checkpoint_callbacks if isinstance(c, ModelCheckpoint)), None)
+    if best is None or best.best_model_score is None:
+        return None
+    if not torch.isfinite(best.best_model_score):  # no labelled pixel
+        return None
+    score = float(best.best_model_score)
+    if trainer.is_global_zero:
+        content = {"figure": best.monitor, "best": score}
+        write_text(folder / OBJECTIVE_FILE, json.dumps(content) + "\n")
+    return score
+
+
+def _fit(run: Run, trainer: lightning.Trainer, resumed: Path | None, last: LastCheckpoint) -> None:
+    with warnings.catch_warnings():
+        # The checkpoints of a resumed run are meant to be there.
+        warnings.filterwarnings("ignore", "Checkpoint directory .* exists and is not empty")
+        # Lightning looks for this in the loader; here the data module knows where to go on.
+        warnings.filterwarnings("ignore", ".* your dataloader is not resumable")
+        # network.frozen_statistics=true
+        warnings.filterwarnings("ignore", "Found .* in eval mode at the start of training")
+        try:
+            trainer.fit(run.task, datamodule=run.data, ckpt_path=resumed, weights_only=True)
+        except SIGTERMException:
+            sys.exit(128 + signal.SIGTERM)
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            if resumed is None or last.has_begun or isinstance(error, DataError | SettingError):
+                raise
+            raise DataError(
+                resumed,
+                found=f"what cannot be resumed ({type(error).__name__}: {error})",
+                expected="the last checkpoint of this run",
+            ) from error
+        except MisconfigurationException as error:  # as fewer epochs than a resumed run has done
+            raise SettingError("trainer", found=error, expected="settings that can work") from error
+
+
+def _check_resumed(settings: Settings, before: Mapping[str, Any]) -> None:
+    """Refuse to resume a run as another one."""
+    for name, now, then in differing_settings(settings, before, "resume"):
+        raise SettingError(
+            name,
+            found=f"{now!r} for a run that began with {then!r}",
+            expected="no other than before",
+            remedy="Start a new run for it.",
+        )
+
+
+def _typed_local() -> list[str]:
+    """What was typed that no file says: a resumed run has to be told it again."""
+    typed = [said.lstrip("+") for said in HydraConfig.get().overrides.task]
+    names = [said.partition("=")[0] for said in typed]
+    pairs = zip(names, typed, strict=True)
+    return [said for name, said in pairs if name == "trust" or not from_file(name)]
+
+
+def _channels(path: Path, data: Any) -> Any:
+    """Names of the channels that the network of a file takes, and of those of the data."""
+    before, now = inputs_in(path), getattr(data, "inputs", None)
+    return None if before is None or now is None else (channel_names(before), channel_names(now))

@@ -1,0 +1,65 @@
+"""Runs as processes: they end with what started them, after a last checkpoint."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from pathlib import Path
+
+import pytest
+
+from tangent_train.cli import processes
+
+
+def _python(code: str) -> list[str]:
+    return [sys.executable, "-c", f"import os, signal, sys, time\n{code}"]
+
+
+def test_the_status_and_variables_of_a_process() -> None:
+    code = "sys.exit(3 if os.environ['PYTHONSAFEPATH'] and os.environ.get('X') == 'y' else 4)"
+    assert processes.run_process(_python(code), {"X": "y"}) == 3
+    code = "sys.exit(3 if 'PATH' not in os.environ else 4)"
+    assert processes.run_process(_python(code), {"PATH": None}) == 3
+
+
+def test_a_folder_reaches_hydra_as_it_is(tmp_path: Path) -> None:
+    line = processes.command_line("train", ["a=1"], tmp_path / "it's ${here}")
+    assert line[-1] == rf"hydra.run.dir='{tmp_path}/it\'s \${{here}}'"
+
+
+def test_sigterm_reaches_the_job_which_may_finish_its_checkpoint(tmp_path: Path) -> None:
+    mark = tmp_path / "saved"
+    code = (
+        f"def save(*_): time.sleep(0.2); open({str(mark)!r}, 'w'); sys.exit(143)\n"
+        "signal.signal(signal.SIGTERM, save)\n"
+        "os.kill(os.getppid(), signal.SIGTERM)\n"
+        "time.sleep(60)"
+    )
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(SystemExit) as stopped:
+        processes.run_process(_python(code))
+    assert stopped.value.code == 128 + signal.SIGTERM
+    assert mark.exists()
+    assert signal.getsignal(signal.SIGTERM) == before
+
+
+def test_ctrl_c_ends_a_job_that_does_not_listen(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(processes, "_PATIENCE_S", 0.3)
+    number = tmp_path / "pid"
+    code = (
+        f"open({str(number)!r}, 'w').write(str(os.getpid()))\n"
+        "signal.signal(signal.SIGTERM, signal.SIG_IGN)\n"
+        "os.kill(os.getppid(), signal.SIGINT)\ntime.sleep(60)"
+    )
+    # A shell starts what runs in the background deaf to it.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            processes.run_process(_python(code))
+    finally:
+        signal.signal(signal.SIGINT, before)
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(number.read_text()), 0)

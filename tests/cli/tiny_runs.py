@@ -1,0 +1,42 @@
+"""Settings of runs of a second, and commands in this process."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tangent_train.cli import main
+
+__all__ = ["SETTINGS", "results", "run_command"]
+
+_ROOMS = {"1": 2, "2": 2, "3": 1, "4": 1, "5a": 1, "5b": 1, "6": 1}
+SETTINGS = (
+    "experiment=rooms/demo",
+    "level=4",
+    "representation.crop_multiple=null",
+    "network.widths=[4,8]",
+    "data.panoramas_per_step=2",
+    "data.validation_fraction=0.2",
+    "data.rooms.height=32",
+    *(f"data.rooms.rooms.area_{area}={n}" for area, n in _ROOMS.items()),
+    "trainer.max_epochs=2",
+    "trainer.check_val_every_n_epoch=1",
+    "trainer.accelerator=cpu",
+    "panels=1",
+)
+
+
+def run_command(monkeypatch: pytest.MonkeyPatch, command: str, *arguments: str) -> None:
+    """Run a command in this process."""
+    monkeypatch.setattr(sys, "argv", [f"tangent-{command}", *arguments])
+    getattr(main, command)()
+
+
+def results(folder: Path) -> dict[str, Any]:
+    """What a run wrote."""
+    content: dict[str, Any] = json.loads((folder / "results.json").read_text())
+    return content

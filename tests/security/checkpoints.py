@@ -1,0 +1,73 @@
+"""Attacks at the places of a checkpoint, through all that reads one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from tangent_train.checkpoints.trained import inputs_in, load_trained
+from tangent_train.cli.build import build
+from tangent_train.cli.stored import stored_run
+from tangent_train.errors import DataError, SettingError
+from tangent_train.registry import make
+from tests.security.attacks import attacks, places, replaced, sampled
+from tests.security.honest import composed
+from tests.security.watch import watched
+
+__all__ = ["attack_checkpoints", "nothing_happens"]
+
+
+def nothing_happens(use: Callable[[Path], Any], path: Path, forbidden: Path, what: object) -> None:
+    """Use a file: it is taken for what it is, or refused in one line that names it."""
+    with watched(forbidden) as happened, suppress(DataError, SettingError):
+        use(path)
+    assert not happened, (what, happened)
+    assert [path.name for path in forbidden.iterdir()] == ["config.json"], what
+
+
+def attack_checkpoints(
+    content: dict[str, Any], forbidden: Path, each: int | None, only: Sequence[str] = ()
+) -> None:
+    """Put attacks into a checkpoint.
+
+    Args:
+        content: Of an honest one.
+        forbidden: A folder that exists and nobody else names.
+        each: How many attacks at every place, and places for every attack; None for all pairs.
+        only: Sections of the config to attack as a whole; all places if empty.
+    """
+    honest = forbidden.parent / "honest.ckpt"
+    torch.save(content, honest)
+    arguments = [f"checkpoint={honest}", "data.root=rooms"]
+    stored = stored_run("evaluate", arguments)
+    assert stored is not None
+    said = composed(stored.arguments)
+
+    def evaluated(path: Path) -> None:
+        stored = stored_run("evaluate", [f"checkpoint={path}", "data.root=rooms"])
+        assert stored is not None
+        settings, source = stored.settings(said)
+        build(settings, source)
+        make(settings["trainer"], "trainer", source, logger=False)
+
+    for path, what in _changed(content, forbidden, each, only):
+        for use in (load_trained, evaluated, inputs_in):
+            nothing_happens(use, path, forbidden, what)
+
+
+def _changed(
+    content: dict[str, Any], forbidden: Path, each: int | None, only: Sequence[str]
+) -> Iterator[tuple[Path, object]]:
+    path = forbidden.parent / "x.ckpt"
+    lighter = content | {"optimizer_states": [], "loops": {}}
+    all_places = [("config", *place) for place in places(content["config"])]
+    all_places += [(name,) for name in ("config", "class_names", "inputs", "kind", "state_dict")]
+    all_places += [("normalization",), ("normalization", "mean")]
+    all_places = [("config", name) for name in only] or all_places
+    for place, value in sampled(list(attacks(forbidden)), all_places, each):
+        torch.save(replaced(lighter, place, value), path)
+        yield path, (place, value)

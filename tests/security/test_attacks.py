@@ -1,0 +1,122 @@
+"""Nothing in a file of other people is interpreted, wherever in it an attack is put."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import onnx
+import pytest
+import yaml  # type: ignore[import-untyped]
+from safetensors.torch import load_file, save_file
+
+from tangent_train import registry
+from tangent_train.checkpoints.content import read_settings
+from tangent_train.checkpoints.trained import METADATA_KEY, inputs_in, load_trained
+from tangent_train.cli.keypoints import earlier_results
+from tangent_train.errors import DataError, SettingError
+from tangent_train.rendering.camera_files import read_cameras
+from tangent_train.results.record import load_record
+from tests.security.attacks import json_attacks, places, replaced, sampled
+from tests.security.checkpoints import attack_checkpoints, nothing_happens
+from tests.security.honest import run_command
+
+
+def test_in_a_checkpoint(content: dict[str, Any], forbidden: Path) -> None:
+    attack_checkpoints(content, forbidden, each=1)
+
+
+def _without_the_registry(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(
+        registry, "_find", lambda target: (registry.import_named(target, "x"), {"**": Any})
+    )
+
+
+def _without_kinds(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(registry, "_fits", lambda value, kind: True)
+
+
+def _without_depth(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(registry, "_DEEPEST", 10**9)
+
+
+def _without_words(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(registry, "_WORD", re.compile(".*", re.DOTALL))
+
+
+@pytest.mark.parametrize(
+    "taken_out", [_without_the_registry, _without_kinds, _without_depth, _without_words]
+)
+def test_attacks_are_noticed_when_a_check_is_taken_out(
+    taken_out: Callable[[pytest.MonkeyPatch], None],
+    content: dict[str, Any],
+    forbidden: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Else the test above could not fail."""
+
+    def no_network(*_: object, **__: object) -> None:
+        raise AssertionError("the network was asked for")
+
+    monkeypatch.setattr("socket.getaddrinfo", no_network)
+    taken_out(monkeypatch)
+    with pytest.raises(BaseException, match=r"(?s).") as raised:
+        attack_checkpoints(content, forbidden, each=None, only=("network", "representation"))
+    assert not isinstance(raised.value, DataError | SettingError)
+
+
+def test_in_the_metadata_of_an_exported_network(run: Path, forbidden: Path) -> None:
+    header = (run.parent / "net.safetensors").read_bytes()
+    length = int.from_bytes(header[:8], "little")
+    described = json.loads(json.loads(header[8 : 8 + length])["__metadata__"][METADATA_KEY])
+    tensors = load_file(run.parent / "net.safetensors")
+    node = onnx.helper.make_node("Identity", ["images"], ["scores"])
+    ends = [
+        onnx.helper.make_tensor_value_info(end, onnx.TensorProto.FLOAT, [None] * 4)
+        for end in ("images", "scores")
+    ]
+    graph = onnx.helper.make_graph([node], "x", ends[:1], ends[1:])
+    opset = [onnx.helper.make_opsetid("", 17)]
+    model = onnx.helper.make_model(graph, opset_imports=opset, ir_version=9)
+    for place, value in sampled(list(json_attacks(forbidden)), list(places(described)), each=1):
+        text = json.dumps(replaced(described, place, value))
+        one, other = forbidden.parent / "x.safetensors", forbidden.parent / "x.onnx"
+        save_file(tensors, one, {METADATA_KEY: text})
+        onnx.helper.set_model_props(model, {METADATA_KEY: text})
+        onnx.save(model, other)
+        for path in (one, other):
+            nothing_happens(load_trained, path, forbidden, (place, value))
+        nothing_happens(inputs_in, one, forbidden, (place, value))
+
+
+def test_in_the_settings_of_a_run(run: Path, forbidden: Path) -> None:
+    folder = forbidden.parent / "theirs"
+    shutil.copytree(run, folder, ignore=shutil.ignore_patterns("tensorboard", "checkpoints"))
+    settings = read_settings(run / "config.yaml")
+    for place, value in sampled(list(json_attacks(forbidden)), list(places(settings)), each=1):
+        (folder / "config.yaml").write_text(yaml.safe_dump(replaced(settings, place, value)))
+        nothing_happens(load_record, folder, forbidden, (place, value))
+
+
+def test_in_lists_of_cameras_and_results_of_keypoints(
+    run: Path, forbidden: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(forbidden.parent)
+    panorama = next((run.parent / "rooms").rglob("*equirectangular_domain_rgb.png"))
+    tangent = ("output=tangent", "level=4", "base_level=0")
+    run_command(monkeypatch, "render", f"input={panorama}", *tangent)
+    cameras = next(Path("tangent").rglob("cameras.json"))
+    Path("found").mkdir()
+    results = Path("found") / "results.json"
+    pairs = {"settings": {"level": 5}, "rows": [{"pair": "a", "pmr": 0.5}]}
+    for path, use, honest in (
+        (cameras, read_cameras, json.loads(cameras.read_text())),
+        (results, lambda p: earlier_results(p.parent, {"level": 5}), pairs),
+    ):
+        for place, value in sampled(list(json_attacks(forbidden)), list(places(honest)), each=1):
+            path.write_text(json.dumps(replaced(honest, place, value)))
+            nothing_happens(use, path, forbidden, (path, place, value))

@@ -1,0 +1,342 @@
+"""Settings inside checkpoints and runs: what they may say, and what is looked up here instead."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import yaml  # type: ignore[import-untyped]
+from rich.console import Console
+from torch import nn
+
+from datamodules.core.samples import Input
+from models import initialize
+from tangent_train import registry
+from tangent_train.callbacks.checkpoints import AtomicCheckpointIO, BestCheckpoint
+from tangent_train.checkpoints.content import INPUTS, read_checkpoint, read_settings
+from tangent_train.checkpoints.trained import completed_settings, inputs_in, load_trained
+from tangent_train.cli.build import build
+from tangent_train.cli.compose import config_folder
+from tangent_train.errors import DataError, SettingError
+from tangent_train.registry import SettingsFile, make
+from tests.security.honest import SECRET, run_command, settled, with_config
+from tests.security.watch import CANARY, watched
+
+_FIRE = f"{CANARY}.fire"
+_UNET = {"_target_": "models.UNet", "in_channels": 3, "num_classes": 14, "widths": [4, 8]}
+_TIMM = {"_target_": "timm.create_model"}
+WAYS: dict[str, tuple[dict[str, Any], str]] = {
+    "code": ({"network": {"_target_": _FIRE}}, rf"network\._target_={_FIRE}.*trust={_FIRE}"),
+    "text for a section": ({"network": f"_target_: {_FIRE}"}, "network="),
+    "resolver": ({"network": f"${{oc.create:{{_target_: {_FIRE}}}}}"}, "network="),
+    "nested resolver": (
+        {"network": _UNET | {"widths": f"${{oc.${{c}}:{{_target_: {_FIRE}}}}}"}, "c": "create"},
+        r"network\.widths=",
+    ),
+    "reference": (
+        {"network": _TIMM | {"model_name": "${note}"}, "note": "hf-hub:somebody/net"},
+        r"network\.model_name=",
+    ),
+    "positional": (
+        {"network": _TIMM | {"_args_": ["resnet18", True, {"hf_hub_id": "a/b"}]}},
+        r"network\._args_=",
+    ),
+    "weights by position": (
+        {"network": _TIMM | {"_args_": ["resnet18", False, None, None, "x.pth"]}},
+        r"network\._args_=",
+    ),
+}
+"""What ran once: sections of a config, and what is said of them now."""
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_what_once_ran_is_refused(way: str, content: dict[str, Any], forbidden: Path) -> None:
+    sections, message = WAYS[way]
+    path = with_config(content, forbidden.parent, **sections)
+    with watched(forbidden) as happened:
+        for read in (load_trained, lambda path: build(*settled(path))):
+            with pytest.raises(DataError, match=rf"last\.ckpt: found (config\.)?{message}"):
+                read(path)
+        network = make(_UNET, "network")
+        assert initialize(network, path).share == 1, "reads tensors only"
+        assert inputs_in(path) == ("rgb",)
+    assert not happened
+
+
+def test_a_command_says_it_in_a_line(
+    content: dict[str, Any], forbidden: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(forbidden.parent)
+    with_config(content, Path(), network={"_target_": _FIRE})
+    commands = {"evaluate": "checkpoint=run/checkpoints/last.ckpt", "train": "resume=run"}
+    for command, given in commands.items():
+        refused = pytest.raises(SystemExit, match=rf"^tangent-{command}: .*trust={_FIRE}")
+        with watched(forbidden) as happened, refused:
+            run_command(monkeypatch, command, given, "data.root=rooms")
+        assert not happened
+
+
+def test_what_concerns_this_machine_is_its_own(content: dict[str, Any], forbidden: Path) -> None:
+    """What compiles, where files are, and how many processes there are."""
+    options = {"options": {"cpp.cxx": f"sh -c 'id > {forbidden}/x'"}}
+    config = content["config"]
+    many = {"devices": 3, "strategy": "ddp", "num_nodes": 2, "accelerator": "gpu"}
+    path = with_config(
+        content,
+        forbidden.parent,
+        task=config["task"] | {"compile": options},
+        data=config["data"] | {"root": str(forbidden), "store": "/x"},
+        trainer=config["trainer"] | many | {"model_registry": "x", "max_time": "00:01:00"},
+    )
+    with watched(forbidden) as happened:
+        settings, _ = settled(path, "task.compile={mode: max-autotune}", root="mine")
+        assert settings["task"]["compile"] == {"mode": "max-autotune"}
+        settings, _ = settled(path, root="mine")
+    assert not happened
+    assert settings["task"].get("compile") is None
+    assert settings["data"]["root"] == "mine"
+    assert settings["data"].get("store") is None
+    assert settings["trainer"]["devices"] == settings["trainer"]["accelerator"] == "auto"
+    assert not {"strategy", "num_nodes", "model_registry", "max_time"} & settings["trainer"].keys()
+    with pytest.raises(SettingError, match=r"data\.root: found .*The run had data\.root="):
+        settled(path, root=None)
+    own = with_config(content, forbidden.parent, data=config["data"] | {"root": "data/rooms_demo"})
+    assert settled(own, root=None)[0]["data"]["root"] == "data/rooms_demo", "as one's own config"
+
+
+def test_names_of_options_are_no_paths(
+    content: dict[str, Any], forbidden: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(forbidden.parent)
+    (forbidden / "data").mkdir()
+    target = content["config"]["data"]["_target_"]
+    theirs = f"# @package data\n_target_: {target}\nroot: rooms\nstore: x_${{oc.env:SECRET}}\n"
+    (forbidden / "data" / "z.yaml").write_text(theirs)
+    up = "/".join([".."] * 30)
+    for option in (f"{up}{forbidden}/data/z", "../data/folder", "a\0b/c", "z", "x\nseed=3"):
+        for group in ("data", "experiment", "trainer"):
+            path = with_config(content, forbidden.parent, choices={group: option})
+            with watched(forbidden) as happened:
+                try:
+                    settings, _ = settled(path)
+                except DataError as error:
+                    assert "choices" in str(error)  # noqa: PT017 - either is right
+                else:
+                    assert settings["data"].get("store") is None
+                    assert settings["seed"] == 0
+            assert not [event for event in happened if "z.yaml" in event]
+
+
+def test_options_in_place_of_stored_sections_keep_what_belongs_to_the_network(
+    content: dict[str, Any], tmp_path: Path
+) -> None:
+    data = content["config"]["data"] | {"fold": 3}
+    path = with_config(content, tmp_path, data=data)
+    settings, source = settled(path, "data=folder", "representation=cubemap", "level=5")
+    assert settings["data"]["_target_"] == "datamodules.FolderPanoramas"
+    assert settings["data"]["inputs"] == ["rgb"]
+    assert "fold" not in settings["data"]
+    assert settings["representation"]["level"] == settings["level"] == 5
+    assert settings["network"]["widths"] == [4, 8]
+    assert not source.owns("data.anything")
+    assert source.owns("network.widths")
+    settings, _ = settled(path, "data.fold=2", "seed=7", "~data.mask")
+    assert (settings["data"]["fold"], settings["data"]["seed"]) == (2, 7)
+    assert "mask" not in settings["data"]
+
+
+@pytest.mark.parametrize("name", ["..", "/", "notes.txt", "/etc/passwd"])
+def test_where_the_best_epoch_is_does_not_come_out_of_a_file(name: str, tmp_path: Path) -> None:
+    """Lightning removes the one that was the best before: once the whole folder, by its state."""
+    best = BestCheckpoint(tmp_path)
+    low = torch.tensor(-1.0)
+    state = dict.fromkeys(("best_model_path", "kth_best_model_path", "last_model_path"), name)
+    scores = dict.fromkeys(("best_model_score", "current_score", "kth_value"), low)
+    best.load_state_dict({**state, **scores, "best_k_models": {name: low}, "dirpath": "/"})
+    mine = str(tmp_path / "best.ckpt")
+    assert best.dirpath == str(tmp_path)
+    assert {best.best_model_path, best.kth_best_model_path, *best.best_k_models} == {mine}
+    assert best.last_model_path == ""
+    assert best.best_model_score == -1
+
+
+def test_checkpoints_are_files_when_they_are_removed(tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(OSError, match="folder"):
+        AtomicCheckpointIO().remove_checkpoint(tmp_path / "folder")
+    (tmp_path / "x.ckpt").touch()
+    AtomicCheckpointIO().remove_checkpoint(tmp_path / "x.ckpt")
+    assert [path.name for path in tmp_path.iterdir()] == ["folder"]
+
+
+def test_what_cannot_be_resumed_is_said_in_a_line(
+    run: Path, content: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(run.parent)
+    theirs = tmp_path / "theirs"
+    (theirs / "checkpoints").mkdir(parents=True)
+    for changed in ({"callbacks": "x"}, {"optimizer_states": [{"state": {}, "param_groups": "x"}]}):
+        torch.save(content | changed, theirs / "checkpoints" / "last.ckpt")
+        refused = pytest.raises(SystemExit, match=r"^tangent-train: .*found what cannot be resumed")
+        with refused:
+            run_command(monkeypatch, "train", f"resume={theirs}", "data.root=rooms")
+
+
+def test_terminals_get_no_commands(content: dict[str, Any], run: Path, tmp_path: Path) -> None:
+    evil = "a.b\x1b]0;owned\x07\n\x1b[31mtrust me"
+    path = with_config(content, tmp_path, network={"_target_": evil})
+    with pytest.raises(DataError) as refused:
+        load_trained(path)
+    assert "\x1b" not in str(refused.value)
+    for name in (evil, "a\nb"):
+        torch.save(content | {"class_names": [name] * 14}, path)
+        with pytest.raises(DataError, match="class_names="):
+            load_trained(path)
+    settings = read_settings(run / "config.yaml") | {"name": evil}
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(settings))
+    with pytest.raises(DataError, match=r"settings\.name="):
+        read_settings(tmp_path / "config.yaml")
+    network = make(_UNET, "network")
+    torch.save({"[/nope][link=x]" + evil: torch.zeros(1), **network.state_dict()}, path)
+    console = Console(record=True, width=200, force_terminal=True)
+    console.print(str(initialize(network, path)), markup=False)
+    shown = console.export_text()
+    assert "[/nope][link=x]a.b" in shown
+    assert "\x07" not in shown
+
+
+def test_reports_of_other_peoples_runs_look_nothing_up(
+    run: Path, forbidden: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(forbidden.parent)
+    settings = read_settings(run / "config.yaml")
+    settings |= {"c": "env", "name": "${oc.${c}:SECRET}"}
+    settings["data"] |= {"inputs": "${oc.env:SECRET}", "fold": "${oc.${c}:SECRET}"}
+    Path("theirs").mkdir()
+    shutil.copy(run / "results.json", "theirs")
+    Path("theirs/config.yaml").write_text(yaml.safe_dump(settings))
+    with pytest.raises(SystemExit, match=r"config\.yaml: found data\.fold=.* inside; expected"):
+        run_command(monkeypatch, "report", "theirs", "--output", "report")
+    settings["data"] |= {"inputs": ["rgb"], "fold": 1}
+    Path("theirs/config.yaml").write_text(yaml.safe_dump(settings))
+    run_command(monkeypatch, "report", "theirs", "--output", "report")
+    said = capsys.readouterr()
+    assert SECRET not in said.out + said.err
+    for path in Path("report").iterdir():
+        assert SECRET.encode() not in path.read_bytes(), path
+
+
+def test_aliases_in_settings_are_not_followed(tmp_path: Path) -> None:
+    lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x]"]
+    lines += [f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]" for k in range(1, 12)]
+    (tmp_path / "config.yaml").write_text("\n".join(lines))
+    with pytest.raises(DataError, match=r"config\.yaml: found an alias"):
+        read_settings(tmp_path / "config.yaml")
+    (tmp_path / "config.yaml").write_text("x: " + "[" * 1500 + "]" * 1500)
+    with pytest.raises(DataError, match=r"config\.yaml: found RecursionError"):
+        read_settings(tmp_path / "config.yaml")
+
+
+class Own(nn.Conv2d):
+    """A network of a user."""
+
+    def __init__(self, in_channels: int, num_classes: int, inner: Any = None) -> None:
+        super().__init__(in_channels, num_classes, 1)
+
+
+OWN = f"{__name__}.Own"
+
+
+def _own(content: dict[str, Any], path: Path, **settings: Any) -> Path:
+    network = {"_target_": OWN, "in_channels": 3, "num_classes": 14, **settings}
+    tensors = {f"network.{n}": t for n, t in Own(3, 14).state_dict().items()}
+    changed = content | {"config": content["config"] | {"network": network}}
+    torch.save(changed | {"state_dict": tensors}, path)
+    return path
+
+
+def test_ones_own_network_is_trusted_by_its_name(content: dict[str, Any], tmp_path: Path) -> None:
+    path = _own(content, tmp_path / "x.ckpt")
+    with pytest.raises(DataError, match=f"trust={OWN}"):
+        load_trained(path)
+    assert load_trained(path, [OWN]).in_channels == 3
+    for said in (f"trust={OWN}", f"trust=['{OWN}',my.Other]", f"network._target_={OWN}"):
+        build(*settled(path, said))
+    with pytest.raises(DataError, match=f"trust={OWN}"):
+        build(*settled(path, "trust=my.Other"))
+    # What it is given may be any plain value, but objects inside are checked all the same.
+    path = _own(content, tmp_path / "x.ckpt", inner={"a": [{"_target_": _FIRE}]})
+    with pytest.raises(DataError, match=rf"network\.inner\.a\.0\._target_={_FIRE}"):
+        load_trained(path, [OWN])
+
+
+def test_trust_reaches_exported_files(
+    content: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    _own(content, Path("x.ckpt"))
+    line = ["checkpoint=x.ckpt", "output=x.safetensors"]
+    with pytest.raises(SystemExit, match="trust: found 3; expected"):
+        run_command(monkeypatch, "export", *line, "trust=3")
+    run_command(monkeypatch, "export", *line, f"trust={OWN}")
+    with pytest.raises(DataError, match=f"trust={OWN}"):
+        load_trained(Path("x.safetensors"))
+    assert load_trained(Path("x.safetensors"), [OWN]).settings
+
+
+def test_tensors_are_tensors(content: dict[str, Any], tmp_path: Path) -> None:
+    path = tmp_path / "x.ckpt"
+    for wrong in ({"network.x": "y"}, {"network.x": [1]}, "text", None):
+        torch.save(content | {"state_dict": wrong}, path)
+        with pytest.raises(DataError, match=r"x\.ckpt: found"):
+            load_trained(path)
+    torch.save(content, path)
+    assert read_checkpoint(path)["kind"] == "segmentation"
+
+
+def _targets(settings: Any) -> set[str]:
+    inner = settings.values() if isinstance(settings, dict) else settings
+    if not isinstance(settings, dict | list):
+        return set()
+    named = {settings["_target_"]} if isinstance(settings, dict) and "_target_" in settings else []
+    return set(named).union(*map(_targets, inner))
+
+
+def test_files_may_name_all_that_the_configs_name() -> None:
+    for path in sorted(config_folder().rglob("*.yaml")):
+        for target in _targets(yaml.safe_load(path.read_text())):
+            if not target.endswith("Pairs"):  # of tangent-keypoints, which leaves no checkpoint
+                assert registry._find(target) is not None, (path, target)
+
+
+@pytest.mark.parametrize(
+    "network",
+    [
+        {"_target_": "torch.nn.Conv2d", "in_channels": 3, "out_channels": 14, "kernel_size": 1},
+        {"_target_": "torchvision.models.segmentation.fcn_resnet50", "weights": "DEFAULT"},
+        {"_target_": "segmentation_models_pytorch.FPN", "encoder_name": "tu-convnext_atto"},
+        {"_target_": "timm.create_model", "model_name": "resnet18.a1_in1k", "pretrained": True},
+    ],
+)
+def test_networks_of_libraries_need_no_trust_and_fetch_nothing(
+    network: dict[str, Any], tmp_path: Path
+) -> None:
+    settings = completed_settings(network, 3, 14, restored=True)
+    with watched(tmp_path / "forbidden") as happened, torch.device("meta"):
+        make(settings, "network", SettingsFile(tmp_path))
+    assert not happened
+
+
+def test_what_networks_are_shown_is_said_alike_in_both_places() -> None:
+    assert list[Input] == INPUTS
+
+
+def test_words_are_no_paths_and_no_addresses(tmp_path: Path) -> None:
+    for text in ("a/b", "hf-hub:a/b", "../x", "${x}", "x" * 101, "é", "a\nb"):
+        network = {"_target_": "timm.create_model", "model_name": text}
+        with pytest.raises(DataError, match=re.escape("network.model_name=")):
+            make(network, "network", SettingsFile(tmp_path))

@@ -1,0 +1,76 @@
+"""Runs of several processes: the steps and figures of one, also when they are cut short."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.cli.test_commands import CUT_SHORT
+from tests.cli.tiny_runs import SETTINGS, results, run_command
+
+# No batch statistics.
+PLAIN = """
+_target_: torch.nn.Conv2d
+in_channels: 4
+out_channels: 14
+kernel_size: 3
+padding: 1
+"""
+
+
+def _train(folder: Path, *arguments: str, status: int = 0, program: str = "-m") -> str:
+    command = ["-m", "tangent_train.cli.main", "train"] if program == "-m" else [program]
+    done = subprocess.run(
+        [sys.executable, *command, *arguments],
+        check=False,
+        cwd=folder,
+        env=os.environ | {"SIGNAL": str(int(signal.SIGTERM))},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == status, done.stderr
+    return done.stderr
+
+
+def test_two_processes_make_the_steps_and_figures_of_one(
+    rooms: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "own" / "network").mkdir(parents=True)
+    (tmp_path / "own" / "network" / "plain.yaml").write_text(PLAIN)
+    settings = [text for text in SETTINGS if not text.startswith("network.")]
+    common = ["--config-dir", str(tmp_path / "own"), *settings, rooms, "network=plain"]
+    common += ["trainer.max_steps=3", "optimizer=adam"]
+    one = ["data.panoramas_per_step=2", "hydra.run.dir=one"]
+    run_command(monkeypatch, "train", *common, *one)
+    devices = ["trainer.accelerator=cpu", "trainer.devices=2"]
+    two = [*common, "trainer=ddp", *devices, "trainer.max_steps=3"]
+    two += ["data.panoramas_per_step=1", "task.images_per_chunk=2"]
+    _train(tmp_path, *two, "hydra.run.dir=two")
+    assert {path.name for path in tmp_path.iterdir()} == {"one", "two", "own"}, "one folder each"
+    first, second = (
+        torch.load(tmp_path / n / "checkpoints" / "last.ckpt", weights_only=True)
+        for n in ("one", "two")
+    )
+    assert first["global_step"] == second["global_step"] == 3
+    torch.testing.assert_close(second["state_dict"], first["state_dict"], rtol=0, atol=1e-6)
+
+    (tmp_path / "cut_short.py").write_text(CUT_SHORT)
+    _train(tmp_path, *two, "hydra.run.dir=cut", status=143, program="cut_short.py")
+    resumed = (f"resume={tmp_path / 'cut'}", rooms, *devices, "trainer.strategy=ddp")
+    _train(tmp_path, *resumed)
+    assert results(tmp_path / "cut") == results(tmp_path / "two")
+    checkpoint = f"checkpoint={tmp_path / 'one' / 'checkpoints' / 'last.ckpt'}"
+    run_command(monkeypatch, "evaluate", checkpoint, rooms, "hydra.run.dir=again")
+    ddp = ["trainer=ddp", *devices, "hydra.run.dir=evaluated"]
+    program = [sys.executable, "-m", "tangent_train.cli.main", "evaluate"]
+    subprocess.run([*program, checkpoint, rooms, *ddp], check=True)
+    figures = [results(tmp_path / folder) for folder in ("again", "evaluated")]
+    assert figures[0]["confusion"] == figures[1]["confusion"]
+    assert figures[0]["miou_solid_angle"] == pytest.approx(figures[1]["miou_solid_angle"])

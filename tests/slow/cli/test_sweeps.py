@@ -1,0 +1,136 @@
+"""Sweeps: every job a run in its own process and folder, whoever launches it."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+from submitit.core.utils import FailedJobError
+
+from tests.cli.tiny_runs import SETTINGS, run_command
+
+# Optuna 2.10, all that hydra-optuna-sweeper works with, is written for an old one.
+OLD_SQLALCHEMY = pytest.mark.filterwarnings("ignore:Deprecated API features detected")
+
+
+@pytest.fixture(autouse=True)
+def _no_debugger(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Hydra takes the tracer of a coverage run for a debugger, and lets exceptions through."""
+    monkeypatch.setattr("hydra._internal.utils.is_under_debugger", lambda: False)
+
+
+@pytest.fixture
+def settings(rooms: str) -> tuple[str, ...]:
+    """Of a run of one epoch."""
+    return (*SETTINGS, rooms, "trainer.max_epochs=1", "panels=0")
+
+
+def _json(path: Path) -> dict[str, Any]:
+    content: dict[str, Any] = json.loads(path.read_text())
+    return content
+
+
+def _writers(run: Path) -> set[int]:
+    """Processes that logged in a run's folder; TensorBoard puts them into the files' names."""
+    names = [path.name for path in (run / "tensorboard").glob("events.*")]
+    return {int(name.split(".")[-2]) for name in names}
+
+
+def _runs(folder: Path) -> list[str]:
+    return sorted(path.parent.name for path in folder.glob("*/results.json"))
+
+
+def test_jobs_of_a_grid_are_runs_of_their_own_on_any_number_of_devices(
+    settings: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    # A folder named as one of this project's packages must not be imported in its place.
+    (tmp_path / "models").mkdir()
+    (tmp_path / "models" / "__init__.py").write_text("raise ImportError('the wrong models')\n")
+    grid = ("-m", "trainer=ddp", "trainer.devices=1,2", "hydra.sweep.dir=a sweep")
+    run_command(monkeypatch, "train", *grid, *settings)
+    runs = [tmp_path / "a sweep" / number for number in "01"]
+    assert _runs(tmp_path / "a sweep") == ["0", "1"]
+    assert {path.name for path in tmp_path.iterdir()} == {"a sweep", "models"}, "run folders"
+    (first,), (second,) = map(_writers, runs)
+    assert len({os.getpid(), first, second}) == 3
+    for run, devices in zip(runs, (1, 2), strict=True):
+        assert f"\n  devices: {devices}\n" in (run / "config.yaml").read_text()
+        assert _json(run / "results.json")["images"] == 2
+    checkpoint = f"checkpoint={runs[0] / 'checkpoints' / 'last.ckpt'}"
+    turned = ("data.test_rotation=null,so3", "hydra.sweep.dir=turned")
+    run_command(monkeypatch, "evaluate", "-m", checkpoint, settings[-3], *turned)
+    figures = [_json(tmp_path / "turned" / n / "results.json")["confusion"] for n in "01"]
+    assert figures[0] == _json(runs[0] / "results.json")["confusion"] != figures[1]
+
+
+@OLD_SQLALCHEMY
+def test_optuna_compares_runs_of_submitit_by_their_validation(
+    settings: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    study = ("hydra.sweeper.n_trials=2", "hydra.sweeper.n_jobs=2", "hydra.sweep.dir=study")
+    run_command(monkeypatch, "train", "-m", "sweep=optuna", "launcher=local", *study, *settings)
+    runs = [tmp_path / "study" / number for number in "01"]
+    assert _runs(tmp_path / "study") == ["0", "1"]
+    (first,), (second,) = map(_writers, runs)
+    assert len({os.getpid(), first, second}) == 3
+    found = [_json(run / "validation.json") for run in runs]
+    assert [figure["figure"] for figure in found] == ["val/miou", "val/miou"]
+    best = (tmp_path / "study" / "optimization_results.yaml").read_text()
+    (value,) = re.findall(r"best_value: (\S+)", best)
+    assert float(value) == max(figure["best"] for figure in found)
+    (rate,) = re.findall(r"optimizer.lr: (\S+)", best)
+    rates = [
+        re.findall(r"^  lr: (\S+)", (run / "config.yaml").read_text(), re.MULTILINE)[0]
+        for run in runs
+    ]
+    assert len(set(rates)) == 2
+    assert rate in rates
+
+
+def test_failing_jobs_are_shown_and_do_not_stop_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit):
+        run_command(monkeypatch, "train", "-m", "data.fold=4,5", "hydra.sweep.dir=sweep", *SETTINGS)
+    error = capfd.readouterr().err
+    assert error.count("tangent-train: data.fold: found 4") == 1
+    assert error.count("tangent-train: data.fold: found 5") == 1
+    assert f"job 0 in {tmp_path / 'sweep' / '0'} ended with status 1" in error
+    assert "Traceback" not in error
+
+
+@OLD_SQLALCHEMY
+def test_a_search_without_a_validation_split_is_refused(
+    settings: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    message = r"^tangent-train: data\.validation_fraction: found no validation split"
+    without = (*settings, "data.validation_fraction=0")
+    with pytest.raises(SystemExit, match=message):
+        run_command(monkeypatch, "train", "-m", "sweep=optuna", *without)
+    assert not list(tmp_path.rglob("checkpoints"))
+
+
+def test_slurm_gets_the_resources_of_the_config(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name, script in {"srun": "exit 0", "sbatch": f'cp "$1" {tmp_path}/job; exit 1'}.items():
+        (tmp_path / "bin").mkdir(exist_ok=True)
+        (tmp_path / "bin" / name).write_text(f"#!/bin/sh\n{script}\n")
+        (tmp_path / "bin" / name).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}:{os.environ['PATH']}")
+    asked = ("hydra.launcher.partition=gpu", "hydra.launcher.gpus_per_node=4")
+    with pytest.raises((SystemExit, FailedJobError)):
+        run_command(monkeypatch, "train", "-m", "launcher=slurm", "seed=1,2", "name=try", *asked)
+    job = (tmp_path / "job").read_text()
+    for option in ("job-name=try", "partition=gpu", "gpus-per-node=4", "ntasks-per-node=4",
+                   "cpus-per-task=8", "mem=32GB", "time=1440", "array=0-1%2"):  # fmt: skip
+        assert f"#SBATCH --{option}\n" in job, job
