@@ -178,53 +178,34 @@ def _hash(cell: Floats, salt: float) -> Floats:
     return np.mod(np.abs(np.sin(cell * np.float32(12.9898 + salt)) * np.float32(437.5453)), 1)
 
 
-def _stripes(u: Floats, v: Floats, f: Floats) -> Floats:
-    return (np.mod(u * f, 1) < 0.45).astype(np.float32)
-
-
-def _tiles(u: Floats, v: Floats, f: Floats) -> Floats:
-    return ((np.mod(u * f, 1) < 0.05) | (np.mod(v * f, 1) < 0.05)).astype(np.float32)
-
-
-def _wood(u: Floats, v: Floats, f: Floats) -> Floats:
-    return 0.6 * _noise(u * 1.2, v * 24) + 0.4 * (np.mod(v * f, 1) < 0.04)
-
-
-def _speckle(u: Floats, v: Floats, f: Floats) -> Floats:
-    return _noise(u * 60, v * 60)
-
-
-def _books(u: Floats, v: Floats, f: Floats) -> Floats:
-    return _hash(np.floor(u * f), 0.0)
-
-
-def _strokes(u: Floats, v: Floats, f: Floats) -> Floats:
+def _strokes(u: Floats, v: Floats, f: Floats) -> NDArray[Any]:
     lines = np.abs(_noise(u * 7, v * f * 2.5) - 0.5) < 0.07
-    return (lines & (_noise(u * 0.9, v * 0.9 + 40) > 0.3)).astype(np.float32)
+    return lines & (_noise(u * 0.9, v * 0.9 + 40) > 0.3)
 
 
-def _papers(u: Floats, v: Floats, f: Floats) -> Floats:
+def _papers(u: Floats, v: Floats, f: Floats) -> NDArray[Any]:
     column, row = np.floor(u * f), np.floor(v * f * 0.75)
     inside = (np.mod(u * f, 1) > 0.15) & (np.mod(v * f * 0.75, 1) > 0.15)
-    return (inside & (_hash(column + 57 * row, 1.0) > 0.4)).astype(np.float32)
+    return inside & (_hash(column + 57 * row, 1.0) > 0.4)
 
 
-def _outside(u: Floats, v: Floats, f: Floats) -> Floats:
+def _outside(u: Floats, v: Floats, f: Floats) -> NDArray[Any]:
     """Land below a ragged skyline, with the sky paling towards it."""
     skyline = 1.1 + 0.7 * (_noise(np.floor(u * 4 * f), u * 0) - 0.5)
-    return np.where(v < skyline, 0.75 + 0.25 * _noise(u * 3, v * 3), 0).astype(np.float32)
+    return np.where(v < skyline, 0.75 + 0.25 * _noise(u * 3, v * 3), 0)
 
 
-_WEIGHTS: dict[int, Callable[[Floats, Floats, Floats], Floats]] = {
-    Pattern.STRIPES: _stripes,
-    Pattern.TILES: _tiles,
-    Pattern.WOOD: _wood,
-    Pattern.SPECKLE: _speckle,
-    Pattern.BOOKS: _books,
+_WEIGHTS: dict[int, Callable[[Floats, Floats, Floats], NDArray[Any]]] = {
+    Pattern.STRIPES: lambda u, v, f: np.mod(u * f, 1) < 0.45,
+    Pattern.TILES: lambda u, v, f: (np.mod(u * f, 1) < 0.05) | (np.mod(v * f, 1) < 0.05),
+    Pattern.WOOD: lambda u, v, f: 0.6 * _noise(u * 1.2, v * 24) + 0.4 * (np.mod(v * f, 1) < 0.04),
+    Pattern.SPECKLE: lambda u, v, f: _noise(u * 60, v * 60),
+    Pattern.BOOKS: lambda u, v, f: _hash(np.floor(u * f), 0.0),
     Pattern.STROKES: _strokes,
     Pattern.PAPERS: _papers,
     Pattern.OUTSIDE: _outside,
 }
+"""Weight of the second colour at positions u, v in metres, with f repetitions per metre."""
 
 
 def albedo(
