@@ -12,12 +12,13 @@ from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
+from numpy.lib.format import open_memmap
 from PIL import ExifTags, Image, ImageOps
 
 from datamodules.images.exr import read_exr, read_exr_size
 from datamodules.images.png import MOST_PIXELS, check_pixels, decode, read_png_header
 from tangent_train.errors import DataError, SettingError
-from tangent_train.files import atomic_path, write_bytes
+from tangent_train.files import atomic_path, reserve, write_bytes
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -29,6 +30,7 @@ __all__ = [
     "LOSSY_SUFFIXES",
     "PIXEL_SUFFIXES",
     "READABLE_SUFFIXES",
+    "array_file",
     "check_writable",
     "photo_fov_deg",
     "read_array",
@@ -290,6 +292,23 @@ def check_writable(suffix: str, dtype: DTypeLike, channels: int) -> None:
             found=f"{np.dtype(dtype)} pixels of {channels} channel{'s' if channels > 1 else ''}",
             expected=f"one that can hold them: {' or '.join((*able, '.npy'))}",
         )
+
+
+@contextmanager
+def array_file(path: Path, shape: tuple[int, ...], dtype: DTypeLike) -> Iterator[NDArray[Any]]:
+    """A ``.npy`` file as an array to be filled by the block; it appears when that succeeds.
+
+    Args:
+        path: The file.
+        shape: Of the array, which may be larger than the memory.
+        dtype: Of the array.
+    """
+    with atomic_path(path) as temporary:
+        array = open_memmap(temporary, "w+", dtype, shape)
+        with temporary.open("r+b") as file:
+            reserve(file, temporary.stat().st_size)
+        yield array
+        array.flush()
 
 
 def write_pixels(path: Path, pixels: NDArray[Any]) -> None:

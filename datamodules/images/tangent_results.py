@@ -10,17 +10,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
-from numpy.lib.format import open_memmap
 
 from datamodules.images.pixel_files import (
     LOSSY_SUFFIXES,
     READABLE_SUFFIXES,
+    array_file,
     check_writable,
     read_pixels,
     write_pixels,
 )
 from tangent_train.errors import DataError, SettingError
-from tangent_train.files import atomic_path, reserve
 from tangent_train.geometry import ResizedGrid
 from tangent_train.rendering import Blend, tangent_to_equirect
 
@@ -178,17 +177,14 @@ class TangentResults:
         arrays = self.arrays
         if z_depth:
             arrays = [_distances(array, grid, path) for array in arrays]
-        if suffix != ".npy":
-            panorama = np.empty((*shape, *channels), arrays[0].dtype)
+        whole = (*shape, *channels)
+        if suffix == ".npy":
+            with array_file(path, whole, dtype) as out:
+                self._render(arrays, grid, blend, out)
+        else:
+            panorama = np.empty(whole, arrays[0].dtype)
             self._render(arrays, grid, blend, panorama)
             write_pixels(path, panorama.astype(dtype, copy=False))
-            return
-        with atomic_path(path) as temporary:
-            mapped = open_memmap(temporary, "w+", dtype, (*shape, *channels))
-            with temporary.open("r+b") as file:
-                reserve(file, temporary.stat().st_size)
-            self._render(arrays, grid, blend, mapped)
-            mapped.flush()
 
     def _image_dtype(self) -> np.dtype[Any]:
         dtype = self.arrays[0].dtype
@@ -203,13 +199,13 @@ class TangentResults:
         shape = (out.shape[0], out.shape[1])
         if self.kind in ("labels", "depth"):
             out[:] = tangent_to_equirect(np.stack(arrays), grid, shape, interpolation="nearest")
-        elif out.ndim == 2:
-            out[:] = tangent_to_equirect(np.stack(arrays), grid, shape, blend)
-        else:
-            step = max(1, _GROUP_BYTES // (4 * grid.num_images * grid.dim**2))
-            for start in range(0, out.shape[2], step):
-                group = np.stack([array[..., start : start + step] for array in arrays])
-                out[..., start : start + step] = tangent_to_equirect(group, grid, shape, blend)
+            return
+        channels = out.shape[2:]
+        step = max(1, _GROUP_BYTES // (4 * grid.num_images * grid.dim**2))
+        for start in range(0, channels[0], step) if channels else (0,):
+            part = (..., slice(start, start + step)) if channels else ...
+            group = np.stack([array[part] for array in arrays])
+            out[part] = tangent_to_equirect(group, grid, shape, blend)
 
 
 def _kind_of(file: Path, array: NDArray[Any]) -> Kind:

@@ -96,7 +96,7 @@ def predict(config: Mapping[str, Any]) -> None:
     )
     earlier = folder.earlier(decisive) if settings.resume else {}
     if not (settings.overwrite or earlier):
-        folder.check(images)
+        folder.check()
     entries = [entry for name, entry in earlier.items() if name in images]
     missing = {name: path for name, path in images.items() if name not in earlier}
     _say(f"{len(images)} images, {len(entries)} of them done already.")

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from datamodules.images.pixel_files import write_pixels
+from datamodules.images.pixel_files import array_file, write_pixels
 from tangent_train.csv_text import csv_text
 from tangent_train.errors import SettingError
-from tangent_train.files import atomic_path, reserve, write_text
+from tangent_train.files import write_text
 from tangent_train.geometry import equirect_solid_angles
 from tangent_train.json_text import parse_json
 from tangent_train.results.html import EncodedImage, ViewerImage, encode_image, write_report
@@ -22,7 +22,7 @@ from tangent_train.results.pictures import colorize, overlay_picture
 from tangent_train.results.tables import Table, percent
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -34,6 +34,10 @@ __all__ = ["Entry", "PredictionFolder", "class_shares", "output_names"]
 
 _ROWS_AT_ONCE = 64
 _SUMMARY = "summary.json"
+_RESULTS = (
+    "labels", "color", "overlay", "probabilities",
+    "classes.json", _SUMMARY, "summary.csv", "report.html",
+)  # fmt: skip
 
 Entry = dict[str, Any]
 """What is known of an image: file, name, rows, columns and ``classes``, or file, name and error."""
@@ -122,22 +126,17 @@ class PredictionFolder:
         kinds |= {"probabilities": ".npy"} if self.probabilities else {}
         return {kind: self.path / kind / f"{name}{suffix}" for kind, suffix in kinds.items()}
 
-    def check(self, names: Iterable[str]) -> None:
-        """Refuse a folder with files that would be written over.
-
-        Args:
-            names: From `output_names`.
+    def check(self) -> None:
+        """Refuse a folder with earlier results.
 
         Raises:
-            SettingError: There is one.
+            SettingError: There are some.
         """
-        wanted = [file for name in names for file in self.files(name).values()]
-        of_all = ("classes.json", _SUMMARY, "summary.csv", "report.html")
-        there = [file for file in [*wanted, *(self.path / n for n in of_all)] if file.exists()]
+        there = [path for name in _RESULTS if (path := self.path / name).exists()]
         if there:
             raise SettingError(
                 "output",
-                found=f"{there[0]}" + (f" and {len(there) - 1} more" if there[1:] else ""),
+                found=there[0],
                 expected="a folder without earlier results",
                 remedy="Give another folder, resume=true to keep them, or overwrite=true.",
             )
@@ -154,17 +153,16 @@ class PredictionFolder:
         try:
             content = parse_json((self.path / _SUMMARY).read_bytes())
             entries = {entry["name"]: entry for entry in content["images"] if "classes" in entry}
-            before = {name: content[name] for name in settings}
+            changed = [f"{n}={v}" for n, v in settings.items() if v != content[n]]
         except (OSError, ValueError, KeyError, TypeError):
             return {}
-        for name, value in settings.items():
-            if value != before[name]:
-                raise SettingError(
-                    name,
-                    found=value,
-                    expected=f"{before[name]}, as for the results in {self.path}",
-                    remedy="Give another folder, or overwrite=true.",
-                )
+        if changed:
+            raise SettingError(
+                "resume",
+                found=f"{changed[0]}, another setting than for the results in {self.path}",
+                expected="the same",
+                remedy="Give another folder, or overwrite=true.",
+            )
         complete = {n for n in entries if all(f.is_file() for f in self.files(n).values())}
         return {name: entry for name, entry in entries.items() if name in complete}
 
@@ -194,14 +192,10 @@ class PredictionFolder:
         everywhere = np.arange(labels.shape[0]), np.arange(labels.shape[1])
         rows, columns = everywhere if area is None else area.places()
         shape = (*labels.shape, len(self.class_names) - 1)
-        with atomic_path(files["probabilities"]) as temporary:
-            array = np.lib.format.open_memmap(temporary, "w+", np.float16, shape)
-            with temporary.open("r+b") as file:
-                reserve(file, temporary.stat().st_size)
+        with array_file(files["probabilities"], shape, np.float16) as array:
             for start in range(0, len(rows), _ROWS_AT_ONCE):
                 part = slice(start, start + _ROWS_AT_ONCE)
                 array[part] = scores.probabilities(rows[part])[:, columns]
-            array.flush()
 
     def write_summary(self, settings: Mapping[str, Any], entries: Sequence[Entry]) -> None:
         """Write ``summary.json``, ``summary.csv`` and ``classes.json`` (label values by name).

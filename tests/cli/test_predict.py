@@ -256,7 +256,7 @@ def test_an_interruption_keeps_what_is_done(
     monkeypatch.setattr("tangent_train.cli.predict.read_panorama", read_panorama)
     first = (output / "labels" / "a.png").stat().st_mtime_ns
     settings = {"checkpoint": checkpoint, "input": tmp_path / "panoramas", "output": output}
-    with pytest.raises(SystemExit, match="blend: found nearest; expected feather"):
+    with pytest.raises(SystemExit, match="resume: found blend=nearest, another setting"):
         _predict(monkeypatch, **settings, resume="true", blend="nearest")
     _predict(monkeypatch, **settings, resume="true")
     images = json.loads((output / "summary.json").read_text())["images"]
