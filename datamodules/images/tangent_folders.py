@@ -60,25 +60,22 @@ def shrink_to_level(image: NDArray[Any], level: int) -> NDArray[Any]:
     """Shrink a panorama with more rows than a level by averaging areas: no aliasing.
 
     Args:
-        image: ``(H, W)`` or ``(H, W, C)`` numbers.
+        image: ``(H, W)`` or ``(H, W, C)``; other dtypes than uint8, uint16, float32 and float64
+            are not averaged.
         level: Level s.
 
     Returns:
-        The image itself, or one of the level's size; same dtype.
+        The image itself, or one of the level's size.
     """
     height, width = equirect_shape(level)
-    if image.shape[0] <= height:
+    if image.shape[0] <= height or image.dtype not in _RESIZABLE:
         return image
-    source = image if image.dtype in _RESIZABLE else image.astype(np.float64)
-    source = source if source.ndim == 3 else source[..., None]
-    small = np.empty((height, width, source.shape[2]), source.dtype)
-    for first in range(0, source.shape[2], 4):  # OpenCV resizes four channels at once
-        group = np.ascontiguousarray(source[..., first : first + 4])
-        part = cv2.resize(group, (width, height), interpolation=cv2.INTER_AREA)
-        small[..., first : first + 4] = part.reshape(height, width, -1)
-    if image.dtype not in _RESIZABLE:
-        small = (np.rint(small) if image.dtype.kind in "ui" else small).astype(image.dtype)
-    return small if image.ndim == 3 else small[..., 0]
+    channels = np.atleast_3d(image)
+    small = np.empty((height, width, channels.shape[2]), image.dtype)
+    for k in range(channels.shape[2]):  # OpenCV takes four channels at most
+        one = np.ascontiguousarray(channels[..., k])
+        small[..., k] = cv2.resize(one, (width, height), interpolation=cv2.INTER_AREA)
+    return small.reshape(height, width, *image.shape[2:])
 
 
 def write_tangent_folder(

@@ -115,9 +115,10 @@ def predict(config: Mapping[str, Any]) -> None:
         _save(folder, decisive, entries)
     if label.shown:
         folder.write_page(entries, label.shown)
-    _say(folder.mean_shares(entries).terminal())
-    _say(f"Results are in {settings.output}.")
     failed = sum("error" in entry for entry in entries)
+    if failed < len(entries):
+        _say(folder.mean_shares(entries).terminal())
+        _say(f"Results are in {settings.output}.")
     if failed:
         sys.exit(f"tangent-predict: {failed} of {len(entries)} images could not be used, see above")
 

@@ -23,6 +23,7 @@ _SAID = {
     str: "a text",
     Path: "a file or folder",
     NoneType: "null",
+    tuple: "a list",
 }
 
 
@@ -79,9 +80,4 @@ def _as(kind: Any, value: Any) -> Any:
 def _said(kind: Any) -> str:
     if get_origin(kind) is Literal:
         return " or ".join(map(str, get_args(kind)))
-    if get_origin(kind) is tuple:
-        *kinds, last = get_args(kind)
-        return f"[{', '.join(_said(one) for one in (kinds if last is ... else (*kinds, last)))}" + (
-            ", …]" if last is ... else "]"
-        )
-    return _SAID[kind]
+    return _SAID[get_origin(kind) or kind]

@@ -50,10 +50,6 @@ class Export(NamedTuple):
     difference: float
 
 
-class _DifferenceError(Exception):
-    """The file does not compute what the network computes."""
-
-
 def export_network(
     trained: TrainedNetwork,
     path: Path,
@@ -195,11 +191,11 @@ def _verified(trained: TrainedNetwork, path: Path) -> Export:
             images = _random_images(trained, count, size)
             expected, found = trained.network(images), exported.network(images)
             if found.shape != expected.shape:
-                raise _DifferenceError(f"scores {tuple(found.shape)}, not {tuple(expected.shape)}")
+                raise ArithmeticError(f"scores {tuple(found.shape)}, not {tuple(expected.shape)}")
             span = float(expected.max() - expected.min())
             difference = float((found - expected).abs().max())
             if not difference <= TOLERANCE * span:  # so that NaN is refused too
-                raise _DifferenceError(
+                raise ArithmeticError(
                     f"its scores differ from PyTorch's by {difference:.2g}, of {span:.2g}"
                 )
             largest = max(largest, difference / span if span else 0.0)

@@ -75,7 +75,7 @@ class Predictor:
             at once, and their scores are held.
 
     Raises:
-        SettingError: There is no such device, or `images_per_forward` is less than 1.
+        SettingError: There is no such device.
     """
 
     def __init__(
@@ -85,8 +85,6 @@ class Predictor:
         device: str = "cpu",
         images_per_forward: int | None = None,
     ) -> None:
-        if images_per_forward is not None and images_per_forward < 1:
-            raise SettingError("images_per_forward", found=images_per_forward, expected="1 or more")
         try:
             self._device = torch.device(device)
             network = trained.network.to(self._device).to(memory_format=_FORMAT)

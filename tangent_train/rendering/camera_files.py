@@ -18,7 +18,7 @@ import numpy as np
 
 from tangent_train.errors import DataError
 from tangent_train.files import write_text
-from tangent_train.geometry import FLIP_Y, TangentGrid, xyz_to_lonlat
+from tangent_train.geometry import FLIP_Y, TangentGrid
 from tangent_train.json_text import parse_json
 from tangent_train.registry import Text, check_fields
 
@@ -43,10 +43,7 @@ _CONVENTIONS = {
     "world_from_camera · d in the world. All cameras stand at the origin.",
     "icosahedron_rotation": "Rotation of the icosahedron as a whole, in the world axes; null for "
     "none.",
-    "center": "Direction of the centre of an image: degrees to the right of the middle of the "
-    "panorama, and upwards.",
-    "fov": "fov_deg is the angle across the middle of an image, from edge to edge; "
-    "fov_between_corners_deg the angle between the centres of two adjacent corner pixels.",
+    "fov_deg": "Angle across the middle of an image, from edge to edge.",
 }
 _NUMBERS = re.compile(r"\[[-+.,\d\se]+\]")
 """Rows of matrices, which are easier to read on one line."""
@@ -107,27 +104,19 @@ def write_cameras(path: Path, cameras: CameraFile) -> None:
             "width": grid.dim,
             "height": grid.dim,
             "matrix": grid.camera_matrix.tolist(),
-            "pixel_pitch": grid.pitch,
             "fov_deg": math.degrees(2 * math.atan(grid.dim * grid.pitch / 2)),
-            "fov_between_corners_deg": grid.fov_deg,
         },
         "images": [
-            _image(grid, face, file)
+            {
+                "file": file,
+                "face": face,
+                "world_from_camera": _world_from_camera(grid, face).tolist(),
+            }
             for face, file in zip(cameras.faces, cameras.files, strict=True)
         ],
     }
     text = json.dumps(content, indent=1, ensure_ascii=False)
     write_text(path, _NUMBERS.sub(lambda match: " ".join(match[0].split()), text) + "\n")
-
-
-def _image(grid: TangentGrid, face: int, file: str) -> dict[str, Any]:
-    lon_deg, lat_deg = np.degrees(xyz_to_lonlat(grid.centers_xyz[face]))
-    return {
-        "file": file,
-        "face": face,
-        "center": {"right_deg": float(lon_deg), "up_deg": float(lat_deg)},
-        "world_from_camera": _world_from_camera(grid, face).tolist(),
-    }
 
 
 def _world_from_camera(grid: TangentGrid, face: int) -> NDArray[np.float64]:

@@ -167,11 +167,11 @@ def test_levels_follow_the_rows_and_large_panoramas_are_averaged(tmp_path: Path)
 
 @pytest.mark.parametrize(
     ("dtype", "channels"),
-    [(np.uint16, ()), (np.float32, (3,)), (np.int64, (6,)), (np.float16, ())],
+    [(np.uint8, (3,)), (np.uint16, ()), (np.float32, (6,))],
 )
 def test_averaging_keeps_the_dtype(dtype: Any, channels: tuple[int, ...]) -> None:
-    blocks = np.random.default_rng(0).random((16, 32, *channels)) * 60000
-    blocks = (blocks if np.dtype(dtype).kind in "ui" else blocks / 60000).astype(dtype)
+    blocks = np.random.default_rng(0).random((16, 32, *channels)) * 250
+    blocks = (blocks if np.dtype(dtype).kind in "ui" else blocks / 250).astype(dtype)
     small = tangent_folders.shrink_to_level(blocks.repeat(3, axis=0).repeat(3, axis=1), 3)
     assert small.dtype == dtype
     np.testing.assert_allclose(small, blocks, rtol=1e-6)

@@ -312,7 +312,5 @@ def test_impossible_settings_are_refused() -> None:
             kind(trained_network(TANGENT, size_multiple=16), level=3)
         with pytest.raises(SettingError, match=r"those of 16×16"):
             kind(trained_network(TANGENT, fixed_size=(16, 16)), level=5)
-    with pytest.raises(SettingError, match="images_per_forward"):
-        Predictor(trained, PanoramaViews(trained), "cpu", 0)
     with pytest.raises(SettingError, match="device"):
         Predictor(trained, PanoramaViews(trained), "nonsense")
