@@ -178,6 +178,6 @@ def check_headers(
                     path,
                     found=f"{found[0]}×{found[1]} pixels",
                     expected=f"{size[0]}×{size[1]}, as {files.rgb}" if size else "",
-                    remedy="Copy or export both at one size.",
+                    remedy="Export or copy both at one size.",
                 )
     return size
