@@ -20,6 +20,7 @@ import numpy as np
 
 from datamodules.core.panorama_module import PanoramaDataModule
 from datamodules.core.samples import Input
+from datamodules.core.split_module import at_least
 from datamodules.folder.classes import UNKNOWN_NAME, read_classes
 from datamodules.folder.reader import FolderReader, list_panoramas, read_codes
 from datamodules.folder.splits import FolderSplits
@@ -67,9 +68,11 @@ class FolderPanoramas(PanoramaDataModule):
             raise SettingError(
                 "data.depth_units_per_m", found=self.depth_units_per_m, expected="more than 0"
             )
-        self._division = FolderSplits(
-            self.root, self.test_fraction, self.validation_fraction, self.split_seed
-        )
+        if not 0 < self.test_fraction < 1:
+            raise SettingError(
+                "data.test_fraction", found=self.test_fraction, expected="above 0 to below 1"
+            )
+        at_least("data.split_seed", self.split_seed, 0)
         # Now, not with the files: the network is made for as many classes.
         self._classes = read_classes(self.root / "classes.json")
         self.class_names = (UNKNOWN_NAME, *self._classes.names)
@@ -78,7 +81,10 @@ class FolderPanoramas(PanoramaDataModule):
         """See `PanoramaDataModule`."""
         panoramas = list_panoramas(self.root, problems, with_depth="depth" in self.inputs)
         # Before any are left out: the splits do not depend on what is broken.
-        splits = self._division.divide(panoramas, problems)
+        division = FolderSplits(
+            self.root, self.test_fraction, self.validation_fraction, self.split_seed
+        )
+        splits = division.divide(panoramas, problems)
         self._check_classes(problems.without(panoramas)[:_TRIED], problems)
         return FolderReader(self._classes, self.depth_units_per_m), splits
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from datamodules.core.found import SPLITS, Split
 from datamodules.core.group_drawing import draw_groups
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -35,23 +35,12 @@ class FolderSplits:
         validation_fraction: Share of the training scenes for validation, if drawn: at least one,
             never all; 0 for no validation, whether there is a list or not.
         seed: Of the drawing.
-
-    Raises:
-        SettingError: A setting that cannot work.
     """
 
     root: Path
-    test_fraction: float = 0.2
-    validation_fraction: float = 0.1
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if not 0 < self.test_fraction < 1:
-            raise SettingError(
-                "data.test_fraction", found=self.test_fraction, expected="above 0 to below 1"
-            )
-        if self.seed < 0:
-            raise SettingError("data.split_seed", found=self.seed, expected="0 or more")
+    test_fraction: float
+    validation_fraction: float
+    seed: int
 
     def divide(
         self, panoramas: Sequence[ImageFiles], problems: Problems

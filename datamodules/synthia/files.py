@@ -6,7 +6,7 @@ On disk, as released (`0X` is 01, 02, 04, 05 or 06)::
       RGB/Stereo_Left/Omni_F/000000.png        760×1280, 8 bit; Omni_R, Omni_B, Omni_L likewise
       GT/LABELS/Stereo_Left/Omni_F/000000.png  16-bit RGB: R is the class, the others the instance
       Depth/Stereo_Left/Omni_F/000000.png      16 bit, z-depth in cm, in every channel there is
-      CameraParams/intrinsics.txt              focal length, centre x and y, baseline; or a matrix
+      CameraParams/intrinsics.txt              focal length, centre x and y, baseline
       pano/                                    OmniSYNTHIA: 2096×4192
         RGB/000000.png                         8 bit, black where no view looks
         GT/LABELS_Correct/000000.png           8 bit, 255 where no view looks
@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import math
 import os
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -54,7 +55,7 @@ GET_IT = (
 """What to do when the data set is not there."""
 
 _SIZE = (760, 1280)
-_FOCAL, _CENTER = 532.740352, (640.0, 380.0)  # of images of that size, centre from pixel corners
+_CAMERA = (532.740352, 640.0, 380.0)  # of views of that size, centre from pixel corners
 _NAME = "[0-9]" * 6 + ".png"
 
 
@@ -133,7 +134,7 @@ def read_camera(folder: Path, size: tuple[int, int]) -> NDArray[np.float64]:
     """Camera matrix of all views of a sequence.
 
     From ``CameraParams/intrinsics.txt``: the focal length, x and y of the centre, and perhaps the
-    baseline; or the matrix. Without that file, the one camera of the release.
+    baseline. Without that file, the one camera of the release.
 
     Args:
         folder: Of the sequence.
@@ -146,43 +147,20 @@ def read_camera(folder: Path, size: tuple[int, int]) -> NDArray[np.float64]:
         DataError: The file holds something else, or is missing and the views have another size.
     """
     path = _camera_file(folder)
-    if path.exists():
-        focal, center = _parse_camera(path, size)
-    elif size == _SIZE:
-        focal, center = (_FOCAL, _FOCAL), _CENTER
-    else:
+    text = path.read_text(encoding="utf-8", errors="replace") if path.exists() else ""
+    numbers = list(_CAMERA) if size == _SIZE and not path.exists() else []
+    with suppress(ValueError):
+        numbers = [float(number) for number in text.replace(",", " ").split()] or numbers
+    focal, x, y = numbers[:3] if len(numbers) in (3, 4) else (0.0, 0.0, 0.0)
+    if not (0 < focal < math.inf and 0 < x < size[1] and 0 < y < size[0]):
         raise DataError(
             path,
-            found=f"no such file, and views of {size[0]}×{size[1]} pixels",
-            expected=f"the file, or views of {_SIZE[0]}×{_SIZE[1]}, whose camera is known",
-            remedy="Write focal length, centre x and centre y in pixels to this file.",
+            found=repr(text[:80]) if path.exists() else "no such file",
+            expected="focal length, centre x and y, and perhaps the baseline, in pixels of "
+            f"views of {size[0]}×{size[1]}; only of {_SIZE[0]}×{_SIZE[1]} is it known without",
+            remedy="Extract the file again.",
         )
-    return np.array([[focal[0], 0, center[0] - 0.5], [0, focal[1], center[1] - 0.5], [0, 0, 1]])
-
-
-def _parse_camera(
-    path: Path, size: tuple[int, int]
-) -> tuple[tuple[float, float], tuple[float, float]]:
-    text = path.read_text(encoding="utf-8", errors="replace")
-    try:
-        numbers = [float(number) for number in text.replace(",", " ").split()]
-    except ValueError:
-        numbers = []
-    if len(numbers) in (3, 4):  # with the baseline or without
-        f, x, y = numbers[:3]
-        numbers = [f, 0, x, 0, f, y, 0, 0, 1]
-    if len(numbers) == 9 and all(map(math.isfinite, numbers)):
-        fx, skew, x, zero, fy, y, *last = numbers
-        plain = skew == 0 and zero == 0 and last == [0, 0, 1]
-        if plain and fx > 0 and fy > 0 and 0 < x < size[1] and 0 < y < size[0]:
-            return (fx, fy), (x, y)
-    raise DataError(
-        path,
-        found=repr(text[:80]),
-        expected="focal length, centre x and y (and baseline), or a 3×3 camera matrix, in pixels "
-        f"of views of {size[0]}×{size[1]}",
-        remedy="Extract the file again; without it the camera of the release is used.",
-    )
+    return np.array([[focal, 0, x - 0.5], [0, focal, y - 0.5], [0, 0, 1]])
 
 
 def _camera_file(folder: Path) -> Path:

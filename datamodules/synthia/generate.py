@@ -232,26 +232,15 @@ def _unfinished(
         if _is_whole(target, height):
             continue
         views = [view_files(root, sequence, frame, view, with_depth=True) for view in VIEWS]
-        found = {_size_of(view, target.name, problems) for view in views}
-        size = size or next(iter(found))
-        with problems.noted(target.name):
-            if found - {size, None}:
-                raise DataError(
-                    views[0].rgb.parents[1],
-                    found=f"views of different sizes in frame {frame}",
-                    expected="one size in a sequence",
-                    remedy="Extract the sequence again.",
-                )
+        for view in views:
+            one = view._replace(name=target.name)
+            size = check_headers(one, SynthiaReader(VIEW_FORMATS), problems) or size
         if target.name not in problems.items:
             whole.append((views, target))
     if size is None or not whole:
         return []
     stitcher = ViewStitcher(read_camera(sequence_folder(root, sequence), size), size, height)
     return [partial(_make, stitcher, views, target, problems) for views, target in whole]
-
-
-def _size_of(view: ImageFiles, name: str, problems: Problems) -> tuple[int, int] | None:
-    return check_headers(view._replace(name=name), SynthiaReader(VIEW_FORMATS), problems)
 
 
 def _is_whole(files: ImageFiles, height: int) -> bool:

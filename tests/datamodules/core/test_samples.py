@@ -91,12 +91,11 @@ def test_impossible_normalization(mean: Any, std: Any) -> None:
 # --- other inputs -------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("up", [None, (0.6, 0.0, 0.8), (0.0, 0.0, -1.0)])
+@pytest.mark.parametrize("up", [None, (0.6, 0.0, 0.8)])
 @pytest.mark.parametrize(
     "representation",
     [
         TangentRepresentation(0, 5, rotation="so3", faces_per_panorama=4, mirror=True),
-        EquirectRepresentation(5, rotation="so3", mirror=True),
         EquirectRepresentation(5, crop_deg=90, rotation="yaw", mirror=True),
     ],
 )
@@ -114,10 +113,6 @@ def test_elevation_is_how_far_a_pixel_looks_up(
         expected = directions @ np.array((0, 0, 1) if up is None else up)
         np.testing.assert_allclose(elevation, expected, atol=1e-5)
         assert elevation.dtype == np.float32
-    whole = representation.turned(np.eye(3)).whole()
-    elevation = render_inputs(image, whole, ("rgb", "elevation"))[1].numpy()
-    assert -1 <= elevation.min() < -0.99
-    assert 0.99 < elevation.max() <= 1
 
 
 def test_the_elevation_follows_the_measured_channels() -> None:

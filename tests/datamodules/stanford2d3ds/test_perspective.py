@@ -108,14 +108,6 @@ def test_samples(photo_root: Path) -> None:
     assert (quarter < 0.75).all(), "what another crop owns does not count"
 
 
-def test_rgb_alone_needs_no_depth_files(broken_root: Path) -> None:
-    _file(broken_root, "5a", "depth").unlink()
-    module = Stanford2D3DSPerspective(broken_root, CROPS, inputs=["rgb"])
-    assert module.source("test").read(0).depth is None
-    with pytest.raises(DataError, match=r"data/depth/camera.*No such file"):
-        Stanford2D3DSPerspective(broken_root, CROPS).setup()
-
-
 # --- what cannot work --------------------------------------------------------------------------
 
 

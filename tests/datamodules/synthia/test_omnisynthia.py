@@ -126,13 +126,6 @@ def test_panoramas_are_made_from_views(tmp_path: Path, strips: Any) -> None:
         two(root, strips, frames=2).make_files()
 
 
-def test_missing_root(tmp_path: Path, strips: Any) -> None:
-    module = OmniSynthia(tmp_path / "nowhere", strips)
-    for step in (module.make_files, module.setup):
-        with pytest.raises(DataError, match=r"nowhere: found no such folder.*synthia-dataset"):
-            step()
-
-
 # --- what cannot be used -------------------------------------------------------------------------
 
 

@@ -208,15 +208,6 @@ def test_an_empty_folder_a_missing_area_and_a_damaged_file_at_once(
     }
 
 
-def test_names_that_are_none_of_the_data_set(
-    root: Path, fabricate_stanford: FabricateStanford
-) -> None:
-    write("stanford", root, fabricate_stanford)
-    strange = root / "area_1" / "pano" / "rgb" / "camera_1.png"
-    shutil.copyfile(colors("stanford", root)[0], strange)
-    assert "an unknown file name" in _found("stanford", root)[str(strange.relative_to(root))]
-
-
 def test_wrong_lines_of_a_list(root: Path, fabricate_stanford: FabricateStanford) -> None:
     write("folder", root, fabricate_stanford)
     lines = ["scene_0/view.0", "scene_0/view.7", "scene_0/view.0", "scene_1/view.0"]

@@ -25,7 +25,6 @@ from tests.slow.faults.small_runs import Faulty, run_trainer, small_data, small_
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from tests.conftest import FabricateStanford
 
 WITHOUT_VALIDATION = pytest.mark.filterwarnings(
     "ignore:You defined a `validation_step`:UserWarning"
@@ -152,29 +151,6 @@ def _assert_reported(found: dict[str, Any], expected: dict[str, Any]) -> None:
     )
     assert np.sum(found["confusion"]) == expected["labelled"]
     assert found["images"] == 5
-
-
-@pytest.mark.parametrize("absent", ["skip", "zero"])
-def test_classes_absent_from_the_truth(
-    fabricate_stanford: FabricateStanford, tmp_path: Path, absent: str
-) -> None:
-    root = fabricate_stanford(tmp_path / "data")
-    gone = (3, 8, 13)
-    names = json.loads((root / "semantic_labels.json").read_text())
-    for path in _label_files(root, "5[ab]"):
-        image = cv2.imread(str(path))
-        assert image is not None
-        place = image.astype(np.int64) @ [1, 256, 65536]
-        table = [CLASSES.index(name.partition("_")[0]) for name in names[1:]]
-        classes = np.array([0, *table])[np.where(place < len(names), place, 0)]
-        image[np.isin(classes, gone)] = 0
-        assert cv2.imwrite(str(path), image)
-    found, expected = _evaluate(root, tmp_path, absent)
-    _assert_reported(found, expected)
-    for label in gone:
-        row = found["classes"][label - 1]
-        assert (row["share"], row["iou"]) == (0, None if absent == "skip" else 0)
-    assert np.sum(found["confusion"], axis=0)[list(gone)].any(), "predicted, but not true"
 
 
 @pytest.mark.parametrize("absent", ["skip", "zero"])
