@@ -51,7 +51,7 @@ class CubeGrid(PinholeGrid):
 
     Args:
         dim: Side d in pixels, 2 or more; 2^s is 90° of a panorama of level s.
-        rotation: ``(3, 3)`` proper rotation R that turns the whole cube: directions become R·d.
+        rotation: ``(3, 3)`` proper rotation R of the whole cube: directions become R·d.
 
     Raises:
         SettingError: The side is too small or no whole number, or the rotation is none.
@@ -95,14 +95,14 @@ class CubeGrid(PinholeGrid):
         return False
 
     def with_rotation(self, rotation: ArrayLike | None) -> Self:
-        """The same cube, turned by this rotation instead of its own.
+        """The same cube, rotated by this instead of its own.
 
         Raises:
             SettingError: The rotation is none.
         """
         return type(self)(self.dim, rotation)
 
-    def _unturned_axes(self) -> NDArray[np.float64]:
+    def _resting_axes(self) -> NDArray[np.float64]:
         return _AXES
 
     def _key(self) -> tuple[object, ...]:

@@ -98,7 +98,7 @@ class TangentGrid(PinholeGrid):
         level: Level s of the panorama, at least b.
         dim: Side d in pixels, default 2^(s−b). It changes the extent of the images, never the
             pitch: less crops towards the owned cell, more adds a margin.
-        rotation: ``(3, 3)`` proper rotation R that turns the whole icosahedron: directions become
+        rotation: ``(3, 3)`` proper rotation R of the whole icosahedron: directions become
             R·d.
 
     Raises:
@@ -178,14 +178,14 @@ class TangentGrid(PinholeGrid):
         return True
 
     def with_rotation(self, rotation: ArrayLike | None) -> Self:
-        """The same images on an icosahedron turned by this rotation instead of its own.
+        """The same images on an icosahedron rotated by this instead of its own.
 
         Raises:
             SettingError: The rotation is none.
         """
         return type(self)(self.base_level, self.level, self.dim, rotation)
 
-    def _unturned_axes(self) -> NDArray[np.float64]:
+    def _resting_axes(self) -> NDArray[np.float64]:
         return _face_table(self.base_level).world_from_camera
 
     def _key(self) -> tuple[object, ...]:

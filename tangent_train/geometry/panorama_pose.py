@@ -1,4 +1,4 @@
-"""Where a panorama was taken, and how it was turned."""
+"""Where a panorama was taken, and how it was rotated."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ class PinholeGrid(ABC):
 
     Attributes:
         dim: Side d in pixels.
-        rotation: ``(3, 3)`` proper rotation R that turns all images: directions become R·d.
+        rotation: ``(3, 3)`` proper rotation R of all images: directions become R·d.
     """
 
     dim: int
@@ -60,14 +60,14 @@ class PinholeGrid(ABC):
 
     @abstractmethod
     def with_rotation(self, rotation: ArrayLike | None) -> Self:
-        """The same images, turned by this rotation instead of their own.
+        """The same images, rotated by this instead of their own.
 
         Raises:
             SettingError: The rotation is none.
         """
 
     @abstractmethod
-    def _unturned_axes(self) -> NDArray[np.float64]:
+    def _resting_axes(self) -> NDArray[np.float64]:
         """``(N, 3, 3)`` camera axes before the rotation."""
 
     @abstractmethod
@@ -102,7 +102,7 @@ class PinholeGrid(ABC):
         The determinant is −1, because the sphere frame is mirrored (see `tangent_train.geometry`);
         ``FLIP_Y @ world_from_camera`` are proper rotations in a right-handed room.
         """
-        axes = self._unturned_axes()
+        axes = self._resting_axes()
         if self.rotation is not None:
             axes = self.rotation @ axes
         axes = axes.copy()

@@ -61,15 +61,15 @@ class ResizedGrid(PinholeGrid):
         return self.original.overlapping
 
     def with_rotation(self, rotation: ArrayLike | None) -> Self:
-        """The same images, turned by this rotation instead of their own.
+        """The same images, rotated by this instead of their own.
 
         Raises:
             SettingError: The rotation is none.
         """
         return type(self)(self.original.with_rotation(rotation), self.dim)
 
-    def _unturned_axes(self) -> NDArray[np.float64]:
-        return self.original._unturned_axes()
+    def _resting_axes(self) -> NDArray[np.float64]:
+        return self.original._resting_axes()
 
     def _key(self) -> tuple[object, ...]:
         return self.original, self.dim

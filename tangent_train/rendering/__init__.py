@@ -24,7 +24,7 @@ from tangent_train.rendering.representations.views import (
     RotationAugmentation,
     Views,
 )
-from tangent_train.rendering.rotate import equirect_to_perspective, rotate_equirect
+from tangent_train.rendering.rotate import rotate_equirect
 from tangent_train.rendering.tables import set_table_cache_limit
 
 __all__ = [
@@ -39,7 +39,6 @@ __all__ = [
     "RotationAugmentation",
     "TangentRepresentation",
     "Views",
-    "equirect_to_perspective",
     "equirect_to_tangent",
     "read_cameras",
     "rotate_equirect",

@@ -15,7 +15,6 @@ from tangent_train.geometry import TangentGrid, rotation_about
 from tangent_train.rendering import (
     Blend,
     Interpolation,
-    equirect_to_perspective,
     equirect_to_tangent,
     rotate_equirect,
     tangent_to_equirect,
@@ -185,31 +184,6 @@ def test_turned_panorama(shape: tuple[int, int], interpolation: Interpolation) -
     assert error[certain].max() < 1e-9
 
 
-@pytest.mark.parametrize("interpolation", ["bilinear", "nearest"])
-@pytest.mark.parametrize(
-    ("lon_deg", "lat_deg"), [(180, 0), (-175, -30), (20, 90), (60, 80), (0, -90)]
-)
-def test_perspective_views_of_the_seam_and_the_poles(
-    lon_deg: float, lat_deg: float, interpolation: Interpolation
-) -> None:
-    shape, size, focal = (63, 126), (11, 16), 9.0
-    lon, lat = np.radians([lon_deg, lat_deg])
-    ahead = to_xyz(np.array([lon, lat]))
-    east = np.array([-np.sin(lon), np.cos(lon), 0])
-    south = np.array([np.sin(lat) * np.cos(lon), np.sin(lat) * np.sin(lon), -np.cos(lat)])
-    rows, columns = np.mgrid[: size[0], : size[1]]
-    right, down = ((columns - 7.5) / focal)[..., None], ((rows - 5.0) / focal)[..., None]
-    rays = ahead + right * east + down * south
-    lonlat = to_lonlat(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
-    image = noise(*shape, 3)
-    expected = sample_panorama(image, lonlat, interpolation)
-    certain = certain_nearest(lonlat, shape, margin=1e-4) | (interpolation == "bilinear")
-    matrix = np.array([[focal, 0, 7.5], [0, focal, 5.0], [0, 0, 1]])
-    axes = np.stack([east, south, ahead], axis=-1)
-    result = equirect_to_perspective(image, matrix, size, axes, interpolation)
-    assert np.abs(result - expected)[certain].max() < 1e-9
-
-
 def rendered_back(pair: Pair, images: Array, shape: tuple[int, int], blend: Blend) -> Array:
     """The reference's panorama of our images ``(n, d, d, C)``."""
     in_their_order = np.empty_like(images)
@@ -252,15 +226,3 @@ def test_labels_are_the_best_interpolated_logits(case: Case, blend: Blend) -> No
         certain = clear & certain_labels(rendered, margin)
         assert certain.mean() > 0.95
         np.testing.assert_array_equal(labels[certain], rendered.argmax(axis=-1)[certain])
-
-
-@pytest.mark.parametrize("height", [32, 33])
-@pytest.mark.parametrize("interpolation", ["bilinear", "nearest"])
-def test_the_very_pole_is_seen_in_the_row_next_to_it(
-    height: int, interpolation: Interpolation
-) -> None:
-    rows = np.repeat(np.arange(height, dtype=np.float32)[:, None], 2 * height, axis=1)
-    for up, row in ((1.0, 0), (-1.0, height - 1)):
-        axes = np.array([[0, -up, 0], [1, 0, 0], [0, 0, up]])
-        view = equirect_to_perspective(rows, np.eye(3), (1, 1), axes, interpolation)
-        assert view.item() == row

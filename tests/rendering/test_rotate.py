@@ -8,23 +8,11 @@ from numpy.typing import NDArray
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry import (
-    TangentGrid,
     rotation_about,
 )
 from tangent_train.rendering import (
-    equirect_to_perspective,
-    equirect_to_tangent,
     rotate_equirect,
 )
-
-
-def test_a_tangent_image_is_a_perspective_view() -> None:
-    image = np.random.default_rng(0).random((64, 128, 3), np.float32)
-    grid = TangentGrid(1, 6)
-    view = equirect_to_perspective(
-        image, grid.camera_matrix, (grid.dim, grid.dim), grid.world_from_camera[13]
-    )
-    np.testing.assert_array_equal(view, equirect_to_tangent(image, grid, [13])[0])
 
 
 @pytest.mark.parametrize("columns", [1, 16, 31])

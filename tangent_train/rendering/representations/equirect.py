@@ -19,7 +19,7 @@ from tangent_train.rendering.forward import Interpolation
 from tangent_train.rendering.representations.pinhole import unless_identity
 from tangent_train.rendering.representations.views import (
     NO_RAYS,
-    UNTURNED,
+    NOT_ROTATED,
     RotationAugmentation,
     Views,
 )
@@ -62,7 +62,7 @@ class EquirectViews:
 
     def rotations(self) -> NDArray[np.float64]:
         """That of the panorama."""
-        return UNTURNED if self.rotation is None else self.rotation[None]
+        return NOT_ROTATED if self.rotation is None else self.rotation[None]
 
 
 @registered
@@ -101,7 +101,7 @@ class EquirectRepresentation:
         self._turn: NDArray[np.float64] | None = None
 
     def turned(self, rotation: NDArray[np.float64]) -> Self:
-        """The same of panoramas looked at turned, R·d; instead of a turn before."""
+        """The same, looking in rotated directions R·d, instead of a rotation before."""
         turned = copy.copy(self)
         turned._turn = unless_identity(rotation)
         return turned
@@ -112,7 +112,7 @@ class EquirectRepresentation:
         return self.erp_height, 2 * self.erp_height
 
     def sample(self, rng: np.random.Generator) -> Views:
-        """The panorama or one crop of it, (perhaps) turned."""
+        """The panorama or one crop of it, perhaps rotated."""
         columns = None
         if self.crop_deg is not None or self.rotation == "yaw":
             width = round(2 * self.erp_height * (self.crop_deg or 360) / 360)
@@ -130,7 +130,7 @@ class EquirectRepresentation:
     def to_labels(
         self, scores: Tensor, shape: tuple[int, int], rotation: NDArray[np.float64] | None = None
     ) -> Tensor:
-        """The best class of every pixel; the scores are already those of the (turned) panorama."""
+        """The best class of every pixel; the scores are already those of the rotated panorama."""
         if scores.shape[0] != 1 or tuple(scores.shape[-2:]) != tuple(shape):
             raise SettingError(
                 "scores of an equirectangular network",

@@ -23,7 +23,7 @@ from tangent_train.geometry import normalize_camera, shift_range
 from tangent_train.registry import registered
 from tangent_train.rendering.checks import check_choice
 from tangent_train.rendering.forward import Interpolation
-from tangent_train.rendering.representations.views import NO_RAYS, UNTURNED
+from tangent_train.rendering.representations.views import NO_RAYS, NOT_ROTATED
 
 __all__ = ["PerspectiveRepresentation", "PhotoCrops", "PhotoSampler"]
 
@@ -68,7 +68,7 @@ class PhotoCrops:
 
     def rotations(self) -> NDArray[np.float64]:
         """None."""
-        return UNTURNED
+        return NOT_ROTATED
 
     def owned(self) -> NDArray[np.bool_]:
         """Which pixels of a crop lie nearer to its centre than to any other's, ``(n, h, w)``.

@@ -57,7 +57,7 @@ class PinholeRepresentation:
     """Pinhole images around the centre: what tangent images and the faces of a cube share.
 
     Args:
-        grid: The images, not turned.
+        grid: The images, not rotated.
         level: Level s of the panorama.
         rotation: Rotation of the images as a whole while training.
         mirror: Mirror half of the training samples left to right.
@@ -94,13 +94,13 @@ class PinholeRepresentation:
         return self.grid.dim, self.grid.dim
 
     def turned(self, rotation: NDArray[np.float64]) -> Self:
-        """The same with the images turned as a whole, R·d; instead of a turn before."""
+        """The same with all images rotated, directions R·d, instead of a rotation before."""
         turned = copy.copy(self)
         turned.grid = self.grid.with_rotation(unless_identity(rotation))
         return turned
 
     def sample(self, rng: np.random.Generator) -> Views:
-        """All images or a random subset, (perhaps) turned as a whole and mirrored one by one."""
+        """All images or a random subset, perhaps rotated as a whole and mirrored one by one."""
         grid = self.grid
         if self.rotation != "none":
             yaw = self.rotation == "yaw"
@@ -143,7 +143,7 @@ class TangentRepresentation(PinholeRepresentation):
             (`nearest`), or probabilities averaged with weights that fall to the borders
             (`feather`).
         erp_height: Rows of the panorama, default `equirect_shape(level)`.
-        average_rotations: Turns of the icosahedron that evaluation averages over, see `turns`.
+        average_rotations: Rotations of the icosahedron that evaluation averages over, see `turns`.
 
     Raises:
         SettingError: An impossible combination.
@@ -183,19 +183,19 @@ class TangentRepresentation(PinholeRepresentation):
         self._turns = turns(average_rotations, "representation.average_rotations")
 
     def whole(self) -> Views:
-        """All images, of every turn that is averaged over."""
+        """All images, of every rotation that is averaged over."""
         views = [PinholeViews(spun(self.grid, turn)) for turn in self._turns]
         return views[0] if len(views) == 1 else ManyViews(tuple(views))
 
     def to_averaged_labels(
         self, scores: Iterable[Tensor], shape: tuple[int, int], rotations: NDArray[np.float64]
     ) -> Tensor:
-        """The class with the highest mean probability over several turns, as in prediction.
+        """The class with the highest mean probability over several rotations, as in prediction.
 
         Args:
-            scores: Of all images of each turn, one turn after the other.
+            scores: Of all images, one rotation after the other.
             shape: ``(H, W)`` of the panorama.
-            rotations: Of the turns, see `Views.rotations`.
+            rotations: The rotations, see `Views.rotations`.
 
         Returns:
             Class indices, on the CPU.
@@ -262,7 +262,7 @@ def turns(count: int, setting: str) -> list[NDArray[np.float64]]:
 
 
 def spun(grid: _Grid, turn: NDArray[np.float64]) -> _Grid:
-    """A grid turned about its own axes: with a rotation R it has, directions become R·turn·d.
+    """A grid rotated about its own axes: with its rotation R, directions become R·turn·d.
 
     Args:
         grid: The images.
@@ -273,5 +273,5 @@ def spun(grid: _Grid, turn: NDArray[np.float64]) -> _Grid:
 
 
 def unless_identity(rotation: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
-    """None for no turn at all: the tables of grids that are not turned are those kept."""
+    """None for the identity: only tables of grids without a rotation are kept."""
     return None if rotation is None or np.array_equal(rotation, np.eye(3)) else rotation

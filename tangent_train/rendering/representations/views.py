@@ -20,8 +20,8 @@ from tangent_train.geometry import PinholeGrid
 from tangent_train.rendering.forward import Interpolation, equirect_to_tangent
 
 __all__ = [
+    "NOT_ROTATED",
     "NO_RAYS",
-    "UNTURNED",
     "Assembler",
     "ManyViews",
     "PinholeViews",
@@ -39,7 +39,7 @@ Image = NDArray[Any]
 NO_RAYS: NDArray[np.float32] = np.empty((0, 3, 3), np.float32)
 """Of views that are no pinhole images of a sphere."""
 
-UNTURNED: NDArray[np.float64] = np.eye(3)[None]
+NOT_ROTATED: NDArray[np.float64] = np.eye(3)[None]
 """Rotations of views that are not rotated."""
 
 
@@ -139,7 +139,7 @@ class PinholeViews:
 
     def rotations(self) -> NDArray[np.float64]:
         """That of the grid."""
-        return UNTURNED if self.grid.rotation is None else self.grid.rotation[None]
+        return NOT_ROTATED if self.grid.rotation is None else self.grid.rotation[None]
 
 
 @dataclass(frozen=True)

@@ -115,7 +115,7 @@ def _candidates(
 def upright_rotation(up: ArrayLike) -> NDArray[np.float64]:
     """The smallest rotation R with ``R @ (0, 0, 1) = up``.
 
-    A grid turned by it (``grid.with_rotation(R)``) has its z axis point up, and
+    A grid rotated by it (``grid.with_rotation(R)``) has its z axis point up, and
     ``rotate_equirect(panorama, R.T)`` is the panorama upright.
 
     Args:
@@ -146,7 +146,7 @@ def up_from_pose(pitch_deg: float, roll_deg: float) -> NDArray[np.float64]:
     In Google's Photo Sphere XMP metadata
     (https://developers.google.com/streetview/spherical-metadata) the pitch is that of the middle of
     the image, in degrees above the horizon; as the roll increases, the horizon rotates
-    counterclockwise in the image: the camera's right side goes down. The camera is turned by the
+    counterclockwise in the image: the camera's right side goes down. The camera is rotated by the
     heading, then by the pitch about its own right, then by the roll about its own forward axis; the
     heading leaves up where it is. Some programs have written, or shown, the roll with the other
     sign.
@@ -159,7 +159,7 @@ def up_from_pose(pitch_deg: float, roll_deg: float) -> NDArray[np.float64]:
         ``(3,)`` unit vector in the panorama's frame: forward, right, up.
 
     Raises:
-        SettingError: An angle that is no number.
+        SettingError: An angle that is NaN or infinite.
 
     >>> up_from_pose(0, -90).round(6).tolist()
     [0.0, 1.0, 0.0]

@@ -142,7 +142,7 @@ def _around(
 def _refined(
     axes: NDArray[np.float64], normals: NDArray[np.float64], weights: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """A frame turned so that the segments that follow it do so best."""
+    """A frame rotated so that the segments that follow it do so best."""
     for tolerance in _REFINEMENTS:
         cosines = normals @ axes
         nearest = np.abs(cosines).argmin(axis=1)
