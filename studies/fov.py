@@ -24,17 +24,10 @@ def fov(level: int = 10) -> list[Row]:
         if TangentGrid.least_dim(b, level) > 2 ** (level - b):
             continue  # images of the default size would not cover the sphere
         grid = TangentGrid(b, level)
-        rows.append(
-            {
-                "base level": b,
-                "images": grid.num_images,
-                "pixels": grid.dim,
-                "between corners": grid.fov_deg,
-                "paper": paper,
-                "across the middle": 2 * math.degrees(math.atan(grid.half_extent)),
-                "least pixels": TangentGrid.least_dim(b, level),
-            }
-        )
+        across = 2 * math.degrees(math.atan(grid.half_extent))
+        row: Row = {"base level": b, "images": grid.num_images, "pixels": grid.dim}
+        row |= {"between corners": grid.fov_deg, "paper": paper, "across the middle": across}
+        rows.append({**row, "least pixels": TangentGrid.least_dim(b, level)})
     return rows
 
 

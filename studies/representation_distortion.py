@@ -60,12 +60,12 @@ def distortion(grid: PinholeGrid | None, shape: tuple[int, int]) -> tuple[Array,
 
 
 def worst(grid: PinholeGrid | None) -> tuple[float, float]:
-    """Greatest angular distortion in radians and greatest area scale."""
+    """Greatest angular distortion in degrees and greatest area scale."""
     if grid is None:
-        return np.pi, np.inf
+        return 180.0, np.inf
     corners = SphericalVoronoi(grid.centers_xyz).vertices
     angle, area = pinhole_distortion(angle_to_owner(grid, corners))
-    return float(angle.max()), float(area.max())
+    return float(np.degrees(angle.max())), float(area.max())
 
 
 def representation_distortion(shape: tuple[int, int] = (512, 1024)) -> list[Row]:
@@ -80,16 +80,11 @@ def representation_distortion(shape: tuple[int, int] = (512, 1024)) -> list[Row]
         angle, area = distortion(grid, shape)
         worst_angle, greatest = worst(grid)
         mean = np.average(area, weights=weights)
-        rows.append(
-            {
-                "images": name,
-                "angle mean °": float(np.degrees(np.average(angle, weights=weights))),
-                "angle worst °": float(np.degrees(worst_angle)),
-                "area mean %": float(100 * np.average(abs(area / mean - 1), weights=weights)),
-                "area least": float(1 / mean),
-                "area most": float(greatest / mean),
-            }
-        )
+        angle_mean = float(np.degrees(np.average(angle, weights=weights)))
+        area_mean = float(100 * np.average(abs(area / mean - 1), weights=weights))
+        row: Row = {"images": name, "angle mean °": angle_mean, "angle worst °": worst_angle}
+        row |= {"area mean %": area_mean, "area least": float(1 / mean)}
+        rows.append({**row, "area most": float(greatest / mean)})
     return rows
 
 

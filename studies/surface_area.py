@@ -28,12 +28,9 @@ def surface_area(levels: int = 8) -> list[Row]:
         radius = np.linalg.norm(vertices, axis=1, keepdims=True)
         unit = 4 * math.pi
         area = mesh_area(vertices, faces) / unit
-        ratios = (
-            area / radius.mean() ** 2,
-            mesh_area(vertices / radius, faces) / unit,
-            area / radius.max() ** 2,
-        )
-        row = {"level": level, "faces": len(faces), **dict(zip(SPHERES, ratios, strict=True))}
+        on_sphere = mesh_area(vertices / radius, faces) / unit
+        ratios = (area / radius.mean() ** 2, on_sphere, area / radius.max() ** 2)
+        row: Row = {"level": level, "faces": len(faces), **dict(zip(SPHERES, ratios, strict=True))}
         rows.append({**row, "mean radius": float(radius.mean())})
     return rows
 

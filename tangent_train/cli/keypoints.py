@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
 import os
 import re
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,11 +18,10 @@ from tangent_train.cli.settings import typed
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import write_bytes
 from tangent_train.json_text import parse_json
-from tangent_train.keypoints import Detector
 from tangent_train.keypoints.colmap import add_pair
 from tangent_train.keypoints.two_view import colmap
 from tangent_train.registry import make, maker_of
-from tangent_train.results.keypoints.compare import AS_GIVEN, Comparer, Comparison, Row
+from tangent_train.results.keypoints.compare import AS_GIVEN, Comparer, Comparison, Row, Ways
 from tangent_train.results.keypoints.report import KeypointReport, matches_png
 
 if TYPE_CHECKING:
@@ -34,24 +32,13 @@ if TYPE_CHECKING:
 __all__ = ["earlier_results", "file_name", "keypoints"]
 
 _OF_IMAGES = ("left", "right", "input", "pairing")
-_NOT_DECIDING = ("output", "max_pairs", *_OF_IMAGES)
-"""Settings that may differ when a run is continued; those of the images are part of ``data``."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """See ``configs/keypoints.yaml``, where ``data`` and one's own images are besides."""
+    """What `Ways` lacks of ``configs/keypoints.yaml``, but for the data."""
 
     output: Path
-    base_level: tuple[int, ...]
-    level: int | None
-    detector: str
-    margin: int
-    ratio: float
-    mutual: bool
-    max_error_deg: float
-    seed: int
-    controls: bool
     max_pairs: int | None
     pictures: int
     export: bool
@@ -67,20 +54,23 @@ def keypoints(config: Mapping[str, Any]) -> None:
         SettingError: A setting is missing or cannot work.
         DataError: There are no pairs.
     """
-    given = typed(Settings, config)
-    comparer, output = _comparer(given), given.output
+    given, comparer = typed(Settings, config), Comparer(typed(Ways, config))
+    output = given.output
     colmap()  # pycolmap is missed now rather than after minutes
     data, pairs = _pairs(config)
-    deciding = {name: config[name] for name in config if name not in _NOT_DECIDING}
+    deciding = {"export": given.export} | {field.name: config[field.name] for field in fields(Ways)}
     settings = {**deciding, "data": data}
     done = earlier_results(output, settings)
     pairs.make_files()
     names = pairs.names[: given.max_pairs]
     console = Console(soft_wrap=True, highlight=False)
+
+    def report() -> KeypointReport:
+        rows = [row for name in pairs.names for row in done.get(name, ())]
+        return KeypointReport(rows, comparer.ways.representations, settings, pairs.published)
+
     missing = [(k, name) for k, name in enumerate(names) if name not in done]
-    if len(missing) < len(names):
-        message = f"{len(names) - len(missing)} of {len(names)} pairs are there already"
-        console.print(message, markup=False)
+    console.print(f"{len(names) - len(missing)} of {len(names)} pairs are there already")
     for index, name in track(missing, "Comparing pairs", console=console, disable=not missing):
         try:
             pair = pairs.read(index)
@@ -91,33 +81,23 @@ def keypoints(config: Mapping[str, Any]) -> None:
             console.print(f"Pair {name}: {error or 'too little memory'}", markup=False)
             continue
         if index < given.pictures:
-            for condition in comparison.images:
-                write_bytes(
-                    output / "matches" / f"{index:03}_{file_name(name)}_{condition}.png",
-                    matches_png(comparison, condition),
-                )
+            _draw(output / "matches" / f"{index:03}_{file_name(name)}", comparison)
         done[name] = comparison.rows
-        _report(pairs, done, comparer, settings).write(output)
-    _tell(console, output, pairs, _report(pairs, done, comparer, settings), names)
+        report().write(output)
+    for table in report().means():
+        console.print(table.terminal())
+    console.print(f"Results are in {output}." if done else "There are no results.", markup=False)
+    if given.export:
+        root = _root(pairs.files)
+        console.print(f"For COLMAP: {output / 'export'}, image_path {root}", markup=False)
+    failed = len(set(names) - set(done))
+    if failed:
+        sys.exit(f"tangent-keypoints: {failed} of {len(names)} pairs could not be used, see above")
 
 
-def _comparer(given: Settings) -> Comparer:
-    ranges = {"margin": (0, math.inf), "ratio": (1e-9, 1), "max_error_deg": (1e-9, 20)}
-    for name, (least, most) in ranges.items():
-        if not least <= getattr(given, name) <= most:
-            expected = f"{least:g} to {most:g}"
-            raise SettingError(name, found=getattr(given, name), expected=expected)
-    return Comparer(
-        base_levels=given.base_level,
-        detector=Detector(given.detector),
-        margin=given.margin,
-        level=given.level,
-        ratio=given.ratio,
-        mutual=given.mutual,
-        max_error_deg=given.max_error_deg,
-        seed=given.seed,
-        controls=given.controls,
-    )
+def _draw(stem: Path, comparison: Comparison) -> None:
+    for condition in comparison.images:
+        write_bytes(Path(f"{stem}_{condition}.png"), matches_png(comparison, condition))
 
 
 def _pairs(config: Mapping[str, Any]) -> tuple[Any, PanoramaPairs]:
@@ -161,35 +141,6 @@ def earlier_results(output: Path, settings: Mapping[str, Any]) -> dict[str, list
                 remedy="Give another output, or remove that folder.",
             )
     return done
-
-
-def _report(
-    pairs: PanoramaPairs,
-    done: Mapping[str, Sequence[Row]],
-    comparer: Comparer,
-    settings: Mapping[str, Any],
-) -> KeypointReport:
-    rows = [row for name in pairs.names for row in done.get(name, ())]
-    return KeypointReport(rows, comparer.representations, settings, pairs.published)
-
-
-def _tell(
-    console: Console,
-    output: Path,
-    pairs: PanoramaPairs,
-    report: KeypointReport,
-    names: Sequence[str],
-) -> None:
-    for table in report.means():
-        console.print(table.terminal())
-    if report.rows:
-        console.print(f"Results are in {output}.", markup=False)
-    if (output / "export").exists():
-        root = _root(pairs.files)
-        console.print(f"For COLMAP: {output / 'export'}, image_path {root}", markup=False)
-    failed = len(set(names) - {row["pair"] for row in report.rows})
-    if failed:
-        sys.exit(f"tangent-keypoints: {failed} of {len(names)} pairs could not be used, see above")
 
 
 def _export(

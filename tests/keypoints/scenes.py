@@ -30,16 +30,13 @@ def two_views(
     baseline_m: float = 0.5,
     wrong: int = 0,
     noise_deg: float = 0.0,
-    flat: bool = False,
     seed: int = 0,
 ) -> Scene:
-    """Points 1.5 to 5 m around the left camera, or on the floor, and in all directions."""
+    """Points 1.5 to 5 m around the left camera, in all directions."""
     rng = np.random.default_rng(seed)
     points_m = unit(rng.normal(size=(count, 3))) * rng.uniform(1.5, 5, (count, 1))
     special = np.array([(0, 0, 2), (0, 0, -2), (-3, 0, 0), (-2, 1e-3, 0.1)])
     points_m[:4] = special[:count]
-    if flat:
-        points_m[:, 2] = -1.2
     left = PanoramaPose(random_rotation(rng) @ FLIP_Y, np.zeros(3))
     right = PanoramaPose(random_rotation(rng) @ FLIP_Y, baseline_m * unit(rng.normal(size=3)))
     left_xyz, right_xyz = (pose.seen(points_m)[0] for pose in (left, right))

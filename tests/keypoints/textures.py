@@ -45,12 +45,6 @@ def blobs(
     return _as_bytes(grey)
 
 
-def disc(shape: tuple[int, int], center_xyz: NDArray[np.float64], radius_rad: float) -> Any:
-    """A bright disc on grey, its border one pixel wide."""
-    angle = np.arccos(np.clip(equirect_directions(shape) @ center_xyz, -1, 1))
-    return _as_bytes(60 + 150 * np.clip((radius_rad - angle) / (np.pi / shape[0]) + 0.5, 0, 1))
-
-
 def _as_bytes(grey: NDArray[np.float64]) -> NDArray[np.uint8]:
     return np.rint(grey.clip(0, 255)).astype(np.uint8)
 

@@ -6,7 +6,7 @@ import math
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -41,7 +41,17 @@ if TYPE_CHECKING:
 
     from datamodules.core.panorama_pairs import PairedPanorama, PanoramaPair
 
-__all__ = ["AS_GIVEN", "ROTATED", "SHRUNK", "Comparer", "Comparison", "Found", "Row", "shrunk_rows"]
+__all__ = [
+    "AS_GIVEN",
+    "ROTATED",
+    "SHRUNK",
+    "Comparer",
+    "Comparison",
+    "Found",
+    "Row",
+    "Ways",
+    "shrunk_rows",
+]
 
 Row = dict[str, Any]
 """Figures of one pair, condition and representation, see `Comparer.compare`."""
@@ -76,24 +86,27 @@ class Comparison(NamedTuple):
     images: Mapping[str, tuple[NDArray[np.uint8], NDArray[np.uint8]]]
 
 
-@dataclass
-class Comparer:
-    """Compares representations on pairs.
+@dataclass(frozen=True)
+class Ways:
+    """How keypoints are detected and matched.
 
     Attributes:
-        base_levels: Of the tangent images.
-        detector: Of keypoints.
+        base_level: Base levels of the tangent images.
+        detector: See `Detector`.
         margin: Pixels added around every tangent image.
         level: Level s; None for the level nearest to the larger panorama.
         ratio: See `match`.
         mutual: See `match`.
-        max_error_deg: See `estimate_two_view`.
+        max_error_deg: See `estimate_two_view`, at most 20.
         seed: Of random samples and of the random rotations.
         controls: Whether to compare the shrunk panorama and the rotated one as well.
+
+    Raises:
+        SettingError: A number is out of range.
     """
 
-    base_levels: tuple[int, ...]
-    detector: Detector = field(default_factory=Detector)
+    base_level: tuple[int, ...]
+    detector: Literal["sift", "orb"] = "sift"
     margin: int = 32
     level: int | None = None
     ratio: float = 0.8
@@ -101,12 +114,26 @@ class Comparer:
     max_error_deg: float = 1.0
     seed: int = 0
     controls: bool = True
-    _kept: dict[tuple[str, int], dict[str, SphericalKeypoints]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        ranges = {"margin": (0, math.inf), "ratio": (1e-9, 1), "max_error_deg": (1e-9, 20)}
+        for name, (least, most) in ranges.items():
+            found = getattr(self, name)
+            if not least <= found <= most:
+                raise SettingError(name, found=found, expected=f"{least:g} to {most:g}")
 
     @property
     def representations(self) -> list[str]:
         """``ERP``, the shrunk one with controls, and ``L0``, ``L1`` … for the base levels."""
-        return ["ERP", *[SHRUNK] * self.controls, *(f"L{b}" for b in self.base_levels)]
+        return ["ERP", *[SHRUNK] * self.controls, *(f"L{b}" for b in self.base_level)]
+
+
+@dataclass
+class Comparer:
+    """Compares representations on pairs."""
+
+    ways: Ways
+    _kept: dict[tuple[str, int], dict[str, SphericalKeypoints]] = field(default_factory=dict)
 
     def compare(self, pair: PanoramaPair) -> Comparison:
         """Compare all representations on one pair.
@@ -129,8 +156,8 @@ class Comparer:
         self._kept = {(side.name, level): self._kept.get((side.name, level), {}) for side in sides}
         left, right = (_at_level(side.rgb, level) for side in sides)
         rotations = {AS_GIVEN: np.eye(3)}
-        if self.controls:
-            rng = np.random.default_rng([self.seed, zlib.crc32(pair.name.encode())])
+        if self.ways.controls:
+            rng = np.random.default_rng([self.ways.seed, zlib.crc32(pair.name.encode())])
             rotations[ROTATED] = random_rotation(rng)
         views = [_depth_view(side) for side in sides]
         overlap = None if None in views else _defined(fov_overlap(*views))  # type: ignore[arg-type]
@@ -161,10 +188,10 @@ class Comparer:
     def _level(self, pair: PanoramaPair) -> int:
         rows = max(side.rgb.shape[0] for side in (pair.left, pair.right))
         own = nearest_level(rows)
-        if self.level is not None and self.level > own:
+        if self.ways.level is not None and self.ways.level > own:
             expected = f"at most {own}, that of pair {pair.name} with {rows} rows"
-            raise SettingError("level", found=self.level, expected=expected)
-        return own if self.level is None else self.level
+            raise SettingError("level", found=self.ways.level, expected=expected)
+        return own if self.ways.level is None else self.ways.level
 
     def _matched(
         self,
@@ -173,9 +200,9 @@ class Comparer:
         level: int,
         condition: str,
     ) -> dict[str, Found]:
-        grids = {f"L{b}": TangentGrid(b, level) for b in self.base_levels}
+        grids = {f"L{b}": TangentGrid(b, level) for b in self.ways.base_level}
         found: dict[str, Found] = {}
-        for name in self.representations:
+        for name in self.ways.representations:
             both = []
             for side, image in zip((pair.left, pair.right), images, strict=True):
                 rotated = condition == ROTATED and side is pair.right
@@ -187,12 +214,12 @@ class Comparer:
             matches = match(
                 left.descriptors,
                 right.descriptors,
-                self.detector.norm,
-                self.ratio,
-                mutual=self.mutual,
+                Detector(self.ways.detector).norm,
+                self.ways.ratio,
+                mutual=self.ways.mutual,
             )
             rays = left.directions_xyz[matches[:, 0]], right.directions_xyz[matches[:, 1]]
-            geometry = estimate_two_view(*rays, self.max_error_deg, seed=self.seed)
+            geometry = estimate_two_view(*rays, self.ways.max_error_deg, seed=self.ways.seed)
             found[name] = Found(left, right, matches, geometry)
         return found
 
@@ -200,10 +227,12 @@ class Comparer:
         self, rgb: NDArray[np.uint8], level: int, name: str, grid: TangentGrid | None
     ) -> SphericalKeypoints:
         if grid is not None:
-            return detect_on_tangent_images(rgb, grid, self.detector, self.margin)
+            return detect_on_tangent_images(
+                rgb, grid, Detector(self.ways.detector), self.ways.margin
+            )
         if name == SHRUNK:
             rgb = _shrunk(rgb, shrunk_rows(level))
-        return detect_on_equirect(rgb, self.detector)
+        return detect_on_equirect(rgb, Detector(self.ways.detector))
 
     def _figures(
         self,
@@ -215,7 +244,7 @@ class Comparer:
         visible = keypoints = (len(found.left), len(found.right))
         truth: Row = dict.fromkeys(_TRUTH)
         if left is not None and right is not None:
-            visible, truth = _truth(found, rotation, left, right, self.max_error_deg)
+            visible, truth = _truth(found, rotation, left, right, self.ways.max_error_deg)
         putative, inliers = len(found.matches), int(found.geometry.inliers.sum())
         return {
             "keypoints_left": keypoints[0],

@@ -30,11 +30,9 @@ def folder(tmp_path: Path) -> Path:
 def test_two_files(folder: Path) -> None:
     pairs = ImagePairs(left=str(folder / "b.png"), right=str(folder / "a.png"))
     assert pairs.names == ["b – a"]
-    pair = pairs.read(0)
-    assert (pair.left.name, pair.right.name, pair.split) == ("b", "a", None)
-    assert pair.left.rgb[0, 0].tolist() == [255, 0, 10]
-    assert (pair.left.distance_m, pair.left.pose) == (None, None)
-    assert pair.left.file == folder / "b.png"
+    left = pairs.read(0).left
+    assert left.rgb[0, 0].tolist() == [255, 0, 10]
+    assert left[2:] == (folder / "b.png", None, None)
 
 
 def test_the_pairs_of_a_folder(folder: Path) -> None:

@@ -7,13 +7,13 @@ import pytest
 
 from datamodules.core.panorama_pairs import PanoramaPair
 from tangent_train.errors import SettingError
-from tangent_train.keypoints import Detector
 from tangent_train.results.keypoints.compare import (
     AS_GIVEN,
     ROTATED,
     SHRUNK,
     Comparer,
     Comparison,
+    Ways,
     shrunk_rows,
 )
 from tests.results.keypoints.ball_room import ball_pair
@@ -28,7 +28,7 @@ def pair() -> PanoramaPair:
 
 @pytest.fixture(scope="module")
 def comparison(pair: PanoramaPair) -> Comparison:
-    return Comparer((1,), margin=16, seed=3).compare(pair)
+    return Comparer(Ways((1,), margin=16, seed=3)).compare(pair)
 
 
 def test_every_way_in_every_condition(comparison: Comparison) -> None:
@@ -72,7 +72,7 @@ def test_tangent_images_match_better_than_the_panorama(comparison: Comparison) -
 
 def test_the_rotation_is_the_same_in_every_run(pair: PanoramaPair) -> None:
     first, again, other = (
-        Comparer((), seed=seed, level=4).compare(pair).images for seed in (3, 3, 4)
+        Comparer(Ways((), seed=seed, level=4)).compare(pair).images for seed in (3, 3, 4)
     )
     np.testing.assert_array_equal(first[ROTATED][1], again[ROTATED][1])
     np.testing.assert_array_equal(first[ROTATED][0], first[AS_GIVEN][0])
@@ -83,7 +83,7 @@ def test_without_depth_all_keypoints_count_and_blank_panoramas_have_no_scores(
     pair: PanoramaPair,
 ) -> None:
     blank = pair.left._replace(rgb=np.full((64, 128, 3), 90, np.uint8), distance_m=None)
-    comparer = Comparer((0,), Detector("orb"), controls=False)
+    comparer = Comparer(Ways((0,), "orb", controls=False))
     for other in (pair.right, blank):
         for row in comparer.compare(PanoramaPair("x", None, other, blank)).rows:
             assert (row["fov_overlap"], row["visible_by"]) == (None, "all keypoints")
@@ -95,9 +95,9 @@ def test_without_depth_all_keypoints_count_and_blank_panoramas_have_no_scores(
 
 def test_levels_that_do_not_fit_are_refused(pair: PanoramaPair) -> None:
     with pytest.raises(SettingError, match=r"dim: found 2; expected at least"):
-        Comparer((6,)).compare(pair)
+        Comparer(Ways((6,))).compare(pair)
     with pytest.raises(SettingError, match=r"level: found 8; expected at most 7, .* 192 rows"):
-        Comparer((0,), level=8).compare(pair)
+        Comparer(Ways((0,), level=8)).compare(pair)
 
 
 @pytest.mark.parametrize(("level", "rows"), [(10, 1453), (5, 45)])

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from datamodules.stanford2d3ds.pairs import published_pairs
-from tangent_train.results.keypoints.compare import AS_GIVEN, ROTATED, SHRUNK, Comparer, Row
+from tangent_train.results.keypoints.compare import AS_GIVEN, ROTATED, SHRUNK, Comparer, Row, Ways
 from tangent_train.results.keypoints.report import KeypointReport, matches_png, with_splits
 from tests.results.keypoints.ball_room import ball_pair
 
@@ -87,13 +87,13 @@ def test_the_papers_means_are_those_of_its_single_figures() -> None:
     away = [
         abs(float(ours) - float(printed))
         for one, paper in pairwise(table)
-        if paper[1].endswith("%, paper") and not paper[1].startswith("overlap")
+        if paper[1] in ("PMR %, paper", "MS %, paper", "P %, paper")
         for ours, printed in zip(one[2:], paper[2:], strict=True)
         if printed != "–"
     ]
     assert len(away) == 2 * 3 * 4
-    assert sorted(away)[-2] < 0.16
-    assert max(away) < 0.35  # hard, L0: printed 28.4, the mean is 28.7
+    # One is a misprint: hard, L0 is 28.4 there, the mean is 28.7.
+    assert sorted(away)[-2:] == pytest.approx([0.1, 0.3], abs=0.06)
 
 
 def test_other_data_have_nothing_of_the_papers() -> None:
@@ -134,7 +134,7 @@ def test_files_hold_every_figure(tmp_path: Path) -> None:
 def test_a_picture_joins_keypoints_across_the_seam() -> None:
     pytest.importorskip("pycolmap")
     pair = ball_pair(shape=(64, 128))
-    comparison = Comparer((0,), controls=False).compare(pair)
+    comparison = Comparer(Ways((0,), controls=False)).compare(pair)
     picture = cv2.imdecode(
         np.frombuffer(matches_png(comparison, AS_GIVEN), np.uint8), cv2.IMREAD_COLOR
     )
