@@ -5,33 +5,41 @@ from __future__ import annotations
 import csv
 import json
 import sys
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-from PIL import Image
+from numpy.typing import NDArray
 
 from tangent_train.cli import main
-from tangent_train.geometry import equirect_directions, equirect_solid_angles
+from tangent_train.geometry import equirect_directions
 from tangent_train.inference.images import read_panorama
-from tests.inference.trained import CLASS_NAMES, PERSPECTIVE, TANGENT, write_checkpoint
+from tests.inference.trained import PERSPECTIVE, TANGENT, write_checkpoint
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
+Predict = Callable[..., dict[str, Any]]
 
 
 @pytest.fixture
-def checkpoint(tmp_path: Path) -> Path:
-    return write_checkpoint(tmp_path / "models" / "best.ckpt")
+def predict(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Predict:
+    """Runs the command on ``in`` into ``out``; returns the entries of the images by name."""
+    checkpoint = write_checkpoint(tmp_path / "model.ckpt")
+
+    def run(**settings: Any) -> dict[str, Any]:
+        given = {"checkpoint": checkpoint, "input": tmp_path / "in", "output": tmp_path / "out"}
+        arguments = [f"{name}={value}" for name, value in (given | settings).items()]
+        monkeypatch.setattr(sys, "argv", ["tangent-predict", *arguments])
+        main.predict()
+        return _entries(Path((given | settings)["output"]))
+
+    return run
 
 
-def _predict(monkeypatch: pytest.MonkeyPatch, **settings: Any) -> None:
-    arguments = [f"{name}={value}" for name, value in settings.items()]
-    monkeypatch.setattr(sys, "argv", ["tangent-predict", *arguments])
-    main.predict()
+def _entries(folder: Path) -> dict[str, Any]:
+    images = json.loads((folder / "summary.json").read_text())["images"]
+    return {entry["name"]: entry for entry in images}
 
 
 def _sphere(height: int) -> NDArray[np.uint8]:
@@ -41,164 +49,172 @@ def _sphere(height: int) -> NDArray[np.uint8]:
 
 def _write(path: Path, rgb: NDArray[np.uint8]) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
-    assert cv2.imwrite(str(path), cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
+    bgr = cv2.cvtColor(np.ascontiguousarray(rgb), cv2.COLOR_RGB2BGR)
+    path.write_bytes(cv2.imencode(path.suffix, bgr)[1].tobytes())
     return path
 
 
 def _labels(path: Path) -> NDArray[np.uint8]:
     labels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     assert labels is not None
-    assert labels.dtype == np.uint8
-    assert labels.ndim == 2
+    assert (labels.dtype, labels.ndim) == (np.uint8, 2)
     return labels
 
 
-def test_a_folder_of_panoramas(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, checkpoint: Path
-) -> None:
-    """Names that command lines and shells dislike, several formats and sizes, one broken file."""
+def test_a_folder_of_panoramas(tmp_path: Path, predict: Predict) -> None:
+    """Names that command lines and shells dislike, several formats and sizes, broken files."""
     folder, output = tmp_path / "my, panoramas (2)", tmp_path / "out='1'"
     _write(folder / "a=b.png", _sphere(32))
     _write(folder / "flat" / "küche #1.tif", _sphere(50))
-    _write(folder / "flat" / "b.webp", _sphere(16))
+    _write(folder / "flat" / "caf\udce9 ${x}.webp", _sphere(16))
+    _write(folder / "square.png", _sphere(16)[:, :16])
     (folder / "broken.jpg").write_bytes(b"\xff\xd8\xff nothing")
-    with pytest.raises(SystemExit, match="1 of 4 images could not be used"):
-        _predict(monkeypatch, checkpoint=checkpoint, input=folder, output=output)
-    names = {"a=b": 32, "flat/küche #1": 50, "flat/b": 16}
-    for name, height in names.items():
+    with pytest.raises(SystemExit, match="2 of 5 images could not be used"):
+        predict(input=folder, output=output)
+    for name, height in {"a=b": 32, "flat/küche #1": 50}.items():
         labels = _labels(output / "labels" / f"{name}.png")
         assert labels.shape == (height, 2 * height)
         assert set(np.unique(labels)) <= {1, 2, 3}
-        color = cv2.imread(str(output / "color" / f"{name}.png"))
-        assert color is not None
-        assert color.shape == (height, 2 * height, 3)
-        assert (output / "overlay" / f"{name}.png").is_file()
-    summary = json.loads((output / "summary.json").read_text())
-    entries = {entry["name"]: entry for entry in summary["images"]}
-    assert set(entries) == {*names, "broken"}
+        for kind in ("color", "overlay"):
+            picture = cv2.imread(str(output / kind / f"{name}.png"))
+            assert picture is not None
+            assert picture.shape[1:] == (2 * height, 3)
+    entries = _entries(output)
+    assert len(entries) == 5
     assert "found" in entries["broken"]["error"]
-    labels = _labels(output / "labels" / "a=b.png")
-    weights = np.repeat(equirect_solid_angles((32, 64))[:, None], 64, axis=1)
-    for value, name in enumerate(CLASS_NAMES[1:], start=1):
-        share = weights[labels == value].sum() / weights.sum()
-        assert entries["a=b"]["classes"][name] == pytest.approx(share)
+    for remedy in ("16×16", "crop=", "GPano", "projection=perspective"):
+        assert remedy in entries["square"]["error"]
+    assert sum(entries["a=b"]["classes"].values()) == pytest.approx(1)
     assert json.loads((output / "classes.json").read_text()) == {"dark": 1, "green": 2, "bright": 3}
     with (output / "summary.csv").open(newline="") as file:
-        assert len(list(csv.DictReader(file))) == 4
+        assert len(list(csv.DictReader(file))) == 5
     page = (output / "report.html").read_text()
     assert "flat/küche #1" in page
     assert "http://" not in page.replace("http://www.w3.org", "")
     assert not list(output.rglob(".partial*"))
 
 
-def test_earlier_results_stay_unless_told(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, checkpoint: Path
-) -> None:
-    image = _write(tmp_path / "a.png", _sphere(16))
-    settings = {"checkpoint": checkpoint, "input": image, "output": tmp_path / "out"}
-    _predict(monkeypatch, **settings)
-    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").rglob("*.png")}
+def test_earlier_results_stay_and_are_not_labelled_again(tmp_path: Path, predict: Predict) -> None:
+    _write(tmp_path / "in" / "a.png", _sphere(16))
+    settings = {"output": tmp_path / "in", "report": 0}  # into the folder of the images
+    assert predict(**settings).keys() == {"a"}
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "in").rglob("*.png")}
     with pytest.raises(SystemExit, match="overwrite=true"):
-        _predict(monkeypatch, **settings)
+        predict(**settings)
     assert {path: path.stat().st_mtime_ns for path in before} == before
-    _predict(monkeypatch, **settings, overwrite="true", report=0)
+    assert predict(**settings, overwrite="true").keys() == {"a"}
     assert {path: path.stat().st_mtime_ns for path in before} != before
+    with pytest.raises(SystemExit, match="found only results"):
+        predict(**settings, input=tmp_path / "in" / "color", overwrite="true")
 
 
-def test_probabilities_agree_with_the_labels(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, checkpoint: Path
+def test_an_interruption_keeps_what_is_done(
+    tmp_path: Path,
+    predict: Predict,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
+    for name in ("a", "b", "c"):
+        _write(tmp_path / "in" / f"{name}.png", _sphere(16))
+
+    def interrupted(path: Path, *args: Any) -> Any:
+        if path.name == "b.png":
+            raise KeyboardInterrupt
+        return read_panorama(path, *args)
+
+    monkeypatch.setattr("tangent_train.cli.predict.read_panorama", interrupted)
+    with pytest.raises(SystemExit) as stopped:
+        predict()
+    assert stopped.value.code == 130
+    assert _entries(tmp_path / "out").keys() == {"a"}
+    first = tmp_path / "out" / "labels" / "a.png"
+    assert list(first.parent.iterdir()) == [first]
+    assert "1 of 3 images are done. resume=true" in capsys.readouterr().out
+    monkeypatch.setattr("tangent_train.cli.predict.read_panorama", read_panorama)
+    written = first.stat().st_mtime_ns
+    with pytest.raises(SystemExit, match="resume: found blend=nearest, another setting"):
+        predict(resume="true", blend="nearest")
+    assert predict(resume="true").keys() == {"a", "b", "c"}
+    assert first.stat().st_mtime_ns == written
+    assert len(list(first.parent.iterdir())) == 3
+
+
+def test_probabilities_agree_with_the_labels(tmp_path: Path, predict: Predict) -> None:
     _write(tmp_path / "a.png", _sphere(24))
-    output = tmp_path / "out"
-    _predict(
-        monkeypatch,
-        checkpoint=checkpoint,
-        input=tmp_path / "*.png",
-        output=output,
-        probabilities="true",
-        rotations=2,
-    )
-    probabilities = np.load(output / "probabilities" / "a.npy", allow_pickle=False)
-    assert probabilities.dtype == np.float16
-    assert probabilities.shape == (24, 48, 3)
+    predict(input=tmp_path / "*.png", probabilities="true", rotations=2)
+    probabilities = np.load(tmp_path / "out" / "probabilities" / "a.npy", allow_pickle=False)
+    assert (probabilities.dtype, probabilities.shape) == (np.float16, (24, 48, 3))
     np.testing.assert_allclose(probabilities.sum(axis=-1, dtype=np.float32), 1, atol=2e-3)
     best = np.sort(probabilities, axis=-1)
     decided = best[..., 2] - best[..., 1] > 0.01
-    labels = _labels(output / "labels" / "a.png")
+    labels = _labels(tmp_path / "out" / "labels" / "a.png")
     assert (probabilities.argmax(axis=-1) + 1 == labels)[decided].all()
 
 
-@pytest.mark.parametrize("crop", ["[135,-135,-45,45]", "[-90,90,0,90]"])
+@pytest.mark.parametrize(
+    ("crop", "rows", "columns"),
+    [
+        ("[135,-135,-45,45]", np.arange(16, 48), np.r_[112:128, 0:16]),
+        ("[-90,90,0,90]", np.arange(32), np.arange(32, 96)),
+    ],
+)
 def test_a_part_of_a_panorama_is_labelled_as_that_part(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, checkpoint: Path, crop: str
+    tmp_path: Path, predict: Predict, crop: str, rows: Any, columns: Any
 ) -> None:
-    """Away from its borders it gets the labels that it has in the whole panorama."""
-    west, east, south, north = json.loads(crop)
-    whole = _sphere(64)
-    columns = np.arange(round((west + 180) / 360 * 128), round((east + 180) / 360 * 128))
-    if east < west:
-        columns = np.r_[round((west + 180) / 360 * 128) : 128, 0 : round((east + 180) / 360 * 128)]
-    rows = np.arange(round((90 - north) / 180 * 64), round((90 - south) / 180 * 64))
-    _write(tmp_path / "whole" / "a.png", whole)
-    part = np.ascontiguousarray(whole[rows][:, columns])
-    _write(tmp_path / "part" / "a.png", part)
-    common = {"checkpoint": checkpoint, "blend": "nearest"}
-    _predict(monkeypatch, **common, input=tmp_path / "whole", output=tmp_path / "w")
-    _predict(monkeypatch, **common, input=tmp_path / "part", output=tmp_path / "p", crop=crop)
-    expected = _labels(tmp_path / "w" / "labels" / "a.png")[rows][:, columns]
-    labels = _labels(tmp_path / "p" / "labels" / "a.png")
-    assert labels.shape == part.shape[:2]
+    """Away from its borders it gets the labels and probabilities of the whole panorama."""
+    whole = _write(tmp_path / "whole" / "a.png", _sphere(64))
+    part = _write(tmp_path / "part" / "a.png", _sphere(64)[rows][:, columns])
+    common = {"blend": "nearest", "probabilities": "true"}
+    predict(**common, input=whole, output=tmp_path / "w")
+    predict(**common, input=part, output=tmp_path / "p", crop=crop)
     inner = slice(8, -8)
-    assert (labels == expected)[inner, inner].mean() > 0.98
-    entry = json.loads((tmp_path / "p" / "summary.json").read_text())["images"][0]
-    assert sum(entry["classes"].values()) == pytest.approx(1)
+    for read in (
+        lambda folder: _labels(folder / "labels" / "a.png"),
+        lambda folder: np.load(folder / "probabilities" / "a.npy").argmax(-1),
+    ):
+        expected, found = read(tmp_path / "w")[rows][:, columns], read(tmp_path / "p")
+        assert found.shape == expected.shape
+        assert (found == expected)[inner, inner].mean() > 0.98
 
 
 @pytest.mark.parametrize("representation", [TANGENT, PERSPECTIVE])
 def test_photos(
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    tmp_path: Path,
     representation: dict[str, Any],
+    tmp_path: Path,
+    predict: Predict,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    checkpoint = write_checkpoint(tmp_path / "model.ckpt", representation)
-    rgb = _sphere(64)[10:40, 20:70]
-    _write(tmp_path / "photos" / "a.png", np.ascontiguousarray(rgb))
-    settings = {"checkpoint": checkpoint, "input": tmp_path / "photos", "projection": "perspective"}
+    checkpoint = write_checkpoint(tmp_path / "photos.ckpt", representation)
+    _write(tmp_path / "in" / "a.png", _sphere(64)[10:40, 20:70])
+    settings = {"checkpoint": checkpoint, "projection": "perspective"}
     with pytest.raises(SystemExit, match="1 of 1 images"):
-        _predict(monkeypatch, **settings, output=tmp_path / "out")
+        predict(**settings)
     assert not (tmp_path / "out").exists()  # nothing in the way of the next try
     assert "Give fov=" in " ".join(capsys.readouterr().out.split())
-    _predict(monkeypatch, **settings, output=tmp_path / "out", fov=70)
+    predict(**settings, fov=70)
     assert _labels(tmp_path / "out" / "labels" / "a.png").shape == (30, 50)
 
 
-def test_networks_with_depth_want_depth(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    checkpoint = write_checkpoint(tmp_path / "model.ckpt", channels=4)
-    _write(tmp_path / "panoramas" / "a.png", _sphere(32))
-    settings = {"checkpoint": checkpoint, "input": tmp_path / "panoramas"}
+def test_depth_is_that_of_the_image_in_its_folder(tmp_path: Path, predict: Predict) -> None:
+    """In metres or units, ``.npy`` or PNG, with ``_depth`` at the end or not."""
+    depth, checkpoint = tmp_path / "depth", write_checkpoint(tmp_path / "d.ckpt", channels=4)
+    for scene, metres in (("x", 0.5), ("y", 3.5), ("z", 3.5)):
+        _write(tmp_path / "in" / scene / "a.png", _sphere(32))
+        (depth / scene).mkdir(parents=True)
+        np.save(depth / scene / "a.npy", np.full((32, 64), metres, np.float32))
+    (depth / "z" / "a.npy").unlink()
+    cv2.imwrite(str(depth / "z" / "a_depth.png"), np.full((32, 64), 3500, np.uint16))
+    predict(checkpoint=checkpoint, depth=depth)
+    near, far, same = (_labels(tmp_path / "out" / "labels" / scene / "a.png") for scene in "xyz")
+    assert (near != far).any()
+    np.testing.assert_array_equal(far, same)
+    np.save(depth / "z" / "a.npy", np.full((32, 64), 1, np.float32))
+    with pytest.raises(SystemExit, match="1 of 3 images"):
+        predict(checkpoint=checkpoint, depth=depth, overwrite="true")
     with pytest.raises(SystemExit, match="depth: found none; expected a folder"):
-        _predict(monkeypatch, **settings, output=tmp_path / "out")
-    (tmp_path / "depth").mkdir()
-    with pytest.raises(SystemExit, match="1 of 1 images"):
-        _predict(monkeypatch, **settings, output=tmp_path / "out", depth=tmp_path / "depth")
-    metres = np.linspace(0.5, 5, 32 * 64, dtype=np.float32).reshape(32, 64)
-    np.save(tmp_path / "depth" / "a.npy", metres)
-    millimetres = tmp_path / "millimetres"
-    millimetres.mkdir()
-    cv2.imwrite(str(millimetres / "a_depth.png"), np.rint(metres * 1000).astype(np.uint16))
-    found = []
-    for name, folder in (("npy", tmp_path / "depth"), ("png", millimetres)):
-        _predict(monkeypatch, **settings, output=tmp_path / name, depth=folder)
-        found.append(_labels(tmp_path / name / "labels" / "a.png"))
-    assert (found[0] == found[1]).mean() > 0.99
-    np.save(tmp_path / "depth" / "a.npy", np.full((32, 64), 0.5, np.float32))
-    _predict(monkeypatch, **settings, output=tmp_path / "near", depth=tmp_path / "depth")
-    assert (_labels(tmp_path / "near" / "labels" / "a.png") != found[0]).any()
-    rgb_only = write_checkpoint(tmp_path / "rgb.ckpt")
-    settings["checkpoint"] = rgb_only
+        predict(checkpoint=checkpoint)
     with pytest.raises(SystemExit, match=r"depth: .*expected null.*takes rgb\."):
-        _predict(monkeypatch, **settings, output=tmp_path / "x", depth=tmp_path / "depth")
+        predict(depth=depth)
 
 
 @pytest.mark.parametrize(
@@ -210,114 +226,14 @@ def test_networks_with_depth_want_depth(monkeypatch: pytest.MonkeyPatch, tmp_pat
         ({"blend": "mean"}, "blend: found mean; expected feather or nearest"),
         ({"base_level": 9}, "base_level"),
         ({"device": "abacus"}, "device"),
-        ({"colour": 1}, "unknown setting"),
         ({"overwrite": "no"}, "overwrite: found no; expected true or false"),
-        ({"images_per_forward": 1.5}, "images_per_forward: found 1.5; expected a whole number"),
         ({"crop": "[a,b,c,d]"}, "crop"),
     ],
 )
 def test_impossible_settings_are_refused_before_any_work(
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-    checkpoint: Path,
-    changes: dict[str, Any],
-    message: str,
+    tmp_path: Path, predict: Predict, changes: dict[str, Any], message: str
 ) -> None:
-    image = _write(tmp_path / "a.png", _sphere(16))
-    settings = {"checkpoint": checkpoint, "input": image, "output": tmp_path / "out"}
+    _write(tmp_path / "in" / "a.png", _sphere(16))
     with pytest.raises(SystemExit, match=message):
-        _predict(monkeypatch, **(settings | changes))
+        predict(**changes)
     assert not (tmp_path / "out").exists()
-
-
-def test_an_interruption_keeps_what_is_done(
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    tmp_path: Path,
-    checkpoint: Path,
-) -> None:
-    for name in ("a", "b", "c"):
-        _write(tmp_path / "panoramas" / f"{name}.png", _sphere(16))
-
-    def interrupted(path: Path, *args: Any) -> Any:
-        if path.name == "b.png":
-            raise KeyboardInterrupt
-        return read_panorama(path, *args)
-
-    monkeypatch.setattr("tangent_train.cli.predict.read_panorama", interrupted)
-    output = tmp_path / "out"
-    with pytest.raises(SystemExit) as stopped:
-        _predict(monkeypatch, checkpoint=checkpoint, input=tmp_path / "panoramas", output=output)
-    assert stopped.value.code == 130
-    images = json.loads((output / "summary.json").read_text())["images"]
-    assert [entry["name"] for entry in images] == ["a"]
-    assert [path.name for path in (output / "labels").iterdir()] == ["a.png"]
-    assert "1 of 3 images are done. resume=true" in capsys.readouterr().out
-    monkeypatch.setattr("tangent_train.cli.predict.read_panorama", read_panorama)
-    first = (output / "labels" / "a.png").stat().st_mtime_ns
-    settings = {"checkpoint": checkpoint, "input": tmp_path / "panoramas", "output": output}
-    with pytest.raises(SystemExit, match="resume: found blend=nearest, another setting"):
-        _predict(monkeypatch, **settings, resume="true", blend="nearest")
-    _predict(monkeypatch, **settings, resume="true")
-    images = json.loads((output / "summary.json").read_text())["images"]
-    assert [entry["name"] for entry in images] == ["a", "b", "c"]
-    assert (output / "labels" / "a.png").stat().st_mtime_ns == first
-    assert len(list((output / "labels").iterdir())) == 3
-
-
-def test_results_are_not_labelled_again(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, checkpoint: Path
-) -> None:
-    _write(tmp_path / "a.png", _sphere(16))
-    settings = {"checkpoint": checkpoint, "input": tmp_path, "output": tmp_path}
-    for overwrite in ("false", "true"):
-        _predict(monkeypatch, **settings, overwrite=overwrite, report=0)
-        images = json.loads((tmp_path / "summary.json").read_text())["images"]
-        assert [entry["name"] for entry in images] == ["a"]
-    with pytest.raises(SystemExit, match="found only results"):
-        _predict(monkeypatch, **(settings | {"input": tmp_path / "color"}), overwrite="true")
-
-
-def test_one_picture_that_cannot_be_used_does_not_stop_the_others(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, checkpoint: Path
-) -> None:
-    """Neither a setting that does not fit it, nor a lie about its size, nor its name."""
-    folder, output = tmp_path / "in", tmp_path / "out"
-    _write(folder / "b.png", _sphere(16))
-    _write(folder / "square.png", _sphere(16)[:, :16])
-    strange = folder / "caf\udce9 ${x}.png"
-    _write(folder / "c.png", _sphere(16)).rename(strange)
-    lie = (
-        '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF '
-        'xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#"><rdf:Description '
-        'xmlns:GPano="http://ns.google.com/photos/1.0/panorama/" '
-        'GPano:ProjectionType="equirectangular" GPano:FullPanoWidthPixels="2000000" '
-        'GPano:FullPanoHeightPixels="1000000" GPano:CroppedAreaImageWidthPixels="32" '
-        'GPano:CroppedAreaImageHeightPixels="16" GPano:CroppedAreaLeftPixels="0" '
-        'GPano:CroppedAreaTopPixels="0"/></rdf:RDF></x:xmpmeta>'
-    )
-    Image.fromarray(_sphere(16)).save(folder / "huge.webp", xmp=lie.encode())
-    with pytest.raises(SystemExit, match="2 of 4 images"):
-        _predict(monkeypatch, checkpoint=checkpoint, input=folder, output=output)
-    assert len(list((output / "labels").iterdir())) == 2
-    with (output / "summary.csv").open(newline="") as file:
-        errors = {row["file"].rpartition("/")[2]: row["error"] for row in csv.DictReader(file)}
-    assert "at most 32768" in errors["huge.webp"]
-    assert "twice as wide" in errors["square.png"]
-
-
-def test_depth_is_that_of_the_image_in_its_folder(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    checkpoint = write_checkpoint(tmp_path / "model.ckpt", channels=4)
-    for scene, metres in (("x", 0.5), ("y", 3.5)):
-        _write(tmp_path / "images" / scene / "a.png", _sphere(32))
-        (tmp_path / "depth" / scene).mkdir(parents=True)
-        np.save(tmp_path / "depth" / scene / "a.npy", np.full((32, 64), metres, np.float32))
-    settings = {"checkpoint": checkpoint, "input": tmp_path / "images", "output": tmp_path / "out"}
-    _predict(monkeypatch, **settings, depth=tmp_path / "depth")
-    near, far = (_labels(tmp_path / "out" / "labels" / scene / "a.png") for scene in "xy")
-    assert (near != far).any()
-    np.save(tmp_path / "depth" / "y" / "a_depth.npy", np.full((32, 64), 1, np.float32))
-    with pytest.raises(SystemExit, match="1 of 2 images"):
-        _predict(monkeypatch, **settings, depth=tmp_path / "depth", overwrite="true")

@@ -69,11 +69,13 @@ PREDICT = ("predict", "checkpoint=x.ckpt", "input=image.png", "output=labels")
         (("predict", "checkpoint=x.ckpt", "input=image.png"), r"output: found none; expected"),
         (("predict", "checkpoint=x.ckpt", "input=nothing", "output=o"), r"nothing: found nothing"),
         ((*PREDICT, "blend=soft"), r"blend: found soft; expected feather or nearest"),
-        ((*PREDICT, "fov=65"), r"fov: found 65; .*Add projection=perspective"),
-        ((*PREDICT, "depth=."), r"depth: found \.; expected none, for a network that takes RGB"),
+        ((*PREDICT, "depth=."), r"depth: found \.; expected null for a network that takes rgb"),
         (("export", "checkpoint=x.ckpt", "output=net.doc"), r"output: found net\.doc; expected"),
         (("report", "nowhere"), r"nowhere: found no such folder; expected a run"),
-        (("render", "input=image.png", "output=o", "level=2", "base_level=5"), r"level: found 2"),
+        (
+            ("render", "input=image.png", "output=o", "base_level=x"),
+            r"base_level: found x; expected",
+        ),
         ((*PREDICT, "device=quantum"), r"device: found quantum .*; expected cpu, or a device"),
         ((*PREDICT, "base_level=7"), r"base_level: found 7; expected 0 to level = 4"),
         (("transfer", "experiment=rooms/transfer", "level=3"), r"stage S: image size .*found 4×4"),
@@ -102,7 +104,7 @@ def test_a_network_for_more_inputs_than_the_data_has(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "image.png").touch()
     monkeypatch.setattr(sys, "argv", ["tangent-predict", *PREDICT[1:]])
-    with pytest.raises(SystemExit, match=r"depth: found none; .*data\.inputs=\[rgb\]"):
+    with pytest.raises(SystemExit, match=r"depth: found none; expected a folder"):
         main.predict()
     content = torch.load(path, weights_only=True)
     assert content["state_dict"]["network.weight"].shape[1] == 4
