@@ -19,8 +19,7 @@ from tensorboard.backend.event_processing.event_accumulator import (  # type: ig
 )
 from torch import nn
 
-from datamodules import Stanford2D3DS, Stanford2D3DSPerspective
-from datamodules.core.samples import EvaluationImages
+from datamodules import Stanford2D3DS
 from tangent_train.callbacks.tensorboard import (
     TrainingSpeed,
     ValidationConfusion,
@@ -29,12 +28,12 @@ from tangent_train.callbacks.tensorboard import (
 from tangent_train.errors import SettingError
 from tangent_train.rendering import PerspectiveRepresentation, TangentRepresentation
 from tangent_train.results.chart import confusion_picture
-from tangent_train.results.pictures import colorize, prediction_panel
+from tangent_train.results.pictures import prediction_panel
 from tangent_train.tasks import SegmentationTask
 from tests.tasks.shapes import Shapes, shape_task
 
 if TYPE_CHECKING:
-    from tests.conftest import FabricateStanford
+    pass
 
 TANGENT = TangentRepresentation(base_level=0, level=4, faces_per_panorama=5)
 PHOTOS = PerspectiveRepresentation(level=5, evaluation="grid", crops_per_photo=2)
@@ -174,29 +173,6 @@ def test_the_speed_is_that_of_training_alone(stanford_root: Path, tmp_path: Path
     images = [event.value for event in events.Scalars("speed/images_per_s")]
     assert images == [2 * 5, 2 * 5], "two panoramas of 5 images each second"
     assert _steps(events, "speed/images_per_s") == [STEPS - 1, 2 * STEPS - 1]
-
-
-def test_crops_of_a_photo_stand_side_by_side(
-    fabricate_stanford: FabricateStanford, tmp_path: Path
-) -> None:
-    root = fabricate_stanford(tmp_path / "data", photos=2)
-    data = Stanford2D3DSPerspective(root, PHOTOS, photos_per_step=3, validation_fraction=0.35)
-    task = _task(PHOTOS, data.class_names)
-    _fit(tmp_path, data, task, count=1, max_epochs=1)
-    events, source = _events(tmp_path), data.source("val")
-    sample: Any = EvaluationImages(source, PHOTOS, data.inputs)[0, 0]
-    rgb, truth = sample.images[0].numpy(), sample.target.numpy()
-    assert len(rgb) > 1, "several crops"
-    (tag,) = _tags(events, "images", "val_images/")
-    picture = _picture(events.Images(tag)[-1])
-    side = rgb.shape[1]
-    scale = 256 // side
-    assert picture.shape[1] == 2 * scale * len(rgb) * side + 8
-    shown = picture[22 : 22 + scale * side : scale, : scale * len(rgb) * side : scale]
-    np.testing.assert_array_equal(shown, np.hstack(rgb))
-    truths = picture[22 : 22 + scale * side : scale, 8 + scale * len(rgb) * side :: scale]
-    np.testing.assert_array_equal(truths, colorize(np.hstack(truth), 14))
-    assert events.Scalars("speed/images_per_s")[0].value > 0
 
 
 def test_shapes_have_accuracies_and_no_unknown_class(tmp_path: Path) -> None:

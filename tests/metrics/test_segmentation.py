@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
-from torchmetrics import JaccardIndex
 
 from tangent_train.errors import SettingError
 from tangent_train.metrics.segmentation import ConfusionMatrix, segmentation_scores
@@ -40,14 +39,6 @@ def test_scores_equal_plain_numpy_over_the_whole_data_set() -> None:
         assert scores.share[k - 1] == pytest.approx(np.mean(truth == k))
     assert scores.miou == pytest.approx(scores.iou.mean())
     assert scores.macc == pytest.approx(scores.accuracy.mean())
-
-
-def test_iou_equals_torchmetrics() -> None:
-    reference = JaccardIndex("multiclass", num_classes=CLASSES, ignore_index=0, average="none")
-    for prediction, truth in _panoramas():
-        reference.update(torch.from_numpy(prediction), torch.from_numpy(truth))
-    scores = segmentation_scores(_counted(_panoramas()).compute().pixels)
-    np.testing.assert_allclose(scores.iou, reference.compute()[1:].numpy(), rtol=1e-6)
 
 
 @pytest.mark.parametrize(("absent", "mean"), [("skip", (1 + 0.5) / 2), ("zero", (1 + 0.5 + 0) / 3)])

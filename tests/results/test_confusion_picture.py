@@ -63,12 +63,6 @@ def test_rows_of_absent_classes_are_grey() -> None:
     assert present[0, 1] < absent[0, 1] < present[1, 1]
 
 
-def test_nothing_labelled_is_a_picture_too() -> None:
-    picture = confusion_picture(np.zeros((3, 3), np.int64), _names(2))
-    assert len(_places(picture, GREY)) == 4
-    assert picture.dtype == np.uint8
-
-
 def test_many_classes_are_drawn_small_and_without_numbers() -> None:
     count = 90
     picture = confusion_picture(

@@ -55,18 +55,6 @@ def test_classes_can_be_hidden(report: OpenReport) -> None:
     close(report.center(), COLORS[index])
 
 
-def test_the_legend_names_the_classes_of_the_image_with_their_shares(report: OpenReport) -> None:
-    entries = report.page.locator(".legend li").all_inner_texts()
-    names = [entry.split("\n")[0].strip() for entry in entries]
-    assert names == list(NAMES)
-    assert report.text(".shares") == "share of truth / prediction, %"
-    truth, prediction = (float(s) for s in entries[3].split("\n")[-1].split("/"))
-    assert truth == pytest.approx(12.5, abs=0.15), "an octant"
-    assert prediction == pytest.approx(12.5, abs=0.15)
-    disc = float(entries[0].split("\n")[-1].split("/")[0])
-    assert disc == pytest.approx(50 * (1 - math.cos(math.radians(20))), abs=0.1)
-
-
 def test_the_class_under_the_pointer_is_named(report: OpenReport) -> None:
     x, y = report.middle()
     box = report.box()
@@ -154,31 +142,3 @@ def test_a_phone_can_reach_everything(browser: Browser, page_path: Path) -> None
         for layer in ("truth", "overlay"):
             page.locator(f".layers label:has([value={layer}])").tap()
             assert page.locator(f"input[value={layer}]").is_checked()
-
-
-def _touch(report: OpenReport, *fingers: list[tuple[float, float]]) -> None:
-    """Fingers on the picture, each along its points, then lifted."""
-    session = report.page.context.new_cdp_session(report.page)
-    kinds = ["touchStart"] + ["touchMove"] * (len(fingers[0]) - 1)
-    for kind, *points in zip(kinds, *fingers, strict=True):
-        places = [{"x": x, "y": y, "id": k} for k, (x, y) in enumerate(points)]
-        session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": places})
-    session.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
-    report.drawn()
-
-
-def test_fingers_drag_and_pinch(browser: Browser, page_path: Path) -> None:
-    phone: dict[str, Any] = {"viewport": {"width": 360, "height": 640}, "has_touch": True}
-    with opened(browser, page_path, **phone) as report:
-        report.page.locator("canvas").scroll_into_view_if_needed()
-        report.layer("input")
-        x, y = report.middle()
-        _touch(report, [(x, y), (x - 20, y), (x - 50, y + 30)])
-        step = math.degrees(step_rad(report))
-        # The first move turns at latitude 0; the second sideways too, its 30 pixels upwards last.
-        longitude, latitude = 50 * step, 30 * step
-        close(report.pixels(), colors_of(view_of(report, longitude, latitude, START_DEG)))
-        report.page.get_by_label("Reset the view").tap()
-        _touch(report, [(x - 40, y), (x - 60, y)], [(x + 40, y), (x + 60, y)])
-        close(report.pixels(), colors_of(view_of(report, 0, 0, START_DEG / 1.5)))
-        assert report.page.evaluate("() => visualViewport.scale") == 1, "the page did not zoom"
