@@ -37,7 +37,7 @@ def pictures(kind: str, folder: Path, settings: Mapping[str, Any]) -> list[Callb
     return [
         ValidationConfusion(),
         PredictionPanels(folder / "panels", settings["panels"]),
-        ValidationPictures(settings.get("tensorboard_images", 0)),
+        ValidationPictures(settings["tensorboard_images"]),
     ]
 
 
