@@ -1,1 +1,1 @@
-"""What happens around training: checkpoints, pictures and curves, progress."""
+"""Lightning callbacks: checkpoints, pictures and curves, results, progress."""

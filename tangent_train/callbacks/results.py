@@ -1,4 +1,4 @@
-"""What becomes of an evaluation: the pictures of a run, its results as files and as a page."""
+"""The pictures of a run, and the files and the page of its evaluation."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ def pictures(kind: str, folder: Path, settings: Mapping[str, Any]) -> list[Callb
     """Callbacks that draw the predictions on the validation and test splits.
 
     Args:
-        kind: Of the task.
-        folder: Of the run.
-        settings: Of the run.
+        kind: Kind of the task.
+        folder: Folder of the run.
+        settings: Settings of the run.
     """
     if kind == "classification":
         return [ValidationConfusion()]
@@ -45,8 +45,8 @@ def evaluated(task: Any, noun: str) -> Record:
     """The record of the last evaluation of a task.
 
     Args:
-        task: With the matrices of that evaluation.
-        noun: What was scored, in the plural.
+        task: Holds the matrices of that evaluation.
+        noun: Plural name of the images.
     """
     if task.kind == "classification":
         return classification_record(task.matrices, task.class_names, noun)
@@ -57,7 +57,7 @@ def write_evaluation(task: Any, record: Record, checkpoint: Path, folder: Path) 
     """Write ``results.*`` and ``report.html``.
 
     Args:
-        task: What was evaluated, still attached to its trainer.
+        task: The evaluated task, still attached to its trainer.
         record: From `evaluated`.
         checkpoint: Its weights.
         folder: Where to.

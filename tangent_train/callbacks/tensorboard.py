@@ -1,4 +1,4 @@
-"""What TensorBoard shows of a training beside its curves: pictures, scores per class, speed."""
+"""Pictures, scores per class and training speed for TensorBoard."""
 
 from __future__ import annotations
 

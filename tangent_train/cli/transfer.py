@@ -106,7 +106,7 @@ def _check_given(config: DictConfig, stages: Sequence[Stage]) -> None:
 
 
 def _check_data(stages: Sequence[Stage]) -> None:
-    """Build what stages are made of: what cannot work is said before hours of training."""
+    """Build the data and networks of all stages: errors come before hours of training."""
     from tangent_train.cli.build import build
 
     built: list[tuple[Stage, Any]] = []

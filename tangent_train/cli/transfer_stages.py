@@ -42,7 +42,7 @@ STUDY = "angular_resolution"
 """The one study there is."""
 
 State = Literal["new", "begun", "finished"]
-"""What is in a stage's folder. A stage that only evaluates is either new or finished."""
+"""Progress of a stage. One that only evaluates is either new or finished."""
 
 _OF_THE_TRANSFER = (
     *("photos", "fine_tuning", "compare", "folds", "seeds", "checkpoint"),
@@ -212,7 +212,7 @@ def _numbers(config: DictConfig, setting: str, least: int) -> list[int]:
 
 
 def stage_state(stage: Stage) -> State:
-    """What there is of a stage.
+    """How far a stage has come, by the files in its folder.
 
     Raises:
         SettingError: Its folder holds something else, or the same stage with other settings.
@@ -260,7 +260,7 @@ def run_stage(stage: Stage, state: State) -> int:
 
     Args:
         stage: Not finished.
-        state: What there is of it.
+        state: From `stage_state`.
 
     Returns:
         The exit status, as a shell says it.

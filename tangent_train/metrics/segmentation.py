@@ -25,7 +25,7 @@ __all__ = [
 ]
 
 AbsentClass = Literal["skip", "zero"]
-"""What a class that no labelled pixel has does to a mean: nothing, or counts as 0."""
+"""Whether a class without labelled pixels is left out of a mean or counts as 0."""
 
 UNKNOWN = 0
 """Class index of unlabelled pixels, everywhere."""
@@ -84,7 +84,7 @@ def segmentation_scores(
 
 
 class ConfusionMatrices(NamedTuple):
-    """What `ConfusionMatrix` has counted; rows truth, columns prediction, class 0 unknown.
+    """The counts of a `ConfusionMatrix`; rows truth, columns prediction, class 0 unknown.
 
     Attributes:
         pixels: ``(K+1, K+1)`` pixels of panoramas and photos.

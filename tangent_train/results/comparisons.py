@@ -1,4 +1,4 @@
-"""What reports compare: groups of runs, the stages of a transfer, one network at several levels."""
+"""Reports over groups of runs, the stages of a transfer, and one network at several levels."""
 
 from __future__ import annotations
 

@@ -65,8 +65,8 @@ def segmentation_record(
     Args:
         matrices: Counts over the data set.
         class_names: K + 1 names, the unknown class first.
-        absent_class: What classes absent from the truth do to the means.
-        noun: What was scored, in the plural. Photos have neither solid angles nor latitude bands.
+        absent_class: How classes absent from the ground truth enter the means.
+        noun: Plural name of the images. Photos have neither solid angles nor latitude bands.
     """
     on_sphere = bool(matrices.solid_angle.any())
     pixels = segmentation_scores(matrices.pixels, absent_class)
@@ -111,7 +111,7 @@ def classification_record(
     Args:
         confusion: ``(K, K)`` counts, rows truth, columns prediction.
         class_names: K names.
-        noun: What was classified, in the plural.
+        noun: Plural name of the images.
     """
     scores = classification_scores(confusion)
     classes = [

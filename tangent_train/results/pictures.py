@@ -95,12 +95,12 @@ def prediction_panel(
 
 
 def shown_image(image: Any, target: Any, representation: Any) -> NDArray[np.uint8]:
-    """What is shown beside labels: the panorama itself, or the crops of a photo side by side.
+    """The colours to show beside labels: the panorama, or the crops of a photo side by side.
 
     Args:
         image: Of an `ImageSource`.
         target: Its labels as they are evaluated: ``(H, W)``, or ``(n, h, w)`` of crops.
-        representation: What makes the crops.
+        representation: Defines the crops.
 
     Returns:
         RGB ``(H, W, 3)``, or ``(h, n·w, 3)``.
@@ -130,7 +130,7 @@ def overlay_picture(
         rgb: ``(H, W, 3)``.
         labels: ``(H, W)`` class indices; what is unknown (0) shows the picture.
         class_names: K + 1 names.
-        opacity: Of the labels.
+        opacity: Of the labels, 0 to 1.
 
     Returns:
         RGB image of the same width, a little higher; the legend grows with the width.

@@ -95,13 +95,13 @@ class Record:
 
     Attributes:
         kind: Kind of the task.
-        noun: What was scored, in the plural: panoramas, photos, shapes.
+        noun: Plural name of the images: panoramas, photos, shapes.
         images: How many of them.
         means: Scores over all classes, see `SCORES`.
         classes: For every class its name (``class``) and scores.
         latitude_bands: For every band ``latitude_deg`` (south, north) and scores; none for photos.
         confusion: Integer counts, rows truth, columns prediction.
-        absent_class: What classes absent from the truth do to the means.
+        absent_class: How classes absent from the ground truth enter the means.
         settings: The resolved config of the run, as ``section.setting``.
         folder: Of the run.
     """

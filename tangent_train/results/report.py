@@ -34,7 +34,7 @@ class Report:
         made_by: The command that writes it; stands in the JSON file.
         rows: Evaluations, and published figures.
         notes: Sentences about the rows.
-        compared: What the column "change" compares; empty without one.
+        compared: Explains the column "change"; empty without one.
     """
 
     title: str
@@ -107,7 +107,7 @@ class Report:
         return [sentence for sentence in found if sentence]
 
     def all_notes(self) -> list[str]:
-        """What has to be known beside the scores."""
+        """Remarks without which the scores would be misread, and the largest losses."""
         lacking: dict[str, list[str]] = defaultdict(list)
         own = [row for row in self.rows if not row.published]
         for row in own:
@@ -228,7 +228,7 @@ def _cell(found: Statistic, folds: int) -> str:
 
 
 def _change(kept: float | None) -> str:
-    """What is kept of another score, as a change.
+    """The ratio to another score as a relative change.
 
     >>> _change(0.955), _change(1.026), _change(0.9999)
     ('−4.5 %', '+2.6 %', '+0.0 %')

@@ -45,7 +45,7 @@ class Row:
     Attributes:
         label: Name of the row.
         records: The evaluations.
-        facts: What else the row's tables say of it, by column.
+        facts: Further columns of the tables, by heading.
         partner: The row that its scores are compared with.
         published: Whether it is from a paper.
     """

@@ -87,7 +87,7 @@ def encode_image(
     halved in size until they fit.
 
     Args:
-        image: What to show.
+        image: The image with its label maps.
         class_count: K + 1, the unknown class 0 included.
         budget_bytes: Of the HTML file, where files are written in base64.
 
