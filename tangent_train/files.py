@@ -100,8 +100,8 @@ def atomic_path(path: Path) -> Iterator[Path]:
 def reserve(file: IO[bytes], size: int) -> None:
     """Take the room of a file before its pages are written through memory.
 
-    A mapped file has holes at first; a disk that is full when one is filled ends the process. Where
-    the system has no way to take room (macOS, Windows), it is written, as it is.
+    A mapped file has holes at first; a disk that is full when one is filled ends the process. Some
+    systems (macOS, Windows) have no way to take room.
 
     Args:
         file: Open for reading and writing.
@@ -112,13 +112,6 @@ def reserve(file: IO[bytes], size: int) -> None:
     """
     if hasattr(os, "posix_fallocate"):
         os.posix_fallocate(file.fileno(), 0, size)
-        return
-    for start in range(0, size, len(_PROBE)):
-        file.seek(start)
-        block = file.read(min(len(_PROBE), size - start))
-        file.seek(start)
-        file.write(block or _PROBE[: size - start])
-    file.flush()
 
 
 def _sync(path: Path) -> None:

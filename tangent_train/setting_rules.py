@@ -22,61 +22,30 @@ Purpose = Literal["resume", "report", "transfer", "evaluation"]
 """A run and itself when it is resumed; runs of one group of a report (folds and seeds); a stage of
 a transfer and one that can stand in for it, if it trains, and if it only evaluates a network."""
 
-_ALWAYS = frozenset[Purpose](("resume", "report", "transfer", "evaluation"))
-_COMPUTED_ELSEWHERE = frozenset[Purpose](("resume", "evaluation"))
-_RESUMED = frozenset[Purpose](("resume",))
-
-_MAY_DIFFER: dict[str, frozenset[Purpose]] = {
+_ALWAYS = "resume report transfer evaluation"
+_RULES = (
     # Where files are, how a run is watched, how fast it is: no result depends on these.
-    "checkpoint": _ALWAYS,
-    "checkpoint_every_n_steps": _ALWAYS,
-    "choices": _ALWAYS,
-    "data.in_memory": _ALWAYS,
-    "data.label_table": _ALWAYS,
-    "data.num_workers": _ALWAYS,
-    "data.root": _ALWAYS,
-    "data.store": _ALWAYS,
-    "panels": _ALWAYS,
-    "resume": _ALWAYS,
-    "trust": _ALWAYS,
-    "task.channels_last": _ALWAYS,
-    "task.compile": _ALWAYS,
-    "task.images_per_forward": _ALWAYS,
-    "tensorboard_images": _ALWAYS,
-    "trainer.accelerator": _ALWAYS,
-    "trainer.enable_model_summary": _ALWAYS,
-    "trainer.enable_progress_bar": _ALWAYS,
-    "trainer.log_every_n_steps": _ALWAYS,
-    "trainer.num_sanity_val_steps": _ALWAYS,
-    "trainer.strategy": _ALWAYS,
-    "init_from": _ALWAYS - {"report"},
-    "name": _ALWAYS - {"report"},
+    (_ALWAYS, "checkpoint checkpoint_every_n_steps choices panels resume tensorboard_images trust"),
+    (_ALWAYS, "data.in_memory data.label_table data.num_workers data.root data.store"),
+    (_ALWAYS, "task.channels_last task.compile task.images_per_forward"),
+    (_ALWAYS, "trainer.accelerator trainer.enable_model_summary trainer.enable_progress_bar"),
+    (_ALWAYS, "trainer.log_every_n_steps trainer.num_sanity_val_steps trainer.strategy"),
+    ("resume transfer evaluation", "init_from name"),
     # What the runs of a group are the mean over.
-    "data.fold": frozenset(("report",)),
-    "data.seed": frozenset(("report",)),
-    "seed": frozenset(("report",)),
+    ("report", "data.fold data.seed seed"),
     # Of the evaluation: it comes after the training that is resumed.
-    "data.test_rotation": _RESUMED,
-    "representation.average_rotations": _RESUMED,
-    "task.absent_class": _RESUMED,
+    ("resume", "data.test_rotation representation.average_rotations task.absent_class"),
     # Of the training: an evaluation does not depend on it.
-    "optimizer": frozenset(("evaluation",)),
-    "scheduler": frozenset(("evaluation",)),
-    "task.images_per_chunk": _COMPUTED_ELSEWHERE,
-    "trainer.devices": _COMPUTED_ELSEWHERE,
-    "trainer.max_epochs": _COMPUTED_ELSEWHERE,
-    "trainer.max_steps": _COMPUTED_ELSEWHERE,
-    "trainer.num_nodes": _COMPUTED_ELSEWHERE,
+    ("evaluation", "optimizer scheduler"),
+    ("resume evaluation", "task.images_per_chunk trainer.devices trainer.num_nodes"),
+    ("resume evaluation", "trainer.max_epochs trainer.max_steps"),
     # A resumed run may go on for longer, or elsewhere, but takes the same steps.
-    "trainer": _RESUMED,
-    "trainer.accumulate_grad_batches": frozenset(),
-    "trainer.gradient_clip_algorithm": frozenset(),
-    "trainer.gradient_clip_val": frozenset(),
-    "trainer.limit_train_batches": frozenset(),
-    "trainer.overfit_batches": frozenset(),
-    "trainer.precision": frozenset(),
-    "trainer.sync_batchnorm": frozenset(),
-}
+    ("resume", "trainer"),
+    ("", "trainer.accumulate_grad_batches trainer.limit_train_batches trainer.overfit_batches"),
+    ("", "trainer.gradient_clip_algorithm trainer.gradient_clip_val"),
+    ("", "trainer.precision trainer.sync_batchnorm"),
+)
+_MAY_DIFFER = {name: purposes.split() for purposes, names in _RULES for name in names.split()}
 
 _OF_THE_TRAINER = (
     "accelerator barebones callbacks default_root_dir devices enable_autolog_hparams fast_dev_run "

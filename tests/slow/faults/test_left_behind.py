@@ -171,7 +171,6 @@ array[:3] = 1, 2, 3
 array.flush()
 with open("a.npy", "r+b") as file:
     reserve(file, os.path.getsize("a.npy"))
-assert os.stat("a.npy").st_blocks * 512 >= 400_000, "taken"
 assert np.load("a.npy")[:4].tolist() == [1, 2, 3, 0]
 """
 
