@@ -32,12 +32,12 @@ from tangent_train.files import write_bytes, write_text
 if TYPE_CHECKING:
     from pathlib import Path
 
-__all__ = ["MANIFEST", "VERSION", "RoomPlan", "generate_rooms", "make_room", "plan_rooms"]
+__all__ = ["MANIFEST", "RoomPlan", "generate_rooms", "make_room", "plan_rooms"]
 
 MANIFEST = "synthrooms.json"
 """File that marks a folder as SynthRooms and holds its settings."""
 
-VERSION = 1
+_VERSION = 1
 """Version of the generator; another one makes other pictures from the same settings."""
 
 _CAMERA_SHARES = (0.75, 0.15, 0.1)  # of rooms with one, two and three cameras
@@ -79,7 +79,7 @@ def generate_rooms(
         SettingError: The number of workers is negative.
     """
     number_of_processes(workers, 0)
-    claim_folder(root, MANIFEST, "SynthRooms", VERSION, asdict(settings))
+    claim_folder(root, MANIFEST, "SynthRooms", _VERSION, asdict(settings))
     plans = plan_rooms(settings)
     labels = root / "semantic_labels.json"
     if not labels.exists():
