@@ -85,7 +85,7 @@ class CubeGrid(PinholeGrid):
     def neighbors(self) -> NDArray[np.int32]:
         """``(6, 4)`` faces that share an edge with a face: all but itself and the opposite one.
 
-        Walking to ever nearer centres over these neighbours ends at the owner.
+        Stepping to the neighbour with the nearest centre, again and again, ends at the owner.
         """
         return _NEIGHBORS
 

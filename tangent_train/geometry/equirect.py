@@ -122,7 +122,7 @@ def equirect_directions(shape: tuple[int, int]) -> NDArray[np.float64]:
 def equirect_elevations(
     shape: tuple[int, int], up_xyz: ArrayLike = (0.0, 0.0, 1.0)
 ) -> NDArray[np.float32]:
-    """How far every ERP pixel looks upwards: the sine of its angle above the horizon.
+    """Sine of the elevation angle of every ERP pixel.
 
     Args:
         shape: ``(H, W)``.

@@ -18,11 +18,11 @@ from tangent_train.geometry.sphere import checked_rotation
 
 __all__ = ["TangentGrid"]
 
-_MOST_LEVEL = 30  # of panoramas with 2³¹ rows; powers of far greater numbers never come to an end
+_MOST_LEVEL = 30  # a panorama of 2³¹ rows; much larger powers of two take for ever to compute
 
 
 class _FaceTable:
-    """What depends on the base level alone: centres, axes, neighbours, the reach of a cell."""
+    """Data that depend on the base level alone: centres, axes, neighbours, extent of the cells."""
 
     def __init__(self, base_level: int) -> None:
         vertices, self.faces = icosphere(base_level)
@@ -37,7 +37,7 @@ class _FaceTable:
 
     @cached_property
     def neighbors(self) -> NDArray[np.int32]:
-        """``(N, 12)`` faces that share a vertex with a face, filled up with the face itself."""
+        """``(N, 12)`` faces that share a vertex with a face, padded with the face itself."""
         around = np.sort(self.faces_of_vertex[self.faces].reshape(len(self.faces), -1), axis=1)
         own = np.arange(len(self.faces))[:, None]
         repeated = np.pad(around[:, 1:] == around[:, :-1], ((0, 0), (1, 0)))
@@ -166,9 +166,9 @@ class TangentGrid(PinholeGrid):
 
     @property
     def neighbors(self) -> NDArray[np.int32]:
-        """``(N, 12)`` faces that share a vertex with a face, filled up with the face itself.
+        """``(N, 12)`` faces that share a vertex with a face, padded with the face itself.
 
-        Walking to ever nearer centres over these neighbours ends at the owner.
+        Stepping to the neighbour with the nearest centre, again and again, ends at the owner.
         """
         return _face_table(self.base_level).neighbors
 

@@ -1,4 +1,4 @@
-"""Where a panorama was taken, and how it was rotated."""
+"""Pose of a panorama: its position and orientation."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class PanoramaPose:
         return self.location_m + ahead * np.asarray(distance_m, np.float64)[..., None]
 
     def seen(self, points_m: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Where points ``(…, 3)`` appear: directions ``(…, 3)`` and distances ``(…)`` in metres.
+        """Project world points ``(…, 3)``: directions ``(…, 3)`` and distances ``(…)`` in metres.
 
         A point at the centre itself has the direction 0.
         """

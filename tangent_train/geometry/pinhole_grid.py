@@ -1,4 +1,4 @@
-"""Square pinhole images around a point: what tangent images and the faces of a cube share."""
+"""Square pinhole images around a common centre: the base of tangent images and cube faces."""
 
 from __future__ import annotations
 
@@ -48,9 +48,9 @@ class PinholeGrid(ABC):
     @property
     @abstractmethod
     def neighbors(self) -> NDArray[np.int32]:
-        """``(N, k)`` images around an image, filled up with the image itself.
+        """``(N, k)`` neighbours of every image, padded with the image itself.
 
-        Walking to ever nearer centres over these neighbours ends at the owner.
+        Stepping to the neighbour with the nearest centre, again and again, ends at the owner.
         """
 
     @property
@@ -72,7 +72,7 @@ class PinholeGrid(ABC):
 
     @abstractmethod
     def _key(self) -> tuple[object, ...]:
-        """What makes two grids of this class equal, beside the rotation."""
+        """Values that make two grids of this class equal, besides the rotation."""
 
     @property
     def half_extent(self) -> float:

@@ -1,4 +1,4 @@
-"""Images that see what others see, with other pixels."""
+"""The images of another grid at another resolution."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from tangent_train.geometry.pinhole_grid import PinholeGrid
 __all__ = ["ResizedGrid"]
 
 
-@dataclass(frozen=True, eq=False, init=False)
+@dataclass(frozen=True, eq=False)
 class ResizedGrid(PinholeGrid):
-    """The images of another grid, cut into more or fewer pixels: their outer edges agree.
+    """The images of another grid at another resolution; their outer edges agree.
 
-    What a network of a lower resolution gives for tangent images, or one that magnifies them, lies
-    on such a grid. With d pixels of pitch p there and d' here, the pitch here is p·d/d'.
+    The output of a network that downsamples or upsamples tangent images lies on such a grid. With d
+    pixels of pitch p there and d' here, the pitch here is p·d/d'.
 
     Args:
         original: The other grid.
@@ -31,14 +31,15 @@ class ResizedGrid(PinholeGrid):
 
     original: PinholeGrid
     dim: int
-    rotation: NDArray[np.float64] | None
 
-    def __init__(self, original: PinholeGrid, dim: int) -> None:
-        if dim < 2:
-            raise SettingError("dim", found=dim, expected="2 or more")
-        object.__setattr__(self, "original", original)
-        object.__setattr__(self, "dim", dim)
-        object.__setattr__(self, "rotation", original.rotation)
+    def __post_init__(self) -> None:
+        if self.dim < 2:
+            raise SettingError("dim", found=self.dim, expected="2 or more")
+
+    @property
+    def rotation(self) -> NDArray[np.float64] | None:  # type: ignore[override]
+        """That of the other grid."""
+        return self.original.rotation
 
     @property
     def num_images(self) -> int:

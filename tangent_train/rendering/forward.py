@@ -21,7 +21,7 @@ __all__ = ["Interpolation", "Pixels", "equirect_to_tangent"]
 Interpolation = Literal["bilinear", "nearest"]
 
 Pixels = TypeVar("Pixels", Tensor, NDArray[Any])
-"""What is rendered from tensors is a tensor, and from arrays an array."""
+"""Tensors are rendered to tensors, arrays to arrays."""
 
 _CHUNK = 2**20
 """Positions whose taps torch holds at once."""
@@ -39,7 +39,7 @@ def equirect_to_tangent(
     """Render tangent images from a panorama (paper, section 3.2).
 
     Longitude wraps and rows reflect at the poles, for every interpolation. A panorama that is not
-    twice as wide as high is taken as the whole sphere, stretched.
+    twice as wide as high is treated as the whole sphere, stretched.
 
     Args:
         image: A tensor ``(..., C, H, W)`` on any device, differentiable; or an array

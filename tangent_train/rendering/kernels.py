@@ -1,4 +1,4 @@
-"""Compiled loops: where pixels are on the sphere, who owns them, and adding images to a canvas.
+"""Compiled loops: positions on the sphere, owners of pixels, and adding images to a canvas.
 
 A *canvas* is what images are put together on: a panorama, or a photo made of crops. Its pixel
 (i, j) looks along the ray ``(rows[i, 0] columns[j, 0], rows[i, 0] columns[j, 1], rows[i, 1])``;
@@ -46,7 +46,7 @@ Tile = tuple[int, int, int, int]
 
 
 class Sight(NamedTuple):
-    """How n images see a canvas of ``(H, W)`` pixels.
+    """Geometry of n images and a canvas of ``(H, W)`` pixels.
 
     Attributes:
         images: ``(n,)`` their numbers, as they stand in `owner`.
@@ -68,7 +68,7 @@ class Sight(NamedTuple):
 
 
 class _Seen(NamedTuple):
-    """What an image gives to a tile.
+    """Pixels of a tile that an image contributes to.
 
     Attributes:
         pixel: Flat indices in the tile.
@@ -134,9 +134,9 @@ def owners(
     start: int, stop: int, centers: Array, neighbors: Array, inner: float,
     columns: Array, rows: Array, face: Array,
 ) -> None:  # fmt: skip
-    """The image with the nearest centre, for the ERP rows ``start:stop``.
+    """Find the image with the nearest centre, for the ERP rows ``start:stop``.
 
-    Walks to ever nearer centres, from the owner of the pixel before.
+    Steps to ever nearer centres, starting from the owner of the previous pixel.
 
     Args:
         start: First row.
@@ -169,7 +169,7 @@ def owners(
 
 @njit_fast
 def _project(side: tuple[int, int], m: Array, feather: bool, u: Array, v: Array, w: Array) -> None:
-    """Where an image sees rays ``(u, v, w)``, which become columns, rows and weights."""
+    """Project rays ``(u, v, w)`` into an image, in place: to columns, rows and weights."""
     for p in range(len(u)):
         x, y, z = u[p], v[p], w[p]
         depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z
@@ -184,7 +184,15 @@ def _project(side: tuple[int, int], m: Array, feather: bool, u: Array, v: Array,
 
 @njit_fast
 def _list_seen(tile: Tile, m: int, side: tuple[int, int], sight: Sight, seen: _Seen) -> int:
-    """List what image m, of so many rows and columns, gives to a tile; returns its length."""
+    """List the pixels of a tile that image m contributes to; returns how many.
+
+    Args:
+        tile: The tile.
+        m: Index of the image in `sight`.
+        side: Rows and columns of the image.
+        sight: Geometry of images and canvas.
+        seen: The list, written.
+    """
     top, bottom, left, right = tile
     columns, owner, (pixel, u, v, weight) = sight.columns, sight.owner, seen
     count = 0
@@ -310,7 +318,7 @@ def _softmax(sums: Array, num_classes: int) -> None:
 def _finish(
     tile: Tile, num_classes: int, softmax: bool, sums: Array, total: Array, labels: Array
 ) -> None:
-    """Of the pixels of a tile that got something, add the sums to the totals or write the label."""
+    """Add the sums of a tile's covered pixels to the totals, or write their labels."""
     top, bottom, left, right = tile
     p = -1
     for i in range(top, bottom):
@@ -340,7 +348,7 @@ def add_images(
         start: First row.
         stop: One past the last row.
         scores: ``(n, K, h, w)`` float32, h and w at least 2.
-        sight: How these images see the canvas.
+        sight: Geometry of these images and the canvas.
         softmax: Whether scores become probabilities after they are interpolated; not feathered.
         total: ``(H, W, K + 1)`` weighted sums, and the sum of the weights, changed. Empty where
             only labels are wanted, for which all images of a pixel have to come at once.
@@ -392,13 +400,13 @@ def seen_table(
     start: int, stop: int, side: tuple[int, int], sight: Sight,
     count: Array, face: Array, u: Array, v: Array, weight: Array,
 ) -> None:  # fmt: skip
-    """All images that give something to a pixel, for the rows ``start:stop``.
+    """All images that contribute to a pixel, for the rows ``start:stop``.
 
     Args:
         start: First row.
         stop: One past the last row.
         side: Rows and columns of the images.
-        sight: How they see the canvas.
+        sight: Geometry of images and canvas.
         count: ``(H, W)`` how many images there are, 0 before, written.
         face: ``(R, H, W)`` images, written; with R = 0 they are only counted.
         u: ``(R, H, W)`` columns in the images, written.

@@ -139,7 +139,7 @@ class ScoreMosaic:
     def _owners(
         self, images: object, build: Callable[[], NDArray[np.integer]]
     ) -> NDArray[np.integer]:
-        """Which image owns each pixel, kept for those that are still to come."""
+        """Owner of each pixel, kept until images of another set are added."""
         if self.blend == "feather":
             return NO_OWNERS
         if self._owned[0] is not images:

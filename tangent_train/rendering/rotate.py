@@ -53,6 +53,6 @@ def rotate_equirect(
 def _rotation_map(
     rotation: bytes, shape: tuple[int, int], dtype: np.dtype[np.floating]
 ) -> EquirectMap:
-    """Where each direction comes from; kept for the other parts of the same panorama."""
+    """Source positions of all directions; kept for the other parts of the same panorama."""
     inverse = np.frombuffer(rotation).reshape(1, 3, 3).transpose(0, 2, 1)
     return equirect_map(inverse, sphere_rays(shape), shape, dtype)

@@ -121,7 +121,7 @@ def equirect_map(
     shape: tuple[int, int],
     dtype: np.dtype[np.floating],
 ) -> EquirectMap:
-    """Where rays are in an ERP, for several canvases one below the other.
+    """Positions of rays in an ERP, of several canvases one below the other.
 
     Args:
         matrices: ``(n, 3, 3)`` from the rays of each canvas to directions of any length.
@@ -144,7 +144,7 @@ def pinhole_equirect_map(
     shape: tuple[int, int],
     dtype: np.dtype[np.floating],
 ) -> EquirectMap:
-    """Where the pixels of pinhole images are in an ERP, one image below the other.
+    """Positions of the pixels of pinhole images in an ERP, one image below the other.
 
     Args:
         world_from_pixel: ``(3, 3)`` or, of n images, ``(n, 3, 3)`` from homogeneous pixels (column,

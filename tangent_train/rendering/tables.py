@@ -1,4 +1,4 @@
-"""Where pixels come from: tables per grid and panorama size, kept in a bounded cache."""
+"""Tables of positions per grid and panorama size, kept in a bounded cache."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ Value = TypeVar("Value", bound=tuple[Any, ...])
 
 
 class ImageTable(NamedTuple):
-    """Where ERP pixels are in the images that see them.
+    """Positions of ERP pixels in the images that see them.
 
     Attributes:
         face: ``(R, H, W)`` images, uint8, int16 or int32.
@@ -130,7 +130,7 @@ def forward_map(
     faces: Sequence[int] | NDArray[np.int64],
     dtype: np.dtype[np.floating],
 ) -> EquirectMap:
-    """Where the pixels of tangent images are in the ERP, one image below the other.
+    """Positions of the pixels of tangent images in the ERP, one image below the other.
 
     Args:
         grid: The images.
@@ -169,7 +169,7 @@ def image_table(
     blend: str,
     rows: slice,
 ) -> ImageTable:
-    """The images that give something to the ERP pixels of some rows, and where they see them.
+    """The images that contribute to the ERP pixels of some rows, and the positions in them.
 
     Args:
         grid: The images.
@@ -203,7 +203,7 @@ def sight_of(
     rows: slice,
     owner: NDArray[np.integer],
 ) -> kernels.Sight:
-    """How images of a grid see rows of a panorama.
+    """Geometry of images of a grid and rows of a panorama, for the kernels.
 
     Args:
         grid: The images.

@@ -22,7 +22,7 @@ __all__ = [
 
 
 class Taps(NamedTuple):
-    """Where P values are taken from.
+    """Sources and weights of P values.
 
     Attributes:
         source: ``(T, P)`` int64, flat indices into the source.

@@ -29,24 +29,6 @@ CORNERS = {
     DOWN: [(1, -1, -1), (1, 1, -1), (-1, -1, -1), (-1, 1, -1)],
 }
 
-# The twelve edges of an unfolded cube: pixels of one face beside pixels of another.
-ALL = slice(None)
-BACKWARDS = slice(None, None, -1)
-EDGES = [
-    ((FRONT, ALL, -1), (RIGHT, ALL, 0)),
-    ((RIGHT, ALL, -1), (BACK, ALL, 0)),
-    ((BACK, ALL, -1), (LEFT, ALL, 0)),
-    ((LEFT, ALL, -1), (FRONT, ALL, 0)),
-    ((FRONT, 0, ALL), (UP, -1, ALL)),
-    ((RIGHT, 0, ALL), (UP, BACKWARDS, -1)),
-    ((BACK, 0, ALL), (UP, 0, BACKWARDS)),
-    ((LEFT, 0, ALL), (UP, ALL, 0)),
-    ((FRONT, -1, ALL), (DOWN, 0, ALL)),
-    ((RIGHT, -1, ALL), (DOWN, ALL, -1)),
-    ((BACK, -1, ALL), (DOWN, -1, BACKWARDS)),
-    ((LEFT, -1, ALL), (DOWN, BACKWARDS, 0)),
-]
-
 
 def random_directions(count: int) -> NDArray[np.float64]:
     directions = np.random.default_rng(0).normal(size=(count, 3))
@@ -60,18 +42,6 @@ def test_the_outer_corners_of_the_pixels_are_the_corners_of_the_cube(face: int, 
     first, last = -0.5, dim - 0.5
     expected = [(first, first), (last, first), (first, last), (last, last)]  # column, row
     np.testing.assert_allclose(grid.project(CORNERS[face], face), expected, atol=1e-12)
-
-
-@pytest.mark.parametrize("dim", [2, 5, 16])
-@pytest.mark.parametrize(("one", "other"), EDGES)
-def test_pixels_at_an_edge_mirror_those_of_the_neighbour(
-    one: tuple[int, slice, int], other: tuple[int, slice, int], dim: int
-) -> None:
-    grid = CubeGrid(dim)
-    directions = grid.directions()
-    normal = grid.centers_xyz[one[0]] - grid.centers_xyz[other[0]]  # of length √2
-    mirrored = directions[one] - (directions[one] @ normal)[:, None] * normal
-    np.testing.assert_allclose(directions[other], mirrored, atol=1e-14)
 
 
 @pytest.mark.parametrize("rotation", [None, TURN])
@@ -88,18 +58,6 @@ def test_every_direction_is_seen_by_its_owner_alone(
     x, y, z = (directions @ grid.rotation if grid.rotation is not None else directions).T
     largest = np.stack([x, y, -x, -y, z, -z]).argmax(axis=0)
     np.testing.assert_array_equal(grid.owners(directions), largest)
-
-
-@pytest.mark.parametrize("start", range(6))
-def test_greedy_walk_over_neighbours_ends_at_the_owner(start: int) -> None:
-    grid = CubeGrid(4, TURN)
-    directions = np.concatenate([random_directions(2000), grid.centers_xyz])
-    face = np.full(len(directions), start)
-    for _ in range(2):  # the opposite face is two steps away
-        candidates = np.concatenate([face[:, None], grid.neighbors[face]], axis=1)
-        closeness = np.einsum("nkc,nc->nk", grid.centers_xyz[candidates], directions)
-        face = candidates[np.arange(len(face)), closeness.argmax(axis=1)]
-    np.testing.assert_array_equal(face, grid.owners(directions))
 
 
 @pytest.mark.parametrize("grid", [CubeGrid(5, TURN.T), TangentGrid(0, 4, 20, TURN.T)])

@@ -10,10 +10,8 @@ from numpy.typing import NDArray
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry import (
-    FLIP_Y,
     TangentGrid,
     lonlat_to_xyz,
-    perspective_directions,
     rotation_about,
     vertex_resolution,
     xyz_to_lonlat,
@@ -63,29 +61,6 @@ def test_directions_follow_the_textbook_formulas(
     for face, (lon_0, lat_0) in enumerate(xyz_to_lonlat(grid.centers_xyz)):
         expected = lonlat_to_xyz(inverse_gnomonic(x, y, lon_0, lat_0))
         np.testing.assert_allclose(directions[face], expected, atol=1e-13)
-
-
-@pytest.mark.parametrize("rotation", [None, TURN])
-def test_pinhole_camera_sees_the_same_directions(rotation: NDArray[np.float64] | None) -> None:
-    grid = TangentGrid(1, 4, rotation=rotation)
-    rays = perspective_directions(grid.camera_matrix, (grid.dim, grid.dim))
-    for face in (0, 17, 79):
-        world = rays @ grid.world_from_camera[face].T
-        np.testing.assert_allclose(grid.directions([face])[0], world, atol=1e-14)
-
-
-def test_camera_axes_are_east_south_and_centre() -> None:
-    axes = TangentGrid(1, 4).world_from_camera
-    east, south, forward = np.moveaxis(axes, -1, 0)
-    lon, lat = xyz_to_lonlat(forward).T
-    np.testing.assert_allclose(
-        east, np.stack([-np.sin(lon), np.cos(lon), np.zeros_like(lon)], axis=-1), atol=1e-14
-    )
-    north = np.stack([-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)], -1)
-    np.testing.assert_allclose(south, -north, atol=1e-14)
-    # Orthonormal, mirrored on the sphere, proper in a right-handed room.
-    np.testing.assert_allclose(np.linalg.det(axes), -1, atol=1e-14)
-    np.testing.assert_allclose(np.linalg.det(FLIP_Y @ axes), 1, atol=1e-14)
 
 
 @pytest.mark.parametrize("rotation", [None, TURN])

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import SphericalVoronoi
 
 from tangent_train.errors import SettingError
-from tangent_train.geometry import TangentGrid, icosphere, rotation_about, xyz_to_lonlat
+from tangent_train.geometry import TangentGrid, rotation_about, xyz_to_lonlat
 
 BASE_LEVELS = range(5)
 
@@ -74,36 +74,3 @@ def test_owner_has_the_nearest_centre(rotation: NDArray[np.float64] | None) -> N
     np.testing.assert_array_equal(
         grid.owners(3 * directions.reshape(20, 30, 3)), expected.reshape(20, 30)
     )
-
-
-@pytest.mark.parametrize("base_level", BASE_LEVELS)
-def test_neighbours_are_the_faces_that_share_a_vertex(base_level: int) -> None:
-    neighbors = TangentGrid(base_level, base_level + 4).neighbors
-    faces = icosphere(base_level).faces
-    assert neighbors.shape == (len(faces), 12)
-    around: dict[int, set[int]] = {}
-    for face, corners in enumerate(faces.tolist()):
-        for vertex in corners:
-            around.setdefault(vertex, set()).add(face)
-    for face, corners in enumerate(faces.tolist()):
-        expected = set.union(*(around[vertex] for vertex in corners)) - {face}
-        listed = neighbors[face].tolist()
-        assert sorted(listed) == sorted([*expected, *[face] * (12 - len(expected))])
-
-
-@pytest.mark.parametrize("base_level", BASE_LEVELS)
-@pytest.mark.parametrize("rotation", [None, rotation_about((3, 1, 2), 0.7)])
-def test_greedy_walk_over_neighbours_ends_at_the_owner(
-    base_level: int, rotation: NDArray[np.float64] | None
-) -> None:
-    grid = TangentGrid(base_level, base_level + 4, rotation=rotation)
-    directions = random_directions(3000, seed=base_level)
-    face = np.random.default_rng(1).integers(grid.num_images, size=len(directions))
-    for _ in range(grid.num_images):
-        candidates = np.concatenate([face[:, None], grid.neighbors[face]], axis=1)
-        closeness = np.einsum("nkc,nc->nk", grid.centers_xyz[candidates], directions)
-        nearer = candidates[np.arange(len(face)), closeness.argmax(axis=1)]
-        if (nearer == face).all():
-            break
-        face = nearer
-    np.testing.assert_array_equal(face, grid.owners(directions))

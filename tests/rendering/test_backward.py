@@ -45,28 +45,6 @@ def test_one_class_everywhere(base_level: int, shape: tuple[int, int]) -> None:
         assert (tangent_to_labels(scores, grid, shape, blend) == 3).all()
 
 
-@pytest.mark.parametrize("blend", BLENDS)
-@pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize("grid", GRIDS)
-def test_labels_are_the_argmax_of_the_rendered_scores(
-    grid: TangentGrid, shape: tuple[int, int], blend: Any
-) -> None:
-    rng = np.random.default_rng(0)
-    scores = rng.standard_normal((2, grid.num_images, 6, grid.dim, grid.dim), np.float32)
-    rendered = tangent_to_equirect(torch.from_numpy(scores).double(), grid, shape, blend)
-    best, expected = rendered.max(dim=1)
-    compiled = tangent_to_labels(scores, grid, shape, blend)
-    assert compiled.dtype == np.uint8
-    assert compiled.shape == (2, *shape)
-    chosen = torch.from_numpy(compiled)[:, None].long()
-    torch.testing.assert_close(rendered.gather(1, chosen)[:, 0], best, atol=1e-5, rtol=0)
-    tensor = tangent_to_labels(torch.from_numpy(scores), grid, shape, blend)
-    assert tensor.dtype == torch.int64
-    np.testing.assert_array_equal(tensor.numpy(), compiled)
-    exact = tangent_to_labels(torch.from_numpy(scores).double(), grid, shape, blend)
-    torch.testing.assert_close(exact, expected)
-
-
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_equal_and_infinite_scores(dtype: Any) -> None:
     grid = TangentGrid(0, 4)

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from tangent_train.errors import SettingError
 from tangent_train.geometry import (
     CubeGrid,
     TangentGrid,
@@ -111,12 +110,6 @@ def test_every_pixel_has_one_owner_even_where_images_are_equally_near() -> None:
         result.add(ones[[face]], grid, np.array([face]))
     total = result._total[..., -1]
     np.testing.assert_array_equal(total, 1)
-
-
-def test_images_that_do_not_overlap_are_not_feathered() -> None:
-    grid = CubeGrid(8)
-    with pytest.raises(SettingError, match="blend"):
-        ScoreMosaic((16, 32), 3, "feather").add(torch.ones(6, 3, 8, 8), grid, np.arange(6))
 
 
 def test_large_sums_live_in_a_file_and_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -117,17 +117,6 @@ def test_forward_in_torch(case: Case, interpolation: Interpolation) -> None:
         assert error[certain].max() < tolerance
 
 
-@pytest.mark.parametrize("interpolation", ["bilinear", "nearest"])
-def test_forward_of_float32_arrays(case: Case, interpolation: Interpolation) -> None:
-    pair = pair_of(case)
-    image = noise(*case.shape, 3).astype(np.float32)
-    expected = pair.theirs.forward(image.astype(np.float64), interpolation)[pair.order]
-    result = equirect_to_tangent(image, pair.ours, interpolation=interpolation)
-    assert result.dtype == np.float32
-    error = np.abs(result - expected)[certain_pixels(pair, case, interpolation)]
-    assert error.max() < 2e-4 + 2 * POSITION_ERROR
-
-
 def test_forward_of_uint8_arrays(case: Case) -> None:
     pair = pair_of(case)
     image = np.round(255 * waves(case.shape)).astype(np.uint8)
@@ -153,7 +142,7 @@ def test_forward_of_labels_is_the_nearest_label(case: Case, dtype: type[np.integ
     np.testing.assert_array_equal(result[certain], expected[..., 0][certain])
 
 
-@pytest.mark.parametrize("channels", [0, 1, 2, 4, 5, 7, 13])  # 0: an image (H, W)
+@pytest.mark.parametrize("channels", [0, 1, 2, 3, 4, 6])  # 0: an image (H, W)
 @pytest.mark.parametrize(
     ("dtype", "largest", "tolerance"),
     [("uint8", 255, 0.501), ("uint16", 65535, 1.0), ("float32", 1, 2e-4), ("float64", 1, 1e-9)],

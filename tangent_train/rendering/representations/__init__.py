@@ -1,1 +1,1 @@
-"""What a network sees: tangent images, cube faces, the panorama itself, crops of photos."""
+"""The input of a network: tangent images, cube faces, the panorama itself, crops of photos."""

@@ -1,4 +1,4 @@
-"""What a network sees of a photo: crops of one common camera (paper, supplement, section 2.1).
+"""Photos as input of a network: crops of one common camera (paper, supplement, section 2.1).
 
 Photos of any camera become images of the same angular resolution as a panorama's, so that a network
 trained on them knows objects at the size they will have in tangent images. The common camera has
@@ -28,7 +28,7 @@ from tangent_train.rendering.representations.views import NO_RAYS, NOT_ROTATED
 __all__ = ["PerspectiveRepresentation", "PhotoCrops", "PhotoSampler"]
 
 Crops = Literal["grid", "center"]
-"""Where the crops of an evaluation are: all over the photo, or one in the middle."""
+"""Crops of an evaluation: all over the photo, or one in the middle."""
 
 _PAPER_FOV_DEG = 45.0
 
@@ -63,7 +63,7 @@ class PhotoCrops:
         return np.ascontiguousarray(crops[:, :, ::-1]) if self.mirrored else crops
 
     def rays(self) -> NDArray[np.float32]:
-        """None: nobody says where on a sphere a photo is."""
+        """None: the direction of a photo on the sphere is unknown."""
         return NO_RAYS
 
     def rotations(self) -> NDArray[np.float64]:
@@ -71,9 +71,9 @@ class PhotoCrops:
         return NOT_ROTATED
 
     def owned(self) -> NDArray[np.bool_]:
-        """Which pixels of a crop lie nearer to its centre than to any other's, ``(n, h, w)``.
+        """Pixels of each crop that lie nearer to its centre than to any other's, ``(n, h, w)``.
 
-        So every place of the photo is counted once, however much the crops overlap.
+        So every point of the photo counts once, however much the crops overlap.
         """
         cells = self.cells()
         across, down = (
@@ -84,7 +84,7 @@ class PhotoCrops:
         return down[:, :, None] & across[:, None, :]
 
     def owners(self, shape: tuple[int, int]) -> NDArray[np.int32]:
-        """Which crop's centre is nearest to each pixel of the photo, ``(H, W)``."""
+        """``(H, W)`` the crop whose centre is nearest to each pixel of the photo."""
         height, width = shape
         edges = np.ceil(self.cells() - 0.5).clip(0, (width, height, width, height)).astype(int)
         owner = np.zeros(shape, np.int32)
@@ -238,7 +238,7 @@ class PerspectiveRepresentation:
         self.evaluation = evaluation
 
     def of_camera(self, camera_matrix: NDArray[np.float64], size: tuple[int, int]) -> PhotoSampler:
-        """What draws the crops of a photo.
+        """The sampler of the crops of a photo.
 
         Args:
             camera_matrix: ``(3, 3)`` K of the photo, integer pixel centres, without skew.

@@ -1,4 +1,4 @@
-"""What a network sees of a panorama, and how its scores become labels of the panorama again.
+"""Representations of panoramas: the images a network sees, and how its scores become labels.
 
 A *representation* turns panoramas into images a network can take: tangent images, or, as
 baselines, the faces of a cube, the equirectangular image itself or crops of it. It draws the
@@ -32,7 +32,7 @@ __all__ = [
 ]
 
 RotationAugmentation = Literal["none", "yaw", "so3"]
-"""How training panoramas are rotated: not, about the vertical, or uniformly over SO(3)."""
+"""Rotation of training panoramas: none, about the vertical, or uniformly over SO(3)."""
 
 Image = NDArray[Any]
 
@@ -51,7 +51,7 @@ class Views(Protocol):
         ...
 
     def rays(self) -> NDArray[np.float32]:
-        """Where the images look, ``(n, 3, 3)``; `NO_RAYS` where that cannot be said so.
+        """``(n, 3, 3)`` viewing directions of the images; `NO_RAYS` of images that are no pinholes.
 
         Each matrix maps ``(x, y, 1)``, with x and y from −1 at the left and upper edge of an image
         to 1 at the opposite one, to a direction (of any length) on the sphere.
@@ -99,7 +99,7 @@ class Assembler(Protocol):
 
 @runtime_checkable
 class Representation(Sampler, Assembler, Protocol):
-    """What a network sees of a panorama."""
+    """The images a network sees of a panorama."""
 
     @property
     def erp_height(self) -> int:

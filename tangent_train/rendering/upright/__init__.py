@@ -1,1 +1,1 @@
-"""Which way is up in a panorama."""
+"""The direction of up in a panorama."""

@@ -1,4 +1,4 @@
-"""Which of the six directions of a Manhattan frame is up, by what rooms look like."""
+"""Choice of up among the six directions of a Manhattan frame, by the appearance of rooms."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ that follow none (clutter); by how many standard deviations its side is brighter
 def up_probabilities(
     rgb: NDArray[np.uint8], segments: LineSegments, axes_xyz: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """How probable it is that each direction of a frame is up, for panoramas held at any angle.
+    """Probability that each direction of a frame is up, for panoramas in any orientation.
 
     Rooms are lower than wide and people live at the bottom: vertical edges are all around, at eye
     level and below; what lies about without order is below; there are few edges right above and

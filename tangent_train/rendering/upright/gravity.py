@@ -1,4 +1,4 @@
-"""Which way is up in a panorama: by its picture, or by how the camera says it was held."""
+"""The direction of up in a panorama, from its content or from the camera's pose tags."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry import rotation_about
-from tangent_train.rendering.checks import check_panorama
 from tangent_train.rendering.upright.cues import up_probabilities
 from tangent_train.rendering.upright.line_segments import LineSegments, find_line_segments
 from tangent_train.rendering.upright.manhattan import ManhattanFrame, find_manhattan_frames
@@ -68,7 +67,6 @@ def estimate_up(rgb: NDArray[np.uint8], max_tilt_deg: float = 60.0) -> Gravity:
     Raises:
         SettingError: The panorama or the tilt cannot be used.
     """
-    check_panorama(rgb, "bilinear")
     if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8:
         found = f"shape {rgb.shape}, dtype {rgb.dtype}"
         raise SettingError("panorama", found=found, expected="(H, W, 3) of dtype uint8")

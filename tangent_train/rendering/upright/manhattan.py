@@ -49,7 +49,7 @@ def segment_weights(segments: LineSegments) -> NDArray[np.float64]:
 def followed_axes(
     segments: LineSegments, axes_xyz: NDArray[np.float64]
 ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Which of three axes each segment follows, and how well.
+    """Assign each segment to the axis it follows, and say how well.
 
     Args:
         segments: n segments.

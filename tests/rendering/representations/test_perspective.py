@@ -72,22 +72,6 @@ def test_the_crop_in_the_middle_is_the_papers_homography() -> None:
     assert np.abs(crop[0] - _triangle(photo, homography, 32)).max() < 1.01
 
 
-@pytest.mark.parametrize("size", [(12, 40), (40, 12)])
-def test_crops_that_are_not_square(size: tuple[int, int]) -> None:
-    photo = _photo()
-    fov_deg = 25.0 if size[1] > size[0] else 8.0
-    representation = PerspectiveRepresentation(7, fov_deg, size, evaluation="center")
-    crop = representation.of_camera(K, SIZE).whole().render(photo, "bilinear")
-    assert crop.shape == (1, *size, 3)
-    homography = normalize_camera(K, SIZE, fov_deg, size).homography
-    assert np.abs(crop[0] - _triangle(photo, homography, *size)).max() < 1.01
-    grid = PerspectiveRepresentation(7, fov_deg, size).of_camera(K, SIZE).whole()
-    assert grid.owned().shape == (len(grid.boxes), *size)
-    np.testing.assert_allclose(grid.boxes[:, 2:].max(axis=0), SIZE[::-1], atol=0.01)
-    shares = grid.owned().mean(axis=(1, 2)).sum() * np.prod(grid.boxes[0, 2:] - grid.boxes[0, :2])
-    assert abs(shares / np.prod(SIZE) - 1) < 0.1, "each place once"
-
-
 def test_labels_come_from_the_pixel_at_the_centre() -> None:
     labels = np.random.default_rng(0).integers(0, 14, SIZE).astype(np.uint8)
     depth = labels.astype(np.uint16) * 300

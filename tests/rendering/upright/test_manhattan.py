@@ -35,15 +35,6 @@ def test_an_edge_all_around_is_found_on_its_great_circle(height: int, seed: int)
     assert np.all(np.diff(segments.lengths_rad) <= 0)
 
 
-def test_edges_of_black_areas_are_left_out() -> None:
-    image = np.full((128, 256, 3), 140, np.uint8)
-    image[:, 100:] = 0
-    image[:20] = 0
-    assert len(find_line_segments(image).lengths_rad) == 0
-    image[image == 0] = 3  # dark, but there
-    assert len(find_line_segments(image).lengths_rad) > 7
-
-
 def _segments(
     axes: NDArray[np.float64], counts: tuple[int, int, int], others: int, seed: int = 0
 ) -> LineSegments:
