@@ -129,17 +129,6 @@ def test_missing_depth() -> None:
     assert (one.known.tolist(), one.correct.tolist()) == ([True], [True])
 
 
-def test_single_missing_pixels_do_not_open_walls() -> None:
-    left, right = ROOM.view(LEFT), ROOM.view(RIGHT)
-    directions = equirect_directions(SHAPE).reshape(-1, 3)
-    full = visible_from(directions, left, right)
-    lone = np.zeros(SHAPE, np.bool_)
-    lone[1::3, ::3] = True  # no two of them are neighbours
-    part = DepthView(np.where(lone, np.nan, right.distance_m), RIGHT)
-    found = visible_from(directions, left, part)
-    assert (found == full).mean() > 0.99
-
-
 def test_distances_between_pixels_of_a_wall_are_exact() -> None:
     view = Room(WALLS).view(LEFT)
     # All around the seam and both poles, between pixel centres.

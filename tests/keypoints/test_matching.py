@@ -6,7 +6,6 @@ from typing import Literal
 
 import cv2
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -37,44 +36,25 @@ def reference(
     return pairs
 
 
-def noisy_copies(n_left: int, n_right: int, norm: Norm) -> list[NDArray[np.generic]]:
-    """Right descriptors like some left ones, with exact duplicates on both sides."""
-    rng = np.random.default_rng(1)
-    left = rng.integers(0, 256, (n_left, 32 if norm == "hamming" else 128), dtype=np.uint8)
-    left[-5:] = left[:5]
-    right = left[rng.integers(0, n_left, n_right)]
-    changed = rng.random(right.shape) < (0.1 if norm == "hamming" else 0.2)
-    right[changed] = rng.integers(0, 256, changed.sum(), dtype=np.uint8)
-    right[-5:] = right[0]
-    return [d if norm == "hamming" else d.astype(np.float32) for d in (left, right)]
-
-
-@pytest.mark.parametrize("mutual", [True, False])
-@pytest.mark.parametrize("ratio", [0.6, 0.8, 1.0])
-@pytest.mark.parametrize("norm", ["l2", "hamming"])
-def test_matches_are_those_of_the_definition(norm: Norm, ratio: float, mutual: bool) -> None:
-    left, right = noisy_copies(61, 47, norm)
-    expected = reference(left, right, norm, ratio, mutual)
-    found = match(left, right, norm, ratio, mutual=mutual)
-    assert found.dtype == np.int64
-    assert found.tolist() == expected
-    assert 5 < len(expected) < 61 or not mutual  # the case says something
-
-
 @given(
     st.integers(0, 9),
     st.integers(0, 9),
+    st.sampled_from(["l2", "hamming"]),
     st.sampled_from([0.5, 0.8, 1.0, 1.5]),
     st.booleans(),
     st.integers(0, 2**32 - 1),
 )
-@settings(max_examples=60, deadline=None)
-def test_ties_go_to_the_first(n: int, m: int, ratio: float, mutual: bool, seed: int) -> None:
-    # Few values in few dimensions: equal distances all over.
+@settings(max_examples=150, deadline=None)
+def test_matches_are_those_of_the_definition(
+    n: int, m: int, norm: Norm, ratio: float, mutual: bool, seed: int
+) -> None:
+    """Few values in few dimensions: equal distances all over, where the first counts."""
     rng = np.random.default_rng(seed)
-    left, right = (rng.integers(0, 2, (k, 3)).astype(np.float32) for k in (n, m))
-    expected = reference(left, right, "l2", ratio, mutual) if n and m else []
-    assert match(left, right, "l2", ratio, mutual=mutual).tolist() == expected
+    left, right = (rng.integers(0, 2 if seed % 2 else 256, (k, 3), np.uint8) for k in (n, m))
+    if norm == "l2":
+        left, right = left.astype(np.float32), right.astype(np.float32)
+    expected = reference(left, right, norm, ratio, mutual) if n and m else []
+    assert match(left, right, norm, ratio, mutual=mutual).tolist() == expected
 
 
 def test_opencv_finds_the_same_matches_of_real_descriptors() -> None:
