@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,8 +19,6 @@ from tangent_train.cli.compose import config_folder
 from tangent_train.registry import SettingsFile, make
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from tangent_train.tasks import SegmentationTask
 
 NAMES = ("unknown", "beam", "board", "sofa", "wall")
