@@ -129,9 +129,9 @@ def test_prepare_checks_and_fills_the_store(
     monkeypatch.chdir(tmp_path)
     _run(monkeypatch, "prepare", *_SETTINGS, f"data.root='{root}'", "data.store=store")
     assert "Panoramas: 6 train, 2 val, 2 test." in capsys.readouterr().out
-    stored = sorted(path.relative_to(tmp_path / "store") for path in tmp_path.rglob("*.panorama"))
+    stored = sorted(path.relative_to(tmp_path / "store") for path in tmp_path.rglob("*.npy"))
     assert len(stored) == 10
-    assert stored[0] == Path("32x64/scene_0/view.0.panorama")
+    assert stored[0].match("32x64_*/scene_0/view.0.npy")
 
 
 def test_errors_reach_the_terminal_as_one_line(
