@@ -243,19 +243,6 @@ def test_images_have_the_precision_of_the_run(make_module: MakeModule, tmp_path:
     assert set(seen) == {torch.bfloat16}
 
 
-# --- class weights -----------------------------------------------------------------------------
-
-
-def test_class_weights_against_the_formula(make_module: MakeModule) -> None:
-    module = make_module()
-    source = module.source("train")
-    labels = np.concatenate([source.read(i).labels.ravel() for i in range(len(source))])
-    shares = np.array([(labels[labels > 0] == c).mean() for c in range(1, 14)])
-    weights = module.class_weights("log")
-    np.testing.assert_allclose(weights[1:], 1 / np.log(1.02 + shares), rtol=1e-5)
-    assert module.class_weights("none").tolist() == [0] + [1] * 13
-
-
 # --- settings ----------------------------------------------------------------------------------
 
 

@@ -172,33 +172,7 @@ def test_colors(tmp_path: Path, strips: Any, mode: str) -> None:
     np.testing.assert_array_equal(_test_labels(tmp_path, strips), expected)
 
 
-def test_odd_sizes_are_shrunk_on_one_grid(tmp_path: Path, strips: Any) -> None:
-    write_classes(tmp_path)
-    for number in range(3):
-        write_panorama(tmp_path, f"{number}", number, 37)
-    source = FolderPanoramas(tmp_path, strips).source("test")
-    panorama = source.read(0)
-    values = blocks(int(source.name(0)), 37)
-    rows = [int((i + 0.5) * 37 / 16) for i in range(16)]
-    columns = [int((j + 0.5) * 74 / 32) for j in range(32)]
-    expected = [[CLASS_OF_STORED[int(values[i, j])] for j in columns] for i in rows]
-    np.testing.assert_array_equal(panorama.labels, expected)
-    assert panorama.rgb.shape == (16, 32, 3)
-
-
 # The store, memory, turned panoramas
-
-
-def test_a_store_of_other_classes_is_made_anew(own_root: Path, tmp_path: Path, strips: Any) -> None:
-    store = tmp_path / "store"
-    FolderPanoramas(own_root, strips, store=store).prepare_data()
-    write_classes(own_root, {"wall": 2, "floor": 1, "window": 255})
-    changed = FolderPanoramas(own_root, strips, store=store)
-    with pytest.raises(DataError, match="no such file"):
-        changed.source("test").read(0)
-    changed.prepare_data()
-    expected = FolderPanoramas(own_root, strips).source("test").read(0).labels
-    np.testing.assert_array_equal(changed.source("test").read(0).labels, expected)
 
 
 @pytest.mark.parametrize(

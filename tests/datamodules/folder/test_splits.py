@@ -128,9 +128,3 @@ def test_lists_that_cannot_be_used(
         (own_root / f"{split}.txt").write_bytes(content)
     with pytest.raises(DataError, match=message):
         FolderPanoramas(own_root, strips).setup()
-
-
-def test_one_scene_cannot_be_split(tmp_path: Path, strips: Any) -> None:
-    root = write_data_set(tmp_path, scenes=1, each=3)
-    with pytest.raises(DataError, match=r"found 1 scenes .* name some in test\.txt"):
-        FolderPanoramas(root, strips).setup()

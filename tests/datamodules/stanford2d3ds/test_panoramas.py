@@ -207,12 +207,6 @@ def test_damage_is_found_before_training(broken_root: Path, strips: Any, damage:
         Stanford2D3DS(broken_root, strips).setup("fit")
 
 
-def test_missing_root(tmp_path: Path, strips: Any) -> None:
-    module = Stanford2D3DS(tmp_path / "nowhere", strips)
-    with pytest.raises(DataError, match=r"nowhere: found no such folder.*buildingparser"):
-        module.setup()
-
-
 def test_wrong_layout(broken_root: Path, strips: Any) -> None:
     with pytest.raises(DataError, match="no area_1, area_2"):
         Stanford2D3DS(broken_root / "area_1", strips).setup()
@@ -222,11 +216,6 @@ def test_wrong_layout(broken_root: Path, strips: Any) -> None:
     (broken_root / "area_5b" / "data").mkdir(parents=True)
     with pytest.raises(DataError, match=r"area_5b/pano/rgb: found no panoramas"):
         Stanford2D3DS(broken_root, strips).setup()
-
-
-def test_more_rows_than_the_files_have(broken_root: Path, strips: Any) -> None:
-    with pytest.raises(SettingError, match="found 32; expected at most the 16 rows"):
-        Stanford2D3DS(broken_root, type(strips)(32)).setup()
 
 
 @pytest.mark.parametrize(
