@@ -10,10 +10,11 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from datamodules.core.inputs import Normalization, normalize
     from datamodules.core.panorama_pairs import ImagePairs
     from datamodules.core.panoramas import Panorama
     from datamodules.core.photos import Photo
-    from datamodules.core.samples import EvaluationSample, Normalization, TrainingSample, normalize
+    from datamodules.core.samples import EvaluationSample, TrainingSample
     from datamodules.core.sampling import EpochSampler, sample_rng
     from datamodules.folder.panoramas import FolderPanoramas
     from datamodules.modelnet40.datamodule import ModelNet40
@@ -60,7 +61,7 @@ _MODULES = {
     "FolderPanoramas": "datamodules.folder.panoramas",
     "ImagePairs": "datamodules.core.panorama_pairs",
     "ModelNet40": "datamodules.modelnet40.datamodule",
-    "Normalization": "datamodules.core.samples",
+    "Normalization": "datamodules.core.inputs",
     "OmniSynthia": "datamodules.synthia.omnisynthia",
     "Panorama": "datamodules.core.panoramas",
     "Photo": "datamodules.core.photos",
@@ -74,7 +75,7 @@ _MODULES = {
     "SynthShapes": "datamodules.synthshapes.datamodule",
     "SynthiaPerspective": "datamodules.synthia.perspective",
     "TrainingSample": "datamodules.core.samples",
-    "normalize": "datamodules.core.samples",
+    "normalize": "datamodules.core.inputs",
     "sample_rng": "datamodules.core.sampling",
 }
 

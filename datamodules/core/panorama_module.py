@@ -9,6 +9,7 @@ from functools import partial
 from typing import Any, ClassVar, Literal
 
 from datamodules.core.found import Found, Split
+from datamodules.core.inputs import RGB_NORMALIZATION, RGBD_NORMALIZATION, Input, Normalization
 from datamodules.core.panoramas import Panorama, Turn
 from datamodules.core.pipeline import (
     EstimatedUp,
@@ -20,13 +21,7 @@ from datamodules.core.pipeline import (
 )
 from datamodules.core.problems import Problems
 from datamodules.core.reading import ImageFiles, ImageReader, PanoramaReading, check_headers
-from datamodules.core.samples import (
-    RGB_NORMALIZATION,
-    RGBD_NORMALIZATION,
-    ImageSamples,
-    Input,
-    Normalization,
-)
+from datamodules.core.samples import ImageSamples
 from datamodules.core.split_module import SplitDataModule
 from datamodules.core.store import Store
 from tangent_train.errors import SettingError

@@ -9,17 +9,12 @@ from functools import partial
 from typing import Any, ClassVar
 
 from datamodules.core.found import Found, Split
+from datamodules.core.inputs import RGB_NORMALIZATION, RGBD_NORMALIZATION, Input, Normalization
 from datamodules.core.photos import Photo
 from datamodules.core.pipeline import SplitItems, in_threads
 from datamodules.core.problems import Problems
 from datamodules.core.reading import ImageFiles, ImageReader, PhotoReading, check_headers
-from datamodules.core.samples import (
-    RGB_NORMALIZATION,
-    RGBD_NORMALIZATION,
-    ImageSamples,
-    Input,
-    Normalization,
-)
+from datamodules.core.samples import ImageSamples
 from datamodules.core.split_module import SplitDataModule
 from datamodules.core.store import Store
 from tangent_train.errors import DataError, SettingError

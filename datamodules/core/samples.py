@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, TypeVar, get_args
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from datamodules.core.inputs import (
+    INPUTS,
+    MAX_DEPTH_M,
+    Input,
+    Normalization,
+    channel_names,
+    normalize,
+)
 from datamodules.core.panoramas import STEPS_PER_M
 from datamodules.core.sampling import Seed, sample_rng
 from datamodules.images.colors import jitter_colors
@@ -27,163 +34,20 @@ if TYPE_CHECKING:
     from tangent_train.rendering.representations.pinhole import Views
 
 __all__ = [
-    "INPUTS",
-    "RGBD_NORMALIZATION",
-    "RGB_NORMALIZATION",
     "EvaluationImages",
     "EvaluationSample",
     "ImageSamples",
-    "Input",
     "Inputs",
-    "Normalization",
     "TrainingImages",
     "TrainingSample",
-    "channel_names",
-    "normalize",
     "render_inputs",
     "world_rays",
 ]
-
-Input = Literal["rgb", "depth", "elevation"]
-"""What a network may be shown of an image, in the order of its channels, see `channel_names`.
-
-* `rgb` and `depth` are normalized.
-* `elevation`: the sine of the angle between a pixel's ray and the horizon, −1 (down) to 1 (up).
-"""
-
-INPUTS: tuple[Input, ...] = get_args(Input)
-"""All of them."""
-
-_COLORS = ("red", "green", "blue")
-
-MAX_DEPTH_M = 4.0
-"""Depth is clipped to this (released code of the paper)."""
 
 Inputs = Sequence[Tensor]
 """RGB, perhaps depth and elevation as they were rendered, see `TrainingSample`."""
 
 _Images = TypeVar("_Images", Inputs, Tensor)
-
-
-@dataclass(frozen=True)
-class Normalization:
-    """Mean and standard deviation of the channels R, G, B (of 0 to 1) and perhaps depth (metres).
-
-    Depth counts clipped to `MAX_DEPTH_M` and 0 where missing. Spheres of shapes have six channels,
-    see `mesh_spheres`.
-
-    Attributes:
-        mean: 3, 4 or 6 numbers.
-        std: As many, greater than 0.
-
-    Raises:
-        SettingError: Other numbers.
-    """
-
-    mean: Sequence[float]
-    std: Sequence[float]
-
-    def __post_init__(self) -> None:
-        # Plain tuples, whatever list a config brought: comparable and safe in checkpoints.
-        object.__setattr__(self, "mean", tuple(float(value) for value in self.mean))
-        object.__setattr__(self, "std", tuple(float(value) for value in self.std))
-        right = len(self.mean) == len(self.std) and len(self.mean) in (3, 4, 6)
-        if not (right and all(map(math.isfinite, [*self.mean, *self.std])) and min(self.std) > 0):
-            raise SettingError(
-                "normalization",
-                found=f"mean {self.mean}, std {self.std}",
-                expected="3 numbers each, 4 with depth, 6 of shapes, std greater than 0",
-            )
-
-    @classmethod
-    def of(
-        cls, given: Normalization | Mapping[str, Sequence[float]], channels: int
-    ) -> Normalization:
-        """The same, made of its `mean` and `std` if need be.
-
-        Args:
-            given: It, or a mapping.
-            channels: How many it has to have.
-
-        Raises:
-            SettingError: It has others.
-        """
-        if isinstance(given, Mapping):
-            if set(given) != {"mean", "std"}:
-                expected = "mean and std"
-                raise SettingError("data.normalization", found=dict(given), expected=expected)
-            given = cls(given["mean"], given["std"])
-        if given.channels != channels:
-            raise SettingError(
-                "data.normalization",
-                found=f"{given.channels} channels",
-                expected=f"{channels}, as the inputs have",
-            )
-        return given
-
-    @property
-    def channels(self) -> int:
-        """3, 4 with depth, or 6 of shapes."""
-        return len(self.mean)
-
-
-RGB_NORMALIZATION = Normalization(
-    mean=(0.5490, 0.5306, 0.4779),
-    std=(0.1992, 0.2005, 0.2129),
-)
-"""Stanford2D3DS without depth (released code of the paper)."""
-
-RGBD_NORMALIZATION = Normalization(
-    mean=(0.4974898, 0.47918808, 0.42809588, 1.0961773),
-    std=(0.23762763, 0.23354423, 0.23272438, 0.75536704),
-)
-"""Stanford2D3DS with depth (ugscnn, used by the released code of the paper)."""
-
-
-def channel_names(inputs: Sequence[Input]) -> tuple[str, ...]:
-    """The channels of an image of these inputs by name, colours apart.
-
-    >>> channel_names(["rgb", "depth"])
-    ('red', 'green', 'blue', 'depth')
-    """
-    return tuple(name for each in inputs for name in (_COLORS if each == "rgb" else (each,)))
-
-
-def normalize(
-    rendered: Sequence[Tensor], normalization: Normalization, inputs: Sequence[Input]
-) -> Tensor:
-    """What a network takes, channels first.
-
-    Args:
-        rendered: RGB ``(..., h, w, 3)`` uint8; with depth ``(..., h, w)`` in steps of 1/512 m, 0
-            where missing, at most `MAX_DEPTH_M`; with elevation ``(..., h, w)`` float32.
-        normalization: Of RGB and depth.
-        inputs: What the network takes, in the order of `INPUTS`.
-
-    Returns:
-        ``(..., C, h, w)`` float32, on the same device.
-
-    Raises:
-        SettingError: The normalization is one of other channels.
-    """
-    parts = dict(zip([name for name in INPUTS if name in inputs], rendered, strict=True))
-    measured = 3 + ("depth" in parts)
-    rgb = parts["rgb"]
-    *batch, height, width, _ = rgb.shape
-    channels = len(channel_names(inputs))
-    images = rgb.new_empty((*batch, channels, height, width), dtype=torch.float32)
-    images[..., :3, :, :] = rgb.movedim(-1, -3)
-    if "depth" in parts:
-        images[..., 3, :, :] = parts["depth"]
-    # One multiplication and one addition per value: (v / unit − mean) / std.
-    unit = [255] * 3 + [STEPS_PER_M] * (measured - 3)
-    scale = zip(unit, normalization.mean, normalization.std, strict=True)
-    values = images.new_tensor([(1 / (step * std), mean / std) for step, mean, std in scale])
-    factor, offset = values.T[..., None, None]
-    images[..., :measured, :, :].mul_(factor).sub_(offset)
-    if "elevation" in inputs:
-        images[..., -1, :, :] = parts["elevation"]
-    return images
 
 
 class TrainingSample(NamedTuple, Generic[_Images]):

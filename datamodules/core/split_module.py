@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Generic, Literal, TypeVar
 
-import cv2
 import numpy as np
-import torch
 from lightning import LightningDataModule
 from lightning.pytorch.trainer.states import TrainerFn
 from lightning.pytorch.utilities import rank_zero_only, rank_zero_warn
@@ -21,13 +18,14 @@ from torch.utils.data import DataLoader, Dataset
 
 from datamodules.core.class_weights import ClassWeights, class_weights
 from datamodules.core.found import SPLITS, Found, Split
+from datamodules.core.inputs import Normalization
+from datamodules.core.loading import at_least, explained, make_loader, this_process
 from datamodules.core.pipeline import Item, SplitItems, in_threads
 from datamodules.core.problems import Problems
-from datamodules.core.samples import Normalization
 from datamodules.core.sampling import EpochSampler
 from tangent_train.errors import DataError, SettingError
 
-__all__ = ["SPLITS", "Found", "Kind", "Split", "SplitDataModule", "at_least"]
+__all__ = ["SPLITS", "Found", "Kind", "Split", "SplitDataModule"]
 
 Kind = Literal["segmentation", "classification"]
 """What a data set is labelled for: classes of pixels, or of whole shapes."""
@@ -36,13 +34,6 @@ _GO_ON = (
     "tangent-check with the same data settings lists all there are; data.skip_broken=true goes on "
     "without what is broken."
 )
-_FEWER = (
-    "Memory may be too small for as many: use fewer (0 works in the process itself), a lower "
-    "level, or a store (data.store=…, data.in_memory=false); or enlarge /dev/shm (docker run "
-    "--shm-size=8g)."
-)
-_CAUGHT = re.compile(r"\ACaught \w+ in DataLoader worker.*\.(?:Data|Setting)Error: ", re.DOTALL)
-
 _Item = TypeVar("_Item", bound=Item)
 
 
@@ -359,17 +350,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
             An error of a worker as it was raised there; what may help when a worker was killed; or
             the same error.
         """
-        if isinstance(error, RuntimeError) and str(error).startswith("DataLoader worker (pid"):
-            return SettingError(
-                "data.num_workers",
-                found=f"{self.num_workers}, and a {str(error).partition('. ')[0]}",
-                expected="workers that live",
-                remedy=_FEWER,
-            )
-        if not isinstance(error, DataError | SettingError):
-            return error
-        message, caught = _CAUGHT.subn("", str(error))
-        return type(error)(message.rstrip()) if caught else error
+        return explained(error, self.num_workers)
 
     def _evaluation_loader(self, split: Split) -> DataLoader[Any]:
         dataset = self.evaluation_samples(split)
@@ -384,7 +365,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
         *,
         shuffle: bool,
     ) -> DataLoader[Any]:
-        rank, world_size = _process()
+        rank, world_size = this_process()
         count = len(self.source(split))
         left_out = count % world_size
         if shuffle and left_out:
@@ -393,44 +374,10 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
                 f"out of each epoch: {world_size} processes take as many each.",
                 category=UserWarning,
             )
-        return DataLoader(
-            dataset,
-            batch_size=batch_size,
-            sampler=EpochSampler(count, self.drawn_from, shuffle, rank, world_size, start),
-            # Its own: the loader draws seeds for its workers, which would shift those of dropout.
-            generator=torch.Generator().manual_seed(self.seed),
-            num_workers=self.num_workers,
-            persistent_workers=self.num_workers > 0,
-            pin_memory=torch.cuda.is_available(),
-            worker_init_fn=_opencv_without_threads,
-        )
+        sampler = EpochSampler(count, self.drawn_from, shuffle, rank, world_size, start)
+        return make_loader(dataset, sampler, batch_size, self.num_workers, self.seed)
 
 
 @rank_zero_only
 def _tell(text: str) -> None:
     Console(soft_wrap=True, highlight=False).print(text, markup=False)
-
-
-def _process() -> tuple[int, int]:
-    """Rank and number of processes of this run."""
-    distributed = torch.distributed
-    if distributed.is_available() and distributed.is_initialized():
-        return distributed.get_rank(), distributed.get_world_size()
-    return 0, 1
-
-
-def _opencv_without_threads(_worker: int) -> None:
-    # The workers are the parallelism; threads inside them would only fight over the cores. Not 1:
-    # that waits for threads which the parent had and the forked worker does not.
-    cv2.setNumThreads(0)
-
-
-def at_least(name: str, value: int, least: int) -> int:
-    """A setting that has to be `least` or more.
-
-    Raises:
-        SettingError: It is less.
-    """
-    if value < least:
-        raise SettingError(name, found=value, expected=f"{least} or more")
-    return value

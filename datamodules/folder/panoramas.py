@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from datamodules.core.inputs import Input
+from datamodules.core.loading import at_least
 from datamodules.core.panorama_module import PanoramaDataModule
-from datamodules.core.samples import Input
-from datamodules.core.split_module import at_least
 from datamodules.folder.classes import UNKNOWN_NAME, read_classes
 from datamodules.folder.reader import FolderReader, list_panoramas, read_codes
 from datamodules.folder.splits import FolderSplits

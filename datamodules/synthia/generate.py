@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING, Any, Literal
 import cv2
 import numpy as np
 
+from datamodules.core.loading import at_least
 from datamodules.core.made_folders import claim_folder
 from datamodules.core.photos import distance_from_z_depth
 from datamodules.core.pipeline import in_threads
 from datamodules.core.problems import Problems
 from datamodules.core.progress import show_progress
 from datamodules.core.reading import check_headers
-from datamodules.core.split_module import at_least
 from datamodules.images.png import read_color_png
 from datamodules.synthia.files import (
     GET_IT,

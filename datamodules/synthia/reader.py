@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
+from datamodules.core.inputs import RGBD_NORMALIZATION, Normalization
 from datamodules.core.panoramas import STEPS_PER_M, resize_nearest
 from datamodules.core.reading import ImageReader
-from datamodules.core.samples import RGBD_NORMALIZATION, Normalization
 from datamodules.images.png import check_png, read_color_png, read_png
 from datamodules.synthia.files import read_camera
 from tangent_train.errors import DataError

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from itertools import chain
 from typing import TYPE_CHECKING, ClassVar
 
+from datamodules.core.inputs import Input
 from datamodules.core.reading import ImageFiles
-from datamodules.core.samples import Input
 from datamodules.core.split_module import SplitDataModule
 from datamodules.synthia.reader import CLASSES, NORMALIZATIONS, Formats, SynthiaReader
 from tangent_train.errors import DataError, SettingError

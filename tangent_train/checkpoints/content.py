@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 __all__ = ["INPUTS", "NORMALIZATION", "read_checkpoint", "read_settings", "write_settings"]
 
 INPUTS = list[Literal["rgb", "depth", "elevation"]]
-"""What a network is shown, see `datamodules.core.samples.Input`, which is slow to import."""
+"""What a network is shown, see `datamodules.core.inputs.Input`, which is slow to import."""
 
 NORMALIZATION = dict[str, list[float]]
 """Its ``mean`` and ``std``."""

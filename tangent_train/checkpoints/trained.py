@@ -13,7 +13,7 @@ from typing import Any
 from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
-from datamodules.core.samples import Input, Normalization, channel_names
+from datamodules.core.inputs import Input, Normalization, channel_names
 from models.onnx_network import OnnxNetwork
 from tangent_train.checkpoints.content import INPUTS, NORMALIZATION, read_checkpoint
 from tangent_train.checkpoints.image_sizes import size_multiple_of
@@ -52,7 +52,7 @@ class TrainedNetwork:
         network: In evaluation mode; ``(B, C, h, w)`` float32, normalized, to scores ``(B, K+1, h,
             w)``, the unknown class first.
         class_names: K + 1 names, the unknown class first.
-        inputs: What it is shown, see `datamodules.core.samples.Input`.
+        inputs: What it is shown, see `datamodules.core.inputs.Input`.
         normalization: Of RGB and depth.
         level: Level s it was trained at.
         representation: The section of the config it was trained with.

@@ -19,7 +19,7 @@ from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 from rich.console import Console
 
-from datamodules.core.samples import channel_names
+from datamodules.core.inputs import channel_names
 from models import initialize
 from tangent_train.callbacks.averaging import averaged_weights
 from tangent_train.callbacks.checkpoints import BestCheckpoint, LastCheckpoint

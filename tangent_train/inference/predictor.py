@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from datamodules.core.samples import normalize, render_inputs
+from datamodules.core.inputs import normalize
+from datamodules.core.samples import render_inputs
 from tangent_train.errors import SettingError
 from tangent_train.rendering.mosaic import ScoreMosaic
 

@@ -12,8 +12,9 @@ import pytest
 import torch
 
 from datamodules import Stanford2D3DS
+from datamodules.core.inputs import normalize
 from datamodules.core.photos import distance_from_z_depth
-from datamodules.core.samples import normalize, render_inputs
+from datamodules.core.samples import render_inputs
 from tangent_train.checkpoints.trained import Scores
 from tangent_train.errors import SettingError
 from tangent_train.geometry import (

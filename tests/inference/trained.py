@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import nn
 
-from datamodules.core.samples import RGB_NORMALIZATION, RGBD_NORMALIZATION
+from datamodules.core.inputs import RGB_NORMALIZATION, RGBD_NORMALIZATION
 from tangent_train.checkpoints.trained import TrainedNetwork
 from tangent_train.registry import make
 

@@ -13,7 +13,7 @@ import yaml  # type: ignore[import-untyped]
 from rich.console import Console
 from torch import nn
 
-from datamodules.core.samples import Input
+from datamodules.core.inputs import Input
 from models import initialize
 from tangent_train import registry
 from tangent_train.callbacks.checkpoints import AtomicCheckpointIO, BestCheckpoint

@@ -11,7 +11,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from torch import nn
 
-from datamodules.core.samples import Input, Normalization
+from datamodules.core.inputs import Input, Normalization
 from tangent_train.checkpoints.image_sizes import size_multiple_of
 from tangent_train.checkpoints.trained import Scores, TrainedNetwork, completed_settings
 from tangent_train.cli.build import build

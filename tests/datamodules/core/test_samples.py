@@ -7,18 +7,15 @@ import numpy as np
 import pytest
 import torch
 
-from datamodules.core.panoramas import Panorama
-from datamodules.core.samples import (
+from datamodules.core.inputs import (
     RGB_NORMALIZATION,
     RGBD_NORMALIZATION,
-    EvaluationImages,
-    ImageSamples,
     Input,
     Normalization,
-    TrainingImages,
     normalize,
-    render_inputs,
 )
+from datamodules.core.panoramas import Panorama
+from datamodules.core.samples import EvaluationImages, ImageSamples, TrainingImages, render_inputs
 from datamodules.images.colors import jitter_colors
 from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_directions

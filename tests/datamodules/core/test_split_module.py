@@ -12,11 +12,9 @@ import torch
 from lightning import LightningModule, Trainer
 
 from datamodules.core.found import Split
+from datamodules.core.inputs import RGB_NORMALIZATION
 from datamodules.core.panoramas import Panorama
-from datamodules.core.samples import (
-    RGB_NORMALIZATION,
-    EvaluationSample,
-)
+from datamodules.core.samples import EvaluationSample
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 from tangent_train.errors import SettingError
 from tangent_train.rendering import TangentRepresentation

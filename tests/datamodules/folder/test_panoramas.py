@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from datamodules.core.samples import RGB_NORMALIZATION, RGBD_NORMALIZATION, Normalization
+from datamodules.core.inputs import RGB_NORMALIZATION, RGBD_NORMALIZATION, Normalization
 from datamodules.folder.panoramas import FolderPanoramas
 from tangent_train.errors import DataError, SettingError
 from tests.datamodules.folder.folder_format import (

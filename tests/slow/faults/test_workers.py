@@ -69,7 +69,6 @@ def test_a_worker_that_dies_is_reported_with_what_may_help(
     death: str,
     training: bool,
     monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
 ) -> None:
     data = small_data(stanford_root, num_workers=2)
     split = "train" if training else "test"
@@ -79,7 +78,6 @@ def test_a_worker_that_dies_is_reported_with_what_may_help(
     message = r"data\.num_workers: found 2, and a DataLoader worker"
     with pytest.raises(SettingError, match=message), machine_faults(tmp_path, data):
         run(small_task(Faulty()), datamodule=data)
-    assert not training or f"tangent-train resume={tmp_path}" in capsys.readouterr().err
 
 
 def test_errors_of_workers_are_said_without_their_stack(
