@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import pytest
-
 from tests.slow.faults.kills import campaign, killed_while_writing
 
 if TYPE_CHECKING:
     from pathlib import Path
 
 
-@pytest.mark.slow
 def test_runs_killed_at_random_moments_end_as_if_nothing_had_happened(
     stanford_root: Path, tmp_path: Path
 ) -> None:

@@ -113,7 +113,6 @@ generate_rooms(Path(sys.argv[1]), RoomSettings(height=256), workers=2, progress=
 """
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM])
 @pytest.mark.parametrize("after_s", [0.5, 4])
 def test_workers_end_with_their_parent(tmp_path: Path, how: signal.Signals, after_s: float) -> None:
