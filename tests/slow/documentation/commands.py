@@ -127,6 +127,8 @@ def words_of(line: str) -> tuple[dict[str, str], list[str]]:
 def typed(words: list[str], world: Path) -> list[str]:
     """The words with files of the world for placeholders and absolute paths; sweeps as one run."""
     program, *given = [word for word in words if word != "…"]
+    if "…" in words and program == "tangent-predict":
+        given += ["input=panoramas", "output=labels"]
     sweep = program != "python" and "-m" in given
     real = []
     for word in given:
