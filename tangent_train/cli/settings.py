@@ -20,7 +20,7 @@ _SAID = {
     bool: "true or false",
     int: "a whole number",
     float: "a number",
-    str: "a text",
+    str: "a name or path",
     Path: "a file or folder",
     NoneType: "null",
     tuple: "a list",
