@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import json
-import sys
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 import torch
 
-from tangent_train.cli import main
+from tests.cli.tiny_runs import results, run_command
 from tests.datamodules.folder.folder_format import (
     CLASS_OF_STORED,
     NAMES,
@@ -36,11 +33,6 @@ _SETTINGS = [
 ]
 
 
-def _run(monkeypatch: pytest.MonkeyPatch, command: str, *arguments: str) -> None:
-    monkeypatch.setattr(sys, "argv", [f"tangent-{command}", *arguments])
-    getattr(main, command)()
-
-
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("own") / "my rooms"
@@ -50,20 +42,15 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def run_folder(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def own_run(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run with depth."""
     folder = tmp_path_factory.mktemp("run")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         arguments = [*_SETTINGS, f"data.root='{root}'", "data.inputs=[rgb,depth]"]
         arguments += ["data.normalization={mean:[0.1,0.2,0.3,2],std:[0.5,0.5,0.5,1.5]}"]
-        _run(patch, "train", *arguments, "hydra.run.dir=finished")
+        run_command(patch, "train", *arguments, "hydra.run.dir=finished")
     return folder / "finished"
-
-
-def _results(folder: Path) -> dict[str, Any]:
-    results: dict[str, Any] = json.loads((folder / "results.json").read_text())
-    return results
 
 
 def _pixels_of_classes(root: Path, names: list[str]) -> list[int]:
@@ -78,46 +65,46 @@ def _pixels_of_classes(root: Path, names: list[str]) -> list[int]:
 
 
 def test_the_results_count_every_labelled_pixel_of_the_test_panoramas(
-    root: Path, run_folder: Path
+    root: Path, own_run: Path
 ) -> None:
-    results = _results(run_folder)
-    assert results["images"] == 2
-    assert [row["class"] for row in results["classes"]] == list(NAMES)
-    assert np.array(results["confusion"]).sum(axis=1).tolist() == _pixels_of_classes(root, _TEST)
-    assert len(list((run_folder / "panels").glob("*.png"))) == 1
+    found = results(own_run)
+    assert found["images"] == 2
+    assert [row["class"] for row in found["classes"]] == list(NAMES)
+    assert np.array(found["confusion"]).sum(axis=1).tolist() == _pixels_of_classes(root, _TEST)
+    assert len(list((own_run / "panels").glob("*.png"))) == 1
 
 
-def test_the_checkpoint_holds_classes_and_normalization(run_folder: Path) -> None:
-    content = torch.load(run_folder / "checkpoints" / "best.ckpt", weights_only=True)
+def test_the_checkpoint_holds_classes_and_normalization(own_run: Path) -> None:
+    content = torch.load(own_run / "checkpoints" / "best.ckpt", weights_only=True)
     assert content["class_names"] == ["unknown", *NAMES]
     assert content["normalization"] == {"mean": [0.1, 0.2, 0.3, 2], "std": [0.5, 0.5, 0.5, 1.5]}
 
 
 def test_the_checkpoint_is_evaluated_again_and_on_other_files(
-    root: Path, run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    root: Path, own_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    checkpoint = f"checkpoint={run_folder / 'checkpoints' / 'best.ckpt'}"
-    _run(monkeypatch, "evaluate", checkpoint, f"data.root='{root}'", "hydra.run.dir=again")
-    assert _results(tmp_path / "again") == _results(run_folder)
+    checkpoint = f"checkpoint={own_run / 'checkpoints' / 'best.ckpt'}"
+    run_command(monkeypatch, "evaluate", checkpoint, f"data.root='{root}'", "hydra.run.dir=again")
+    assert results(tmp_path / "again") == results(own_run)
     # Another folder of the same classes, with all panoramas for test but one of each other split.
     own = write_data_set(tmp_path / "more", scenes=4, each=1, height=_ROWS, depth=True)
     (own / "train.txt").write_text("scene_0/view.0\n")
     (own / "val.txt").write_text("scene_1/view.0\n")
-    _run(monkeypatch, "evaluate", checkpoint, f"data.root={own}", "hydra.run.dir=more")
+    run_command(monkeypatch, "evaluate", checkpoint, f"data.root={own}", "hydra.run.dir=more")
     expected = _pixels_of_classes(own, ["scene_2/view.0", "scene_3/view.0"])
-    assert np.array(_results(tmp_path / "more")["confusion"]).sum(axis=1).tolist() == expected
+    assert np.array(results(tmp_path / "more")["confusion"]).sum(axis=1).tolist() == expected
 
 
 def test_other_classes_are_refused(
-    run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    own_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     own = write_data_set(tmp_path / "data", scenes=4, each=1, height=_ROWS, depth=True)
     write_classes(own, {"floor": 1, "wall": [2, 3], "window": 255})
-    checkpoint = f"checkpoint={run_folder / 'checkpoints' / 'best.ckpt'}"
+    checkpoint = f"checkpoint={own_run / 'checkpoints' / 'best.ckpt'}"
     with pytest.raises(SystemExit, match=r"found class names .*floor.*expected .*'wall', 'floor'"):
-        _run(monkeypatch, "evaluate", checkpoint, f"data.root={own}")
+        run_command(monkeypatch, "evaluate", checkpoint, f"data.root={own}")
 
 
 def test_prepare_checks_and_fills_the_store(
@@ -127,22 +114,8 @@ def test_prepare_checks_and_fills_the_store(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    _run(monkeypatch, "prepare", *_SETTINGS, f"data.root='{root}'", "data.store=store")
+    run_command(monkeypatch, "prepare", *_SETTINGS, f"data.root='{root}'", "data.store=store")
     assert "Panoramas: 6 train, 2 val, 2 test." in capsys.readouterr().out
     stored = sorted(path.relative_to(tmp_path / "store") for path in tmp_path.rglob("*.npy"))
     assert len(stored) == 10
     assert stored[0].match("32x64_*/scene_0/view.0.npy")
-
-
-def test_errors_reach_the_terminal_as_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit, match=r"^tangent-prepare: .*panoramas/classes\.json: found"):
-        _run(monkeypatch, "prepare", *_SETTINGS)
-    own = write_data_set(tmp_path / "data", scenes=4, each=1, height=_ROWS)
-    with pytest.raises(SystemExit, match=r"depth/scene_0/view\.0: found no such file"):
-        _run(monkeypatch, "prepare", *_SETTINGS, f"data.root={own}", "data.inputs=[rgb,depth]")
-    (own / "labels" / "scene_2" / "view.0.png").unlink()
-    with pytest.raises(SystemExit, match=r"labels/scene_2/view\.0\.png: found"):
-        _run(monkeypatch, "prepare", *_SETTINGS, f"data.root={own}")

@@ -60,29 +60,6 @@ def test_every_network_takes_the_data_s_channels_and_classes(network: str) -> No
     assert not unused, "parameters without gradient"
 
 
-@pytest.mark.parametrize(
-    ("network", "stride", "channels", "classes"),
-    [
-        ("unet_context", 32, 256, 14),
-        ("unet_small_context", 16, 256, 14),
-        ("unet_small_aux", 16, 256, 14),
-    ],
-)
-def test_heads_and_context_are_at_the_deepest_features(
-    network: str, stride: int, channels: int, classes: int
-) -> None:
-    _, task = build(_composed(f"network={network}"))
-    seen: list[tuple[int, ...]] = []
-    head = next(m for n, m in task.named_modules() if n.endswith("auxiliary_head"))
-    head.register_forward_pre_hook(lambda _module, inputs: seen.append(tuple(inputs[0].shape)))
-    outputs = task.outputs(torch.randn(2, 4, 64, 96))
-    assert seen == [(2, channels, 64 // stride, 96 // stride)]
-    assert outputs["aux"].shape == (2, classes, 64 // stride, 96 // stride)
-    assert list(task.eval().outputs(torch.randn(2, 4, 64, 96))) == ["out"]
-    if network != "unet_small_aux":
-        assert task.network.mixer.norm.normalized_shape == (channels,)
-
-
 SHAPES = ("data=modelnet40", "data.root=nowhere", "task=classification")
 
 
@@ -97,30 +74,6 @@ def test_every_network_of_shapes_takes_their_channels_and_classes(network: str) 
     scores.square().mean().backward()
     unused = [n for n, p in task.named_parameters() if p.grad is None and ".mixer." not in n]
     assert not unused, "parameters without gradient"
-
-
-def test_the_papers_shape_classifiers_have_their_numbers_of_parameters() -> None:
-    for network, count in (("shape_classifier", 5_135_880), ("shape_classifier_16", 1_309_976)):
-        _, task = build(_composed(*SHAPES, f"network={network}"))
-        assert sum(p.numel() for p in task.parameters()) == count
-
-
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (
-            ["data=modelnet40", "data.root=nowhere"],
-            r"task: found segmentation, with shapes; expected classification",
-        ),
-        (
-            ["task=classification", "network=shape_classifier"],
-            r"task: found classification, with panoramas; expected segmentation",
-        ),
-    ],
-)
-def test_what_does_not_belong_together_is_refused(overrides: list[str], message: str) -> None:
-    with pytest.raises(SettingError, match=message):
-        build(_composed(*overrides))
 
 
 def test_networks_for_single_images_are_refused_for_shapes() -> None:

@@ -46,7 +46,7 @@ def test_two_processes_make_the_steps_and_figures_of_one(
     (tmp_path / "own" / "network" / "plain.yaml").write_text(PLAIN)
     settings = [text for text in SETTINGS if not text.startswith("network.")]
     common = ["--config-dir", str(tmp_path / "own"), *settings, rooms, "network=plain"]
-    common += ["trainer.max_steps=3", "optimizer=adam"]
+    common += ["trainer.max_steps=3", "optimizer=adam", "data.validation_fraction=0.4"]
     one = ["data.panoramas_per_step=2", "hydra.run.dir=one"]
     run_command(monkeypatch, "train", *common, *one)
     devices = ["trainer.accelerator=cpu", "trainer.devices=2"]

@@ -26,7 +26,7 @@ def _no_debugger(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def settings(rooms: str) -> tuple[str, ...]:
     """Of a run of one epoch."""
-    return (*SETTINGS, rooms, "trainer.max_epochs=1", "panels=0")
+    return (*SETTINGS, "data.validation_fraction=0.4", "trainer.max_epochs=1", "panels=0", rooms)
 
 
 def _json(path: Path) -> dict[str, Any]:
@@ -63,7 +63,7 @@ def test_jobs_of_a_grid_are_runs_of_their_own_on_any_number_of_devices(
         assert _json(run / "results.json")["images"] == 2
     checkpoint = f"checkpoint={runs[0] / 'checkpoints' / 'last.ckpt'}"
     turned = ("data.test_rotation=null,so3", "hydra.sweep.dir=turned")
-    run_command(monkeypatch, "evaluate", "-m", checkpoint, settings[-3], *turned)
+    run_command(monkeypatch, "evaluate", "-m", checkpoint, settings[-1], *turned)
     figures = [_json(tmp_path / "turned" / n / "results.json")["confusion"] for n in "01"]
     assert figures[0] == _json(runs[0] / "results.json")["confusion"] != figures[1]
 

@@ -72,15 +72,6 @@ def test_what_a_killed_process_left_is_removed_by_the_next(
     assert (tmp_path / "kept" / ".partial-x").exists(), "only in the folder that is written to"
 
 
-def test_what_is_being_written_is_left_alone(
-    tmp_path: Path, writer: tuple[subprocess.Popen[str], Path]
-) -> None:
-    _, temporary = writer
-    _age(temporary, hours=23)  # a process that was stopped for a night
-    write_text(tmp_path / "file.txt", "of another process")
-    assert temporary.read_text() == "half"
-
-
 def test_what_is_young_may_be_of_another_machine(tmp_path: Path) -> None:
     (tmp_path / ".partial-young").touch()
     _age(tmp_path / ".partial-young", hours=23)
