@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 __all__ = ["Goal", "Row", "Table", "Way", "added_mib", "measure"]
 
 _SHORTEST_S = 0.02
-"""What takes less is repeated until it takes that long."""
+"""Shorter calls are repeated until they take that long."""
 
 
 class Way(NamedTuple):

@@ -1,4 +1,4 @@
-"""What every study shares: a table for the terminal, a CSV file and a picture."""
+"""Output that all studies share: a table for the terminal, a CSV file and a picture."""
 
 from __future__ import annotations
 

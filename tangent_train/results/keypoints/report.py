@@ -185,7 +185,9 @@ def _paper() -> dict[str, dict[str, dict[str, str]]]:
 
 
 def _text(value: float | None, metric: str) -> str:
-    return percent(value) if metric.endswith("%") or value is None else f"{value:.3g}"
+    if metric.endswith("%") or value is None:
+        return percent(value)
+    return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"
 
 
 def _triple(scores: Sequence[float | None]) -> str:

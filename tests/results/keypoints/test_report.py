@@ -100,7 +100,7 @@ def test_other_data_have_nothing_of_the_papers() -> None:
     rows = [
         row("a|b", fov_overlap=0.5, rotation_error_deg=1.0, correct_share=0.5),
         row("a|b", condition=ROTATED, fov_overlap=0.5, pmr=0.4),
-        row("c", fov_overlap=0.6, rotation_error_deg=2.0, pmr=None),
+        row("c", fov_overlap=0.6, rotation_error_deg=2.0, pmr=None, inliers=12345),
         row("c", condition=ROTATED, fov_overlap=0.6),
     ]
     text = KeypointReport(rows, ("ERP",), {"seed": 0}, {}).markdown()
@@ -111,6 +111,7 @@ def test_other_data_have_nothing_of_the_papers() -> None:
     assert table[1:3] == [["hard (1)", "PMR %", "20.0"], ["", "MS %", "10.0"]]
     assert ["", "right matches %", "50.0"] in table
     assert ["", "keypoints, left", "100"] in table
+    assert ["", "inliers", "12,345"] in table
     assert ["", "rotation error °, median", "2"] in table
     assert ["easy (1)", "PMR %", "–"] in table
     assert tables(text)["Right panorama randomly rotated"][1][2] == "40.0"
