@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Callable, Hashable, Sequence
+from contextlib import suppress
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -59,15 +61,11 @@ class TableCache:
 
     def __init__(self, limit: int) -> None:
         self.limit = limit
-        self._tables: dict[Hashable, tuple[Any, ...]] = {}
+        self.nbytes = 0
+        self._tables: OrderedDict[Hashable, tuple[Any, ...]] = OrderedDict()
 
     def __len__(self) -> int:
         return len(self._tables)
-
-    @property
-    def nbytes(self) -> int:
-        """Memory of what is held."""
-        return sum(map(_nbytes, list(self._tables.values())))
 
     def get(self, key: Hashable, build: Callable[[], Value]) -> Value:
         """The table of a key, built if it is not held.
@@ -76,23 +74,23 @@ class TableCache:
             key: What the table depends on.
             build: Makes the table, a tuple of arrays or tensors.
         """
-        table: Any = self._tables.pop(key, None)
-        if table is None:
-            table = build()
-            if _nbytes(table) > self.limit:
-                return table
-            self._shrink(self.limit - _nbytes(table))
-        self._tables[key] = table  # the last used is the last
+        held: Any = self._tables.get(key)
+        if held is not None:
+            with suppress(KeyError):  # dropped by another thread
+                self._tables.move_to_end(key)
+            return held
+        table = build()
+        if _nbytes(table) <= self.limit and key not in self._tables:
+            self._tables[key] = table
+            self.nbytes += _nbytes(table)
+            self.set_limit(self.limit)
         return table
 
     def set_limit(self, limit: int) -> None:
         """Change the limit, dropping what no longer fits."""
         self.limit = limit
-        self._shrink(limit)
-
-    def _shrink(self, room: int) -> None:
-        while self.nbytes > room:
-            self._tables.pop(next(iter(self._tables)), None)
+        while self.nbytes > limit and self._tables:
+            self.nbytes -= _nbytes(self._tables.popitem(last=False)[1])
 
 
 def _nbytes(table: tuple[Any, ...]) -> int:
@@ -106,7 +104,7 @@ def set_table_cache_limit(nbytes: int) -> None:
     """Bound the memory of the rendering tables of this process, 512 MiB at first.
 
     At level 10 and base level 1 the tables take 168 MB for panorama to images and, in PyTorch,
-    109 MB back. Tables on a GPU count too.
+    117 MB back. Tables on a GPU count too.
 
     Args:
         nbytes: Most bytes held; 0 keeps nothing.
