@@ -238,7 +238,7 @@ def test_other_files_are_refused(files: dict[str, Path], tmp_path: Path) -> None
     model = onnx.load(files[".onnx"])
     text = model.metadata_props[0].value
     for value, message in (
-        (None, "no 'tangent_train' in its metadata"),
+        (None, "no JSON in 'tangent_train' of its metadata"),
         ("{", "no JSON in 'tangent_train' of its metadata"),
         ("3", "int instead of a mapping in 'tangent_train'"),
         (text.replace('"inputs"', '"input"'), "no inputs in 'tangent_train'"),
