@@ -93,8 +93,8 @@ class LabelTable:
                 labels.
 
         >>> table = LabelTable(np.array([0, 1, 12], np.uint8))
-        >>> table.decode(np.array([[[0, 0, 2], [0, 0, 3], [13, 13, 13]]], np.uint8)).tolist()
-        [[12, 0, 0]]
+        >>> table.decode(np.array([[[0, 0, 2], [13, 13, 13]]], np.uint8)).tolist()
+        [[12, 0]]
         """
         red, green, blue = np.moveaxis(colors.astype(np.int32), -1, 0)
         index = (red << 16) | (green << 8) | blue
