@@ -18,7 +18,6 @@ PREDICT = ("predict", "checkpoint=x.ckpt", "input=image.png", "output=labels")
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        # Misspelt.
         # Levels and images.
         (("train", "level=2", "representation.base_level=2"), r"dim: found 1; expected at least 2"),
         (("train", "level=2", "representation.base_level=3"), r"base_level: found 3; .* level = 2"),
@@ -29,7 +28,7 @@ PREDICT = ("predict", "checkpoint=x.ckpt", "input=image.png", "output=labels")
             r"representation\.faces_per_panorama: found 99; expected 1 to 20",
         ),
         ((*ROOMS, "representation.faces_per_panorama=0"), r"faces_per_panorama: found 0; exp"),
-        (("train", "representation.rotation=any"), r"\.rotation: found 'any'; .*none, yaw, so3"),
+        (("train", "representation.rotation=any"), r"\.rotation: found 'any'; .*'yaw' or 'so3'"),
         # Classes, inputs and networks.
         ((*ROOMS, "network.num_classes=5"), r"scores of the network: found .*5.*; expected .*14"),
         ((*ROOMS, "network.in_channels=3"), r"network: found UNet, which does not take .*4, "),
@@ -38,7 +37,7 @@ PREDICT = ("predict", "checkpoint=x.ckpt", "input=image.png", "output=labels")
             r"network: found UNet, which does not take \(1, 3, 48, 48\)",
         ),
         ((*ROOMS, "data.inputs=[depth,rgbd]"), r"data\.inputs: found .*; expected a list: rgb"),
-        ((*ROOMS, "task.class_weights=[1,2]"), r"class_weights: found 2 numbers; expected 14"),
+        ((*ROOMS, "task.class_weights=[1,2]"), r"class_weights: found \[1, 2\]; .*14 numbers"),
         ((*ROOMS, "task.class_weights=logg"), r"class_weights: found logg; expected .*log, sqrt"),
         ((*ROOMS, "task=classification"), r"task: found classification, .*; expected segm"),
         (
@@ -54,13 +53,13 @@ PREDICT = ("predict", "checkpoint=x.ckpt", "input=image.png", "output=labels")
         ((*ROOMS, "data.rooms.height=7"), r"height: found 7; expected"),
         # Training.
         ((*ROOMS, "task.label_smoothing=2"), r"label_smoothing: found 2; expected 0 to 1"),
-        ((*ROOMS, "task.images_per_chunk=0"), r"images_per_chunk: found 0; expected .* from 1"),
+        ((*ROOMS, "task.images_per_chunk=0"), r"images_per_chunk: found 0; expected from 1"),
         ((*ROOMS, "ema=2"), r"ema: found 2; expected a decay"),
         ((*ROOMS, "panels=-1"), r"panels: found -1; expected 0 or more"),
         ((*ROOMS, "checkpoint_every_n_steps=0"), r"checkpoint_every_n_steps: found 0; expected"),
         # Files.
         (("evaluate", "checkpoint=nowhere.ckpt"), r"nowhere\.ckpt: found no such file; expected"),
-        (("evaluate",), r"checkpoint: found none; expected a checkpoint"),
+        (("evaluate",), r"checkpoint: found none; expected checkpoints/best"),
         (("evaluate", "checkpoint=."), r"found a folder; .*checkpoints/best\.ckpt"),
         ((*ROOMS, "init_from=nowhere.ckpt"), r"nowhere\.ckpt: found no such file; expected"),
         ((*ROOMS, "init_from=x.ckpt"), r"x\.ckpt: found no tensor that fits.*; expected"),
