@@ -34,7 +34,7 @@ MEASURED = {
     "evaluation": "benchmarks.training",
     "start": "benchmarks.start",
 }
-"""Where what is measured is; each has a function of its name."""
+"""Modules of the rows; each has a function of the same name."""
 
 BASELINE = Path(__file__).with_name("baseline.json")
 _NOISE = 1.1

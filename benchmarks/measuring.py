@@ -1,4 +1,4 @@
-"""Ways to do the same, measured in turn.
+"""Alternatives measured in turn.
 
 All ways of a table run one after the other, round after round, so that the load of the machine
 meets all of them; what counts is the quotient with the first way within each round. Absolute
@@ -100,7 +100,7 @@ class Table:
 
 
 def measure(ways: Sequence[Way], rounds: int) -> list[Row]:
-    """Seconds of all ways, run in turn, every other round in the opposite order.
+    """Seconds of all alternatives, run in turn, every other round in the opposite order.
 
     Args:
         ways: Each is run twice before, which compiles and fills caches.

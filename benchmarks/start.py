@@ -1,4 +1,4 @@
-"""How long commands take to start, beside the imports they cannot do without.
+"""Start-up time of commands, compared with the imports they cannot do without.
 
 Every measurement is a new interpreter, everything in the page cache.
 """

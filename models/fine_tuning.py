@@ -19,7 +19,7 @@ _LISTED = 8
 
 
 class Origins(NamedTuple):
-    """Where the tensors of a network come from.
+    """Origin of each tensor of a network.
 
     Attributes:
         loaded: Names of those taken unchanged.

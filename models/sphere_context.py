@@ -121,7 +121,7 @@ class SphereContext(nn.Module):
         rays: Float[Tensor, "spheres images_of_sphere 3 3"],
         tokens: Float[Tensor, "images features rows columns"],
     ) -> Float[Tensor, "images features rows columns"]:
-        """What is added to the tokens of all images of the spheres: the second step."""
+        """Residual of the tokens of all images of the spheres: the second step."""
         directions = token_directions(rays, tokens.shape[-2], tokens.shape[-1])
         context: Tensor = self.mixer(tokens.reshape(*rays.shape[:2], *tokens.shape[1:]), directions)
         return context.flatten(0, 1)

@@ -13,7 +13,7 @@ from tangent_train.errors import SettingError
 __all__ = ["stage_channels"]
 
 _TRIALS = list(product(("meta", "cpu"), (256, 224)))
-"""Devices and sides of the empty images: some networks look at values, some fix their input."""
+"""Devices and sides of the empty images: some networks depend on values, some fix their input."""
 
 _LISTED_DEPTH = 2
 

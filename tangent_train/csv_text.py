@@ -10,7 +10,7 @@ from typing import Any
 __all__ = ["csv_text"]
 
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")
-"""What a text begins with that spreadsheets compute (OWASP, "CSV Injection")."""
+"""First characters of text that spreadsheets evaluate (OWASP, "CSV Injection")."""
 
 
 def csv_text(columns: Sequence[str], rows: Iterable[Mapping[str, Any] | Sequence[Any]]) -> str:

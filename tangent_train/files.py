@@ -30,7 +30,7 @@ class NoRoomError(SettingError):
 
 
 def no_room(path: Path, error: BaseException) -> NoRoomError | None:
-    """What to tell the user when a file did not fit.
+    """Error with a remedy if a file did not fit on the disk.
 
     Args:
         path: The file.

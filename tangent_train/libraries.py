@@ -1,4 +1,4 @@
-"""What settings in files may name of other libraries, and with which arguments.
+"""Callables of other libraries that settings in files may name, and their arguments.
 
 All are numbers, words and lists of these: whatever would read, fetch or run something (weights,
 addresses, files, plugins) is not among them.

@@ -266,7 +266,7 @@ def _check_argument(
 
 
 def _find(target: str) -> tuple[Any, Mapping[str, Any]] | None:
-    """What every file may name, with the kinds of its arguments."""
+    """A callable that every file may name, with the kinds of its arguments."""
     module, _, name = target.rpartition(".")
     if module in _HOMES:
         home = import_module(module)

@@ -1,1 +1,1 @@
-"""What all data sets share: data modules, samples, transforms, the prepared store, checks."""
+"""Common parts of all data sets: data modules, samples, transforms, the prepared store, checks."""

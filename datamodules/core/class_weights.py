@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 __all__ = ["ClassWeights", "class_weights"]
 
 ClassWeights = Literal["log", "sqrt", "effective", "none"]
-"""How the loss weighs classes; see `class_weights`."""
+"""Class weighting of the loss; see `class_weights`."""
 
 _LOG_OFFSET = 1.02
 

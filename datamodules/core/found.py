@@ -1,4 +1,4 @@
-"""What there is of a data set, and finding out what of it is broken."""
+"""The items of a data set, and the check for broken ones."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SPLITS: tuple[Split, ...] = ("train", "val", "test")
 """All of them."""
 
 SAMPLED = 32
-"""How many images `Found.read_some` decodes, at most."""
+"""Maximum number of images that `Found.read_some` decodes."""
 
 _SECONDS = 2.0
 _Item = TypeVar("_Item", bound=Item)
@@ -54,7 +54,7 @@ class Found(Generic[_Item]):
     in_parallel: Callable[[Callable[[_Item], Any], Sequence[_Item]], Generator[Any]] = in_threads
 
     def of(self, splits: Sequence[Split] = SPLITS) -> list[_Item]:
-        """What some splits have."""
+        """Items of some splits."""
         return [item for split in splits for item in self.splits[split]]
 
     def check(self, problems: Problems, *, progress: bool) -> int:
@@ -136,7 +136,7 @@ def _add(problems: Problems, item: Item, errors: Iterable[Exception]) -> None:
 
 
 def _failures(reads: Callable[[Any], Iterable[Callable[[], object]]], item: Item) -> _Failures:
-    """What is wrong with one image; another process may call this."""
+    """Problems of one image; runs in worker processes too."""
     errors: list[Exception] = []
     for read in reads(item):
         try:

@@ -1,4 +1,4 @@
-"""What networks are shown of an image: inputs, their channels and their normalization."""
+"""Network inputs: their channels and normalization."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ __all__ = [
 ]
 
 Input = Literal["rgb", "depth", "elevation"]
-"""What a network may be shown of an image, in the order of its channels, see `channel_names`.
+"""Inputs of a network, in channel order, see `channel_names`.
 
 * `rgb` and `depth` are normalized.
 * `elevation`: the sine of the angle between a pixel's ray and the horizon, −1 (down) to 1 (up).
@@ -127,7 +127,7 @@ def channel_names(inputs: Sequence[Input]) -> tuple[str, ...]:
 def normalize(
     rendered: Sequence[Tensor], normalization: Normalization, inputs: Sequence[Input]
 ) -> Tensor:
-    """What a network takes, channels first.
+    """Normalize to a network's input, channels first.
 
     Args:
         rendered: RGB ``(..., h, w, 3)`` uint8; with depth ``(..., h, w)`` in steps of 1/512 m, 0

@@ -48,7 +48,7 @@ def make_loader(
 
 
 def explained(error: Exception, num_workers: int) -> Exception:
-    """What to tell the user of an error that a loader raised, perhaps for one of its workers.
+    """Explain an error that a loader, or one of its workers, raised.
 
     Args:
         error: It.

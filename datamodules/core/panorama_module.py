@@ -1,4 +1,4 @@
-"""What the data modules of all panorama data sets share."""
+"""Base data module of panorama data sets."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ __all__ = ["PanoramaDataModule", "Split", "Upright"]
 _HALF_TURN_DEG = 180
 
 Upright = Literal["pose", "auto"] | None
-"""Where it is known from which way is up in a panorama."""
+"""Source of the up direction of a panorama."""
 
 
 @dataclass(kw_only=True, eq=False, repr=False)
@@ -46,7 +46,7 @@ class PanoramaDataModule(SplitDataModule[ImageFiles]):
         inputs: What the network is shown, `rgb` and perhaps others, see `Input`.
         color_jitter: Strength of the colour augmentation, 0 (none) to 1, see `jitter_colors`.
         test_rotation: Rotate the test panoramas: tilt in degrees, or `so3`, see `RotatedPanoramas`.
-        upright: Look at panoramas upright that are not. `pose`: as their files say (GPano) and, of
+        upright: Align tilted panoramas with gravity. `pose`: as their files say (GPano) and, of
             test panoramas, as they were rotated. `auto`: as their files say, else as estimated from
             the image.
         max_tilt_deg: Of `auto`: some degrees more than they are tilted, see `estimate_up`.
@@ -91,7 +91,7 @@ class PanoramaDataModule(SplitDataModule[ImageFiles]):
     def find_images(
         self, problems: Problems
     ) -> tuple[ImageReader, Mapping[Split, Sequence[ImageFiles]]]:
-        """How the data set is read, and the files of all splits, not yet looked into.
+        """Return the reader of the data set and the files of all splits, not yet opened.
 
         Args:
             problems: Where it is noted what is wrong with the folders.
@@ -113,7 +113,7 @@ class PanoramaDataModule(SplitDataModule[ImageFiles]):
         return found
 
     def pipeline(self, found: Found[ImageFiles], split: Split) -> SplitItems[ImageFiles, Panorama]:
-        """From files or store, then rotated, then looked at upright."""
+        """From files or store, then rotated, then aligned with gravity."""
         transforms: list[Transform[Panorama, Any]] = []
         if self.upright is not None:
             transforms.append(PosedUp())

@@ -37,10 +37,10 @@ __all__ = [
 _Pixel = TypeVar("_Pixel", bound=np.generic)
 
 Mask = Literal["labels", "any_black", "all_black"]
-"""Which pixels count as unknown besides those without a label; see `mask_black`."""
+"""Pixels that count as unknown besides unlabelled ones; see `mask_black`."""
 
 Turn = float | Literal["so3"] | None
-"""How test panoramas are rotated: tilted by degrees, uniformly over all rotations, or not."""
+"""Rotation of test panoramas: a tilt in degrees, uniformly random (SO(3)), or none."""
 
 STEPS_PER_M = 512
 """Depth is in steps of 1/512 m, as in the files of Stanford2D3DS."""
@@ -65,7 +65,7 @@ class Panorama(NamedTuple):
     up: NDArray[np.float64] | None = None
 
     def sampler(self, representation: Representation) -> Sampler:
-        """What draws its views: the representation, brought upright."""
+        """The sampler of its views: the representation, aligned with gravity."""
         if self.up is None:
             return representation
         return representation.turned(upright_rotation(self.up))

@@ -1,4 +1,4 @@
-"""What the data modules of all data sets of photos share."""
+"""Base data module of photo data sets."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class PhotoDataModule(SplitDataModule[ImageFiles]):
             raise SettingError(
                 "data.inputs",
                 found=list(self.inputs),
-                expected="no elevation: nobody knows where the horizon of a photo is",
+                expected="no elevation: the horizon of a photo is unknown",
                 remedy="Train on photos without it, then on panoramas with it and init_from=…: "
                 "its filters start at zero.",
             )

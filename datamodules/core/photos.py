@@ -43,7 +43,7 @@ class Photo(NamedTuple):
         return
 
     def sampler(self, representation: PerspectiveRepresentation) -> PhotoSampler:
-        """What draws its crops, which depend on its camera."""
+        """The sampler of its crops, which depend on its camera."""
         height, width = self.labels.shape
         return representation.of_camera(self.camera_matrix, (height, width))
 

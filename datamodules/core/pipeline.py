@@ -41,7 +41,7 @@ _Work = TypeVar("_Work")
 
 
 class Item(Protocol):
-    """What one image or shape is made of."""
+    """The source of one image or shape."""
 
     @property
     def name(self) -> str:
@@ -176,7 +176,7 @@ class PosedUp:
 class EstimatedUp:
     """Panoramas with an estimate of the direction of up, where it is not known.
 
-    They are looked at upright, however the camera was held; pixels and labels stay where they are.
+    Views are aligned with gravity; pixels and labels stay in place.
 
     Args:
         max_tilt_deg: The most they may be tilted, see `estimate_up`.

@@ -1,4 +1,4 @@
-"""What is wrong with a data set: all problems there are, not only the first."""
+"""Problems of a data set, all of them collected."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Problems:
 
     @contextmanager
     def noted(self, item: str | None = None, file: Path | None = None) -> Iterator[None]:
-        """A block after whose errors the search goes on.
+        """A block after whose errors the check continues.
 
         Args:
             item: Name of what cannot be used then; None for the whole data set.
@@ -127,7 +127,7 @@ class Problems:
 
 
 def _finding(error: DataError | SettingError, where: object) -> str:
-    """What an error says, without the file and the remedy, which stand beside it."""
+    """Message of an error without its file and remedy, which have columns of their own."""
     text = str(error).removesuffix(error.remedy).rstrip(". ")
     text = text.removeprefix(str(where)).lstrip(",: ").removeprefix("found ")
     text = text.replace(f": '{where}'", "").replace(f" of {where}", "")

@@ -25,7 +25,7 @@ _Result = TypeVar("_Result")
 
 
 def number_of_processes(workers: int | None, pieces: int, least: int = 1) -> int:
-    """How many processes a piece of work is worth.
+    """Number of processes for a piece of work.
 
     Args:
         workers: What is asked for; by default one per CPU core.

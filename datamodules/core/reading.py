@@ -48,11 +48,11 @@ class ImageFiles(NamedTuple):
 
 
 class ImageReader(ABC):
-    """How the files of a data set are decoded."""
+    """Decoder of the files of a data set."""
 
     @property
     def settings(self) -> Mapping[str, str]:
-        """What decides the labels and depth besides the files: a store is made for each choice."""
+        """Settings that affect labels and depth; each choice has a store of its own."""
         return {}
 
     @abstractmethod
@@ -117,7 +117,7 @@ class PanoramaReading:
         return self.reader.labels(files, self.shape)
 
     def parts(self, files: ImageFiles) -> list[Callable[[], object]]:
-        """What decodes each of its files by itself."""
+        """Functions that decode each of its files separately."""
         return [partial(getattr(self.reader, part), files) for part in files.parts]
 
 
@@ -144,7 +144,7 @@ class PhotoReading:
         return self.reader.labels(files)
 
     def parts(self, files: ImageFiles) -> list[Callable[[], object]]:
-        """What decodes each of its files by itself."""
+        """Functions that decode each of its files separately."""
         return [partial(getattr(self.reader, part), files) for part in files.parts]
 
 

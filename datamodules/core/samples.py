@@ -65,7 +65,7 @@ class TrainingSample(NamedTuple, Generic[_Images]):
     images: _Images
     labels: Tensor
     rays: Tensor
-    index: int  # type: ignore[assignment]  # nobody needs tuple.index
+    index: int  # type: ignore[assignment]  # hides tuple.index
 
 
 class EvaluationSample(NamedTuple, Generic[_Images]):
@@ -84,7 +84,7 @@ class EvaluationSample(NamedTuple, Generic[_Images]):
     target: Tensor
     rays: Tensor
     rotations: Tensor
-    index: int  # type: ignore[assignment]  # nobody needs tuple.index
+    index: int  # type: ignore[assignment]  # hides tuple.index
 
 
 class ImageSamples:
@@ -208,7 +208,7 @@ def _checked_inputs(inputs: Sequence[Input]) -> tuple[Input, ...]:
 
 
 def render_inputs(image: Any, views: Views, inputs: Sequence[Input]) -> tuple[Tensor, ...]:
-    """What a network is shown of an image, before `normalize`.
+    """Render the inputs of a network, before `normalize`.
 
     Args:
         image: What has `rgb`, `depth` where that is an input, and `up`, as `Panorama` and `Photo`.
@@ -232,7 +232,7 @@ def render_inputs(image: Any, views: Views, inputs: Sequence[Input]) -> tuple[Te
 
 
 def world_rays(views: Views, up: NDArray[np.float64] | None) -> NDArray[np.float32]:
-    """Where images look in a world whose zenith is z, see `Views.rays`.
+    """Viewing rays in a world whose zenith is z, see `Views.rays`.
 
     Args:
         views: Of a panorama.

@@ -1,4 +1,4 @@
-"""Which image comes when, and the randomness of each sample.
+"""Order of the images, and the random generator of each sample.
 
 Everything random about a sample is drawn from a generator seeded by (seed, epoch, index), so a
 run shows the same faces for any number of workers, and after a resume. The epoch travels with

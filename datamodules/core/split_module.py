@@ -1,4 +1,4 @@
-"""What the data modules of all data sets share: splits, checks, the store, loaders, resuming."""
+"""Base data module of all data sets: splits, checks, the store, loaders, resuming."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from tangent_train.errors import DataError, SettingError
 __all__ = ["SPLITS", "Found", "Kind", "Split", "SplitDataModule"]
 
 Kind = Literal["segmentation", "classification"]
-"""What a data set is labelled for: classes of pixels, or of whole shapes."""
+"""Kind of labels: classes of pixels, or of whole shapes."""
 
 _GO_ON = (
     "tangent-check with the same data settings lists all there are; data.skip_broken=true goes on "
@@ -108,7 +108,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
 
     @abstractmethod
     def find(self, problems: Problems) -> Found[_Item]:
-        """What all splits have, checked without decoding it.
+        """Find the items of all splits and check them without decoding.
 
         Args:
             problems: Where it is noted what is wrong; what is, is found nevertheless.
@@ -119,7 +119,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
 
     @abstractmethod
     def pipeline(self, found: Found[_Item], split: Split) -> SplitItems[_Item, Any]:
-        """How what a split has is read."""
+        """Reading pipeline of the items of a split."""
 
     def make_files(self) -> None:
         """Make the files of the data set, where it is one that is made."""
@@ -155,7 +155,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
             problems.refuse(self.root, _GO_ON)
 
     def found(self) -> Found[_Item]:
-        """What there is, see `setup`."""
+        """Items found by `setup`."""
         if self._found is None:
             self._found = self._usable()
         return self._found
@@ -182,7 +182,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
         return problems, count
 
     def _usable(self, *, sample: bool = False) -> Found[_Item]:
-        """What can be used; all is refused if something cannot, unless that is to be left out."""
+        """Usable items; refuse the data set if one is broken, unless broken ones are left out."""
         problems = Problems()
         found: Any = None
         with problems.noted():
@@ -279,7 +279,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
         return 1
 
     def state_dict(self) -> dict[str, int]:
-        """Where training is: the epoch, and the batches of it that are done."""
+        """Training position: the epoch, and its finished batches."""
         trainer = self.trainer
         if trainer is None:
             return {}
@@ -341,7 +341,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
         return self._evaluation_loader("test")
 
     def explained(self, error: Exception) -> Exception:
-        """What to tell the user of an error during training or evaluation.
+        """Explain an error during training or evaluation.
 
         Args:
             error: As a loader raised it, perhaps for one of its workers.

@@ -4,7 +4,7 @@ A store is a folder of ``.npy`` files, one for each panorama, photo or shape. A 
 record whose fields are the arrays (``numpy.load`` reads it), followed by one line of JSON: name,
 size and time of the files it was made from. It counts as out of date when these change.
 
-Mapped, not read: rendering a tangent image touches the pages it looks at, and processes share them.
+Memory-mapped: rendering a tangent image touches only the pages it needs, shared by all processes.
 docs/store.md compares this with other formats.
 """
 
@@ -124,7 +124,7 @@ class Store:
 
 
 def _stamps(files: Mapping[str, Path]) -> dict[str, str]:
-    """What tells this version of every file from others."""
+    """Size and time of every file, which identify its version."""
     stamps = {}
     for part, path in files.items():
         status = path.stat()

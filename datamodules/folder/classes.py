@@ -36,7 +36,7 @@ _EXPECTED = (
 
 @dataclass(frozen=True, eq=False)
 class FolderClasses:
-    """Which values or colours of label images are which class.
+    """Mapping from values or colours of label images to classes.
 
     Attributes:
         names: K names; the label of a class is its place here plus one.

@@ -1,4 +1,4 @@
-"""How the files of one's own panoramas are decoded."""
+"""Decoder of the files of a user's own panoramas."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which panoramas of one's own data set are for training, validation and test."""
+"""Training, validation and test splits of a user's own data set."""
 
 from __future__ import annotations
 

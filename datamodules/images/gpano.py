@@ -1,4 +1,4 @@
-"""What cameras and stitchers say about a panorama: which part of the sphere it is, and its pose.
+"""GPano tags of cameras and stitchers: a panorama's part of the sphere, and its pose.
 
 They write it into the XMP data of the image, in the tags of Google's Photo Sphere format
 (https://developers.google.com/streetview/spherical-metadata): the size the whole panorama would

@@ -1,4 +1,4 @@
-"""What other programs made of tangent images, back on the panorama."""
+"""Results of other programs on tangent images, rendered back to the panorama."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 __all__ = ["Kind", "TangentResults", "result_files"]
 
 Kind = Literal["color", "labels", "depth", "features"]
-"""What pixels mean: colours and features are interpolated, labels and depth never mixed."""
+"""Meaning of pixels: colours and features are interpolated, labels and depth never."""
 
 _TYPES = {"color": "uif", "labels": "bui", "depth": "uif", "features": "uif"}
 _CHANNELS = {"color": ((), (3,)), "labels": ((),), "depth": ((),)}

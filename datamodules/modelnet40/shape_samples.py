@@ -45,7 +45,7 @@ SPHERE_NORMALIZATION = Normalization(
 """The six channels of `mesh_spheres` over ModelNet40 (the released code of the paper)."""
 
 TestRotation = Literal["yaw", "so3"] | None
-"""How test shapes are rotated: about the vertical, uniformly over all rotations, or not."""
+"""Rotation of test shapes: about the vertical, uniformly random (SO(3)), or none."""
 
 
 STEPS = 16384
@@ -95,7 +95,7 @@ class ShapeSample(NamedTuple):
 
     images: Tensor
     label: Tensor
-    index: Tensor  # type: ignore[assignment]  # nobody needs tuple.index
+    index: Tensor  # type: ignore[assignment]  # hides tuple.index
 
 
 class ShapeSamples:
@@ -181,7 +181,7 @@ class ShapeViews(Dataset[ShapeSample]):
 
 
 def normalize_spheres(images: Tensor, normalization: Normalization) -> Tensor:
-    """What a network takes, channels first.
+    """Normalize to a network's input, channels first.
 
     Args:
         images: ``(..., h, w, 6)`` int16 in steps of `STEPS`.

@@ -34,7 +34,7 @@ GET_IT = (
     "Get Stanford2D3DS from http://buildingparser.stanford.edu/dataset.html and point data.root at "
     "the folder with area_1 … area_6, or train on data=synthrooms, which needs no download."
 )
-"""What to do when the data set is not there."""
+"""Remedy if the data set is missing."""
 
 MISSING_DEPTH = 65535
 """Marks pixels without depth in depth files."""

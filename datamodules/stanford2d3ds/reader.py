@@ -1,4 +1,4 @@
-"""How the files of Stanford2D3DS are decoded."""
+"""Decoder of the files of Stanford2D3DS."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What panoramas and photos of Stanford2D3DS have in common: areas, folds, the class table."""
+"""Areas, folds and class table of Stanford2D3DS, for panoramas and photos."""
 
 from __future__ import annotations
 

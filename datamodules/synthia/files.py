@@ -46,13 +46,13 @@ __all__ = [
 ]
 
 VIEWS: tuple[str, ...] = ("F", "R", "B", "L")
-"""Front, right, back, left: each looks a quarter turn to the right of the one before."""
+"""Front, right, back, left: each a quarter turn to the right of the previous one."""
 
 GET_IT = (
     "Get SYNTHIA-SEQS-01, -02, -04, -05 and -06 SUMMER from http://synthia-dataset.net and point "
     "data.root at the folder that holds them."
 )
-"""What to do when the data set is not there."""
+"""Remedy if the data set is missing."""
 
 _SIZE = (760, 1280)
 _CAMERA = (532.740352, 640.0, 380.0)  # of views of that size, centre from pixel corners

@@ -136,7 +136,7 @@ class ViewStitcher:
 def _view_positions(
     camera_matrix: NDArray[np.float64], height: int
 ) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]:
-    """Which view owns each column of a panorama, and where its pixels are in that view.
+    """View that owns each column of a panorama, and the column's pixels in that view.
 
     All pixels of a column belong to the view whose optical axis is nearest, as the views are
     upright: there they lie nearest to the middle of the image.
@@ -224,7 +224,7 @@ def _claim(folder: Path, frames: int, height: int) -> bool:
 def _unfinished(
     root: Path, sequence: str, frames: Sequence[str], height: int, problems: Problems
 ) -> list[Callable[[], None]]:
-    """What is to be made, after a check of all that it will be made from."""
+    """Panoramas to generate, after a check of all their sources."""
     size: tuple[int, int] | None = None
     whole = []
     for frame in frames:

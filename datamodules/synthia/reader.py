@@ -1,4 +1,4 @@
-"""How the files of SYNTHIA and OmniSYNTHIA are decoded: labels, depth, cameras."""
+"""Decoder of the files of SYNTHIA and OmniSYNTHIA: labels, depth, cameras."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ NORMALIZATIONS = (
         std=(0.2601, 0.2680, 0.2931, RGBD_NORMALIZATION.std[3]),
     ),
 )
-"""Of RGB as in the released code of the paper. Nobody published one of SYNTHIA's depth; this is
+"""Of RGB as in the released code of the paper. None is published for SYNTHIA's depth; this is
 that of Stanford2D3DS, clipped alike."""
 
 Formats = dict[str, tuple[int, tuple[str, ...]]]

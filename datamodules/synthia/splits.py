@@ -1,4 +1,4 @@
-"""Which frames of SYNTHIA's sequences are for training, validation and test."""
+"""Training, validation and test splits of SYNTHIA's sequences."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ def divide(
     test: Sequence[str],
     validation_fraction: float,
 ) -> dict[Split, list[ImageFiles]]:
-    """What belongs to which split.
+    """Assign frames to splits.
 
     Frames of a sequence are nearly the same as their neighbours, so validation takes those at the
     end of each training sequence, not some here and there.

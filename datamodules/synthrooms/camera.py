@@ -4,7 +4,7 @@ Room coordinates are right-handed, in metres, z up. Camera axes are x right, y d
 in `tangent_train.geometry`. A pose (R, c) takes room to camera coordinates by
 ``x_cam = R (x − c)``; ``camera_rt_matrix`` in the pose file is ``[R | −R c]``.
 
-A panorama's pose is that of an upright camera that looks at the middle of the panorama. Its pixel
+A panorama's pose is that of an upright camera facing the middle of the panorama. Its pixel
 with sphere direction s (`tangent_train.geometry`: x to the middle, y right, z up) and distance d is
 the room's point ``c + d Rᵀ (s_y, −s_z, s_x)``, which is ``c + d Rz(ψ) FLIP_Y s`` with the heading ψ
 counterclockwise from the room's x axis. A perspective pixel (column j, row i) with z-depth d is
@@ -69,7 +69,7 @@ def euler_angles(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class Pose:
-    """Where a camera is and how it looks.
+    """Position and orientation of a camera.
 
     Attributes:
         location: ``(3,)`` centre in metres.

@@ -26,7 +26,7 @@ _NEAREST = 0.3  # square metres: lamps are not brighter closer than this
 
 
 class Hits(NamedTuple):
-    """Where rays end.
+    """Hit points of rays.
 
     Attributes:
         found: ``(n,)`` whether the ray hit a surface; the other fields are undefined where not.

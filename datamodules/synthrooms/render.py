@@ -61,7 +61,7 @@ class Holes(NamedTuple):
     radii: NDArray[np.float64]
 
     def cover(self, points: Floats) -> NDArray[np.bool_]:
-        """Which of ``(n, 3)`` points lie in a hole; the rims are ragged."""
+        """Mask of the ``(n, 3)`` points that lie in a hole; the rims are ragged."""
         ragged = 1 + 0.25 * np.sin(points @ np.array([23.0, 29.0, 31.0], np.float32))
         covered = np.zeros(len(points), np.bool_)
         for center, radius in zip(self.centers, self.radii, strict=True):

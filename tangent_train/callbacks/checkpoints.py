@@ -86,7 +86,7 @@ class CheckpointContents(Callback):
     def on_train_start(
         self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
     ) -> None:
-        """Restore them: what a network draws (dropout) goes on, on as many processes as before."""
+        """Restore them: the random state (dropout) continues, on as many processes as before."""
         states = self._random_states
         if states is not None and len(states) == trainer.world_size:
             state = states[trainer.global_rank]

@@ -169,7 +169,7 @@ def _writer(trainer: lightning.Trainer) -> Any:
 
 
 def _step(trainer: lightning.Trainer) -> int:
-    """Where Lightning puts the figures of a validation (one less than `global_step` then)."""
+    """Step at which Lightning logs a validation (one less than `global_step` then)."""
     return trainer.fit_loop.epoch_loop._batches_that_stepped
 
 

@@ -1,4 +1,4 @@
-"""What is in a checkpoint, and in the settings of a run."""
+"""Content of a checkpoint and of the settings of a run."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 __all__ = ["INPUTS", "NORMALIZATION", "read_checkpoint", "read_settings", "write_settings"]
 
 INPUTS = list[Literal["rgb", "depth", "elevation"]]
-"""What a network is shown, see `datamodules.core.inputs.Input`, which is slow to import."""
+"""Inputs of a network, see `datamodules.core.inputs.Input`, which is slow to import."""
 
 NORMALIZATION = dict[str, list[float]]
 """Its ``mean`` and ``std``."""

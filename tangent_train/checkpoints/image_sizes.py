@@ -1,4 +1,4 @@
-"""Which sizes of images a network takes."""
+"""Image sizes that a network accepts."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ _PROBED = {
     64: (5, 7),
     128: (5, 7),
 }
-"""What sides may have to be multiples of, and how often they are that when it is tried: primes, so
-that they are multiples of nothing else. 14 is for transformers with such patches."""
+"""Candidate multiples, and the factors to try each with: primes, so that a tried side is a
+multiple of nothing else. 14 is for transformers with such patches."""
 
 
 def size_multiple_of(network: nn.Module, in_channels: int) -> int | None:
-    """What height and width of a network's images must be multiples of, found by trying.
+    """Find by trial the number that height and width must be multiples of.
 
     Args:
         network: In evaluation mode, on the CPU; its result a tensor.
@@ -36,7 +36,7 @@ def size_multiple_of(network: nn.Module, in_channels: int) -> int | None:
     """
     shapes_only: nn.Module = copy.deepcopy(network).to("meta")
     found = _least_multiple(shapes_only, in_channels, "meta")
-    # Some networks look at values, which there are none of there.
+    # Some networks depend on values, which the meta device does not have.
     return found or _least_multiple(network, in_channels, "cpu")
 
 

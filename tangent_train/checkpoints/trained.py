@@ -93,7 +93,7 @@ _KINDS = {
     "fixed_size": list[int] | None,
     "settings": dict | None,
 }
-"""What the metadata of an exported network say."""
+"""Metadata of an exported network."""
 
 
 class Scores(nn.Module):
@@ -174,7 +174,7 @@ def load_trained(path: Path, trust: Collection[str] = ()) -> TrainedNetwork:
 
 
 def inputs_in(path: Path) -> tuple[Input, ...] | None:
-    """What the network in a checkpoint or safetensors file is shown, where that is said."""
+    """Inputs of the network in a checkpoint or safetensors file, if stored."""
     try:
         if path.suffix.lower() == ".safetensors":
             with _safetensors(path) as file:

@@ -1,4 +1,4 @@
-"""What ``tangent-check`` does: everything that is wrong with a data set, in one table."""
+"""``tangent-check``: all problems of a data set, in one table."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def check(settings: Mapping[str, Any]) -> None:
     """Read all of the data set of a run; leave with 1 if something is wrong.
 
     On a terminal the problems are a table, elsewhere lines of file, finding and remedy with tabs
-    between them; what was looked at goes to the standard error output then.
+    between them; the summary goes to standard error then.
 
     Args:
         settings: The composed ``check.yaml``.

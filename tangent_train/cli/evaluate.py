@@ -79,7 +79,7 @@ class Run:
         return run
 
     def shown(self) -> dict[str, Any]:
-        """What the network is shown, and what its scores are of, as plain values."""
+        """Inputs and classes of the network, as plain values."""
         mean, std = list(self.data.normalization.mean), list(self.data.normalization.std)
         inputs = {"inputs": list(self.data.inputs)} if hasattr(self.data, "inputs") else {}
         names = list(self.data.class_names)

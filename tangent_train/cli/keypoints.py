@@ -36,7 +36,7 @@ _OF_IMAGES = ("left", "right", "input", "pairing")
 
 @dataclass(frozen=True)
 class Settings:
-    """What `Ways` lacks of ``configs/keypoints.yaml``, but for the data."""
+    """Settings of ``configs/keypoints.yaml`` that are neither in `Ways` nor data."""
 
     output: Path
     max_pairs: int | None

@@ -1,4 +1,4 @@
-"""What a machine does to a run, said so that its user knows what to do."""
+"""Failures of the machine, explained with a remedy."""
 
 from __future__ import annotations
 

@@ -142,7 +142,7 @@ class _Labeller:
     shown: list[EncodedImage] = field(default_factory=list)
 
     def __call__(self, name: str, path: Path, progress: Callable[[float], object]) -> Entry:
-        """What is known of the image afterwards."""
+        """Label one image and return its entry of the summary."""
         image, area = self._read(name.removesuffix(path.suffix), path)
         scores = self.predictor.predict(image, progress, probabilities=self.settings.probabilities)
         rgb, labels = image.rgb, scores.labels() + np.uint8(1)  # 0 is the unknown class

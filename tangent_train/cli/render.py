@@ -91,7 +91,7 @@ def render(config: Mapping[str, Any]) -> None:
 
 
 def _forward(settings: Settings) -> tuple[_Work, dict[Path, Path]]:
-    """What renders a panorama into a folder, and the panorama of every folder."""
+    """Function that renders a panorama to a folder, and the panorama of every folder."""
     found = find_images(settings.input or "")
     paths = [path for path in found if not (path.parent / CAMERAS_FILE).exists()]
     if not paths:
@@ -146,7 +146,7 @@ def _rotation(settings: Settings) -> NDArray[np.float64] | None:
 
 
 def _back(settings: Settings) -> tuple[_Work, dict[Path, Path]]:
-    """What renders the results in a folder, and the folder of every panorama."""
+    """Function that renders the results in a folder, and the folder of every panorama."""
     back, output = settings.back or Path(), settings.output or Path()
     if not back.is_dir():
         raise DataError(back, found="no such folder", expected="a folder of results")

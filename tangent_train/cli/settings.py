@@ -29,7 +29,7 @@ _SAID = {
 
 @dataclass(frozen=True)
 class Trust:
-    """What settings in files may name besides what is registered."""
+    """Names that settings in files may use besides registered ones."""
 
     trust: tuple[str, ...]
 

@@ -70,7 +70,7 @@ class StoredRun:
         return [*options, *self.added, *overrides, *self.place]
 
     def settings(self, said: Mapping[str, Any]) -> tuple[dict[str, Any], SettingsFile]:
-        """All settings of the run that goes on.
+        """All settings of the continued run.
 
         Args:
             said: The composed config, resolved.
@@ -118,7 +118,7 @@ class StoredRun:
         return section
 
     def _of_the_network(self, data: Mapping[str, Any], own: set[str]) -> dict[str, Any]:
-        """What belongs to the network whatever the data: the fold it left out, and its inputs."""
+        """Settings tied to the network, not to the data: its test fold and its inputs."""
         kinds = {"fold": int | None, "inputs": INPUTS | None, "normalization": NORMALIZATION | None}
         before = check_fields(self.path, self.config["data"], kinds, _EXPECTED, "data")
         known = {name for name in (*data, "normalization") if f"data.{name}" not in own}
@@ -126,7 +126,7 @@ class StoredRun:
 
 
 def stored_run(command: str, arguments: Sequence[str]) -> StoredRun | None:
-    """Start from a stored config where the command goes on from one.
+    """Start from a stored config if the command continues from one.
 
     ``tangent-train resume=<run folder>`` takes the settings inside the run's last checkpoint,
     ``tangent-evaluate checkpoint=<file>`` those inside that; ``data=<option>`` (or another section)

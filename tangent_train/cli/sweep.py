@@ -45,7 +45,7 @@ def run_job(
     Args:
         command: Of the sweep.
         config: Of the job.
-        added: Overrides that nobody typed.
+        added: Overrides that were not typed.
         visible_gpus: ``CUDA_VISIBLE_DEVICES`` where the sweep was started.
 
     Returns:

@@ -133,7 +133,7 @@ def _check_resumed(settings: Settings, before: Mapping[str, Any]) -> None:
 
 
 def _typed_local() -> list[str]:
-    """What was typed that no file says: a resumed run has to be told it again."""
+    """Typed machine-specific settings, which no file holds: a resumed run needs them again."""
     typed = [said.lstrip("+") for said in HydraConfig.get().overrides.task]
     names = [said.partition("=")[0] for said in typed]
     pairs = zip(names, typed, strict=True)

@@ -212,7 +212,7 @@ def _numbers(config: DictConfig, setting: str, least: int) -> list[int]:
 
 
 def stage_state(stage: Stage) -> State:
-    """How far a stage has come, by the files in its folder.
+    """Progress of a stage, from the files in its folder.
 
     Raises:
         SettingError: Its folder holds something else, or the same stage with other settings.

@@ -39,7 +39,7 @@ _LEAST_TRACED = 32
 
 
 class Export(NamedTuple):
-    """What was written.
+    """Result of an export.
 
     Attributes:
         trained: The network as the file gives it back.

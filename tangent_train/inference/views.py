@@ -1,4 +1,4 @@
-"""Which views a network sees of a panorama or photo it was not trained on."""
+"""Views of new panoramas and photos for a trained network."""
 
 from __future__ import annotations
 

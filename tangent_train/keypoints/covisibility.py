@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 __all__ = ["DepthView", "MatchTruth", "correct_matches", "fov_overlap", "visible_from"]
 
 _TOLERANCE, _TOLERANCE_M = 0.03, 0.03
-"""How far behind a surface a point still counts as seen: share of its distance, and metres."""
+"""Occlusion tolerance behind a surface: share of the distance, and metres."""
 
 _SMOOTH = 1.1
 """Distances of neighbouring pixels of one surface rarely differ by more than this factor."""
@@ -35,7 +35,7 @@ _ROWS = 512
 
 @dataclass(frozen=True, eq=False)
 class DepthView:
-    """What a panorama knows of the room.
+    """Depth and pose of a panorama, as known of its room.
 
     Args:
         distance_m: ``(H, W)`` distances from the centre in metres, of any resolution; NaN where
@@ -102,7 +102,7 @@ class DepthView:
 def visible_from(
     directions_xyz: NDArray[np.float64], source: DepthView, target: DepthView
 ) -> NDArray[np.bool_]:
-    """Which directions of one panorama show what another one sees as well.
+    """Mask of the directions of one panorama whose points are visible in another.
 
     A panorama has no borders: a point is visible unless the target's distance in its direction is
     shorter than its own by more than 3 % and 3 cm. A direction without distance cannot be placed
@@ -158,7 +158,7 @@ def _step(size: int, wanted: int) -> int:
 
 
 class MatchTruth(NamedTuple):
-    """Which matches show the same point of the room.
+    """Matches verified against depth and pose.
 
     Attributes:
         correct: ``(m,)`` bool.

@@ -93,7 +93,7 @@ class Detector:
 
     @property
     def norm(self) -> Literal["l2", "hamming"]:
-        """How descriptors are compared: numbers in float32, or bits in uint8."""
+        """Descriptor distance: L2 for float32, Hamming for uint8 bits."""
         return "l2" if self.name == "sift" else "hamming"
 
     def detect(self, gray: NDArray[np.uint8]) -> Detections:
@@ -198,7 +198,7 @@ def detect_on_tangent_images(
 def gnomonic_jacobian(
     directions_xyz: NDArray[np.float64], grid: TangentGrid, face: int
 ) -> NDArray[np.float64]:
-    """How directions change with their pixel in a tangent image: ``∂d/∂(column, row)``.
+    """Jacobian of directions by pixel in a tangent image, ``∂d/∂(column, row)``.
 
     At (X, Y) on the tangent plane, with r² = 1 + X² + Y², pitch p and the camera's axes
     A = (a, b, c): ``d = A (X, Y, 1) / r``, ``∂d/∂(column, row) = p/r · (I − d dᵀ) (a, b)``.

@@ -44,7 +44,7 @@ class Motion(NamedTuple):
 def motion_errors(
     left_xyz: NDArray[np.float64], right_xyz: NDArray[np.float64], motion: Motion
 ) -> NDArray[np.float64]:
-    """How far matches are from where a motion allows them.
+    """Angular error of matches under a motion.
 
     Args:
         left_xyz: ``(m, 3)`` unit vectors.

@@ -85,7 +85,7 @@ def angles_between(first_xyz: ArrayLike, second_xyz: ArrayLike) -> NDArray[np.fl
 def equirect_jacobian(
     directions_xyz: NDArray[np.float64], shape: tuple[int, int]
 ) -> NDArray[np.float64]:
-    """How directions change with their pixel in a panorama: ``∂d/∂(u, v)``.
+    """Jacobian of directions by pixel in a panorama, ``∂d/∂(u, v)``.
 
     With east e = (−sin λ, cos λ, 0) and north n: ``∂d/∂u = 2π/W · cos φ · e``,
     ``∂d/∂v = −π/H · n``.

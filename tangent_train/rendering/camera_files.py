@@ -62,7 +62,7 @@ _KINDS: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class CameraFile:
-    """What a ``cameras.json`` says.
+    """Content of a ``cameras.json``.
 
     Attributes:
         source: Name of the panorama.

@@ -140,7 +140,7 @@ def _base_level(record: Record) -> str:
 
 
 def _representation(record: Record) -> str:
-    """How the network saw the images."""
+    """Short name of the representation."""
     target = str(record.settings.get("representation._target_")).rpartition(".")[2]
     name = target.removesuffix("Representation")
     return _REPRESENTATIONS.get(name, "tangent images" if name == "Tangent" else name)

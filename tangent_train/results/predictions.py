@@ -1,4 +1,4 @@
-"""The files that predictions leave: label maps, pictures, a summary and a page to look at."""
+"""Output files of predictions: label maps, pictures, a summary and a report page."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _RESULTS = (
 )  # fmt: skip
 
 Entry = dict[str, Any]
-"""What is known of an image: file, name, rows, columns and ``classes``, or file, name and error."""
+"""Entry of an image: file, name, rows, columns and ``classes``, or file, name and error."""
 
 
 def output_names(paths: Sequence[Path]) -> list[str]:
@@ -108,7 +108,7 @@ def _solid_angles(
 
 @dataclass(frozen=True)
 class PredictionFolder:
-    """Where predictions go.
+    """Output folder of predictions.
 
     Attributes:
         path: The folder.
@@ -242,7 +242,7 @@ class PredictionFolder:
 
         Args:
             entries: Of all images.
-            shown: Some of them, to look at.
+            shown: Some of them, for the report.
         """
         tables = [self.mean_shares(entries)]
         failed = [[entry["name"], entry["error"]] for entry in entries if "error" in entry]

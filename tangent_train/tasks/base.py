@@ -1,4 +1,4 @@
-"""What all tasks share: one gradient per batch, the optimizer, and the scores of a split."""
+"""Base of all tasks: one gradient per batch, the optimizer, and the scores of a split."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ class Task(lightning.LightningModule, ABC):
 
     @abstractmethod
     def loss_norm(self, labels: Tensor) -> Tensor:
-        """What the sum over all labels is divided by."""
+        """Normalizer of the sum of losses over all labels."""
 
     @abstractmethod
     def evaluate(self, batch: Any) -> Tensor:
@@ -174,7 +174,7 @@ class Task(lightning.LightningModule, ABC):
     def on_after_backward(self) -> None:
         """Stop before a step whose loss is not finite, on all processes.
 
-        Gradients are not looked at: with `trainer.precision=16-mixed` those that overflow are
+        Gradients are not checked: with `trainer.precision=16-mixed` those that overflow are
         skipped and the loss scale shrinks, as it should.
 
         Raises:

@@ -42,7 +42,7 @@ def refuse_loss(task: lightning.LightningModule, loss: float, batch: Any) -> NoR
 
 
 def check_weights(task: lightning.LightningModule) -> None:
-    """Refuse to overwrite a good checkpoint with one that nobody could use.
+    """Refuse to overwrite a good checkpoint with an unusable one.
 
     Args:
         task: What is trained.

@@ -177,7 +177,7 @@ class SegmentationTask(Task):
             images: The representation's views of the whole.
             shape: Of the truth: ``(H, W)`` of the panorama, or ``(n, h, w)`` of the crops.
             rays: Of the views.
-            rotations: Of the views; by default they are not turned.
+            rotations: Of the views; none by default.
 
         Returns:
             Class indices 1 … K of that shape.

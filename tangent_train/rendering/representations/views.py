@@ -44,7 +44,7 @@ NOT_ROTATED: NDArray[np.float64] = np.eye(3)[None]
 
 
 class Views(Protocol):
-    """One way to look at one panorama or photo."""
+    """Views of one panorama or photo."""
 
     def render(self, image: Image, interpolation: Interpolation) -> Image:
         """Render it ``(H, W[, C])`` to images ``(n, h, w[, C])``, dtype kept."""
@@ -77,7 +77,7 @@ class Sampler(Protocol):
 
 @runtime_checkable
 class Assembler(Protocol):
-    """Turns scores into labels: all that a task knows of a representation."""
+    """Convert scores to labels: the part of a representation that a task uses."""
 
     @property
     def image_size(self) -> tuple[int, int]:

@@ -29,7 +29,7 @@ _QUALITY = 88
 
 @dataclass(frozen=True)
 class ViewerImage:
-    """An image to look at, with its label maps.
+    """An image of the viewer, with its label maps.
 
     Attributes:
         name: Shown beside it.

@@ -128,7 +128,7 @@ def _base64(content: bytes) -> str:
 
 
 def _filled(template: str, parts: dict[str, str]) -> str:
-    """The template with its ``{{names}}`` replaced; what is put in is not looked at again."""
+    """The template with its ``{{names}}`` replaced; inserted text is not scanned again."""
     return _PLACEHOLDER.sub(lambda match: parts[match[1]], template)
 
 

@@ -88,7 +88,7 @@ class Comparison(NamedTuple):
 
 @dataclass(frozen=True)
 class Ways:
-    """How keypoints are detected and matched.
+    """Settings of detection and matching.
 
     Attributes:
         base_level: Base levels of the tangent images.
