@@ -183,18 +183,55 @@ def _project(side: tuple[int, int], m: Array, feather: bool, u: Array, v: Array,
 
 
 @njit_fast
-def _list_seen(tile: Tile, m: int, side: tuple[int, int], sight: Sight, seen: _Seen) -> int:
-    """List the pixels of a tile that image m contributes to; returns how many.
+def _count(sight: Sight) -> int:
+    """One more than the greatest number of an image."""
+    greatest = sight.images.max()
+    return max(greatest, sight.owner.max()) + 1 if len(sight.owner) else greatest + 1
 
-    Args:
-        tile: The tile.
-        m: Index of the image in `sight`.
-        side: Rows and columns of the image.
-        sight: Geometry of images and canvas.
-        seen: The list, written.
-    """
+
+@njit_fast
+def _mark_owners(tile: Tile, owner: Array, owns: Array) -> None:
+    """Mark the images that own a pixel of a tile, unless they are feathered."""
     top, bottom, left, right = tile
-    columns, owner, (pixel, u, v, weight) = sight.columns, sight.owner, seen
+    owns[:] = False
+    if len(owner) == 0:
+        return
+    for i in range(top, bottom):
+        for j in range(left, right):
+            owns[owner[i, j]] = True
+
+
+@njit_fast
+def _list_owned(tile: Tile, m: int, side: tuple[int, int], sight: Sight, seen: _Seen) -> int:
+    """See `_list_pixels`, of images that have weight 1 where they are the owner."""
+    top, bottom, left, right = tile
+    pixel, u, v, weight = seen
+    count, image = 0, sight.images[m]
+    for i in range(top, bottom):
+        owner, at = sight.owner[i], (i - top) * (right - left) - left
+        x, z = sight.rows[i, 0], sight.rows[i, 1]
+        stop = left
+        while stop < right:
+            start = stop
+            while start < right and owner[start] != image:
+                start += 1
+            stop = start
+            while stop < right and owner[stop] == image:
+                stop += 1
+            for j in range(start, stop):
+                p = count + j - start
+                pixel[p], weight[p] = at + j, z
+                u[p], v[p] = x * sight.columns[j, 0], x * sight.columns[j, 1]
+            count += stop - start
+    _project(side, sight.matrices[m], False, u[:count], v[:count], weight[:count])
+    return count
+
+
+@njit_fast
+def _list_seen(tile: Tile, m: int, side: tuple[int, int], sight: Sight, seen: _Seen) -> int:
+    """See `_list_pixels`, of images that are feathered."""
+    top, bottom, left, right = tile
+    columns, (pixel, u, v, weight) = sight.columns, seen
     count = 0
     for i in range(top, bottom):
         begin, span = sight.spans[m, i, 0], sight.spans[m, i, 1]
@@ -205,17 +242,35 @@ def _list_seen(tile: Tile, m: int, side: tuple[int, int], sight: Sight, seen: _S
         x, z = sight.rows[i, 0], sight.rows[i, 1]
         for back in range(0, len(columns) + 1, len(columns)):
             for j in range(max(left, begin - back), min(right, begin + span - back)):
-                if len(owner) == 0 or owner[i, j] == sight.images[m]:
-                    pixel[count], u[count], v[count] = at + j, x * columns[j, 0], x * columns[j, 1]
-                    weight[count] = z
-                    count += 1
-    _project(side, sight.matrices[m], len(owner) == 0, u[:count], v[:count], weight[:count])
+                pixel[count], u[count], v[count] = at + j, x * columns[j, 0], x * columns[j, 1]
+                weight[count] = z
+                count += 1
+    _project(side, sight.matrices[m], True, u[:count], v[:count], weight[:count])
     kept = 0
     for p in range(count):
         if weight[p] > 0:
             pixel[kept], u[kept], v[kept], weight[kept] = pixel[p], u[p], v[p], weight[p]
             kept += 1
     return kept
+
+
+@njit_fast
+def _list_pixels(
+    tile: Tile, m: int, side: tuple[int, int], sight: Sight, owns: Array, seen: _Seen
+) -> int:
+    """List the pixels of a tile that image m contributes to; returns how many.
+
+    Args:
+        tile: The tile.
+        m: Index of the image in `sight`.
+        side: Rows and columns of the image.
+        sight: Geometry of images and canvas.
+        owns: From `_mark_owners`.
+        seen: The list, written.
+    """
+    if len(sight.owner) == 0:
+        return _list_seen(tile, m, side, sight, seen)
+    return _list_owned(tile, m, side, sight, seen) if owns[sight.images[m]] else 0
 
 
 @njit_fast
@@ -245,17 +300,28 @@ def _copy_patch(
     scores: Array, left: int, top: int, height: int, width: int, lanes: int, patch: Array
 ) -> None:
     """Copy a part of ``(K, h, w)`` scores so that those of a pixel lie together, and a 1."""
+    step, one = np.uint64(lanes), np.uint64(1)
+    columns = np.uint64(left), np.uint64(left + width)
+    num_classes = scores.shape[0]
+    by_four = num_classes - num_classes % 4
     for y in range(height):
-        for k in range(scores.shape[0]):
-            line = scores[k, top + y]
-            at = np.uint64(y * width * lanes + k)
-            for x in range(left, left + width):
+        lines, start = scores[:, top + y], y * width * lanes
+        for k in range(0, by_four, 4):  # four stores side by side become one
+            a, b, c, d = lines[k], lines[k + 1], lines[k + 2], lines[k + 3]
+            at = np.uint64(start + k)
+            for x in range(columns[0], columns[1]):
+                patch[at], patch[at + one] = a[x], b[x]
+                patch[at + one + one], patch[at + one + one + one] = c[x], d[x]
+                at += step
+        for k in range(by_four, num_classes):
+            line, at = lines[k], np.uint64(start + k)
+            for x in range(columns[0], columns[1]):
                 patch[at] = line[x]
-                at += np.uint64(lanes)
-        at = np.uint64(y * width * lanes + scores.shape[0])
+                at += step
+        at = np.uint64(start + num_classes)
         for _ in range(width):
             patch[at] = 1
-            at += np.uint64(lanes)
+            at += step
 
 
 @njit_fast
@@ -357,6 +423,7 @@ def add_images(
     num_classes = scores.shape[1]
     side = scores.shape[2], scores.shape[3]
     lanes = (num_classes // _LANES + 1) * _LANES
+    owns = np.empty(_count(sight), np.bool_)
     u, v, weight = np.empty((3, _TILE**2))
     seen = _Seen(np.empty(_TILE**2, np.int32), u, v, weight)
     column, row = np.empty((2, _TILE**2), np.int32)
@@ -368,8 +435,9 @@ def add_images(
         for left in range(0, len(sight.columns), _TILE):
             tile = top, min(stop, top + _TILE), left, min(len(sight.columns), left + _TILE)
             sums[:] = 0
+            _mark_owners(tile, sight.owner, owns)
             for m in range(len(scores)):
-                n = _list_seen(tile, m, side, sight, seen)
+                n = _list_pixels(tile, m, side, sight, owns, seen)
                 if n == 0:
                     continue
                 first, last = _split(u[:n], side[1], column, right)
@@ -414,11 +482,14 @@ def seen_table(
         weight: ``(R, H, W)`` weights, written.
     """
     width = len(sight.columns)
+    owns = np.empty(_count(sight), np.bool_)
     line_u, line_v, line_w = np.empty((3, width))
-    seen = _Seen(np.empty(width, np.int32), line_u, line_v, line_w)
+    seen = _Seen(np.empty(width + 1, np.int32), line_u, line_v, line_w)
     for i in range(start, stop):
+        tile = i, i + 1, 0, width
+        _mark_owners(tile, sight.owner, owns)
         for m in range(len(sight.matrices)):
-            for p in range(_list_seen((i, i + 1, 0, width), m, side, sight, seen)):
+            for p in range(_list_pixels(tile, m, side, sight, owns, seen)):
                 j = seen.pixel[p]
                 rank = count[i, j]
                 count[i, j] += 1
