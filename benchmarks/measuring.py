@@ -31,7 +31,7 @@ class Way(NamedTuple):
         name: For people.
         run: Does it.
         ours: Whether it is this project's.
-        scale: What its time is multiplied by, where it does only a part, or several.
+        scale: Factor for its time, if it does only a part of the work, or several times as much.
         rounds: Most rounds, of ways that take long.
     """
 
@@ -78,7 +78,7 @@ class Table:
         name: Short and unique: the baseline knows it by this.
         rows: Measurements.
         unit: ``s`` or ``MiB``.
-        goals: What was promised about it.
+        goals: Its promises.
     """
 
     name: str

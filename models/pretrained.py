@@ -85,7 +85,7 @@ def load_tensors(
     Args:
         network: Into which.
         tensors: Names and values.
-        source: Where they come from, for the message.
+        source: Their source, for the message.
         fresh: Prefix of the names of tensors that are not loaded.
 
     Raises:

@@ -27,7 +27,7 @@ def save(
         name: Of the study.
         rows: Lines of the table, all with the same columns.
         figure: The picture.
-        folder: Where the files go; created if it is missing.
+        folder: Output folder; created if missing.
         digits: Significant digits of the printed table; the CSV file has all.
     """
     Path(folder).mkdir(parents=True, exist_ok=True)

@@ -27,9 +27,9 @@ class _ExplainedError(ValueError):
     Args:
         subject: The setting, file or folder; alone, the whole message (as when unpickled in
             another process).
-        found: What it was.
-        expected: What is allowed.
-        remedy: What to do about it, one sentence.
+        found: Value found.
+        expected: Allowed values.
+        remedy: Remedy, one sentence.
     """
 
     def __init__(

@@ -34,7 +34,7 @@ def no_room(path: Path, error: BaseException) -> NoRoomError | None:
 
     Args:
         path: The file.
-        error: What was raised.
+        error: The raised error.
 
     Returns:
         None if it was raised for another reason.

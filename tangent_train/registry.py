@@ -109,7 +109,7 @@ def make(settings: Any, place: str, file: SettingsFile | None = None, **given: A
         settings: ``_target_``, its arguments by name, which may be such sections themselves, and
             perhaps ``_partial_: true`` for a function that still takes further ones.
         place: Of the section, for messages.
-        file: Where the settings come from; None for the user's own, which may name anything.
+        file: File of the settings; None for the user's own, which may name anything.
         **given: Further arguments, handed on as they are.
 
     Raises:
@@ -170,7 +170,7 @@ def check_fields(
         path: The file, for the message.
         content: The mapping.
         kinds: Of every field; one that may be missing is a union with None.
-        expected: What the file should be.
+        expected: Expected file.
         where: In it, for the message.
 
     Returns:

@@ -64,7 +64,7 @@ def may_differ(name: str, purpose: Purpose) -> bool:
 
     Args:
         name: As ``section.setting``.
-        purpose: What the two are to each other.
+        purpose: Relation of the two.
     """
     while name and name not in _MAY_DIFFER:
         name = name.rpartition(".")[0]
@@ -96,7 +96,7 @@ def differing_settings(
     Args:
         now: A resolved config.
         before: Another one.
-        purpose: What the two runs are to each other.
+        purpose: Relation of the two runs.
     """
     new, old = dict(flat_settings(now)), dict(flat_settings(before))
     return [

@@ -38,7 +38,7 @@ def class_weights(counts: NDArray[np.int64], kind: ClassWeights) -> Tensor:
 
     Args:
         counts: ``(classes,)`` pixels of every label, the unknown one first.
-        kind: Which.
+        kind: Kind of weighting.
 
     Returns:
         ``(classes,)`` float32, 0 for the unknown label and, but for `none`, for classes never seen.

@@ -39,11 +39,11 @@ class Found(Generic[_Item]):
     """The images or shapes of a data set.
 
     Attributes:
-        noun: What they are, in the plural.
+        noun: Name of the items, in the plural.
         splits: Their files.
         read: Reads one from its files, see `pipeline.Reading`; may have a method `parts` that gives
             what decodes each of its files by itself.
-        store: Where they are prepared, if anywhere.
+        store: Prepared store, if any.
         in_parallel: The results of some work on each, as they come.
     """
 
@@ -61,7 +61,7 @@ class Found(Generic[_Item]):
         """Decode every file by itself and note what is broken; nothing is written.
 
         Args:
-            problems: What is known to be broken, and where more is noted.
+            problems: Known problems; new ones are added.
             progress: Whether to show a progress bar.
 
         Returns:
@@ -89,7 +89,7 @@ class Found(Generic[_Item]):
 
         Args:
             seed: Others for other seeds.
-            problems: What is known to be broken, and where more is noted.
+            problems: Known problems; new ones are added.
         """
         items = problems.without(self.of())
         rng = np.random.default_rng(seed)

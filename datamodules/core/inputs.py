@@ -78,7 +78,7 @@ class Normalization:
 
         Args:
             given: It, or a mapping.
-            channels: How many it has to have.
+            channels: Required number of channels.
 
         Raises:
             SettingError: It has others.
@@ -133,7 +133,7 @@ def normalize(
         rendered: RGB ``(..., h, w, 3)`` uint8; with depth ``(..., h, w)`` in steps of 1/512 m, 0
             where missing, at most `MAX_DEPTH_M`; with elevation ``(..., h, w)`` float32.
         normalization: Of RGB and depth.
-        inputs: What the network takes, in the order of `INPUTS`.
+        inputs: Inputs of the network, in the order of `INPUTS`.
 
     Returns:
         ``(..., C, h, w)`` float32, on the same device.

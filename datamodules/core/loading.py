@@ -1,4 +1,4 @@
-"""Loaders of samples: their workers, and what to tell the user of these."""
+"""Loaders of samples, and explanations of their workers' errors."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ def make_loader(
 
     Args:
         dataset: Samples by (epoch, index).
-        sampler: Which come when.
+        sampler: Order of the samples.
         batch_size: Samples of a batch.
         num_workers: Worker processes.
-        seed: Of what the loader itself draws.
+        seed: Of the loader's own random numbers.
     """
     return DataLoader(
         dataset,
@@ -51,11 +51,11 @@ def explained(error: Exception, num_workers: int) -> Exception:
     """Explain an error that a loader, or one of its workers, raised.
 
     Args:
-        error: It.
+        error: The error.
         num_workers: Of the loader.
 
     Returns:
-        An error of a worker as it was raised there; what may help when a worker was killed; or the
+        The error of a worker as raised there; a remedy if a worker was killed; or the
         same error.
     """
     text = str(error)

@@ -1,4 +1,4 @@
-"""Folders of made data: marked with their settings; what is someone else's is left alone."""
+"""Folders of generated data: marked with their settings; other folders are left alone."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ def claim_folder(
     Args:
         root: Folder of the data set: new, empty, or of the same settings.
         manifest: Name of the file in it that marks it and holds the settings.
-        generator: Name of what makes the data.
-        version: Its version; another one makes other files from the same settings.
+        generator: Name of the generator.
+        version: Its version; another version generates other files from the same settings.
         settings: Its settings, plain values.
 
     Raises:

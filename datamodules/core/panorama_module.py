@@ -43,7 +43,7 @@ class PanoramaDataModule(SplitDataModule[ImageFiles]):
 
     Args:
         panoramas_per_step: Panoramas per training step and process. Evaluation takes one at a time.
-        inputs: What the network is shown, `rgb` and perhaps others, see `Input`.
+        inputs: Inputs of the network, `rgb` and optionally others, see `Input`.
         color_jitter: Strength of the colour augmentation, 0 (none) to 1, see `jitter_colors`.
         test_rotation: Rotate the test panoramas: tilt in degrees, or `so3`, see `RotatedPanoramas`.
         upright: Align tilted panoramas with gravity. `pose`: as their files say (GPano) and, of
@@ -56,7 +56,7 @@ class PanoramaDataModule(SplitDataModule[ImageFiles]):
         normalizations: The default ones, without and with depth.
 
     Raises:
-        SettingError: A setting that cannot work.
+        SettingError: A setting is invalid.
     """
 
     noun: ClassVar[str] = "panoramas"
@@ -94,7 +94,7 @@ class PanoramaDataModule(SplitDataModule[ImageFiles]):
         """Return the reader of the data set and the files of all splits, not yet opened.
 
         Args:
-            problems: Where it is noted what is wrong with the folders.
+            problems: Problems of the folders are added.
 
         Raises:
             DataError: The data set as a whole cannot be used.

@@ -1,4 +1,4 @@
-"""Pairs of panoramas of one place, with depth and pose where they are known."""
+"""Pairs of panoramas of one place, with depth and pose if known."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class PairedPanorama(NamedTuple):
         rgb: ``(H, W, 3)`` uint8.
         file: The image it was read from.
         distance_m: ``(H, W)`` float32 metres from the centre, NaN where missing; or None.
-        pose: Where it was taken; or None.
+        pose: Camera pose; or None.
     """
 
     name: str
@@ -48,7 +48,7 @@ class PanoramaPair(NamedTuple):
 
     Attributes:
         name: Unique among the pairs.
-        split: Which part of the data set it belongs to, where that is given.
+        split: Its split, if given.
         left: One of them.
         right: The other.
     """
@@ -60,7 +60,7 @@ class PanoramaPair(NamedTuple):
 
 
 class PublishedPair(NamedTuple):
-    """A pair of the paper, and what the paper reports of it.
+    """A pair of the paper, and its published scores.
 
     Attributes:
         number: 0 to 59.
@@ -83,13 +83,13 @@ class PanoramaPairs(ABC):
     """Pairs to read one by one.
 
     Attributes:
-        published: The paper's figures by the name of a pair, where the pairs are the paper's.
+        published: The paper's scores by the name of a pair, for the paper's pairs.
     """
 
     published: Mapping[str, PublishedPair] = MappingProxyType({})
 
     def make_files(self) -> None:  # noqa: B027, most have all their files
-        """Generate what is not there yet; called before anything else."""
+        """Generate missing files; called before anything else."""
 
     @property
     @abstractmethod

@@ -54,7 +54,7 @@ class Panorama(NamedTuple):
         depth: ``(H, W)`` uint16 distance from the centre in steps of 1/512 m, 0 where missing; or
             None. See `steps_to_meters`.
         labels: ``(H, W)`` uint8, 0 where unknown.
-        up: ``(3,)`` direction of the zenith, a unit vector; None where it is z, as it should be.
+        up: ``(3,)`` direction of the zenith, a unit vector; None if it is z (upright).
 
     The arrays may be shared or read-only: not to be written to.
     """
@@ -77,14 +77,14 @@ class Panorama(NamedTuple):
 
 
 def resize_area(image: NDArray[np.uint8], shape: tuple[int, int]) -> NDArray[np.uint8]:
-    """Shrink ``(H, W, 3)`` to ``shape`` by averaging areas: no aliasing."""
+    """Downsample ``(H, W, 3)`` to ``shape`` by area averaging."""
     if image.shape[:2] == shape:
         return image
     return cv2.resize(image, (shape[1], shape[0]), interpolation=cv2.INTER_AREA)
 
 
 def resize_nearest(image: NDArray[_Pixel], shape: tuple[int, int]) -> NDArray[_Pixel]:
-    """Shrink ``(H, W[, C])`` to ``shape``, taking the pixel at the centre of each target pixel.
+    """Downsample ``(H, W[, C])`` to ``shape``: the pixel at the centre of each target pixel.
 
     Where that is a corner of four pixels (even ratios) it is the lower right one.
     """
@@ -98,7 +98,7 @@ def resize_nearest(image: NDArray[_Pixel], shape: tuple[int, int]) -> NDArray[_P
 
 
 def resize_depth(depth: NDArray[np.uint16], shape: tuple[int, int]) -> NDArray[np.uint16]:
-    """Shrink raw depth ``(H, W)``, 0 where missing, without ever mixing two values.
+    """Downsample raw depth ``(H, W)``, 0 where missing, without mixing values.
 
     As `resize_nearest`, but where that pixel is missing, the valid pixel nearest to the centre,
     of those in the area of the target pixel, is taken instead.
@@ -151,7 +151,7 @@ def steps_to_meters(steps: NDArray[np.uint16]) -> NDArray[np.float32]:
 def meters_to_steps(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
     """Depth in steps of 1/512 m, rounded, at most 65535 (128 m), of depth in metres.
 
-    What is there but nearer than half a step is one step away: 0 would mean that it is missing.
+    Depth below half a step is rounded up to one step: 0 means missing.
 
     >>> meters_to_steps(np.array([0, 1e-4, 1, 1000], np.float32)).tolist()
     [0, 1, 512, 65535]

@@ -28,18 +28,18 @@ class PhotoDataModule(SplitDataModule[ImageFiles]):
     """Labelled photos of one data set.
 
     A data set says which photos it has (`find_images`) and its `class_names`, the unknown one (0)
-    first. The representation is the camera that all photos are brought to.
+    first. The representation is the camera to which all photos are normalized.
 
     Args:
         photos_per_step: Photos per training step and process. Evaluation takes one at a time.
-        inputs: What the network is shown, `rgb` and perhaps `depth`.
+        inputs: Inputs of the network, `rgb` and optionally `depth`.
         color_jitter: Strength of the colour augmentation, 0 (none) to 1, see `jitter_colors`.
 
     Attributes:
         normalizations: The default ones, without and with depth.
 
     Raises:
-        SettingError: A setting that cannot work.
+        SettingError: A setting is invalid.
     """
 
     noun: ClassVar[str] = "photos"

@@ -39,7 +39,7 @@ class Photo(NamedTuple):
 
     @property
     def up(self) -> None:
-        """Not known."""
+        """Unknown."""
         return
 
     def sampler(self, representation: PerspectiveRepresentation) -> PhotoSampler:
@@ -56,7 +56,7 @@ class Photo(NamedTuple):
 def distance_from_z_depth(
     z_depth: NDArray[np.uint16], camera_matrix: NDArray[np.float64]
 ) -> NDArray[np.uint16]:
-    """Distance from the centre of projection, which is what panoramas hold.
+    """Distance from the centre of projection, as in panoramas, from z-depth.
 
     Args:
         z_depth: ``(H, W)`` depth along the optical axis in any unit, 0 where missing.

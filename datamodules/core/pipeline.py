@@ -1,4 +1,4 @@
-"""The images of a split: read from files or from a store, then rotated, then made upright."""
+"""The images of a split: read from files or a store, rotated, then aligned with gravity."""
 
 from __future__ import annotations
 
@@ -45,12 +45,12 @@ class Item(Protocol):
 
     @property
     def name(self) -> str:
-        """A short name that no other of the data set has."""
+        """Unique short name."""
         ...
 
     @property
     def parts(self) -> Mapping[str, Path]:
-        """Its files by what they hold."""
+        """Its files by content."""
         ...
 
 
@@ -70,8 +70,8 @@ class SplitItems(Generic[_Item, _Image]):
     Args:
         items: Their files.
         read: Reads one from its files.
-        store: Where they are prepared; what is read from there is mapped, not copied.
-        kind: The named tuple that `read` makes, to be made of stored arrays as well.
+        store: Prepared store; its arrays are memory-mapped, not copied.
+        kind: Named tuple of `read`, which stored arrays are wrapped in too.
         transforms: Changes to every image, in their order.
 
     Attributes:
@@ -97,14 +97,14 @@ class SplitItems(Generic[_Item, _Image]):
         return len(self.items)
 
     def name(self, index: int) -> str:
-        """A short name of one of them, which no other has; with ``/`` between groups."""
+        """Unique short name of an item; ``/`` between groups."""
         return self.items[index].name
 
     def read(self, index: int) -> _Image:
         """One image; its arrays may be shared or read-only.
 
         Raises:
-            DataError: A file is broken, or what is prepared is missing or out of date.
+            DataError: A file is broken, or its prepared version is missing or out of date.
         """
         if self._kept:
             return self._kept[index]
@@ -115,7 +115,7 @@ class SplitItems(Generic[_Item, _Image]):
         return image
 
     def labels(self, index: int) -> NDArray[np.uint8]:
-        """The labels of one image alone, which costs less than all of it."""
+        """The labels of one image, cheaper than the whole image."""
         decode: Any = self._decode
         image: Any = None
         if self._kept or self._transforms or self._store is not None:
@@ -161,7 +161,7 @@ class SplitItems(Generic[_Item, _Image]):
 
 
 class PosedUp:
-    """Panoramas with the direction of up that their files say (GPano); None where they do not."""
+    """Panoramas with the up direction of their GPano tags; None without tags."""
 
     def __init__(self) -> None:
         self._ups: dict[int, NDArray[np.float64] | None] = {}
@@ -174,12 +174,12 @@ class PosedUp:
 
 
 class EstimatedUp:
-    """Panoramas with an estimate of the direction of up, where it is not known.
+    """Panoramas with an estimated up direction if it is unknown.
 
     Views are aligned with gravity; pixels and labels stay in place.
 
     Args:
-        max_tilt_deg: The most they may be tilted, see `estimate_up`.
+        max_tilt_deg: Maximum tilt, see `estimate_up`.
     """
 
     def __init__(self, max_tilt_deg: float) -> None:
@@ -187,7 +187,7 @@ class EstimatedUp:
         self._ups: dict[int, NDArray[np.float64] | None] = {}
 
     def __call__(self, panorama: Panorama, index: int, files: ImageFiles) -> Panorama:
-        """The panorama with `up`; None where the image does not show it."""
+        """The panorama with `up`; None if it cannot be estimated."""
         del files
         if panorama.up is not None:
             return panorama
@@ -197,7 +197,7 @@ class EstimatedUp:
 
 
 class RotatedPanoramas:
-    """Panoramas as seen by a camera that is not upright.
+    """Panoramas as seen by a tilted camera.
 
     Labels rotate with the image, so the score is that of the rotated panorama. The same panorama is
     rotated the same way in every run with the same seed.
@@ -206,7 +206,7 @@ class RotatedPanoramas:
         rotation: Tilt in degrees about a random horizontal axis, after a random rotation about the
             vertical; or `so3`, uniform over all rotations.
         seed: Seed of the rotations.
-        known: Whether the panoramas say where up is, as those of a camera with a sensor for it.
+        known: Whether the up direction is known, as from a camera with a gravity sensor.
     """
 
     def __init__(self, rotation: float | Literal["so3"], seed: int, *, known: bool = False) -> None:
@@ -239,7 +239,7 @@ class RotatedPanoramas:
 
 
 def in_threads(work: Callable[[_Work], _Result], items: Sequence[_Work]) -> Generator[_Result]:
-    """The results of some work on each item, in their order, on all cores.
+    """Results of some work on each item, in order, on all cores.
 
     OpenCV and zlib free the GIL.
     """

@@ -28,12 +28,12 @@ _Item = TypeVar("_Item", bound=_Named)
 
 
 class Problem(NamedTuple):
-    """One thing that is wrong.
+    """One problem of a data set.
 
     Attributes:
         file: File or folder.
-        finding: What is wrong with it.
-        remedy: What to do about it; may be empty.
+        finding: The problem.
+        remedy: The remedy; may be empty.
         item: Name of the image or shape that cannot be used; None if none of the data set can.
         error: The error that says all this.
     """
@@ -56,11 +56,11 @@ class Problems:
         """A block after whose errors the check continues.
 
         Args:
-            item: Name of what cannot be used then; None for the whole data set.
-            file: What is wrong then, if the error does not name it first.
+            item: Name of the unusable item; None for the whole data set.
+            file: The broken file, if the error does not name it first.
 
         Raises:
-            NoRoomError: The disk is full: nothing can go on.
+            NoRoomError: The disk is full.
         """
         try:
             yield
@@ -82,7 +82,7 @@ class Problems:
         self._noted.append(Problem(str(where), _finding(error, where), error.remedy, item, error))
 
     def add_all(self, others: Problems) -> None:
-        """Take over what another search has noted."""
+        """Add the problems of another check."""
         self._noted += others._noted
 
     def listed(self) -> list[Problem]:
@@ -101,16 +101,16 @@ class Problems:
         return {p.item for p in self._noted if p.item is not None}
 
     def without(self, items: Iterable[_Item]) -> list[_Item]:
-        """Those images or shapes that can be used."""
+        """Usable images or shapes."""
         broken = self.items
         return [item for item in items if item.name not in broken]
 
     def refuse(self, root: object, remedy: str = "") -> None:
-        """Raise what was noted, if anything.
+        """Raise the noted problems, if any.
 
         Args:
             root: The data set.
-            remedy: What else to do about a list of problems.
+            remedy: Further remedy for a list of problems.
 
         Raises:
             DataError: One problem, or a list of all.

@@ -1,4 +1,4 @@
-"""Work in several processes: results as they come, an interrupt leaves what was begun finished."""
+"""Work in several processes: results as they complete; an interrupt finishes the begun pieces."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ def number_of_processes(workers: int | None, pieces: int, least: int = 1) -> int
     """Number of processes for a piece of work.
 
     Args:
-        workers: What is asked for; by default one per CPU core.
-        pieces: How many pieces there are.
-        least: Pieces for which one more process is worth starting.
+        workers: Requested number; by default one per CPU core.
+        pieces: Number of pieces of work.
+        least: Pieces per process that justify starting it.
 
     Raises:
         SettingError: The number asked for is negative.
@@ -50,7 +50,7 @@ def in_processes(
     Args:
         work: A function of a module.
         pieces: Its arguments.
-        processes: How many; 0 and 1 work in this one.
+        processes: Number of processes; 0 and 1 work in this one.
     """
     if processes <= 1:
         for piece in pieces:
@@ -70,7 +70,7 @@ def in_processes(
 
 @contextmanager
 def _one_thread_each() -> Iterator[None]:
-    """Let processes that are started inside have one thread of linear algebra each."""
+    """Limit processes started inside to one linear algebra thread each."""
     before = {name: os.environ.get(name) for name in _THREADS}
     os.environ.update(dict.fromkeys(_THREADS, "1"))
     try:
@@ -90,7 +90,7 @@ def _prepare_worker() -> None:
 
 
 def _end_with_parent() -> None:
-    """A worker waits for work for ever: of a parent that was killed it would hear nothing."""
+    """End this worker with its parent: it would wait for work forever if the parent was killed."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         connection.wait([parent.sentinel])

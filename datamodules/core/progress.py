@@ -37,11 +37,11 @@ def show_progress(
     before: int = 0,
     show: bool = True,
 ) -> None:
-    """Take what comes, one piece of the work at a time, and show how far it is.
+    """Consume finished pieces of work and show the progress.
 
     Args:
         done: Yields something whenever a piece is done.
-        description: What is being done.
+        description: Description of the work.
         unit: Pieces, in the plural.
         total: Number of pieces.
         before: Pieces that were done before.

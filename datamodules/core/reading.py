@@ -1,4 +1,4 @@
-"""Labelled images on disk: their files, how a data set decodes them, and what is checked first."""
+"""Labelled images on disk: their files, decoding and checks."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ class ImageFiles(NamedTuple):
     """The files of one panorama or photo.
 
     Attributes:
-        name: A short name that no other image of the data set has; ``/`` between groups.
+        name: Unique short name; ``/`` between groups.
         rgb: Colours.
         labels: Classes.
         depth: Depth, where it is an input.
-        camera: What holds the camera matrix, of photos that have such a file each.
+        camera: File with the camera matrix, for photos with one file each.
     """
 
     name: str
@@ -43,7 +43,7 @@ class ImageFiles(NamedTuple):
 
     @property
     def parts(self) -> dict[str, Path]:
-        """All files by what they hold."""
+        """All files by content."""
         return {part: path for part, path in self._asdict().items() if part != "name" and path}
 
 
@@ -57,7 +57,7 @@ class ImageReader(ABC):
 
     @abstractmethod
     def size(self, part: str, path: Path) -> tuple[int, int]:
-        """Rows and columns by the header of a file, which has to be as the data set promises.
+        """Rows and columns from the header of a file, which must have the data set's format.
 
         Args:
             part: ``rgb``, ``labels`` or ``depth``.
@@ -80,7 +80,7 @@ class ImageReader(ABC):
             shape: ``(h, w)`` of the result, see `resize_nearest`; by default that of the file.
 
         Raises:
-            DataError: The file is broken, or holds what stands for no class.
+            DataError: The file is broken, or holds a value without a class.
         """
 
     @abstractmethod
@@ -156,8 +156,8 @@ def check_headers(
     Args:
         files: Of the image.
         reader: Of the data set.
-        problems: What is wrong is noted here, under the image's name.
-        erp_height: Rows that are wanted of a panorama; None of photos.
+        problems: Problems are added under the image's name.
+        erp_height: Required rows of a panorama; None for photos.
 
     Returns:
         Rows and columns; None where the colours cannot be used.

@@ -1,4 +1,4 @@
-"""From labelled images to what a network is trained and evaluated on."""
+"""Training and evaluation samples from labelled images."""
 
 from __future__ import annotations
 
@@ -54,11 +54,11 @@ class TrainingSample(NamedTuple, Generic[_Images]):
     """One panorama or photo seen through P images; collated, each has a leading batch dimension.
 
     Attributes:
-        images: From the loader what was rendered, RGB ``(P, h, w, 3)`` uint8, perhaps depth
-            ``(P, h, w)`` int16 and elevation ``(P, h, w)`` float32: fewer bytes. On the device
+        images: From the loader as rendered, to save bytes: RGB ``(P, h, w, 3)`` uint8, optionally
+            depth ``(P, h, w)`` int16 and elevation ``(P, h, w)`` float32. On the device
             `normalize` makes them ``(P, C, h, w)`` float32.
         labels: ``(P, h, w)`` uint8, 0 where unknown.
-        rays: ``(P, 3, 3)`` float32 where the images look, see `world_rays`; or ``(0, 3, 3)``.
+        rays: ``(P, 3, 3)`` float32 viewing rays, see `world_rays`; or ``(0, 3, 3)``.
         index: Place in its split.
     """
 
@@ -72,7 +72,7 @@ class EvaluationSample(NamedTuple, Generic[_Images]):
     """One whole panorama or photo; collated, each has a leading batch dimension.
 
     Attributes:
-        images: N images of all of it, as in `TrainingSample`.
+        images: N images that cover it, as in `TrainingSample`.
         target: uint8 labels, 0 where unknown: ``(H, W)`` of the panorama itself; ``(N, h, w)`` of
             the crops of a photo.
         rays: As in `TrainingSample`.
@@ -91,17 +91,17 @@ class ImageSamples:
     """Makes the samples of labelled images, and the input of a network.
 
     Args:
-        inputs: What the network is shown, `rgb` and perhaps others, see `Input`.
+        inputs: Inputs of the network, `rgb` and optionally others, see `Input`.
         normalization: Of RGB and depth, or its `mean` and `std`.
         color_jitter: Strength of the colour augmentation, 0 (none) to 1, see `jitter_colors`.
 
     Attributes:
         inputs: As given, in the order of the channels.
         normalization: As given.
-        in_channels: Of all inputs together.
+        in_channels: Total channels of all inputs.
 
     Raises:
-        SettingError: A setting that cannot work.
+        SettingError: A setting is invalid.
     """
 
     def __init__(
@@ -126,7 +126,7 @@ class ImageSamples:
         return EvaluationImages(source, representation, self.inputs)
 
     def normalized(self, batch: Any) -> Tensor:
-        """The images of a batch as the network takes them."""
+        """The images of a batch, normalized for the network."""
         return normalize(batch.images, self.normalization, self.inputs)
 
 
@@ -136,9 +136,9 @@ class TrainingImages(Dataset[TrainingSample[Inputs]]):
 
     Attributes:
         source: The images.
-        representation: What the network sees of them.
+        representation: Representation of the images.
         seed: Seed of the run, 0 or more.
-        inputs: What the network is shown, see `Input`.
+        inputs: Inputs of the network, see `Input`.
         color_jitter: Strength of the colour augmentation, 0 to 1, see `jitter_colors`.
     """
 
@@ -170,8 +170,8 @@ class EvaluationImages(Dataset[EvaluationSample[Inputs]]):
 
     Attributes:
         source: The images.
-        representation: What the network sees of them.
-        inputs: What it is shown, see `Input`.
+        representation: Representation of the images.
+        inputs: Inputs of the network, see `Input`.
     """
 
     source: SplitItems[Any, Any]
@@ -211,8 +211,8 @@ def render_inputs(image: Any, views: Views, inputs: Sequence[Input]) -> tuple[Te
     """Render the inputs of a network, before `normalize`.
 
     Args:
-        image: What has `rgb`, `depth` where that is an input, and `up`, as `Panorama` and `Photo`.
-        views: Where it looks.
+        image: A `Panorama` or `Photo`; its `depth` is needed if that is an input.
+        views: Its views.
         inputs: See `Input`.
 
     Returns:
@@ -236,7 +236,7 @@ def world_rays(views: Views, up: NDArray[np.float64] | None) -> NDArray[np.float
 
     Args:
         views: Of a panorama.
-        up: Its zenith; None where that is z.
+        up: Its zenith; None if that is z.
     """
     rays = views.rays()
     return rays if up is None else upright_rotation(up).T.astype(np.float32) @ rays

@@ -1,7 +1,7 @@
 """Order of the images, and the random generator of each sample.
 
 Everything random about a sample is drawn from a generator seeded by (seed, epoch, index), so a
-run shows the same faces for any number of workers, and after a resume. The epoch travels with
+run draws the same faces for any number of workers, and after a resume. The epoch travels with
 the index, from the sampler to the workers: persistent workers need not be told about it.
 """
 
@@ -25,7 +25,7 @@ Seed = int | tuple[int, int]
 
 
 def sample_rng(seed: Seed, epoch: int, index: int) -> np.random.Generator:
-    """The source of randomness of one sample.
+    """Random generator of one sample.
 
     Args:
         seed: Seed of the run.
@@ -41,12 +41,12 @@ class EpochSampler(Sampler[tuple[int, int]]):
 
     * Shuffled (training), every process gets the same number of samples, as gradients are
       exchanged at every step: the last few of the epoch's order, fewer than there are processes,
-      are dropped. They are others every epoch.
+      are dropped, different ones every epoch.
     * In order (evaluation), process r gets r, r + world_size, …: every sample exactly once on any
       number of processes, nothing repeated or dropped.
 
-    Lightning calls `set_epoch` by itself. It must not replace or wrap this sampler: make the
-    trainer with ``use_distributed_sampler=False``.
+    Lightning calls `set_epoch` by itself. It must not replace or wrap this sampler: create
+    the trainer with ``use_distributed_sampler=False``.
 
     Args:
         length: Number of samples in the data set.
@@ -54,8 +54,8 @@ class EpochSampler(Sampler[tuple[int, int]]):
         shuffle: A new random order every epoch.
         rank: This process.
         world_size: Number of processes.
-        start: An epoch and how many of its samples this process has had already: a resumed run
-            goes on behind them. The length stays that of a whole epoch.
+        start: An epoch and the number of its samples that this process has consumed: a resumed run
+            continues after them. The length stays that of a whole epoch.
 
     Raises:
         SettingError: Fewer samples than processes.
@@ -87,7 +87,7 @@ class EpochSampler(Sampler[tuple[int, int]]):
         self._epoch = start[0]
 
     def set_epoch(self, epoch: int) -> None:
-        """Say which epoch the next iteration belongs to."""
+        """Set the epoch of the next iteration."""
         self._epoch = epoch
 
     def __len__(self) -> int:

@@ -41,35 +41,35 @@ _Item = TypeVar("_Item", bound=Item)
 class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
     """A data set split for training, validation and test.
 
-    A data set is a dataclass: its fields are the settings `data.*` of a config. It says what its
-    splits consist of (`find`), how they are read (`pipeline`) and what is made of them (`samples`).
+    A data set is a dataclass: its fields are the settings `data.*` of a config. It defines the
+    items of its splits (`find`), how they are read (`pipeline`) and their samples (`samples`).
 
     The trainer must be made with ``use_distributed_sampler=False``, see `EpochSampler`.
 
     Args:
         root: Folder of the data set.
-        representation: What the network sees.
+        representation: Representation of the images.
         validation_fraction: Share of the training data that is held out for validation; 0 for no
             validation.
         normalization: Of the input channels, or its `mean` and `std`; by default that of the data.
         num_workers: Worker processes of a loader; the samples are the same for any number.
         seed: Seed of order, views and augmentation, 0 or more.
-        stream: Another number draws another order and other views from the same seed: training
-            that starts from a network which has seen those of stream 0 sees new ones.
+        stream: Another number draws another order and other views from the same seed, so that
+            fine-tuning after stream 0 does not repeat its views.
         store: Folder of a prepared store, see `store`: everything is decoded once, then read from
             there. The samples are the same without.
-        in_memory: Keep what is read in memory.
-        skip_broken: Leave out what cannot be used, after reading all once, instead of refusing.
+        in_memory: Keep decoded data in memory.
+        skip_broken: Leave broken items out, after reading all once, instead of refusing.
 
     Attributes:
         class_names: Name of every class.
-        kind: What its labels say.
-        noun: What the data set consists of, in the plural.
+        kind: Kind of its labels.
+        noun: Name of the items, in the plural.
         samples: Makes the samples of a split and the input of the network, see `ImageSamples`.
-        is_made: Whether `make_files` makes all of it.
+        is_made: Whether `make_files` generates all of it.
 
     Raises:
-        SettingError: A setting that cannot work.
+        SettingError: A setting is invalid.
     """
 
     kind: ClassVar[Kind] = "segmentation"
@@ -111,7 +111,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
         """Find the items of all splits and check them without decoding.
 
         Args:
-            problems: Where it is noted what is wrong; what is, is found nevertheless.
+            problems: Problems are added; broken items are found nevertheless.
 
         Raises:
             DataError: The data set as a whole cannot be used.
@@ -122,15 +122,15 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
         """Reading pipeline of the items of a split."""
 
     def make_files(self) -> None:
-        """Make the files of the data set, where it is one that is made."""
+        """Generate the files of the data set, if it is a synthetic one."""
 
     # --- checks --------------------------------------------------------------------------------
 
     def setup(self, stage: str | None = None) -> None:
-        """Find what is there, once.
+        """Find the items, once.
 
         Args:
-            stage: Ignored: what a test will need is checked before training already.
+            stage: Ignored: the test data are checked before training too.
 
         Raises:
             DataError: Something is broken: all that was found is named.
@@ -139,7 +139,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
         self.found()
 
     def prepare_data(self) -> None:
-        """Make the files, and what the store lacks; before training, decode some images.
+        """Generate the files and complete the store; before training, decode some images.
 
         An evaluation prepares the test split only.
 
@@ -161,13 +161,13 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
         return self._found
 
     def check(self, *, progress: bool = True) -> tuple[Problems, int]:
-        """Read all of the data set; nothing is made or written.
+        """Read the whole data set; nothing is generated or written.
 
         Args:
             progress: Whether to show a progress bar.
 
         Returns:
-            All that is wrong, and how many images or shapes were read.
+            All problems, and the number of images or shapes read.
         """
         problems, count = Problems(), 0
         with problems.noted():
@@ -252,7 +252,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
         return self._sources[split]
 
     def sample_name(self, split: Split, index: int) -> str:
-        """A short name of what has this index in the samples of the split."""
+        """Short name of the sample with this index in the split."""
         return self.source(split).name(index)
 
     @property
@@ -295,7 +295,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
         }
 
     def load_state_dict(self, state_dict: dict[str, int]) -> None:
-        """Let the next training loader go on there, in the same order with the same views.
+        """Let the next training loader continue there, with the same order and views.
 
         Raises:
             SettingError: Other processes or batches would divide the epoch differently.
@@ -347,7 +347,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
             error: As a loader raised it, perhaps for one of its workers.
 
         Returns:
-            An error of a worker as it was raised there; what may help when a worker was killed; or
+            The error of a worker as raised there; a remedy if a worker was killed; or
             the same error.
         """
         return explained(error, self.num_workers)

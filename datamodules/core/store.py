@@ -1,4 +1,4 @@
-"""The prepared store: what was decoded once, to be memory-mapped by every sample after it.
+"""The prepared store: data decoded once and then memory-mapped by every sample.
 
 A store is a folder of ``.npy`` files, one for each panorama, photo or shape. A file holds one
 record whose fields are the arrays (``numpy.load`` reads it), followed by one line of JSON: name,
@@ -38,7 +38,7 @@ class Store:
     """A folder of prepared arrays.
 
     Args:
-        folder: The folder; made when there is something to write.
+        folder: The folder; created on the first write.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -46,12 +46,12 @@ class Store:
 
     @classmethod
     def of(cls, folder: Path | None, name: str, settings: Mapping[str, str]) -> Store | None:
-        """The store of one choice of settings, which has a folder of its own.
+        """Store of one choice of settings, in its own subfolder.
 
         Args:
-            folder: Of the stores of all choices; without it, there is none.
-            name: Beginning of the name of its own.
-            settings: What decides the arrays besides the files.
+            folder: Of the stores of all choices; without it, there is no store.
+            name: Prefix of the subfolder's name.
+            settings: Settings that affect the arrays besides the files.
         """
         if folder is None:
             return None
@@ -65,11 +65,11 @@ class Store:
     def make(
         self, name: str, files: Mapping[str, Path], read: Callable[[], Mapping[str, NDArray[Any]]]
     ) -> None:
-        """Write the file of one item, whole or not at all.
+        """Write the file of one item atomically.
 
         Args:
             name: Of the item, with ``/`` between folders.
-            files: What it is made from, by part.
+            files: Its source files, by part.
             read: Decodes them to named arrays.
 
         Raises:
@@ -91,10 +91,10 @@ class Store:
 
         Args:
             name: Of the item.
-            files: What it has to be made from; it may be made from more.
+            files: Required source files; it may have more.
 
         Raises:
-            DataError: It is missing, cut off, or out of date.
+            DataError: It is missing, truncated or out of date.
         """
         path = self.path(name)
         try:

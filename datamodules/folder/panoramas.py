@@ -54,7 +54,7 @@ class FolderPanoramas(PanoramaDataModule):
 
     Raises:
         DataError: ``classes.json`` is missing or cannot be used.
-        SettingError: A setting that cannot work.
+        SettingError: A setting is invalid.
     """
 
     inputs: Sequence[Input] = ("rgb",)

@@ -35,7 +35,7 @@ class FolderReader(ImageReader):
     """Reads one's own panoramas.
 
     Attributes:
-        classes: What their labels mean.
+        classes: Meaning of their labels.
         depth_units_per_m: Units in a metre of depth files of whole numbers.
     """
 
@@ -78,7 +78,7 @@ def list_panoramas(root: Path, problems: Problems, *, with_depth: bool) -> list[
 
     Args:
         root: Folder with ``images/`` and ``labels/``.
-        problems: Where it is noted that two images have one name, or one has no depth, or several.
+        problems: Duplicate names and missing or ambiguous depth are added.
         with_depth: Whether depth is wanted.
 
     Raises:

@@ -49,7 +49,7 @@ class FolderSplits:
 
         Args:
             panoramas: All of the data set.
-            problems: Where wrong lines of lists are noted.
+            problems: Invalid lines of lists are added.
 
         Raises:
             DataError: A list cannot be used, or there are too few scenes to draw from.

@@ -22,7 +22,7 @@ def jitter_colors(rgb: Tensor, strength: float, rng: np.random.Generator) -> Ten
         rgb: ``(n, h, w, 3)`` uint8, views of one panorama or photo.
         strength: 0 to 1. The factors of the first three are uniform in 1 ± strength, hue is
             rotated by up to strength / 10 of the circle either way.
-        rng: Where four numbers are drawn from.
+        rng: Generator of four numbers.
 
     Returns:
         ``(n, h, w, 3)`` uint8.

@@ -30,7 +30,7 @@ def find_images(pattern: str | Path, noted: Noted | None = None) -> list[Path]:
     Args:
         pattern: A file; a folder, searched recursively; or a glob pattern, with ``**`` for folders
             of any depth. ``~`` is the home folder.
-        noted: Where folders that cannot be opened are reported, see `Problems.noted`.
+        noted: Reports folders that cannot be opened, see `Problems.noted`.
 
     Returns:
         Sorted paths. Of folders and patterns only files with one of `IMAGE_SUFFIXES`, in lower or
@@ -84,7 +84,7 @@ def find_depth(folder: Path, name: str, remedy: str) -> Path:
         folder: Of the depth maps.
         name: Path of the image below the folder of images, without suffix. The depth map has the
             same name, or that with ``_depth`` at the end, and one of `DEPTH_SUFFIXES`.
-        remedy: What to do where there is none.
+        remedy: Remedy if there is none.
 
     Raises:
         DataError: There is none, or there are several.

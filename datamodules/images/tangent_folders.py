@@ -92,7 +92,7 @@ def write_tangent_folder(
     Args:
         folder: A new one, or one with tangent images of an earlier run, which it replaces.
         image: ``(H, W)`` or ``(H, W, C)`` panorama.
-        cameras: What its ``cameras.json`` will say.
+        cameras: Content of its ``cameras.json``.
         interpolation: As of `equirect_to_tangent`.
         progress: Called with the share of the images written since its last call.
         colmap: Whether to write COLMAP's text files too.

@@ -50,7 +50,7 @@ def result_files(folder: Path, cameras: CameraFile) -> list[Path]:
     """The results for all images of a grid: files with the images' names and any suffix.
 
     Args:
-        folder: Where they are.
+        folder: Their folder.
         cameras: The images.
 
     Returns:
@@ -91,7 +91,7 @@ class TangentResults:
     Attributes:
         arrays: ``(d, d)`` or ``(d, d, C)`` for every image of the grid, all alike.
         grid: The geometry of the images the results were made of.
-        kind: What the pixels mean.
+        kind: Meaning of the pixels.
     """
 
     arrays: Sequence[NDArray[Any]]
@@ -156,7 +156,7 @@ class TangentResults:
             path: The panorama's file. Arrays (``.npy``) keep the dtype; in images, floats are
                 32-bit and labels the smallest integers that hold them.
             shape: ``(H, W)`` of the panorama.
-            blend: How overlapping images are joined, of colours and features.
+            blend: Blending of overlapping images, for colours and features.
             z_depth: Whether depth is along the axes of the images' cameras, to be converted to
                 distance from the centre.
 

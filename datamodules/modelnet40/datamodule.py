@@ -57,7 +57,7 @@ class ModelNet40(SplitDataModule[ShapeFile]):
         erp_height: Rows of the spherical images.
 
     Raises:
-        SettingError: A setting that cannot work.
+        SettingError: A setting is invalid.
         DataError: `root` holds no tree of meshes.
     """
 

@@ -48,7 +48,7 @@ class ShapeFile(NamedTuple):
         path: The file.
         name: Its path in the data set, without the suffix.
         label: Name of its class.
-        part: What it is for.
+        part: Its split.
     """
 
     path: Path

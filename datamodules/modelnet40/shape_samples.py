@@ -137,10 +137,10 @@ class ShapeViews(Dataset[ShapeSample]):
     Attributes:
         source: The shapes.
         labels: Of the classes, by name.
-        representation: What the network sees of them.
+        representation: Representation of the images.
         seed: Of the run, 0 or more.
         random: Whether views are drawn for every epoch and index; else all are taken.
-        rotation: How shapes are rotated of which all views are taken, each in its own way.
+        rotation: Rotation of whole shapes in evaluation, each with its own.
     """
 
     source: _Shapes

@@ -136,7 +136,7 @@ def list_pictures(
         area: One of `AREAS`.
         group: Panoramas or photos.
         with_depth: Whether depth is wanted.
-        problems: Where it is noted what is wrong, to go on after it.
+        problems: Problems are added, and the search continues.
 
     Raises:
         DataError: There are none, or other files.

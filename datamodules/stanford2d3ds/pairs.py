@@ -73,11 +73,11 @@ class StanfordPairs(PanoramaPairs):
         root: Folder with ``area_1`` …, of which ``pano/rgb``, ``pano/depth`` and ``pano/pose`` are
             read.
         pairs: `paper`, the sixty of area 1; or `rooms`, any two panoramas of the same room.
-        areas: Where to look with `rooms`; by default all areas that are there.
+        areas: Areas to search with `rooms`; by default all present.
         erp_height: Rows to shrink the panoramas to; by default they stay as they are.
 
     Raises:
-        SettingError: A setting that cannot work.
+        SettingError: A setting is invalid.
     """
 
     def __init__(

@@ -40,10 +40,10 @@ class Stanford2D3DS(StanfordAreas, PanoramaDataModule):
     """Stanford2D3DS, 13 classes, in the three folds of its authors.
 
     Args:
-        mask: Which pixels count as unknown, see `mask_black`.
+        mask: Pixels that count as unknown, see `mask_black`.
 
     Raises:
-        SettingError: A setting that cannot work.
+        SettingError: A setting is invalid.
     """
 
     group = "pano"

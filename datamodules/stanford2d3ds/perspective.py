@@ -30,7 +30,7 @@ class Stanford2D3DSPerspective(StanfordAreas, PhotoDataModule):
     Validation rooms are those of the panoramas, where every room has both.
 
     Raises:
-        SettingError: A setting that cannot work.
+        SettingError: A setting is invalid.
     """
 
     group = "data"

@@ -36,7 +36,7 @@ class StanfordReader(ImageReader):
 
     Attributes:
         table: The classes of the instances.
-        mask: Which pixels count as unknown, see `mask_black`.
+        mask: Pixels that count as unknown, see `mask_black`.
     """
 
     table: LabelTable

@@ -35,10 +35,10 @@ class StanfordAreas(SplitDataModule[ImageFiles]):
         label_table: The class table, when it is not where the release has it.
 
     Attributes:
-        group: Which pictures.
+        group: Kind of pictures.
 
     Raises:
-        SettingError: A setting that cannot work.
+        SettingError: A setting is invalid.
     """
 
     class_names = ("unknown", *CLASSES)

@@ -175,7 +175,7 @@ def make_panoramas(
     Args:
         root: Folder of the sequences.
         sequences: Which, as ``01``.
-        problems: Where broken views are noted, under the name of the panorama.
+        problems: Broken views are added under the name of the panorama.
         frames: About how many of each sequence, see `choose_frames`.
         height: Rows of the panoramas.
         progress: Whether to show a progress bar.

@@ -46,7 +46,7 @@ class OmniSynthia(SynthiaSequences, PanoramaDataModule):
         panorama_height: Rows of the panoramas that are made.
 
     Raises:
-        SettingError: A setting that cannot work.
+        SettingError: A setting is invalid.
     """
 
     formats = PANORAMA_FORMATS

@@ -34,7 +34,7 @@ class SynthiaPerspective(SynthiaSequences, PhotoDataModule):
     """SYNTHIA's views, 13 classes, of the frames and in the splits of OmniSYNTHIA.
 
     Raises:
-        SettingError: A setting that cannot work.
+        SettingError: A setting is invalid.
     """
 
     formats = VIEW_FORMATS

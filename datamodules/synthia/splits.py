@@ -74,7 +74,7 @@ class SynthiaSequences(SplitDataModule[ImageFiles]):
         formats: Of the files.
 
     Raises:
-        SettingError: A setting that cannot work.
+        SettingError: A setting is invalid.
     """
 
     class_names = ("unknown", *CLASSES)

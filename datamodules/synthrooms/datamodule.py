@@ -32,10 +32,10 @@ class SynthRooms(Stanford2D3DS):
     """Panoramas of synthetic rooms, read as Stanford2D3DS: the data set that needs no download.
 
     Args:
-        rooms: Which rooms to generate; their areas are the areas used.
+        rooms: Rooms to generate; their areas are the areas used.
 
     Raises:
-        SettingError: A setting that cannot work.
+        SettingError: A setting is invalid.
     """
 
     is_made = True
@@ -59,10 +59,10 @@ class SynthRoomsPerspective(Stanford2D3DSPerspective):
     """Photos of the same rooms, read as those of Stanford2D3DS.
 
     Args:
-        rooms: Which rooms to generate, with photos; their areas are the areas used.
+        rooms: Rooms to generate, with photos; their areas are the areas used.
 
     Raises:
-        SettingError: A setting that cannot work.
+        SettingError: A setting is invalid.
     """
 
     is_made = True
@@ -89,11 +89,11 @@ class SynthRoomsPairs(StanfordPairs):
 
     Args:
         root: Folder for the files.
-        rooms: Which rooms to generate, with two cameras or more.
+        rooms: Rooms to generate, with two cameras or more.
         erp_height: See `StanfordPairs`.
 
     Raises:
-        SettingError: A setting that cannot work.
+        SettingError: A setting is invalid.
     """
 
     def __init__(

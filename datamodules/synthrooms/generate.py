@@ -70,7 +70,7 @@ def generate_rooms(
 
     Args:
         root: Folder of the data set: new, empty, or of the same settings.
-        settings: What to generate.
+        settings: Settings of the generator.
         workers: Processes; 0 and 1 work in this one. By default one per CPU core.
         progress: Whether to show a progress bar.
 
@@ -109,7 +109,7 @@ def make_room(root: Path, settings: RoomSettings, plan: RoomPlan) -> None:
     Args:
         root: Folder of the data set.
         settings: Settings of the data set.
-        plan: Which room.
+        plan: The room.
     """
     rng = plan.rng
     room = furnish(rng, plan.kind)

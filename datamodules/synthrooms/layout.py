@@ -163,7 +163,7 @@ class FloorPlan:
             rng: Source of randomness.
             width: Metres along the wall.
             depth: Metres of floor in front of it that must be and stay free; 0 for what hangs.
-            zone: Which part of the wall's height.
+            zone: Part of the wall's height.
 
         Returns:
             Frame at the middle of the stretch on the floor, x along the wall, y into the room; None

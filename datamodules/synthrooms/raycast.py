@@ -105,7 +105,7 @@ class RayScene:
         surfaces, which surfaces within 0.8 m occlude.
 
         Args:
-            hits: Where the rays ended.
+            hits: Hit points of the rays.
             place: Point of every lamp that lights these rays, in [−1, 1]² of its half sides: rays
                 of one pixel that use different points make soft shadows.
             spread: ``(3,)`` unit vector added to the normal for ambient occlusion.

@@ -71,7 +71,7 @@ class Item:
     Attributes:
         parts: The room's parts, to which its own are added.
         index: Position in `Room.items`.
-        frame: Where it stands; all parts are given in this frame.
+        frame: Its place; all parts are given in this frame.
     """
 
     parts: list[Part]

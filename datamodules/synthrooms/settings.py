@@ -34,7 +34,7 @@ class RoomSettings:
         least_cameras: Least number of panoramas per room; most rooms have one otherwise.
 
     Raises:
-        SettingError: A setting that cannot work.
+        SettingError: A setting is invalid.
     """
 
     seed: int = 0

@@ -143,7 +143,7 @@ def encode_picture(picture: Picture, labels: NDArray[np.uint32]) -> dict[str, by
     """PNG files of a picture.
 
     Args:
-        picture: What was rendered.
+        picture: The rendered picture.
         labels: Index into the label table of every item.
 
     Returns:
@@ -182,7 +182,7 @@ def pose_record(
         room: Where.
         camera: One of its cameras.
         frame: `PANORAMA`, or the number of a perspective view.
-        view: How it was taken.
+        view: Its camera.
         original: Pose of the panorama of the same camera.
     """
     pose = view.pose

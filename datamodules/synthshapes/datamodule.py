@@ -19,10 +19,10 @@ class SynthShapes(ModelNet40):
     """Synthetic shapes, generated on first use and read as ModelNet40: no download.
 
     Args:
-        shapes: Which shapes to generate.
+        shapes: Shapes to generate.
 
     Raises:
-        SettingError: A setting that cannot work.
+        SettingError: A setting is invalid.
     """
 
     is_made = True

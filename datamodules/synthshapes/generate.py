@@ -58,7 +58,7 @@ class ShapeSettings:
         test: Shapes of every class for the test.
 
     Raises:
-        SettingError: A setting that cannot work.
+        SettingError: A setting is invalid.
     """
 
     seed: int = 0
@@ -93,7 +93,7 @@ def generate_shapes(
 
     Args:
         root: Folder of the data set: new, empty, or of the same settings.
-        settings: What to generate.
+        settings: Settings of the generator.
         workers: Processes; 0 and 1 work in this one. By default one per CPU core, fewer for little
             work.
         progress: Whether to show a progress bar.
@@ -128,7 +128,7 @@ def make_shape(seed: int, label: str, number: int) -> Trimesh:
     Args:
         seed: Seed of the data set.
         label: Class.
-        number: Which of its class.
+        number: Index within its class.
     """
     # The name, not its place: classes that are added later leave the others as they are.
     rng = np.random.default_rng((seed, zlib.crc32(label.encode()), number))

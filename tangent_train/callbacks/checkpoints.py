@@ -118,9 +118,9 @@ class LastCheckpoint(Checkpoint):
     it is interrupted.
 
     Args:
-        folder: Where to; the checkpoints' folder of a run.
+        folder: The checkpoints' folder of a run.
         every_n_steps: Optimizer steps between checkpoints within an epoch; None for none.
-        typed: What the command to go on with has to say besides the folder.
+        typed: Settings that the resuming command needs besides the folder.
 
     Attributes:
         has_begun: Whether the training has: all that is restored is.
@@ -219,7 +219,7 @@ class BestCheckpoint(ModelCheckpoint):
     """Keeps ``best.ckpt``, the epoch with the highest figure of the validation split.
 
     Args:
-        folder: Where to, also of a resumed run whose folder was moved.
+        folder: Output folder, of a resumed run whose folder was moved too.
         monitor: The figure.
     """
 

@@ -27,8 +27,8 @@ class PredictionPanels(Callback):
     """Writes pictures of test panoramas or photos: input, truth, prediction, error.
 
     Args:
-        folder: Where to.
-        count: How many of them, spread over the test split.
+        folder: Output folder.
+        count: Number of images, spread over the test split.
 
     Attributes:
         images: The same, compressed, for the viewer of the report; after the test those of all

@@ -60,7 +60,7 @@ def write_evaluation(task: Any, record: Record, checkpoint: Path, folder: Path) 
         task: The evaluated task, still attached to its trainer.
         record: From `evaluated`.
         checkpoint: Its weights.
-        folder: Where to.
+        folder: Output folder.
     """
     write_results(record, folder)
     callbacks = task.trainer.callbacks

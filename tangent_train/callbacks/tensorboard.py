@@ -34,7 +34,7 @@ class ValidationPictures(Callback):
     those that the first process sees.
 
     Args:
-        count: How many images.
+        count: Number of images.
 
     Raises:
         SettingError: Less than 0.

@@ -52,7 +52,7 @@ class TrainedNetwork:
         network: In evaluation mode; ``(B, C, h, w)`` float32, normalized, to scores ``(B, K+1, h,
             w)``, the unknown class first.
         class_names: K + 1 names, the unknown class first.
-        inputs: What it is shown, see `datamodules.core.inputs.Input`.
+        inputs: Its inputs, see `datamodules.core.inputs.Input`.
         normalization: Of RGB and depth.
         level: Level s it was trained at.
         representation: The section of the config it was trained with.

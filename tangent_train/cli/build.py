@@ -1,4 +1,4 @@
-"""Data module and task of a config, tried before any data is made."""
+"""Data module and task of a config, checked before any data is generated."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def build(settings: Settings, source: SettingsFile | None = None) -> tuple[Any, 
         Data module and task.
 
     Raises:
-        SettingError: A setting cannot work, or two of them not together.
+        SettingError: A setting, or a combination of settings, is invalid.
     """
     parts = {
         name: make(settings[name], name, source)
@@ -57,7 +57,7 @@ def build(settings: Settings, source: SettingsFile | None = None) -> tuple[Any, 
 
 
 def _try_network(task: Any, channels: int) -> None:
-    """Run the network on an empty input: what does not fit shows before any data is made."""
+    """Run the network on an empty input, to find mismatches before any data is generated."""
     images = task.example(channels)
     probe = copy.deepcopy(task).to("meta").eval()  # shapes only: nothing is computed
     with torch.no_grad():

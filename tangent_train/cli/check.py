@@ -20,7 +20,7 @@ __all__ = ["check"]
 
 
 def check(settings: Mapping[str, Any]) -> None:
-    """Read all of the data set of a run; leave with 1 if something is wrong.
+    """Read the whole data set of a run; exit with status 1 if there are problems.
 
     On a terminal the problems are a table, elsewhere lines of file, finding and remedy with tabs
     between them; the summary goes to standard error then.
@@ -57,7 +57,7 @@ def _table(problems: Sequence[Problem]) -> Table:
 
 
 def _printable(text: str) -> str:
-    r"""Names of files may hold anything: line ends, commands of terminals, bytes that are no text.
+    r"""Escape file names, which may hold line ends, terminal escapes and invalid bytes.
 
     >>> print(_printable("küche 1\n\x1b[2J\udcff.png"))
     küche 1\n\x1b[2J\udcff.png

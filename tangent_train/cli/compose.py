@@ -30,7 +30,7 @@ def config_folder() -> Path:
 
 
 def quote_path(argument: str) -> str:
-    """An override of a file or folder so that Hydra takes its value as it is.
+    """Quote an override of a file or folder, so that Hydra takes its value literally.
 
     >>> quote_path("input=holiday (1)/a=b,c.jpg"), quote_path("level=7"), quote_path("depth=null")
     ("input='holiday (1)/a=b,c.jpg'", 'level=7', 'depth=null')
@@ -42,21 +42,21 @@ def quote_path(argument: str) -> str:
 
 
 def quoted(text: str) -> str:
-    """A text as Hydra takes it for what it is, without interpolation."""
+    """Quote a string so that Hydra takes it literally, without interpolation."""
     if re.fullmatch(r"[\w/.+-]+", text):
         return text
     return QuotedString(text.replace("${", r"\${"), Quote.single).with_quotes()
 
 
 def compose_option(group: str, option: str, search: Sequence[str] = ()) -> dict[str, Any]:
-    """An option of a config group by itself; what it refers to elsewhere is left as it is.
+    """Compose an option of a config group alone; references elsewhere stay unresolved.
 
     Hydra must be initialized.
 
     Args:
         group: The group, without folders.
         option: The option.
-        search: Overrides that say where Hydra looks besides.
+        search: Overrides with further search paths of Hydra.
     """
     config = OmegaConf.to_container(compose(f"{group}/{option}", list(search)), resolve=False)
     section: dict[str, Any] = config[group]  # type: ignore[index, call-overload, assignment]

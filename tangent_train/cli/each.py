@@ -28,7 +28,7 @@ def each(
     Args:
         description: Of the work.
         items: Files by item.
-        work: Takes an item, its file, and what is to be called with the share of the work done
+        work: Takes an item, its file, and a function to call with the share of the work done
             since the last call.
 
     Yields:

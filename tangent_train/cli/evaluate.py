@@ -52,9 +52,9 @@ class Run:
     """A run with its objects.
 
     Attributes:
-        folder: Where all of it is written.
-        settings: What its checkpoints keep.
-        source: Where they come from; None for the user's own.
+        folder: Output folder.
+        settings: Settings kept in its checkpoints.
+        source: File they come from; None for the user's own.
         data: The data module.
         task: The task.
     """
@@ -107,10 +107,10 @@ class Run:
         return trainer
 
     def test(self, trainer: lightning.Trainer, checkpoint: Path) -> None:
-        """Evaluate weights on the test fold, and write the results.
+        """Evaluate weights on the test fold and write the results.
 
         Raises:
-            SettingError: The data or the network are not those of the weights.
+            SettingError: The data or the network do not match the weights.
         """
         content = read_checkpoint(checkpoint)
         for name, value in self.shown().items():

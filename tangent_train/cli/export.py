@@ -31,7 +31,7 @@ class Settings:
 
 
 def export(config: Mapping[str, Any]) -> None:
-    """Write a trained network to a file and say how well it agrees with PyTorch.
+    """Write a trained network to a file and print its largest difference from PyTorch.
 
     Args:
         config: The composed ``export.yaml``.

@@ -51,7 +51,7 @@ def keypoints(config: Mapping[str, Any]) -> None:
         config: The composed ``keypoints.yaml``.
 
     Raises:
-        SettingError: A setting is missing or cannot work.
+        SettingError: A setting is missing or invalid.
         DataError: There are no pairs.
     """
     given, comparer = typed(Settings, config), Comparer(typed(Ways, config))
@@ -101,7 +101,7 @@ def _draw(stem: Path, comparison: Comparison) -> None:
 
 
 def _pairs(config: Mapping[str, Any]) -> tuple[Any, PanoramaPairs]:
-    """The settings of the pairs, and the pairs: one's own images, or those of a data set."""
+    """Settings of the pairs, and the pairs: the user's own images, or those of a data set."""
     images = {name: config[name] for name in _OF_IMAGES}
     if any(images[name] is not None for name in ("left", "right", "input")):
         return images, ImagePairs(**images)
@@ -115,7 +115,7 @@ def _pairs(config: Mapping[str, Any]) -> tuple[Any, PanoramaPairs]:
 
 
 def earlier_results(output: Path, settings: Mapping[str, Any]) -> dict[str, list[Row]]:
-    """Figures of the pairs that are done already, by name.
+    """Scores of the finished pairs, by name.
 
     Raises:
         SettingError: The folder holds something else, or results of other settings.
@@ -146,7 +146,7 @@ def earlier_results(output: Path, settings: Mapping[str, Any]) -> dict[str, list
 def _export(
     folder: Path, files: Sequence[Path], pair: PanoramaPair, comparison: Comparison
 ) -> None:
-    """Add the pair as it is, not rotated, to the database of every representation.
+    """Add the unrotated pair to the database of every representation.
 
     Raises:
         DataError: A file is a part of a panorama.

@@ -23,8 +23,8 @@ def machine_faults(folder: Path, data: Any) -> Iterator[None]:
         data: Its data module.
 
     Raises:
-        NoRoomError: Something that is not written atomically, as TensorBoard's events, found no
-            room.
+        NoRoomError: The disk is full for a file that is not written atomically, as TensorBoard's
+            events.
         DataError: A worker died.
     """
     try:

@@ -104,7 +104,7 @@ def _run(command: str, config: DictConfig, stored: Any, visible_gpus: str | None
 
 @contextmanager
 def _refusals(command: str) -> Iterator[None]:
-    """Leave with one line where a setting or a file cannot be used."""
+    """Exit with a one-line message if a setting or a file cannot be used."""
     try:
         yield
     except (DataError, SettingError) as error:

@@ -1,4 +1,4 @@
-"""``tangent-predict``: label maps of one's own panoramas and photos."""
+"""``tangent-predict``: label maps of the user's own panoramas and photos."""
 
 from __future__ import annotations
 
@@ -77,13 +77,13 @@ class Settings:
 
 
 def predict(config: Mapping[str, Any]) -> None:
-    """Predict the labels of images and write what was found.
+    """Predict the labels of images and write them.
 
     Args:
         config: The composed ``predict.yaml``.
 
     Raises:
-        SettingError: A setting is missing or cannot work.
+        SettingError: A setting is missing or invalid.
         DataError: The checkpoint cannot be read, or there are no images.
     """
     settings = typed(Settings, config)
@@ -131,8 +131,8 @@ class _Labeller:
         settings: Of the command.
         predictor: The network.
         depth: Depth images, for networks that take depth.
-        folder: Where the labels go.
-        shown: Images for the page, those of the first ones done.
+        folder: Output folder.
+        shown: Images for the report: the first ones done.
     """
 
     settings: Settings

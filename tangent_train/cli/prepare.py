@@ -1,4 +1,4 @@
-"""``tangent-prepare``: make or check a data set, and its prepared store if one is set."""
+"""``tangent-prepare``: generate or check a data set, and its prepared store if set."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["prepare"]
 
 
 def prepare(settings: Settings) -> None:
-    """Make or check the data set.
+    """Generate or check the data set.
 
     Args:
         settings: The composed ``prepare.yaml``.

@@ -33,11 +33,11 @@ def command_line(command: str, arguments: Sequence[str], folder: Path) -> list[s
 
 
 def run_process(line: Sequence[str], changes: Mapping[str, str | None] | None = None) -> int:
-    """Run to the end. When this process is interrupted or ended, so is that one.
+    """Run a command to the end; an interrupt or end of this process ends it too.
 
     Args:
         line: Program and arguments.
-        changes: Environment variables that it has another value of, or None for not at all.
+        changes: Environment variables to change, or to remove with None.
 
     Returns:
         The exit status.
@@ -63,7 +63,7 @@ def run_process(line: Sequence[str], changes: Mapping[str, str | None] | None = 
 
 @contextmanager
 def ended_by_sigterm() -> Iterator[None]:
-    """Let SIGTERM unwind this process as Ctrl-C does, rather than end it at once."""
+    """Let SIGTERM unwind this process like Ctrl-C instead of ending it at once."""
 
     def leave(number: int, frame: object) -> NoReturn:
         sys.exit(128 + number)

@@ -69,7 +69,7 @@ def render(config: Mapping[str, Any]) -> None:
 
     Raises:
         DataError: There is nothing to render.
-        SettingError: A setting cannot work, or a file would be overwritten.
+        SettingError: A setting is invalid, or a file would be overwritten.
     """
     settings = typed(Settings, config)
     if (settings.input is None) == (settings.back is None):

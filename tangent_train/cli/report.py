@@ -65,7 +65,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _check_output(folder: Path) -> None:
-    """Refuse to write over files that another program left there."""
+    """Refuse to replace files of other programs."""
     made_by_us = folder / "report.json"
     there = [
         path for path in folder.glob("report.*") if path.suffix in (".md", ".csv", ".png", ".json")

@@ -1,4 +1,4 @@
-"""Settings of a command as an object whose annotations say their types."""
+"""Settings of a command as an object with typed fields."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ class Trust:
 
 
 def typed(kind: type[_Settings], config: Mapping[str, Any]) -> _Settings:
-    """Make a dataclass of settings; what its fields' values mean is checked where they are used.
+    """Build a dataclass of settings; values are checked where they are used.
 
     Annotations may be ``bool``, ``int``, ``float``, ``str``, `Path`, ``None``, `Literal`, tuples
-    and unions of these. A single value will do for a tuple, and ``~`` in a path is the home folder.
+    and unions of these. A single value may stand for a tuple; ``~`` in a path is the home folder.
 
     Args:
         kind: The class.

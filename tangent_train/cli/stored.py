@@ -1,4 +1,4 @@
-"""Starting from the settings inside a checkpoint: to resume a run, or to evaluate it.
+"""Settings inside a checkpoint, to resume a run or to evaluate it.
 
 Hydra composes the user's own config, with the options of the run where the user has options of
 these names. The settings of the file are plain data: they are laid over the composed ones, except
@@ -51,9 +51,9 @@ class StoredRun:
     Attributes:
         path: The checkpoint.
         config: Its settings, plain values.
-        typed: What the user typed, without the checkpoint.
+        typed: Overrides of the user, without the checkpoint.
         added: The options of the run among the user's own, its level and seed.
-        place: Overrides that say which checkpoint it is, and where to go on.
+        place: Overrides for the checkpoint and the run folder.
     """
 
     path: Path
@@ -102,7 +102,7 @@ class StoredRun:
         return settings, SettingsFile(self.path, trust, own.union(OF_THIS_MACHINE))
 
     def _section(self, name: str, here: Mapping[str, Any], own: set[str]) -> dict[str, Any]:
-        """A section of the file; what is this machine's is as the user's own config says it."""
+        """A section of the file, with machine-specific settings from the user's own config."""
         theirs = self.config[name]
         section = {n: v for n, v in theirs.items() if from_file(f"{name}.{n}")}
         if here.get("_target_") == theirs.get("_target_"):
@@ -130,7 +130,7 @@ def stored_run(command: str, arguments: Sequence[str]) -> StoredRun | None:
 
     ``tangent-train resume=<run folder>`` takes the settings inside the run's last checkpoint,
     ``tangent-evaluate checkpoint=<file>`` those inside that; ``data=<option>`` (or another section)
-    takes an option of one's own in place of the stored section.
+    takes the user's own option in place of the stored section.
 
     Args:
         command: Any command.
@@ -184,7 +184,7 @@ def _is_own(group: str, option: str) -> bool:
 
 
 def _lay(settings: dict[str, Any], said: Any, place: Sequence[str]) -> None:
-    """Put what is said at a place into settings."""
+    """Set a value at a place in settings."""
     *sections, name = place
     for section in sections:
         said = said.get(section) if isinstance(said, dict) else None

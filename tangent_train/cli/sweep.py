@@ -49,11 +49,11 @@ def run_job(
         visible_gpus: ``CUDA_VISIBLE_DEVICES`` where the sweep was started.
 
     Returns:
-        The run's best figure on its validation split; None if it has none.
+        The run's best validation score; None without a validation split.
 
     Raises:
         CompactHydraException: The run failed. Hydra prints it without a traceback.
-        SettingError: The sweep compares figures that its runs would not have.
+        SettingError: The sweep compares scores that its runs would not have.
     """
     hydra = HydraConfig.get()
     searches = not hydra.sweeper["_target_"].endswith("BasicSweeper")

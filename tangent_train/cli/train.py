@@ -48,7 +48,7 @@ def train(settings: Settings, source: SettingsFile | None = None) -> float | Non
         source: The file they come from, see `registry.make`.
 
     Returns:
-        The best figure on the validation split, what sweeps compare; None without such a split.
+        The best validation score, which sweeps compare; None without a validation split.
     """
     resumed = None
     if settings["resume"] is not None:
@@ -79,7 +79,7 @@ def train(settings: Settings, source: SettingsFile | None = None) -> float | Non
 
 
 def best_on_validation(trainer: lightning.Trainer, folder: Path) -> float | None:
-    """The best figure on the validation split, kept for sweeps; None if there is none.
+    """The best validation score, kept for sweeps; None if there is none.
 
     Args:
         trainer: Of the run.
@@ -141,6 +141,6 @@ def _typed_local() -> list[str]:
 
 
 def _channels(path: Path, data: Any) -> Any:
-    """Names of the channels that the network of a file takes, and of those of the data."""
+    """Names of the input channels of a file's network, and of the data."""
     before, now = inputs_in(path), getattr(data, "inputs", None)
     return None if before is None or now is None else (channel_names(before), channel_names(now))

@@ -42,7 +42,7 @@ def transfer(config: DictConfig) -> None:
         config: The composed ``transfer.yaml``.
 
     Raises:
-        SettingError: A setting cannot work, or a stage's folder holds something else.
+        SettingError: A setting is invalid, or a stage's folder holds something else.
         DataError: The given checkpoint, or a file of a stage, cannot be used.
     """
     folder = Path(HydraConfig.get().runtime.output_dir)
@@ -64,7 +64,7 @@ def transfer(config: DictConfig) -> None:
 
 
 def _check_typed(config: DictConfig) -> None:
-    """Refuse a single fold or seed beside a list of them, which would go unheard."""
+    """Refuse a single fold or seed beside a list of them, which would be ignored."""
     for text in HydraConfig.get().overrides.task:
         name, _, number = text.partition("=")
         several = {"data.fold": "folds", "seed": "seeds"}.get(name)
@@ -133,7 +133,7 @@ def _check_data(stages: Sequence[Stage]) -> None:
 
 @contextmanager
 def _named(stage: Stage) -> Iterator[None]:
-    """Say which stage an error is about: settings of the photos are below ``photos``."""
+    """Name the stage of an error: settings of the photos are under ``photos``."""
     try:
         yield
     except (DataError, SettingError) as error:

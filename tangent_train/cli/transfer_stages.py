@@ -2,15 +2,15 @@
 
 ===========  ===============================================================================
 P            trained on photos, tested on photos
-S            P's network, tested on panoramas
-S-<name>     the same, the panoramas seen through another representation
-P-FT-n       P's network, fine-tuned for n epochs on photos, tested on photos
-S-FT-n       P's network, fine-tuned for n epochs on panoramas, tested on panoramas
-S-level-n    P's network, tested on panoramas of level n (study of the angular resolution)
+S            P, tested on panoramas
+S-<name>     P, tested on panoramas through another representation
+P-FT-n       P, fine-tuned for n epochs on photos, tested on photos
+S-FT-n       P, fine-tuned for n epochs on panoramas, tested on panoramas
+S-level-n    P, tested on panoramas of level n (study of the angular resolution)
 ===========  ===============================================================================
 
-Beside what a run leaves, a stage's folder holds ``stage.yaml``, its config for ``tangent-train`` or
-``tangent-evaluate``, and ``stage.json``, a digest of the checkpoint it starts from.
+Besides the files of a run, a stage's folder holds ``stage.yaml``, its config for ``tangent-train``
+or ``tangent-evaluate``, and ``stage.json``, a digest of the checkpoint it starts from.
 """
 
 from __future__ import annotations
@@ -84,15 +84,15 @@ class Stage:
 def plan(
     config: DictConfig, folder: Path, compared: Mapping[str, Mapping[str, Any]]
 ) -> list[Stage]:
-    """All stages, those of one fold and seed after those of the other.
+    """All stages, grouped by fold and seed.
 
     Args:
         config: The composed ``transfer.yaml``; ``checkpoint``, if any, an absolute path.
         folder: The transfer's.
-        compared: Sections ``representation`` of the further ways to see panoramas, by name.
+        compared: Sections ``representation`` of the further representations, by name.
 
     Raises:
-        SettingError: A setting of the transfer cannot work.
+        SettingError: A setting of the transfer is invalid.
     """
     if config.study not in (None, STUDY):
         raise SettingError("study", found=repr(config.study), expected=f"{STUDY}, or null")
@@ -147,7 +147,7 @@ class _Planner:
             yield self._stage(f"S-level-{level}", settings, level=level)
 
     def _settings(self, changes: Mapping[str, Any] | None = None) -> dict[str, Any]:
-        """All settings, resolved after some were changed."""
+        """All settings, resolved after the changes."""
         config: Any = OmegaConf.create(OmegaConf.to_container(self._config))
         config.seed = self._seed
         for data in (config.data, config.photos.data):
@@ -159,7 +159,7 @@ class _Planner:
         return dict(resolved)
 
     def _slower(self, settings: dict[str, Any]) -> dict[str, Any]:
-        """The optimizer of fine-tuning: what it does not say is as in P's training."""
+        """The optimizer of fine-tuning; other settings are those of P's training."""
         own, before = settings["fine_tuning"]["optimizer"], settings["optimizer"]
         optimizer = own if "_target_" in own else before | own
         if optimizer.get("lr") is None:
@@ -256,14 +256,14 @@ def stage_state(stage: Stage) -> State:
 
 
 def run_stage(stage: Stage, state: State) -> int:
-    """Start a stage, or go on with it, and wait for it.
+    """Start or resume a stage and wait for it.
 
     Args:
         stage: Not finished.
         state: From `stage_state`.
 
     Returns:
-        The exit status, as a shell says it.
+        The exit status, as in a shell.
 
     Raises:
         DataError: The checkpoint it starts from is missing.
@@ -309,7 +309,7 @@ def stage_command(stage: Stage) -> list[str]:
 
 
 def _checkpoint_in(weights: Path) -> Path | None:
-    """The checkpoint: a file itself, of a run the one that it has tested; None if missing."""
+    """The checkpoint: a file itself, or the one that a run has tested; None if missing."""
     folder = weights / "checkpoints"
     places = (weights, folder / "best.ckpt", folder / "last.ckpt")
     return next((path for path in places if path.is_file()), None)

@@ -77,9 +77,9 @@ def read_panorama(
     Args:
         path: Its file.
         name: Its path below the folder of all images, without suffix.
-        depth: Where its depth is, for networks that take it.
-        crop: What it shows, see `area_of_crop`; None for what its GPano tags say.
-        upright: Where its zenith is: ``pose`` by its GPano tags, ``auto`` by these or else as
+        depth: Its depth file, for networks with depth.
+        crop: Its part of the sphere, see `area_of_crop`; None for that of its GPano tags.
+        upright: Source of its zenith: ``pose`` by its GPano tags, ``auto`` by these or else as
             estimated; None for z.
         max_tilt_deg: Of estimates, see `estimate_up`.
 
@@ -112,7 +112,7 @@ def read_photo(
     Args:
         path: Its file.
         name: Its path below the folder of all images, without suffix.
-        depth: Where its depth along the optical axis is, for networks that take depth.
+        depth: File of its z-depth, for networks with depth.
         fov_deg: Its horizontal field of view; None for what its EXIF data say.
 
     Raises:

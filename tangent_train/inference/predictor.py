@@ -69,7 +69,7 @@ class Predictor:
 
     Args:
         trained: The network; it is moved to the device.
-        view_sets: Which views it sees: `PanoramaViews` or `PhotoViews`.
+        view_sets: Its views: `PanoramaViews` or `PhotoViews`.
         device: Any of torch's.
         images_per_forward: Views per call of the network, a bound on memory; None for as many as
             have 2^20 pixels. A network with cross-image attention takes all views of a panorama

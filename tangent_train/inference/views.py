@@ -106,7 +106,7 @@ class PanoramaViews:
         trained: The network.
         level: Level s, the angular resolution; None as trained.
         base_level: Base level b of tangent images; None as trained.
-        blend: How overlapping views are joined.
+        blend: Blending of overlapping views.
         rotations: Number of icosahedra, rotated about the vertical, to average over.
         upright: Whether some panoramas will have their own `InputImage.up`.
 

@@ -40,7 +40,7 @@ class DepthView:
     Args:
         distance_m: ``(H, W)`` distances from the centre in metres, of any resolution; NaN where
             missing.
-        pose: Where it was taken.
+        pose: Camera pose.
     """
 
     distance_m: NDArray[np.floating]

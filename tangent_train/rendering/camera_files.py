@@ -68,7 +68,7 @@ class CameraFile:
         source: Name of the panorama.
         shape: ``(H, W)`` of the panorama.
         grid: The geometry of all images.
-        faces: Which of them there are.
+        faces: Indices of its images.
         files: The files' names, one for each face.
     """
 
@@ -84,7 +84,7 @@ def write_cameras(path: Path, cameras: CameraFile) -> None:
 
     Args:
         path: The file.
-        cameras: What it says; see its own ``conventions`` for how.
+        cameras: Its content; its ``conventions`` define the fields.
     """
     grid = cameras.grid
     rotation = None if grid.rotation is None else _in_world(grid.rotation).tolist()
@@ -171,7 +171,7 @@ def write_colmap(folder: Path, cameras: CameraFile) -> None:
     world to camera as a unit quaternion (w, x, y, z), no translation; no points.
 
     Args:
-        folder: Where they go; a sparse model for COLMAP.
+        folder: Output folder; a sparse model for COLMAP.
         cameras: The images; the world is that of `write_cameras`.
     """
     grid = cameras.grid

@@ -80,10 +80,10 @@ def check_images(
     """Raise SettingError unless images are all of a grid.
 
     Args:
-        name: What they are, for the message.
+        name: Their name, for the message.
         images: Tensor ``(..., N, C, d, d)`` or array ``(N, d, d[, C])``.
         grid: Their geometry.
-        interpolation: How they will be sampled.
+        interpolation: Interpolation they will be sampled with.
     """
     shape, sides = tuple(images.shape), (grid.num_images, grid.dim, grid.dim)
     if isinstance(images, np.ndarray):

@@ -45,7 +45,7 @@ def over_rows(kernel: Callable[..., None], rows: int, width: int, *arguments: An
 
     Args:
         kernel: A compiled function that releases the GIL.
-        rows: How many there are.
+        rows: Number of rows.
         width: Pixels in a row.
         *arguments: What the kernel takes besides the rows.
     """

@@ -69,7 +69,7 @@ class ScoreMosaic:
 
         Args:
             scores: ``(n, K, d, d)`` scores, not probabilities.
-            grid: What they belong to.
+            grid: Their grid.
             faces: ``(n,)`` which images they are.
 
         Raises:
@@ -93,7 +93,7 @@ class ScoreMosaic:
 
         Args:
             scores: ``(n, K, h, w)`` scores, not probabilities.
-            crops: Where all crops are.
+            crops: Positions of all crops.
             which: ``(n,)`` which of them these are.
         """
         height, width = self.shape

@@ -71,7 +71,7 @@ class TableCache:
         """The table of a key, built if it is not held.
 
         Args:
-            key: What the table depends on.
+            key: Everything the table depends on.
             build: Makes the table, a tuple of arrays or tensors.
         """
         held: Any = self._tables.get(key)
@@ -241,9 +241,9 @@ def tensors_on(
     """Tables as tensors, kept; on the CPU they share the memory of the arrays.
 
     Args:
-        device: Where they are needed.
-        grid: What they belong to.
-        key: What else they depend on; None for tables that are not kept.
+        device: Device of the tables.
+        grid: Their grid.
+        key: Everything else they depend on; None for tables that are not cached.
         build: Gives the arrays.
     """
 

@@ -65,7 +65,7 @@ def segmentation_record(
     Args:
         matrices: Counts over the data set.
         class_names: K + 1 names, the unknown class first.
-        absent_class: How classes absent from the ground truth enter the means.
+        absent_class: Treatment of classes absent from the ground truth in the means.
         noun: Plural name of the images. Photos have neither solid angles nor latitude bands.
     """
     on_sphere = bool(matrices.solid_angle.any())
@@ -221,7 +221,7 @@ def write_results(record: Record, folder: Path) -> None:
 
     Args:
         record: Of an evaluation.
-        folder: Where to.
+        folder: Output folder.
     """
     write_text(folder / RESULTS_FILE, record.json())
     write_text(folder / "results.csv", csv_text(list(record.classes[0]), record.classes))

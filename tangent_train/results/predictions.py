@@ -145,7 +145,7 @@ class PredictionFolder:
         """The entries of the images whose files are there, by name.
 
         Args:
-            settings: What earlier predictions must agree in.
+            settings: Settings that earlier predictions must share.
 
         Raises:
             SettingError: They were made with other settings.
@@ -181,7 +181,7 @@ class PredictionFolder:
             rgb: ``(h, w, 3)`` the image.
             labels: ``(h, w)`` its labels.
             scores: Those of the photo, or of the whole sphere.
-            area: Which part of the sphere the image is.
+            area: Part of the sphere that the image covers.
         """
         files = self.files(name)
         write_pixels(files["labels"], labels)
@@ -201,7 +201,7 @@ class PredictionFolder:
         """Write ``summary.json``, ``summary.csv`` and ``classes.json`` (label values by name).
 
         Args:
-            settings: How the images were predicted.
+            settings: Settings of the prediction.
             entries: Of the images done so far.
         """
         names = self.class_names[1:]

@@ -96,12 +96,12 @@ class Record:
     Attributes:
         kind: Kind of the task.
         noun: Plural name of the images: panoramas, photos, shapes.
-        images: How many of them.
+        images: Number of images.
         means: Scores over all classes, see `SCORES`.
         classes: For every class its name (``class``) and scores.
         latitude_bands: For every band ``latitude_deg`` (south, north) and scores; none for photos.
         confusion: Integer counts, rows truth, columns prediction.
-        absent_class: How classes absent from the ground truth enter the means.
+        absent_class: Treatment of classes absent from the ground truth in the means.
         settings: The resolved config of the run, as ``section.setting``.
         folder: Of the run.
     """

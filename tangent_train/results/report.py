@@ -124,7 +124,7 @@ class Report:
         """Write the report as ``.json``, ``.md``, ``.csv`` and ``.png``, each atomically.
 
         Args:
-            folder: Where to.
+            folder: Output folder.
             name: Of the files.
         """
         write_text(folder / f"{name}.json", self._json())  # first: it says who wrote the others

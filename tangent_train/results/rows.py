@@ -29,7 +29,7 @@ class Statistic(NamedTuple):
         mean: Over the folds' means; None where it is defined in no run.
         over_folds: Standard deviation of the folds' means; None with one fold.
         over_seeds: Pooled standard deviation within folds; None with one seed for each.
-        folds: How many folds have the score: a class may be absent from a fold.
+        folds: Number of folds with the score: a class may be absent from a fold.
     """
 
     mean: float | None

@@ -32,7 +32,7 @@ class Task(lightning.LightningModule, ABC):
 
     Args:
         network: The network to train.
-        representation: What made its images.
+        representation: Representation of its images.
         class_names: Names of the classes.
         optimizer: Makes the optimizer from parameters.
         scheduler: Makes a learning rate scheduler from the optimizer, or None. One that takes
@@ -45,14 +45,14 @@ class Task(lightning.LightningModule, ABC):
         compile: Arguments of `torch.compile` for the network, empty for its defaults; None not to.
 
     Attributes:
-        kind: What is learned.
+        kind: Kind of labels learned.
         monitor: The score on the validation split that selects the best epoch.
-        takes: What a network for this task maps to what, for messages.
+        takes: Input and output of a network for this task, for messages.
         metric: The torchmetrics class that counts predictions, made from the number of classes.
-        matrices: What `metric` counted in the last evaluation.
+        matrices: Confusion matrices of `metric` in the last evaluation.
 
     Raises:
-        SettingError: A setting that cannot work.
+        SettingError: A setting is invalid.
     """
 
     kind: ClassVar[Kind]

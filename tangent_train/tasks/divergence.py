@@ -20,7 +20,7 @@ def refuse_loss(task: lightning.LightningModule, loss: float, batch: Any) -> NoR
     Args:
         task: With the weights before the step.
         loss: Of all processes.
-        batch: What it was computed from, of this process.
+        batch: This process's batch that it was computed from.
 
     Raises:
         SettingError: Always.
@@ -45,7 +45,7 @@ def check_weights(task: lightning.LightningModule) -> None:
     """Refuse to overwrite a good checkpoint with an unusable one.
 
     Args:
-        task: What is trained.
+        task: The trained task.
 
     Raises:
         SettingError: A weight or a running statistic is not finite.

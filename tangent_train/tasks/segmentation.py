@@ -37,14 +37,14 @@ class SegmentationTask(Task):
             unknown class, which is never predicted. One whose `forward` also takes ``rays`` and
             ``images_per_chunk`` is told where on the sphere its images look, and bounds its memory
             itself (`models.SphereContext`).
-        representation: What made the images; it assembles the scores.
+        representation: Representation of the images; it assembles the scores.
         class_names: K + 1 names, the unknown class first.
         *arguments: Optimizer and scheduler, see `Task`.
         class_weights: Weights of the loss: a name that the data module knows (``none``, ``log``,
             ``sqrt``, ``effective``) or K + 1 numbers.
         auxiliary_weight: Weight of the loss of the scores under ``"aux"``.
         images_per_forward: Images evaluated at once, a bound on memory.
-        absent_class: How classes absent from the truth enter the means.
+        absent_class: Treatment of classes absent from the ground truth in the means.
         **settings: See `Task`.
     """
 
@@ -116,7 +116,7 @@ class SegmentationTask(Task):
 
         Args:
             images: Of one or several spheres.
-            rays: Where they look, see `Views.rays`, for networks that take it.
+            rays: Viewing rays, see `Views.rays`, for networks that take them.
 
         Raises:
             SettingError: The network's scores do not fit the images or the classes.

@@ -36,7 +36,7 @@ class EquirectViews:
 
     Attributes:
         rotation: ``(3, 3)`` rotation of the directions it looks in; None for none.
-        columns: Where a crop starts, as a share of the columns, and its width; None for no crop.
+        columns: Start of a crop, as a share of the columns, and its width; None for no crop.
         mirrored: Whether it is mirrored left to right.
     """
 

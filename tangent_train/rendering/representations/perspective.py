@@ -211,7 +211,7 @@ class PerspectiveRepresentation:
         image_size: Rows and columns of a crop.
 
     Raises:
-        SettingError: A setting that cannot work.
+        SettingError: A setting is invalid.
     """
 
     def __init__(

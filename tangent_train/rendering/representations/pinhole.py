@@ -62,7 +62,7 @@ class PinholeRepresentation:
         rotation: Rotation of the images as a whole while training.
         mirror: Mirror half of the training samples left to right.
         erp_height: Rows of the panorama, default `equirect_shape(level)`.
-        blend: How overlapping images are joined in evaluation.
+        blend: Blending of overlapping images in evaluation.
         faces_per_panorama: Images drawn at random for a training sample; all by default.
 
     Raises:
@@ -139,7 +139,7 @@ class TangentRepresentation(PinholeRepresentation):
         faces_per_panorama: Images drawn at random for a training sample; all by default.
         rotation: Rotation of the icosahedron while training.
         mirror: Mirror half of the training samples left to right.
-        blend: How overlapping images are joined in evaluation: the scores of the owner
+        blend: Blending of overlapping images in evaluation: the scores of the owner
             (`nearest`), or probabilities averaged with weights that fall to the borders
             (`feather`).
         erp_height: Rows of the panorama, default `equirect_shape(level)`.
@@ -249,7 +249,7 @@ def turns(count: int, setting: str) -> list[NDArray[np.float64]]:
     Images stay upright, as most networks know them: any rotation at all halves their scores.
 
     Args:
-        count: How many, 1 or more.
+        count: Number of rotations, 1 or more.
         setting: Its name, for the message.
 
     Raises:

@@ -53,7 +53,7 @@ class KeypointReport:
     Attributes:
         rows: From `Comparer.compare`, of all pairs.
         representations: In the order of the columns.
-        settings: What decides the figures.
+        settings: Settings that affect the scores.
         published: The paper's pairs by name, where the data are those; else empty.
     """
 
