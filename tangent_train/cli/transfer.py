@@ -92,11 +92,14 @@ def _compared(config: DictConfig) -> dict[str, dict[str, Any]]:
 def _check_given(config: DictConfig, stages: Sequence[Stage]) -> None:
     """Refuse a checkpoint that has seen the test rooms of another fold."""
     from tangent_train.checkpoints.content import read_checkpoint
+    from tangent_train.registry import check_fields
 
     if config.checkpoint is None:
         return
-    given = read_checkpoint(Path(config.checkpoint), ("config",))["config"]
-    fold = given.get("data", {}).get("fold")
+    path, expected = Path(config.checkpoint), "the settings of a run"
+    given = read_checkpoint(path, ("config",))["config"]
+    data = check_fields(path, given, {"data": dict}, expected)["data"]
+    fold = check_fields(path, data, {"fold": int | None}, expected, "data")["fold"]
     if fold is not None and {stage.fold for stage in stages} != {fold}:
         raise SettingError(
             f"checkpoint={config.checkpoint}",

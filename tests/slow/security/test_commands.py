@@ -44,6 +44,26 @@ def test_every_command_refuses_what_once_ran(
     assert not happened
 
 
+@pytest.mark.parametrize("way", [*WAYS, "no data"])
+def test_a_transfer_takes_tensors_and_the_fold_only(
+    way: str,
+    content: dict[str, Any],
+    forbidden: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(forbidden.parent)
+    sections: dict[str, Any] = {"data": "text"} if way == "no data" else WAYS[way][0]
+    path = with_config(content, Path(), **sections)
+    arguments = ["experiment=rooms/transfer", f"checkpoint={path}", "seeds=[0]", "data.root=rooms"]
+    made = ["data.rooms.height=1"]  # refused when the data are about to be made
+    with watched(forbidden) as happened, pytest.raises(SystemExit) as raised:
+        run_command(monkeypatch, "transfer", *arguments, *made)
+    assert "Traceback" not in capsys.readouterr().err
+    assert re.search("last.ckpt: found" if way == "no data" else "height", str(raised.value))
+    assert not happened
+
+
 def test_names_of_classes_are_names(
     forbidden: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
