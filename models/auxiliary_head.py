@@ -19,8 +19,8 @@ __all__ = ["AuxiliaryHead"]
 class AuxiliaryHead(nn.Module):
     """Scores at an encoder stage beside those of the network, in training only.
 
-    A 1×1 convolution on the features of the stage. It puts deep layers to use that a network with
-    skip connections learns to need only late; evaluation and export are not affected.
+    A 1×1 convolution on the features of the stage. It trains deep layers that a network with
+    skip connections otherwise learns to use only late; evaluation and export are not affected.
 
     Args:
         network: Any module ``(B, C, h, w) -> scores``, a tensor or a mapping with one under
@@ -30,8 +30,8 @@ class AuxiliaryHead(nn.Module):
         num_classes: Classes, the unknown class 0 included.
 
     Raises:
-        SettingError: There is no such stage (it names those there are), or the network takes more
-            than images.
+        SettingError: There is no such stage (the message lists the stages), or the network takes
+            more than images.
     """
 
     def __init__(self, network: nn.Module, stage: str, in_channels: int, num_classes: int) -> None:

@@ -40,14 +40,14 @@ _DROPPED = (_LAST, "aux_classifier.", "backbone.fc.")
 class FCNResNet(nn.Module):
     """torchvision's FCN on a dilated ResNet, without its auxiliary classifier.
 
-    The last layer is always untrained, and the filters of channels after the third start at zero
-    (paper, supplement, "Level 10 parameters").
+    The last layer is always randomly initialized, and filters of channels after the third start at
+    zero (paper, supplement, "Level 10 parameters").
 
     Args:
         in_channels: Channels of the image: 3 for RGB, 4 for RGB-D.
         num_classes: Classes, the unknown class 0 included.
         depth: 50 or 101.
-        weights: Trained RGB weights. ``coco``: torchvision's FCN, trained on COCO; ``imagenet``:
+        weights: Pretrained RGB weights. ``coco``: torchvision's FCN, trained on COCO; ``imagenet``:
             its ResNet; both are downloaded on first use. Or a file: a state dict of the FCN or of
             the ResNet, or a checkpoint of this package. None: random initialization.
         frozen_statistics: Train in evaluation mode, as the released code does: batch normalization
@@ -83,7 +83,7 @@ class FCNResNet(nn.Module):
         self.train()
 
     def train(self, mode: bool = True) -> FCNResNet:
-        """Set the mode; with `frozen_statistics`, normalization and dropout stay as evaluated."""
+        """Set the mode; with `frozen_statistics`, normalization and dropout keep evaluation mode."""
         super().train(mode)
         for module in self.modules() if self.frozen_statistics else ():
             if isinstance(module, _BatchNorm | nn.Dropout):

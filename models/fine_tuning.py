@@ -1,4 +1,4 @@
-"""Starting a network from the trained tensors of another one."""
+"""Initialization of a network from the trained tensors of another."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def initialize(
     path: Path | str,
     channels: tuple[Sequence[str], Sequence[str]] | None = None,
 ) -> Origins:
-    """Load what fits from a checkpoint, a state dict or a safetensors file, in place.
+    """Load matching tensors from a checkpoint, state dict or safetensors file, in place.
 
     Names are compared without the prefix that most of the file's (``module.``, ``model.net.``, …)
     or the network's have, and without ``network.``, so tensors move into and out of modules that
@@ -62,7 +62,7 @@ def initialize(
 
     Args:
         network: Changed in place.
-        path: The file, of which nothing but tensors and plain values is read.
+        path: The file; only tensors and plain values are read.
         channels: Names of the input channels of the file's network and of this one; filters of the
             first convolution are matched by them. By default they are matched by position.
 
@@ -129,7 +129,7 @@ def _channel_names(
 
 
 def _by_channel(given: Tensor, before: Sequence[str], now: Sequence[str]) -> tuple[Tensor, str]:
-    """Filters for the channels wanted, and what has changed."""
+    """Filters for the wanted channels, and a description of the change."""
     new = ", ".join(name for name in now if name not in before)
     lost = ", ".join(name for name in before if name not in now)
     notes = [f"starts at zero: {new}"] * bool(new) + [f"left out: {lost}"] * bool(lost)

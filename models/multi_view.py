@@ -14,9 +14,9 @@ __all__ = ["MultiView"]
 
 @registered
 class MultiView(nn.Module):
-    """Classifies every view of a shape by itself and averages the scores.
+    """Classify every view of a shape separately and average the scores.
 
-    In this way networks trained on photos classify shapes (after Su et al. 2015, who max-pool
+    Networks trained on photos can thus classify shapes (after Su et al. 2015, who max-pool
     features). The first convolution is widened to further channels, whose filters start at zero; a
     last layer for another number of classes is replaced by an untrained one.
 

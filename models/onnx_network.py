@@ -67,7 +67,7 @@ class OnnxNetwork(nn.Module):
             raise DataError(
                 path,
                 found="tensors in other files",
-                expected="a network with all that belongs to it inside",
+                expected="a self-contained network",
                 remedy="Save it with its weights in the file.",
             )
         inputs, outputs = self._session.get_inputs(), self._session.get_outputs()

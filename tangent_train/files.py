@@ -47,8 +47,7 @@ def no_room(path: Path, error: BaseException) -> NoRoomError | None:
         found=f"{os.strerror(error.errno).lower()} ({shutil.disk_usage(folder).free / 1e9:.1f} GB "
         "free)",
         expected="room for the file",
-        remedy="Nothing that was there before has changed. Free some space, or write to another "
-        "disk.",
+        remedy="Existing files are unchanged. Free some space, or write to another disk.",
     )
 
 

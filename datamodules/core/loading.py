@@ -66,7 +66,7 @@ def explained(error: Exception, num_workers: int) -> Exception:
         return SettingError(
             "data.num_workers",
             found=f"{num_workers}, and a {text.partition('. ')[0]}",
-            expected="workers that live",
+            expected="workers that keep running",
             remedy=_FEWER,
         )
     if not isinstance(error, DataError | SettingError):

@@ -176,7 +176,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
                     self.root,
                     found="no such folder",
                     expected="the data set",
-                    remedy="Run tangent-prepare with the same settings: it makes it.",
+                    remedy="Run tangent-prepare with the same settings.",
                 )
             count = self.find(problems).check(problems, progress=progress)
         return problems, count
@@ -202,7 +202,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
                     self.root,
                     found=f"no {self.noun} for {split} that can be used",
                     expected="one or more",
-                    remedy="tangent-check lists what is wrong with them.",
+                    remedy="tangent-check lists their problems.",
                 )
         if problems.items:
             total = len(problems.items.union(item.name for item in found.of()))

@@ -137,7 +137,7 @@ def read_classes(path: Path) -> FolderClasses:
         raise DataError(
             path,
             found="no such file" if path.parent.is_dir() else f"no folder {path.parent}",
-            expected="the classes of one's own panoramas",
+            expected="the classes of your panoramas",
             remedy="Give data.root=<folder>; docs/own_data.md says what is in it.",
         ) from error
     except (OSError, ValueError) as error:
@@ -173,7 +173,7 @@ def _check_names(path: Path, names: list[Any]) -> None:
         raise DataError(
             path,
             found=f"a class {UNKNOWN_NAME!r}",
-            expected="none: all that is not named is unknown",
+            expected="none: everything not named is unknown",
             remedy="Leave it out; in a list, write null in its place.",
         )
     twice = sorted({name for name in names if names.count(name) > 1})

@@ -103,8 +103,8 @@ class FolderSplits:
             raise DataError(
                 self.root / "images",
                 found=f"{len(scenes)} scenes to draw those of {split} from",
-                expected="two or more: first folders, or images that are in none",
-                remedy=f"Have more of them, or name some in {split}.txt.",
+                expected="two or more: top-level folders, or images outside folders",
+                remedy=f"Add scenes, or name some in {split}.txt.",
             )
         return {files.name for files in panoramas if _scene(files) in drawn}
 

@@ -73,7 +73,7 @@ class ModelNet40(SplitDataModule[ShapeFile]):
             raise SettingError(
                 "representation",
                 found=type(self.representation).__name__,
-                expected="one for panoramas: the spheres of shapes are such",
+                expected="one for panoramas, such as the spheres of shapes",
                 remedy="Choose representation=tangent.",
             )
         if self.test_rotation not in (None, "yaw", "so3"):

@@ -179,6 +179,6 @@ def _resolve(names: Iterable[str], files: Sequence[PictureFiles]) -> dict[str, P
             files[0].rgb.parent,
             found=", ".join(wrong),
             expected="one panorama for each image of the paper's pairs",
-            remedy="Copy or extract area_1 again; data.pairs=rooms takes what is there.",
+            remedy="Copy or extract area_1 again; data.pairs=rooms uses the panoramas present.",
         )
     return {name: by_name[name][0] for name in names}

@@ -1,4 +1,4 @@
-"""The exponential moving average of the weights of a training."""
+"""Exponential moving average of the weights in training."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Checkpoints: what is in them, when they are written, and going on exactly where one was."""
+"""Checkpoints: their content, when they are written, and exact resuming."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ __all__ = [
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
-    """Writes beside the old checkpoint and renames.
+    """Write beside the old checkpoint and rename.
 
     Lightning's own writes to the system's temporary folder, often another disk: moving from there
     is a copy that a kill cuts off.
@@ -49,12 +49,12 @@ class AtomicCheckpointIO(TorchCheckpointIO):
             torch.save(checkpoint, temporary)
 
     def remove_checkpoint(self, path: str | Path) -> None:
-        """Remove a file. Lightning's own would remove a folder with all that is in it."""
+        """Remove a file. Lightning's own would remove a whole folder."""
         Path(path).unlink(missing_ok=True)
 
 
 class CheckpointContents(Callback):
-    """Puts all that later commands need into every checkpoint, and the state of the randomness.
+    """Store what later commands need in every checkpoint, and the random state.
 
     Args:
         contents: Nested dicts and lists of plain values, by name.
@@ -110,12 +110,11 @@ def _of_all_processes(trainer: lightning.Trainer, value: Any) -> list[Any]:
 
 
 class LastCheckpoint(Checkpoint):
-    """Keeps ``last.ckpt`` at the newest state training can go on from.
+    """Keep ``last.ckpt`` at the newest state from which training can resume.
 
     Written before the first step, after every epoch, every so many steps, and on SIGTERM (what a
-    cluster sends before it kills): after the running step, or at the end of the epoch when its
-    steps are done. A run can always be resumed, exactly where it was. How to do that is said when
-    it is interrupted.
+    cluster sends before it kills): after the current step, or at the end of the epoch once its
+    steps are done. A run can always be resumed exactly; an interrupted run prints the command.
 
     Args:
         folder: The checkpoints' folder of a run.
@@ -123,7 +122,7 @@ class LastCheckpoint(Checkpoint):
         typed: Settings that the resuming command needs besides the folder.
 
     Attributes:
-        has_begun: Whether the training has: all that is restored is.
+        has_begun: Whether training has begun: everything restored is then in place.
 
     Raises:
         SettingError: Fewer than one step.
@@ -146,8 +145,8 @@ class LastCheckpoint(Checkpoint):
     ) -> None:
         """Save the untrained state of a new run, and listen for SIGTERM.
 
-        Not by Lightning's handler: it talks to the other processes from within the signal, in the
-        middle of what they are saying, and all may wait for ever.
+        Not by Lightning's handler: it communicates with the other processes inside the signal
+        handler, which can deadlock.
         """
 
         def listen(number: int, _: object) -> None:
@@ -197,7 +196,7 @@ class LastCheckpoint(Checkpoint):
         pl_module: lightning.LightningModule,
         exception: BaseException,
     ) -> None:
-        """Say how to resume the run."""
+        """Print how to resume the run."""
         if trainer.is_global_zero and self.has_begun:
             saved = "here" if isinstance(exception, SIGTERMException) else "the last checkpoint"
             command = shlex.join([f"resume={self.path.parent.parent}", *self.typed])
@@ -216,11 +215,11 @@ class LastCheckpoint(Checkpoint):
 
 
 class BestCheckpoint(ModelCheckpoint):
-    """Keeps ``best.ckpt``, the epoch with the highest figure of the validation split.
+    """Keep ``best.ckpt``, the epoch with the highest validation score.
 
     Args:
         folder: Output folder, of a resumed run whose folder was moved too.
-        monitor: The figure.
+        monitor: The score.
     """
 
     def __init__(self, folder: Path | str, monitor: str = "val/miou") -> None:
@@ -234,7 +233,7 @@ class BestCheckpoint(ModelCheckpoint):
         )
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Take how good the best epoch was; where its file is does not come out of a file."""
+        """Restore the best score; the path of its file is not taken from a file."""
         score = state_dict["best_model_score"]
         if score is None:
             return

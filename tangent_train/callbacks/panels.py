@@ -24,7 +24,7 @@ _PANORAMA_DIMENSIONS = 2
 
 
 class PredictionPanels(Callback):
-    """Writes pictures of test panoramas or photos: input, truth, prediction, error.
+    """Writes pictures of test panoramas or photos: input, ground truth, prediction, error.
 
     Args:
         folder: Output folder.
@@ -49,7 +49,7 @@ class PredictionPanels(Callback):
     def on_test_start(
         self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
     ) -> None:
-        """Start anew."""
+        """Reset."""
         self._encoded = {}
 
     def on_test_batch_end(  # noqa: D102 - a hook of Lightning
@@ -84,7 +84,7 @@ class PredictionPanels(Callback):
         self._encoded[index] = encode_image(viewed, classes)
 
     def on_test_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Bring together what the processes have."""
+        """Gather the images of all processes."""
         parts = [self._encoded]
         if torch.distributed.is_available() and torch.distributed.is_initialized():
             parts *= trainer.world_size
@@ -102,7 +102,7 @@ class ProgressBar(RichProgressBar):
     def get_metrics(
         self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
     ) -> dict[str, Any]:
-        """The figures behind the bar."""
+        """Metrics shown behind the bar."""
         figures = dict(super().get_metrics(trainer, pl_module))
         figures.pop("v_num", None)
         return figures

@@ -30,8 +30,8 @@ _PANORAMA_DIMENSIONS = 2
 class ValidationPictures(Callback):
     """Shows a few validation images in TensorBoard, after every validation.
 
-    ``val_images/<name>``: input, truth, prediction and error; always the same images, spread over
-    those that the first process sees.
+    ``val_images/<name>``: input, ground truth, prediction and error; always the same images,
+    spread over those of the first process.
 
     Args:
         count: Number of images.
@@ -71,12 +71,12 @@ class ValidationPictures(Callback):
 
 
 class ValidationConfusion(Callback):
-    """Shows in TensorBoard, after every validation, how every class fares.
+    """Log per-class scores to TensorBoard after every validation.
 
     * ``val_iou/<class>``, of shapes ``val_accuracy/<class>``: of the classes that occur.
     * ``val/confusion``: the confusion matrix, in percent of the true class.
 
-    They stand at the same steps as ``val/miou``. Only the first process draws, and only with a
+    They are logged at the same steps as ``val/miou``. Only the first process draws, and only with a
     TensorBoard logger.
     """
 
@@ -105,8 +105,8 @@ class ValidationConfusion(Callback):
 class TrainingSpeed(Callback):
     """Logs ``speed/images_per_s`` once an epoch.
 
-    Images (tangent images, crops, whatever the network sees) that all processes trained on per
-    second of the epoch, its validation left out.
+    Network inputs (tangent images, crops, …) that all processes trained on per second of the
+    epoch, without its validation.
     """
 
     def __init__(self) -> None:
@@ -150,7 +150,7 @@ class TrainingSpeed(Callback):
 
 
 def _smaller(image: NDArray[Any]) -> NDArray[Any]:
-    """At most `_MOST_ROWS` rows: every so many labels, the mean of so many colours."""
+    """Downsample to at most `_MOST_ROWS` rows: labels by striding, colours by averaging."""
     step = -(-image.shape[0] // _MOST_ROWS)
     labels = image[step // 2 :: step, step // 2 :: step]
     if image.ndim == _PANORAMA_DIMENSIONS or step == 1:
@@ -161,7 +161,7 @@ def _smaller(image: NDArray[Any]) -> NDArray[Any]:
 
 
 def _writer(trainer: lightning.Trainer) -> Any:
-    """TensorBoard's writer, in the first process; None where nothing is to be written."""
+    """TensorBoard's writer in the first process, otherwise None."""
     if trainer.sanity_checking or not trainer.is_global_zero:
         return None
     found = (x.experiment for x in trainer.loggers if isinstance(x, TensorBoardLogger))
@@ -174,7 +174,7 @@ def _step(trainer: lightning.Trainer) -> int:
 
 
 def _now(module: lightning.LightningModule) -> float:
-    """Seconds, once the device has done what it was given."""
+    """Seconds, after synchronizing the device."""
     if module.device.type == "cuda":
         torch.cuda.synchronize(module.device)
     return time.perf_counter()

@@ -37,7 +37,7 @@ def read_checkpoint(path: Path, needed: Collection[str] = tuple(_FIELDS)) -> dic
     """The content of a checkpoint; nothing but tensors and plain values is unpickled.
 
     Args:
-        path: The file. Tensors stay in it until they are used.
+        path: The file; tensors are memory-mapped.
         needed: Which of its fields: ``config`` (the resolved settings of the run, plain values),
             ``class_names``, ``inputs``, ``kind``, ``normalization``, ``state_dict``.
 
@@ -65,8 +65,8 @@ def read_checkpoint(path: Path, needed: Collection[str] = tuple(_FIELDS)) -> dic
 def read_settings(path: Path) -> dict[str, Any]:
     """The settings of a run, from the file that `write_settings` wrote.
 
-    Nothing in them is looked up: ``${oc.env:HOME}`` stays what it is. Nor are aliases followed, by
-    which a few lines can stand for more than fits into memory.
+    Nothing is interpolated: ``${oc.env:HOME}`` is an ordinary string. Aliases, by which a few lines
+    can stand for more than fits into memory, are not followed.
 
     Raises:
         DataError: It is missing, or something else.
@@ -94,5 +94,5 @@ class _Dumper(yaml.SafeDumper):  # type: ignore[misc]
 
 
 def write_settings(path: Path, settings: Mapping[str, Any]) -> None:
-    """Write settings as YAML; texts are written so that any reader takes them for what they are."""
+    """Write settings as YAML, with strings quoted so that every reader takes them literally."""
     write_text(path, yaml.dump(dict(settings), Dumper=_Dumper, sort_keys=False, allow_unicode=True))

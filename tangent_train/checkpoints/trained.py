@@ -46,7 +46,7 @@ _TRAINED = "a checkpoint written by tangent-train"
 
 @dataclass(frozen=True)
 class TrainedNetwork:
-    """A trained network with all that is needed to use it.
+    """A trained network with everything needed to use it.
 
     Attributes:
         network: In evaluation mode; ``(B, C, h, w)`` float32, normalized, to scores ``(B, K+1, h,
@@ -185,7 +185,7 @@ def inputs_in(path: Path) -> tuple[Input, ...] | None:
 
 
 def metadata_json(trained: TrainedNetwork) -> str:
-    """All that is known of a network besides its numbers, as JSON.
+    """Metadata of a network, as JSON.
 
     The fields of `TrainedNetwork`, but ``network`` and ``source``, under their names;
     ``normalization`` with ``mean`` and ``std``; ``tangent_train_version``.

@@ -70,7 +70,7 @@ def keypoints(config: Mapping[str, Any]) -> None:
         return KeypointReport(rows, comparer.ways.representations, settings, pairs.published)
 
     missing = [(k, name) for k, name in enumerate(names) if name not in done]
-    console.print(f"{len(names) - len(missing)} of {len(names)} pairs are there already")
+    console.print(f"{len(names) - len(missing)} of {len(names)} pairs are done already")
     for index, name in track(missing, "Comparing pairs", console=console, disable=not missing):
         try:
             pair = pairs.read(index)
@@ -156,7 +156,9 @@ def _export(
     for file, (height, width) in zip(sides, shapes, strict=True):
         if abs(width - 2 * height) > 1:
             found = f"{height}×{width} pixels, a part of a panorama"
-            raise DataError(file, found=found, expected="a whole one: COLMAP knows no others")
+            raise DataError(
+                file, found=found, expected="a whole panorama: COLMAP supports no partial ones"
+            )
     root = _root(files)
     names = tuple(file.absolute().relative_to(root).as_posix() for file in sides)
     for name, found_ in comparison.found[AS_GIVEN].items():

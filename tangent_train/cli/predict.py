@@ -109,7 +109,7 @@ def predict(config: Mapping[str, Any]) -> None:
                 _save(folder, decisive, entries)
                 saved = time.monotonic()
     except KeyboardInterrupt:
-        _say(f"{len(entries)} of {len(images)} images are done. resume=true goes on.")
+        _say(f"{len(entries)} of {len(images)} images are done. resume=true continues.")
         raise
     finally:
         _save(folder, decisive, entries)

@@ -153,7 +153,7 @@ def stored_run(command: str, arguments: Sequence[str]) -> StoredRun | None:
             raise SettingError(
                 f"resume={path}",
                 found=f"{chosen[0]} beside it",
-                expected="single settings (data.root=…): a run that is resumed has its options",
+                expected="single settings (data.root=…): a resumed run keeps its options",
             )
         place.append(f"hydra.run.dir={quoted(str(path))}")
         path = path / "checkpoints" / "last.ckpt"
@@ -161,7 +161,7 @@ def stored_run(command: str, arguments: Sequence[str]) -> StoredRun | None:
             raise DataError(
                 path.parents[1],
                 found="no checkpoints/last.ckpt",
-                expected="the folder of a run that has begun",
+                expected="the folder of a started run",
                 remedy="Give resume= the folder that tangent-train printed.",
             )
     config = read_checkpoint(path, ("config",))["config"]

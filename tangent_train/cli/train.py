@@ -118,7 +118,7 @@ def _fit(run: Run, trainer: lightning.Trainer, resumed: Path | None, last: LastC
                 expected="the last checkpoint of this run",
             ) from error
         except MisconfigurationException as error:  # as fewer epochs than a resumed run has done
-            raise SettingError("trainer", found=error, expected="settings that can work") from error
+            raise SettingError("trainer", found=error, expected="valid settings") from error
 
 
 def _check_resumed(settings: Settings, before: Mapping[str, Any]) -> None:
@@ -127,7 +127,7 @@ def _check_resumed(settings: Settings, before: Mapping[str, Any]) -> None:
         raise SettingError(
             name,
             found=f"{now!r} for a run that began with {then!r}",
-            expected="no other than before",
+            expected="the same as before",
             remedy="Start a new run for it.",
         )
 

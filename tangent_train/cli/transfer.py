@@ -58,7 +58,7 @@ def transfer(config: DictConfig) -> None:
         for number, stage in enumerate(stages, start=1):
             _run(stage, f"Stage {number} of {len(stages)}, {stage.name} in {stage.folder}")
     except (KeyboardInterrupt, SystemExit):
-        _say("Finished stages stay; the same command goes on.", error=True)
+        _say("Finished stages are kept; the same command continues.", error=True)
         raise
     _report(config, folder, stages)
 

@@ -113,7 +113,7 @@ class PinholeGrid(ABC):
         """Directions of the pixel centres.
 
         Args:
-            faces: Images asked for, default all.
+            faces: Images to return, default all.
 
         Returns:
             ``(n, d, d, 3)`` unit vectors.

@@ -99,7 +99,7 @@ def export_network(
     raise SettingError(
         "output",
         found=f"{path.name}, which cannot be written ({str(cause).strip().partition(chr(10))[0]})",
-        expected="a network that the exporter of torch understands",
+        expected="a network that torch's exporter supports",
         remedy="A .safetensors file takes every network.",
     ) from failure
 
@@ -157,7 +157,7 @@ def _write_onnx(trained: TrainedNetwork, path: Path, opset: int | None) -> None:
 
 @contextmanager
 def _quiet_exporter() -> Iterator[None]:
-    """Hide the exporter's notes to its developers: what it writes is verified anyway."""
+    """Hide the exporter's developer notes: its output is verified anyway."""
     disabled = logging.root.manager.disable
     logging.disable()
     try:
@@ -179,7 +179,7 @@ def _write_safetensors(trained: TrainedNetwork, path: Path) -> None:
 
 @torch.no_grad()
 def _verified(trained: TrainedNetwork, path: Path) -> Export:
-    """Read the file as any user does and compare."""
+    """Read the file as a user would and compare."""
     exported = load_trained(path, trained.source.trust if trained.source else ())
     rows, columns = trained.image_size
     step = trained.size_multiple

@@ -1,4 +1,4 @@
-"""People's own images as input of a network."""
+"""The user's own images as network input."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def read_panorama(
         max_tilt_deg: Of estimates, see `estimate_up`.
 
     Returns:
-        The whole sphere, black where the file shows nothing, and where on it the file lies.
+        The whole sphere, black outside the file's area, and that area.
 
     Raises:
         DataError: A file cannot be used.
@@ -125,7 +125,7 @@ def read_photo(
         raise DataError(
             path,
             found="no focal length in its EXIF data",
-            expected="the field of view, which tells how large things in the photo are",
+            expected="the field of view, which gives the angular resolution",
             remedy="Give fov=, the horizontal one in degrees: 65 to 80 for most phones.",
         )
     depth_steps = None if depth is None else depth.read(name, size)

@@ -30,7 +30,7 @@ _PIXELS_PER_FORWARD = 2**20
 
 
 def sees_rays(network: nn.Module) -> bool:
-    """Whether a network takes where its images look, as one with cross-image attention does."""
+    """Whether a network takes viewing rays, as for cross-image attention."""
     return "rays" in inspect.signature(network.forward).parameters
 
 
@@ -70,9 +70,9 @@ class Predictor:
     Args:
         trained: The network; it is moved to the device.
         view_sets: Its views: `PanoramaViews` or `PhotoViews`.
-        device: Any of torch's.
-        images_per_forward: Views per call of the network, a bound on memory; None for as many as
-            have 2^20 pixels. A network with cross-image attention takes all views of a panorama
+        device: A torch device.
+        images_per_forward: Views per call of the network, which bounds memory; None for 2^20
+            pixels' worth. A network with cross-image attention takes all views of a panorama
             at once, and their scores are held.
 
     Raises:
@@ -114,7 +114,7 @@ class Predictor:
         Args:
             image: A panorama or photo.
             progress: Called with the share of the image done since its last call.
-            probabilities: Whether `ScoreMosaic.probabilities` will be asked for.
+            probabilities: Whether `ScoreMosaic.probabilities` is needed.
 
         Returns:
             The scores; class k of them is label k + 1.

@@ -97,10 +97,10 @@ class ViewSets(Protocol):
 
 
 class PanoramaViews:
-    """Views of panoramas: those of the training, if nothing else is asked for.
+    """Views of panoramas, by default those of training.
 
-    Networks trained on photos see tangent images of base level 1, at the level whose angular
-    resolution their crops had.
+    Networks trained on photos get tangent images of base level 1, at the level that matches the
+    angular resolution of their crops.
 
     Args:
         trained: The network.
@@ -133,8 +133,8 @@ class PanoramaViews:
                 raise SettingError(
                     "rotations and upright",
                     found=f"{rotations}, {upright}",
-                    expected="1 and null for a network that sees equirectangular images",
-                    remedy="Give base_level= to show it tangent images.",
+                    expected="1 and null for a network that takes equirectangular images",
+                    remedy="Give base_level= to use tangent images.",
                 )
             self.blend = "nearest"
         elif not self._seen.grid.overlapping:
@@ -155,7 +155,7 @@ class PanoramaViews:
 
 
 class PhotoViews:
-    """Crops of photos, with the size and angular resolution of what the network was trained on.
+    """Crops of photos, with the size and angular resolution of the network's training images.
 
     Args:
         trained: The network.

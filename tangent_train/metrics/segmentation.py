@@ -61,9 +61,9 @@ def segmentation_scores(
 
     Args:
         confusion: ``(K+1, K+1)`` counts or weights, rows truth, columns prediction, class 0 unknown
-            (pixels of unknown truth do not count).
-        absent_class: `skip` leaves classes absent from the truth out of the means; `zero` counts
-            them as 0, as the released code does.
+            (pixels without ground truth are ignored).
+        absent_class: `skip` leaves classes absent from the ground truth out of the means; `zero`
+            counts them as 0, as the released code does.
 
     Returns:
         The scores; means are NaN when nothing is labelled and absent classes are skipped.
@@ -102,7 +102,7 @@ class ConfusionMatrices(NamedTuple):
 class ConfusionMatrix(Metric):
     """Confusion matrices: integer pixel counts, and of panoramas also by latitude and solid angle.
 
-    ERP pixels over-count the poles; the matrix of solid angles weighs every pixel by its own.
+    ERP pixels over-count the poles; the matrix of solid angles weights every pixel by its own.
     All are summed over processes.
 
     Args:

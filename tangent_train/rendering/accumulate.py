@@ -1,7 +1,7 @@
-"""Adding images of a grid to a panorama: what labels, feathering and mosaics have in common.
+"""Adding images of a grid to a panorama, for labels, feathering and mosaics.
 
-Nearest and feather are two weightings of the same sum: 1 where an image is the owner, or what falls
-to 0 at its borders.
+Nearest and feather are two weightings of the same sum: 1 where an image is the owner, or a weight
+that falls to 0 at its borders.
 """
 
 from __future__ import annotations

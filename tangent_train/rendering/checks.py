@@ -1,4 +1,4 @@
-"""Checks of what callers hand to the renderers."""
+"""Argument checks of the renderers."""
 
 from __future__ import annotations
 

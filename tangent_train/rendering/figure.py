@@ -1,4 +1,4 @@
-"""A panorama beside its tangent images, in one picture."""
+"""A panorama and its tangent images in one figure."""
 
 from __future__ import annotations
 

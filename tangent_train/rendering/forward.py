@@ -46,7 +46,7 @@ def equirect_to_tangent(
             ``(H, W[, C])``: uint8, uint16 and float32 go through `cv2.remap` (see `sample_map`
             about its precision), other dtypes are slower.
         grid: The images, a `TangentGrid` or a `CubeGrid`.
-        faces: Images asked for, default all; only they are rendered.
+        faces: Images to render, default all.
         interpolation: ``bilinear``, or ``nearest`` for labels and masks of any dtype.
 
     Returns:

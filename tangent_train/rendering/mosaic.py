@@ -1,8 +1,8 @@
-"""Class scores of one panorama or photo, put together image by image.
+"""Class scores of one panorama or photo, accumulated image by image.
 
 `tangent_to_labels` wants the scores of all images at once: 5 GB for 13 classes at level 11. Here
-they come a few images at a time, of any number of grids, and are forgotten. Without averaging only
-the labels are kept.
+they arrive a few images at a time, from any number of grids, and are not kept. Without averaging,
+only the labels are kept.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class ScoreMosaic:
             a pixel, beyond 2 GiB in a temporary file (of the folder TMPDIR).
 
     Raises:
-        SettingError: There is no room for the sums.
+        SettingError: The temporary file for the sums does not fit on the disk.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class ScoreMosaic:
         self._owned: tuple[object, NDArray[np.integer]] = None, NO_OWNERS
 
     def add(self, scores: Tensor, grid: PinholeGrid, faces: NDArray[np.int64]) -> None:
-        """Add some images of a grid; every face of it is to come once.
+        """Add some images of a grid; every face must be added once.
 
         Args:
             scores: ``(n, K, d, d)`` scores, not probabilities.
@@ -89,7 +89,7 @@ class ScoreMosaic:
         )
 
     def add_crops(self, scores: Tensor, crops: PhotoCrops, which: NDArray[np.int64]) -> None:
-        """Add some crops of a photo; every one of them is to come once.
+        """Add some crops of a photo; each must be added once.
 
         Args:
             scores: ``(n, K, h, w)`` scores, not probabilities.

@@ -1,4 +1,4 @@
-"""The whole panorama rotated."""
+"""Rotation of whole panoramas."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Scalar = TypeVar("Scalar", bound=np.generic)
 def rotate_equirect(
     image: NDArray[Scalar], rotation: ArrayLike, interpolation: Interpolation = "bilinear"
 ) -> NDArray[Scalar]:
-    """Rotate what a panorama shows: direction d of the result shows the input at Rᵀd.
+    """Rotate a panorama: direction d of the result shows the input at Rᵀd.
 
     Args:
         image: ``(H, W[, C])``, as `equirect_to_tangent` takes it.

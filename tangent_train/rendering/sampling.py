@@ -52,8 +52,8 @@ def sample_map(
     """Sample a panorama, longitude wrapped and poles reflected.
 
     uint8, uint16 and float32, and the nearest pixel of anything, are sampled by `cv2.remap`. OpenCV
-    4 may round positions to 1/32 pixel, which 8-bit images do not show; OpenCV 5 does not. All else
-    is exact.
+    4 may round positions to 1/32 pixel, which is invisible in 8-bit images; OpenCV 5 does not. All
+    other sampling is exact.
 
     Args:
         table: Positions ``(h, w)`` in the panorama.

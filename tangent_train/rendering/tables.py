@@ -56,7 +56,7 @@ class TableCache:
     once both build it.
 
     Args:
-        limit: Most bytes held.
+        limit: Maximum number of bytes held.
     """
 
     def __init__(self, limit: int) -> None:
@@ -107,7 +107,7 @@ def set_table_cache_limit(nbytes: int) -> None:
     117 MB back. Tables on a GPU count too.
 
     Args:
-        nbytes: Most bytes held; 0 keeps nothing.
+        nbytes: Maximum number of bytes held; 0 disables the cache.
 
     Raises:
         SettingError: The number is negative.
@@ -118,7 +118,7 @@ def set_table_cache_limit(nbytes: int) -> None:
 
 
 def _cached(grid: PinholeGrid, key: tuple[Hashable, ...], build: Callable[[], Value]) -> Value:
-    """Tables of rotated grids are not kept: random rotations would push out all others."""
+    """Tables of rotated grids are not cached: random rotations would evict all others."""
     return build() if grid.rotation is not None else TABLES.get((grid, *key), build)
 
 

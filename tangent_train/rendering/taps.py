@@ -81,7 +81,7 @@ def nearest_equirect_index(u: Tensor, v: Tensor, shape: tuple[int, int]) -> Tens
 def image_taps(
     face: Tensor, u: Tensor, v: Tensor, dim: int, weight: Tensor, image_size: int
 ) -> Taps:
-    """Bilinear taps in tangent images; positions off the outermost pixel centres move onto them.
+    """Bilinear taps in tangent images; positions beyond the outermost pixel centres are clamped.
 
     Args:
         face: ``(R, P)`` images, any integer dtype.

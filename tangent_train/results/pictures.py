@@ -1,4 +1,4 @@
-"""Pictures of predictions: input, truth, prediction and error, with a legend."""
+"""Pictures of predictions: input, ground truth, prediction and error, with a legend."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tasks: what is learned and how it is scored. Networks are injected, never imported."""
+"""Tasks: loss, metrics and optimization. Networks are injected, never imported."""
 
 from tangent_train.tasks.classification import ClassificationTask
 from tangent_train.tasks.segmentation import SegmentationTask

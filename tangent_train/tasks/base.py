@@ -36,13 +36,13 @@ class Task(lightning.LightningModule, ABC):
         class_names: Names of the classes.
         optimizer: Makes the optimizer from parameters.
         scheduler: Makes a learning rate scheduler from the optimizer, or None. One that takes
-            `total_steps` is told the length of the training and stepped every step, others every
+            `total_steps` gets the length of the training and is stepped every step, others every
             epoch.
         label_smoothing: Fraction of the target that is spread over all classes.
-        images_per_chunk: Images trained at once, a bound on memory; None for the whole batch.
-            Batch normalization sees one chunk at a time.
+        images_per_chunk: Images per forward pass in training, which bounds memory; None for the
+            whole batch. Batch normalization sees one chunk at a time.
         channels_last: Memory format of network and images, often faster.
-        compile: Arguments of `torch.compile` for the network, empty for its defaults; None not to.
+        compile: Arguments of `torch.compile`, empty for its defaults; None to disable it.
 
     Attributes:
         kind: Kind of labels learned.
@@ -172,13 +172,13 @@ class Task(lightning.LightningModule, ABC):
         return loss
 
     def on_after_backward(self) -> None:
-        """Stop before a step whose loss is not finite, on all processes.
+        """Stop before a step with a non-finite loss, on all processes.
 
         Gradients are not checked: with `trainer.precision=16-mixed` those that overflow are
-        skipped and the loss scale shrinks, as it should.
+        skipped and the loss scale shrinks, as intended.
 
         Raises:
-            SettingError: The loss is not finite.
+            SettingError: The loss is NaN or infinite.
         """
         if self._pending is None:  # a part that is not the last
             return

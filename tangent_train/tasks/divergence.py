@@ -15,7 +15,7 @@ _NAMED = 5
 
 
 def refuse_loss(task: lightning.LightningModule, loss: float, batch: Any) -> NoReturn:
-    """End the training at a loss that is not finite, and say where it comes from.
+    """Stop training at a non-finite loss and name its cause.
 
     Args:
         task: With the weights before the step.
@@ -48,7 +48,7 @@ def check_weights(task: lightning.LightningModule) -> None:
         task: The trained task.
 
     Raises:
-        SettingError: A weight or a running statistic is not finite.
+        SettingError: A weight or a running statistic is NaN or infinite.
     """
     broken = _not_finite(task)
     if broken:
@@ -62,7 +62,7 @@ def check_weights(task: lightning.LightningModule) -> None:
 
 
 def _not_finite(task: lightning.LightningModule) -> list[str]:
-    """Names of tensors that no training survives; masks may well hold infinities."""
+    """Names of tensors with NaN or infinite weights; masks may hold infinities."""
 
     def broken(tensor: Tensor) -> bool:
         return not (tensor.isfinite() if tensor.requires_grad else ~tensor.isnan()).all()

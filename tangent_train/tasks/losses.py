@@ -18,7 +18,7 @@ def cross_entropy_sum(
     class_weights: Float[Tensor, " classes"],
     label_smoothing: float = 0.0,
 ) -> Tensor:
-    """Weighted cross-entropy, summed; unknown pixels (class 0) count for nothing.
+    """Weighted cross-entropy, summed; unknown pixels (class 0) are ignored.
 
     Divided by the `cross_entropy_norm` of the same images it is torch's weighted mean. Divided by
     the norm of *all* images, chunks and processes instead, it is their share of one mean.
@@ -43,7 +43,7 @@ def cross_entropy_sum(
 def cross_entropy_norm(
     labels: UInt8[Tensor, "images height width"], class_weights: Float[Tensor, " classes"]
 ) -> Tensor:
-    """The class weights of the labelled pixels, added up: known before any network has run."""
+    """Sum of the class weights of the labelled pixels, known before the forward pass."""
     pixels = torch.bincount(labels.flatten(), minlength=len(class_weights))
     # Not a matrix product, which autocast would compute in half precision.
     return (pixels * _exact(class_weights))[UNKNOWN + 1 :].sum()
@@ -54,7 +54,7 @@ def auxiliary_sum(
     labels: UInt8[Tensor, "images height width"],
     class_weights: Float[Tensor, " classes"],
 ) -> Tensor:
-    """Weighted cross-entropy of the cells of a coarser stage of a network, summed over pixels.
+    """Weighted cross-entropy of the cells of a coarser network stage, summed over pixels.
 
     Every cell is compared with the class histogram of the pixels whose centers lie in it. That is
     the cross-entropy of the pixels, each with the scores of its cell, without upsampling them; its
@@ -62,7 +62,7 @@ def auxiliary_sum(
 
     Args:
         scores: Logits of the cells, of any size.
-        labels: Class indices of the pixels; 0 is unknown and counts for nothing.
+        labels: Class indices of the pixels; 0 is unknown and ignored.
         class_weights: Weight of every class.
     """
     exact = _exact(scores)

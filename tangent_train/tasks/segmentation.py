@@ -24,18 +24,18 @@ __all__ = ["SegmentationTask"]
 
 @registered
 class SegmentationTask(Task):
-    """Trains a network on views of panoramas, or on crops of photos, and scores it on the whole.
+    """Trains a network on views of panoramas, or on crops of photos, and scores whole images.
 
     The views of all images of a batch, on all processes, make one gradient (paper, supplement,
     "Semantic segmentation"): the loss is the sum over their labelled pixels divided by the sum of
-    those pixels' class weights. Validation and test see the whole sphere, or all of a photo; the
-    scores are rendered back and compared with its own labels.
+    those pixels' class weights. Validation and test cover the whole sphere, or the whole photo; the
+    scores are rendered back and compared with the original labels.
 
     Args:
         network: Any module ``(B, C, h, w) -> (B, K+1, h, w)`` or a dict with that under ``"out"``,
-            and perhaps scores of an auxiliary head under ``"aux"``; the first score belongs to the
+            and optionally auxiliary scores under ``"aux"``; the first score belongs to the
             unknown class, which is never predicted. One whose `forward` also takes ``rays`` and
-            ``images_per_chunk`` is told where on the sphere its images look, and bounds its memory
+            ``images_per_chunk`` gets the viewing rays of its images and bounds its memory
             itself (`models.SphereContext`).
         representation: Representation of the images; it assembles the scores.
         class_names: K + 1 names, the unknown class first.
@@ -43,7 +43,7 @@ class SegmentationTask(Task):
         class_weights: Weights of the loss: a name that the data module knows (``none``, ``log``,
             ``sqrt``, ``effective``) or K + 1 numbers.
         auxiliary_weight: Weight of the loss of the scores under ``"aux"``.
-        images_per_forward: Images evaluated at once, a bound on memory.
+        images_per_forward: Images per forward pass in evaluation, which bounds memory.
         absent_class: Treatment of classes absent from the ground truth in the means.
         **settings: See `Task`.
     """
@@ -160,7 +160,7 @@ class SegmentationTask(Task):
         return loss + self.auxiliary_weight * auxiliary_sum(outputs["aux"], labels, weights)
 
     def loss_norm(self, labels: Tensor) -> Tensor:
-        """The class weights of the labelled pixels, added up."""
+        """Sum of the class weights of the labelled pixels."""
         return cross_entropy_norm(labels, self.class_weights)
 
     @torch.no_grad()
@@ -175,7 +175,7 @@ class SegmentationTask(Task):
 
         Args:
             images: The representation's views of the whole.
-            shape: Of the truth: ``(H, W)`` of the panorama, or ``(n, h, w)`` of the crops.
+            shape: Of the ground truth: ``(H, W)`` of the panorama, or ``(n, h, w)`` of the crops.
             rays: Of the views.
             rotations: Of the views; none by default.
 

@@ -53,7 +53,7 @@ def test_a_command_without_a_stored_run_starts_from_the_users_configs(
 
 
 def test_what_is_no_checkpoint_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="the folder of a run that has begun"):
+    with pytest.raises(DataError, match="the folder of a started run"):
         stored_run("train", [f"resume={tmp_path}"])
     path = tmp_path / "x.ckpt"
     for content, message in (

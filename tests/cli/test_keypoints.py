@@ -110,7 +110,7 @@ def test_an_interrupted_run_goes_on(
     first = results(tmp_path / "out")["rows"]
     run(*arguments)
     assert compared == ["a – b", "a – c", "a – c", "b – c"]
-    assert "1 of 3 pairs are there already" in capsys.readouterr().out
+    assert "1 of 3 pairs are done already" in capsys.readouterr().out
     assert pairs_in(tmp_path / "out") == ["a – b", "a – c", "b – c"]
     assert results(tmp_path / "out")["rows"][:2] == first
     run(*arguments, "max_pairs=1")  # takes nothing away
@@ -146,7 +146,7 @@ def test_a_broken_pair_is_named_and_the_others_are_compared(
     # Mended, only that pair is compared.
     (tmp_path / "in" / "d.png").write_bytes(whole)
     run("input=in", *SMALL, "output=out")
-    assert "1 of 2 pairs are there already" in capsys.readouterr().out
+    assert "1 of 2 pairs are done already" in capsys.readouterr().out
     assert pairs_in(tmp_path / "out") == ["a – b", "b – d"]
     # Of nothing but broken pairs there are no results.
     assert cv2.imwrite(str(tmp_path / "square.png"), np.zeros((8, 8, 3), np.uint8))

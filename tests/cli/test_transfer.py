@@ -195,7 +195,7 @@ def test_a_killed_stage_ends_the_command(
     with pytest.raises(SystemExit) as stopped:
         run_transfer()
     assert stopped.value.code == 137, "as a shell says it"
-    assert "Finished stages stay; the same command goes on" in capsys.readouterr().err
+    assert "Finished stages are kept; the same command continues" in capsys.readouterr().err
 
 
 def test_the_level_of_the_photos() -> None:

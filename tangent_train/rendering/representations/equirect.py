@@ -35,7 +35,7 @@ class EquirectViews:
     """The panorama itself.
 
     Attributes:
-        rotation: ``(3, 3)`` rotation of the directions it looks in; None for none.
+        rotation: ``(3, 3)`` rotation of its directions; None for none.
         columns: Start of a crop, as a share of the columns, and its width; None for no crop.
         mirrored: Whether it is mirrored left to right.
     """
@@ -69,7 +69,7 @@ class EquirectViews:
 class EquirectRepresentation:
     """The baseline without tangent images: the equirectangular image, or random crops of it.
 
-    Evaluation always sees the whole image.
+    Evaluation always uses the whole image.
 
     Args:
         level: Level s of the panorama.
@@ -108,11 +108,11 @@ class EquirectRepresentation:
 
     @property
     def image_size(self) -> tuple[int, int]:
-        """Rows and columns of the panorama, which evaluation sees."""
+        """Rows and columns of the panorama, as evaluated."""
         return self.erp_height, 2 * self.erp_height
 
     def sample(self, rng: np.random.Generator) -> Views:
-        """The panorama or one crop of it, perhaps rotated."""
+        """The panorama or one crop of it, optionally rotated."""
         columns = None
         if self.crop_deg is not None or self.rotation == "yaw":
             width = round(2 * self.erp_height * (self.crop_deg or 360) / 360)

@@ -1,7 +1,7 @@
-"""Photos as input of a network: crops of one common camera (paper, supplement, section 2.1).
+"""Photos as network input: crops of one common camera (paper, supplement, section 2.1).
 
 Photos of any camera become images of the same angular resolution as a panorama's, so that a network
-trained on them knows objects at the size they will have in tangent images. The common camera has
+trained on them sees objects at their size in tangent images. The common camera has
 the side W' = H' and the field of view Ω': ``f' = W' / (2 tan(Ω'/2))``; a crop is
 ``x' = K'(K+Δ)⁻¹x`` with a shift Δ that keeps it inside the photo.
 """
@@ -55,8 +55,8 @@ class PhotoCrops:
 
         Args:
             image: The photo; for `bilinear` uint8.
-            interpolation: `bilinear` averages when it shrinks (a triangle as wide as two pixels of
-                the crop): no aliasing. `nearest` takes the pixel at the centre.
+            interpolation: `bilinear` antialiases when it downsamples (a triangle filter two crop
+                pixels wide). `nearest` takes the pixel at the centre.
         """
         draw = _nearest if interpolation == "nearest" else _smooth
         crops = np.stack([draw(image, box, self.size) for box in self.boxes])
@@ -134,7 +134,7 @@ class PhotoSampler:
     Attributes:
         camera_matrix: ``(3, 3)`` K, integer pixel centres.
         size: ``(height, width)`` of the photo.
-        representation: The common camera, and which crops to take.
+        representation: The common camera, and the selection of crops.
     """
 
     camera_matrix: NDArray[np.float64]
@@ -253,7 +253,7 @@ class PerspectiveRepresentation:
 
         Args:
             scores: Of all crops.
-            shape: Of the truth, ``(n, h, w)``.
+            shape: Of the ground truth, ``(n, h, w)``.
             rotation: Ignored: photos are not rotated.
 
         Raises:

@@ -54,7 +54,7 @@ _Grid = TypeVar("_Grid", bound=PinholeGrid)
 
 
 class PinholeRepresentation:
-    """Pinhole images around the centre: what tangent images and the faces of a cube share.
+    """Pinhole images around the centre: base of tangent images and cube maps.
 
     Args:
         grid: The images, not rotated.
@@ -100,7 +100,7 @@ class PinholeRepresentation:
         return turned
 
     def sample(self, rng: np.random.Generator) -> Views:
-        """All images or a random subset, perhaps rotated as a whole and mirrored one by one."""
+        """All images or a random subset, optionally rotated as a whole and mirrored one by one."""
         grid = self.grid
         if self.rotation != "none":
             yaw = self.rotation == "yaw"
@@ -211,10 +211,10 @@ class TangentRepresentation(PinholeRepresentation):
 
 @registered
 class CubemapRepresentation(PinholeRepresentation):
-    """The baseline between panorama and tangent images: the six faces of a cube.
+    """Cube-map baseline: the six faces of a cube.
 
-    Training and evaluation see all six. They do not overlap, so every pixel of the panorama takes
-    the scores of the one face that sees it.
+    Training and evaluation use all six. They do not overlap, so every pixel of the panorama takes
+    the scores of a single face.
 
     Args:
         level: Level s of the panorama.
@@ -246,7 +246,7 @@ class CubemapRepresentation(PinholeRepresentation):
 def turns(count: int, setting: str) -> list[NDArray[np.float64]]:
     """Rotations of the icosahedron to average over, evenly about the vertical; none is the first.
 
-    Images stay upright, as most networks know them: any rotation at all halves their scores.
+    Images stay upright, as in most networks' training: arbitrary rotations halve their scores.
 
     Args:
         count: Number of rotations, 1 or more.

@@ -1,10 +1,10 @@
-"""Representations of panoramas: the images a network sees, and how its scores become labels.
+"""Representations of panoramas: images for a network, and labels from its scores.
 
-A *representation* turns panoramas into images a network can take: tangent images, or, as
+A *representation* converts panoramas to images for a network: tangent images or, as
 baselines, the faces of a cube, the equirectangular image itself or crops of it. It draws the
 *views* of one training sample (which images, rotated and mirrored how), gives the views of the
-whole sphere for evaluation, and assembles the scores of the latter. Data modules and tasks know
-nothing else about it.
+whole sphere for evaluation, and assembles the scores of the latter. Data modules and tasks use
+nothing else of it.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Views(Protocol):
         ...
 
     def rays(self) -> NDArray[np.float32]:
-        """``(n, 3, 3)`` viewing directions of the images; `NO_RAYS` of images that are no pinholes.
+        """``(n, 3, 3)`` viewing rays of the images; `NO_RAYS` if they are not pinhole images.
 
         Each matrix maps ``(x, y, 1)``, with x and y from −1 at the left and upper edge of an image
         to 1 at the opposite one, to a direction (of any length) on the sphere.
@@ -91,7 +91,7 @@ class Assembler(Protocol):
 
         Args:
             scores: ``(n, K, h, w)`` of all images of `Sampler.whole`; of one rotation.
-            shape: Of the truth.
+            shape: Of the ground truth.
             rotation: Of the views, one of `Views.rotations`; None where they are not rotated.
         """
         ...
@@ -99,7 +99,7 @@ class Assembler(Protocol):
 
 @runtime_checkable
 class Representation(Sampler, Assembler, Protocol):
-    """The images a network sees of a panorama."""
+    """Images of a panorama for a network, and their assembly."""
 
     @property
     def erp_height(self) -> int:

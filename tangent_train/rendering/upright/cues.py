@@ -35,9 +35,8 @@ def up_probabilities(
 ) -> NDArray[np.float64]:
     """Probability that each direction of a frame is up, for panoramas in any orientation.
 
-    Rooms are lower than wide and people live at the bottom: vertical edges are all around, at eye
-    level and below; what lies about without order is below; there are few edges right above and
-    below; light comes from above. The weights were fitted to panoramas of SynthRooms.
+    Cues of rooms: vertical edges all around, at eye level and below; clutter below; few edges
+    straight above and below; light from above. The weights were fitted to panoramas of SynthRooms.
 
     Args:
         rgb: ``(H, W, 3)`` panorama.

@@ -51,18 +51,18 @@ def estimate_up(rgb: NDArray[np.uint8], max_tilt_deg: float = 60.0) -> Gravity:
     Most of them follow three directions at right angles, one of which is the vertical: the frame
     that most edges follow (Coughlan and Yuille, "Manhattan World", ICCV 1999) gives its axes, to a
     fraction of a degree. Where only one of them is within `max_tilt_deg` of the panorama's own
-    vertical, it is up. Of several, one is chosen by what rooms look like (see `up_probabilities`):
-    of SynthRooms held at any angle, one in six gets another axis of the room.
+    vertical, it is up. Of several, one is chosen by the appearance of rooms (see
+    `up_probabilities`): one in six randomly rotated SynthRooms gets a wrong axis.
 
-    An estimate that is less probable than not is no estimate: pictures of nature, noise and
-    pictures without edges leave the panorama as it is.
+    Estimates with a probability below one half are rejected: nature, noise and pictures without
+    edges leave the panorama as it is.
 
     Args:
         rgb: ``(H, W, 3)`` uint8 whole panorama. 128 rows or more give good results, less than 64
             none. Black (0, 0, 0) areas count as missing.
-        max_tilt_deg: The farthest that up may be from ``(0, 0, 1)``, above 0; 180 is any
-            orientation. Allow some degrees more than the camera was tilted: of a panorama beyond
-            it, another axis of the room may be within.
+        max_tilt_deg: Maximum angle of up from ``(0, 0, 1)``, above 0; 180 is any orientation.
+            Choose it slightly above the camera's tilt: beyond it, another axis of the room may be
+            taken for up.
 
     Raises:
         SettingError: The panorama or the tilt cannot be used.
