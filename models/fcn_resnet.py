@@ -83,7 +83,7 @@ class FCNResNet(nn.Module):
         self.train()
 
     def train(self, mode: bool = True) -> FCNResNet:
-        """Set the mode; with `frozen_statistics`, normalization and dropout keep evaluation mode."""
+        """Set the mode; with `frozen_statistics`, batch norm and dropout keep evaluation mode."""
         super().train(mode)
         for module in self.modules() if self.frozen_statistics else ():
             if isinstance(module, _BatchNorm | nn.Dropout):

@@ -31,8 +31,8 @@ Kind = Literal["segmentation", "classification"]
 """Kind of labels: classes of pixels, or of whole shapes."""
 
 _GO_ON = (
-    "tangent-check with the same data settings lists all there are; data.skip_broken=true goes on "
-    "without what is broken."
+    "tangent-check with the same data settings lists all problems; data.skip_broken=true leaves "
+    "broken files out."
 )
 _Item = TypeVar("_Item", bound=Item)
 

@@ -1,4 +1,4 @@
-"""The classes of one's own data set, `classes.json`: what the pixels of its label images mean."""
+"""Classes of a user's own data set, `classes.json`: the meaning of its label pixels."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class FolderClasses:
 
         Args:
             stored: ``(H, W)`` values, or ``(H, W, 3)`` uint8 colours.
-            path: Where they are from.
+            path: Their file, for messages.
 
         Returns:
             ``(H, W)``.

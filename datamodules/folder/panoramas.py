@@ -1,4 +1,4 @@
-"""One's own panoramas: a folder of images, one of label images, and a list of classes.
+"""A user's own panoramas: folders of images and label images, and a list of classes.
 
 On disk::
 
@@ -40,13 +40,13 @@ _TRIED = 4
 @registered
 @dataclass(kw_only=True, eq=False, repr=False)
 class FolderPanoramas(PanoramaDataModule):
-    """One's own panoramas, with the classes of ``classes.json``. Depth is clipped to 4 m.
+    """A user's own panoramas, with the classes of ``classes.json``. Depth is clipped to 4 m.
 
     Args:
         test_fraction: Share of the scenes for test, unless there are lists, see `FolderSplits`;
             `validation_fraction` is that of the training scenes, likewise.
-        split_seed: Of the drawing of both. Not the seed of the run: networks of other seeds are
-            compared on the same panoramas, and none is ever tested on what another was trained on.
+        split_seed: Of the drawing of both. Independent of the run's seed, so that runs with
+            different seeds share their splits.
         depth_units_per_m: Units in a metre of depth files of whole numbers, 1000 for millimetres.
 
     Attributes:
@@ -89,7 +89,7 @@ class FolderPanoramas(PanoramaDataModule):
         return FolderReader(self._classes, self.depth_units_per_m), splits
 
     def _check_classes(self, panoramas: Sequence[ImageFiles], problems: Problems) -> None:
-        """Make sure that the class list is that of the label images, by the first few of them."""
+        """Check the class list against the first few label images."""
         classes = self._classes
         seen: set[int] = set()
         for files in panoramas:

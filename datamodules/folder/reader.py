@@ -32,7 +32,7 @@ _COLORS = ("8-bit RGB", "8-bit RGBA", "8-bit grey", "8-bit grey with alpha", "pa
 
 @dataclass(frozen=True)
 class FolderReader(ImageReader):
-    """Reads one's own panoramas.
+    """Reads a user's own panoramas.
 
     Attributes:
         classes: Meaning of their labels.

@@ -23,11 +23,11 @@ __all__ = ["FolderSplits"]
 class FolderSplits:
     """The splits that ``train.txt``, ``val.txt`` and ``test.txt`` name, or that are drawn.
 
-    Scenes, the first folders inside ``images/``, are drawn as a whole: images of one room or street
-    resemble each other. Images that are in no folder are drawn one by one.
+    Scenes, the top-level folders in ``images/``, are drawn as a whole: images of one room or street
+    resemble each other. Images outside folders are drawn individually.
 
     Attributes:
-        root: Folder of the data set, where the lists are, or not. Without ``test.txt``, the test
+        root: Folder of the data set, with or without the lists. Without ``test.txt``, the test
             panoramas are those in no other list if there is a ``train.txt``, else drawn; without
             ``train.txt`` all others are for training; without ``val.txt`` some of those for
             training are drawn for validation.
@@ -79,7 +79,7 @@ class FolderSplits:
     def _read_lists(
         self, panoramas: Sequence[ImageFiles], problems: Problems
     ) -> dict[Split, set[str]]:
-        """The names in each list that is there."""
+        """Names in each existing list."""
         names = {files.name: files.name for files in panoramas}
         # With the ending of the image is right as well.
         names |= {files.name + files.rgb.suffix: files.name for files in panoramas}
@@ -122,7 +122,7 @@ class FolderSplits:
 
 
 def _scene(files: ImageFiles) -> str:
-    """The first folder of the name; the name itself of an image that is in none."""
+    """The top-level folder of the name; the name itself of an image outside folders."""
     return files.name.partition("/")[0]
 
 

@@ -72,7 +72,7 @@ class PanoramaArea:
         return self.rows == (0, height) and self.columns == (0, width)
 
     def place(self, image: NDArray[_Pixel]) -> NDArray[_Pixel]:
-        """Lay the image ``(h, w[, C])`` onto a panorama ``(H, W[, C])`` that is 0 elsewhere."""
+        """Place the image ``(h, w[, C])`` on a panorama ``(H, W[, C])`` that is 0 elsewhere."""
         rows, columns = slice(*self.rows), np.arange(*self.columns) % self.full_shape[1]
         placed = resize_nearest(image, (self.rows[1] - self.rows[0], len(columns)))
         if self.is_whole:
@@ -97,14 +97,14 @@ class PanoramaArea:
 def area_of(path: Path, size: tuple[int, int]) -> PanoramaArea | None:
     """The place of an image by its own GPano tags.
 
-    Images that were resized after the tags were written are taken to show the same.
+    Images resized after the tags were written are assumed to show the same area.
 
     Args:
         path: JPEG, PNG, TIFF or WebP.
         size: Its rows and columns.
 
     Returns:
-        None where the image does not say, or not all.
+        None if tags are missing.
 
     Raises:
         DataError: The tags cannot be those of such an image.
@@ -180,8 +180,8 @@ def whole_area(path: Path, size: tuple[int, int]) -> PanoramaArea:
 
     Args:
         path: The image, for the message.
-        size: Its rows and columns. One column too many or too few is allowed: programs that shrink
-            images round so. It is left out, or its neighbour is repeated.
+        size: Its rows and columns. One column too many or too few is allowed, a rounding error of
+            other programs: it is left out, or its neighbour is repeated.
 
     Raises:
         DataError: It is not twice as wide as high.
@@ -204,8 +204,8 @@ def up_of(path: Path) -> NDArray[np.float64] | None:
         path: JPEG, PNG, TIFF or WebP.
 
     Returns:
-        ``(3,)`` unit vector in the panorama's frame. None where the image does not say, or says 0
-        for pitch and roll: programs that do not know write that.
+        ``(3,)`` unit vector in the panorama's frame. None without tags, or with pitch and roll 0,
+        which programs write by default.
 
     Raises:
         DataError: A tag is not such an angle.

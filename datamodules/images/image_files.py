@@ -1,4 +1,4 @@
-"""Finding people's own images and depth maps."""
+"""Finding the user's own images and depth maps."""
 
 from __future__ import annotations
 

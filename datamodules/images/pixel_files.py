@@ -1,7 +1,7 @@
-"""Reading and writing people's own images: colours, depth, labels, arrays.
+"""Reading and writing the user's own images: colours, depth, labels, arrays.
 
-Pillow opens every image and says what it is; OpenCV decodes the 16-bit colours that Pillow would
-cut to 8 bits, and writes.
+Pillow opens and identifies every image; OpenCV writes, and decodes the 16-bit colours that Pillow
+would cut to 8 bits.
 """
 
 from __future__ import annotations
@@ -256,7 +256,7 @@ def photo_fov_deg(path: Path) -> float | None:
     diagonal (CIPA DCG-001), whatever the aspect ratio of the photo.
 
     Returns:
-        None where they do not say.
+        None if they lack it.
 
     Raises:
         DataError: The file cannot be read, or is not an image.
@@ -275,7 +275,7 @@ def photo_fov_deg(path: Path) -> float | None:
 
 
 def check_writable(suffix: str, dtype: DTypeLike, channels: int) -> None:
-    """Refuse pixels that a file cannot hold as they are.
+    """Refuse pixels that a file format cannot hold.
 
     Args:
         suffix: Of the file, in lower case, with the dot.
@@ -312,7 +312,7 @@ def array_file(path: Path, shape: tuple[int, ...], dtype: DTypeLike) -> Iterator
 
 
 def write_pixels(path: Path, pixels: NDArray[Any]) -> None:
-    """Write pixels as they are, atomically.
+    """Write pixels unchanged, atomically.
 
     Args:
         path: The file; its suffix gives the format.

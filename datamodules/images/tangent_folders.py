@@ -57,7 +57,7 @@ def read_panorama(path: Path, interpolation: Interpolation) -> NDArray[Any]:
 
 
 def shrink_to_level(image: NDArray[Any], level: int) -> NDArray[Any]:
-    """Shrink a panorama with more rows than a level by averaging areas: no aliasing.
+    """Downsample a panorama with more rows than a level by area averaging.
 
     Args:
         image: ``(H, W)`` or ``(H, W, C)``; other dtypes than uint8, uint16, float32 and float64
@@ -87,7 +87,7 @@ def write_tangent_folder(
     *,
     colmap: bool,
 ) -> None:
-    """Render tangent images into a folder, which appears when all are there.
+    """Render tangent images to a folder, which appears once complete.
 
     Args:
         folder: A new one, or one with tangent images of an earlier run, which it replaces.
@@ -124,7 +124,7 @@ def write_tangent_folder(
 
 
 def _remove_earlier(folder: Path) -> None:
-    """Remove a folder that holds what an earlier run left there and nothing else."""
+    """Remove a folder that holds only the files of an earlier run."""
     there = {path.relative_to(folder) for path in folder.rglob("*") if not path.is_dir()}
     if there:
         ours = {Path(CAMERAS_FILE), *map(Path, read_cameras(folder / CAMERAS_FILE).files)}

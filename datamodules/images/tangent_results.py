@@ -150,7 +150,7 @@ class TangentResults:
     def write(self, path: Path, shape: tuple[int, int], blend: Blend, *, z_depth: bool) -> None:
         """Render them back to a panorama.
 
-        Results of another size than the images are taken to show the same, edge to edge.
+        Results of another size than the images cover the same field of view, edge to edge.
 
         Args:
             path: The panorama's file. Arrays (``.npy``) keep the dtype; in images, floats are

@@ -1,8 +1,8 @@
 """ModelNet40 (Wu et al. 2015): 12,311 meshes of 40 classes, as spheres.
 
 The meshes are free for research: https://modelnet.cs.princeton.edu (``ModelNet40.zip``, 2 GB). See
-`shape_files` about the layouts and `meshes` about spheres. Any other tree of the same form can be
-used, such as that of ModelNet10.
+`shape_files` about the layouts and `meshes` about spheres. Any other data set with the same layout
+can be used, such as ModelNet10.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class ModelNet40(SplitDataModule[ShapeFile]):
         self.normalization = samples.normalization
 
     def find_classes(self) -> tuple[str, ...]:
-        """The names of the classes, before there need be files."""
+        """Names of the classes, even before the files exist."""
         if not self.root.exists():
             return MODELNET40
         return tuple(sorted({mesh.label for mesh in find_shapes(self.root)}))
@@ -112,7 +112,7 @@ class ModelNet40(SplitDataModule[ShapeFile]):
         return SplitItems(found.splits[split], found.read, Spheres, found.store)
 
     def evaluation_samples(self, split: Split) -> ShapeViews:
-        """Samples `ShapeSample`: those of the test split rotated, if asked for."""
+        """Samples `ShapeSample`; those of the test split are rotated if set."""
         rotation = self.test_rotation if split == "test" else None
         samples: Any = self.samples
         views: ShapeViews = samples.evaluation(
@@ -127,7 +127,7 @@ class ModelNet40(SplitDataModule[ShapeFile]):
     def _choose_for_validation(self, meshes: Sequence[ShapeFile]) -> set[str]:
         """Names drawn from those for training, of every class the same share.
 
-        Whether a mesh can be used does not matter: the draw is the same before that is known.
+        Broken meshes are drawn too, so that the draw does not depend on them.
         """
         chosen: set[str] = set()
         for number, label in enumerate(self.class_names if self.validation_fraction else ()):

@@ -1,4 +1,4 @@
-"""Meshes in OFF files, as ModelNet40's, and what they look like from the sphere around them.
+"""Meshes in OFF files, such as ModelNet40's, and their spherical images.
 
 The recipe is that of Cohen et al., Spherical CNNs (2018), which the paper follows. A mesh is moved
 so that the centroid of its surface is at the origin, and scaled to reach to `RADIUS`. From every

@@ -122,7 +122,7 @@ class ShapeSamples:
     def evaluation(
         self, source: _Shapes, representation: Any, rotation: TestRotation = None, seed: int = 0
     ) -> ShapeViews:
-        """All views, of shapes that are rotated if asked for."""
+        """All views, of rotated shapes if set."""
         return ShapeViews(source, self._labels, representation, seed, rotation=rotation)
 
     def normalized(self, batch: ShapeSample) -> Tensor:

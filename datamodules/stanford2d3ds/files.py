@@ -1,4 +1,4 @@
-"""The files of Stanford2D3DS: their names, their partners, and what is expected of them."""
+"""The files of Stanford2D3DS: names, partners and formats."""
 
 from __future__ import annotations
 
@@ -57,13 +57,13 @@ class FileName(NamedTuple):
 
     @classmethod
     def parse(cls, name: str) -> FileName:
-        """Take a file's name apart.
+        """Parse a file name.
 
         Args:
             name: The name without folders.
 
         Raises:
-            DataError: It is no name of the data set.
+            DataError: It is not a file name of the data set.
 
         >>> FileName.parse(f"camera_{'0f' * 16}_office_7_frame_3_domain_rgb.png")[1:]
         ('office', 7, '3', 'rgb', '.png')

@@ -1,4 +1,4 @@
-"""The class table of Stanford2D3DS: what the colours of its `semantic` images mean."""
+"""The class table of Stanford2D3DS: the meaning of the colours of `semantic` images."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class LabelTable:
 
     A pixel of a `semantic` image holds the index of an instance as the colour
     R · 65536 + G · 256 + B. Missing labels are #0D0D0D = 855309, past the end of the table.
-    (Leaving out R would turn them into instance 3341, clutter.)
+    (Without R they would be instance 3341, clutter.)
 
     Attributes:
         class_ids: ``(entries,)`` uint8, 1 to 13 in the order of `CLASSES`, or `UNKNOWN`.
@@ -83,7 +83,7 @@ class LabelTable:
 
         Args:
             colors: ``(H, W, 3)`` uint8 in RGB order.
-            path: Where they are from.
+            path: Their file, for messages.
 
         Returns:
             ``(H, W)`` uint8 labels.

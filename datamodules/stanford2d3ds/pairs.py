@@ -2,7 +2,7 @@
 
 ``pairs.csv`` holds the paper's tables of pairs and of single results as they are printed:
 number, split, images, overlap of the fields of view, then PMR, MS and P on the equirectangular
-image and at base levels 0, 1 and 2. What does not fit together in print is left so: the means of
+image and at base levels 0, 1 and 2. Inconsistencies in print are kept: the means of
 the overlaps are 0.896 (easy) and 0.836 (hard) where the paper's text has 89.35 % and 83.35 %, and
 the mean PMR of the hard pairs at level 0 is 28.7 % where its table has 28.4 %. Pairs 17 and 22 are
 hard with the overlap, 0.86, that six easy ones have: the split is by figures before rounding.
@@ -74,7 +74,7 @@ class StanfordPairs(PanoramaPairs):
             read.
         pairs: `paper`, the sixty of area 1; or `rooms`, any two panoramas of the same room.
         areas: Areas to search with `rooms`; by default all present.
-        erp_height: Rows to shrink the panoramas to; by default they stay as they are.
+        erp_height: Rows to downsample the panoramas to; by default unchanged.
 
     Raises:
         SettingError: A setting is invalid.
@@ -164,7 +164,7 @@ def _resolve(names: Iterable[str], files: Sequence[PictureFiles]) -> dict[str, P
     """The files of abbreviated names, ``<beginning of the camera>_<room>_<number>``.
 
     Raises:
-        DataError: Some names fit no panorama, or several; all are told at once.
+        DataError: Some names fit no panorama, or several; the message lists all.
     """
     by_name: dict[str, list[PictureFiles]] = {}
     for file in files:

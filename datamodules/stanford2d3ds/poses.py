@@ -7,10 +7,9 @@ camera coordinates, x right, y down, z forward; in photos R is ``diag(1, −1, �
 rotation F of `final_camera_rotation` (2D-3D-Semantics issues 26 and 50). Of panoramas, its issues
 16 and 42 say that a point is ``A R A x' + c``: x' in the panorama's own coordinates, taken here for
 x right, y down, z to the middle; c the `camera_location`; A the Euler rotation of
-`camera_original_rotation`. Where F = A, as in our files, that is ``Rᵀ x' + c``. It is computed so
-for both. No file of the real set was at hand to try it on: the overlap of the fields of view
-computed from depth and pose, which ``tangent-keypoints`` puts beside the paper's, tells whether it
-is right.
+`camera_original_rotation`. Where F = A, as in our files, that is ``Rᵀ x' + c``. Both are read
+this way. Not yet verified on the real set: compare the overlap of the fields of view from depth and
+pose, which ``tangent-keypoints`` shows beside the paper's.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ _TABLE_NAME = "semantic_labels.json"
 
 @dataclass(frozen=True)
 class StanfordReader(ImageReader):
-    """Panoramas and photos alike.
+    """Reader of panoramas and photos.
 
     Attributes:
         table: The classes of the instances.
@@ -48,7 +48,7 @@ class StanfordReader(ImageReader):
 
         Args:
             root: Its folder.
-            label_table: The class table, when it is not where the release has it.
+            label_table: The class table, if not at the place of the release.
             mask: See `mask_black`.
 
         Raises:

@@ -27,12 +27,12 @@ class StanfordAreas(SplitDataModule[ImageFiles]):
     """The three folds of the authors, with rooms for validation.
 
     Validation pictures are those of whole rooms drawn from the training areas, so that nothing is
-    ever chosen by the test areas: at least one room, never all.
+    selected on the test areas: at least one room, never all.
 
     Args:
         fold: 1, 2 or 3, see `FOLDS`.
-        areas: Areas to use, all of which must be there; by default all.
-        label_table: The class table, when it is not where the release has it.
+        areas: Areas to use, all of which must exist; by default all.
+        label_table: The class table, if not at the place of the release.
 
     Attributes:
         group: Kind of pictures.

@@ -8,12 +8,12 @@ On disk, as released (`0X` is 01, 02, 04, 05 or 06)::
       Depth/Stereo_Left/Omni_F/000000.png      16 bit, z-depth in cm, in every channel there is
       CameraParams/intrinsics.txt              focal length, centre x and y, baseline
       pano/                                    OmniSYNTHIA: 2096×4192
-        RGB/000000.png                         8 bit, black where no view looks
-        GT/LABELS_Correct/000000.png           8 bit, 255 where no view looks
+        RGB/000000.png                         8 bit, black outside the views
+        GT/LABELS_Correct/000000.png           8 bit, 255 outside the views
         Depth/000000.png                       16 bit, cm
 
-The four views of a frame are upright and share their centre: F looks ahead and each of R, B, L a
-quarter turn further to the right.
+The four views of a frame are upright and share their centre: F faces forward, and R, B and L are
+each rotated by a further 90° to the right.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ __all__ = [
 ]
 
 VIEWS: tuple[str, ...] = ("F", "R", "B", "L")
-"""Front, right, back, left: each a quarter turn to the right of the previous one."""
+"""Front, right, back, left: each rotated by 90° to the right of the previous one."""
 
 GET_IT = (
     "Get SYNTHIA-SEQS-01, -02, -04, -05 and -06 SUMMER from http://synthia-dataset.net and point "
@@ -63,7 +63,7 @@ def sequence_folder(root: Path, sequence: str) -> Path:
     """Folder of a sequence.
 
     Raises:
-        DataError: The data set is not there at all.
+        DataError: The data set is missing.
 
     >>> from pathlib import Path
     >>> sequence_folder(Path("."), "01").name

@@ -1,9 +1,9 @@
-"""OmniSYNTHIA from SYNTHIA: four views of a frame become one panorama.
+"""Generating OmniSYNTHIA from SYNTHIA: the four views of a frame form one panorama.
 
 The front view is in the middle of the panorama, every pixel belongs to one view, and depth is the
 distance from the centre. The script that made the published panoramas (Zhang et al. 2019) has the
-left view in the middle, a quarter turn away, keeps the z-depth of the views, and averages where
-views overlap, labels included.
+left view in the middle, 90° away, keeps the z-depth of the views, and averages where views overlap,
+labels included.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ _PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 
 
 class ViewStitcher:
-    """Makes panoramas of the four views of a frame; the tables for it are computed once.
+    """Stitches the four views of a frame to a panorama; its tables are computed once.
 
     Args:
         camera_matrix: ``(3, 3)`` K of all views, integer pixel centres, without skew.
@@ -103,7 +103,7 @@ class ViewStitcher:
         return self._stitch(views, "bilinear", 0)
 
     def labels(self, views: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
-        """Panorama ``(H, W)`` of labels, nearest; `INVALID` where no view looks."""
+        """Panorama ``(H, W)`` of labels, nearest; `INVALID` outside the views."""
         return self._stitch(views, "nearest", INVALID)
 
     def depth(self, views: Sequence[NDArray[np.uint16]]) -> NDArray[np.uint16]:
@@ -139,7 +139,7 @@ def _view_positions(
     """View that owns each column of a panorama, and the column's pixels in that view.
 
     All pixels of a column belong to the view whose optical axis is nearest, as the views are
-    upright: there they lie nearest to the middle of the image.
+    upright: there they are nearest to the image centre.
 
     Returns:
         ``(W,)`` place in `VIEWS`, ``(W,)`` columns and ``(H, W)`` rows.
@@ -169,24 +169,24 @@ def make_panoramas(
 ) -> int:
     """Write the panoramas of OmniSYNTHIA, as published, from the views of SYNTHIA.
 
-    Whole files are kept, so that the work can be interrupted. Panoramas that were not made here are
-    left alone, and none are added to them: they look another way.
+    Complete files are kept, so that the work can be interrupted. Published panoramas are left alone
+    and never mixed with generated ones, whose heading differs.
 
     Args:
         root: Folder of the sequences.
-        sequences: Which, as ``01``.
+        sequences: Sequences, as ``01``.
         problems: Broken views are added under the name of the panorama.
-        frames: About how many of each sequence, see `choose_frames`.
+        frames: Approximate number per sequence, see `choose_frames`.
         height: Rows of the panoramas.
         progress: Whether to show a progress bar.
 
     Returns:
-        How many were to be made.
+        Number of panoramas to generate.
 
     Raises:
-        DataError: A sequence has neither views nor panoramas, or panoramas that were made with
-            other settings.
-        SettingError: A number that cannot be.
+        DataError: A sequence has neither views nor panoramas, or panoramas generated with other
+            settings.
+        SettingError: A number is out of range.
     """
     at_least("data.panorama_height", height, 1)
     jobs: list[Callable[[], None]] = []
@@ -206,7 +206,7 @@ def make_panoramas(
 
 
 def _claim(folder: Path, frames: int, height: int) -> bool:
-    """Whether there are panoramas for us to make; if so, the folder for them is marked."""
+    """Whether there are panoramas to generate; if so, mark their folder."""
     pano = folder / "pano"
     ready = (pano / MANIFEST).exists() or any(pano.glob("**/[!.]*.png"))
     if not list_frames(folder):

@@ -1,8 +1,8 @@
 """OmniSYNTHIA (Zhang et al. 2019): panoramas of virtual streets, from SYNTHIA (Ros et al. 2016).
 
-Features: 2096×4192 RGB, depth and 13 semantic classes (`reader.CLASSES`). The panoramas show what
-four cameras saw: a band around the horizon, black and unknown above and below. Where there are none
-yet, they are made from the four views of SYNTHIA's sequences 01, 02, 04, 05 and 06 SUMMER. `files`
+Features: 2096×4192 RGB, depth and 13 semantic classes (`reader.CLASSES`). The panoramas combine
+four cameras: a band around the horizon, black and unknown above and below. Missing panoramas are
+generated from the four views of SYNTHIA's sequences 01, 02, 04, 05 and 06 SUMMER. `files`
 has the tree on disk.
 
 Licence: SYNTHIA is free for research: http://synthia-dataset.net.
@@ -38,12 +38,12 @@ __all__ = ["OmniSynthia"]
 class OmniSynthia(SynthiaSequences, PanoramaDataModule):
     """OmniSYNTHIA, 13 classes, with the training and test sequences of its authors.
 
-    `root` holds ``SYNTHIA-SEQS-01-SUMMER`` …, each with the four views or with panoramas, which
-    are made of `frames` frames where there are none. The published panoramas have the z-depth of
+    `root` holds ``SYNTHIA-SEQS-01-SUMMER`` …, each with the four views or with panoramas; missing
+    panoramas are generated from `frames` frames. The published panoramas have the z-depth of
     the views instead of distance.
 
     Args:
-        panorama_height: Rows of the panoramas that are made.
+        panorama_height: Rows of generated panoramas.
 
     Raises:
         SettingError: A setting is invalid.
@@ -58,10 +58,10 @@ class OmniSynthia(SynthiaSequences, PanoramaDataModule):
         self._not_made = Problems()
 
     def make_files(self) -> None:
-        """Make the panoramas of sequences that have none yet, or are not finished.
+        """Generate the panoramas of sequences without or with unfinished panoramas.
 
         Raises:
-            DataError: There is nothing to make them from, or it is broken.
+            DataError: The views are missing or broken.
         """
         self._not_made = Problems()
         make_panoramas(
@@ -75,7 +75,7 @@ class OmniSynthia(SynthiaSequences, PanoramaDataModule):
             self._not_made.refuse(self.root, "data.skip_broken=true leaves out these frames.")
 
     def find(self, problems: Problems) -> Found[ImageFiles]:
-        """See `SplitDataModule`; panoramas that could not be made are broken."""
+        """See `SplitDataModule`; panoramas that could not be generated count as broken."""
         problems.add_all(self._not_made)
         return super().find(problems)
 

@@ -1,4 +1,4 @@
-"""SYNTHIA's views as photos (Ros et al. 2016): those that OmniSYNTHIA's panoramas are made of.
+"""SYNTHIA's views as photos (Ros et al. 2016): the sources of OmniSYNTHIA's panoramas.
 
 `files` has the tree on disk, `omnisynthia` licence and citation.
 """

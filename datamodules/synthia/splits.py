@@ -63,12 +63,12 @@ class SynthiaSequences(SplitDataModule[ImageFiles]):
     """The training and test sequences of OmniSYNTHIA's authors.
 
     Validation takes the last frames of each training sequence. Depth is clipped to 4 m, which is
-    little in a street.
+    short for streets.
 
     Args:
         train_sequences: As ``01``.
         test_sequences: As ``04``.
-        frames: About how many frames of each sequence to use, see `choose_frames`.
+        frames: Approximate number of frames per sequence, see `choose_frames`.
 
     Attributes:
         formats: Of the files.
@@ -133,8 +133,8 @@ def divide(
 ) -> dict[Split, list[ImageFiles]]:
     """Assign frames to splits.
 
-    Frames of a sequence are nearly the same as their neighbours, so validation takes those at the
-    end of each training sequence, not some here and there.
+    Neighbouring frames are nearly identical, so validation takes those at the end of each training
+    sequence.
 
     Args:
         frames: Of every sequence, in order: the images of each frame.
@@ -143,7 +143,7 @@ def divide(
             never all; 0 for no validation.
 
     Raises:
-        DataError: A training sequence has a single frame, and validation wants some.
+        DataError: A training sequence has a single frame, and validation needs one.
     """
     splits: dict[Split, list[ImageFiles]] = {"train": [], "val": [], "test": []}
     for sequence, found in frames.items():

@@ -10,8 +10,8 @@ the room's point ``c + d Rᵀ (s_y, −s_z, s_x)``, which is ``c + d Rz(ψ) FLIP
 counterclockwise from the room's x axis. A perspective pixel (column j, row i) with z-depth d is
 ``c + d Rᵀ K⁻¹ (j, i, 1)`` with K for integer pixel centres.
 
-Angles in pose files are Blender's XYZ Euler angles of a camera that looks along its −z with +y up:
-``Rᵀ = Rz(c) Ry(b) Rx(a) diag(1, −1, −1)`` (that is where the real set's come from).
+Angles in pose files are Blender's XYZ Euler angles of a camera facing its −z with +y up:
+``Rᵀ = Rz(c) Ry(b) Rx(a) diag(1, −1, −1)`` (as in the real set).
 """
 
 from __future__ import annotations

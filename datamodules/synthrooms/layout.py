@@ -167,7 +167,7 @@ class FloorPlan:
 
         Returns:
             Frame at the middle of the stretch on the floor, x along the wall, y into the room; None
-            when no place was found.
+            if no place was found.
         """
         lengths = np.array([wall.length for wall in self.walls])
         for _ in range(_TRIES):

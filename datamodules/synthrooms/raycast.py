@@ -156,7 +156,7 @@ def _bounced_light(room: Room) -> Floats:
     """Irradiance by light that was reflected once or more, the same everywhere.
 
     The integrating sphere's law: flux Φ in an enclosure of area A and reflectance ρ gives
-    Φρ / (A(1 − ρ)); a Lambertian lamp of intensity I along its normal sends out Φ = πI.
+    Φρ / (A(1 − ρ)); a Lambertian lamp of intensity I along its normal emits Φ = πI.
     """
     plan = room.plan
     area = 2 * plan.floor_area + plan.height * sum(wall.length for wall in plan.walls)

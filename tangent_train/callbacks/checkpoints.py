@@ -122,7 +122,7 @@ class LastCheckpoint(Checkpoint):
         typed: Settings that the resuming command needs besides the folder.
 
     Attributes:
-        has_begun: Whether training has begun: everything restored is then in place.
+        has_begun: Whether training has begun, with everything restored.
 
     Raises:
         SettingError: Fewer than one step.

@@ -1,4 +1,4 @@
-"""Covisibility: how much two panoramas see of each other's surroundings, from depth and poses."""
+"""Covisibility of two panoramas, from depth and poses."""
 
 from __future__ import annotations
 

@@ -137,8 +137,8 @@ class Detector:
 def detect_on_equirect(image: NDArray[np.uint8], detector: Detector) -> SphericalKeypoints:
     """Detect keypoints on a panorama as if it were an ordinary image, but across ±180°.
 
-    The image is continued by W/8 columns of its other side, left and right, so that keypoints at
-    ±180° are found once. It is not continued beyond the poles, as in the paper's baseline.
+    The image is extended by W/8 columns of its other side, left and right, so that keypoints at
+    ±180° are found once. It is not extended beyond the poles, as in the paper's baseline.
 
     Args:
         image: ``(H, W)`` grey or ``(H, W, 3)`` RGB, uint8.
@@ -170,7 +170,7 @@ def detect_on_tangent_images(
         grid: The tangent images.
         detector: The detector.
         margin: Pixels added on every side of the images, at the same pitch: detectors find nothing
-            near borders, and large keypoints need room.
+            near borders, and large keypoints need space.
 
     Returns:
         Keypoints in the order of the faces they were detected in.

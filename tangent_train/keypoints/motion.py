@@ -1,4 +1,4 @@
-"""The motion between two panoramas, where it allows a match, and how much a fit proves.
+"""Motion between two panoramas: its epipolar arcs, and the significance of a fit.
 
 A point in direction l of the left panorama lies somewhere on a ray. In the right panorama, with
 ``x_right = R x_left + t``, the ray appears as the great-circle arc from ``R l``, its point at
@@ -37,7 +37,7 @@ class Motion(NamedTuple):
 
     @property
     def sample(self) -> int:
-        """Matches that some motion fits whatever they are."""
+        """Size of a minimal sample of matches, which some motion always fits."""
         return 2 if self.translation is None else 5
 
 
@@ -85,7 +85,7 @@ def is_by_chance(
     motion: Motion,
     max_error_rad: float,
 ) -> bool:
-    """Whether some motion would fit as many matches if all of them were wrong.
+    """Whether a motion would fit as many matches by chance.
 
     The expected number of such motions is ``(m − s) · C(m, k) · C(k, s) · pᵏ⁻ˢ`` (Moisan and Stival
     2004, equation 6; the criterion of OpenMVG, which the paper used) with m matches, k inliers, the

@@ -1,4 +1,4 @@
-"""Two-view geometry of panoramas: the motion between them among matches most of which may be wrong.
+"""Two-view geometry of panoramas: their motion from matches with a majority of outliers.
 
 pycolmap calls are in COLMAP's camera axes: x right, y down, z to the middle of the panorama.
 """
@@ -95,7 +95,7 @@ def estimate_two_view(
 
     A general motion comes from COLMAP's five-point RANSAC, a rotation from pairs of matches. Torr's
     criterion decides between them (`prefers_rotation`), because a general motion fits the matches
-    of a rotation as well. A motion that chance explains is none (`is_by_chance`).
+    of a rotation as well. A motion explained by chance is rejected (`is_by_chance`).
 
     Args:
         left_xyz: ``(m, 3)`` unit vectors in the left panorama.
@@ -143,7 +143,7 @@ class _Search:
     def general(self) -> Motion | None:
         """The best of several runs of COLMAP's LO-RANSAC on rays, each refined.
 
-        A single run may stop at a motion that is degrees away and fits nearly as many matches.
+        A single run may stop at a motion degrees away that fits nearly as many matches.
         `pycolmap.estimate_calibrated_two_view_geometry` measures errors in pixels of the ERP, so
         that it loses matches near the poles.
         """
@@ -200,7 +200,7 @@ class _Search:
     def _refined(
         self, motion: Motion, refit: Callable[[NDArray[np.bool_], Motion], Motion | None]
     ) -> Motion:
-        """Fit again to what fits well, as long as that lowers the cost."""
+        """Refit to the inliers as long as that lowers the cost."""
         for _ in range(_REFINEMENTS):
             errors = self.errors(motion)
             fits = errors <= self.max_error_rad

@@ -1,4 +1,4 @@
-"""From the confusion matrices of an evaluation to its record, tables and files."""
+"""Record, tables and files of an evaluation, from its confusion matrices."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ def classification_record(
 
 
 def _taken_for(row: NDArray[np.int64], own: int, class_names: Sequence[str]) -> dict[str, Any]:
-    """The other class that most of a class was taken for, and its share; the first of equals."""
+    """Most frequent confusion of a class, and its share; the first of equals."""
     missed = row.copy()
     missed[own] = 0
     other = int(missed.argmax())
@@ -156,7 +156,7 @@ def headline(record: Record) -> str:
 
 
 def largest_loss(record: Record) -> str:
-    """The class that takes most from the mean, and what it is taken for; empty without a loss."""
+    """The class that lowers the mean most, and its confusion; empty without a loss."""
     score = SCORES[record.kind].worst
     labelled = [e for e in record.classes if e.get("share", e.get("images")) and e[score] < 1]
     if not labelled:

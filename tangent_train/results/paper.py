@@ -5,8 +5,8 @@ Eder, Shvets, Lim and Frahm: Tangent Images for Mitigating Spherical Distortion,
 classification and network transfer, and the per-class tables of the supplement. Percent.
 
 Rows without a stage are of networks trained on panoramas, "averaged over the 3 folds" on
-Stanford2D3DS. Of the transfer the file has the single folds, as the rows for all folds repeat fold
-3 digit for digit; its figures per class are over all folds.
+Stanford2D3DS. For the transfer the file has the single folds, because the rows for all folds
+repeat fold 3; its scores per class are over all folds.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _KEY = ("data", "stage", "method", "level", "base_level", "inputs")
 
 
 def published(records: Sequence[Record], *, transfer: bool = False) -> list[Row]:
-    """The published figures for the data and resolutions of some evaluations.
+    """Published scores for the data and resolutions of some evaluations.
 
     Args:
         records: Evaluations; those on other data, other classes or rotated data match nothing.

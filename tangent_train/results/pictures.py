@@ -61,7 +61,7 @@ def prediction_panel(
     prediction: NDArray[np.integer],
     class_names: Sequence[str],
 ) -> _Image:
-    """Input, truth, prediction and error in a 2×2 grid, over a legend of the classes seen.
+    """Input, ground truth, prediction and error in a 2×2 grid, above a legend of the classes.
 
     Args:
         rgb: ``(H, W, 3)`` the panorama, or the crops of a photo side by side.
@@ -71,7 +71,7 @@ def prediction_panel(
 
     Returns:
         RGB image, about 2W × 2H; panoramas of less than 256 rows are shown in whole multiples of
-        their size. Errors are red, unknown truth is grey.
+        their size. Errors are red, unlabelled pixels are grey.
     """
     count = len(class_names)
     error = np.full((*truth.shape, 3), 255, np.uint8)
@@ -95,7 +95,7 @@ def prediction_panel(
 
 
 def shown_image(image: Any, target: Any, representation: Any) -> NDArray[np.uint8]:
-    """The colours to show beside labels: the panorama, or the crops of a photo side by side.
+    """Colours to show beside labels: the panorama, or the crops of a photo side by side.
 
     Args:
         image: Of an `ImageSource`.
@@ -124,11 +124,11 @@ def _titled(image: _Image, title: str) -> _Image:
 def overlay_picture(
     rgb: _Image, labels: NDArray[np.integer], class_names: Sequence[str], opacity: float = 0.5
 ) -> _Image:
-    """A picture with its labels laid over it, over a legend of the classes in it.
+    """A picture overlaid with its labels, above a legend of its classes.
 
     Args:
         rgb: ``(H, W, 3)``.
-        labels: ``(H, W)`` class indices; what is unknown (0) shows the picture.
+        labels: ``(H, W)`` class indices; unknown pixels (0) show the picture.
         class_names: K + 1 names.
         opacity: Of the labels, 0 to 1.
 

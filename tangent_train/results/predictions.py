@@ -148,7 +148,7 @@ class PredictionFolder:
             settings: Settings that earlier predictions must share.
 
         Raises:
-            SettingError: They were made with other settings.
+            SettingError: They have other settings.
         """
         try:
             content = parse_json((self.path / _SUMMARY).read_bytes())
@@ -231,7 +231,7 @@ class PredictionFolder:
         labels: NDArray[np.unsignedinteger],
         area: PanoramaArea | None,
     ) -> EncodedImage:
-        """An image for `write_page`: some hundred kilobytes to some megabytes; see `write`."""
+        """An image for `write_page`, of 0.1 to a few megabytes; see `write`."""
         if area is not None:
             rgb, labels = area.place(rgb), area.place(labels)
         shown = ViewerImage(name, rgb, labels, sphere=area is not None)

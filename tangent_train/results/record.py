@@ -1,4 +1,4 @@
-"""The record of an evaluation: what was evaluated, its scores, its files.
+"""The record of an evaluation: its data and settings, scores and files.
 
 A finished run holds it as ``results.json`` beside its settings, ``config.yaml``.
 """
@@ -258,7 +258,7 @@ def find_runs(folders: Sequence[Path]) -> list[Path]:
 
 
 def unfinished_runs(folders: Sequence[Path]) -> list[Path]:
-    """Folders of runs in and below the given ones that have begun and have no results."""
+    """Folders of started runs without results, in and below the given ones."""
     begun = [path for folder in folders for path in _below(folder, "checkpoints")]
     return sorted({path.resolve() for path in begun if not (path / RESULTS_FILE).exists()})
 

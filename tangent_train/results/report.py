@@ -102,12 +102,12 @@ class Report:
                 yield Table(f"{heading[0].upper()}{heading[1:]} %", ("", *self.classes), rows)
 
     def losses(self) -> list[str]:
-        """For every row its worst class, or that which loses most against the partner."""
+        """Per row, its worst class, or the one that loses most against the partner."""
         found = (_loss(row, SCORES[self.kind], self.classes) for row in self.rows)
         return [sentence for sentence in found if sentence]
 
     def all_notes(self) -> list[str]:
-        """Remarks without which the scores would be misread, and the largest losses."""
+        """Notes needed to read the scores correctly, and the largest losses."""
         lacking: dict[str, list[str]] = defaultdict(list)
         own = [row for row in self.rows if not row.published]
         for row in own:
@@ -194,7 +194,7 @@ class Report:
 
 
 def _loss(row: Row, scores: Scores, classes: Sequence[str]) -> str:
-    """The class that takes most from the mean; classes without labels do not count."""
+    """The class that lowers the mean most; classes without labels are ignored."""
     found = []
     for name in classes:
         labelled = tuple(r for r in row.records if _is_labelled(r, name))

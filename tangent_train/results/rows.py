@@ -1,9 +1,9 @@
 """Rows of a report: evaluations alike but for fold and seed, as mean and spread.
 
 A score of a row is first averaged over the seeds of each fold, then over the folds, as the paper's
-"averaged over the 3 folds". Two spreads, sample standard deviations, tell two things: over the
-folds' means, how different the folds are; over seeds, pooled over the folds that have several, how
-far training itself is repeatable.
+"averaged over the 3 folds". Two spreads are sample standard deviations: over the folds' means
+(difference between folds), and over seeds, pooled over the folds with several (repeatability of
+training).
 """
 
 from __future__ import annotations
@@ -158,7 +158,7 @@ def check_alike(records: Sequence[Record]) -> None:
 
 
 def group_runs(records: Sequence[Record]) -> list[Row]:
-    """Put evaluations together that differ only in fold and seed.
+    """Group evaluations that differ only in fold and seed.
 
     Args:
         records: Of finished runs, with their settings.

@@ -1,4 +1,4 @@
-"""One self-contained HTML file with tables and a viewer of panoramas; no network needed."""
+"""One self-contained HTML file with tables and a viewer of panoramas."""
 
 from tangent_train.results.html.images import EncodedImage, ViewerImage, encode_image
 from tangent_train.results.html.page import write_report

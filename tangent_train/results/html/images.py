@@ -1,4 +1,4 @@
-"""Panoramas and photos as the compressed files a report holds, within a budget of bytes."""
+"""Compressed panoramas and photos of a report, within a byte budget."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class ViewerImage:
 
 @dataclass(frozen=True)
 class EncodedImage:
-    """A `ViewerImage` compressed: what a report holds of it, and what to keep meanwhile.
+    """A compressed `ViewerImage`, as in a report.
 
     Attributes:
         name: As given.
@@ -81,10 +81,10 @@ class EncodedImage:
 def encode_image(
     image: ViewerImage, class_count: int, budget_bytes: int = BUDGET_BYTES
 ) -> EncodedImage:
-    """Compress an image so that it takes no more than its share of the report.
+    """Compress an image to its share of the report.
 
-    Sides longer than `MOST_PIXELS` are shrunk, colors by area, labels to the nearest; all are
-    halved in size until they fit.
+    Sides longer than `MOST_PIXELS` are downsampled, colours by area, labels by nearest neighbour,
+    then halved until they fit.
 
     Args:
         image: The image with its label maps.

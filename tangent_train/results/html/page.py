@@ -1,4 +1,4 @@
-"""Writes the report: one HTML file that needs nothing else."""
+"""Writing the report as one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def write_report(
         path: The file.
         title: Of the page.
         tables: Below the viewer.
-        images: For the viewer, taken one at a time: only one of them is in memory.
+        images: For the viewer, consumed one at a time to bound memory.
         class_names: K + 1 names of the classes in the label maps, the unknown class first.
         notes: Lines below the title, the most important first.
 
@@ -119,7 +119,7 @@ def _write_image(file: TextIO, image: EncodedImage) -> None:
 
 
 def _json(content: Any) -> str:
-    """JSON that cannot end, or be mistaken for a comment in, the script element around it."""
+    """JSON that can neither close the script element around it nor start a comment in it."""
     return json.dumps(content, separators=(",", ":")).replace("<", "\\u003c")
 
 

@@ -1,1 +1,1 @@
-"""Keypoints of pairs of panoramas: detected in several ways, matched, scored and shown."""
+"""Keypoints of panorama pairs: detected on several representations, matched, scored, shown."""

@@ -1,4 +1,4 @@
-"""Detecting, matching and scoring the keypoints of one pair of panoramas, in several ways."""
+"""Detecting, matching and scoring the keypoints of a pair, on several representations."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ class Ways:
         mutual: See `match`.
         max_error_deg: See `estimate_two_view`, at most 20.
         seed: Of random samples and of the random rotations.
-        controls: Whether to compare the shrunk panorama and the rotated one as well.
+        controls: Whether to compare the downsampled panorama and the rotated one too.
 
     Raises:
         SettingError: A number is out of range.
@@ -271,7 +271,7 @@ def _truth(
     right: DepthView,
     max_error_deg: float,
 ) -> tuple[tuple[int, int], Row]:
-    """Visible keypoints on either side, and the figures that need depth and pose."""
+    """Visible keypoints on either side, and the scores that need depth and pose."""
     left_xyz = found.left.directions_xyz
     # Back to the right panorama as it is, whose depth needs no resampling.
     right_xyz = found.right.directions_xyz @ rotation
@@ -293,7 +293,7 @@ def _depth_view(panorama: PairedPanorama) -> DepthView | None:
 
 
 def _defined(value: float) -> float | None:
-    """A figure, or None where it is undefined: JSON has no NaN."""
+    """A score, or None if undefined: JSON has no NaN."""
     return float(value) if math.isfinite(value) else None
 
 
@@ -301,8 +301,8 @@ def shrunk_rows(level: int) -> int:
     """Rows of a panorama whose pixels are as large as those of tangent images of a level.
 
     Tangent images have pixels R_v(b−1)/2^(s−b) wide, more than the π/2^(s+1) of the panorama:
-    0.709 times as many fit. Fewer, larger pixels show less noise, so that this much of a gain has
-    nothing to do with distortion. Base levels 0 and 1 have the same pixels, those of level 2 are
+    0.709 times as many fit. Fewer, larger pixels have less noise, a gain that is
+    unrelated to distortion. Base levels 0 and 1 have the same pixels, those of level 2 are
     6 % larger.
 
     >>> shrunk_rows(10)
@@ -316,7 +316,7 @@ def _at_level(rgb: NDArray[np.uint8], level: int) -> NDArray[np.uint8]:
 
 
 def _shrunk(rgb: NDArray[np.uint8], rows: int) -> NDArray[np.uint8]:
-    """A panorama, averaged over areas where it has more rows."""
+    """A panorama, downsampled by area averaging if it has more rows."""
     if rgb.shape[0] <= rows:
         return rgb
     return cv2.resize(rgb, (2 * rows, rows), interpolation=cv2.INTER_AREA)

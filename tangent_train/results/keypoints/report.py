@@ -144,7 +144,7 @@ class KeypointReport:
 
 
 def with_splits(rows: Sequence[Row]) -> list[Row]:
-    """Divide pairs in two halves by their overlaps, as the paper's are, where no split is given.
+    """Split pairs in two halves by overlap, as in the paper, unless splits are given.
 
     Args:
         rows: Of all pairs.
