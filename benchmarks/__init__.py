@@ -1,1 +1,1 @@
-"""Speed and memory beside what users could take instead: ``python -m benchmarks --help``."""
+"""Speed and memory compared with alternatives: ``python -m benchmarks --help``."""

@@ -1,4 +1,4 @@
-"""From panoramas to tangent images, beside bare `cv2.remap` and other libraries."""
+"""Rendering tangent images, compared with bare `cv2.remap` and other libraries."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def rivals(panorama: NDArray[Any], grid: TangentGrid) -> dict[str, Render]:
 
 
 def check_same_views(name: str, ours: NDArray[Any], theirs: Sequence[NDArray[Any]]) -> None:
-    """Refuse a comparison with something else.
+    """Refuse a comparison of different views.
 
     Args:
         name: Of the library.

@@ -1,4 +1,4 @@
-"""From scores to labels beside `grid_sample` and `argmax`; growth with the level."""
+"""Rendering labels, compared with `grid_sample` and `argmax`; growth with the level."""
 
 from __future__ import annotations
 

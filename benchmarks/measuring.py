@@ -1,8 +1,8 @@
 """Alternatives measured in turn.
 
-All ways of a table run one after the other, round after round, so that the load of the machine
-meets all of them; what counts is the quotient with the first way within each round. Absolute
-times say little about another machine.
+All alternatives of a table run one after the other, round after round, so that background load
+affects all of them; the result is the ratio to the first alternative within each round. Absolute
+times do not transfer to another machine.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The training loader, a training step and an evaluation, beside doing the least by hand.
+"""The training loader, a training step and an evaluation, compared with minimal code.
 
 All read a few synthetic rooms in Stanford2D3DS's format.
 """

@@ -45,7 +45,7 @@ class MultiView(nn.Module):
 
 
 def _fit_head(network: nn.Module, num_classes: int) -> None:
-    """Replace the last layer, in the order of definition, unless it has so many outputs."""
+    """Replace the last layer, in order of definition, unless its outputs match the classes."""
     layers = [n for n, m in network.named_modules() if isinstance(m, nn.Linear | nn.Conv2d)]
     head = network.get_submodule(layers[-1])
     if not isinstance(head, nn.Linear):

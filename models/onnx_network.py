@@ -1,4 +1,4 @@
-"""An ONNX file as a network like any other."""
+"""An ONNX file as a network."""
 
 from __future__ import annotations
 

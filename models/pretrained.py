@@ -1,4 +1,4 @@
-"""Tensors of trained networks: reading and fetching them, and loading all of them or none."""
+"""Tensors of trained networks: reading, fetching and strict loading."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
     """Tensors of a state dict, or those under ``network.`` of a checkpoint, by name.
 
     Args:
-        path: A file that `torch.save` wrote, of which nothing but tensors and plain values is
-            unpickled, or a ``.safetensors`` file.
+        path: A file of `torch.save`, of which only tensors and plain values are unpickled, or a
+            ``.safetensors`` file.
 
     Raises:
         DataError: There is no such file, or it holds something else.
@@ -83,7 +83,7 @@ def load_tensors(
     """Load a network's tensors; every one must be there and fit.
 
     Args:
-        network: Into which.
+        network: The network, changed in place.
         tensors: Names and values.
         source: Their source, for the message.
         fresh: Prefix of the names of tensors that are not loaded.

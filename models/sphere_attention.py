@@ -74,7 +74,7 @@ class SphereAttention(nn.Module):
 
         Args:
             tokens: Features of the images of each sphere.
-            directions: Unit vectors the tokens look along.
+            directions: Unit viewing directions of the tokens.
         """
         spheres, images, channels, rows, columns = tokens.shape
         x = self.norm(tokens.movedim(2, -1).flatten(1, 3))
@@ -113,7 +113,7 @@ def angular_attention(
         queries: Of every head.
         keys: Of every head.
         values: Of every head.
-        directions: Unit vectors the tokens look along.
+        directions: Unit viewing directions of the tokens.
         kappa: Concentration of every head.
 
     Returns:

@@ -34,8 +34,8 @@ class SphereContext(nn.Module):
 
     A tangent image sees only its field of view (paper, supplement, "Limitations"). Here the
     features F at a stage become F + upsample(mixer(pool(F))): a few tokens per image are mixed with
-    those of all images of the sphere, by the directions they look along. Mixers start at zero: at
-    first this computes exactly what the network does, and can be added to a trained one. Any subset
+    those of all images of the sphere, by the directions they look along. Mixers start at zero, so
+    that adding one to a trained network does not change its result at first. Any subset
     of the images of a sphere will do.
 
     Args:
@@ -46,10 +46,10 @@ class SphereContext(nn.Module):
             and directions ``(S, n, 3, t, t)`` of n images on each of S spheres to what is added to
             the tokens. `SphereAttention` or another.
         in_channels: Channels C of the images.
-        tokens: Rows and columns of tokens per image, at most.
+        tokens: Maximum rows and columns of tokens per image.
 
     Raises:
-        SettingError: No token, or no such stage (it names those there are).
+        SettingError: No token, or no such stage (the message lists the stages).
     """
 
     def __init__(
@@ -190,7 +190,7 @@ class SphereContext(nn.Module):
 def token_directions(
     rays: Float[Tensor, "spheres images 3 3"], rows: int, columns: int
 ) -> Float[Tensor, "spheres images 3 rows columns"]:
-    """Unit vectors that the centers of tokens look along.
+    """Unit viewing directions of the token centres.
 
     Args:
         rays: They map image coordinates to directions, see `SphereContext.forward`.

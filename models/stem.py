@@ -17,10 +17,10 @@ _RGB = 3
 
 @registered
 def widen_stem(network: nn.Module, in_channels: int) -> nn.Module:
-    """Let a network for RGB images take further channels, depth for example.
+    """Extend a network for RGB images to further channels, such as depth.
 
     The filters of the further channels start at zero (paper, supplement, "Level 10 parameters"):
-    untrained, the network computes from RGB-D exactly what it does from RGB.
+    at first, the network computes the same from RGB-D as from RGB.
 
     Args:
         network: Any network; its first convolution must be the one that sees the image.

@@ -1,6 +1,6 @@
 """A classifier on distorted digits: ``python -m studies.distorted_digits [--mnist FOLDER]``.
 
-The paper's figure "MNIST accuracy": trained on digits as they are, tested on digits with pincushion
+The paper's figure "MNIST accuracy": trained on undistorted digits, tested on digits with pincushion
 distortion x' = x (1 + K1 r²), where half a side of the image is the unit of length.
 """
 

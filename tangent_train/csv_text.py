@@ -1,4 +1,4 @@
-"""CSV whose texts stay texts in a spreadsheet."""
+"""CSV safe for spreadsheets: no text is taken for a formula."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ _FORMULA = ("=", "+", "-", "@", "\t", "\r")
 def csv_text(columns: Sequence[str], rows: Iterable[Mapping[str, Any] | Sequence[Any]]) -> str:
     r"""A table as CSV, its header first.
 
-    Texts that a spreadsheet would take for a formula begin with ``'``: names of classes and files
-    may be anybody's.
+    Text that a spreadsheet would take for a formula is prefixed with ``'``: names of classes and
+    files are untrusted.
 
     Args:
         columns: Their names.

@@ -1,4 +1,4 @@
-"""The two errors users meet: a setting that cannot work, a file that cannot be used."""
+"""The two user errors: an invalid setting, and an unusable file."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _CONTROL = re.compile(r"[^\n\t -~\xa0-\U0010ffff]")
 
 
 def printable(text: str) -> str:
-    r"""Lines of text whose commands for terminals are written out.
+    r"""Escape terminal control sequences in lines of text.
 
     >>> print(printable("sofa\x1b[2J"))
     sofa\x1b[2J
@@ -22,7 +22,7 @@ def printable(text: str) -> str:
 
 
 class _ExplainedError(ValueError):
-    """An error that says what it is about, what was found, what was expected and the remedy.
+    """An error with its subject, the value found, the values expected and the remedy.
 
     Args:
         subject: The setting, file or folder; alone, the whole message (as when unpickled in
@@ -48,7 +48,7 @@ class _ExplainedError(ValueError):
 
 
 class SettingError(_ExplainedError):
-    """A setting that cannot work, named as in the config."""
+    """An invalid setting, named as in the config."""
 
 
 class DataError(_ExplainedError):

@@ -1,4 +1,4 @@
-"""Writing files so that a reader never sees half of one."""
+"""Atomic writing of files."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _tidied: set[Path] = set()
 
 
 class NoRoomError(SettingError):
-    """A disk that is full, a quota that is used up, a file larger than files may be."""
+    """A full disk, an exhausted quota, or a file above the size limit."""
 
 
 def no_room(path: Path, error: BaseException) -> NoRoomError | None:
@@ -97,10 +97,10 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
 
 def reserve(file: IO[bytes], size: int) -> None:
-    """Take the room of a file before its pages are written through memory.
+    """Allocate the disk space of a file before it is written through memory mapping.
 
-    A mapped file has holes at first; a disk that is full when one is filled ends the process. Some
-    systems (macOS, Windows) have no way to take room.
+    A mapped file is sparse at first; a full disk then kills the process. macOS and Windows cannot
+    allocate in advance.
 
     Args:
         file: Open for reading and writing.
@@ -114,7 +114,7 @@ def reserve(file: IO[bytes], size: int) -> None:
 
 
 def _sync(path: Path) -> None:
-    """Have a file, or the names in a folder, written to the disk now."""
+    """Flush a file, or the names in a folder, to the disk."""
     if path.is_dir() and os.name == "nt":  # where folders cannot be opened
         return
     handle = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
@@ -137,7 +137,7 @@ def write_text(path: Path, content: str) -> None:
 
 
 def _refused(path: Path) -> OSError:
-    """Why the disk takes no more of a file: libraries fail without saying it."""
+    """The reason why a file cannot grow, which libraries do not report."""
     try:
         with path.open("ab") as file:
             file.write(_PROBE)

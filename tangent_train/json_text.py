@@ -1,4 +1,4 @@
-"""JSON from files that anybody may have written."""
+"""JSON from untrusted files."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ __all__ = ["parse_json"]
 
 
 def parse_json(text: str | bytes, **options: Any) -> Any:
-    """`json.loads`, for which text nested too deeply is broken like any other.
+    """`json.loads`, with a `ValueError` for text that is nested too deeply.
 
     Args:
         text: UTF-8, UTF-16 or UTF-32 where it is bytes.

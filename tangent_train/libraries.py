@@ -1,7 +1,7 @@
 """Callables of other libraries that settings in files may name, and their arguments.
 
-All are numbers, words and lists of these: whatever would read, fetch or run something (weights,
-addresses, files, plugins) is not among them.
+Arguments are numbers, strings and lists of these; arguments that would read, fetch or run something
+(weights, URLs, files, plugins) are excluded.
 """
 
 from __future__ import annotations

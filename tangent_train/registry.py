@@ -1,10 +1,10 @@
-"""Objects made from settings, and which of them the settings inside a file may name.
+"""Building objects from settings, and the registry of those that files may name.
 
-A section of a config says by ``_target_`` what is made from it. What stands in a config folder or
-on the command line is the user's own, and may name any class or function. What stands in a file may
-be anybody's: it is plain data, and may name registered classes and give their arguments, as far as
-the types of these allow, and nothing in it is ever interpreted: no interpolations, no positional
-arguments, no paths, no addresses. `make` is the only code that turns settings into objects.
+``_target_`` of a config section names the object to build. Config folders and the command line are
+the user's own and may name any class or function. Files are untrusted plain data: they may name
+registered classes and give their arguments, as far as the argument types allow, and are never
+interpreted: no interpolations, no positional arguments, no paths, no URLs. `make` is the only code
+that builds objects from settings.
 
 This module imports nothing heavy: networks and data sets import it.
 """
@@ -51,11 +51,11 @@ _CALLED_LATER = ("mixer", "optimizer", "scheduler")
 
 
 class Text:
-    """A kind of value: any line that is only ever shown, as names of classes."""
+    """A kind of value: text that is only displayed, such as class names."""
 
 
 class Weights:
-    """A kind of argument: names trained weights. Null for a file, whose own tensors are used."""
+    """A kind of argument: names pretrained weights; null for a file, whose own tensors are used."""
 
 
 class _Object:
@@ -85,7 +85,7 @@ class SettingsFile:
         path: The file, for messages.
         trust: Full names of classes and functions that it may name besides the registered ones;
             their arguments may be any plain values.
-        own: Places (``data.fold``) where the values, with all below them, are the user's own.
+        own: Settings (``data.fold``), with all below them, whose values are the user's own.
     """
 
     path: Path
@@ -97,13 +97,13 @@ class SettingsFile:
         return not any(f"{place}.".startswith(f"{own}.") for own in self.own)
 
     def refused(self, place: str, value: Any, expected: str) -> DataError:
-        """The error that a value of the file is not usable."""
+        """The error for an invalid value of the file."""
         remedy = f"On the command line {place}=… may be anything."
         return DataError(self.path, found=f"{place}={value!r}", expected=expected, remedy=remedy)
 
 
 def make(settings: Any, place: str, file: SettingsFile | None = None, **given: Any) -> Any:
-    """The object that a section of a config describes.
+    """Build the object that a section of a config describes.
 
     Args:
         settings: ``_target_``, its arguments by name, which may be such sections themselves, and
@@ -114,7 +114,7 @@ def make(settings: Any, place: str, file: SettingsFile | None = None, **given: A
 
     Raises:
         SettingError: The class or function cannot be imported.
-        DataError: The file gives what files must not give, or what cannot be made.
+        DataError: The file gives forbidden or invalid settings.
     """
     maker, kinds = _maker(settings, place, file)
     arguments = {name: None for name, kind in kinds.items() if kind is Weights} | {
@@ -145,7 +145,7 @@ def maker_of(settings: Any, place: str, file: SettingsFile | None = None) -> Any
 
 
 def import_named(target: Any, place: str) -> Any:
-    """Import what a full name names.
+    """Import an object by its full name.
 
     Raises:
         SettingError: It cannot be imported.
@@ -201,7 +201,7 @@ def check_plain(path: Path, value: Any, place: str, depth: int = 0) -> Any:
         depth: In how many others they are.
 
     Raises:
-        DataError: There is something else, or they are nested without end.
+        DataError: There are other values, or they are nested too deeply.
     """
     expected = f"plain values, at most {_DEEPEST} inside each other"
     if depth > _DEEPEST:

@@ -89,7 +89,7 @@ def flat_settings(config: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple
 def differing_settings(
     now: Mapping[str, Any], before: Mapping[str, Any], purpose: Purpose
 ) -> list[tuple[str, Any, Any]]:
-    """Settings that differ and must not, with what they are and what they were, sorted by name.
+    """Settings that differ and must not, with their new and old values, sorted by name.
 
     A setting that one of the two does not have is None there.
 

@@ -26,7 +26,7 @@ class RoomSettings:
         seed: Seed of everything, 0 or more.
         rooms: Number of rooms per area (a subset of `AREAS`, also written ``area_5a``).
         height: Rows of the panoramas; they have twice as many columns.
-        views: How perspective views look around: ``"stanford"`` upright like the real set's (pitch
+        views: Viewing directions of photos: ``"stanford"`` upright as in the real set (pitch
             about N(0, 20°)), ``"uniform"`` in directions uniform on the sphere.
         views_per_camera: Perspective views per panorama.
         view_size: Side of the square perspective views in pixels.

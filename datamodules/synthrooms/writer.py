@@ -73,7 +73,7 @@ _PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 
 
 class RoomPlan(NamedTuple):
-    """A room before it is made.
+    """A planned room.
 
     Attributes:
         area: ``"1"`` to ``"6"``, with ``"5a"`` and ``"5b"``.
@@ -179,7 +179,7 @@ def pose_record(
     of 90° and the camera matrix of one face of the cube around it.
 
     Args:
-        room: Where.
+        room: The room.
         camera: One of its cameras.
         frame: `PANORAMA`, or the number of a perspective view.
         view: Its camera.

@@ -1,1 +1,1 @@
-"""SynthShapes: parametric families of shapes, written as OFF files in ModelNet40's own tree."""
+"""SynthShapes: parametric families of shapes, written as OFF files in ModelNet40's layout."""

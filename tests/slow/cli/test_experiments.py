@@ -41,7 +41,7 @@ class OneStep(lightning.Callback):
 
 @pytest.fixture(scope="module")
 def rooms_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where the first experiment on made rooms makes them, for all."""
+    """Folder where the first experiment generates synthetic rooms, for all."""
     return tmp_path_factory.mktemp("rooms")
 
 
