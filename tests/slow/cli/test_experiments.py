@@ -21,6 +21,9 @@ from tests.datamodules.synthia.synthia_format import write_panoramas, write_view
 if TYPE_CHECKING:
     from tests.conftest import FabricateStanford
 
+# network.frozen_statistics=true
+pytestmark = pytest.mark.filterwarnings("ignore:Found .* in eval mode:UserWarning")
+
 FOLDER = config_folder() / "experiment"
 FOUND = sorted(
     path.relative_to(FOLDER).with_suffix("").as_posix() for path in FOLDER.rglob("*.yaml")

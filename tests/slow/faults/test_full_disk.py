@@ -13,6 +13,7 @@ import resource
 import shlex
 import subprocess
 import sys
+import threading
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -131,7 +132,7 @@ for name, write in WRITERS.items():
 def test_files_that_may_not_become_larger(tmp_path: Path, writer: str) -> None:
     path = tmp_path / "file.ckpt"
     path.write_text("old")
-    message = rf"{re.escape(str(path))}: found file too large .*Nothing .* has changed. Free some"
+    message = rf"{re.escape(str(path))}: found file too large .*Existing files are unchanged"
     with _small_files(), pytest.raises(NoRoomError, match=message):
         WRITERS[writer](path)
     assert path.read_text() == "old"
@@ -204,6 +205,9 @@ def test_what_tensorboard_cannot_write_stops_with_a_checkpoint_to_go_on_from(
         machine_faults(tmp_path, data),
     ):
         trainer.fit(small_task(Faulty()), datamodule=data)
+    for thread in threading.enumerate():  # TensorBoard's ends with the same error, a little later
+        if "AsyncWriter" in type(thread).__name__:
+            thread.join(timeout=60)
     said = capfd.readouterr().err
     assert f"tangent-train resume={tmp_path}" in said
     content = torch.load(tmp_path / "checkpoints" / "last.ckpt", weights_only=True)
