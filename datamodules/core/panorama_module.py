@@ -104,7 +104,7 @@ class PanoramaDataModule(SplitDataModule[ImageFiles]):
         """See `SplitDataModule`."""
         reader, splits = self.find_images(problems)
         height, width = shape = self.erp_height, 2 * self.erp_height
-        read = PanoramaReading(reader, shape)
+        read = PanoramaReading(reader, shape, len(self.class_names))
         store = Store.of(self.store, f"{height}x{width}", reader.settings)
         found = Found(self.noun, splits, read, store)
         check = partial(check_headers, reader=reader, problems=problems, erp_height=height)

@@ -83,7 +83,7 @@ class PhotoDataModule(SplitDataModule[ImageFiles]):
         """See `SplitDataModule`."""
         reader, splits = self.find_images(problems)
         store = Store.of(self.store, "photos", reader.settings)
-        found = Found(self.noun, splits, PhotoReading(reader), store)
+        found = Found(self.noun, splits, PhotoReading(reader, len(self.class_names)), store)
         check = partial(self._check, reader=reader, problems=problems)
         for _ in in_threads(check, found.of()):
             pass

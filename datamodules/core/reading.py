@@ -51,9 +51,12 @@ class ImageReader(ABC):
     """Decoder of the files of a data set."""
 
     @property
+    @abstractmethod
     def settings(self) -> Mapping[str, str]:
-        """Settings that affect labels and depth; each choice has a store of its own."""
-        return {}
+        """Everything that affects labels and depth besides the files, such as a class table.
+
+        Each choice has a prepared store of its own.
+        """
 
     @abstractmethod
     def size(self, part: str, path: Path) -> tuple[int, int]:
@@ -99,10 +102,12 @@ class PanoramaReading:
     Attributes:
         reader: Of the data set.
         shape: Rows and columns of the result.
+        num_classes: K + 1, the unknown class included.
     """
 
     reader: ImageReader
     shape: tuple[int, int]
+    num_classes: int
 
     def __call__(self, files: ImageFiles) -> Panorama:
         """One panorama."""
@@ -114,11 +119,11 @@ class PanoramaReading:
 
     def labels(self, files: ImageFiles) -> NDArray[np.uint8]:
         """Its labels alone."""
-        return self.reader.labels(files, self.shape)
+        return _labels(self.reader, self.num_classes, files, self.shape)
 
     def parts(self, files: ImageFiles) -> list[Callable[[], object]]:
         """Functions that decode each of its files separately."""
-        return [partial(getattr(self.reader, part), files) for part in files.parts]
+        return _parts(self.reader, self.num_classes, files)
 
 
 @dataclass(frozen=True)
@@ -127,9 +132,11 @@ class PhotoReading:
 
     Attributes:
         reader: Of the data set.
+        num_classes: K + 1, the unknown class included.
     """
 
     reader: ImageReader
+    num_classes: int
 
     def __call__(self, files: ImageFiles) -> Photo:
         """One photo."""
@@ -141,11 +148,33 @@ class PhotoReading:
 
     def labels(self, files: ImageFiles) -> NDArray[np.uint8]:
         """Its labels alone."""
-        return self.reader.labels(files)
+        return _labels(self.reader, self.num_classes, files)
 
     def parts(self, files: ImageFiles) -> list[Callable[[], object]]:
         """Functions that decode each of its files separately."""
-        return [partial(getattr(self.reader, part), files) for part in files.parts]
+        return _parts(self.reader, self.num_classes, files)
+
+
+def _parts(reader: ImageReader, num_classes: int, files: ImageFiles) -> list[Callable[[], object]]:
+    read = {"labels": partial(_labels, reader, num_classes)}
+    return [partial(read.get(part, getattr(reader, part)), files) for part in files.parts]
+
+
+def _labels(
+    reader: ImageReader,
+    num_classes: int,
+    files: ImageFiles,
+    shape: tuple[int, int] | None = None,
+) -> NDArray[np.uint8]:
+    labels = reader.labels(files, shape)
+    if labels.max(initial=0) >= num_classes:
+        raise DataError(
+            files.labels,
+            found=f"label {labels.max()}",
+            expected=f"0 (unknown) to {num_classes - 1}",
+            remedy="The data set's class_names and its reader's labels have to agree.",
+        )
+    return labels
 
 
 def check_headers(

@@ -58,7 +58,7 @@ class EpochSampler(Sampler[tuple[int, int]]):
             continues after them. The length stays that of a whole epoch.
 
     Raises:
-        SettingError: Fewer samples than processes.
+        SettingError: No samples, or fewer than processes.
     """
 
     def __init__(
@@ -70,6 +70,8 @@ class EpochSampler(Sampler[tuple[int, int]]):
         world_size: int = 1,
         start: tuple[int, int] = (0, 0),
     ) -> None:
+        if length == 0:
+            raise SettingError("data", found="a split without images", expected="one or more")
         if length < world_size:
             raise SettingError(
                 "trainer.devices",

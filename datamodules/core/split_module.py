@@ -178,15 +178,29 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
                     expected="the data set",
                     remedy="Run tangent-prepare with the same settings.",
                 )
-            count = self.find(problems).check(problems, progress=progress)
+            count = self._listed(problems).check(problems, progress=progress)
         return problems, count
+
+    def _listed(self, problems: Problems) -> Found[_Item]:
+        """Items of all splits, with the checks that hold for every data set."""
+        if self.kind == "segmentation" and self.class_names[0] != "unknown":
+            raise SettingError(
+                "class_names of the data",
+                found=f"{self.class_names[0]} first",
+                expected="unknown, then the classes: label 0 is ignored",
+            )
+        found = self.find(problems)
+        if not found.of() and not problems.items:
+            expected = f"{self.noun}, as docs and the docstring of the data set describe them"
+            raise DataError(self.root, found=f"no {self.noun}", expected=expected)
+        return found
 
     def _usable(self, *, sample: bool = False) -> Found[_Item]:
         """Usable items; refuse the data set if one is broken, unless broken ones are left out."""
         problems = Problems()
         found: Any = None
         with problems.noted():
-            found = self.find(problems)
+            found = self._listed(problems)
         if problems.fatal:
             problems.refuse(self.root)
         if not self.skip_broken:

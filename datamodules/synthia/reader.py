@@ -99,6 +99,11 @@ class SynthiaReader(ImageReader):
 
     formats: Formats
 
+    @property
+    def settings(self) -> dict[str, str]:
+        """None: all classes are those of the release."""
+        return {}
+
     def size(self, part: str, path: Path) -> tuple[int, int]:
         """See `ImageReader`, as all others."""
         header = check_png(path, *self.formats[part])

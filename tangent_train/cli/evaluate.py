@@ -9,6 +9,7 @@ from typing import Any
 
 import lightning
 from hydra.core.hydra_config import HydraConfig
+from lightning.pytorch.accelerators import CPUAccelerator
 from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
@@ -104,6 +105,12 @@ class Run:
             # The data module's samplers count every image once on any number of processes.
             use_distributed_sampler=False,
         )
+        if section.get("sync_batchnorm") and isinstance(trainer.accelerator, CPUAccelerator):
+            raise SettingError(
+                "trainer.sync_batchnorm",
+                found="true, on a CPU",
+                expected="false: torch synchronizes batch statistics on GPUs only",
+            )
         return trainer
 
     def test(self, trainer: lightning.Trainer, checkpoint: Path) -> None:

@@ -39,6 +39,8 @@ __all__ = [
 def _main(command: str) -> None:
     """Compose the config ``<command>.yaml`` with the command line and hand it to the command."""
     import hydra
+    from hydra.errors import HydraException
+    from omegaconf.errors import OmegaConfBaseException
 
     from tangent_train.cli.compose import config_folder, quote_path
     from tangent_train.cli.stored import stored_run
@@ -60,7 +62,18 @@ def _main(command: str) -> None:
         sys.argv[1:] = map(quote_path, arguments)
         try:
             folder = str(config_folder())
+            os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises what it would print
             hydra.main(version_base="1.3", config_path=folder, config_name=command)(job)()
+        except (HydraException, OmegaConfBaseException) as error:
+            cause = str(error.__cause__ or "").partition("\n")[0]
+            sys.exit(f"tangent-{command}: {error}" + f"\n{cause}" * bool(cause))
+        except (NotADirectoryError, PermissionError) as error:
+            raise SettingError(
+                error.filename or "output",
+                found=(error.strerror or str(error)).lower(),
+                expected="a file or folder that can be read and written",
+                remedy="Change its permissions, or choose another one (of a run: hydra.run.dir=…).",
+            ) from error
         finally:
             sys.argv[1:] = typed
 

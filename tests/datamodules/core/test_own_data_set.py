@@ -1,0 +1,107 @@
+"""The smallest data set of panoramas, and what is refused of one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+import pytest
+
+from datamodules.core.panorama_module import PanoramaDataModule
+from datamodules.core.reading import ImageFiles, ImageReader
+from datamodules.images.png import check_png, read_color_png, read_png
+from tangent_train.errors import DataError, SettingError
+from tangent_train.rendering import EquirectRepresentation
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from datamodules.core.found import Split
+    from datamodules.core.problems import Problems
+
+
+class ToyReader(ImageReader):
+    @property
+    def settings(self) -> dict[str, str]:
+        return {}
+
+    def size(self, part: str, path: Path) -> tuple[int, int]:
+        header = check_png(path, 8, ("RGB",) if part == "rgb" else ("grey",))
+        return header.height, header.width
+
+    def rgb(self, files: ImageFiles) -> NDArray[np.uint8]:
+        return read_color_png(files.rgb)
+
+    def labels(self, files: ImageFiles, shape: tuple[int, int] | None = None) -> NDArray[np.uint8]:
+        labels: NDArray[np.uint8] = read_png(files.labels, cv2.IMREAD_UNCHANGED)
+        return labels if shape is None else cv2.resize(labels, shape[::-1], interpolation=0)
+
+    def depth(self, files: ImageFiles) -> NDArray[np.uint16]:
+        raise NotImplementedError(files.name)
+
+
+@dataclass(kw_only=True, eq=False, repr=False)
+class Toy(PanoramaDataModule):
+    class_names = ("unknown", "sky", "wall", "ground")
+
+    def find_images(self, problems: Problems) -> tuple[ToyReader, dict[Split, list[ImageFiles]]]:
+        files = [
+            ImageFiles(path.stem, path, self.root / "labels" / path.name)
+            for path in sorted((self.root / "rgb").glob("*.png"))
+        ]
+        return ToyReader(), {"train": files[:-1], "val": [], "test": files[-1:]}
+
+
+class Nameless(Toy):
+    class_names = ("sky", "wall", "ground", "door")
+
+
+def _write(root: Path, largest: int) -> None:
+    rng = np.random.default_rng(0)
+    for folder, high, size in (("rgb", 255, (32, 64, 3)), ("labels", largest, (32, 64))):
+        (root / folder).mkdir()
+        for name in "abc":
+            image = rng.integers(0, high + 1, size, np.uint8)
+            assert cv2.imwrite(str(root / folder / f"{name}.png"), image)
+
+
+def _toy(root: Path, made: type[Toy] = Toy) -> Toy:
+    return made(root, EquirectRepresentation(level=4), inputs=["rgb"], validation_fraction=0)
+
+
+def test_a_data_set_is_a_reader_and_its_files(tmp_path: Path) -> None:
+    _write(tmp_path, 3)
+    data = _toy(tmp_path)
+    data.prepare_data()
+    assert len(data.source("train")) == 2
+    expected = cv2.imread(str(tmp_path / "labels" / "c.png"), cv2.IMREAD_UNCHANGED)
+    sample = data.evaluation_samples("test")[0, 0]
+    np.testing.assert_array_equal(sample.target, expected)
+    problems, count = data.check(progress=False)
+    assert not problems.items
+    assert count == 3
+
+
+def test_labels_past_the_classes_are_found(tmp_path: Path) -> None:
+    _write(tmp_path, 4)
+    data = _toy(tmp_path)
+    problems, _ = data.check(progress=False)
+    assert problems.items == {"a", "b", "c"}
+    with pytest.raises(DataError, match=r"labels/c\.png: found label 4; expected 0 .* to 3"):
+        data.source("test").labels(0)
+
+
+def test_the_first_class_is_the_unknown_one(tmp_path: Path) -> None:
+    _write(tmp_path, 2)
+    with pytest.raises(SettingError, match=r"class_names .*found sky first; expected unknown"):
+        _toy(tmp_path, Nameless).prepare_data()
+
+
+def test_a_data_set_without_images_is_refused(tmp_path: Path) -> None:
+    data = _toy(tmp_path / "nowhere")
+    with pytest.raises(DataError, match="nowhere: found no panoramas"):
+        data.prepare_data()
+    assert data.check(progress=False)[0]
