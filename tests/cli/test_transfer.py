@@ -85,7 +85,7 @@ def test_a_failing_stage_leaves_the_others_and_the_command_goes_on(
     error = capsys.readouterr().err
     folder = (OF_SEED_0 / "P-FT-1").absolute()
     assert f"stage P-FT-1 in {folder} ended with status 7" in error
-    assert "the same command goes on" in error
+    assert "the same command continues" in error
     assert not (HERE / "transfer.md").exists()
 
     shutil.move("runs", "elsewhere")
