@@ -97,12 +97,12 @@ def test_failing_jobs_are_shown_and_do_not_stop_the_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit):
+    with pytest.raises(SystemExit) as stopped:
         run_command(monkeypatch, "train", "-m", "data.fold=4,5", "hydra.sweep.dir=sweep", *SETTINGS)
     error = capfd.readouterr().err
     assert error.count("tangent-train: data.fold: found 4") == 1
     assert error.count("tangent-train: data.fold: found 5") == 1
-    assert f"job 0 in {tmp_path / 'sweep' / '0'} ended with status 1" in error
+    assert f"job 0 in {tmp_path / 'sweep' / '0'} ended with status 1" in str(stopped.value)
     assert "Traceback" not in error
 
 
