@@ -74,13 +74,11 @@ class PanoramaDataModule(SplitDataModule[ImageFiles]):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not hasattr(self.representation, "erp_height"):
-            raise SettingError(
-                "representation",
-                found=type(self.representation).__name__,
-                expected="one for panoramas",
-                remedy="Choose representation=tangent, or photos, as data=synthrooms_perspective.",
-            )
+        self.need_representation(
+            "erp_height",
+            "one for panoramas",
+            "Choose representation=tangent, or photos, as data=synthrooms_perspective.",
+        )
         self.erp_height: int = self.representation.erp_height
         default = self.normalizations["depth" in self.inputs]
         self.samples = ImageSamples(self.inputs, self.normalization or default, self.color_jitter)

@@ -54,13 +54,11 @@ class PhotoDataModule(SplitDataModule[ImageFiles]):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not hasattr(self.representation, "of_camera"):
-            raise SettingError(
-                "representation",
-                found=type(self.representation).__name__,
-                expected="one for photos",
-                remedy="Choose representation=perspective, or panoramas, as data=synthrooms.",
-            )
+        self.need_representation(
+            "of_camera",
+            "one for photos",
+            "Choose representation=perspective, or panoramas, as data=synthrooms.",
+        )
         default = self.normalizations["depth" in self.inputs]
         self.samples = ImageSamples(self.inputs, self.normalization or default, self.color_jitter)
         self.inputs, self.normalization = self.samples.inputs, self.samples.normalization

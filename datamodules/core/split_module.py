@@ -126,6 +126,25 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
 
     # --- checks --------------------------------------------------------------------------------
 
+    def need_representation(self, attribute: str, expected: str, remedy: str) -> None:
+        """Refuse a representation of another kind of images.
+
+        Args:
+            attribute: Of all representations of the right kind.
+            expected: The right kind, for the message.
+            remedy: For the message.
+
+        Raises:
+            SettingError: It is of another kind.
+        """
+        if not hasattr(self.representation, attribute):
+            raise SettingError(
+                "representation",
+                found=type(self.representation).__name__,
+                expected=expected,
+                remedy=remedy,
+            )
+
     def setup(self, stage: str | None = None) -> None:
         """Find the items, once.
 

@@ -69,13 +69,11 @@ class ModelNet40(SplitDataModule[ShapeFile]):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not hasattr(self.representation, "erp_height"):
-            raise SettingError(
-                "representation",
-                found=type(self.representation).__name__,
-                expected="one for panoramas, such as the spheres of shapes",
-                remedy="Choose representation=tangent.",
-            )
+        self.need_representation(
+            "erp_height",
+            "one for panoramas, such as the spheres of shapes",
+            "Choose representation=tangent.",
+        )
         if self.test_rotation not in (None, "yaw", "so3"):
             raise SettingError(
                 "data.test_rotation", found=repr(self.test_rotation), expected="null, yaw or so3"
