@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 import torch
 
-from tests.security.honest import SECRET, SETTINGS, run_command
+from tests.cli.tiny_runs import run_command
+from tests.security.honest import SECRET, SETTINGS
 
 
 @pytest.fixture(scope="session")

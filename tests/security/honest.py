@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any
 
-import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from tangent_train.cli import main
 from tangent_train.cli.compose import config_folder, quote_path
 from tangent_train.cli.stored import stored_run
 from tangent_train.registry import SettingsFile
 
-__all__ = ["SECRET", "SETTINGS", "composed", "run_command", "settled", "with_config"]
+__all__ = ["SECRET", "SETTINGS", "composed", "settled", "with_config"]
 
 SECRET = "sesame-open"
 SETTINGS = (
@@ -35,12 +32,6 @@ SETTINGS = (
     "panels=0",
     "tensorboard_images=0",
 )
-
-
-def run_command(monkeypatch: pytest.MonkeyPatch, command: str, *arguments: str) -> None:
-    """Run a command in this process."""
-    monkeypatch.setattr(sys, "argv", [f"tangent-{command}", *arguments])
-    getattr(main, command)()
 
 
 def composed(arguments: list[str]) -> dict[str, Any]:

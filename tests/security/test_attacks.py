@@ -21,9 +21,9 @@ from tangent_train.cli.keypoints import earlier_results
 from tangent_train.errors import DataError, SettingError
 from tangent_train.rendering.camera_files import read_cameras
 from tangent_train.results.record import load_record
+from tests.cli.tiny_runs import run_command
 from tests.security.attacks import json_attacks, places, replaced, sampled
 from tests.security.checkpoints import attack_checkpoints, nothing_happens
-from tests.security.honest import run_command
 
 
 def test_in_a_checkpoint(content: dict[str, Any], forbidden: Path) -> None:

@@ -23,7 +23,8 @@ from tangent_train.cli.build import build
 from tangent_train.cli.compose import config_folder
 from tangent_train.errors import DataError, SettingError
 from tangent_train.registry import SettingsFile, make
-from tests.security.honest import SECRET, run_command, settled, with_config
+from tests.cli.tiny_runs import run_command
+from tests.security.honest import SECRET, settled, with_config
 from tests.security.watch import CANARY, watched
 
 _FIRE = f"{CANARY}.fire"

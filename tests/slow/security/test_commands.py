@@ -9,8 +9,9 @@ from typing import Any
 
 import pytest
 
+from tests.cli.tiny_runs import run_command
 from tests.datamodules.folder.folder_format import write_classes, write_data_set
-from tests.security.honest import SECRET, SETTINGS, run_command, with_config
+from tests.security.honest import SECRET, SETTINGS, with_config
 from tests.security.test_stored_settings import WAYS
 from tests.security.watch import CANARY, watched
 
