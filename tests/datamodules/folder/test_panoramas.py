@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +18,6 @@ from tests.datamodules.folder.folder_format import (
     save,
     save_depth,
     write_classes,
-    write_data_set,
     write_panorama,
 )
 
@@ -29,23 +27,6 @@ if TYPE_CHECKING:
     from datamodules.core.found import Split
 
 _SPLITS: tuple[Split, ...] = ("train", "val", "test")
-
-
-@pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Six scenes of two panoramas, 32×64; not to be changed."""
-    return write_data_set(tmp_path_factory.mktemp("folder") / "data", depth=True)
-
-
-@pytest.fixture
-def own_root(root: Path, tmp_path: Path) -> Path:
-    """A copy of it, to be changed."""
-    return Path(shutil.copytree(root, tmp_path / "data"))
-
-
-def _names(module: FolderPanoramas, split: Split) -> list[str]:
-    source = module.source(split)
-    return [source.name(index) for index in range(len(source))]
 
 
 # Pixels

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -8,7 +7,7 @@ import pytest
 
 from datamodules.folder.panoramas import FolderPanoramas
 from tangent_train.errors import DataError
-from tests.datamodules.folder.folder_format import write_data_set
+from tests.datamodules.folder.folder_format import names_of, write_data_set
 
 if TYPE_CHECKING:
     from datamodules.core.found import Split
@@ -16,25 +15,8 @@ if TYPE_CHECKING:
 _SPLITS: tuple[Split, ...] = ("train", "val", "test")
 
 
-@pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Six scenes of two panoramas, 32×64; not to be changed."""
-    return write_data_set(tmp_path_factory.mktemp("folder") / "data", depth=True)
-
-
-@pytest.fixture
-def own_root(root: Path, tmp_path: Path) -> Path:
-    """A copy of it, to be changed."""
-    return Path(shutil.copytree(root, tmp_path / "data"))
-
-
-def _names(module: FolderPanoramas, split: Split) -> list[str]:
-    source = module.source(split)
-    return [source.name(index) for index in range(len(source))]
-
-
 def _all_names(module: FolderPanoramas) -> dict[str, list[str]]:
-    return {split: _names(module, split) for split in _SPLITS}
+    return {split: names_of(module, split) for split in _SPLITS}
 
 
 def _together(names: dict[str, list[str]]) -> list[str]:
@@ -83,7 +65,7 @@ def test_lists_of_all_splits(own_root: Path, strips: Any) -> None:
         "val": ["scene_1/view.1"],
         "test": ["scene_0/view.1", "scene_3/view.0"],
     }
-    assert _names(FolderPanoramas(own_root, strips, validation_fraction=0), "val") == []
+    assert names_of(FolderPanoramas(own_root, strips, validation_fraction=0), "val") == []
 
 
 def test_lists_of_some_splits(own_root: Path, strips: Any) -> None:
