@@ -180,14 +180,16 @@ def image_table(
     part = owners(grid, shape)[rows] if blend == "nearest" else np.empty((0, 0), np.uint8)
     sight = sight_of(grid, grid.face_indices(), shape, rows, part)
     size = (rows.stop - rows.start, shape[1])
-    count = np.zeros(size, np.int32)
-    for ranks in (0, None):
-        table = (int(count.max()) if ranks is None else 0, *size)
-        count[:] = 0
-        face = np.zeros(table, np.int16 if grid.num_images < 2**15 else np.int32)
-        u, v, weight = np.zeros((3, *table), dtype)
-        arguments = ((grid.dim, grid.dim), sight, count, face, u, v, weight)
-        over_rows(kernels.seen_table, *size, *arguments)
+
+    def fill(ranks: int) -> tuple[NDArray[Any], ...]:
+        count = np.zeros(size, np.int32)
+        face = np.zeros((ranks, *size), np.int16 if grid.num_images < 2**15 else np.int32)
+        u, v, weight = np.zeros((3, ranks, *size), dtype)
+        table = (count, face, u, v, weight)
+        over_rows(kernels.seen_table, *size, (grid.dim, grid.dim), sight, *table)
+        return table
+
+    count, face, u, v, weight = fill(1 if blend == "nearest" else int(fill(0)[0].max()))
     # Pixels that fewer images see take their first one again, with weight 0.
     unused = np.arange(len(face))[:, None, None] >= count
     face, u, v = (np.where(unused, line[:1], line) for line in (face, u, v))
