@@ -57,6 +57,13 @@ PREDICT = ("predict", "checkpoint=x.ckpt", "input=image.png", "output=labels")
         ((*ROOMS, "ema=2"), r"ema: found 2; expected a decay"),
         ((*ROOMS, "panels=-1"), r"panels: found -1; expected 0 or more"),
         ((*ROOMS, "checkpoint_every_n_steps=0"), r"checkpoint_every_n_steps: found 0; expected"),
+        (
+            (*ROOMS, "trainer=ddp", "trainer.accelerator=cpu", "trainer.sync_batchnorm=true"),
+            r"trainer\.sync_batchnorm: found true, on a CPU; expected false",
+        ),
+        ((*ROOMS, "hydra.run.dir=image.png/run"), r"image\.png/run: found not a directory; expect"),
+        (("train", "levl=3"), r"Could not override 'levl'.*Key 'levl' is not in struct"),
+        (("train", "level=${oc.env:NOT_SET}"), r"Environment variable 'NOT_SET' not found"),
         # Files.
         (("evaluate", "checkpoint=nowhere.ckpt"), r"nowhere\.ckpt: found no such file; expected"),
         (("evaluate",), r"checkpoint: found none; expected checkpoints/best"),
