@@ -1,6 +1,6 @@
 # make demo   sets up, makes furnished rooms, trains on them and shows the results
-# make test   sets up and runs the tests, about 5 minutes on two cores
-# make test-all  with the slow ones and the coverage, about 40 minutes; what CI runs
+# make test   sets up and runs the tests, about 2 minutes on two cores
+# make test-all  with the slow ones and the coverage, about 20 minutes; what CI runs
 # make bench  measures speed and memory, under 10 minutes; make bench-compare looks for regressions
 PYTHON ?= python3
 BIN := .venv/bin
@@ -26,7 +26,7 @@ demo: install
 		echo "Going on with the interrupted demo …"; \
 		$(BIN)/tangent-train resume=$(DEMO); \
 	else \
-		echo "Making rooms, training and evaluating (about 4 minutes on two cores) …"; \
+		echo "Rendering rooms, training and evaluating (4 to 7 minutes on two cores) …"; \
 		$(BIN)/tangent-train experiment=rooms/demo hydra.run.dir=$(DEMO); \
 	fi
 
