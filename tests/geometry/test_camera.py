@@ -66,34 +66,7 @@ def test_shift_range_is_the_papers(
     np.testing.assert_allclose(shift_range(matrix, size, fov_deg), expected, atol=1e-9)
 
 
-@pytest.mark.parametrize("least_x", [True, False])
-@pytest.mark.parametrize("least_y", [True, False])
-def test_crops_at_the_ends_of_the_range_touch_the_border_of_the_image(
-    least_x: bool, least_y: bool
-) -> None:
-    least, greatest = shift_range(K, SIZE)
-    shift = np.where([least_x, least_y], least, greatest)
-    old_from_new = np.linalg.inv(normalize_camera(K, SIZE, shift=tuple(shift)).homography)
-    corners = np.array([[-0.5, -0.5], [127.5, 127.5]])
-    old = np.column_stack([corners, [1, 1]]) @ old_from_new.T
-    height, width = SIZE
-    assert old[0 if least_x else 1, 0] == pytest.approx(-0.5 if least_x else width - 0.5)
-    assert old[0 if least_y else 1, 1] == pytest.approx(-0.5 if least_y else height - 0.5)
-    assert (old[:, :2] > -0.5 - 1e-9).all()
-    assert (old[:, :2] < np.array([width, height]) - 0.5 + 1e-9).all()
-
-
-@pytest.mark.parametrize("shift", [(0.0, 0.0), (90.0, -3.5), (-100.0, 2.0)])
-def test_homography_is_the_papers_in_its_own_pixels(shift: tuple[float, float]) -> None:
-    camera = normalize_camera(K, SIZE, fov=40.0, dim=96, shift=shift)
-    delta = np.zeros((3, 3))
-    delta[:2, 2] = shift
-    expected = CORNER @ camera.camera_matrix @ np.linalg.inv(CORNER @ K + delta)
-    np.testing.assert_allclose(CORNER @ camera.homography @ np.linalg.inv(CORNER), expected,
-                               atol=1e-12)  # fmt: skip
-
-
-@pytest.mark.parametrize("fov_deg", [0.5, 10.0, 45.0, 90.0, 150.0])
+@pytest.mark.parametrize("fov_deg", [0.5, 45.0, 150.0])
 @pytest.mark.parametrize("size", [(4, 6), (11, 7)])
 def test_fov_is_between_the_outer_pixel_edges(fov_deg: float, size: tuple[int, int]) -> None:
     matrix = camera_matrix_from_fov(fov_deg, size)
@@ -106,7 +79,7 @@ def test_fov_is_between_the_outer_pixel_edges(fov_deg: float, size: tuple[int, i
     assert matrix[0, 0] == matrix[1, 1]
 
 
-@pytest.mark.parametrize("fov_deg", [0, -5, 180, 270, math.nan])
+@pytest.mark.parametrize("fov_deg", [0, 180, math.nan])
 def test_impossible_fields_of_view_are_refused(fov_deg: float) -> None:
     with pytest.raises(SettingError, match=r"fov_deg: found .*; expected more than 0 and less"):
         camera_matrix_from_fov(fov_deg, (4, 4))

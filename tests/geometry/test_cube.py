@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import math
-import pickle
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from tangent_train.errors import SettingError
-from tangent_train.geometry import (
-    CubeGrid,
-    TangentGrid,
-    rotation_about,
-)
+from tangent_train.geometry import CubeGrid, TangentGrid, rotation_about
+from tests.geometry.directions import random_directions
 
 TURN = rotation_about((1, 2, -3), 1.1)
 FRONT, RIGHT, BACK, LEFT, UP, DOWN = range(6)
@@ -28,11 +24,6 @@ CORNERS = {
     UP: [(-1, -1, 1), (-1, 1, 1), (1, -1, 1), (1, 1, 1)],
     DOWN: [(1, -1, -1), (1, 1, -1), (-1, -1, -1), (-1, 1, -1)],
 }
-
-
-def random_directions(count: int) -> NDArray[np.float64]:
-    directions = np.random.default_rng(0).normal(size=(count, 3))
-    return np.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True))
 
 
 @pytest.mark.parametrize("dim", [2, 5, 16])
@@ -81,17 +72,7 @@ def test_tangent_images_overlap_and_the_faces_of_a_cube_do_not(base_level: int) 
         assert grid.overlapping == bool(beyond < -0.4)
 
 
-def test_grids_are_values() -> None:
-    different = [CubeGrid(32), CubeGrid(33), CubeGrid(32, TURN), CubeGrid(32, TURN.T)]
-    assert len({*different, TangentGrid(0, 5)}) == 5
-    assert CubeGrid(32, TURN) == CubeGrid(32, TURN.tolist())
-    assert hash(CubeGrid(32, TURN)) == hash(CubeGrid(32, TURN.tolist()))
-    assert CubeGrid(32) != TangentGrid(0, 5, 32)
-    assert CubeGrid(32) != (32, None)
-    assert pickle.loads(pickle.dumps(CubeGrid(32, TURN))) == CubeGrid(32, TURN)
-
-
-@pytest.mark.parametrize("dim", [1, 0, -4, 8.5, 8.0, "8", True])
+@pytest.mark.parametrize("dim", [1, -4, 8.0, "8", True])
 def test_impossible_sides_are_refused(dim: int) -> None:
     with pytest.raises(SettingError, match=r"dim: found .*; expected a whole number, 2 or more"):
         CubeGrid(dim)

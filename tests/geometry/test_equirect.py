@@ -27,14 +27,6 @@ Shape = tuple[int, int]
 SHAPES = [(1, 1), (2, 4), (50, 100), (63, 126), (7, 9)]
 
 
-@pytest.mark.parametrize(
-    ("level", "shape"), [(0, (2, 4)), (5, (64, 128)), (7, (256, 512)), (8, (512, 1024)),
-                         (10, (2048, 4096))]
-)  # fmt: skip
-def test_shape_of_a_level(level: int, shape: Shape) -> None:
-    assert equirect_shape(level) == shape
-
-
 def test_negative_level_is_refused() -> None:
     with pytest.raises(SettingError, match="level: found -1; expected 0 or more"):
         equirect_shape(-1)
@@ -80,12 +72,6 @@ def test_directions_are_those_of_the_pixel_centres(shape: Shape) -> None:
     assert directions.shape == (*shape, 3)
     np.testing.assert_allclose(directions, lonlat_to_xyz(lonlat), atol=1e-14)
     np.testing.assert_allclose(equirect_latitudes(height), lonlat[:, 0, 1], atol=1e-15)
-
-
-@pytest.mark.parametrize("shape", SHAPES)
-def test_solid_angles_add_up_to_the_sphere(shape: Shape) -> None:
-    width = shape[1]
-    assert (equirect_solid_angles(shape) * width).sum() == pytest.approx(4 * math.pi, rel=1e-13)
 
 
 def test_solid_angle_of_a_row_is_the_integral_of_cos_latitude() -> None:

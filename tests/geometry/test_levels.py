@@ -13,7 +13,7 @@ from tangent_train.geometry import TangentGrid, equirect_shape, nearest_level
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "levels.md"
 
 
-@pytest.mark.parametrize("level", range(14))
+@pytest.mark.parametrize("level", [0, 1, 7, 13])
 def test_the_level_s_own_rows(level: int) -> None:
     rows, _ = equirect_shape(level)
     assert nearest_level(rows) == level

@@ -12,13 +12,7 @@ from scipy.spatial import SphericalVoronoi
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry import TangentGrid, rotation_about, xyz_to_lonlat
-
-BASE_LEVELS = range(5)
-
-
-def random_directions(count: int, seed: int = 0) -> NDArray[np.float64]:
-    directions = np.random.default_rng(seed).normal(size=(count, 3))
-    return np.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True))
+from tests.geometry.directions import random_directions
 
 
 @lru_cache
@@ -35,7 +29,7 @@ def voronoi_extent(base_level: int) -> float:
     return float(np.abs([x, y]).max())
 
 
-@pytest.mark.parametrize("base_level", BASE_LEVELS)
+@pytest.mark.parametrize("base_level", range(5))
 @pytest.mark.parametrize("finer", [3, 4, 6])
 def test_least_dim_covers_the_voronoi_cells_exactly(base_level: int, finer: int) -> None:
     level = base_level + finer
@@ -45,22 +39,6 @@ def test_least_dim_covers_the_voronoi_cells_exactly(base_level: int, finer: int)
         TangentGrid(base_level, level, least - 1)
     assert TangentGrid(base_level, level, least).half_extent >= voronoi_extent(base_level)
     assert TangentGrid.least_dim(base_level, level) == least
-
-
-@pytest.mark.parametrize("base_level", BASE_LEVELS)
-@pytest.mark.parametrize("finer", [2, 3, 5])
-def test_default_images_cover_the_sphere(base_level: int, finer: int) -> None:
-    grid = TangentGrid(base_level, base_level + finer)
-    directions = random_directions(5000)
-    pixels = grid.project(directions, grid.owners(directions))
-    assert pixels.min() >= -1e-9
-    assert pixels.max() <= grid.dim - 1 + 1e-9
-
-
-def test_at_base_level_0_15_percent_of_the_pixels_is_owned() -> None:
-    grid = TangentGrid(0, 7)
-    owned = grid.owners(grid.directions()) == np.arange(20)[:, None, None]
-    assert owned.mean() == pytest.approx(0.15, abs=0.005)
 
 
 @pytest.mark.parametrize("rotation", [None, rotation_about((1, 1, 0), 2.0)])

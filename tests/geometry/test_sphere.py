@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry import (
+    CubeGrid,
+    TangentGrid,
     checked_rotation,
     lonlat_to_xyz,
     random_rotation,
@@ -89,6 +93,17 @@ def test_random_rotations_are_proper_and_uniform() -> None:
     np.testing.assert_allclose((rotations**2).mean(axis=0), 1 / 3, atol=0.03)
     angle = np.arccos(np.clip((np.trace(rotations, axis1=1, axis2=2) - 1) / 2, -1, 1))
     assert angle.mean() == pytest.approx(math.pi / 2 + 2 / math.pi, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    "rotation", [np.eye(2), 2 * np.eye(3), np.diag([1.0, 1, -1]), np.full((3, 3), np.nan)]
+)
+@pytest.mark.parametrize(
+    "take", [checked_rotation, CubeGrid(4).with_rotation, TangentGrid(0, 4).with_rotation]
+)
+def test_impossible_rotations_are_refused(take: Any, rotation: NDArray[np.float64]) -> None:
+    with pytest.raises(SettingError, match=r"rotation: found .* of determinant"):
+        take(rotation)
 
 
 def test_rotations_written_with_seven_digits_are_taken() -> None:
