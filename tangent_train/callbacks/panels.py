@@ -10,17 +10,23 @@ import lightning
 import numpy as np
 import torch
 from lightning.pytorch.callbacks import Callback, RichProgressBar
+from numpy.typing import NDArray
 
-from tangent_train.errors import SettingError
+from datamodules.core.loading import at_least
 from tangent_train.files import write_bytes
 from tangent_train.metrics.segmentation import segmentation_scores
-from tangent_train.results.html import EncodedImage, ViewerImage, encode_image
-from tangent_train.results.pictures import prediction_panel, shown_image, side_by_side
+from tangent_train.results.html import EncodedImage, encode_image
+from tangent_train.results.pictures import prediction_panel, shown_arrays
 from tangent_train.results.tables import percent
 
-__all__ = ["PredictionPanels", "ProgressBar"]
+__all__ = ["PredictionPanels", "ProgressBar", "evenly_spread"]
 
 _PANORAMA_DIMENSIONS = 2
+
+
+def evenly_spread(count: int, total: int) -> NDArray[np.float64]:
+    """At most `count` of the numbers from 0 to ``total - 1``, the first and the last among them."""
+    return np.linspace(0, total - 1, min(count, total)).round()
 
 
 class PredictionPanels(Callback):
@@ -39,10 +45,8 @@ class PredictionPanels(Callback):
     """
 
     def __init__(self, folder: Path | str, count: int = 6) -> None:
-        if count < 0:
-            raise SettingError("panels", found=count, expected="0 or more")
         self.folder = Path(folder)
-        self.count = count
+        self.count = at_least("panels", count, 0)
         self.images: list[EncodedImage] = []
         self._encoded: dict[int, EncodedImage] = {}
 
@@ -62,7 +66,7 @@ class PredictionPanels(Callback):
         dataloader_idx: int = 0,
     ) -> None:
         source: Any = trainer.datamodule.source("test")  # type: ignore[attr-defined]
-        chosen = np.linspace(0, len(source) - 1, min(self.count, len(source))).round()
+        chosen = evenly_spread(self.count, len(source))
         for index, prediction, target in zip(
             batch.index.tolist(), outputs, batch.target, strict=True
         ):
@@ -71,8 +75,8 @@ class PredictionPanels(Callback):
 
     def _show(self, source: Any, index: int, target: Any, prediction: Any, task: Any) -> None:
         name, classes = source.name(index), len(task.class_names)
-        rgb = shown_image(source.read(index), target, task.representation)
-        truth, labels = (side_by_side(x.cpu().numpy()) for x in (target, prediction))
+        image, representation = source.read(index), task.representation
+        rgb, truth, labels = shown_arrays(image, target, prediction, representation)
         panel = prediction_panel(rgb, truth, labels, task.class_names)
         encoded = cv2.imencode(".png", cv2.cvtColor(panel, cv2.COLOR_RGB2BGR))[1]
         write_bytes(self.folder / f"{name.replace('/', '_')}.png", encoded.tobytes())
@@ -80,8 +84,9 @@ class PredictionPanels(Callback):
         counts = np.bincount(pairs, minlength=classes**2).reshape(classes, classes)
         note = f"mIoU {percent(segmentation_scores(counts).miou)}\u00a0%" if truth.any() else ""
         sphere = target.ndim == _PANORAMA_DIMENSIONS
-        viewed = ViewerImage(name, rgb, labels, truth, sphere=sphere, note=note)
-        self._encoded[index] = encode_image(viewed, classes)
+        self._encoded[index] = encode_image(
+            name, rgb, classes, prediction=labels, truth=truth, sphere=sphere, note=note
+        )
 
     def on_test_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Gather the images of all processes."""

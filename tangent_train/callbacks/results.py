@@ -9,7 +9,7 @@ from typing import Any
 from lightning.pytorch.callbacks import Callback
 
 from tangent_train.callbacks.panels import PredictionPanels
-from tangent_train.callbacks.tensorboard import ValidationConfusion, ValidationPictures
+from tangent_train.callbacks.tensorboard import ClassScores, ValidationPictures
 from tangent_train.results.evaluation import (
     classification_record,
     confusion_table,
@@ -33,9 +33,9 @@ def pictures(kind: str, folder: Path, settings: Mapping[str, Any]) -> list[Callb
         settings: Settings of the run.
     """
     if kind == "classification":
-        return [ValidationConfusion()]
+        return [ClassScores()]
     return [
-        ValidationConfusion(),
+        ClassScores(),
         PredictionPanels(folder / "panels", settings["panels"]),
         ValidationPictures(settings["tensorboard_images"]),
     ]

@@ -18,7 +18,6 @@ from rich.console import Console
 from tangent_train.callbacks.checkpoints import AtomicCheckpointIO, CheckpointContents
 from tangent_train.callbacks.panels import ProgressBar
 from tangent_train.callbacks.results import evaluated, pictures, write_evaluation
-from tangent_train.callbacks.tensorboard import TrainingSpeed
 from tangent_train.checkpoints.content import read_checkpoint, write_settings
 from tangent_train.cli.build import Settings, build
 from tangent_train.cli.machine import machine_faults
@@ -89,7 +88,7 @@ class Run:
     def trainer(self, callbacks: Sequence[Callback]) -> lightning.Trainer:
         """The trainer of the config, with callbacks besides those of every run."""
         contents = {"kind": self.task.kind, "config": self.settings, **self.shown()}
-        common = [CheckpointContents(contents), TrainingSpeed(), ProgressBar()]
+        common = [CheckpointContents(contents), ProgressBar()]
         section = self.settings["trainer"]
         every, epochs = section.get("check_val_every_n_epoch"), section.get("max_epochs")
         trainer: lightning.Trainer = make(

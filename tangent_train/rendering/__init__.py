@@ -21,8 +21,6 @@ from tangent_train.rendering.representations.pinhole import (
 from tangent_train.rendering.representations.views import (
     Assembler,
     Representation,
-    RotationAugmentation,
-    Views,
 )
 from tangent_train.rendering.rotate import rotate_equirect
 from tangent_train.rendering.tables import set_table_cache_limit
@@ -36,9 +34,7 @@ __all__ = [
     "Interpolation",
     "PerspectiveRepresentation",
     "Representation",
-    "RotationAugmentation",
     "TangentRepresentation",
-    "Views",
     "equirect_to_tangent",
     "read_cameras",
     "rotate_equirect",

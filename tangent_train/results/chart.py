@@ -1,16 +1,15 @@
-"""Charts: bars of scores, confusion matrices, and the style that all charts share."""
+"""Charts: bars of scores, and the style that all charts share."""
 
 from __future__ import annotations
 
 import io
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
-from numpy.typing import ArrayLike, NDArray
 
 from tangent_train.results.record import SCORES
 from tangent_train.results.rows import Row, Statistic
@@ -18,17 +17,12 @@ from tangent_train.results.rows import Row, Statistic
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["COLORS", "confusion_picture", "png_bytes", "report_png", "row_shares"]
+__all__ = ["COLORS", "png_bytes", "report_png"]
 
 COLORS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#999999")
 """Okabe and Ito's colours, which people with colour blindness can tell apart."""
 
 _LONGEST_LABEL = 60
-_CELL_IN = 0.34
-"""Side of a square of a confusion matrix in inches: room for two digits."""
-_SMALL_CELL_IN = 0.12
-_MOST_NUMBERED = 40
-"""Of more classes the squares are smaller and without numbers."""
 
 
 def report_png(title: str, rows: Sequence[Row], software: str) -> bytes:
@@ -125,77 +119,8 @@ def png_bytes(figure: Figure, software: str) -> bytes:
         figure: With a canvas.
         software: Stands in the file.
     """
-    _plain_texts(figure)
+    for text in figure.findobj(Text):
+        text.set_parse_math(False)  # "$" in a name is no formula
     file = io.BytesIO()
     figure.savefig(file, format="png", metadata={"Software": software})
     return file.getvalue()
-
-
-def _plain_texts(figure: Figure) -> None:
-    for text in figure.findobj(Text):
-        text.set_parse_math(False)  # "$" in a name is no formula
-
-
-def row_shares(confusion: ArrayLike, *, unknown: bool = True) -> NDArray[np.float64]:
-    """A confusion matrix as shares of its rows.
-
-    Args:
-        confusion: Counts or weights, rows truth, columns prediction: ``(K+1, K+1)`` with the
-            unknown class first, or ``(K, K)`` without.
-        unknown: Whether there is an unknown class.
-
-    Returns:
-        ``(K, K)`` without the unknown class; NaN in rows of classes without labels.
-    """
-    first = int(unknown)
-    rows = np.asarray(confusion, np.float64)[first:]
-    total = rows.sum(axis=1, keepdims=True)
-    shares: NDArray[np.float64] = np.full((len(rows), len(rows)), np.nan)
-    np.divide(rows[:, first:], total, out=shares, where=total > 0)
-    return shares
-
-
-def confusion_picture(
-    confusion: ArrayLike, class_names: Sequence[str], *, unknown: bool = True
-) -> NDArray[np.uint8]:
-    """A confusion matrix in percent of the true class, its numbers rounded to whole percents.
-
-    Numbers that round to 0 are left out, as are all of more than 40 classes; rows of classes
-    without labels are grey.
-
-    Args:
-        confusion: As in `row_shares`.
-        class_names: As many names as it has rows.
-        unknown: Whether the first one is the unknown class.
-
-    Returns:
-        RGB image, as large as its classes need.
-    """
-    shares, names = row_shares(confusion, unknown=unknown), class_names[int(unknown) :]
-    numbered = len(names) <= _MOST_NUMBERED
-    side = (_CELL_IN if numbered else _SMALL_CELL_IN) * len(names)
-    margin = 0.5 + 0.075 * max(map(len, names))  # inches for the longest name
-    width, height = max(margin + side + 0.15, 2.5), margin + side + 0.4
-    figure = Figure(figsize=(width, height), dpi=100)
-    canvas: Any = FigureCanvasAgg(figure)
-    axes = figure.add_axes((margin / width, 0.4 / height, side / width, side / height))
-    axes.set_facecolor("#cccccc")  # seen through NaN
-    axes.imshow(shares, cmap="Blues", vmin=0, vmax=1, aspect="auto", interpolation="nearest")
-    font = 8 if numbered else 6
-    axes.set_xticks(range(len(names)), names, rotation=90, fontsize=font)
-    axes.set_yticks(range(len(names)), names, fontsize=font)
-    axes.xaxis.tick_top()
-    axes.tick_params(length=0)
-    edges, end = np.arange(1, len(names)) - 0.5, len(names) - 0.5
-    axes.hlines(edges, -0.5, end, colors="white", linewidth=0.6)
-    axes.vlines(edges, -0.5, end, colors="white", linewidth=0.6)
-    axes.set_ylabel("truth", fontsize=9)
-    axes.set_xlabel("prediction, % of the true class", fontsize=9, loc="left")
-    percents = np.rint(100 * np.nan_to_num(shares)).astype(int)
-    for row, column in np.argwhere(percents) if numbered else ():
-        color = "white" if shares[row, column] > 0.5 else "black"
-        text = str(percents[row, column])
-        axes.text(column, row, text, ha="center", va="center", color=color, fontsize=7)
-    _plain_texts(figure)
-    canvas.draw()
-    return np.asarray(canvas.buffer_rgba())[..., :3].copy()

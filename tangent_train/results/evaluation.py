@@ -7,12 +7,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from tangent_train.csv_text import csv_text
-from tangent_train.files import write_bytes, write_text
+from tangent_train.files import write_text
 from tangent_train.metrics.classification import classification_scores
 from tangent_train.metrics.segmentation import (
     BAND_EDGES_DEG,
@@ -20,7 +19,6 @@ from tangent_train.metrics.segmentation import (
     ConfusionMatrices,
     segmentation_scores,
 )
-from tangent_train.results.chart import confusion_picture, row_shares
 from tangent_train.results.record import RESULTS_FILE, SCORES, Record
 from tangent_train.results.tables import Table, percent
 
@@ -204,8 +202,9 @@ def _cell(value: Any) -> str:
 
 def confusion_table(record: Record) -> Table:
     """The confusion matrix as a heat map: percent of the true class."""
-    unknown = record.kind == "segmentation"
-    shares = np.nan_to_num(row_shares(record.confusion, unknown=unknown))
+    first = int(record.kind == "segmentation")  # without the unknown class
+    counts = np.asarray(record.confusion, np.float64)[first:]
+    shares = counts[:, first:] / np.maximum(counts.sum(axis=1, keepdims=True), 1)
     rows = [
         (name, *(f"{100 * share:.0f}" if share >= 0.005 else "" for share in row))
         for name, row in zip(record.class_names, shares, strict=True)
@@ -217,8 +216,6 @@ def confusion_table(record: Record) -> Table:
 def write_results(record: Record, folder: Path) -> None:
     """Write ``results.json``, ``.csv`` and ``.md``, each atomically.
 
-    Of a classification also ``confusion.png``.
-
     Args:
         record: Of an evaluation.
         folder: Output folder.
@@ -227,7 +224,3 @@ def write_results(record: Record, folder: Path) -> None:
     write_text(folder / "results.csv", csv_text(list(record.classes[0]), record.classes))
     tables = "\n".join(table.markdown() for table in result_tables(record))
     write_text(folder / "results.md", f"# Results\n\n{headline(record)}\n\n{tables}")
-    if record.kind == "classification":
-        picture = confusion_picture(record.confusion, record.class_names, unknown=False)
-        encoded = cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))[1]
-        write_bytes(folder / "confusion.png", encoded.tobytes())

@@ -17,8 +17,7 @@ __all__ = [
     "colorize",
     "overlay_picture",
     "prediction_panel",
-    "shown_image",
-    "side_by_side",
+    "shown_arrays",
 ]
 
 _Image = NDArray[np.uint8]
@@ -94,26 +93,25 @@ def prediction_panel(
     return np.concatenate([grid, _legend(grid.shape[1], seen, class_names)])
 
 
-def shown_image(image: Any, target: Any, representation: Any) -> NDArray[np.uint8]:
-    """Colours to show beside labels: the panorama, or the crops of a photo side by side.
+def shown_arrays(
+    image: Any, target: Any, prediction: Any, representation: Any
+) -> tuple[_Image, NDArray[np.integer], NDArray[np.integer]]:
+    """A panorama with its labels, or the crops of a photo side by side.
 
     Args:
-        image: Of an `ImageSource`.
-        target: Its labels as they are evaluated: ``(H, W)``, or ``(n, h, w)`` of crops.
+        image: A `Panorama` or `Photo`.
+        target: Tensor of its labels as they are evaluated: ``(H, W)``, or ``(n, h, w)`` of crops.
+        prediction: Tensor of predicted labels, as many.
         representation: Defines the crops.
 
     Returns:
-        RGB ``(H, W, 3)``, or ``(h, n·w, 3)``.
+        RGB ``(H, W, 3)``, truth and prediction ``(H, W)``; W is n·w of crops.
     """
-    if target.ndim == _PANORAMA_DIMENSIONS:
-        return np.asarray(image.rgb)
+    truth, labels = (tensor.cpu().numpy() for tensor in (target, prediction))
+    if truth.ndim == _PANORAMA_DIMENSIONS:
+        return image.rgb, truth, labels
     crops = image.sampler(representation).whole().render(image.rgb, "bilinear")
-    return np.hstack(crops)
-
-
-def side_by_side(labels: NDArray[np.integer]) -> NDArray[np.integer]:
-    """``(H, W)`` labels as they are, ``(n, h, w)`` of crops in one row."""
-    return labels if labels.ndim == _PANORAMA_DIMENSIONS else np.hstack([*labels])
+    return np.hstack(crops), np.hstack(truth), np.hstack(labels)
 
 
 def _titled(image: _Image, title: str) -> _Image:

@@ -17,7 +17,7 @@ from tangent_train.errors import SettingError
 from tangent_train.files import write_text
 from tangent_train.geometry import equirect_solid_angles
 from tangent_train.json_text import parse_json
-from tangent_train.results.html import EncodedImage, ViewerImage, encode_image, write_report
+from tangent_train.results.html import EncodedImage, encode_image, write_report
 from tangent_train.results.pictures import colorize, overlay_picture
 from tangent_train.results.tables import Table, percent
 
@@ -234,8 +234,8 @@ class PredictionFolder:
         """An image for `write_page`, of 0.1 to a few megabytes; see `write`."""
         if area is not None:
             rgb, labels = area.place(rgb), area.place(labels)
-        shown = ViewerImage(name, rgb, labels, sphere=area is not None)
-        return encode_image(shown, len(self.class_names))
+        count, sphere = len(self.class_names), area is not None
+        return encode_image(name, rgb, count, prediction=labels, sphere=sphere)
 
     def write_page(self, entries: Sequence[Entry], shown: Sequence[EncodedImage]) -> None:
         """Write ``report.html``.

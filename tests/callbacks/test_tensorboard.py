@@ -20,14 +20,9 @@ from tensorboard.backend.event_processing.event_accumulator import (  # type: ig
 from torch import nn
 
 from datamodules import Stanford2D3DS
-from tangent_train.callbacks.tensorboard import (
-    TrainingSpeed,
-    ValidationConfusion,
-    ValidationPictures,
-)
+from tangent_train.callbacks.tensorboard import ClassScores, ValidationPictures
 from tangent_train.errors import SettingError
 from tangent_train.rendering import PerspectiveRepresentation, TangentRepresentation
-from tangent_train.results.chart import confusion_picture
 from tangent_train.results.pictures import prediction_panel
 from tangent_train.tasks import SegmentationTask
 from tests.tasks.shapes import Shapes, shape_task
@@ -58,7 +53,7 @@ def _fit(
         **{"max_epochs": 2} | settings,
         accelerator="cpu",
         logger=TensorBoardLogger(folder, name="", version="tensorboard"),
-        callbacks=[ValidationPictures(count), ValidationConfusion(), TrainingSpeed()],
+        callbacks=[ValidationPictures(count), ClassScores()],
         enable_checkpointing=False,
         enable_progress_bar=False,
         enable_model_summary=False,
@@ -146,42 +141,13 @@ def test_figures_of_every_class_are_those_of_numpy(
         assert events.Scalars(tag)[-1].value == pytest.approx(matrix[k, k] / union, rel=1e-6)
     mean = np.mean([events.Scalars(tag)[-1].value for tag in named])
     assert mean == pytest.approx(events.Scalars("val/miou")[-1].value, rel=1e-6)
-    picture = _picture(events.Images("val/confusion")[-1])
-    np.testing.assert_array_equal(picture, confusion_picture(matrix, data.class_names))
-
-
-def test_the_speed_is_that_of_training_alone(stanford_root: Path, tmp_path: Path) -> None:
-    """Every step takes a second of a clock that only steps and validations move."""
-    data = _panoramas(stanford_root)
-    task = _task(TANGENT, data.class_names)
-    clock = SimpleNamespace(now=100.0)
-
-    class Watch(TrainingSpeed):
-        def on_train_batch_end(self, *hooked: Any) -> None:
-            clock.now += 1.0
-            super().on_train_batch_end(*hooked)
-
-        def on_validation_batch_end(self, *_: Any) -> None:
-            clock.now += 7.0
-
-    with pytest.MonkeyPatch.context() as patch:
-        module = "tests.callbacks.test_tensorboard"
-        patch.setattr(f"{module}.TrainingSpeed", Watch)
-        patch.setattr("time.perf_counter", lambda: clock.now)
-        _fit(tmp_path, data, task)
-    events = _events(tmp_path)
-    images = [event.value for event in events.Scalars("speed/images_per_s")]
-    assert images == [2 * 5, 2 * 5], "two panoramas of 5 images each second"
-    assert _steps(events, "speed/images_per_s") == [STEPS - 1, 2 * STEPS - 1]
 
 
 def test_shapes_have_accuracies_and_no_unknown_class(tmp_path: Path) -> None:
     task: Any = shape_task()
     _fit(tmp_path, Shapes(), task, count=0)
     events = _events(tmp_path)
-    assert _steps(events, "val/confusion") == [2, 5]
-    expected = confusion_picture(task.matrices, task.class_names, unknown=False)
-    np.testing.assert_array_equal(_picture(events.Images("val/confusion")[-1]), expected)
+    assert _steps(events, f"val_accuracy/{task.class_names[0]}") == [2, 5]
     mean = np.mean([events.Scalars(f"val_accuracy/{n}")[-1].value for n in task.class_names])
     assert mean == pytest.approx(events.Scalars("val/class_accuracy")[-1].value, rel=1e-6)
 
@@ -202,7 +168,7 @@ def test_nothing_is_drawn_by_other_processes_or_without_tensorboard(tmp_path: Pa
         pictures = ValidationPictures(3)
         unused: Any = Unused()
         pictures.on_validation_batch_end(trainer, unused, None, unused, 0)
-        ValidationConfusion().on_validation_end(trainer, unused)
+        ClassScores().on_validation_end(trainer, unused)
     assert not list(tmp_path.rglob("events*"))
 
 

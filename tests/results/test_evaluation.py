@@ -7,16 +7,15 @@ import json
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
 from tangent_train.callbacks.results import evaluated, pictures, write_evaluation
-from tangent_train.callbacks.tensorboard import ValidationConfusion
+from tangent_train.callbacks.tensorboard import ClassScores
 from tangent_train.metrics.segmentation import ConfusionMatrices
-from tangent_train.results.chart import confusion_picture
 from tangent_train.results.evaluation import (
     classification_record,
+    confusion_table,
     headline,
     largest_loss,
     result_tables,
@@ -120,10 +119,22 @@ def test_shapes_are_counted_per_class_and_over_all(tmp_path: Path) -> None:
     assert "| mug | 4 | 25.0 | bottle | 75.0 |" in text
     assert "| plant | 0 | – | – | – |" in text
     assert "| mean |  | 75.0 |  |  |" in text
-    read = cv2.imread(str(tmp_path / "confusion.png"))
-    assert read is not None
-    drawn = confusion_picture(SHAPE_MATRIX, SHAPES, unknown=False)
-    np.testing.assert_array_equal(cv2.cvtColor(read, cv2.COLOR_BGR2RGB), drawn)
+
+
+@pytest.mark.parametrize("kind", ["segmentation", "classification"])
+def test_the_heat_map_has_shares_of_the_true_class(kind: Any) -> None:
+    confusion = [[1, 2, 1, 0], [0, 0, 0, 0], [0, 3, 0, 1], [9, 9, 9, 9]]
+    names = ["a", "b", "c", "d"]
+    expected = np.array([[0.25, 0.5, 0.25, 0], [0] * 4, [0, 0.75, 0, 0.25], [0.25] * 4])
+    if kind == "segmentation":  # of which the unknown class comes first, and counts as predicted
+        confusion = [confusion[-1], *confusion[:-1]]
+        names, expected = names[1:], expected[:3, 1:]
+    table = confusion_table(
+        Record(kind, "", 1, {}, [{"class": name} for name in names], confusion=confusion)
+    )
+    np.testing.assert_array_equal(np.array(table.shades), expected)
+    percents = [[f"{100 * share:.0f}" if share else "" for share in row] for row in expected]
+    assert table.rows == [(name, *row) for name, row in zip(names, percents, strict=True)]
 
 
 def test_an_evaluated_task_leaves_files_and_a_page(tmp_path: Path) -> None:
@@ -133,10 +144,10 @@ def test_an_evaluated_task_leaves_files_and_a_page(tmp_path: Path) -> None:
     record = evaluated(task, "shapes")
     assert record.images == 9
     write_evaluation(task, record, tmp_path / "x.ckpt", tmp_path)
-    written = {"results.json", "results.csv", "results.md", "confusion.png", "report.html"}
+    written = {"results.json", "results.csv", "results.md", "report.html"}
     assert {path.name for path in tmp_path.iterdir()} == written
     page = (tmp_path / "report.html").read_text()
     assert f"<p>{headline(record)}</p>" in page
     for title in ("Per class", "Confusion"):
         assert f"<h2>{title}</h2>" in page
-    assert [type(c) for c in pictures(task.kind, tmp_path, {})] == [ValidationConfusion]
+    assert [type(c) for c in pictures(task.kind, tmp_path, {})] == [ClassScores]

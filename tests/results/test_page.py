@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from tangent_train.results.html import ViewerImage, write_report
+from tangent_train.results.html import encode_image, write_report
 from tangent_train.results.tables import Table
 
 if TYPE_CHECKING:
@@ -50,7 +50,8 @@ def _page(path: Path, **content: Any) -> str:
 @pytest.fixture
 def nasty_page(tmp_path: Path) -> str:
     labels = np.array([[0, 1], [2, 3]], np.uint8)
-    image = ViewerImage(NASTY, np.zeros((4, 8, 3), np.uint8), labels, labels, note=NASTY)
+    rgb = np.zeros((4, 8, 3), np.uint8)
+    image = encode_image(NASTY, rgb, len(NAMES), prediction=labels, truth=labels, note=NASTY)
     return _page(
         tmp_path / "report.html",
         title=NASTY,

@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
-from tangent_train.errors import DataError
 from tangent_train.geometry import equirect_solid_angles
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["BUDGET_BYTES", "MOST_PIXELS", "EncodedImage", "ViewerImage", "encode_image"]
+__all__ = ["BUDGET_BYTES", "MOST_PIXELS", "EncodedImage", "encode_image"]
 
 BUDGET_BYTES = 8_000_000
 """Of the HTML file, for one image with its label maps."""
@@ -28,36 +27,15 @@ _QUALITY = 88
 
 
 @dataclass(frozen=True)
-class ViewerImage:
-    """An image of the viewer, with its label maps.
+class EncodedImage:
+    """A compressed image of the viewer, with its label maps; see `encode_image`.
 
     Attributes:
         name: Shown beside it.
-        rgb: ``(H, W, 3)`` uint8.
-        prediction: ``(h, w)`` class indices, 0 where there is none; of any size.
-        truth: ``(h, w)`` class indices, 0 unknown; of any size.
-        sphere: Whether it is a whole equirectangular panorama; others are shown flat.
         note: A line about it, such as a score.
-    """
-
-    name: str
-    rgb: NDArray[np.uint8]
-    prediction: NDArray[np.integer] | None = None
-    truth: NDArray[np.integer] | None = None
-    sphere: bool = True
-    note: str = ""
-
-
-@dataclass(frozen=True)
-class EncodedImage:
-    """A compressed `ViewerImage`, as in a report.
-
-    Attributes:
-        name: As given.
-        note: As given.
-        sphere: As given.
-        width: Columns of the image as given.
-        height: Rows of the image as given.
+        sphere: Whether it is a whole equirectangular panorama; others are shown flat.
+        width: Columns of the image before it was compressed.
+        height: Rows of the image before it was compressed.
         jpeg: The image.
         thumbnail: A small JPEG of it.
         prediction: 8-bit grey PNG of class indices, perhaps of fewer pixels.
@@ -79,7 +57,15 @@ class EncodedImage:
 
 
 def encode_image(
-    image: ViewerImage, class_count: int, budget_bytes: int = BUDGET_BYTES
+    name: str,
+    rgb: NDArray[np.uint8],
+    class_count: int,
+    *,
+    prediction: NDArray[np.integer] | None = None,
+    truth: NDArray[np.integer] | None = None,
+    sphere: bool = True,
+    note: str = "",
+    budget_bytes: int = BUDGET_BYTES,
 ) -> EncodedImage:
     """Compress an image to its share of the report.
 
@@ -87,64 +73,38 @@ def encode_image(
     then halved until they fit.
 
     Args:
-        image: The image with its label maps.
-        class_count: K + 1, the unknown class 0 included.
+        name: Shown beside it.
+        rgb: ``(H, W, 3)`` the image.
+        class_count: K + 1, the unknown class 0 included; at most 256.
+        prediction: ``(h, w)`` class indices, 0 where there is none; of any size.
+        truth: ``(h, w)`` class indices, 0 unknown; of any size.
+        sphere: Whether it is a whole equirectangular panorama.
+        note: A line about it.
         budget_bytes: Of the HTML file, where files are written in base64.
-
-    Raises:
-        DataError: Arrays of other shapes or types, or class indices out of range.
     """
-    _check(image, class_count)
-    maps = {"truth": image.truth, "prediction": image.prediction}
+    maps = {"truth": truth, "prediction": prediction}
     labels = {k: v.astype(np.uint8, copy=False) for k, v in maps.items() if v is not None}
-    thumbnail = _jpeg(_shrunk(image.rgb, _THUMBNAIL_PIXELS, cv2.INTER_AREA))
+    thumbnail = _jpeg(_shrunk(rgb, _THUMBNAIL_PIXELS, cv2.INTER_AREA))
     room, side = budget_bytes * 3 // 4 - len(thumbnail), MOST_PIXELS
     while True:
         small = {k: _shrunk(v, side, cv2.INTER_NEAREST_EXACT) for k, v in labels.items()}
         pngs = {k: _encoded(".png", v, [cv2.IMWRITE_PNG_COMPRESSION, 6]) for k, v in small.items()}
-        jpeg = _jpeg(_shrunk(image.rgb, side, cv2.INTER_AREA))
+        jpeg = _jpeg(_shrunk(rgb, side, cv2.INTER_AREA))
         if len(jpeg) + sum(map(len, pngs.values())) <= room or side == 1:
             break
         side //= 2
     return EncodedImage(
-        name=image.name,
-        note=image.note,
-        sphere=image.sphere,
-        width=image.rgb.shape[1],
-        height=image.rgb.shape[0],
+        name=name,
+        note=note,
+        sphere=sphere,
+        width=rgb.shape[1],
+        height=rgb.shape[0],
         jpeg=jpeg,
         thumbnail=thumbnail,
         prediction=pngs.get("prediction"),
         truth=pngs.get("truth"),
-        shares=_shares(list(small.values()), class_count, sphere=image.sphere),
+        shares=_shares(list(small.values()), class_count, sphere=sphere),
     )
-
-
-def _check(image: ViewerImage, class_count: int) -> None:
-    rgb = image.rgb
-    if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8 or not rgb.size:
-        raise DataError(
-            f"image {image.name}",
-            found=f"{rgb.dtype} of shape {rgb.shape}",
-            expected="uint8 of shape (H, W, 3)",
-        )
-    for kind, labels in (("truth", image.truth), ("prediction", image.prediction)):
-        if labels is not None:
-            _check_labels(f"{kind} of {image.name}", labels, min(class_count, 256))
-
-
-def _check_labels(name: str, labels: NDArray[np.integer], count: int) -> None:
-    if labels.ndim != 2 or labels.dtype.kind not in "iu" or not labels.size:
-        raise DataError(
-            name,
-            found=f"{labels.dtype} of shape {labels.shape}",
-            expected="whole numbers of shape (H, W)",
-        )
-    least, most = int(labels.min()), int(labels.max())
-    if least < 0 or most >= count:
-        raise DataError(
-            name, found=f"class indices {least} to {most}", expected=f"0 to {count - 1}"
-        )
 
 
 def _shrunk(pixels: NDArray[np.uint8], side: int, interpolation: int) -> NDArray[np.uint8]:

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import html
-import itertools
 import json
 import re
 from base64 import b64encode
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
 from tangent_train.files import atomic_path
-from tangent_train.results.html.images import EncodedImage, ViewerImage, encode_image
+from tangent_train.results.html.images import EncodedImage
 from tangent_train.results.pictures import class_colors
 from tangent_train.results.tables import Table
 
@@ -32,7 +31,7 @@ def write_report(
     title: str,
     *,
     tables: Sequence[Table] = (),
-    images: Iterable[ViewerImage | EncodedImage] = (),
+    images: Sequence[EncodedImage] = (),
     class_names: Sequence[str] = (),
     notes: Sequence[str] = (),
 ) -> None:
@@ -42,21 +41,16 @@ def write_report(
         path: The file.
         title: Of the page.
         tables: Below the viewer.
-        images: For the viewer, consumed one at a time to bound memory.
+        images: For the viewer.
         class_names: K + 1 names of the classes in the label maps, the unknown class first.
         notes: Lines below the title, the most important first.
-
-    Raises:
-        DataError: An image has arrays of other shapes or types, or unknown class indices.
     """
-    encoded = _encoded(images, len(class_names))
-    first = next(encoded, None)
     parts: dict[str, str] = {
         "title": html.escape(title),
         "notes": "\n".join(f"<p>{html.escape(note)}</p>" for note in notes),
         "style": _resource("viewer.css"),
-        "viewer": "" if first is None else _viewer(class_names),
-        "script": "" if first is None else _script(),
+        "viewer": _viewer(class_names) if images else "",
+        "script": _script() if images else "",
         "tables": "\n".join(table.html() for table in tables),
     }
     page = _filled(_resource("page.html"), parts)
@@ -66,18 +60,9 @@ def write_report(
         temporary.open("w", encoding="utf-8", errors="backslashreplace") as file,
     ):
         file.write(before)
-        for image in itertools.chain(filter(None, [first]), encoded):
+        for image in images:
             _write_image(file, image)
         file.write(after)
-
-
-def _encoded(
-    images: Iterable[ViewerImage | EncodedImage], class_count: int
-) -> Iterator[EncodedImage]:
-    for image in images:
-        encoded = image if isinstance(image, EncodedImage) else encode_image(image, class_count)
-        del image  # before the next one is made
-        yield encoded
 
 
 def _viewer(class_names: Sequence[str]) -> str:

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tangent_train.results.html import ViewerImage, write_report
+from tangent_train.results.html import encode_image, write_report
 from tangent_train.results.tables import Table
 from tests.slow.results.browser import OpenReport, chromium, opened
-from tests.slow.results.scene import NAMES, panorama, photo
+from tests.slow.results.scene import NAMES, panorama, panorama_rgb, photo
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -28,12 +28,11 @@ def browser() -> Iterator[Browser]:
 @pytest.fixture(scope="session")
 def page_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("html") / "a report.html"
-    sphere = panorama()
     write_report(
         path,
         "Test",
         tables=[Table("Wide", [f"column {k}" for k in range(30)], [["12345.6"] * 30])],
-        images=[sphere, ViewerImage("bare", sphere.rgb), photo()],
+        images=[panorama(), encode_image("bare", panorama_rgb(), len(NAMES)), photo()],
         class_names=NAMES,
         notes=["a note without any place to break: " + "x" * 200],
     )

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tangent_train.results.html import ViewerImage
+from tangent_train.results.html import EncodedImage, encode_image
 from tangent_train.results.pictures import class_colors
 from tests.slow.results.reference import classes_of, colors_of, erp_directions, rays
 
@@ -27,20 +27,25 @@ WRONG, UNLABELLED = (214, 39, 40), (110, 110, 110)
 PANORAMA, BARE_PANORAMA, FLAT_PHOTO = range(3)
 
 
-def panorama() -> ViewerImage:
+def panorama_rgb() -> NDArray[np.uint8]:
+    return colors_of(erp_directions(HEIGHT, WIDTH)).round().astype(np.uint8)
+
+
+def panorama() -> EncodedImage:
     directions = erp_directions(HEIGHT, WIDTH)
     truth = classes_of(directions)
     prediction = np.maximum(truth, 1)
     prediction[directions[..., 1] < -0.9] = 8
-    rgb = colors_of(directions).round().astype(np.uint8)
-    return ViewerImage("a <b>sphere</b>", rgb, prediction, truth, note="mIoU 61.2 %")
+    rgb = panorama_rgb()
+    name, note = "a <b>sphere</b>", "mIoU 61.2 %"
+    return encode_image(name, rgb, len(NAMES), prediction=prediction, truth=truth, note=note)
 
 
-def photo() -> ViewerImage:
+def photo() -> EncodedImage:
     v, u = np.meshgrid(*(np.linspace(0, 1, n) for n in PHOTO), indexing="ij")
     rgb = np.stack([40 + 180 * u, 40 + 180 * v, 0 * u + 90], axis=-1).round().astype(np.uint8)
     prediction = (1 + 2 * (v > 0.5) + (u > 0.5)).astype(np.uint8)
-    return ViewerImage("a photo", rgb, prediction, sphere=False)
+    return encode_image("a photo", rgb, len(NAMES), prediction=prediction, sphere=False)
 
 
 def close(shown: NDArray[Any], expected: NDArray[Any], but: float = 0.0) -> None:
