@@ -57,7 +57,8 @@ class ValidationPictures(Callback):
         source, index = data.source("val"), int(batch.index[0])
         image, representation = source.read(index), task.representation
         shown = shown_arrays(image, batch.target[0], outputs[0], representation)
-        panel = prediction_panel(*map(_smaller, shown), class_names=task.class_names)
+        rgb, truth, labels = map(_smaller, shown)
+        panel = prediction_panel(rgb, truth, labels, task.class_names)
         tag = f"val_images/{source.name(index).replace('/', '_')}"
         writer.add_image(tag, panel, _step(trainer), dataformats="HWC")
 

@@ -6,14 +6,10 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tangent_train.errors import SettingError
-
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
 __all__ = ["report"]
-
-_MADE_BY = "tangent-report"
 
 
 def report(arguments: Sequence[str]) -> None:
@@ -24,10 +20,8 @@ def report(arguments: Sequence[str]) -> None:
 
     Raises:
         DataError: Runs are missing or cannot be read.
-        SettingError: The output folder holds files of these names that are not a report.
     """
     options = _parser().parse_args(arguments)
-    _check_output(options.output)
     # Heavy, and not needed to say what is wrong with the command line.
     from rich.console import Console
 
@@ -36,7 +30,7 @@ def report(arguments: Sequence[str]) -> None:
 
     records = [load_record(folder) for folder in find_runs(options.folders)]
     notes = [f"{run}: not finished, left out." for run in unfinished_runs(options.folders)]
-    found = runs_report(records, _MADE_BY, notes)
+    found = runs_report(records, notes)
     found.write(options.output, "report")
     console = Console(highlight=False)
     console.print(found.tables()[0].terminal())
@@ -62,20 +56,3 @@ def _parser() -> argparse.ArgumentParser:
         help="where report.md, .csv, .json and .png are written (default: report)",
     )
     return parser
-
-
-def _check_output(folder: Path) -> None:
-    """Refuse to replace files of other programs."""
-    made_by_us = folder / "report.json"
-    there = [
-        path for path in folder.glob("report.*") if path.suffix in (".md", ".csv", ".png", ".json")
-    ]
-    if there and not (
-        made_by_us.is_file()
-        and f'"made_by": "{_MADE_BY}"' in made_by_us.read_text(errors="replace")[:200]
-    ):
-        raise SettingError(
-            "--output",
-            found=f"{there[0]}, which tangent-report did not write",
-            expected="a new folder, or one with an earlier report",
-        )

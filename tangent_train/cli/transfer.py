@@ -32,8 +32,6 @@ if TYPE_CHECKING:
 
 __all__ = ["trained_level", "transfer"]
 
-_MADE_BY = "tangent-transfer"
-
 
 def transfer(config: DictConfig) -> None:
     """Run all stages that are not finished, then write and print the tables.
@@ -168,9 +166,9 @@ def _report(config: DictConfig, folder: Path, stages: Sequence[Stage]) -> None:
         if not config.study or stage.level is not None:
             found[stage.level if config.study else stage.name].append(load_record(stage.folder))
     if config.study:
-        name, report = STUDY, levels_report(found, trained_level(config), _MADE_BY)
+        name, report = STUDY, levels_report(found, trained_level(config))
     else:
-        name, report = "transfer", transfer_report(found, _MADE_BY)
+        name, report = "transfer", transfer_report(found)
     report.write(folder, name)
     Console(highlight=False).print(report.tables()[0].terminal())
     for note in report.all_notes():

@@ -1,4 +1,4 @@
-"""Charts: bars of scores, and the style that all charts share."""
+"""The chart of a report: bars of scores, and lines over the latitude."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from tangent_train.results.rows import Row, Statistic
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["COLORS", "png_bytes", "report_png"]
+__all__ = ["report_png"]
 
-COLORS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#999999")
+_COLORS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#999999")
 """Okabe and Ito's colours, which people with colour blindness can tell apart."""
 
 _LONGEST_LABEL = 60
 
 
-def report_png(title: str, rows: Sequence[Row], software: str) -> bytes:
+def report_png(title: str, rows: Sequence[Row]) -> bytes:
     """Bars of the means over the classes and of every class, lines over the latitude.
 
     Error bars are the standard deviation over folds, else over seeds; hatched bars are published.
@@ -33,7 +33,6 @@ def report_png(title: str, rows: Sequence[Row], software: str) -> bytes:
     Args:
         title: Of the chart.
         rows: Of one kind and with the same classes.
-        software: Stands in the file.
 
     Returns:
         A PNG file.
@@ -56,7 +55,11 @@ def report_png(title: str, rows: Sequence[Row], software: str) -> bytes:
         _band_lines(axes, banded)
     handles, labels = means.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper left", frameon=False, ncols=2)
-    return png_bytes(figure, software)
+    for text in figure.findobj(Text):
+        text.set_parse_math(False)  # "$" in a name is no formula
+    file = io.BytesIO()
+    figure.savefig(file, format="png")
+    return file.getvalue()
 
 
 def _bars(
@@ -71,7 +74,7 @@ def _bars(
             _percents([score.mean for score in found]),
             0.92 * width,
             yerr=_percents(spreads),
-            color=COLORS[names.index(row.label.removesuffix(" (paper)")) % len(COLORS)],
+            color=_COLORS[names.index(row.label.removesuffix(" (paper)")) % len(_COLORS)],
             hatch="//" if row.published else "",
             label=_short(row.label),
             error_kw={"elinewidth": 1.2, "capsize": min(4.0, 14 * width), "ecolor": "#333333"},
@@ -85,7 +88,7 @@ def _band_lines(axes: Axes, rows: Sequence[Row]) -> None:
         bands = sorted(row.bands)
         centers = [(south + north) / 2 for south, north in bands]
         shares = _percents([row.score("miou", band).mean for band in bands])
-        axes.plot(centers, shares, color=COLORS[k % len(COLORS)], marker=".", label=row.label)
+        axes.plot(centers, shares, color=_COLORS[k % len(_COLORS)], marker=".", label=row.label)
     axes.set_xticks(range(-90, 91, 30), [f"{k}°" for k in range(-90, 91, 30)])
     axes.legend(frameon=False, fontsize=8)
     _percent_axis(axes)
@@ -110,17 +113,3 @@ def _short(label: str) -> str:
     """A label for the legend; its end, where settings differ, matters more than its middle."""
     half = _LONGEST_LABEL // 2
     return label if len(label) <= _LONGEST_LABEL else f"{label[:half]} … {label[-half:]}"
-
-
-def png_bytes(figure: Figure, software: str) -> bytes:
-    """A chart as a PNG file.
-
-    Args:
-        figure: With a canvas.
-        software: Stands in the file.
-    """
-    for text in figure.findobj(Text):
-        text.set_parse_math(False)  # "$" in a name is no formula
-    file = io.BytesIO()
-    figure.savefig(file, format="png", metadata={"Software": software})
-    return file.getvalue()

@@ -20,17 +20,16 @@ _ROTATIONS = {None: "–", "none": "–", "yaw": "z", "so3": "SO3"}
 """The field's names: none, about the vertical axis, any."""
 
 
-def runs_report(records: Sequence[Record], made_by: str, notes: Sequence[str] = ()) -> Report:
+def runs_report(records: Sequence[Record], notes: Sequence[str] = ()) -> Report:
     """The report over finished runs: mean and spread of each group, beside the paper's figures.
 
     Args:
         records: Of the runs.
-        made_by: See `Report`.
         notes: Further ones.
     """
     rows = [replace(row, facts=_facts(row.records)) for row in group_runs(records)]
     together = sorted([*published(records), *rows], key=_by_data)
-    return Report("Report", made_by, together, [*_repeated(rows), *notes])
+    return Report("Report", together, [*_repeated(rows), *notes])
 
 
 def _by_data(row: Row) -> tuple[str, int]:
@@ -49,13 +48,12 @@ def _repeated(rows: Sequence[Row]) -> Iterator[str]:
             seen.add((record.fold, record.seed))
 
 
-def transfer_report(stages: Mapping[str, Sequence[Record]], made_by: str) -> Report:
+def transfer_report(stages: Mapping[str, Sequence[Record]]) -> Report:
     """The report of a transfer from photos to panoramas, beside the paper's.
 
     Args:
         stages: Evaluations by the names of their stages: S, S-erp and S-FT-10, tested on panoramas,
             are compared with P and P-FT-10, tested on photos, after as much fine-tuning.
-        made_by: See `Report`.
     """
     records = [record for found in stages.values() for record in found]
     check_alike(records)
@@ -64,7 +62,7 @@ def transfer_report(stages: Mapping[str, Sequence[Record]], made_by: str) -> Rep
     rows += published(panoramas, transfer=True)
     by_name = {row.label: row for row in rows}
     rows = [replace(row, partner=by_name.get(_photos_of(row.label))) for row in rows]
-    return Report("Transfer from photos to panoramas", made_by, rows, (), _CHANGE_OF_STAGES)
+    return Report("Transfer from photos to panoramas", rows, (), _CHANGE_OF_STAGES)
 
 
 def _photos_of(stage: str) -> str:
@@ -80,9 +78,7 @@ def _photos_of(stage: str) -> str:
     return photos + mark + paper
 
 
-def levels_report(
-    levels: Mapping[int, Sequence[Record]], trained_level: float, made_by: str
-) -> Report:
+def levels_report(levels: Mapping[int, Sequence[Record]], trained_level: float) -> Report:
     """The report over one network at several levels of the panoramas.
 
     The paper's third transfer experiment: photos are normalized to the angular resolution of one
@@ -92,7 +88,6 @@ def levels_report(
         levels: Evaluations by level.
         trained_level: The level whose angular resolution the photos had in training; between two
             levels where it is that of neither.
-        made_by: See `Report`.
     """
     check_alike([record for found in levels.values() for record in found])
     rows = {
@@ -106,7 +101,7 @@ def levels_report(
     ]
     note = f"Photos in training: the angular resolution of level {trained_level:g}."
     change = f"Change: against level {nearest}, over the folds and seeds that both have."
-    return Report("One network at several levels", made_by, compared, [note], change)
+    return Report("One network at several levels", compared, [note], change)
 
 
 def _facts(records: Sequence[Record]) -> dict[str, str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from datamodules.stanford2d3ds.files import FOLDS
 from tangent_train.csv_text import csv_text
 from tangent_train.files import write_bytes, write_text
 from tangent_train.results.chart import report_png
-from tangent_train.results.record import SCORES, Band, Record, Scores
+from tangent_train.results.record import SCORES, Band
 from tangent_train.results.rows import Row, Statistic
 from tangent_train.results.tables import Table, percent
 
@@ -31,14 +31,12 @@ class Report:
 
     Attributes:
         title: Of the report.
-        made_by: The command that writes it; stands in the JSON file.
         rows: Evaluations, and published figures.
         notes: Sentences about the rows.
         compared: Explains the column "change"; empty without one.
     """
 
     title: str
-    made_by: str
     rows: Sequence[Row]
     notes: Sequence[str] = ()
     compared: str = ""
@@ -101,13 +99,8 @@ class Report:
             if rows:
                 yield Table(f"{heading[0].upper()}{heading[1:]} %", ("", *self.classes), rows)
 
-    def losses(self) -> list[str]:
-        """Per row, its worst class, or the one that loses most against the partner."""
-        found = (_loss(row, SCORES[self.kind], self.classes) for row in self.rows)
-        return [sentence for sentence in found if sentence]
-
     def all_notes(self) -> list[str]:
-        """Notes needed to read the scores correctly, and the largest losses."""
+        """Notes needed to read the scores correctly."""
         lacking: dict[str, list[str]] = defaultdict(list)
         own = [row for row in self.rows if not row.published]
         for row in own:
@@ -118,7 +111,7 @@ class Report:
             f"{', '.join(labels)}: fold {folds} missing; not a mean of {len(FOLDS)} folds."
             for folds, labels in lacking.items()
         ]
-        return [*self.losses(), *notes, *self.notes]
+        return [*notes, *self.notes]
 
     def write(self, folder: Path, name: str) -> None:
         """Write the report as ``.json``, ``.md``, ``.csv`` and ``.png``, each atomically.
@@ -127,12 +120,12 @@ class Report:
             folder: Output folder.
             name: Of the files.
         """
-        write_text(folder / f"{name}.json", self._json())  # first: it says who wrote the others
+        write_text(folder / f"{name}.json", self._json())
         write_text(folder / f"{name}.md", self._markdown())
         figures = list(self.figures())
         columns = list(dict.fromkeys(key for figure in figures for key in figure))
         write_text(folder / f"{name}.csv", csv_text(columns, figures))
-        write_bytes(folder / f"{name}.png", report_png(self.title, self.rows, self.made_by))
+        write_bytes(folder / f"{name}.png", report_png(self.title, self.rows))
 
     def figures(self) -> Iterator[dict[str, Any]]:
         """A line per row, fold ("mean" over all), class or band, and score; shares of 1."""
@@ -184,37 +177,12 @@ class Report:
             for row in self.rows
         ]
         content = {
-            "made_by": self.made_by,
             "unit": "shares of 1",
             "rows": rows,
             "figures": list(self.figures()),
             "notes": self.all_notes(),
         }
         return json.dumps(content, indent=1) + "\n"
-
-
-def _loss(row: Row, scores: Scores, classes: Sequence[str]) -> str:
-    """The class that lowers the mean most; classes without labels are ignored."""
-    found = []
-    for name in classes:
-        labelled = tuple(r for r in row.records if _is_labelled(r, name))
-        own = replace(row, records=labelled).score(scores.worst, name).mean
-        base = row.partner.score(scores.worst, name).mean if row.partner else 0.0
-        if own is not None and base is not None:
-            found.append((own - base, name, base, own))
-    if not found or row.published:
-        return ""
-    _, name, base, own = min(found)
-    heading = scores.per_class[scores.worst]
-    if row.partner is None:
-        return f"{row.label}: largest loss: {name}, {percent(own)} % {heading}."
-    change = f"{percent(base)} % to {percent(own)} % {heading}"
-    return f"{row.label}: largest loss against {row.partner.label}: {name}, {change}."
-
-
-def _is_labelled(record: Record, name: str) -> bool:
-    """Whether a class has labels: ``absent_class=zero`` scores others with 0."""
-    return bool(record.score("share", name) or record.score("images", name))
 
 
 def _cell(found: Statistic, folds: int) -> str:

@@ -56,17 +56,6 @@ def test_the_files_hold_the_runs(
     assert "mine: fold 2 and 3 missing" in (tmp_path / "report" / "report.md").read_text()
 
 
-@pytest.mark.parametrize(("name", "content"), [("report.md", "# Mine"), ("report.json", "{}")])
-def test_other_files_are_not_written_over(
-    name: str, content: str, runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / name).write_text(content)
-    with pytest.raises(SystemExit, match=rf"--output: found .*{name}.*did not write"):
-        _report(monkeypatch, runs, "--output", tmp_path / "out")
-    assert (tmp_path / "out" / name).read_text() == content
-
-
 def test_what_cannot_be_reported_is_said_and_nothing_written(
     runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
