@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import threading
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from tangent_train.files import no_room
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
 __all__ = ["machine_faults"]
@@ -17,6 +18,8 @@ __all__ = ["machine_faults"]
 @contextmanager
 def machine_faults(folder: Path, data: Any) -> Iterator[None]:
     """Explain a full disk, and workers that died.
+
+    TensorBoard writes in a thread that ends with the error of a full disk; its stack is not shown.
 
     Args:
         folder: Of the run.
@@ -27,6 +30,8 @@ def machine_faults(folder: Path, data: Any) -> Iterator[None]:
             events.
         DataError: A worker died.
     """
+    show = threading.excepthook
+    threading.excepthook = _all_but_full_disks(folder, show)
     try:
         yield
     except (OSError, EOFError, RuntimeError, ValueError) as error:
@@ -34,3 +39,15 @@ def machine_faults(folder: Path, data: Any) -> Iterator[None]:
         if told is error:
             raise
         raise told from error
+    finally:
+        threading.excepthook = show
+
+
+def _all_but_full_disks(
+    folder: Path, show: Callable[[threading.ExceptHookArgs], object]
+) -> Callable[[threading.ExceptHookArgs], None]:
+    def hook(failed: threading.ExceptHookArgs) -> None:
+        if failed.exc_value is None or no_room(folder, failed.exc_value) is None:
+            show(failed)
+
+    return hook
