@@ -1,4 +1,4 @@
-"""Matches of known motion, all around the sphere."""
+"""Keypoints, and matches of known motion, all around the sphere."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tangent_train.geometry import FLIP_Y, PanoramaPose, random_rotation
+from tangent_train.keypoints import SphericalKeypoints
+from tests.geometry.directions import unit
 
-__all__ = ["Scene", "angle_deg", "rotation_angle_deg", "two_views", "unit"]
+__all__ = ["Scene", "keypoints_at", "rotation_angle_deg", "two_views"]
 
 
 class Scene(NamedTuple):
@@ -49,22 +51,23 @@ def two_views(
     return Scene(unit(left_xyz), unit(right_xyz), rotation, translation_m, left, right, wrong)
 
 
-def unit(vectors: ArrayLike) -> NDArray[np.float64]:
-    """Vectors of length 1."""
-    array = np.asarray(vectors, np.float64)
-    scaled: NDArray[np.float64] = array / np.linalg.norm(array, axis=-1, keepdims=True)
-    return scaled
-
-
-def angle_deg(first: ArrayLike, second: ArrayLike) -> NDArray[np.float64]:
-    """Angles between vectors, by another formula than the library's."""
-    a, b = unit(first), unit(second)
-    sines = np.linalg.norm(np.cross(a, b), axis=-1)
-    degrees: NDArray[np.float64] = np.degrees(np.arctan2(sines, (a * b).sum(axis=-1)))
-    return degrees
-
-
 def rotation_angle_deg(first: ArrayLike, second: ArrayLike) -> float:
     """Angle of the rotation from one to the other, by its trace."""
     trace = np.trace(np.asarray(first, np.float64) @ np.asarray(second, np.float64).T)
     return float(np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1))))
+
+
+def keypoints_at(directions_xyz: NDArray[np.float64], *, bits: bool = False) -> SphericalKeypoints:
+    """Keypoints of 2° in these directions, their orientation to the right."""
+    n = len(directions_xyz)
+    x, y, _ = directions_xyz.T
+    right = np.stack([-y, x, 0 * x], axis=-1) / np.maximum(np.hypot(x, y), 1e-9)[:, None]
+    descriptors = np.random.default_rng(n).integers(0, 256, (n, 32 if bits else 128))
+    return SphericalKeypoints(
+        directions_xyz,
+        np.full(n, np.radians(2), np.float32),
+        right,
+        np.ones(n, np.float32),
+        descriptors.astype(np.uint8 if bits else np.float32),
+        np.zeros(n, np.int32),
+    )

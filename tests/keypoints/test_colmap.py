@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -13,32 +13,12 @@ from tangent_train.geometry import FLIP_Y, PanoramaPose, lonlat_to_xyz, random_r
 from tangent_train.keypoints import Detector, SphericalKeypoints, TwoView, detect_on_equirect
 from tangent_train.keypoints.colmap import add_pair
 from tangent_train.keypoints.two_view import estimate_two_view
-from tests.keypoints.scenes import unit
+from tests.geometry.directions import random_directions, unit
+from tests.keypoints.scenes import keypoints_at
 
 pycolmap = pytest.importorskip("pycolmap")
 SHAPE = (512, 1024)
 CAMERA_FROM_PANORAMA = np.array([[0, 1.0, 0], [0, 0, -1.0], [1.0, 0, 0]])
-
-
-def keypoints(directions_xyz: NDArray[np.float64], *, bits: bool = False) -> SphericalKeypoints:
-    """Keypoints of 2° in these directions, their orientation to the right."""
-    n = len(directions_xyz)
-    rng = np.random.default_rng(n)
-    x, y, _ = directions_xyz.T
-    right = np.stack([-y, x, 0 * x], axis=-1) / np.maximum(np.hypot(x, y), 1e-9)[:, None]
-    descriptors: Any = rng.integers(0, 256, (n, 32 if bits else 128))
-    return SphericalKeypoints(
-        directions_xyz,
-        np.full(n, np.radians(2), np.float32),
-        right,
-        np.ones(n, np.float32),
-        descriptors.astype(np.uint8 if bits else np.float32),
-        np.zeros(n, np.int32),
-    )
-
-
-def some(n: int, seed: int = 0) -> NDArray[np.float64]:
-    return unit(np.random.default_rng(seed).normal(size=(n, 3)))
 
 
 class Walk(NamedTuple):
@@ -51,7 +31,7 @@ class Walk(NamedTuple):
 
 def walk(count: int, path: Path) -> Walk:
     rng = np.random.default_rng(3)
-    points_m = some(250, 4) * rng.uniform(1.5, 5, (250, 1))
+    points_m = random_directions(250, 4) * rng.uniform(1.5, 5, (250, 1))
     poses, found, places = [], [], []
     for _ in range(count):
         pose = PanoramaPose(random_rotation(rng) @ FLIP_Y, rng.normal(size=3) * 0.6)
@@ -59,7 +39,7 @@ def walk(count: int, path: Path) -> Walk:
         seen = unit(pose.seen(points_m[order])[0] + rng.normal(size=(250, 3)) * 3e-4)
         poses.append(pose)
         places.append(np.argsort(order))
-        found.append(keypoints(seen))
+        found.append(keypoints_at(seen))
     pairs = {}
     for left in range(count):
         for right in range(left):  # the order of names and of images differ
@@ -112,7 +92,7 @@ def test_keypoints_in_colmaps_units(tmp_path: Path) -> None:
     blob = (255 * np.exp(-((u - 60) ** 2 + (v - 40) ** 2) / 18)).astype(np.uint8)
     detected = detect_on_equirect(blob, Detector("sift"))
     detected = detected.select(np.array([np.argmax(detected.responses)]))
-    both = keypoints(lonlat_to_xyz(lonlat)), detected
+    both = keypoints_at(lonlat_to_xyz(lonlat)), detected
     none = np.empty((0, 2), np.int64)
     path = tmp_path / "a.db"
     add_pair(path, ("a", "b"), ((100, 200), (100, 200)), both, none, TwoView(np.empty(0, bool)))
@@ -135,7 +115,7 @@ def test_pairs_without_translation_and_bits(tmp_path: Path, kind: str) -> None:
     rotation = random_rotation(np.random.default_rng(1)) if rotated else None
     two_view = TwoView(np.full(9, rotated), rotation)
     matches = np.stack([np.arange(9), np.arange(9)], axis=1)
-    both = keypoints(some(9), bits=True), keypoints(some(9))
+    both = keypoints_at(random_directions(9), bits=True), keypoints_at(random_directions(9))
     path = tmp_path / "pair.db"
     add_pair(path, ("a", "b"), ((50, 100), (60, 120)), both, matches, two_view)
     with pycolmap.Database.open(path) as database:

@@ -22,7 +22,7 @@ from tangent_train.keypoints.covisibility import (
     fov_overlap,
     visible_from,
 )
-from tests.keypoints.scenes import angle_deg, unit
+from tests.geometry.directions import angle_deg, random_directions, unit
 
 Array = NDArray[np.float64]
 SHAPE = (128, 256)
@@ -155,7 +155,7 @@ def test_at_an_edge_of_depth_there_are_two_distances() -> None:
 def test_matches_of_the_same_point_are_correct() -> None:
     left, right = ROOM.view(LEFT, (256, 512)), ROOM.view(tilted((1.6, -0.4, 1.4), 5), (256, 512))
     rng = np.random.default_rng(3)
-    rays = unit(rng.normal(size=(3000, 3)))
+    rays = random_directions(3000)
     points_m = left.pose.points_m(
         rays, ROOM.distance_m(LEFT.location_m, rays @ LEFT.world_from_panorama.T)
     )

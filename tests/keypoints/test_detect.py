@@ -26,9 +26,10 @@ from tangent_train.keypoints.detect import (
     gnomonic_jacobian,
 )
 from tangent_train.keypoints.spherical import SphericalKeypoints
-from tests.keypoints.textures import Agreement, angles_deg, blobs, rotated, texture
+from tests.geometry.directions import angle_deg, unit
+from tests.keypoints.textures import Agreement, blobs, rotated, texture
 
-LEVEL, SHAPE = 7, (256, 512)
+SHAPE = (256, 512)
 ROTATION = random_rotation(np.random.default_rng(1))
 DOG = 2 ** (1 / 6)
 """The DoG of a Gaussian blob of width s is largest at σ = s / this."""
@@ -140,9 +141,9 @@ def test_a_blob_is_found_once_wherever_it_is(lon_deg: float, lat_deg: float) -> 
     center = lonlat_to_xyz(np.deg2rad([lon_deg, lat_deg]))
     sigma = np.deg2rad(1.2 if lat_deg > 0 else 2.5)
     found = detect_on_equirect(blobs(SHAPE, center[None], sigma), Detector())
-    found = found.select(angles_deg(found.directions_xyz, center) < 5)
+    found = found.select(angle_deg(found.directions_xyz, center) < 5)
     assert len(np.unique(found.directions_xyz.round(4), axis=0)) == 1
-    assert angles_deg(found.directions_xyz, center).max() < (0.03 if lat_deg > 0 else 1)
+    assert angle_deg(found.directions_xyz, center).max() < (0.03 if lat_deg > 0 else 1)
     assert 2 * sigma / DOG / found.sizes_rad.min() == pytest.approx(1, abs=0.25)
     columns = found.equirect_pixels(SHAPE)[:, 0]
     assert ((columns >= -0.5) & (columns <= SHAPE[1] - 0.5)).all()
@@ -168,18 +169,18 @@ def test_a_blank_panorama_has_none_and_colour_is_grey(name: str, tangent: bool) 
 # Tangent images.
 
 
+GRID = TangentGrid(0, 7)  # other base levels are in tests/slow/keypoints
+
+
 @lru_cache
-def found_on_texture(
-    base_level: int, *, rotate: bool = False, margin: int = 16, name: str = "sift"
-) -> SphericalKeypoints:
+def found_on_texture(*, rotate: bool = False) -> SphericalKeypoints:
     image = texture(SHAPE, ROTATION if rotate else None)
-    return detect_on_tangent_images(image, TangentGrid(base_level, LEVEL), Detector(name), margin)
+    return detect_on_tangent_images(image, GRID, Detector("sift"), 16)
 
 
-@pytest.mark.parametrize("base_level", [0])  # others are in tests/slow/keypoints
-def test_a_rotated_panorama_has_rotated_keypoints(base_level: int) -> None:
-    left = rotated(found_on_texture(base_level), ROTATION)
-    right = found_on_texture(base_level, rotate=True)
+def test_a_rotated_panorama_has_rotated_keypoints() -> None:
+    left = rotated(found_on_texture(), ROTATION)
+    right = found_on_texture(rotate=True)
     agreement = Agreement(left, right)
     assert min(len(left), len(right)) > 900
     assert agreement.share > 0.7
@@ -198,8 +199,7 @@ def test_the_gnomonic_jacobian_is_the_derivative(base_level: int) -> None:
 
         def ray(pixels_xy: NDArray[np.float64], face: int = face) -> NDArray[np.float64]:
             homogeneous = np.column_stack([pixels_xy, np.ones(len(pixels_xy))])
-            rays = homogeneous @ np.linalg.inv(grid.camera_matrix).T
-            rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+            rays = unit(homogeneous @ np.linalg.inv(grid.camera_matrix).T)
             return np.asarray(rays @ grid.world_from_camera[face].T)
 
         steps = 1e-5 * np.eye(2)
@@ -208,42 +208,36 @@ def test_the_gnomonic_jacobian_is_the_derivative(base_level: int) -> None:
         np.testing.assert_allclose(jacobian, np.stack(numeric, axis=-1), atol=1e-9)
 
 
-@pytest.mark.parametrize("base_level", [0])
-def test_every_keypoint_is_owned_by_its_image_and_there_once(base_level: int) -> None:
-    points = found_on_texture(base_level)
-    grid = TangentGrid(base_level, LEVEL)
-    np.testing.assert_array_equal(grid.owners(points.directions_xyz), points.images)
+def test_every_keypoint_is_owned_by_its_image_and_there_once() -> None:
+    points = found_on_texture()
+    np.testing.assert_array_equal(GRID.owners(points.directions_xyz), points.images)
     assert (np.diff(points.images) >= 0).all()
-    left, right = cKDTree(points.directions_xyz).query_pairs(grid.pitch, output_type="ndarray").T
+    left, right = cKDTree(points.directions_xyz).query_pairs(GRID.pitch, output_type="ndarray").T
     other_image = points.images[left] != points.images[right]
     ratio = np.abs(np.log(points.sizes_rad[left] / points.sizes_rad[right]))
-    angle = angles_deg(points.orientations_xyz[left], points.orientations_xyz[right])
+    angle = angle_deg(points.orientations_xyz[left], points.orientations_xyz[right])
     assert not (other_image & (ratio < np.log(1.1)) & (angle < 15)).any()
     inner = (points.directions_xyz * points.orientations_xyz).sum(axis=1)
     np.testing.assert_allclose(inner, 0, atol=1e-12)
 
 
-def spots(grid: TangentGrid) -> NDArray[np.float64]:
+def spots() -> NDArray[np.float64]:
     """Half a pixel beside corners of cells, two of them the poles, and two on the seam."""
-    corners = icosphere(grid.base_level)[0][[0, 1, 4, 9, 6, -1]]
-    corners /= np.linalg.norm(corners, axis=1, keepdims=True)
-    inwards = grid.centers_xyz[grid.owners(corners)] - corners
-    corners += 0.5 * grid.pitch * inwards / np.linalg.norm(inwards, axis=1, keepdims=True)
+    corners = unit(icosphere(GRID.base_level)[0][[0, 1, 4, 9, 6, -1]])
+    inwards = unit(GRID.centers_xyz[GRID.owners(corners)] - corners)
     seam = lonlat_to_xyz(np.deg2rad([[180.0, 12.0], [-179.9, 40.0]]))
-    return np.concatenate([corners / np.linalg.norm(corners, axis=1, keepdims=True), seam])
+    return np.concatenate([unit(corners + 0.5 * GRID.pitch * inwards), seam])
 
 
-@pytest.mark.parametrize("base_level", [0])
-def test_a_blob_is_found_at_its_place_and_by_its_owner_alone(base_level: int) -> None:
+def test_a_blob_is_found_at_its_place_and_by_its_owner_alone() -> None:
     """Of several widths: SIFT passes over some of those that lie between two of its scales."""
-    grid = TangentGrid(base_level, LEVEL)
-    centers = spots(grid)
-    owners = grid.owners(centers)
+    centers = spots()
+    owners = GRID.owners(centers)
     seen = np.zeros(len(centers), int)
     for sigma_deg in (1.6, 1.85, 2.1, 2.4):
         sigma = np.deg2rad(sigma_deg)
-        found = detect_on_tangent_images(blobs(SHAPE, centers, sigma), grid, Detector(), 16)
-        distance = angles_deg(found.directions_xyz[:, None], centers)
+        found = detect_on_tangent_images(blobs(SHAPE, centers, sigma), GRID, Detector(), 16)
+        distance = angle_deg(found.directions_xyz[:, None], centers)
         near = distance.min(axis=1) < 3  # what is farther off is dark and between them
         found, distance = found.select(near), distance[near]
         nearest = distance.argmin(axis=1)

@@ -9,31 +9,12 @@ import pytest
 from numpy.typing import NDArray
 
 from tangent_train.geometry import equirect_to_lonlat, lonlat_to_xyz, rotation_about
-from tangent_train.keypoints.spherical import (
-    SphericalKeypoints,
-    angles_between,
-    equirect_jacobian,
-    local_to_sphere,
-)
+from tangent_train.keypoints.spherical import angles_between, equirect_jacobian, local_to_sphere
+from tests.geometry.directions import random_directions
+from tests.keypoints.scenes import keypoints_at
 
 SHAPE = (90, 210)
 """Not twice as wide as high."""
-
-
-def keypoints(count: int = 50, seed: int = 0) -> SphericalKeypoints:
-    rng = np.random.default_rng(seed)
-    directions, others = rng.normal(size=(2, count, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    tangents = np.cross(directions, others)
-    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
-    return SphericalKeypoints(
-        directions,
-        rng.uniform(0.01, 0.1, count).astype(np.float32),
-        tangents,
-        rng.random(count, np.float32),
-        rng.integers(0, 256, (count, 32), np.uint8),
-        rng.integers(0, 20, count).astype(np.int32),
-    )
 
 
 def direction(pixels_xy: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -51,7 +32,7 @@ def test_the_panoramas_jacobian_is_the_derivative() -> None:
 
 def skewed_maps(count: int = 40) -> NDArray[np.float64]:
     """Jacobians of maps to tangent planes: stretched, sheared, mirrored ones too."""
-    points = keypoints(count)
+    points = keypoints_at(random_directions(count))
     across = np.cross(points.directions_xyz, points.orientations_xyz)
     basis = np.stack([points.orientations_xyz, across], axis=-1)
     linear = np.random.default_rng(1).normal(size=(count, 2, 2)) + 2 * np.eye(2)
@@ -89,9 +70,7 @@ def test_there_and_back_from_a_panorama() -> None:
     diameters, angles = rng.uniform(1, 9, 300), rng.uniform(-np.pi, np.pi, 300)
     directions = direction(pixels)
     sizes, orientations = local_to_sphere(equirect_jacobian(directions, SHAPE), diameters, angles)
-    found = replace(
-        keypoints(300), directions_xyz=directions, sizes_rad=sizes, orientations_xyz=orientations
-    )
+    found = replace(keypoints_at(directions), sizes_rad=sizes, orientations_xyz=orientations)
     np.testing.assert_allclose((orientations * directions).sum(axis=1), 0, atol=1e-12)
     np.testing.assert_allclose(found.equirect_pixels(SHAPE), pixels, atol=1e-9)
     np.testing.assert_allclose(found.equirect_sizes(SHAPE), diameters, rtol=1e-5)
@@ -100,8 +79,7 @@ def test_there_and_back_from_a_panorama() -> None:
 
 def test_sizes_and_angles_at_the_poles_are_finite() -> None:
     poles = replace(
-        keypoints(2),
-        directions_xyz=np.array([[0, 0, 1.0], [0, 0, -1]]),
+        keypoints_at(np.array([[0, 0, 1.0], [0, 0, -1]])),
         orientations_xyz=np.array([[1, 0, 0.0], [0, 1, 0]]),
     )
     np.testing.assert_allclose(poles.equirect_pixels(SHAPE)[:, 1], [-0.5, SHAPE[0] - 0.5])

@@ -12,7 +12,8 @@ from tangent_train.errors import SettingError
 from tangent_train.geometry import PanoramaPose, random_rotation, rotation_about
 from tangent_train.keypoints.motion import Motion, is_by_chance, motion_errors
 from tangent_train.keypoints.two_view import TwoView, estimate_two_view
-from tests.keypoints.scenes import Scene, angle_deg, rotation_angle_deg, two_views, unit
+from tests.geometry.directions import angle_deg, unit
+from tests.keypoints.scenes import Scene, rotation_angle_deg, two_views
 
 pytest.importorskip("pycolmap")
 HERE = PanoramaPose(np.eye(3), np.zeros(3))
@@ -70,8 +71,8 @@ def test_chance_of_a_rotation_is_that_of_caps(inliers: int) -> None:
     right[:inliers] = left[:inliers]
     fits = int((angle_deg(left, right) <= 1).sum())
     share = math.sin(math.radians(0.5)) ** 2
-    measured = share  # at least; the shifted matches have about as much
-    alarms = (4000 - 2) * math.comb(4000, fits) * math.comb(fits, 2) * measured ** (fits - 2)
+    # The share is measured on shifted matches, which have about as much.
+    alarms = (4000 - 2) * math.comb(4000, fits) * math.comb(fits, 2) * share ** (fits - 2)
     assert fits == inliers
     assert is_by_chance(left, right, Motion(np.eye(3)), math.radians(1)) == (
         fits <= 2 or alarms > 1

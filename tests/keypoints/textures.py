@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
 from tangent_train.geometry import equirect_directions
+from tests.geometry.directions import angle_deg
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -49,11 +50,6 @@ def _as_bytes(grey: NDArray[np.float64]) -> NDArray[np.uint8]:
     return np.rint(grey.clip(0, 255)).astype(np.uint8)
 
 
-def angles_deg(left_xyz: NDArray[np.float64], right_xyz: NDArray[np.float64]) -> Any:
-    """Angles between unit vectors, exact for small ones too."""
-    return np.degrees(2 * np.arcsin(np.linalg.norm(left_xyz - right_xyz, axis=-1).clip(0, 2) / 2))
-
-
 def rotated(points: SphericalKeypoints, rotation: ArrayLike) -> SphericalKeypoints:
     """The keypoints of the rotated panorama: directions and orientations become R·d."""
     matrix = np.asarray(rotation)
@@ -89,7 +85,7 @@ class Agreement:
         left, right = left.select(found), right.select(nearest)
         ratios = right.sizes_rad / left.sizes_rad
         self.share = found.mean()
-        self.error_deg = np.median(angles_deg(left.directions_xyz, right.directions_xyz))
+        self.error_deg = np.median(angle_deg(left.directions_xyz, right.directions_xyz))
         self.size_ratio = np.median(ratios)
         self.size_spread = np.median(np.abs(np.log(ratios)))
-        self.turn_deg = np.median(angles_deg(left.orientations_xyz, right.orientations_xyz))
+        self.turn_deg = np.median(angle_deg(left.orientations_xyz, right.orientations_xyz))

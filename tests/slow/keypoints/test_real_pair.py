@@ -17,7 +17,8 @@ from tangent_train.keypoints import (
     estimate_two_view,
     match,
 )
-from tests.keypoints.scenes import angle_deg, rotation_angle_deg
+from tests.geometry.directions import angle_deg
+from tests.keypoints.scenes import rotation_angle_deg
 
 REAL_DATA = os.environ.get("TANGENT_REAL_DATA")
 
