@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -62,7 +62,7 @@ def keypoints_at(directions_xyz: NDArray[np.float64], *, bits: bool = False) -> 
     n = len(directions_xyz)
     x, y, _ = directions_xyz.T
     right = np.stack([-y, x, 0 * x], axis=-1) / np.maximum(np.hypot(x, y), 1e-9)[:, None]
-    descriptors = np.random.default_rng(n).integers(0, 256, (n, 32 if bits else 128))
+    descriptors: Any = np.random.default_rng(n).integers(0, 256, (n, 32 if bits else 128))
     return SphericalKeypoints(
         directions_xyz,
         np.full(n, np.radians(2), np.float32),

@@ -29,7 +29,7 @@ from tangent_train.keypoints.spherical import SphericalKeypoints
 from tests.geometry.directions import angle_deg, unit
 from tests.keypoints.textures import Agreement, blobs, rotated, texture
 
-SHAPE = (256, 512)
+LEVEL, SHAPE = 7, (256, 512)
 ROTATION = random_rotation(np.random.default_rng(1))
 DOG = 2 ** (1 / 6)
 """The DoG of a Gaussian blob of width s is largest at σ = s / this."""
@@ -169,18 +169,21 @@ def test_a_blank_panorama_has_none_and_colour_is_grey(name: str, tangent: bool) 
 # Tangent images.
 
 
-GRID = TangentGrid(0, 7)  # other base levels are in tests/slow/keypoints
+# Other base levels than 0 are in tests/slow/keypoints.
 
 
 @lru_cache
-def found_on_texture(*, rotate: bool = False) -> SphericalKeypoints:
+def found_on_texture(
+    base_level: int, *, rotate: bool = False, margin: int = 16, name: str = "sift"
+) -> SphericalKeypoints:
     image = texture(SHAPE, ROTATION if rotate else None)
-    return detect_on_tangent_images(image, GRID, Detector("sift"), 16)
+    return detect_on_tangent_images(image, TangentGrid(base_level, LEVEL), Detector(name), margin)
 
 
-def test_a_rotated_panorama_has_rotated_keypoints() -> None:
-    left = rotated(found_on_texture(), ROTATION)
-    right = found_on_texture(rotate=True)
+@pytest.mark.parametrize("base_level", [0])
+def test_a_rotated_panorama_has_rotated_keypoints(base_level: int) -> None:
+    left = rotated(found_on_texture(base_level), ROTATION)
+    right = found_on_texture(base_level, rotate=True)
     agreement = Agreement(left, right)
     assert min(len(left), len(right)) > 900
     assert agreement.share > 0.7
@@ -208,11 +211,13 @@ def test_the_gnomonic_jacobian_is_the_derivative(base_level: int) -> None:
         np.testing.assert_allclose(jacobian, np.stack(numeric, axis=-1), atol=1e-9)
 
 
-def test_every_keypoint_is_owned_by_its_image_and_there_once() -> None:
-    points = found_on_texture()
-    np.testing.assert_array_equal(GRID.owners(points.directions_xyz), points.images)
+@pytest.mark.parametrize("base_level", [0])
+def test_every_keypoint_is_owned_by_its_image_and_there_once(base_level: int) -> None:
+    points = found_on_texture(base_level)
+    grid = TangentGrid(base_level, LEVEL)
+    np.testing.assert_array_equal(grid.owners(points.directions_xyz), points.images)
     assert (np.diff(points.images) >= 0).all()
-    left, right = cKDTree(points.directions_xyz).query_pairs(GRID.pitch, output_type="ndarray").T
+    left, right = cKDTree(points.directions_xyz).query_pairs(grid.pitch, output_type="ndarray").T
     other_image = points.images[left] != points.images[right]
     ratio = np.abs(np.log(points.sizes_rad[left] / points.sizes_rad[right]))
     angle = angle_deg(points.orientations_xyz[left], points.orientations_xyz[right])
@@ -221,22 +226,24 @@ def test_every_keypoint_is_owned_by_its_image_and_there_once() -> None:
     np.testing.assert_allclose(inner, 0, atol=1e-12)
 
 
-def spots() -> NDArray[np.float64]:
+def spots(grid: TangentGrid) -> NDArray[np.float64]:
     """Half a pixel beside corners of cells, two of them the poles, and two on the seam."""
-    corners = unit(icosphere(GRID.base_level)[0][[0, 1, 4, 9, 6, -1]])
-    inwards = unit(GRID.centers_xyz[GRID.owners(corners)] - corners)
+    corners = unit(icosphere(grid.base_level)[0][[0, 1, 4, 9, 6, -1]])
+    inwards = unit(grid.centers_xyz[grid.owners(corners)] - corners)
     seam = lonlat_to_xyz(np.deg2rad([[180.0, 12.0], [-179.9, 40.0]]))
-    return np.concatenate([unit(corners + 0.5 * GRID.pitch * inwards), seam])
+    return np.concatenate([unit(corners + 0.5 * grid.pitch * inwards), seam])
 
 
-def test_a_blob_is_found_at_its_place_and_by_its_owner_alone() -> None:
+@pytest.mark.parametrize("base_level", [0])
+def test_a_blob_is_found_at_its_place_and_by_its_owner_alone(base_level: int) -> None:
     """Of several widths: SIFT passes over some of those that lie between two of its scales."""
-    centers = spots()
-    owners = GRID.owners(centers)
+    grid = TangentGrid(base_level, LEVEL)
+    centers = spots(grid)
+    owners = grid.owners(centers)
     seen = np.zeros(len(centers), int)
     for sigma_deg in (1.6, 1.85, 2.1, 2.4):
         sigma = np.deg2rad(sigma_deg)
-        found = detect_on_tangent_images(blobs(SHAPE, centers, sigma), GRID, Detector(), 16)
+        found = detect_on_tangent_images(blobs(SHAPE, centers, sigma), grid, Detector(), 16)
         distance = angle_deg(found.directions_xyz[:, None], centers)
         near = distance.min(axis=1) < 3  # what is farther off is dark and between them
         found, distance = found.select(near), distance[near]

@@ -87,20 +87,6 @@ def test_probabilities_of_owners_are_the_softmax_of_the_interpolated_scores() ->
     np.testing.assert_allclose(result.probabilities(slice(None)), expected.numpy(), atol=1e-5)
 
 
-def test_several_grids_are_averaged() -> None:
-    shape = (32, 64)
-    grids = [TangentGrid(0, 4), TangentGrid(0, 4, rotation=rotation_about((0, 0, 1), 0.4))]
-    result = ScoreMosaic(shape, 7, "nearest", averaged=True)
-    singles = []
-    for grid in grids:
-        _added(result, _scores(grid), grid)
-        single = ScoreMosaic(shape, 7, "nearest", averaged=True)
-        singles.append(_added(single, _scores(grid), grid).probabilities(slice(None)))
-    np.testing.assert_allclose(
-        result.probabilities(slice(None)), np.mean(singles, axis=0), atol=1e-6
-    )
-
-
 def test_every_pixel_has_one_owner_even_where_images_are_equally_near() -> None:
     # Pixel centres on the cube's edges and corners: width 8 puts columns on its 45° meridians.
     grid, shape = CubeGrid(8), (6, 12)

@@ -117,18 +117,6 @@ def test_forward_in_torch(case: Case, interpolation: Interpolation) -> None:
         assert error[certain].max() < tolerance
 
 
-def test_forward_of_uint8_arrays(case: Case) -> None:
-    pair = pair_of(case)
-    image = np.round(255 * waves(case.shape)).astype(np.uint8)
-    expected = pair.theirs.forward(image.astype(np.float64))[pair.order]
-    result = equirect_to_tangent(image, pair.ours)
-    assert result.dtype == np.uint8
-    steps = [np.abs(np.diff(image.astype(float), axis=axis)).max() for axis in (0, 1)]
-    error = result - expected
-    assert np.abs(error).max() < 0.501 + 2 * POSITION_ERROR * sum(steps)
-    assert abs(error.mean()) < 0.1  # no bias
-
-
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 def test_forward_of_labels_is_the_nearest_label(case: Case, dtype: type[np.integer]) -> None:
     pair = pair_of(case)
@@ -145,21 +133,30 @@ def test_forward_of_labels_is_the_nearest_label(case: Case, dtype: type[np.integ
 @pytest.mark.parametrize("channels", [0, 1, 2, 3, 4, 6])  # 0: an image (H, W)
 @pytest.mark.parametrize(
     ("dtype", "largest", "tolerance"),
-    [("uint8", 255, 0.501), ("uint16", 65535, 1.0), ("float32", 1, 2e-4), ("float64", 1, 1e-9)],
+    [
+        ("uint8", 255, 0.501),
+        ("uint16", 65535, 1.0),
+        ("int32", 2**16, 0.55),
+        ("float32", 1, 2e-4),
+        ("float64", 1, 1e-9),
+    ],
 )
 def test_forward_of_any_number_of_channels(
     channels: int, dtype: str, largest: int, tolerance: float
 ) -> None:
     pair = pair_of(CASES[0])
     shape = (50, 100, channels) if channels else (50, 100)
-    # Noise has steps of `largest` both ways; float32 positions near 100 are good to 4e-6 px.
-    tolerance += (dtype != "float64") * 2 * POSITION_ERROR * largest
-    image = (largest * noise(*shape)).astype(dtype)
+    smooth = np.take(waves((50, 100)), np.arange(max(1, channels)) % 3, axis=-1)
+    image = (largest * smooth.reshape(shape)).astype(dtype)
     exact = image.reshape(50, 100, -1).astype(np.float64)
+    # OpenCV rounds positions; float32 positions near 100 are good to 4e-6 px.
+    steps = [np.abs(np.diff(exact, axis=axis)).max() for axis in (0, 1)]
+    tolerance += (dtype not in ("int32", "float64")) * 2 * POSITION_ERROR * sum(steps)
     expected = pair.theirs.forward(exact)[pair.order].reshape(20, 16, 16, *shape[2:])
     result = equirect_to_tangent(image, pair.ours)
-    assert result.shape == expected.shape
+    assert (result.dtype.name, result.shape) == (dtype, expected.shape)
     assert np.abs(result - expected).max() < tolerance
+    assert abs((result - expected).mean()) < 0.1 or largest > 255, "no bias"
 
 
 @pytest.mark.parametrize("interpolation", ["bilinear", "nearest"])
@@ -201,6 +198,24 @@ def test_backward_in_torch(case: Case, blend: Blend) -> None:
         assert (result.dtype, result.shape) == (dtype, (3, *case.shape))
         error = result.permute(1, 2, 0).double().numpy()[clear] - expected
         assert np.abs(error).max() < tolerance
+    arrays = tangent_to_equirect(images.astype(np.float32), pair.ours, case.shape, blend)
+    np.testing.assert_allclose(arrays[clear], expected, atol=2e-5)
+
+
+def test_nearest_is_the_nearest_pixel(case: Case) -> None:
+    ours, theirs, order = pair_of(case)
+    owner = theirs.nearness(case.shape).argmax(axis=-1)
+    places = np.stack(theirs.positions(case.shape, owner))
+    # Half-way between two pixels or two images, rounding decides.
+    certain = theirs.clear(case.shape) & (np.abs(places % 1 - 0.5) > 1e-4).all(axis=0)
+    assert certain.mean() > 0.9
+    # Every pixel has a value of its own.
+    images = np.arange(ours.num_images * ours.dim**2).reshape(-1, ours.dim, ours.dim)
+    row, column = np.floor(places + 0.5).clip(0, ours.dim - 1).astype(int)
+    expected = images[np.argsort(order)[owner], row, column]
+    found = tangent_to_equirect(images, ours, case.shape, interpolation="nearest")
+    assert found.dtype == images.dtype
+    np.testing.assert_array_equal(found[certain], expected[certain])
 
 
 @pytest.mark.parametrize("blend", ["nearest", "feather"])

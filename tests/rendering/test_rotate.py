@@ -4,15 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from tangent_train.errors import SettingError
-from tangent_train.geometry import (
-    rotation_about,
-)
-from tangent_train.rendering import (
-    rotate_equirect,
-)
+from tangent_train.geometry import rotation_about
+from tangent_train.rendering import rotate_equirect
 
 
 @pytest.mark.parametrize("columns", [1, 16, 31])
@@ -24,7 +19,6 @@ def test_a_turn_about_the_vertical_shifts_columns(columns: int) -> None:
         np.testing.assert_array_equal(turned, np.roll(image, columns, axis=1))
 
 
-@pytest.mark.parametrize("rotation", [np.eye(2), 2 * np.eye(3), np.diag([1.0, -1, 1])])
-def test_errors(rotation: NDArray[np.float64]) -> None:
+def test_errors() -> None:
     with pytest.raises(SettingError, match="rotation"):
-        rotate_equirect(np.zeros((4, 8)), rotation)
+        rotate_equirect(np.zeros((4, 8)), np.diag([1.0, -1, 1]))
