@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar, Literal
 
 from datamodules.core.found import Found, Split
-from datamodules.core.inputs import RGB_NORMALIZATION, RGBD_NORMALIZATION, Input, Normalization
+from datamodules.core.image_module import ImageDataModule
 from datamodules.core.panoramas import Panorama, Turn
 from datamodules.core.pipeline import (
     EstimatedUp,
@@ -20,9 +18,7 @@ from datamodules.core.pipeline import (
     in_threads,
 )
 from datamodules.core.problems import Problems
-from datamodules.core.reading import ImageFiles, ImageReader, PanoramaReading, check_headers
-from datamodules.core.samples import ImageSamples
-from datamodules.core.split_module import SplitDataModule
+from datamodules.core.reading import ImageFiles, PanoramaReading, check_headers
 from datamodules.core.store import Store
 from tangent_train.errors import SettingError
 
@@ -35,16 +31,11 @@ Upright = Literal["pose", "auto"] | None
 
 
 @dataclass(kw_only=True, eq=False, repr=False)
-class PanoramaDataModule(SplitDataModule[ImageFiles]):
-    """Labelled panoramas of one data set.
-
-    A data set says which panoramas it has (`find_images`) and its `class_names`, the unknown one
-    (0) first.
+class PanoramaDataModule(ImageDataModule):
+    """Labelled panoramas of one data set, see `ImageDataModule`.
 
     Args:
         panoramas_per_step: Panoramas per training step and process. Evaluation takes one at a time.
-        inputs: Inputs of the network, `rgb` and optionally others, see `Input`.
-        color_jitter: Strength of the colour augmentation, 0 (none) to 1, see `jitter_colors`.
         test_rotation: Rotate the test panoramas: tilt in degrees, or `so3`, see `RotatedPanoramas`.
         upright: Align tilted panoramas with gravity. `pose`: as their files say (GPano) and, of
             test panoramas, as they were rotated. `auto`: as their files say, else as estimated from
@@ -53,21 +44,14 @@ class PanoramaDataModule(SplitDataModule[ImageFiles]):
 
     Attributes:
         erp_height: Rows of the panoramas read.
-        normalizations: The default ones, without and with depth.
 
     Raises:
         SettingError: A setting is invalid.
     """
 
     noun: ClassVar[str] = "panoramas"
-    normalizations: ClassVar[tuple[Normalization, Normalization]] = (
-        RGB_NORMALIZATION,
-        RGBD_NORMALIZATION,
-    )
 
     panoramas_per_step: int = 4
-    inputs: Sequence[Input] = ("rgb", "depth")
-    color_jitter: float = 0.0
     test_rotation: Turn = None
     upright: Upright = None
     max_tilt_deg: float = 60.0
@@ -80,29 +64,13 @@ class PanoramaDataModule(SplitDataModule[ImageFiles]):
             "Choose representation=tangent, or photos, as data=synthrooms_perspective.",
         )
         self.erp_height: int = self.representation.erp_height
-        default = self.normalizations["depth" in self.inputs]
-        self.samples = ImageSamples(self.inputs, self.normalization or default, self.color_jitter)
-        self.inputs, self.normalization = self.samples.inputs, self.samples.normalization
         self._check_rotations()
-
-    @abstractmethod
-    def find_images(
-        self, problems: Problems
-    ) -> tuple[ImageReader, Mapping[Split, Sequence[ImageFiles]]]:
-        """Return the reader of the data set and the files of all splits, not yet opened.
-
-        Args:
-            problems: Problems of the folders are added.
-
-        Raises:
-            DataError: The data set as a whole cannot be used.
-        """
 
     def find(self, problems: Problems) -> Found[ImageFiles]:
         """See `SplitDataModule`."""
         reader, splits = self.find_images(problems)
         height, width = shape = self.erp_height, 2 * self.erp_height
-        read = PanoramaReading(reader, shape, len(self.class_names))
+        read = PanoramaReading(reader, len(self.class_names), shape)
         store = Store.of(self.store, f"{height}x{width}", reader.settings)
         found = Found(self.noun, splits, read, store)
         check = partial(check_headers, reader=reader, problems=problems, erp_height=height)

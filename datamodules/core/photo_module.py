@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar
 
 from datamodules.core.found import Found, Split
-from datamodules.core.inputs import RGB_NORMALIZATION, RGBD_NORMALIZATION, Input, Normalization
+from datamodules.core.image_module import ImageDataModule
 from datamodules.core.photos import Photo
 from datamodules.core.pipeline import SplitItems, in_threads
 from datamodules.core.problems import Problems
 from datamodules.core.reading import ImageFiles, ImageReader, PhotoReading, check_headers
-from datamodules.core.samples import ImageSamples
-from datamodules.core.split_module import SplitDataModule
 from datamodules.core.store import Store
 from tangent_train.errors import DataError, SettingError
 from tangent_train.geometry import shift_range
@@ -24,33 +20,21 @@ __all__ = ["PhotoDataModule", "Split"]
 
 
 @dataclass(kw_only=True, eq=False, repr=False)
-class PhotoDataModule(SplitDataModule[ImageFiles]):
-    """Labelled photos of one data set.
+class PhotoDataModule(ImageDataModule):
+    """Labelled photos of one data set, see `ImageDataModule`.
 
-    A data set says which photos it has (`find_images`) and its `class_names`, the unknown one (0)
-    first. The representation is the camera to which all photos are normalized.
+    The representation is the camera to which all photos are normalized.
 
     Args:
         photos_per_step: Photos per training step and process. Evaluation takes one at a time.
-        inputs: Inputs of the network, `rgb` and optionally `depth`.
-        color_jitter: Strength of the colour augmentation, 0 (none) to 1, see `jitter_colors`.
-
-    Attributes:
-        normalizations: The default ones, without and with depth.
 
     Raises:
         SettingError: A setting is invalid.
     """
 
     noun: ClassVar[str] = "photos"
-    normalizations: ClassVar[tuple[Normalization, Normalization]] = (
-        RGB_NORMALIZATION,
-        RGBD_NORMALIZATION,
-    )
 
     photos_per_step: int = 16
-    inputs: Sequence[Input] = ("rgb", "depth")
-    color_jitter: float = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -59,9 +43,6 @@ class PhotoDataModule(SplitDataModule[ImageFiles]):
             "one for photos",
             "Choose representation=perspective, or panoramas, as data=synthrooms.",
         )
-        default = self.normalizations["depth" in self.inputs]
-        self.samples = ImageSamples(self.inputs, self.normalization or default, self.color_jitter)
-        self.inputs, self.normalization = self.samples.inputs, self.samples.normalization
         if "elevation" in self.inputs:
             raise SettingError(
                 "data.inputs",
@@ -70,12 +51,6 @@ class PhotoDataModule(SplitDataModule[ImageFiles]):
                 remedy="Train on photos without it, then on panoramas with it and init_from=…: "
                 "its filters start at zero.",
             )
-
-    @abstractmethod
-    def find_images(
-        self, problems: Problems
-    ) -> tuple[ImageReader, Mapping[Split, Sequence[ImageFiles]]]:
-        """See `PanoramaDataModule`."""
 
     def find(self, problems: Problems) -> Found[ImageFiles]:
         """See `SplitDataModule`."""

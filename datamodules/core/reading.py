@@ -96,18 +96,46 @@ class ImageReader(ABC):
 
 
 @dataclass(frozen=True)
-class PanoramaReading:
-    """Reads panoramas at one size.
+class _Reading:
+    """Reads the images of a data set.
 
     Attributes:
         reader: Of the data set.
-        shape: Rows and columns of the result.
         num_classes: K + 1, the unknown class included.
     """
 
     reader: ImageReader
-    shape: tuple[int, int]
     num_classes: int
+
+    def checked_labels(
+        self, files: ImageFiles, shape: tuple[int, int] | None = None
+    ) -> NDArray[np.uint8]:
+        """Its labels, none beyond the classes; see `ImageReader.labels`."""
+        labels = self.reader.labels(files, shape)
+        if labels.max(initial=0) >= self.num_classes:
+            raise DataError(
+                files.labels,
+                found=f"label {labels.max()}",
+                expected=f"0 (unknown) to {self.num_classes - 1}",
+                remedy="The data set's class_names and its reader's labels have to agree.",
+            )
+        return labels
+
+    def parts(self, files: ImageFiles) -> list[Callable[[], object]]:
+        """Functions that decode each of its files separately."""
+        read = {"labels": self.checked_labels}
+        return [partial(read.get(part, getattr(self.reader, part)), files) for part in files.parts]
+
+
+@dataclass(frozen=True)
+class PanoramaReading(_Reading):
+    """Reads panoramas at one size.
+
+    Attributes:
+        shape: Rows and columns of the result.
+    """
+
+    shape: tuple[int, int]
 
     def __call__(self, files: ImageFiles) -> Panorama:
         """One panorama."""
@@ -119,24 +147,11 @@ class PanoramaReading:
 
     def labels(self, files: ImageFiles) -> NDArray[np.uint8]:
         """Its labels alone."""
-        return _labels(self.reader, self.num_classes, files, self.shape)
-
-    def parts(self, files: ImageFiles) -> list[Callable[[], object]]:
-        """Functions that decode each of its files separately."""
-        return _parts(self.reader, self.num_classes, files)
+        return self.checked_labels(files, self.shape)
 
 
-@dataclass(frozen=True)
-class PhotoReading:
-    """Reads photos; z-depth becomes distance from the centre of projection.
-
-    Attributes:
-        reader: Of the data set.
-        num_classes: K + 1, the unknown class included.
-    """
-
-    reader: ImageReader
-    num_classes: int
+class PhotoReading(_Reading):
+    """Reads photos; z-depth becomes distance from the centre of projection."""
 
     def __call__(self, files: ImageFiles) -> Photo:
         """One photo."""
@@ -148,33 +163,7 @@ class PhotoReading:
 
     def labels(self, files: ImageFiles) -> NDArray[np.uint8]:
         """Its labels alone."""
-        return _labels(self.reader, self.num_classes, files)
-
-    def parts(self, files: ImageFiles) -> list[Callable[[], object]]:
-        """Functions that decode each of its files separately."""
-        return _parts(self.reader, self.num_classes, files)
-
-
-def _parts(reader: ImageReader, num_classes: int, files: ImageFiles) -> list[Callable[[], object]]:
-    read = {"labels": partial(_labels, reader, num_classes)}
-    return [partial(read.get(part, getattr(reader, part)), files) for part in files.parts]
-
-
-def _labels(
-    reader: ImageReader,
-    num_classes: int,
-    files: ImageFiles,
-    shape: tuple[int, int] | None = None,
-) -> NDArray[np.uint8]:
-    labels = reader.labels(files, shape)
-    if labels.max(initial=0) >= num_classes:
-        raise DataError(
-            files.labels,
-            found=f"label {labels.max()}",
-            expected=f"0 (unknown) to {num_classes - 1}",
-            remedy="The data set's class_names and its reader's labels have to agree.",
-        )
-    return labels
+        return self.checked_labels(files)
 
 
 def check_headers(

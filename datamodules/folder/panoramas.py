@@ -78,7 +78,7 @@ class FolderPanoramas(PanoramaDataModule):
         self.class_names = (UNKNOWN_NAME, *self._classes.names)
 
     def find_images(self, problems: Problems) -> tuple[FolderReader, dict[Split, list[ImageFiles]]]:
-        """See `PanoramaDataModule`."""
+        """See `ImageDataModule`."""
         panoramas = list_panoramas(self.root, problems, with_depth="depth" in self.inputs)
         # Before any are left out: the splits do not depend on what is broken.
         division = FolderSplits(

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from datamodules.core.group_drawing import draw_groups
+from datamodules.core.image_module import ImageDataModule
 from datamodules.core.reading import ImageFiles
-from datamodules.core.split_module import SplitDataModule
 from datamodules.stanford2d3ds.files import AREAS, FOLDS, GET_IT, list_pictures
 from datamodules.stanford2d3ds.label_table import CLASSES
 from datamodules.stanford2d3ds.reader import StanfordReader
@@ -23,7 +23,7 @@ __all__ = ["StanfordAreas"]
 
 
 @dataclass(kw_only=True, eq=False, repr=False)
-class StanfordAreas(SplitDataModule[ImageFiles]):
+class StanfordAreas(ImageDataModule):
     """The three folds of the authors, with rooms for validation.
 
     Validation pictures are those of whole rooms drawn from the training areas, so that nothing is
@@ -70,7 +70,7 @@ class StanfordAreas(SplitDataModule[ImageFiles]):
     def find_images(
         self, problems: Problems
     ) -> tuple[StanfordReader, dict[Split, list[ImageFiles]]]:
-        """See `PanoramaDataModule`."""
+        """See `ImageDataModule`."""
         root, areas = self.root, self.areas
         if not root.is_dir():
             raise DataError(root, found="no such folder", expected="the data set", remedy=GET_IT)

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from itertools import chain
 from typing import TYPE_CHECKING, ClassVar
 
+from datamodules.core.image_module import ImageDataModule
 from datamodules.core.inputs import Input
 from datamodules.core.reading import ImageFiles
-from datamodules.core.split_module import SplitDataModule
 from datamodules.synthia.reader import CLASSES, NORMALIZATIONS, Formats, SynthiaReader
 from tangent_train.errors import DataError, SettingError
 
@@ -59,7 +59,7 @@ def choose_frames(frames: Sequence[str], count: int = FRAMES) -> list[str]:
 
 
 @dataclass(kw_only=True, eq=False, repr=False)
-class SynthiaSequences(SplitDataModule[ImageFiles]):
+class SynthiaSequences(ImageDataModule):
     """The training and test sequences of OmniSYNTHIA's authors.
 
     Validation takes the last frames of each training sequence. Depth is clipped to 4 m, which is
@@ -115,7 +115,7 @@ class SynthiaSequences(SplitDataModule[ImageFiles]):
     def find_images(
         self, problems: Problems
     ) -> tuple[SynthiaReader, dict[Split, list[ImageFiles]]]:
-        """See `PanoramaDataModule`."""
+        """See `ImageDataModule`."""
         found: dict[str, list[list[ImageFiles]]] = {}
         for sequence in self.sequences:
             found[sequence] = []

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 from datamodules.stanford2d3ds.pairs import StanfordPairs
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 from datamodules.stanford2d3ds.perspective import Stanford2D3DSPerspective
+from datamodules.stanford2d3ds.splits import StanfordAreas
+from datamodules.synthrooms.generate import generate_rooms
 from datamodules.synthrooms.settings import RoomSettings
 from tangent_train.errors import SettingError
 from tangent_train.registry import registered
@@ -19,23 +21,12 @@ if TYPE_CHECKING:
 __all__ = ["SynthRooms", "SynthRoomsPairs", "SynthRoomsPerspective"]
 
 
-def _generate(root: Path, rooms: Any) -> None:
-    """Generate the files, unless they are there."""
-    from datamodules.synthrooms.generate import generate_rooms
-
-    generate_rooms(root, rooms)
-
-
-@registered
 @dataclass(kw_only=True, eq=False, repr=False)
-class SynthRooms(Stanford2D3DS):
-    """Panoramas of synthetic rooms, read as Stanford2D3DS: the data set that needs no download.
+class SynthRoomsAreas(StanfordAreas):
+    """Areas of synthetic rooms, generated on first use.
 
     Args:
         rooms: Rooms to generate; their areas are the areas used.
-
-    Raises:
-        SettingError: A setting is invalid.
     """
 
     is_made = True
@@ -50,36 +41,32 @@ class SynthRooms(Stanford2D3DS):
 
     def make_files(self) -> None:
         """Generate the files, unless they are there."""
-        _generate(self.root, self.rooms)
+        generate_rooms(self.root, RoomSettings.of(self.rooms))
 
 
 @registered
 @dataclass(kw_only=True, eq=False, repr=False)
-class SynthRoomsPerspective(Stanford2D3DSPerspective):
-    """Photos of the same rooms, read as those of Stanford2D3DS.
-
-    Args:
-        rooms: Rooms to generate, with photos; their areas are the areas used.
+class SynthRooms(SynthRoomsAreas, Stanford2D3DS):
+    """Panoramas of synthetic rooms, read as Stanford2D3DS: the data set that needs no download.
 
     Raises:
         SettingError: A setting is invalid.
     """
 
-    is_made = True
 
-    areas: Sequence[str] = field(init=False, default=())
-    rooms: RoomSettings | Mapping[str, int | str | Mapping[str, int]]
+@registered
+@dataclass(kw_only=True, eq=False, repr=False)
+class SynthRoomsPerspective(SynthRoomsAreas, Stanford2D3DSPerspective):
+    """Photos of the same rooms, read as those of Stanford2D3DS.
+
+    Raises:
+        SettingError: A setting is invalid.
+    """
 
     def __post_init__(self) -> None:
-        self.rooms = rooms = RoomSettings.of(self.rooms)
-        if not rooms.views_per_camera:
-            raise SettingError("data.rooms.views_per_camera", found=0, expected="1 or more photos")
-        self.areas = rooms.areas
         super().__post_init__()
-
-    def make_files(self) -> None:
-        """Generate the files, unless they are there."""
-        _generate(self.root, self.rooms)
+        if not RoomSettings.of(self.rooms).views_per_camera:
+            raise SettingError("data.rooms.views_per_camera", found=0, expected="1 or more photos")
 
 
 class SynthRoomsPairs(StanfordPairs):
@@ -111,4 +98,4 @@ class SynthRoomsPairs(StanfordPairs):
 
     def make_files(self) -> None:
         """Generate the files, unless they are there."""
-        _generate(self.root, self.rooms)
+        generate_rooms(self.root, self.rooms)
