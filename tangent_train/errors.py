@@ -37,7 +37,8 @@ class _ExplainedError(ValueError):
     ) -> None:
         message = str(subject)
         if found is not None:
-            shown = str(found)
+            # Of an OSError without its number and the path, which is the subject.
+            shown = getattr(found, "strerror", None) or str(found)
             shown = shown if len(shown) <= _LONGEST else shown[:_LONGEST] + "…"
             message = f"{subject}: found {shown}; expected {expected}. {remedy}".rstrip()
         super().__init__(printable(message))

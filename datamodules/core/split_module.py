@@ -200,14 +200,23 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
             count = self._listed(problems).check(problems, progress=progress)
         return problems, count
 
-    def _listed(self, problems: Problems) -> Found[_Item]:
-        """Items of all splits, with the checks that hold for every data set."""
-        if self.kind == "segmentation" and self.class_names[0] != "unknown":
+    def check_classes(self) -> None:
+        """Check that the data set names its classes.
+
+        Raises:
+            SettingError: It does not.
+        """
+        names = getattr(self, "class_names", ())
+        if not names or (self.kind == "segmentation" and names[0] != "unknown"):
             raise SettingError(
-                "class_names of the data",
-                found=f"{self.class_names[0]} first",
+                f"class_names of {type(self).__name__}",
+                found=f"{names[0]} first" if names else "none",
                 expected="unknown, then the classes: label 0 is ignored",
             )
+
+    def _listed(self, problems: Problems) -> Found[_Item]:
+        """Items of all splits, with the checks that hold for every data set."""
+        self.check_classes()
         found = self.find(problems)
         if not found.of() and not problems.items:
             expected = f"{self.noun}, as docs and the docstring of the data set describe them"

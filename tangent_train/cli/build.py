@@ -10,7 +10,7 @@ import torch
 
 from tangent_train.checkpoints.trained import completed_settings
 from tangent_train.errors import SettingError
-from tangent_train.registry import SettingsFile, make, maker_of
+from tangent_train.registry import SettingsFile, check_registered, make, maker_of
 
 __all__ = ["Settings", "build"]
 
@@ -42,10 +42,13 @@ def build(settings: Settings, source: SettingsFile | None = None) -> tuple[Any, 
     }
     representation = parts["representation"]
     data = make(settings["data"], "data", source, representation=representation)
-    labelled = getattr(data, "kind", "segmentation")
-    kind = getattr(maker_of(settings["task"], "task", source), "kind", labelled)
-    if kind != labelled:
-        raise SettingError("task", found=f"{kind}, with {data.noun}", expected=labelled)
+    data.check_classes()
+    kind = getattr(maker_of(settings["task"], "task", source), "kind", data.kind)
+    if kind != data.kind:
+        raise SettingError("task", found=f"{kind}, with {data.noun}", expected=data.kind)
+    if source is None:
+        for place in ("data", "network"):
+            _check_registered(settings[place], place)
     restored = settings.get("resume") is not None or settings.get("checkpoint") is not None
     network = completed_settings(
         settings["network"], data.in_channels, len(data.class_names), restored=restored
@@ -54,6 +57,15 @@ def build(settings: Settings, source: SettingsFile | None = None) -> tuple[Any, 
     task = make(settings["task"], "task", source, class_names=data.class_names, **parts)
     _try_network(task, data.in_channels)
     return data, task
+
+
+def _check_registered(section: Any, place: str) -> None:
+    """Check the classes of a section and of those in it, which will stand in checkpoints."""
+    if isinstance(section, Mapping):
+        if "_target_" in section:
+            check_registered(str(section["_target_"]), place)
+        for name, value in section.items():
+            _check_registered(value, f"{place}.{name}")
 
 
 def _try_network(task: Any, channels: int) -> None:

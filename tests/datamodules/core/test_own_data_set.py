@@ -100,6 +100,15 @@ def test_the_first_class_is_the_unknown_one(tmp_path: Path) -> None:
         _toy(tmp_path, Nameless).prepare_data()
 
 
+def test_a_data_set_without_names_of_classes_is_refused(tmp_path: Path) -> None:
+    class Unnamed(PanoramaDataModule):
+        find_images = Toy.find_images
+
+    data = Unnamed(tmp_path, EquirectRepresentation(level=4), inputs=["rgb"])
+    with pytest.raises(SettingError, match=r"class_names of Unnamed: found none; expected unknown"):
+        data.check_classes()
+
+
 def test_a_data_set_without_images_is_refused(tmp_path: Path) -> None:
     data = _toy(tmp_path / "nowhere")
     with pytest.raises(DataError, match="nowhere: found no panoramas"):
