@@ -6,10 +6,25 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import pytest
 
+from datamodules.synthrooms.generate import generate_rooms
+from datamodules.synthrooms.settings import RoomSettings
+from datamodules.synthshapes.generate import ShapeSettings, generate_shapes
+
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from numpy.typing import NDArray
 
 STRIPS = 4
+TINY_ROOMS = RoomSettings(
+    seed=3,
+    rooms={"1": 2, "5a": 1, "5b": 1},
+    height=16,
+    views_per_camera=1,
+    view_size=8,
+    supersample=1,
+)
+TINY_SHAPES = ShapeSettings(seed=3, train=2, test=1)
 
 
 @dataclass(frozen=True)
@@ -63,3 +78,19 @@ class StripRepresentation:
 @pytest.fixture
 def strips() -> StripRepresentation:
     return StripRepresentation()
+
+
+@pytest.fixture(scope="session")
+def tiny_rooms(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Rooms of `TINY_ROOMS`; not to be changed."""
+    root = tmp_path_factory.mktemp("data") / "rooms"
+    generate_rooms(root, TINY_ROOMS, workers=0, progress=False)
+    return root
+
+
+@pytest.fixture(scope="session")
+def tiny_shapes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Shapes of `TINY_SHAPES`; not to be changed."""
+    root = tmp_path_factory.mktemp("data") / "shapes"
+    generate_shapes(root, TINY_SHAPES, workers=0, progress=False)
+    return root

@@ -14,15 +14,10 @@ from numpy.typing import NDArray
 from datamodules.synthrooms.generate import generate_rooms, plan_rooms
 from datamodules.synthrooms.settings import RoomSettings
 from tangent_train.geometry import equirect_directions, lonlat_to_equirect, xyz_to_lonlat
+from tests.datamodules.data_files import read_png
 
 # Seed 6's first room has two cameras.
 TRUE = RoomSettings(seed=6, rooms={"2": 1}, height=256, views_per_camera=3, view_size=128)
-
-
-def read_png(path: Path) -> NDArray[Any]:
-    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    assert image is not None
-    return image
 
 
 class Shot(NamedTuple):
@@ -106,13 +101,8 @@ def test_views_show_what_the_panorama_shows(shots: dict[str, list[list[Shot]]]) 
             same = at_nearest(panorama.label, pixels) == view.label[seen]
             assert same[inner].mean() > 0.99
             near = pixels[inner].astype(np.float32)[None]
-            shown = cv2.remap(
-                panorama.rgb,
-                near[..., 0],
-                near[..., 1],
-                cv2.INTER_LINEAR,
-                borderMode=cv2.BORDER_WRAP,
-            )[0]
+            x, y = near[..., 0], near[..., 1]
+            shown = cv2.remap(panorama.rgb, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)[0]
             error = np.mean((shown.astype(float) - view.rgb[seen][inner]) ** 2)
             assert 10 * np.log10(255**2 / error) > 28
             compared += int(inner.sum())

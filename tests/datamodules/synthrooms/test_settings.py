@@ -1,11 +1,15 @@
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from datamodules import SynthRooms
 from datamodules.synthrooms.settings import RoomSettings
 from tangent_train.errors import SettingError
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 
 def test_rooms_come_in_the_order_of_the_areas() -> None:
@@ -19,17 +23,18 @@ def test_rooms_come_in_the_order_of_the_areas() -> None:
     ("wrong", "message"),
     [
         ({"rooms": {"7": 1}}, "rooms: found"),
-        ({"rooms": {}}, "rooms: found"),
         ({"rooms": {"1": 0}}, "rooms: found"),
         ({"rooms": {"1": -1}}, r"rooms\[1\]: found -1"),
         ({"seed": True}, "seed"),
-        ({"height": 4}, "height: found 4; expected an integer of 8 or more"),
-        ({"height": 64.0}, "height"),
+        ({"height": 7}, "height: found 7; expected an integer of 8 or more"),
         ({"views": "all"}, "views: found all"),
-        ({"views_per_camera": -1}, "views_per_camera"),
-        ({"least_cameras": 0}, "least_cameras"),
     ],
 )
 def test_what_cannot_work_is_named(wrong: dict[str, Any], message: str) -> None:
     with pytest.raises(SettingError, match=message):
         RoomSettings(**wrong)
+
+
+def test_a_fold_without_test_rooms(tmp_path: Path, strips: Any) -> None:
+    with pytest.raises(SettingError, match="fold 2: 2, 4"):
+        SynthRooms(tmp_path, strips, rooms={"rooms": {"1": 2, "5a": 1}}, fold=2)

@@ -1,13 +1,11 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 
-from datamodules import SynthShapes
 from datamodules.modelnet40.meshes import clean_mesh, mesh_spheres
 from datamodules.modelnet40.shape_files import find_shapes
 from datamodules.synthshapes.generate import (
@@ -18,85 +16,33 @@ from datamodules.synthshapes.generate import (
     make_shape,
 )
 from datamodules.synthshapes.parts import Parts
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import SettingError
 from tangent_train.geometry import rotation_about
-from tangent_train.rendering import TangentRepresentation
+from tests.datamodules.data_files import contents
 
 if TYPE_CHECKING:
-    from datamodules.core.found import Split
-
-TINY = ShapeSettings(seed=3, train=2, test=1)
+    from pathlib import Path
 
 
-def contents(root: Path) -> dict[str, bytes]:
-    return {
-        path.relative_to(root).as_posix(): path.read_bytes()
-        for path in sorted(root.rglob("*"))
-        if path.is_file()
-    }
-
-
-@pytest.fixture(scope="module")
-def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("data") / "tiny"
-    generate_shapes(root, TINY, workers=0, progress=False)
-    return root
-
-
-@pytest.fixture
-def copy(tiny: Path, tmp_path: Path) -> Path:
-    root = tmp_path / "copy"
-    for name, content in contents(tiny).items():
-        (root / name).parent.mkdir(parents=True, exist_ok=True)
-        (root / name).write_bytes(content)
-    return root
-
-
-def test_the_tree_is_that_of_the_real_set(tiny: Path) -> None:
-    shapes = find_shapes(tiny)
+def test_the_tree_is_that_of_the_real_set(tiny_shapes: Path) -> None:
+    shapes = find_shapes(tiny_shapes)
     assert len(shapes) == 30
     assert {shape.label for shape in shapes} == set(CLASSES)
     names = {shape.name for shape in shapes if shape.label == "cup"}
     assert names == {"cup/train/cup_0001", "cup/train/cup_0002", "cup/test/cup_0003"}
-    assert json.loads((tiny / MANIFEST).read_text())["settings"] == {
-        "seed": 3,
-        "train": 2,
-        "test": 1,
-    }
-    assert len(contents(tiny)) == 31
+    manifest = json.loads((tiny_shapes / MANIFEST).read_text())
+    assert manifest["settings"] == {"seed": 3, "train": 2, "test": 1}
+    assert len(contents(tiny_shapes)) == 31
 
 
-def test_another_seed_or_more_shapes(tiny: Path, tmp_path: Path) -> None:
+def test_another_seed_or_more_shapes(tiny_shapes: Path, tmp_path: Path) -> None:
     generate_shapes(tmp_path / "more", ShapeSettings(3, 3, 1), workers=0, progress=False)
-    more, own = contents(tmp_path / "more"), contents(tiny)
+    more, own = contents(tmp_path / "more"), contents(tiny_shapes)
     assert more["cup/train/cup_0002.off"] == own["cup/train/cup_0002.off"]
     assert more["cup/train/cup_0003.off"] == own["cup/test/cup_0003.off"]
     generate_shapes(tmp_path / "other", ShapeSettings(4, 2, 1), workers=0, progress=False)
     other = contents(tmp_path / "other")
     assert not any(other[name] == own[name] for name in own)
-
-
-def test_missing_files_are_made_again(tiny: Path, copy: Path) -> None:
-    kept = copy / "vase/train/vase_0001.off"
-    before = kept.stat().st_mtime_ns
-    (copy / "vase/test/vase_0003.off").unlink()
-    generate_shapes(copy, TINY, workers=0, progress=False)
-    assert contents(copy) == contents(tiny)
-    assert kept.stat().st_mtime_ns == before
-
-
-def test_a_folder_of_other_settings_or_of_someone_else_is_left_alone(
-    copy: Path, tmp_path: Path
-) -> None:
-    before = contents(copy)
-    with pytest.raises(DataError, match="found train=2; expected train=9"):
-        generate_shapes(copy, ShapeSettings(3, 9, 1))
-    assert contents(copy) == before
-    real = tmp_path / "ModelNet40"
-    (real / "airplane/train").mkdir(parents=True)
-    with pytest.raises(DataError, match=r"not SynthShapes'.*airplane"):
-        generate_shapes(real, TINY)
-    assert contents(real) == {}
 
 
 @pytest.mark.parametrize(
@@ -138,14 +84,9 @@ def test_parts_are_where_they_should_be() -> None:
         return parts.mesh().bounds
 
     upright = rotation_about((1, 0, 0), np.pi / 2)
+    rotated = rotation_about((0, 0, 1), np.pi / 2)
     for expected, add, *arguments in (
-        (
-            [[-2, -1, -3], [2, 1, 3]],
-            "box",
-            (0, 0, 0),
-            (2, 4, 6),
-            rotation_about((0, 0, 1), np.pi / 2),
-        ),
+        ([[-2, -1, -3], [2, 1, 3]], "box", (0, 0, 0), (2, 4, 6), rotated),
         ([[0, -1, -1], [5, 1, 1]], "rod", (0, 0, 0), (5, 0, 0), 1),
         ([[-1, -1, -3], [1, 1, 2]], "rod", (0, 0, 2), (0, 0, -3), 1),
         ([[0.9, 0.9, 0], [1.1, 1.1, 4]], "leg", (1, 1, 4), (1, 1, 0), 0.2, True),
@@ -155,28 +96,3 @@ def test_parts_are_where_they_should_be() -> None:
         ([[0, 0, -0.1], [3, 2, 0.1]], "panel", [(0, 0, 0), (3, 0, 0), (3, 2, 0), (0, 2, 0)], 0.2),
     ):
         np.testing.assert_allclose(extent(add, *arguments), expected, atol=0.05)
-
-
-# --- as a data module --------------------------------------------------------------------------
-
-
-def test_shapes_are_generated_then_read_like_the_real_set(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("os.cpu_count", lambda: 1)  # in this process
-    settings = {"seed": 3, "train": 4, "test": 1}
-    representation = TangentRepresentation(0, 3)
-    module = SynthShapes(
-        tmp_path / "shapes", representation, shapes=settings, validation_fraction=0.25
-    )
-    assert module.class_names == CLASSES
-    with pytest.raises(DataError, match="no such folder"):
-        module.setup()
-    module.prepare_data()
-    splits: tuple[Split, ...] = ("train", "val", "test")
-    assert [len(module.source(split)) for split in splits] == [30, 10, 10]
-    assert next(iter(module.test_dataloader())).images.shape == (10, 20, 8, 8, 6)
-    before = contents(tmp_path / "shapes")
-    again = SynthShapes(tmp_path / "shapes", representation, shapes=ShapeSettings(**settings))
-    again.prepare_data()  # the spheres in the folder are no foreign files
-    assert contents(tmp_path / "shapes") == before

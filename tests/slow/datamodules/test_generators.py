@@ -10,6 +10,7 @@ from datamodules.synthrooms.generate import generate_rooms
 from datamodules.synthrooms.settings import RoomSettings
 from datamodules.synthshapes import generate as shapes
 from datamodules.synthshapes.generate import ShapeSettings, generate_shapes
+from tests.datamodules.data_files import contents
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -17,10 +18,6 @@ if TYPE_CHECKING:
 ROOMS = RoomSettings(
     rooms={"1": 2, "5b": 1}, height=16, views_per_camera=1, view_size=8, supersample=1
 )
-
-
-def _contents(root: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(root)): p.read_bytes() for p in root.rglob("*") if p.is_file()}
 
 
 @pytest.mark.parametrize(
@@ -33,4 +30,4 @@ def test_the_same_bytes_for_any_number_of_processes(
     monkeypatch.setattr(shapes, "_PER_PROCESS", 1)
     for workers in (0, 2):
         generate(tmp_path / f"{workers}", settings, workers=workers, progress=bool(workers))
-    assert _contents(tmp_path / "2") == _contents(tmp_path / "0")
+    assert contents(tmp_path / "2") == contents(tmp_path / "0")

@@ -1,0 +1,42 @@
+"""Files of data sets, and the names in their splits."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import cv2
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from datamodules.core.found import Split
+    from datamodules.core.split_module import SplitDataModule
+
+__all__ = ["contents", "names_of", "read_png", "write_png"]
+
+
+def write_png(path: Path, image: NDArray[Any]) -> None:
+    """Write an image in OpenCV's order of colours."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), image)
+
+
+def read_png(path: Path) -> NDArray[Any]:
+    """Read an image as it is stored, in OpenCV's order of colours."""
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert image is not None
+    return image
+
+
+def contents(root: Path) -> dict[str, bytes]:
+    """All files of a folder, by their names relative to it."""
+    files = sorted(path for path in root.rglob("*") if path.is_file())
+    return {path.relative_to(root).as_posix(): path.read_bytes() for path in files}
+
+
+def names_of(module: SplitDataModule[Any], split: Split) -> list[str]:
+    """Names of the samples of a split."""
+    source: Any = module.source(split)
+    return [source.name(index) for index in range(len(source))]
