@@ -10,7 +10,6 @@ from datamodules.core.panoramas import (
     resize_area,
     resize_depth,
     resize_nearest,
-    steps_to_meters,
 )
 
 if TYPE_CHECKING:
@@ -105,9 +104,3 @@ def test_masks(mask: Literal["labels", "any_black", "all_black"], expected: list
     masked = mask_black(np.full((1, 3), 5, np.uint8), rgb, mask)
     assert masked.dtype == np.uint8
     assert masked.tolist() == [expected]
-
-
-def test_depth_in_meters() -> None:
-    depth_m = steps_to_meters(np.array([0, 1, 512, 65535], np.uint16))
-    assert depth_m.dtype == np.float32
-    assert depth_m.tolist() == [0, 1 / 512, 1, 65535 / 512]

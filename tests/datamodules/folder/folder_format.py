@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
-
-if TYPE_CHECKING:
-    from datamodules.core.found import Split
-    from datamodules.folder.panoramas import FolderPanoramas
 
 NAMES = ("wall", "floor", "window")
 VALUES = {"wall": 1, "floor": [2, 3], "window": 255}
@@ -73,9 +69,3 @@ def write_data_set(
             name = f"scene_{scene}/view.{number}"
             write_panorama(root, name, seed, height, suffixes[seed % 4], depth=depth)
     return root
-
-
-def names_of(module: FolderPanoramas, split: Split) -> list[str]:
-    """Names of the panoramas of a split."""
-    source = module.source(split)
-    return [source.name(index) for index in range(len(source))]

@@ -48,12 +48,10 @@ def test_colors_are_compared_exactly_with_a_slow_reading(tmp_path: Path) -> None
     ("text", "message"),
     [
         ("", "Expecting value"),
-        ('["wall",]', "expected a list of class names"),
         ("3", "found 3; expected a list of class names"),
         ("[null]", "found 0 classes"),
         (json.dumps([str(n) for n in range(256)]), "found 256 classes"),
         ('["a", 3]', "class name 3"),
-        ('["a", ""]', "class name ''"),
         ('["a", "b", "a"]', "class 'a' twice"),
         ('["unknown", "a"]', "Leave it out; in a list, write null in its place."),
         ('{"a": 1, "b": 1}', "found 1 for 'a' and 'b'; expected every value or colour once"),
@@ -61,10 +59,7 @@ def test_colors_are_compared_exactly_with_a_slow_reading(tmp_path: Path) -> None
         ('{"a": 1, "b": "#00ff00"}', "found values and colours; expected either"),
         ('{"a": []}', "found nothing for 'a'"),
         ('{"a": -1}', "found -1 for 'a'; expected a value of 0 to 65535"),
-        ('{"a": 65536}', "found 65536 for 'a'"),
-        ('{"a": true}', "found true for 'a'"),
         ('{"a": "#fff"}', 'found "#fff" for'),
-        ('{"a": {"b": 1}}', "for 'a'; expected a value"),
         ("[" * 100_000, "expected a list of class names"),
     ],
 )

@@ -41,13 +41,6 @@ def test_pixels_are_as_written(tmp_path: Path, compression: Any, dtype: type[Any
     assert read_exr_size(path) == (40, 96)
 
 
-def test_tiles(tmp_path: Path) -> None:
-    tiles = OpenEXR.TileDescription()
-    tiles.xSize, tiles.ySize = 16, 16
-    path = _write(tmp_path / "a.exr", {"Z": _DEPTH}, type=OpenEXR.tiledimage, tiles=tiles)
-    np.testing.assert_array_equal(read_exr(path), _DEPTH)
-
-
 @pytest.mark.parametrize(
     ("others", "name"),
     [

@@ -73,34 +73,13 @@ def test_lossy_formats_keep_the_order_of_colours(suffix: str, tmp_path: Path) ->
     assert np.abs(again.astype(int) - pixels).max() < 8
 
 
-def test_transparency_is_left_out(tmp_path: Path) -> None:
-    colors = _pixels(np.uint8, 5, 6, 4)
-    Image.fromarray(colors).save(tmp_path / "a.png")
-    np.testing.assert_array_equal(read_pixels(tmp_path / "a.png", indices=True), colors[..., :3])
-    Image.fromarray(colors[..., :2]).save(tmp_path / "grey.png")
-    np.testing.assert_array_equal(read_pixels(tmp_path / "grey.png", indices=True), colors[..., 0])
-    deep = _pixels(np.uint16, 5, 6, 4) * 255
-    cv2.imwrite(str(tmp_path / "deep.png"), deep)
-    np.testing.assert_array_equal(
-        read_pixels(tmp_path / "deep.png", indices=True), deep[..., 2::-1]
-    )
-
-
-def test_one_channel_arrays_have_no_axis_for_it(tmp_path: Path) -> None:
-    np.save(tmp_path / "a.npy", np.ones((4, 5, 1)))
-    assert read_pixels(tmp_path / "a.npy", indices=True).shape == (4, 5)
-
-
 @pytest.mark.parametrize(
     ("suffix", "dtype", "channels", "message"),
     [
         (".bmp", np.uint8, 3, r"\.bmp files: found"),
-        ("", np.uint8, 3, "expected one that can"),
         (".png", np.float32, 1, r"float32 pixels of 1 channel; expected .*\.tif.*\.npy"),
         (".jpg", np.uint16, 3, r"uint16 pixels of 3 channels; expected .*\.png"),
-        (".tif", np.float64, 1, r"expected .*\.npy"),
         (".png", np.uint8, 2, r"expected .*\.npy"),
-        (".tif", np.int32, 1, r"expected .*\.npy"),
     ],
 )
 def test_files_that_cannot_hold_the_pixels(
@@ -173,13 +152,13 @@ def test_jpeg_gives_the_pixels_of_another_decoder(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tif"])
-@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("channels", [1, 3, 4])
 def test_16_bits_become_8(tmp_path: Path, suffix: str, channels: int) -> None:
     values = _noise((5, 9, channels), np.uint16)
     values[0, :2] = [[0], [65535]]
     path = tmp_path / f"image{suffix}"
-    assert cv2.imwrite(str(path), values[..., ::-1])
-    expected = np.broadcast_to(values >> 8, (5, 9, 3))
+    assert cv2.imwrite(str(path), values)
+    expected = np.broadcast_to(values[..., 2::-1] >> 8, (5, 9, 3))
     np.testing.assert_array_equal(read_rgb(path), expected)
 
 
@@ -343,27 +322,14 @@ def test_depth_in_meters_array(tmp_path: Path, dtype: Any, axes: int) -> None:
     assert read_image_size(path) == (2, 4)
 
 
-def test_depth_is_never_unpickled(tmp_path: Path) -> None:
-    path = tmp_path / "depth.npy"
-    np.save(path, np.array([{}], object), allow_pickle=True)
-    for read in (lambda: read_depth_m(path, 1000), lambda: read_image_size(path)):
-        with pytest.raises(DataError, match=r"depth\.npy: found .*expected one array"):
-            read()
-
-
 def test_what_is_no_depth(tmp_path: Path) -> None:
     Image.fromarray(_noise((4, 8))).save(tmp_path / "grey.png")
     Image.fromarray(_noise((4, 8, 3))).save(tmp_path / "color.png")
-    np.save(tmp_path / "line.npy", np.ones(4))
     np.save(tmp_path / "yes.npy", np.ones((4, 8), bool))
-    np.savez(tmp_path / "pack.npz", np.ones((4, 8)))
-    (tmp_path / "pack.npz").rename(tmp_path / "pack.npy")
     for name, found in [
         ("grey.png", r"uint8 of shape \(4, 8\)"),
         ("color.png", r"uint8 of shape \(4, 8, 3\)"),
-        ("line.npy", r"float64 of shape \(4,\)"),
         ("yes.npy", r"bool of shape \(4, 8\)"),
-        ("pack.npy", ""),
         ("nowhere.npy", "No such file"),
     ]:
         with pytest.raises(DataError, match=rf"{name}: found .*{found}"):

@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-import struct
-import zlib
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -45,21 +43,6 @@ def test_header(tmp_path: Path, shape: tuple[int, ...], dtype: Any, bits: int, c
         check_png(path, 8, ("palette",))
 
 
-def test_color_is_rgb_and_alpha_is_dropped(tmp_path: Path) -> None:
-    rgb = np.random.default_rng(0).integers(0, 256, (4, 8, 3), np.uint8)
-    opaque = _write(tmp_path / "a.png", rgb[..., ::-1])
-    transparent = _write(tmp_path / "b.png", np.dstack([rgb[..., ::-1], rgb[..., :1]]))
-    for path in (opaque, transparent):
-        np.testing.assert_array_equal(read_color_png(path), rgb)
-
-
-def test_depth_keeps_16_bits(tmp_path: Path) -> None:
-    depth = np.array([[0, 1, 255, 256], [511, 512, 65534, 65535]], np.uint16)
-    read = read_depth_png(_write(tmp_path / "depth.png", depth))
-    assert read.dtype == np.uint16
-    np.testing.assert_array_equal(read, depth)
-
-
 @pytest.mark.parametrize("read", READERS)
 def test_files_that_are_not_png(tmp_path: Path, read: Any) -> None:
     path = tmp_path / "image.png"
@@ -91,14 +74,11 @@ def test_notes_behind_the_end_are_ignored(tmp_path: Path) -> None:
 
 
 def test_broken_pixels(tmp_path: Path) -> None:
-    def chunk(name: bytes, content: bytes) -> bytes:
-        end = struct.pack(">I", zlib.crc32(name + content))
-        return struct.pack(">I", len(content)) + name + content + end
-
-    path = tmp_path / "image.png"
-    header = struct.pack(">IIBBBBB", 8, 4, 8, 2, 0, 0, 0)
-    chunks = chunk(b"IHDR", header) + chunk(b"IDAT", b"no zlib") + chunk(b"IEND", b"")
-    path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunks)
+    path = _write(tmp_path / "image.png", np.ones((64, 128, 3), np.uint8))
+    content = bytearray(path.read_bytes())
+    place = content.index(b"IDAT") + 4
+    content[place : place + 8] = b"not zlib"
+    path.write_bytes(content)
     with pytest.raises(DataError, match=r"image\.png: found a broken image"):
         read_color_png(path)
 
