@@ -52,10 +52,11 @@ def _save(path: Path, xmp: str, shape: tuple[int, int] = (40, 60)) -> Path:
     image = Image.new("RGB", (shape[1], shape[0]))
     text = PngImagePlugin.PngInfo()
     text.add_itxt("XML:com.adobe.xmp", xmp)
-    settings: dict[str, Any] = {
-        ".png": {"pnginfo": text},
-        ".tif": {"tiffinfo": {700: xmp.encode()}},
-    }.get(path.suffix, {"xmp": xmp.encode()})
+    settings: dict[str, Any] = {"xmp": xmp.encode()}
+    if path.suffix == ".png":
+        settings = {"pnginfo": text}
+    elif path.suffix == ".tif":
+        settings = {"tiffinfo": {700: xmp.encode()}}
     image.save(path, **settings)
     return path
 

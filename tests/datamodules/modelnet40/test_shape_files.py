@@ -39,11 +39,6 @@ def test_both_layouts(tmp_path: Path, layout: Literal["by class", "by split"]) -
     assert found == sorted(found, key=lambda shape: (shape.part, shape.name))
 
 
-def test_a_missing_folder_says_where_to_get_it(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"no such folder.*modelnet.cs.princeton.edu.*synthshapes"):
-        find_shapes(tmp_path / "ModelNet40")
-
-
 def test_no_meshes(tmp_path: Path) -> None:
     _touch(tmp_path / "chair/train/chair_0001.obj")
     with pytest.raises(DataError, match="no meshes"):

@@ -48,7 +48,6 @@ def test_what_is_past_the_end_of_the_table_is_missing_or_a_mistake() -> None:
     [
         ("{not json", "Expecting"),
         ('{"beam": 1}', "dict"),
-        ("[]", "list"),
         ('["beam_1_office_1_1", "sky_1_office_1_1"]', "'sky'"),
         (None, "No such file"),
     ],

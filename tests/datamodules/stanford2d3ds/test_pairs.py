@@ -109,21 +109,6 @@ def test_depth_of_another_size_is_refused(tmp_path: Path) -> None:
         StanfordPairs(tmp_path, "rooms").read(0)
 
 
-# Pairs of rooms, and what is made.
-
-
-def test_panoramas_shrink_with_their_depth(rooms: Path) -> None:
-    whole = SynthRoomsPairs(rooms, ROOMS).read(0)
-    small = SynthRoomsPairs(rooms, ROOMS, erp_height=32).read(0)
-    assert whole.left.rgb.shape == (64, 128, 3)
-    assert small.left.rgb.shape == (32, 64, 3)
-    assert whole.left.distance_m is not None
-    assert small.left.distance_m is not None
-    assert small.left.distance_m.shape == (32, 64)
-    means = whole.left.rgb.astype(float).mean(), small.left.rgb.astype(float).mean()
-    assert abs(means[0] - means[1]) < 1
-
-
 # Depth and pose agree: what one panorama sees is where the other sees it.
 
 
@@ -160,10 +145,8 @@ def test_pairs_of_synthetic_rooms_agree_in_depth_and_pose(rooms: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"camera_rt_matrix": None}, "not 3×4 numbers"),
         ({"camera_rt_matrix": [[1, 2], [3]]}, "found ValueError"),
         ({"camera_location": [0, 0, float("nan")]}, "not 3 numbers"),
-        ({"camera_rt_matrix": [[1e300, 0, 0, 0]] * 3}, "not 3×4 numbers"),
         ({"camera_rt_matrix": [[1.0, 0, 0, 0]] * 3}, "rotation"),
     ],
 )

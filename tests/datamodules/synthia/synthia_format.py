@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
+
+from tests.datamodules.data_files import write_png
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -24,17 +25,6 @@ LOOKS = {
     "B": ((-1, 0, 0), (0, -1, 0)),
     "L": ((0, -1, 0), (1, 0, 0)),
 }
-
-
-def write_png(path: Path, image: NDArray[Any]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    assert cv2.imwrite(str(path), image)
-
-
-def read_png(path: Path) -> NDArray[Any]:
-    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    assert image is not None
-    return image
 
 
 def sequence(root: Path, name: str) -> Path:

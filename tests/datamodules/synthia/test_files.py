@@ -8,56 +8,23 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from datamodules.core.problems import Problems
-from datamodules.core.reading import ImageFiles, check_headers
-from datamodules.synthia.files import (
-    VIEWS,
-    panorama_files,
-    read_camera,
-    sequence_folder,
-    view_files,
-)
+from datamodules.core.reading import ImageFiles
+from datamodules.synthia.files import read_camera
 from datamodules.synthia.omnisynthia import OmniSynthia
 from datamodules.synthia.reader import (
     CLASSES,
-    PANORAMA_FORMATS,
     VIEW_FORMATS,
     SynthiaReader,
     depth_steps,
     read_first_channel,
-    read_ids,
 )
 from datamodules.synthia.splits import choose_frames, divide
 from tangent_train.errors import DataError, SettingError
+from tests.datamodules.data_files import write_png
 from tests.datamodules.synthia import synthia_format as synthia
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A sequence of two frames with views and three with panoramas; not to be changed."""
-    root = synthia.write_views(tmp_path_factory.mktemp("synthia"), {"05": 2})
-    return synthia.sequence(synthia.write_panoramas(root, {"05": 3}), "05")
-
-
-# --- names ---------------------------------------------------------------------------------------
-
-
-def test_files_are_where_the_release_has_them(folder: Path) -> None:
-    root, problems = folder.parent, Problems()
-    assert sequence_folder(root, "05") == folder
-    for view in VIEWS:
-        files = view_files(root, "05", "000001", view, with_depth=True)
-        assert files.name == f"sequence_05/000001/{view}"
-        assert list(files.parts) == ["rgb", "labels", "depth", "camera"]
-        assert check_headers(files, SynthiaReader(VIEW_FORMATS), problems) == synthia.SIZE
-    files = panorama_files(root, "05", "000002", with_depth=True)
-    assert check_headers(files, SynthiaReader(PANORAMA_FORMATS), problems) == (32, 64)
-    assert not problems.listed()
-    without = panorama_files(root, "05", "000002", with_depth=False)
-    assert list(without.parts) == ["rgb", "labels"]
 
 
 # --- cameras -------------------------------------------------------------------------------------
@@ -93,7 +60,6 @@ def test_cameras(tmp_path: Path, text: str | None) -> None:
     [
         "focal 532 640 380",
         "532 640 380 0.8 1",
-        "-532 640 380",
         "nan 640 380",
         "532 64000 380",
     ],
@@ -114,17 +80,8 @@ def test_unknown_cameras_of_other_views(tmp_path: Path) -> None:
 
 def _labels(tmp_path: Path, image: NDArray[Any]) -> NDArray[np.uint8]:
     path = tmp_path / "labels.png"
-    synthia.write_png(path, image)
+    write_png(path, image)
     return SynthiaReader(VIEW_FORMATS).labels(ImageFiles("a", path, path))
-
-
-def test_the_class_of_a_view_is_in_the_first_channel(tmp_path: Path) -> None:
-    ids = np.arange(16, dtype=np.uint16).reshape(2, 8)
-    image = np.stack([ids + 700, 15 - ids, ids], axis=-1)  # blue, green, red
-    labels = _labels(tmp_path, image)
-    assert labels.dtype == np.uint8
-    assert labels.ravel().tolist() == [*range(13), 0, 0, 13]
-    np.testing.assert_array_equal(read_ids(tmp_path / "labels.png"), ids)
 
 
 def test_classes(tmp_path: Path) -> None:
@@ -135,7 +92,7 @@ def test_classes(tmp_path: Path) -> None:
     assert CLASSES[13 - 1] == "traffic light"
 
 
-@pytest.mark.parametrize("value", [16, 254, 256, 3000])
+@pytest.mark.parametrize("value", [16, 256])
 def test_there_are_no_other_labels(tmp_path: Path, value: int) -> None:
     image = np.full((2, 2), value, np.uint16 if value > 255 else np.uint8)
     with pytest.raises(DataError, match=rf"labels\.png: found labels {value}; expected 0 to 15"):
@@ -149,7 +106,7 @@ def test_depth_in_any_number_of_channels(tmp_path: Path, channels: int) -> None:
     image = depth if channels == 1 else np.stack([depth * 0, depth // 2, depth], axis=-1)
     if channels == 4:
         image = np.dstack([image, np.full(depth.shape, 7, np.uint16)])
-    synthia.write_png(tmp_path / "depth.png", image)
+    write_png(tmp_path / "depth.png", image)
     read = read_first_channel(tmp_path / "depth.png")
     assert read.dtype == np.uint16
     np.testing.assert_array_equal(read, depth)
@@ -171,7 +128,7 @@ def test_steps_of_depth() -> None:
 
 @pytest.mark.parametrize(
     ("count", "step"),
-    [(1, 1), (500, 1), (501, 1), (749, 1), (750, 2), (900, 2), (1249, 2), (1250, 3), (1451, 3)],
+    [(1, 1), (749, 1), (750, 2), (1249, 2), (1250, 3)],
 )
 def test_every_nth_frame(count: int, step: int) -> None:
     frames = [f"{i:06d}" for i in range(count)]

@@ -5,16 +5,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
+from datamodules.core.found import SPLITS
 from datamodules.synthia.omnisynthia import OmniSynthia
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError
+from tests.datamodules.data_files import names_of, read_png, write_png
 from tests.datamodules.synthia import synthia_format as synthia
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from pathlib import Path
 
 FRAMES = {"01": 5, "02": 3, "04": 2, "05": 2, "06": 4}
-SPLITS: tuple[Any, ...] = ("train", "val", "test")
 
 
 @pytest.fixture(scope="module")
@@ -35,11 +35,6 @@ def two(root: Path, strips: Any, **settings: Any) -> OmniSynthia:
     )
 
 
-def names(module: OmniSynthia, split: Any) -> list[str]:
-    source = module.source(split)
-    return [source.name(i) for i in range(len(source))]
-
-
 # --- splits --------------------------------------------------------------------------------------
 
 
@@ -47,7 +42,7 @@ def test_splits(root: Path, strips: Any) -> None:
     module = OmniSynthia(root, strips)
     module.prepare_data()  # nothing to make
     module.setup("fit")
-    splits = {split: names(module, split) for split in SPLITS}
+    splits = {split: names_of(module, split) for split in SPLITS}
     assert splits["val"] == [
         "sequence_01/000004",
         "sequence_02/000002",
@@ -71,7 +66,7 @@ def test_reads_what_was_written(root: Path, strips: Any, erp_height: int) -> Non
     pano = synthia.sequence(root, "04") / "pano"
     # Blocks of 4×4 pixels: at these sizes every pixel is one block's.
     step = 32 // erp_height
-    labels = synthia.read_png(pano / "GT" / "LABELS_Correct" / "000001.png")
+    labels = read_png(pano / "GT" / "LABELS_Correct" / "000001.png")
     ids = labels[::step, ::step].astype(int)
     assert {15, 255} <= set(np.unique(ids).tolist())
     expected = np.where(ids == 15, 13, np.where(ids == 255, 0, ids))
@@ -89,20 +84,6 @@ def test_reads_what_was_written(root: Path, strips: Any, erp_height: int) -> Non
     np.testing.assert_array_equal(source.labels(1), expected)
 
 
-def test_reserved_labels_are_unknown(broken_root: Path, strips: Any) -> None:
-    pano = synthia.sequence(broken_root, "04") / "pano"
-    labels = np.full((32, 64), 14, np.uint8)
-    labels[:16] = 13
-    synthia.write_png(pano / "GT" / "LABELS_Correct" / "000000.png", labels)
-    assert not two(broken_root, strips).source("test").read(0).labels.any()
-    labels[20, 30] = 16
-    synthia.write_png(pano / "GT" / "LABELS_Correct" / "000000.png", labels)
-    source = two(broken_root, strips).source("test")
-    for read in (source.read, source.labels):
-        with pytest.raises(DataError, match=r"04-SUMMER.*000000\.png: found labels 16"):
-            read(0)
-
-
 # --- making --------------------------------------------------------------------------------------
 
 
@@ -116,8 +97,8 @@ def test_panoramas_are_made_from_views(tmp_path: Path, strips: Any) -> None:
         module.setup()
     module.prepare_data()
     module.setup("fit")
-    assert names(module, "train") == ["sequence_01/000000"]
-    assert names(module, "val") == ["sequence_01/000002"]
+    assert names_of(module, "train") == ["sequence_01/000000"]
+    assert names_of(module, "val") == ["sequence_01/000002"]
     labels = module.source("train").read(0).labels
     assert labels.shape == (16, 32)
     assert set(np.unique(labels).tolist()) == set(range(14))
@@ -129,38 +110,12 @@ def test_panoramas_are_made_from_views(tmp_path: Path, strips: Any) -> None:
 # --- what cannot be used -------------------------------------------------------------------------
 
 
-def _cut_off(path: Path) -> None:
-    path.write_bytes(path.read_bytes()[:-30])
-
-
-def _rewrite(shape: tuple[int, ...], dtype: Any) -> Callable[[Path], None]:
-    return lambda path: synthia.write_png(path, np.zeros(shape, dtype))
-
-
-DAMAGES: dict[str, tuple[str, Callable[[Path], object], str]] = {
-    "cut off": ("RGB", _cut_off, "truncated"),
-    "labels of 16 bits": ("GT/LABELS_Correct", _rewrite((32, 64), np.uint16), "16-bit grey"),
-    "8-bit depth": ("Depth", _rewrite((32, 64), np.uint8), "8-bit grey; expected 16-bit grey"),
-    "other size": ("Depth", _rewrite((16, 32), np.uint16), "found 16×32 pixels; expected 32×64"),
-}
-
-
-@pytest.mark.parametrize("damage", DAMAGES)
-def test_damage_is_found_before_training(broken_root: Path, strips: Any, damage: str) -> None:
-    part, inflict, message = DAMAGES[damage]
+@pytest.mark.parametrize(("part", "dtype"), [("GT/LABELS_Correct", np.uint16), ("Depth", np.uint8)])
+def test_another_bit_depth_is_found_before_training(
+    broken_root: Path, strips: Any, part: str, dtype: Any
+) -> None:
     place = f"pano/{part}/000001.png"
-    inflict(synthia.sequence(broken_root, "04") / place)  # training would never notice
-    with pytest.raises(DataError, match=f"{place}: .*{message}"):
+    path = synthia.sequence(broken_root, "04") / place  # training would never notice
+    write_png(path, np.zeros((32, 64), dtype))
+    with pytest.raises(DataError, match=f"{place}: found .*-bit grey; expected"):
         two(broken_root, strips, inputs=("rgb", "depth")).setup("fit")
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("train_sequences", ["03"]),
-        ("test_sequences", ["01"]),
-    ],
-)
-def test_impossible_settings(tmp_path: Path, strips: Any, name: str, value: Any) -> None:
-    with pytest.raises(SettingError, match=rf"data\.{name}"):
-        OmniSynthia(tmp_path, strips, **{name: value})
