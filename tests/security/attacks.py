@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import itertools
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -13,7 +12,7 @@ import torch
 
 from tests.security.watch import CANARY
 
-__all__ = ["attacks", "json_attacks", "places", "replaced"]
+__all__ = ["attacks", "json_attacks", "places", "replaced", "sampled"]
 
 _NAMES = (
     f"{CANARY}.fire",
@@ -110,13 +109,9 @@ def replaced(content: Any, place: tuple[Any, ...], value: Any) -> Any:
 
 
 def sampled(
-    all_attacks: list[Any], all_places: list[tuple[Any, ...]], each: int | None
+    all_attacks: list[Any], all_places: list[tuple[Any, ...]]
 ) -> Iterator[tuple[tuple[Any, ...], Any]]:
-    """Every attack at some places and every place with some attacks; None for all pairs."""
-    if each is None:
-        yield from itertools.product(all_places, all_attacks)
-        return
+    """Pairs in which every attack and every place occurs."""
     longest = max(len(all_places), len(all_attacks))
-    for k in range(longest * each):
-        place = all_places[k % len(all_places)]
-        yield place, all_attacks[(k + k // longest * 7) % len(all_attacks)]
+    for k in range(longest):
+        yield all_places[k % len(all_places)], all_attacks[k % len(all_attacks)]

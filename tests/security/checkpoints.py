@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -29,21 +29,16 @@ def nothing_happens(use: Callable[[Path], Any], path: Path, forbidden: Path, wha
     assert [path.name for path in forbidden.iterdir()] == ["config.json"], what
 
 
-def attack_checkpoints(
-    content: dict[str, Any], forbidden: Path, each: int | None, only: Sequence[str] = ()
-) -> None:
-    """Put attacks into a checkpoint.
+def attack_checkpoints(content: dict[str, Any], forbidden: Path) -> None:
+    """Put every attack into a checkpoint, and an attack at every place of it.
 
     Args:
         content: Of an honest one.
         forbidden: A folder that exists and nobody else names.
-        each: How many attacks at every place, and places for every attack; None for all pairs.
-        only: Sections of the config to attack as a whole; all places if empty.
     """
-    honest = forbidden.parent / "honest.ckpt"
+    honest, path = forbidden.parent / "honest.ckpt", forbidden.parent / "x.ckpt"
     torch.save(content, honest)
-    arguments = [f"checkpoint={honest}", "data.root=rooms"]
-    stored = stored_run("evaluate", arguments)
+    stored = stored_run("evaluate", [f"checkpoint={honest}", "data.root=rooms"])
     assert stored is not None
     said = composed(stored.arguments)
 
@@ -54,20 +49,11 @@ def attack_checkpoints(
         build(settings, source)
         make(settings["trainer"], "trainer", source, logger=False)
 
-    for path, what in _changed(content, forbidden, each, only):
-        for use in (load_trained, evaluated, inputs_in):
-            nothing_happens(use, path, forbidden, what)
-
-
-def _changed(
-    content: dict[str, Any], forbidden: Path, each: int | None, only: Sequence[str]
-) -> Iterator[tuple[Path, object]]:
-    path = forbidden.parent / "x.ckpt"
     lighter = content | {"optimizer_states": [], "loops": {}}
     all_places = [("config", *place) for place in places(content["config"])]
     all_places += [(name,) for name in ("config", "class_names", "inputs", "kind", "state_dict")]
     all_places += [("normalization",), ("normalization", "mean")]
-    all_places = [("config", name) for name in only] or all_places
-    for place, value in sampled(list(attacks(forbidden)), all_places, each):
+    for place, value in sampled(list(attacks(forbidden)), all_places):
         torch.save(replaced(lighter, place, value), path)
-        yield path, (place, value)
+        for use in (load_trained, evaluated, inputs_in):
+            nothing_happens(use, path, forbidden, (place, value))

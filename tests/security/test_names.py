@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -14,9 +13,9 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from datamodules.images.pixel_files import write_pixels
-from tangent_train.cli import main
 from tangent_train.cli.keypoints import file_name
 from tangent_train.results.predictions import PredictionFolder, output_names
+from tests.cli.tiny_runs import run_command
 from tests.inference.trained import write_checkpoint
 
 SCRIPT = '<img src=x onerror="alert(1)"><script>alert(1)<\\script>'
@@ -44,11 +43,6 @@ def test_pictures_of_pairs_stay_in_their_folder(name: str) -> None:
     assert file_name(name).strip(".")
 
 
-def _run(monkeypatch: pytest.MonkeyPatch, command: str, *arguments: str) -> None:
-    monkeypatch.setattr(sys, "argv", [f"tangent-{command}", *arguments])
-    getattr(main, command)()
-
-
 def test_names_in_a_list_of_cameras_lead_nowhere(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -56,7 +50,7 @@ def test_names_in_a_list_of_cameras_lead_nowhere(
     monkeypatch.chdir(tmp_path)
     write_pixels(tmp_path / "a.png", np.zeros((32, 64, 3), np.uint8))
     render = ["input=a.png", "output=tangent", "base_level=0", "level=4"]
-    _run(monkeypatch, "render", *render)
+    run_command(monkeypatch, "render", *render)
     file = tmp_path / "tangent" / "a" / "cameras.json"
     content = json.loads(file.read_text())
     precious = tmp_path / "precious.png"
@@ -66,9 +60,9 @@ def test_names_in_a_list_of_cameras_lead_nowhere(
     content["source"]["file"] = "../../../precious.png"
     file.write_text(json.dumps(content))
     with pytest.raises(SystemExit):
-        _run(monkeypatch, "render", "back=tangent/a", "output=back.png")
+        run_command(monkeypatch, "render", "back=tangent/a", "output=back.png")
     with pytest.raises(SystemExit):  # a folder with other files than it lists
-        _run(monkeypatch, "render", *render, "overwrite=true")
+        run_command(monkeypatch, "render", *render, "overwrite=true")
     assert precious.read_bytes() == b"mine"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.png", "precious.png", "tangent"]
 
@@ -98,7 +92,9 @@ def test_a_report_of_hostile_names_runs_nothing(
     for name in (f"{SCRIPT}.png", "--><b onclick=alert(4)>.png", "a\nb.png", "'; x.png"):
         write_pixels(images / name, noise)
     monkeypatch.chdir(tmp_path)
-    _run(monkeypatch, "predict", "checkpoint=x.ckpt", "input=images", "output=o", "device=cpu")
+    run_command(
+        monkeypatch, "predict", "checkpoint=x.ckpt", "input=images", "output=o", "device=cpu"
+    )
     text = (tmp_path / "o" / "report.html").read_text()
     page = _Page()
     page.feed(text)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import pickle
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +16,8 @@ from datamodules.images.pixel_files import read_array
 from models.pretrained import read_tensors
 from tangent_train.checkpoints.content import read_checkpoint
 from tangent_train.checkpoints.trained import load_trained
-from tangent_train.cli import main
 from tangent_train.errors import DataError
-from tangent_train.results.record import load_record
+from tests.cli.tiny_runs import run_command
 from tests.inference.trained import write_checkpoint
 
 
@@ -78,14 +76,6 @@ def test_these_files_would_do_it(tmp_path: Path, created: Path) -> None:
         created.rmdir()
 
 
-def _run(monkeypatch: pytest.MonkeyPatch, command: str, *arguments: str) -> str:
-    """What a command that is refused says."""
-    monkeypatch.setattr(sys, "argv", [f"tangent-{command}", *arguments])
-    with pytest.raises(SystemExit) as refused:
-        getattr(main, command)()
-    return str(refused.value)
-
-
 COMMANDS = {
     "evaluate": ["checkpoint={file}"],
     "predict": ["checkpoint={file}", "input=image.png", "output=labels"],
@@ -118,9 +108,10 @@ def test_no_command_unpickles(
     _archive(tmp_path / file, created)
     (tmp_path / "image.png").touch()
     command = {"resume": "train", "init_from": "train", "weights": "train"}.get(what, what)
-    message = _run(monkeypatch, command, *(text.format(file=file) for text in COMMANDS[what]))
+    with pytest.raises(SystemExit) as refused:
+        run_command(monkeypatch, command, *(text.format(file=file) for text in COMMANDS[what]))
     assert not created.exists()
-    message += capsys.readouterr().out  # where one file of several is named
+    message = str(refused.value) + capsys.readouterr().out  # which names one file of several
     assert file.name in message
     assert "found" in message
     assert "expected" in message
@@ -148,10 +139,3 @@ def test_no_reader_unpickles(make: Any, created: Path, tmp_path: Path) -> None:
             with pytest.raises(DataError):
                 read(path)
             assert not created.exists()
-
-
-def test_neither_do_results(created: Path, tmp_path: Path) -> None:
-    _pickle(tmp_path / "results.json", created)
-    with pytest.raises(DataError, match=r"results\.json"):
-        load_record(tmp_path)
-    assert not created.exists()

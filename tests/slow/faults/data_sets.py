@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -37,7 +36,6 @@ SEQUENCES = {"01": 4, "02": 3, "04": 2}
 _OF_SYNTHIA: dict[str, Any] = {"train_sequences": ("01", "02"), "test_sequences": ("04",)}
 
 KINDS = ("folder", "stanford", "stanford photos", "omnisynthia", "synthia photos", "shapes")
-IMAGES = KINDS[:-1]
 
 
 def write(kind: str, root: Path, fabricate: FabricateStanford) -> Path:
@@ -135,16 +133,6 @@ def smaller(path: Path) -> None:
 
 def to_8_bits(path: Path) -> None:
     change(path, lambda image: (image >> 8).astype(np.uint8))
-
-
-def to_16_bits(path: Path) -> None:
-    change(path, lambda image: image.astype(np.uint16) << 8)
-
-
-def without_key(path: Path, key: str) -> None:
-    record = json.loads(path.read_bytes())
-    del record[key]
-    path.write_text(json.dumps(record))
 
 
 def link_to_itself(path: Path) -> None:

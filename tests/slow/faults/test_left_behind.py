@@ -9,25 +9,11 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 
 from tangent_train import files
-from tangent_train.files import atomic_path, write_text
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-SLOW_WRITER = """
-import sys, time
-from pathlib import Path
-from tangent_train.files import atomic_path
-with atomic_path(Path(sys.argv[1])) as temporary:
-    temporary.write_text("half")
-    print(temporary, flush=True)
-    time.sleep(600)
-"""
+from tangent_train.files import write_text
 
 
 @pytest.fixture(autouse=True)
@@ -36,62 +22,27 @@ def new_process(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(files, "_tidied", set())
 
 
-@pytest.fixture
-def writer(tmp_path: Path) -> Iterator[tuple[subprocess.Popen[str], Path]]:
-    """A process in the middle of writing, and its temporary file."""
-    with subprocess.Popen(
-        [sys.executable, "-c", SLOW_WRITER, str(tmp_path / "file.txt")],
-        env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[3])},
-        stdout=subprocess.PIPE,
-        text=True,
-    ) as process:
-        assert process.stdout is not None
-        yield process, Path(process.stdout.readline().strip())
-        process.kill()
-
-
 def _age(path: Path, hours: float) -> None:
     then = time.time() - 3600 * hours
     os.utime(path, (then, then))
 
 
-def test_what_a_killed_process_left_is_removed_by_the_next(
-    tmp_path: Path, writer: tuple[subprocess.Popen[str], Path]
-) -> None:
-    process, temporary = writer
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    assert temporary.read_text() == "half"
-    assert list(tmp_path.iterdir()) == [temporary], "no file that could be taken for a whole one"
-    _age(temporary, hours=25)
-    (tmp_path / "kept").mkdir()
-    (tmp_path / "kept" / ".partial-x").touch()
-    _age(tmp_path / "kept" / ".partial-x", hours=25)
-    write_text(tmp_path / "file.txt", "whole")
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["file.txt", "kept"]
-    assert (tmp_path / "kept" / ".partial-x").exists(), "only in the folder that is written to"
-
-
-def test_what_is_young_may_be_of_another_machine(tmp_path: Path) -> None:
-    (tmp_path / ".partial-young").touch()
-    _age(tmp_path / ".partial-young", hours=23)
+def test_old_temporary_files_are_removed_by_the_next_process(tmp_path: Path) -> None:
+    (tmp_path / "inner").mkdir()
     (tmp_path / ".partial-folder").mkdir()
+    for name in (".partial-old", ".partial-young", "inner/.partial-old"):
+        (tmp_path / name).touch()
+        _age(tmp_path / name, hours=25)
     _age(tmp_path / ".partial-folder", hours=25)
+    _age(tmp_path / ".partial-young", hours=23)  # another machine may be writing it
     write_text(tmp_path / "a", "x")
-    assert {path.name for path in tmp_path.iterdir()} == {
-        "a",
-        ".partial-young",
-        ".partial-folder",
-    }
-
-
-def test_a_folder_is_looked_at_once(tmp_path: Path) -> None:
-    write_text(tmp_path / "a", "x")
+    kept = {"a", "inner", ".partial-young", ".partial-folder"}
+    assert {path.name for path in tmp_path.iterdir()} == kept
+    assert (tmp_path / "inner" / ".partial-old").exists(), "only in the folder that is written to"
     (tmp_path / ".partial-old").touch()
     _age(tmp_path / ".partial-old", hours=25)
-    with atomic_path(tmp_path / "b") as temporary:
-        temporary.write_text("x")
-    assert (tmp_path / ".partial-old").exists(), "thousands of files are not listed for each"
+    write_text(tmp_path / "b", "x")
+    assert (tmp_path / ".partial-old").exists(), "a folder is listed once, not for each file"
 
 
 MAKER = """
@@ -104,10 +55,9 @@ generate_rooms(Path(sys.argv[1]), RoomSettings(height=256), workers=2, progress=
 """
 
 
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM])
-@pytest.mark.parametrize("after_s", [0.5, 4])
+@pytest.mark.parametrize(("how", "after_s"), [(signal.SIGTERM, 0.5), (signal.SIGKILL, 4)])
 def test_workers_end_with_their_parent(tmp_path: Path, how: signal.Signals, after_s: float) -> None:
-    """While they start and while they work: none keeps the terminal's pipe open."""
+    """While they start and while they work; none keeps the pipe open."""
     with subprocess.Popen(
         [sys.executable, "-c", MAKER, str(tmp_path / "rooms")],
         env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[3])},

@@ -1,8 +1,7 @@
-"""What is broken is told before training, or left out and counted if that is asked for."""
+"""Broken files are named before training, or left out and counted if that is asked for."""
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
@@ -16,16 +15,14 @@ from datamodules.core import found as found_module
 from datamodules.core.found import Found
 from datamodules.core.problems import Problems
 from datamodules.core.reading import ImageFiles
-from tangent_train.cli import main
 from tangent_train.errors import DataError, SettingError
+from tests.cli.tiny_runs import run_command
 from tests.slow.faults import data_sets as sets
 from tests.slow.faults.data_sets import colors, module, names, partner, write
 
 if TYPE_CHECKING:
     from datamodules.core.split_module import SplitDataModule
     from tests.conftest import FabricateStanford
-
-PANORAMAS = ("folder", "stanford", "omnisynthia")
 
 
 def _as_in_training(data: SplitDataModule[Any]) -> SplitDataModule[Any]:
@@ -52,7 +49,7 @@ def root(tmp_path: Path) -> Path:
 # --- left out -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", sets.IMAGES)
+@pytest.mark.parametrize("kind", ["folder", "stanford", "synthia photos"])
 def test_what_is_broken_is_left_out_and_counted(
     kind: str, root: Path, fabricate_stanford: FabricateStanford, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -133,27 +130,10 @@ def test_a_level_that_no_panorama_has_is_said_once(
     assert "\n" not in str(caught.value)
 
 
-def test_frames_of_synthia_whose_views_are_broken(
-    tmp_path: Path, fabricate_stanford: FabricateStanford, capsys: pytest.CaptureFixture[str]
-) -> None:
-    root = write("synthia photos", tmp_path, fabricate_stanford)
-    views = colors("synthia photos", root)
-    sets.truncate(views[0])
-    sets.corrupt(views[1])
-    with pytest.raises(DataError, match="found 2 problems") as caught:
-        module("omnisynthia", root, panorama_height=32).prepare_data()
-    assert all(str(view) in str(caught.value) for view in views[:2])
-    data = module("omnisynthia", root, panorama_height=32, skip_broken=True)
-    data.prepare_data()
-    data.setup()
-    assert "2 of 9 panoramas are broken and left out" in capsys.readouterr().out
-    assert sum(map(len, names(data).values())) == 7
-
-
 # --- with a store and in memory -----------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", PANORAMAS)
+@pytest.mark.parametrize("kind", ["folder", "stanford"])
 def test_a_store_has_no_holes_unless_they_are_asked_for(
     kind: str, root: Path, fabricate_stanford: FabricateStanford, tmp_path: Path
 ) -> None:
@@ -182,7 +162,7 @@ def test_a_store_has_no_holes_unless_they_are_asked_for(
 # --- as training begins -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", sets.IMAGES)
+@pytest.mark.parametrize("kind", ["folder", "stanford"])
 def test_training_begins_with_a_look_at_some_images_of_all_splits(
     kind: str,
     root: Path,
@@ -239,11 +219,6 @@ def test_the_look_is_short_and_goes_everywhere(monkeypatch: pytest.MonkeyPatch) 
 # --- the commands -------------------------------------------------------------------------------
 
 
-def _run(monkeypatch: pytest.MonkeyPatch, command: str, *arguments: str) -> None:
-    monkeypatch.setattr(sys, "argv", [f"tangent-{command}", *arguments])
-    getattr(main, command)()
-
-
 def test_a_training_refuses_then_goes_on_without(
     tmp_path: Path,
     fabricate_stanford: FabricateStanford,
@@ -260,14 +235,14 @@ def test_a_training_refuses_then_goes_on_without(
     arguments += ["representation.base_level=0", "data.num_workers=0", f"data.root='{root}'"]
     arguments += ["trainer.max_epochs=1", "trainer.accelerator=cpu", "panels=0"]
     with pytest.raises(SystemExit, match="found 2 problems") as caught:
-        _run(monkeypatch, "train", *arguments, "hydra.run.dir=run")
+        run_command(monkeypatch, "train", *arguments, "hydra.run.dir=run")
     assert all(str(path) in str(caught.value) for path in broken)
     assert not list((tmp_path / "run").rglob("*.ckpt"))
-    _run(monkeypatch, "train", *arguments, "hydra.run.dir=run", "data.skip_broken=true")
+    run_command(monkeypatch, "train", *arguments, "hydra.run.dir=run", "data.skip_broken=true")
     left_out = "2 of 12 panoramas are broken and left out (data.skip_broken=true)"
     assert left_out in capsys.readouterr().out
     checkpoint = f"checkpoint={tmp_path / 'run/checkpoints/last.ckpt'}"
-    _run(monkeypatch, "evaluate", checkpoint, f"data.root='{root}'", "hydra.run.dir=again")
+    run_command(monkeypatch, "evaluate", checkpoint, f"data.root='{root}'", "hydra.run.dir=again")
     assert left_out in capsys.readouterr().out
     for folder in ("run", "again"):
         assert '"images": 1' in (tmp_path / folder / "results.json").read_text()
@@ -282,11 +257,11 @@ def test_the_command_lists_problems_line_by_line(
     monkeypatch.chdir(tmp_path)
     root = write("stanford", tmp_path / sets.NAME, fabricate_stanford)
     arguments = ("data=stanford2d3ds", "level=3", f"data.root='{root}'")
-    _run(monkeypatch, "check", *arguments)
+    run_command(monkeypatch, "check", *arguments)
     assert "Nothing is wrong; 14 panoramas" in capsys.readouterr().out
     cut, corrupted = _damage("stanford", root)
     with pytest.raises(SystemExit) as left:
-        _run(monkeypatch, "check", *arguments, "data.skip_broken=true")
+        run_command(monkeypatch, "check", *arguments, "data.skip_broken=true")
     assert left.value.code == 1
     captured = capsys.readouterr()
     lines = [line.split("\t") for line in captured.out.splitlines()]
@@ -311,7 +286,7 @@ def test_the_command_shows_a_table_on_a_terminal(
     strange = root / "images" / "scene_0" / "[red]line\nend\x1b[2J\udcff.png"
     strange.write_bytes(b"nothing")
     with pytest.raises(SystemExit):
-        _run(monkeypatch, "check", "data=folder", "level=3", f"data.root='{root}'")
+        run_command(monkeypatch, "check", "data=folder", "level=3", f"data.root='{root}'")
     printed = capsys.readouterr().out
     assert "\x1b[2J" not in printed, "no command to the terminal"
     rows = [line.split("│") for line in printed.splitlines() if line.startswith("│")]

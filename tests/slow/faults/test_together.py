@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
-import signal
 import zlib
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
@@ -14,7 +12,6 @@ import pytest
 import torch
 
 from datamodules.core.made_folders import claim_folder
-from datamodules.core.store import Store
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 from datamodules.synthrooms.generate import generate_rooms
 from datamodules.synthrooms.settings import RoomSettings
@@ -25,6 +22,7 @@ if TYPE_CHECKING:
 
 PROCESSES = 3
 PANORAMAS = 14
+ROOMS = RoomSettings(rooms={"area_1": 2, "area_5a": 1}, height=32)
 
 
 @pytest.fixture(scope="module")
@@ -81,41 +79,8 @@ def test_runs_that_prepare_the_same_store_at_once_see_the_same(
     assert {path: path.stat().st_mtime_ns for path in before} == before, "all are whole"
 
 
-def _prepare_and_die(root: Path, store: Path, barrier: Any) -> None:
-    make, names = Store.make, []
-
-    def fall(self: Store, name: str, *content: Any) -> None:
-        names.append(name)
-        if len(names) == 5:
-            barrier.wait()
-            os.kill(os.getpid(), signal.SIGKILL)
-        make(self, name, *content)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Store, "make", fall)
-        _data(root, store).prepare_data()
-
-
-def test_a_run_that_is_killed_while_it_prepares_harms_no_other(
-    stanford_root: Path, tmp_path: Path, processes: ForkServerContext
-) -> None:
-    store, barrier = tmp_path / "store", processes.Barrier(2)
-    killed = processes.Process(target=_prepare_and_die, args=(stanford_root, store, barrier))
-    killed.start()
-    barrier.wait(120)
-    _data(stanford_root, store).prepare_data()
-    killed.join()
-    assert killed.exitcode == -signal.SIGKILL
-    data = _data(stanford_root, store)
-    data.prepare_data()
-    assert len(list(store.rglob("[!.]*.npy"))) == PANORAMAS
-    assert _samples(data) == _samples(_data(stanford_root, None))
-
-
-def test_what_is_made_by_two_at_once_is_claimed_by_both(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # The other one claims the folder and makes its first file just after this one has looked.
+def test_two_runs_claim_the_same_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # The other run claims the folder and makes its first file just after this one has looked.
     root = tmp_path / "rooms"
     looked: list[Path] = []
     really_exists = Path.exists
@@ -140,7 +105,7 @@ def _claim(root: Path) -> None:
 
 def _make(root: Path, barrier: Any) -> None:
     barrier.wait()
-    generate_rooms(root, RoomSettings(rooms={"area_1": 2, "area_5a": 1}, height=32), workers=0)
+    generate_rooms(root, ROOMS, workers=0)
 
 
 def test_runs_that_make_the_same_rooms_at_once(
@@ -150,9 +115,7 @@ def test_runs_that_make_the_same_rooms_at_once(
         barrier = manager.Barrier(2)
         for run in [pool.submit(_make, tmp_path / "rooms", barrier) for _ in range(2)]:
             run.result()
-    generate_rooms(
-        tmp_path / "alone", RoomSettings(rooms={"area_1": 2, "area_5a": 1}, height=32), workers=0
-    )
+    generate_rooms(tmp_path / "alone", ROOMS, workers=0)
     found, expected = (
         {p.relative_to(root): p.read_bytes() for p in root.rglob("*") if p.is_file()}
         for root in (tmp_path / "rooms", tmp_path / "alone")
