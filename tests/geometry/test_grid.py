@@ -1,4 +1,4 @@
-"""Tangent images: constants of the paper, textbook gnomonic formulas, cameras, errors."""
+"""Tangent images: textbook gnomonic formulas, rotations, errors."""
 
 from __future__ import annotations
 
@@ -10,23 +10,10 @@ import pytest
 from numpy.typing import NDArray
 
 from tangent_train.errors import SettingError
-from tangent_train.geometry import CubeGrid, TangentGrid, rotation_about, vertex_resolution
+from tangent_train.geometry import CubeGrid, TangentGrid, rotation_about
 from tests.rendering.reference import ReferenceGrid, to_xyz
 
 TURN = rotation_about((1, 2, -3), 1.1)
-
-
-@pytest.mark.parametrize(
-    ("base_level", "num_images", "dim", "fov_deg"),
-    [(0, 20, 1024, 73.1345), (1, 80, 512, 51.6162), (2, 320, 256, 31.4503),
-     (3, 1280, 128, 16.6995), (4, 5120, 64, 8.4306)],
-)  # fmt: skip
-def test_constants_of_level_10(base_level: int, num_images: int, dim: int, fov_deg: float) -> None:
-    grid = TangentGrid(base_level, 10)
-    assert (grid.num_images, grid.dim) == (num_images, dim)
-    assert grid.fov_deg == pytest.approx(fov_deg, abs=5.1e-5)
-    half_extent = (dim - 1) / (2 * dim) * vertex_resolution(base_level - 1)  # paper's bounds
-    assert grid.half_extent == pytest.approx(half_extent, rel=1e-14)
 
 
 @pytest.mark.parametrize(("base_level", "level", "dim"), [(0, 5, None), (1, 5, 13), (2, 5, 20)])

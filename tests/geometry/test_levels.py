@@ -10,7 +10,7 @@ import pytest
 from tangent_train.errors import SettingError
 from tangent_train.geometry import TangentGrid, equirect_shape, nearest_level
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "levels.md"
+PAGE = (Path(__file__).parents[2] / "docs" / "levels.md").read_text().splitlines()
 
 
 @pytest.mark.parametrize("level", [0, 1, 7, 13])
@@ -26,45 +26,26 @@ def test_too_few_rows() -> None:
         nearest_level(1)
 
 
-def _tables() -> list[list[list[str]]]:
-    tables: list[list[list[str]]] = [[]]
-    for line in PAGE.read_text().splitlines():
-        if line.startswith("|"):
-            tables[-1].append([cell.strip() for cell in line.strip("|").split("|")])
-        elif tables[-1]:
-            tables.append([])
-    return [[table[0], *table[2:]] for table in tables if table]
+def _row(*cells: object) -> str:
+    return f"| {' | '.join(map(str, cells))} |"
 
 
-def _grid(base_level: int, level: int) -> TangentGrid | None:
-    try:
-        return TangentGrid(base_level, level)
-    except SettingError:
-        return None
+@pytest.mark.parametrize("level", range(5, 13))
+def test_the_page_s_panoramas(level: int) -> None:
+    height, width = equirect_shape(level)
+    assert _row(level, f"{height} × {width}", f"{360 / width:.4f}") in PAGE
 
 
-def test_the_page_s_tables() -> None:
-    panoramas, images, sides, pixels = _tables()
-    assert len(panoramas) == 9
-    for level, size, degrees in panoramas[1:]:
-        height, width = equirect_shape(int(level))
-        assert size == f"{height} × {width}"
-        assert degrees == f"{360 / width:.4f}"
-    assert len(images) == 6
-    for base_level, number, across, corners in images[1:]:
-        grid = TangentGrid(int(base_level), 10)
-        assert number == str(grid.num_images)
-        assert across == f"{2 * math.degrees(math.atan(grid.dim * grid.pitch / 2)):.2f}°"
-        assert corners == f"{grid.fov_deg:.2f}°"
-    for table in (sides, pixels):
-        assert len(table) == 6
-        for base_level, *cells in table[1:]:
-            for level, cell in zip(table[0][1:], cells, strict=True):
-                grid_there = _grid(int(base_level), int(level))
-                if grid_there is None:
-                    assert cell == "–"
-                elif table is sides:
-                    least = TangentGrid.least_dim(grid_there.base_level, grid_there.level)
-                    assert cell == f"{grid_there.dim} ({least})"
-                else:
-                    assert cell == f"{math.degrees(grid_there.pitch):.4f}"
+@pytest.mark.parametrize("base_level", range(5))
+def test_the_page_s_images(base_level: int) -> None:
+    """The angles between corners are the paper's."""
+    grid = TangentGrid(base_level, 10)
+    across = math.degrees(2 * math.atan(grid.dim * grid.pitch / 2))
+    assert _row(base_level, grid.num_images, f"{across:.2f}°", f"{grid.fov_deg:.2f}°") in PAGE
+    levels = range(max(5, base_level + 2), 13)
+    missing = ["–"] * (8 - len(levels))
+    grids = [TangentGrid(base_level, level) for level in levels]
+    sides = [f"{one.dim} ({TangentGrid.least_dim(base_level, one.level)})" for one in grids]
+    assert _row(base_level, *missing, *sides) in PAGE
+    pitches = [f"{math.degrees(one.pitch):.4f}" for one in grids]
+    assert _row(base_level, *missing, *pitches) in PAGE

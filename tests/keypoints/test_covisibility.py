@@ -88,6 +88,7 @@ LEFT, RIGHT = upright((-1.8, 0.2, 1.5), 20), upright((1.6, -0.4, 1.4), 170)
 def test_what_a_box_hides(left: PanoramaPose, right: PanoramaPose) -> None:
     views = ROOM.view(left), ROOM.view(right)
     directions = equirect_directions(SHAPE).reshape(-1, 3)
+    shares = []
     for source, target in (views, views[::-1]):
         found = visible_from(directions, source, target)
         points_m = source.pose.points_m(directions, source.distance_m.reshape(-1))
@@ -98,17 +99,8 @@ def test_what_a_box_hides(left: PanoramaPose, right: PanoramaPose) -> None:
         # surfaces seen edge-on, a pixel more or less is seen.
         assert found[clearly_seen].mean() > 0.96
         assert found[clearly_hidden].mean() < 0.03
-
-
-def test_overlap_is_the_share_of_points_the_other_sees() -> None:
-    views = ROOM.view(LEFT), ROOM.view(RIGHT)
-    shares = []
-    for source, target in (views, views[::-1]):
-        rays = equirect_directions(SHAPE)
-        hidden_m = ROOM.hidden(target.pose, source.pose.points_m(rays, source.distance_m))
         shares.append((hidden_m < 0.05).mean())
     assert fov_overlap(*views) == pytest.approx(np.mean(shares), abs=0.015)
-    assert 0.4 < fov_overlap(*views) < 0.95
 
 
 def test_missing_depth() -> None:

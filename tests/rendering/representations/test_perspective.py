@@ -20,16 +20,14 @@ SIZE = (90, 140)
 K = np.array([[150.0, 0, 66.3], [0, 145.0, 47.1], [0, 0, 1]])
 
 
-def _photo(seed: int = 0, size: tuple[int, int] = SIZE) -> NDArray[np.uint8]:
+def _photo() -> NDArray[np.uint8]:
     """Smooth noise, so that interpolation is well defined."""
-    noise = np.random.default_rng(seed).integers(0, 256, (*size, 3)).astype(np.uint8)
+    noise = np.random.default_rng(0).integers(0, 256, (*SIZE, 3)).astype(np.uint8)
     smooth: NDArray[Any] = cv2.GaussianBlur(noise, (0, 0), 1.5)
     return cv2.normalize(smooth, smooth.copy(), 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
 
 
-def _triangle(
-    image: NDArray[np.uint8], homography: NDArray[np.float64], rows: int, columns: int | None = None
-) -> NDArray[Any]:
+def _triangle(image: NDArray[np.uint8], homography: NDArray[np.float64], side: int) -> NDArray[Any]:
     """Every pixel of a crop in float64: a weighted mean over a triangle around its place.
 
     The triangle is as wide as two pixels of the crop, at least two of the photo: then it is
@@ -37,9 +35,7 @@ def _triangle(
     """
     old_from_new = np.linalg.inv(homography)
     weights = []
-    for axis, (count, side) in enumerate(
-        zip(image.shape[1::-1], (columns or rows, rows), strict=True)
-    ):
+    for axis, count in enumerate(image.shape[1::-1]):
         places = old_from_new[axis, axis] * np.arange(side) + old_from_new[axis, 2]
         away = np.abs(np.arange(count) - places[:, None])
         weight = np.maximum(0, 1 - away / max(old_from_new[axis, axis], 1))
@@ -153,13 +149,7 @@ def test_the_side_follows_from_the_level() -> None:
 
 
 @pytest.mark.parametrize(
-    ("setting", "value"),
-    [
-        ("dim", 1),
-        ("dim", [8, 0]),
-        ("dim", [8, 8, 8]),
-        ("evaluation", "all"),
-    ],
+    ("setting", "value"), [("dim", 1), ("dim", [8, 0]), ("dim", [8, 8, 8]), ("evaluation", "all")]
 )
 def test_impossible_settings(setting: str, value: Any) -> None:
     with pytest.raises(SettingError, match=f"representation.{setting}"):

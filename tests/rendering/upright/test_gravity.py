@@ -15,19 +15,14 @@ from scipy.spatial.transform import Rotation
 from tangent_train.errors import SettingError
 from tangent_train.geometry import (
     equirect_directions,
-    equirect_to_lonlat,
-    lonlat_to_xyz,
     random_rotation,
     rotation_about,
 )
 from tangent_train.rendering.upright.gravity import estimate_up, up_from_pose, upright_rotation
+from tests.geometry.directions import angle_deg
 from tests.rendering.drawn_room import draw_room
 
 _UP = np.array([0.0, 0.0, 1.0])
-
-
-def _degrees_between(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
-    return math.degrees(math.atan2(np.linalg.norm(np.cross(one, other)), float(one @ other)))
 
 
 def _tilted(tilt_deg: float, azimuth_deg: float, yaw_deg: float) -> NDArray[np.float64]:
@@ -49,7 +44,7 @@ def test_tilted_rooms(
 ) -> None:
     turn = _tilted(tilt_deg, azimuth_deg, yaw_deg)
     gravity = estimate_up(draw_room(shape, turn))
-    assert _degrees_between(gravity.up, turn[:, 2]) < 0.5
+    assert angle_deg(gravity.up, turn[:, 2]) < 0.5
     assert 0.9 < gravity.confidence <= 1
     np.testing.assert_array_equal(gravity.candidates[0], gravity.up)
     np.testing.assert_allclose(np.linalg.norm(gravity.candidates, axis=1), 1)
@@ -59,19 +54,19 @@ def test_tilted_rooms(
 def test_rooms_held_at_any_angle(seed: int) -> None:
     turn = random_rotation(np.random.default_rng(seed))
     gravity = estimate_up(draw_room((128, 256), turn), max_tilt_deg=180)
-    assert _degrees_between(gravity.up, turn[:, 2]) < 0.5
+    assert angle_deg(gravity.up, turn[:, 2]) < 0.5
     assert len(gravity.candidates) >= 6
     # All axes of the room are candidates, upside down as well.
     for axis in (*turn.T, *-turn.T):
-        assert min(_degrees_between(axis, one) for one in gravity.candidates) < 0.5
+        assert min(angle_deg(axis, one) for one in gravity.candidates) < 0.5
 
 
 def test_upside_down() -> None:
     turn = rotation_about((1, 0, 0), math.pi)
     room = draw_room((128, 256), turn)
-    assert _degrees_between(estimate_up(room, 180).up, -_UP) < 0.5
+    assert angle_deg(estimate_up(room, 180).up, -_UP) < 0.5
     # Not to be considered: the axis that is nearest to upright is that of the floor.
-    assert _degrees_between(estimate_up(room).up, _UP) < 0.5
+    assert angle_deg(estimate_up(room).up, _UP) < 0.5
 
 
 def _waves(seed: int) -> NDArray[np.uint8]:
@@ -87,21 +82,17 @@ def _waves(seed: int) -> NDArray[np.uint8]:
 
 
 def _without_structure() -> dict[str, NDArray[np.uint8]]:
-    rng = np.random.default_rng(0)
-    noise = rng.integers(0, 256, (128, 256, 3), np.uint8)
-    cut = np.zeros_like(noise)
-    cut[40:90, 60:200] = noise[40:90, 60:200]
+    noise = np.random.default_rng(0).integers(0, 256, (128, 256, 3), np.uint8)
+    part = np.zeros_like(noise)
+    part[40:90, 60:200] = noise[40:90, 60:200]
     ramp = np.linspace(0, 255, 128).astype(np.uint8)
     return {
         "black": np.zeros((128, 256, 3), np.uint8),
-        "grey": np.full((128, 256, 3), 90, np.uint8),
         "one pixel": np.full((1, 1, 3), 90, np.uint8),
         "ramp": np.broadcast_to(ramp[:, None, None], (128, 256, 3)).copy(),
         "noise": noise,
-        "noise of few rows": noise[:32, :64].copy(),
-        "noise on a part": cut,
+        "noise on a part": part,
         "waves": _waves(1),
-        "other waves": _waves(2),
     }
 
 
@@ -118,16 +109,14 @@ def test_dark_rooms_with_missing_parts() -> None:
     turn = _tilted(18, 130, 60)
     room = draw_room((128, 256), turn) // 8
     room[:12], room[-9:], room[:, 30:45] = 0, 0, 0
-    assert _degrees_between(estimate_up(room).up, turn[:, 2]) < 0.5
+    assert angle_deg(estimate_up(room).up, turn[:, 2]) < 0.5
 
 
 @pytest.mark.parametrize(
     ("panorama", "found"),
     [
         (np.zeros((8, 16), np.uint8), r"shape \(8, 16\)"),
-        (np.zeros((8, 16, 4), np.uint8), r"shape \(8, 16, 4\)"),
         (np.zeros((8, 16, 3), np.float32), "dtype float32"),
-        (np.zeros((8, 16, 3), bool), "dtype bool"),
     ],
 )
 def test_other_arrays_are_refused(panorama: NDArray[Any], found: str) -> None:
@@ -171,24 +160,15 @@ def _horizon_of_pose(pitch_deg: float, roll_deg: float) -> NDArray[np.float64]:
     z), the pitch about x, the roll about y, in that order, each about the axes as already turned.
     """
     turn = Rotation.from_euler("ZXY", [-77, pitch_deg, roll_deg], degrees=True).as_matrix()
-    lon, lat = np.moveaxis(
-        equirect_to_lonlat(np.stack(np.meshgrid(np.arange(720), np.arange(360)), -1), (360, 720)),
-        -1,
-        0,
-    )
-    local = np.stack([np.cos(lat) * np.sin(lon), np.cos(lat) * np.cos(lon), np.sin(lat)], axis=-1)
-    heights: NDArray[np.float64] = (local @ turn.T)[..., 2]
-    return heights
+    local = equirect_directions((360, 720))[..., [1, 0, 2]]
+    return np.asarray((local @ turn.T)[..., 2])
 
 
 @pytest.mark.parametrize(
     ("pitch_deg", "roll_deg"),
-    [(0, 0), (30, 0), (-30, 0), (0, 30), (0, -150), (17, -121), (-24.49, 8.96), (90, 0), (-90, 50)],
+    [(0, 0), (30, 0), (0, -150), (-24.49, 8.96), (-90, 50)],
 )
-def test_up_is_where_the_zenith_was_rendered(pitch_deg: float, roll_deg: float) -> None:
+def test_up_is_that_of_the_rendered_heights(pitch_deg: float, roll_deg: float) -> None:
     heights = _horizon_of_pose(pitch_deg, roll_deg)
-    row, column = np.unravel_index(heights.argmax(), heights.shape)
-    zenith = lonlat_to_xyz(equirect_to_lonlat((column, row), heights.shape))
     up = up_from_pose(pitch_deg, roll_deg)
-    assert _degrees_between(up, zenith) < 0.5
     np.testing.assert_allclose(equirect_directions((360, 720)) @ up, heights, atol=1e-12)

@@ -11,16 +11,13 @@ from numpy.typing import NDArray
 from tangent_train.geometry import equirect_directions, random_rotation
 from tangent_train.rendering.upright.line_segments import LineSegments, find_line_segments
 from tangent_train.rendering.upright.manhattan import find_manhattan_frames
-
-
-def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+from tests.geometry.directions import unit
 
 
 @pytest.mark.parametrize("height", [128, 700])
 @pytest.mark.parametrize("seed", range(2))
 def test_an_edge_all_around_is_found_on_its_great_circle(height: int, seed: int) -> None:
-    normal = _unit(np.random.default_rng(seed).normal(size=3))
+    normal = unit(np.random.default_rng(seed).normal(size=3))
     side = np.clip(equirect_directions((height, 2 * height)) @ normal * height / 3, -1, 1)
     gray = (130 + 60 * side).astype(np.uint8)
     segments = find_line_segments(np.repeat(gray[..., None], 3, axis=-1))
@@ -40,9 +37,9 @@ def _segments(
 ) -> LineSegments:
     """Exact segments along three axes, and some of random directions."""
     rng = np.random.default_rng(seed)
-    along = np.concatenate([np.repeat(axes.T, counts, axis=0), _unit(rng.normal(size=(others, 3)))])
-    normals = _unit(np.cross(along, rng.normal(size=along.shape)))
-    middles = _unit(np.cross(normals, rng.normal(size=along.shape)))
+    along = np.concatenate([np.repeat(axes.T, counts, axis=0), unit(rng.normal(size=(others, 3)))])
+    normals = unit(np.cross(along, rng.normal(size=along.shape)))
+    middles = unit(np.cross(normals, rng.normal(size=along.shape)))
     return LineSegments(normals, middles, rng.uniform(0.1, 0.6, len(along)))
 
 
