@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -60,16 +58,6 @@ def test_a_rotation_replaces_the_grids_own(grid: CubeGrid | TangentGrid) -> None
     plain = grid.with_rotation(None)
     assert (plain.rotation, plain.dim) == (None, grid.dim)
     np.testing.assert_allclose(turned.directions([2]), plain.directions([2]) @ TURN.T, atol=1e-14)
-
-
-@pytest.mark.parametrize("base_level", range(3))
-def test_tangent_images_overlap_and_the_faces_of_a_cube_do_not(base_level: int) -> None:
-    directions = np.concatenate([random_directions(5000), np.array(CORNERS[UP]) / math.sqrt(3)])
-    least = TangentGrid.least_dim(base_level, base_level + 5)
-    for grid in (TangentGrid(base_level, base_level + 5, least), CubeGrid(32)):
-        places = grid.project(directions, grid.owners(directions))
-        beyond = np.abs(places - (grid.dim - 1) / 2).max() - grid.dim / 2
-        assert grid.overlapping == bool(beyond < -0.4)
 
 
 @pytest.mark.parametrize("dim", [1, -4, 8.0, "8", True])

@@ -77,11 +77,6 @@ def test_rotation_about_an_axis_is_scipys(seed: int, angle: float) -> None:
     np.testing.assert_allclose(rotation_about(axis, angle), expected, atol=1e-12)
 
 
-def test_a_positive_angle_about_the_vertical_adds_to_the_longitude() -> None:
-    turned = rotation_about((0, 0, 2), 0.4) @ lonlat_to_xyz([0.1, 0.7])
-    np.testing.assert_allclose(xyz_to_lonlat(turned), [0.5, 0.7], atol=1e-14)
-
-
 def test_random_rotations_are_proper_and_uniform() -> None:
     rng = np.random.default_rng(3)
     rotations = np.stack([random_rotation(rng) for _ in range(4000)])

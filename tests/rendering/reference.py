@@ -1,94 +1,46 @@
-"""Tangent images once more: slow, float64, written from the paper (section 3.2) and nothing else.
+"""Tangent images once more: slow, float64, written from the paper (section 3.2).
 
-No line here is shared with the library, which is tested against it. Everything goes through
-longitude and latitude and the textbook formulas of the gnomonic projection (Snyder 1987, chapter
-22), where the library works with camera matrices. Faces come in an order of their own:
-`ReferenceGrid.order` matches them by their centres.
+No line here is shared with the library, which is tested against it. The mesh is trimesh's; the rest
+goes through longitude and latitude and the textbook formulas of the gnomonic projection (Snyder
+1987, chapter 22), where the library works with camera matrices. Faces come in an order of their
+own: `ReferenceGrid.order` matches them by their centres.
 """
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
+import trimesh
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import ConvexHull
 
 Array = NDArray[np.float64]
-Triangles = list[tuple[int, int, int]]
 
 
-def icosahedron() -> tuple[list[Array], Triangles]:
-    """Twelve vertices, poles included; faces are the triples of mutual neighbours."""
+def subdivided_icosahedron(level: int) -> trimesh.Trimesh:
+    """S(b), by trimesh's Loop subdivision; the vertices of the icosahedron include the poles."""
     ring = math.atan(0.5)
     lonlat = [(0.0, math.pi / 2), (0.0, -math.pi / 2)]
     lonlat += [(math.radians(72 * k), ring) for k in range(5)]
     lonlat += [(math.radians(72 * k + 36), -ring) for k in range(5)]
-    vertices = [to_xyz(np.array(position)) for position in lonlat]
-    edge = 1 / math.sin(math.radians(72))
-    faces = [
-        triple
-        for triple in itertools.combinations(range(12), 3)
-        if all(
-            math.isclose(np.linalg.norm(vertices[a] - vertices[b]), edge)
-            for a, b in itertools.combinations(triple, 2)
-        )
-    ]
-    return vertices, faces
-
-
-def neighbors(count: int, faces: Triangles) -> list[set[int]]:
-    """The vertices joined to each vertex by an edge."""
-    found: list[set[int]] = [set() for _ in range(count)]
-    for a, b, c in faces:
-        found[a] |= {b, c}
-        found[b] |= {c, a}
-        found[c] |= {a, b}
-    return found
-
-
-def loop_subdivision(vertices: list[Array], faces: Triangles) -> tuple[list[Array], Triangles]:
-    """Loop's masks (1987): 3/8 3/8 1/8 1/8 on edges, 1 − kβ and β around a vertex of valence k."""
-    around = neighbors(len(vertices), faces)
-    points = []
-    for vertex, joined in zip(vertices, around, strict=True):
-        k = len(joined)
-        beta = (5 / 8 - (3 / 8 + math.cos(2 * math.pi / k) / 4) ** 2) / k
-        points.append((1 - k * beta) * vertex + beta * sum(vertices[w] for w in joined))
-    middle: dict[frozenset[int], int] = {}
-    for a, joined in enumerate(around):
-        for b in joined:
-            if a < b:
-                left, right = joined & around[b]  # a closed mesh: two triangles at every edge
-                ends, wings = vertices[a] + vertices[b], vertices[left] + vertices[right]
-                middle[frozenset((a, b))] = len(points)
-                points.append((3 * ends + wings) / 8)
-    refined = []
-    for a, b, c in faces:
-        ab, bc, ca = (middle[frozenset(edge)] for edge in ((a, b), (b, c), (c, a)))
-        refined += [(a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca)]
-    return points, refined
-
-
-def subdivided_icosahedron(level: int) -> tuple[list[Array], Triangles]:
-    """S(b)."""
-    mesh = icosahedron()
-    for _ in range(level):
-        mesh = loop_subdivision(*mesh)
-    return mesh
+    vertices = to_xyz(np.array(lonlat))
+    faces = ConvexHull(vertices).simplices
+    mesh = trimesh.remesh.subdivide_loop(vertices, faces, level)
+    return trimesh.Trimesh(*mesh, process=False)
 
 
 def vertex_resolution(level: int) -> float:
     """R_v(b), in radians."""
     if level == -1:
         return 2 * vertex_resolution(0)
-    vertices, faces = subdivided_icosahedron(level)
-    units = [vertex / np.linalg.norm(vertex) for vertex in vertices]
+    mesh = subdivided_icosahedron(level)
+    units = mesh.vertices / np.linalg.norm(mesh.vertices, axis=1, keepdims=True)
     means = []
-    for v, joined in enumerate(neighbors(len(vertices), faces)):
-        means.append(np.mean([math.acos(units[v] @ units[w]) for w in joined]))
+    for unit, joined in zip(units, mesh.vertex_neighbors, strict=True):
+        means.append(np.arccos(units[joined] @ unit).mean())
     return float(np.mean(means))
 
 
@@ -171,8 +123,7 @@ class ReferenceGrid:
     @cached_property
     def centers_lonlat(self) -> Array:
         """``(N, 2)`` barycentres of the faces, not turned."""
-        vertices, faces = subdivided_icosahedron(self.base_level)
-        centers = np.array([sum(vertices[v] for v in face) for face in faces])
+        centers = subdivided_icosahedron(self.base_level).triangles_center
         return to_lonlat(centers / np.linalg.norm(centers, axis=1, keepdims=True))
 
     @cached_property
