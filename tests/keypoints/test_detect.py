@@ -60,24 +60,12 @@ def scattered(seed: int, size: tuple[int, int]) -> NDArray[np.float64]:
 
 
 def errors(found: Detections, centers_xy: NDArray[np.float64], reach: float) -> Any:
-    """Error, place and size of what is within reach of a centre, and the centre."""
+    """Error, place and size of what is within reach of a centre."""
     offsets = found.points_xy[:, None] - centers_xy
     nearest = np.linalg.norm(offsets, axis=-1).argmin(axis=1)
     error = offsets[np.arange(len(nearest)), nearest]
     near = np.linalg.norm(error, axis=1) < reach
-    return error[near], found.points_xy[near], found.sizes[near], nearest[near]
-
-
-@pytest.mark.parametrize("sigma", [1.5, 6.0])
-def test_sift_finds_blobs_where_they_are(sigma: float) -> None:
-    """OpenCV's default is off by a quarter of a pixel."""
-    size = (401, 500)
-    centers = scattered(0, size)
-    found = Detector().detect(flat_blobs(centers, np.full(len(centers), sigma), size))
-    error, _, _, nearest = errors(found, centers, sigma)
-    assert len(np.unique(nearest)) == len(centers)
-    assert np.abs(error.mean(axis=0)).max() < 0.03
-    assert np.median(np.linalg.norm(error, axis=1)) < 0.05
+    return error[near], found.points_xy[near], found.sizes[near]
 
 
 def test_orbs_levels_are_where_they_belong() -> None:
@@ -88,7 +76,7 @@ def test_orbs_levels_are_where_they_belong() -> None:
         centers = scattered(seed, size)
         sigmas = np.random.default_rng(seed).uniform(1.5, 6, len(centers))
         found = Detector("orb").detect(flat_blobs(centers, sigmas, size))
-        parts.append(errors(found, centers, 8)[:3])
+        parts.append(errors(found, centers, 8))
     error, place, diameter = map(np.concatenate, zip(*parts, strict=True))
     lever = place / ((np.array(size[::-1]) - 1) / 2) - 1
     for level in range(8):
@@ -143,6 +131,7 @@ def test_a_blob_is_found_once_wherever_it_is(lon_deg: float, lat_deg: float) -> 
     found = detect_on_equirect(blobs(SHAPE, center[None], sigma), Detector())
     found = found.select(angle_deg(found.directions_xyz, center) < 5)
     assert len(np.unique(found.directions_xyz.round(4), axis=0)) == 1
+    # OpenCV's default is off by a quarter of a pixel of 0.7°.
     assert angle_deg(found.directions_xyz, center).max() < (0.03 if lat_deg > 0 else 1)
     assert 2 * sigma / DOG / found.sizes_rad.min() == pytest.approx(1, abs=0.25)
     columns = found.equirect_pixels(SHAPE)[:, 0]

@@ -14,20 +14,17 @@ _HIGH = np.array([2.4, 3.6, 1.2])
 _GRAY = np.array([[150, 120], [170, 95], [80, 225]])  # of the lower and upper side of each axis
 
 
-def draw_room(
-    shape: tuple[int, int], turn: NDArray[np.float64], supersample: int = 2
-) -> NDArray[np.uint8]:
+def draw_room(shape: tuple[int, int], turn: NDArray[np.float64]) -> NDArray[np.uint8]:
     """A panorama inside a box: doors and pictures on its walls, tiles below, a bright ceiling.
 
     Args:
         shape: ``(H, W)``.
         turn: ``(3, 3)`` rotation; what stands upright is seen along ``turn @ (0, 0, 1)``.
-        supersample: Rays per pixel side.
 
     Returns:
         ``(H, W, 3)``.
     """
-    height, width = shape[0] * supersample, shape[1] * supersample
+    height, width = 2 * shape[0], 2 * shape[1]  # four rays per pixel
     latitude = np.pi * (0.5 - (np.arange(height) + 0.5) / height)[:, None]
     longitude = np.pi * ((np.arange(width) + 0.5) / width * 2 - 1)[None]
     x, y = np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude)
@@ -38,7 +35,7 @@ def draw_room(
     points = rays * distances.min(axis=-1)[..., None]
     upper = np.take_along_axis(rays, axis[..., None], axis=-1)[..., 0] > 0
     gray = _GRAY[axis, upper.astype(int)] + _decoration(points, axis, upper)
-    pixels = gray.reshape(shape[0], supersample, shape[1], supersample).mean(axis=(1, 3))
+    pixels = gray.reshape(shape[0], 2, shape[1], 2).mean(axis=(1, 3))
     return np.repeat(np.rint(pixels).astype(np.uint8)[..., None], 3, axis=-1)
 
 

@@ -13,13 +13,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from tangent_train.errors import SettingError
-from tangent_train.geometry import (
-    equirect_directions,
-    random_rotation,
-    rotation_about,
-)
+from tangent_train.geometry import equirect_directions, random_rotation, rotation_about
 from tangent_train.rendering.upright.gravity import estimate_up, up_from_pose, upright_rotation
 from tests.geometry.directions import angle_deg
+from tests.keypoints.textures import texture
 from tests.rendering.drawn_room import draw_room
 
 _UP = np.array([0.0, 0.0, 1.0])
@@ -69,18 +66,6 @@ def test_upside_down() -> None:
     assert angle_deg(estimate_up(room).up, _UP) < 0.5
 
 
-def _waves(seed: int) -> NDArray[np.uint8]:
-    """Noise that looks the same in all directions: waves through space, cut by the sphere."""
-    rng = np.random.default_rng(seed)
-    directions = equirect_directions((128, 256)).reshape(-1, 3)
-    axes = rng.normal(size=(60, 3))
-    length = 2 ** rng.uniform(1, 6, 60)
-    axes *= (length / np.linalg.norm(axes, axis=1))[:, None]
-    values = np.cos(directions @ axes.T + rng.uniform(0, 6, 60)) @ (1 / length)
-    gray = np.clip(128 + 50 * values / values.std(), 0, 255).astype(np.uint8)
-    return np.repeat(gray.reshape(128, 256, 1), 3, axis=-1)
-
-
 def _without_structure() -> dict[str, NDArray[np.uint8]]:
     noise = np.random.default_rng(0).integers(0, 256, (128, 256, 3), np.uint8)
     part = np.zeros_like(noise)
@@ -92,7 +77,7 @@ def _without_structure() -> dict[str, NDArray[np.uint8]]:
         "ramp": np.broadcast_to(ramp[:, None, None], (128, 256, 3)).copy(),
         "noise": noise,
         "noise on a part": part,
-        "waves": _waves(1),
+        "noise of the same look everywhere": texture((128, 256))[..., None].repeat(3, axis=-1),
     }
 
 
