@@ -9,7 +9,7 @@ import torch
 from torch import nn
 from torchvision import models as torchvision_models
 
-from models import MultiView, initialize, widen_stem
+from models import MultiView, widen_stem
 from tangent_train.errors import SettingError
 from tests.tasks.small_networks import with_statistics
 
@@ -57,16 +57,6 @@ def test_a_network_that_fits_is_left_alone() -> None:
     before = dict(inner.named_parameters())
     after = dict(MultiView(inner, 6, 7).network.named_parameters())
     assert all(after[name] is parameter for name, parameter in before.items())
-
-
-def test_it_starts_from_weights_of_the_same_network(tmp_path: Any) -> None:
-    torch.manual_seed(0)
-    published = _torchvision("resnet18")
-    torch.save(published.state_dict(), tmp_path / "resnet18.pth")
-    network = MultiView(_torchvision("resnet18", num_classes=10), 6, 10)
-    origins = initialize(network, tmp_path / "resnet18.pth")
-    assert list(origins.adapted) == ["network.conv1.weight"]
-    assert set(origins.fresh) == {"network.fc.weight", "network.fc.bias"}
 
 
 def test_further_channels_change_nothing_at_first_and_are_learned() -> None:

@@ -99,27 +99,6 @@ def test_gradients_are_those_of_a_mask() -> None:
     assert torch.autograd.gradcheck(angular_attention, (*leaves[:3], directions, kappa))
 
 
-def test_turning_all_directions_changes_nothing() -> None:
-    mixer, (tokens, directions) = _mixer(), _inputs()
-    turn = torch.tensor(random_rotation(np.random.default_rng(3)), dtype=torch.float32)
-    turned = torch.einsum("ab,snbrc->snarc", turn, directions)
-    expected = mixer(tokens, directions)
-    torch.testing.assert_close(mixer(tokens, turned), expected, rtol=1e-4, atol=1e-5)
-    assert not torch.allclose(mixer(tokens, directions.flip(1)), expected, atol=0.01)
-
-
-def test_images_have_no_order_and_spheres_do_not_see_each_other() -> None:
-    mixer, (tokens, directions) = _mixer(), _inputs()
-    together = mixer(tokens, directions)
-    order = torch.tensor([3, 1, 4, 0, 2])
-    torch.testing.assert_close(mixer(tokens[:, order], directions[:, order]), together[:, order])
-    for sphere in range(2):
-        part = slice(sphere, sphere + 1)
-        torch.testing.assert_close(mixer(tokens[part], directions[part]), together[part])
-    fewer = mixer(tokens[:, :2], directions[:, :2])
-    assert not torch.allclose(fewer, together[:, :2], atol=0.01)
-
-
 def test_an_image_alone_learns_nothing() -> None:
     mixer, (tokens, directions) = _mixer(), _inputs(images=1)
     learned = mixer(tokens.requires_grad_(), directions)
@@ -136,17 +115,12 @@ def test_it_starts_from_nothing_and_every_parameter_learns() -> None:
     assert kappa[0] < 0.2
     assert kappa[-1] > 20
     torch.testing.assert_close(kappa[1] / kappa[0], kappa[2] / kappa[1])
-    target = torch.randn_like(tokens)
-    optimizer = torch.optim.SGD(mixer.parameters(), 0.1)
-    for _ in range(2):
-        optimizer.zero_grad()
-        loss: Any = functional.mse_loss(mixer(tokens, directions), target)
-        loss.backward()
-        optimizer.step()
+    torch.nn.init.normal_(mixer.get_parameter("output.weight"))
+    loss: Any = (mixer(tokens, directions) * torch.randn_like(tokens)).sum()
+    loss.backward()
     for name, parameter in mixer.named_parameters():
         assert parameter.grad is not None
         assert parameter.grad.any(), name
-    assert not torch.equal(mixer.log_kappa.exp(), kappa)
 
 
 def test_half_precision_does_not_blur_directions() -> None:

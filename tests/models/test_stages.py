@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torchvision.models.segmentation import deeplabv3_mobilenet_v3_large
 
-from models import AuxiliaryHead, FCNResNet, HexUNet, UNet
+from models import AuxiliaryHead, FCNResNet, UNet
 from models.stages import stage_channels
 from tangent_train.errors import SettingError
 from tests.models.sphere_networks import STAGE, small_context, small_unet
@@ -43,11 +43,10 @@ class _Twice(nn.Module):
     [
         (UNet(4, 14), "downs.4", 4, 256),
         (FCNResNet(3, 5, 50), "backbone.layer4", 3, 2048),
-        (HexUNet(3, 5), "encoders.1", 3, 64),
         (deeplabv3_mobilenet_v3_large(weights=None, weights_backbone=None), "backbone.16", 3, 960),
         (_Looking(nn.Conv2d(3, 6, 1), nn.Conv2d(6, 2, 1)), "0", 3, 6),
     ],
-    ids=["unet", "fcn", "hexunet", "deeplab", "looking"],
+    ids=["unet", "fcn", "deeplab", "looking"],
 )
 def test_channels_are_found_by_running_a_copy(
     network: nn.Module, stage: str, in_channels: int, channels: int

@@ -10,7 +10,6 @@ import pytest
 import torch
 from torch import nn
 
-import models
 from models import HexUNet, UNet
 from models.unet import Down
 from tangent_train.errors import SettingError
@@ -27,16 +26,6 @@ from tangent_train.errors import SettingError
 )
 def test_parameters_are_those_of_the_released_code(network: nn.Module, parameters: int) -> None:
     assert sum(p.numel() for p in network.parameters() if p.requires_grad) == parameters
-
-
-def test_convolutions_of_the_hexunet_are_those_of_the_paper_in_order() -> None:
-    convolutions = [m for m in HexUNet(3, 14).modules() if isinstance(m, nn.Conv2d)]
-    layers = [(m.in_channels, m.out_channels, m.kernel_size[0]) for m in convolutions]
-    encoders = [(3, 32), (32, 32), (32, 64), (64, 64), (64, 128), (128, 128), (128, 256)]
-    expected = [(*channels, 3) for channels in (*encoders, (256, 256))]
-    for below, neck, out in ((256, 512, 256), (512, 256, 128), (256, 128, 64), (128, 64, 32)):
-        expected += [(below, neck, 3), (neck, neck, 3), (neck, out, 1)]
-    assert layers == [*expected, (64, 32, 3), (32, 32, 3), (32, 14, 3)]
 
 
 def test_pooling_first_equals_halving_after_the_first_convolution() -> None:
@@ -101,9 +90,3 @@ def test_importing_a_network_imports_its_own_file() -> None:
         "tangent_train.errors",
         "tangent_train.registry",
     }
-
-
-def test_all_names_are_there() -> None:
-    assert all(callable(getattr(models, name)) for name in models.__all__)
-    with pytest.raises(AttributeError, match="no attribute 'Nothing'"):
-        models.Nothing  # noqa: B018 - looked up, that is all

@@ -59,13 +59,8 @@ def test_roll_lifts_the_left_side() -> None:
 
 def test_panorama_rays_are_the_sphere_mirrored_and_turned_by_the_heading() -> None:
     view = PanoramaView(Pose.looking(HERE, heading=0.7), 16)
-    sphere = equirect_directions((16, 32))
-    expected = sphere @ (rotation_about((0, 0, 1), 0.7) @ FLIP_Y).T
+    expected = equirect_directions((16, 32)) @ (rotation_about((0, 0, 1), 0.7) @ FLIP_Y).T
     np.testing.assert_allclose(view.rays(), expected, atol=1e-6)
-    rotation = view.pose.rt_matrix[:, :3]
-    sx, sy, sz = np.moveaxis(sphere, -1, 0)
-    stated = np.stack([sy, -sz, sx], axis=-1) @ rotation
-    np.testing.assert_allclose(view.rays(), stated, atol=1e-6)
 
 
 def test_perspective_rays_project_to_their_pixels() -> None:
