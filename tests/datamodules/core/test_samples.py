@@ -131,16 +131,16 @@ def test_impossible_inputs(inputs: Any) -> None:
 # --- samples -----------------------------------------------------------------------------------
 
 
-def _training(strips: Representation, seed: int = 0) -> TrainingImages:
-    return TrainingImages(POSITIONS, strips, seed, DEPTH)
+def _training(erp: Representation, seed: int = 0) -> TrainingImages:
+    return TrainingImages(POSITIONS, erp, seed, DEPTH)
 
 
-def test_training_sample(strips: Representation) -> None:
-    sample = _training(strips)[4, 1]
+def test_training_sample(erp: Representation) -> None:
+    sample = _training(erp)[4, 1]
     rgb, depth = sample.images
-    assert (rgb.shape, rgb.dtype) == ((2, 16, 8, 3), torch.uint8)
-    assert (depth.shape, depth.dtype) == ((2, 16, 8), torch.int16)
-    assert (sample.labels.shape, sample.labels.dtype) == ((2, 16, 8), torch.uint8)
+    assert (rgb.shape, rgb.dtype) == ((1, 16, 8, 3), torch.uint8)
+    assert (depth.shape, depth.dtype) == ((1, 16, 8), torch.int16)
+    assert (sample.labels.shape, sample.labels.dtype) == ((1, 16, 8), torch.uint8)
     assert sample.index == 1
     # The same pixels in all channels.
     for channel in range(3):
@@ -148,38 +148,42 @@ def test_training_sample(strips: Representation) -> None:
     torch.testing.assert_close(depth, sample.labels.short() * 4)
 
 
+def test_neither_depth_nor_labels_are_interpolated() -> None:
+    sample = _training(TangentRepresentation(0, 3, rotation="so3"))[0, 0]
+    torch.testing.assert_close(sample.images[1], sample.labels.short() * 4)
+
+
 def test_depth_is_clipped_and_missing_is_zero(
-    strips: Representation, monkeypatch: pytest.MonkeyPatch
+    erp: Representation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     steps = np.tile(np.array([0, 1, 2047, 2048, 2049, 32768, 65535, 0], np.uint16), (16, 4))
     panorama = _positions(0)._replace(depth=steps)
     monkeypatch.setattr(_Positions, "read", lambda *_: panorama)
-    images = EvaluationImages(POSITIONS, strips, DEPTH)[0, 0].images
-    assert images[1][0, 0].tolist() == [0, 1, 2047, 2048, 2048, 2048, 2048, 0]
+    images = EvaluationImages(POSITIONS, erp, DEPTH)[0, 0].images
+    assert images[1][0, 0, :8].tolist() == [0, 1, 2047, 2048, 2048, 2048, 2048, 0]
     assert normalize(images, IDENTITY, DEPTH)[0, 3, 0, 3] == 4  # metres
 
 
-def test_views_are_those_of_seed_epoch_and_index(strips: Representation) -> None:
-    first = _training(strips)[4, 1].labels
-    assert torch.equal(first, _training(strips)[4, 1].labels)
-    assert not torch.equal(first, _training(strips)[5, 1].labels)
-    assert not torch.equal(first, _training(strips, seed=1)[4, 1].labels)
+def test_views_are_those_of_seed_epoch_and_index(erp: Representation) -> None:
+    first = _training(erp)[4, 1].labels
+    assert torch.equal(first, _training(erp)[4, 1].labels)
+    assert not torch.equal(first, _training(erp)[5, 1].labels)
+    assert not torch.equal(first, _training(erp, seed=1)[4, 1].labels)
 
 
-def test_evaluation_sample(strips: Representation) -> None:
-    dataset = EvaluationImages(POSITIONS, strips, DEPTH)
+def test_evaluation_sample(erp: Representation) -> None:
+    dataset = EvaluationImages(POSITIONS, erp, DEPTH)
     sample = dataset[0, 2]
-    assert len(dataset) == len(_training(strips)) == 3
+    assert len(dataset) == len(_training(erp)) == 3
     images = normalize(sample.images, IDENTITY, DEPTH)
-    assert images.shape == (4, 4, 16, 8)
+    assert images.shape == (1, 4, 16, 32)
     assert sample.index == 2
     np.testing.assert_array_equal(sample.target.numpy(), _positions(2).labels)
-    joined = torch.cat(list(images[:, 0]), dim=1)
-    torch.testing.assert_close(joined, sample.target.float())
+    torch.testing.assert_close(images[0, 0], sample.target.float())
 
 
 def test_samples_share_no_memory_with_panoramas(
-    strips: Representation, monkeypatch: pytest.MonkeyPatch
+    erp: Representation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     panorama = _positions(0)
     monkeypatch.setattr(_Positions, "read", lambda *_: panorama)
@@ -195,10 +199,10 @@ def test_samples_share_no_memory_with_panoramas(
 # --- colours -----------------------------------------------------------------------------------
 
 
-def test_jitter_changes_the_colours_and_nothing_else(strips: Representation) -> None:
+def test_jitter_changes_the_colours_and_nothing_else(erp: Representation) -> None:
     plain, jittered = (
-        TrainingImages(POSITIONS, strips, 0, DEPTH),
-        TrainingImages(POSITIONS, strips, 0, DEPTH, 0.5),
+        TrainingImages(POSITIONS, erp, 0, DEPTH),
+        TrainingImages(POSITIONS, erp, 0, DEPTH, 0.5),
     )
     for epoch in range(3):
         before, after = plain[epoch, 1], jittered[epoch, 1]

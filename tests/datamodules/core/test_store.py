@@ -12,7 +12,7 @@ import torch
 from datamodules import Stanford2D3DS, Stanford2D3DSPerspective
 from datamodules.core.store import Store
 from tangent_train.errors import DataError
-from tangent_train.rendering import PerspectiveRepresentation
+from tangent_train.rendering import EquirectRepresentation, PerspectiveRepresentation
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -42,9 +42,9 @@ def store(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def make_module(root: Path, strips: Any, store: Path) -> MakeModule:
+def make_module(root: Path, erp: Any, store: Path) -> MakeModule:
     def make(**settings: Any) -> Stanford2D3DS:
-        return Stanford2D3DS(root, strips, **{"store": store, **settings})
+        return Stanford2D3DS(root, erp, **{"store": store, **settings})
 
     return make
 
@@ -177,7 +177,7 @@ def test_photos_have_a_store_as_well(root: Path, store: Path) -> None:
 
 
 def test_what_is_there_is_kept_and_what_is_not_is_made(
-    make_module: MakeModule, store: Path, root: Path, strips: Any
+    make_module: MakeModule, store: Path, root: Path, erp: Any
 ) -> None:
     make_module().prepare_data()
     before = _times(store)
@@ -189,7 +189,7 @@ def test_what_is_there_is_kept_and_what_is_not_is_made(
     make_module().prepare_data()
     assert _made(store, before) == {damaged}
     make_module(mask="any_black").prepare_data()
-    Stanford2D3DS(root, type(strips)(8), store=store).prepare_data()
+    Stanford2D3DS(root, EquirectRepresentation(level=2), store=store).prepare_data()
     assert len(_times(store)) == 3 * PANORAMAS, "masks and sizes lie beside each other"
     table = root / "semantic_labels.json"
     table.write_text(table.read_text().replace("sofa", "clutter"))

@@ -23,9 +23,9 @@ def _together(names: dict[str, list[str]]) -> list[str]:
     return sorted(found)
 
 
-def test_whole_scenes_are_drawn(root: Path, strips: Any) -> None:
+def test_whole_scenes_are_drawn(root: Path, erp: Any) -> None:
     chosen: dict[str, str] = {}
-    for split, names in _all_names(FolderPanoramas(root, strips)).items():
+    for split, names in _all_names(FolderPanoramas(root, erp)).items():
         for name in names:
             assert chosen.setdefault(name.partition("/")[0], split) == split
     splits = list(chosen.values())
@@ -33,22 +33,22 @@ def test_whole_scenes_are_drawn(root: Path, strips: Any) -> None:
     assert (splits.count("test"), splits.count("val"), splits.count("train")) == (1, 1, 4)
 
 
-def test_shares_and_seeds_of_the_drawing(tmp_path: Path, strips: Any) -> None:
+def test_shares_and_seeds_of_the_drawing(tmp_path: Path, erp: Any) -> None:
     root = write_data_set(tmp_path, scenes=20, each=1, height=16)
-    names = _all_names(FolderPanoramas(root, strips, seed=5))
+    names = _all_names(FolderPanoramas(root, erp, seed=5))
     assert [len(names[split]) for split in SPLITS] == [14, 2, 4]
     assert len(_together(names)) == 20
-    assert _all_names(FolderPanoramas(root, strips, seed=6)) == names, "not the run's seed"
-    other = _all_names(FolderPanoramas(root, strips, split_seed=1))
+    assert _all_names(FolderPanoramas(root, erp, seed=6)) == names, "not the run's seed"
+    other = _all_names(FolderPanoramas(root, erp, split_seed=1))
     assert other["test"] != names["test"]
     assert other["val"] != names["val"]
     settings: dict[str, Any] = {"test_fraction": 0.5, "validation_fraction": 0}
-    half = _all_names(FolderPanoramas(root, strips, **settings))
+    half = _all_names(FolderPanoramas(root, erp, **settings))
     assert [len(half[split]) for split in SPLITS] == [10, 0, 10]
-    assert FolderPanoramas(root, strips, **settings).val_dataloader() == []
+    assert FolderPanoramas(root, erp, **settings).val_dataloader() == []
 
 
-def test_lists_of_all_splits(own_root: Path, strips: Any) -> None:
+def test_lists_of_all_splits(own_root: Path, erp: Any) -> None:
     lists = {
         "train": "\ufeffscene_5/view.1\n\n# the kitchen\nscene_0/view.0.png\r\n",
         "val": "scene_1/view.1",
@@ -56,32 +56,32 @@ def test_lists_of_all_splits(own_root: Path, strips: Any) -> None:
     }
     for split, text in lists.items():
         (own_root / f"{split}.txt").write_text(text, "utf-8")
-    module = FolderPanoramas(own_root, strips)
+    module = FolderPanoramas(own_root, erp)
     assert _all_names(module) == {
         "train": ["scene_0/view.0", "scene_5/view.1"],
         "val": ["scene_1/view.1"],
         "test": ["scene_0/view.1", "scene_3/view.0"],
     }
-    assert names_of(FolderPanoramas(own_root, strips, validation_fraction=0), "val") == []
+    assert names_of(FolderPanoramas(own_root, erp, validation_fraction=0), "val") == []
 
 
-def test_lists_of_some_splits(own_root: Path, strips: Any) -> None:
+def test_lists_of_some_splits(own_root: Path, erp: Any) -> None:
     all_names = sorted(f"scene_{scene}/view.{view}" for scene in range(6) for view in range(2))
     (own_root / "test.txt").write_text("scene_2/view.0\n")
-    names = _all_names(FolderPanoramas(own_root, strips))
+    names = _all_names(FolderPanoramas(own_root, erp))
     assert names["test"] == ["scene_2/view.0"]
     assert _together(names) == all_names
     assert len({name.partition("/")[0] for name in names["val"]}) == 1
 
     (own_root / "test.txt").unlink()
     (own_root / "train.txt").write_text("\n".join(all_names[:8]))
-    names = _all_names(FolderPanoramas(own_root, strips))
+    names = _all_names(FolderPanoramas(own_root, erp))
     assert names["test"] == all_names[8:], "all that are in no list"
     assert sorted(names["train"] + names["val"]) == all_names[:8]
 
     (own_root / "train.txt").unlink()
     (own_root / "val.txt").write_text("\n".join(all_names[:3]))
-    names = _all_names(FolderPanoramas(own_root, strips))
+    names = _all_names(FolderPanoramas(own_root, erp))
     assert names["val"] == all_names[:3]
     assert len({name.partition("/")[0] for name in names["test"]}) == 1
     assert _together(names) == all_names
@@ -99,10 +99,10 @@ def test_lists_of_some_splits(own_root: Path, strips: Any) -> None:
     ],
 )
 def test_lists_that_cannot_be_used(
-    own_root: Path, strips: Any, lists: dict[str, str | bytes], message: str
+    own_root: Path, erp: Any, lists: dict[str, str | bytes], message: str
 ) -> None:
     for split, text in lists.items():
         content = text if isinstance(text, bytes) else text.encode()
         (own_root / f"{split}.txt").write_bytes(content)
     with pytest.raises(DataError, match=message):
-        FolderPanoramas(own_root, strips).setup()
+        FolderPanoramas(own_root, erp).setup()

@@ -17,13 +17,12 @@ from datamodules.modelnet40.shape_samples import (
     ShapeSample,
     ShapeViews,
 )
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError
 from tangent_train.rendering import (
     EquirectRepresentation,
     TangentRepresentation,
     equirect_to_tangent,
 )
-from tangent_train.rendering.representations.perspective import PerspectiveRepresentation
 from tests.datamodules.modelnet40.shapes_format import COUNTS, write_tree
 
 if TYPE_CHECKING:
@@ -239,26 +238,3 @@ def test_views_of_a_rotated_shape_are_views_of_its_rotated_mesh(
         upright = module.source("test").read(index).spheres
         before = views.render(np.ascontiguousarray(upright[..., :3]), "bilinear") / STEPS
         assert np.abs(before - expected[..., :3] / STEPS).mean() > 0.05
-
-
-# --- settings ----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("shapes_per_step", 0),
-        ("validation_fraction", 1),
-        ("test_rotation", "z"),
-        ("normalization", {"mean": [0, 0, 0], "std": [1, 1, 1]}),
-    ],
-)
-def test_impossible_settings(make_module: MakeModule, name: str, value: Any) -> None:
-    with pytest.raises(SettingError, match=rf"data\.{name}"):
-        make_module(**{name: value})
-
-
-def test_photos_are_no_way_to_see_a_sphere(root: Path) -> None:
-    photos: Any = PerspectiveRepresentation(level=5)
-    with pytest.raises(SettingError, match="representation=tangent"):
-        ModelNet40(root, photos)

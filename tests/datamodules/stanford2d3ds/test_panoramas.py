@@ -12,7 +12,8 @@ from datamodules.core.panoramas import steps_to_meters
 from datamodules.stanford2d3ds.files import AREAS, FOLDS, FileName
 from datamodules.stanford2d3ds.label_table import CLASSES
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError
+from tangent_train.rendering import EquirectRepresentation
 from tests.datamodules.data_files import names_of, read_png
 
 if TYPE_CHECKING:
@@ -70,10 +71,8 @@ def test_all_real_names_come_apart() -> None:
 
 
 @pytest.mark.parametrize("fold", [1, 3])
-def test_folds_are_disjoint_and_rooms_stay_whole(
-    stanford_root: Path, strips: Any, fold: int
-) -> None:
-    module = Stanford2D3DS(stanford_root, strips, fold=fold, validation_fraction=0.3)
+def test_folds_are_disjoint_and_rooms_stay_whole(stanford_root: Path, erp: Any, fold: int) -> None:
+    module = Stanford2D3DS(stanford_root, erp, fold=fold, validation_fraction=0.3)
     module.setup("fit")
     splits = {split: names_of(module, split) for split in ("train", "val", "test")}
     names = [name for split in splits.values() for name in split]
@@ -87,21 +86,19 @@ def test_folds_are_disjoint_and_rooms_stay_whole(
     assert not rooms["train"] & rooms["val"]
 
 
-def test_rooms_of_5a_and_5b_are_the_same_rooms(stanford_root: Path, strips: Any) -> None:
+def test_rooms_of_5a_and_5b_are_the_same_rooms(stanford_root: Path, erp: Any) -> None:
     # hallway_2 is in both: it must never be half in training, half in validation.
     for seed in range(20):
-        module = Stanford2D3DS(stanford_root, strips, fold=3, seed=seed, validation_fraction=0.4)
+        module = Stanford2D3DS(stanford_root, erp, fold=3, seed=seed, validation_fraction=0.4)
         halves = [n for n in names_of(module, "val") if "/hallway_2/" in n]
         assert len(halves) in (0, 2)
 
 
-def test_one_training_room(
-    fabricate_stanford: FabricateStanford, tmp_path: Path, strips: Any
-) -> None:
+def test_one_training_room(fabricate_stanford: FabricateStanford, tmp_path: Path, erp: Any) -> None:
     root = fabricate_stanford(tmp_path, {"1": ("office_1",) * 3, "5a": ("office_1",)})
     with pytest.raises(DataError, match="one training room"):
-        Stanford2D3DS(root, strips, areas=("1", "5a")).setup()
-    module = Stanford2D3DS(root, strips, areas=("1", "5a"), validation_fraction=0)
+        Stanford2D3DS(root, erp, areas=("1", "5a")).setup()
+    module = Stanford2D3DS(root, erp, areas=("1", "5a"), validation_fraction=0)
     assert [len(names_of(module, split)) for split in ("train", "val", "test")] == [3, 0, 1]
 
 
@@ -109,8 +106,8 @@ def test_one_training_room(
 
 
 @pytest.mark.parametrize("erp_height", [32, 8])
-def test_reads_what_was_written(stanford_root: Path, strips: Any, erp_height: int) -> None:
-    module = Stanford2D3DS(stanford_root, type(strips)(erp_height))
+def test_reads_what_was_written(stanford_root: Path, erp: Any, erp_height: int) -> None:
+    module = Stanford2D3DS(stanford_root, EquirectRepresentation(3, erp_height=erp_height))
     source = module.source("test")
     area, room, camera = source.name(1).split("/")
     folder = stanford_root / area / "pano"
@@ -138,10 +135,10 @@ def test_reads_what_was_written(stanford_root: Path, strips: Any, erp_height: in
     assert known.mean() == 7 / 8
 
 
-def test_masks_are_applied_on_reading(stanford_root: Path, strips: Any) -> None:
+def test_masks_are_applied_on_reading(stanford_root: Path, erp: Any) -> None:
     unknown = {}
     for mask in ("labels", "any_black", "all_black"):
-        module = Stanford2D3DS(stanford_root, strips, mask=mask)
+        module = Stanford2D3DS(stanford_root, erp, mask=mask)
         source = module.source("train")
         unknown[mask] = source.read(0).labels == 0
         np.testing.assert_array_equal(source.labels(0), source.read(0).labels)
@@ -151,47 +148,31 @@ def test_masks_are_applied_on_reading(stanford_root: Path, strips: Any) -> None:
     assert not unknown["labels"][-2:, :4].any()
 
 
-def test_without_depth_its_files_are_not_needed(broken_root: Path, strips: Any) -> None:
+def test_without_depth_its_files_are_not_needed(broken_root: Path, erp: Any) -> None:
     for path in broken_root.glob("area_*/pano/depth/*.png"):
         path.unlink()
-    module = Stanford2D3DS(broken_root, strips, inputs=("rgb",))
+    module = Stanford2D3DS(broken_root, erp, inputs=("rgb",))
     assert module.source("test").read(0).depth is None
     with pytest.raises(DataError, match=r"depth\.png"):
-        Stanford2D3DS(broken_root, strips).setup()
+        Stanford2D3DS(broken_root, erp).setup()
 
 
 # --- what cannot be used -----------------------------------------------------------------------
 
 
-def test_wrong_layout(broken_root: Path, strips: Any) -> None:
+def test_wrong_layout(broken_root: Path, erp: Any) -> None:
     with pytest.raises(DataError, match="no area_1, area_2"):
-        Stanford2D3DS(broken_root / "area_1", strips).setup()
+        Stanford2D3DS(broken_root / "area_1", erp).setup()
     (broken_root / "area_5b").rename(broken_root / "spare")
     with pytest.raises(DataError, match=r"found no area_5b; expected all of area_1"):
-        Stanford2D3DS(broken_root, strips).setup()
+        Stanford2D3DS(broken_root, erp).setup()
     (broken_root / "area_5b" / "data").mkdir(parents=True)
     with pytest.raises(DataError, match=r"area_5b/pano/rgb: found no panoramas"):
-        Stanford2D3DS(broken_root, strips).setup()
+        Stanford2D3DS(broken_root, erp).setup()
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("fold", 4),
-        ("mask", "black"),
-        ("validation_fraction", 1.0),
-        ("areas", ("1", "7")),
-        ("areas", ("1", "2")),
-        ("areas", ("5a", "5b")),
-    ],
-)
-def test_impossible_settings(tmp_path: Path, strips: Any, name: str, value: Any) -> None:
-    with pytest.raises(SettingError, match=rf"data\.{name}"):
-        Stanford2D3DS(tmp_path, strips, **{name: value})
-
-
-def test_a_strange_name_is_found_before_training(broken_root: Path, strips: Any) -> None:
+def test_a_strange_name_is_found_before_training(broken_root: Path, erp: Any) -> None:
     path = next((broken_root / "area_5b" / "pano" / "rgb").iterdir())  # only for the test
     path.rename(path.with_name("a.png"))
     with pytest.raises(DataError, match="unknown file name"):
-        Stanford2D3DS(broken_root, strips).setup("fit")
+        Stanford2D3DS(broken_root, erp).setup("fit")

@@ -1,15 +1,15 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 
-from datamodules import Stanford2D3DS, Stanford2D3DSPerspective, SynthRoomsPerspective
+from datamodules import Stanford2D3DS, Stanford2D3DSPerspective
 from datamodules.core.found import SPLITS
 from datamodules.core.photos import distance_from_z_depth
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError
 from tangent_train.geometry import camera_matrix_from_fov
 from tangent_train.rendering import PerspectiveRepresentation, TangentRepresentation
 from tests.datamodules.data_files import names_of, read_png
@@ -131,14 +131,3 @@ def test_broken_poses_are_found_before_training(broken_root: Path, damage: str) 
 def test_no_photos(stanford_root: Path) -> None:
     with pytest.raises(DataError, match=r"area_1/data/rgb: found no photos"):
         Stanford2D3DSPerspective(stanford_root, CROPS).setup()
-    with pytest.raises(SettingError, match=r"views_per_camera: found 0"):
-        SynthRoomsPerspective(stanford_root, CROPS, rooms={})
-
-
-def test_representations_of_the_other_kind(photo_root: Path) -> None:
-    tangent: Any = TangentRepresentation(0, 5)
-    with pytest.raises(SettingError, match="found TangentRepresentation; expected one for photos"):
-        Stanford2D3DSPerspective(photo_root, tangent)
-    crops: Any = CROPS
-    with pytest.raises(SettingError, match="PerspectiveRepresentation; expected one for panoramas"):
-        Stanford2D3DS(photo_root, crops)

@@ -10,7 +10,6 @@ import pytest
 
 from datamodules.core.reading import ImageFiles
 from datamodules.synthia.files import read_camera
-from datamodules.synthia.omnisynthia import OmniSynthia
 from datamodules.synthia.reader import (
     CLASSES,
     VIEW_FORMATS,
@@ -19,7 +18,7 @@ from datamodules.synthia.reader import (
     read_first_channel,
 )
 from datamodules.synthia.splits import choose_frames, divide
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError
 from tests.datamodules.data_files import write_png
 from tests.datamodules.synthia import synthia_format as synthia
 
@@ -158,15 +157,3 @@ def test_a_sequence_of_one_frame() -> None:
         divide(frames, ["04"], 0.1)
     one = divide(frames, ["04"], 0)
     assert [len(one[split]) for split in ("train", "val", "test")] == [1, 0, 1]
-
-
-@pytest.mark.parametrize(
-    ("train", "test", "name"),
-    [((), ("04",), "train"), (("03",), ("04",), "train"), (("01",), (), "test"),
-     (("01", "04"), ("04",), "test")],
-)  # fmt: skip
-def test_impossible_sequences(
-    tmp_path: Path, strips: Any, train: tuple[str, ...], test: tuple[str, ...], name: str
-) -> None:
-    with pytest.raises(SettingError, match=rf"data\.{name}_sequences"):
-        OmniSynthia(tmp_path, strips, train_sequences=train, test_sequences=test)

@@ -8,6 +8,7 @@ import pytest
 from datamodules.core.found import SPLITS
 from datamodules.synthia.omnisynthia import OmniSynthia
 from tangent_train.errors import DataError
+from tangent_train.rendering import EquirectRepresentation
 from tests.datamodules.data_files import names_of, read_png, write_png
 from tests.datamodules.synthia import synthia_format as synthia
 
@@ -29,17 +30,17 @@ def broken_root(tmp_path: Path) -> Path:
     return synthia.write_panoramas(tmp_path / "data", {"01": 2, "04": 2})
 
 
-def two(root: Path, strips: Any, **settings: Any) -> OmniSynthia:
+def two(root: Path, erp: Any, **settings: Any) -> OmniSynthia:
     return OmniSynthia(
-        root, strips, **{"train_sequences": ["01"], "test_sequences": ["04"], **settings}
+        root, erp, **{"train_sequences": ["01"], "test_sequences": ["04"], **settings}
     )
 
 
 # --- splits --------------------------------------------------------------------------------------
 
 
-def test_splits(root: Path, strips: Any) -> None:
-    module = OmniSynthia(root, strips)
+def test_splits(root: Path, erp: Any) -> None:
+    module = OmniSynthia(root, erp)
     module.prepare_data()  # nothing to make
     module.setup("fit")
     splits = {split: names_of(module, split) for split in SPLITS}
@@ -59,8 +60,10 @@ def test_splits(root: Path, strips: Any) -> None:
 
 
 @pytest.mark.parametrize("erp_height", [32, 8])
-def test_reads_what_was_written(root: Path, strips: Any, erp_height: int) -> None:
-    module = OmniSynthia(root, type(strips)(erp_height), inputs=("rgb", "depth"))
+def test_reads_what_was_written(root: Path, erp: Any, erp_height: int) -> None:
+    module = OmniSynthia(
+        root, EquirectRepresentation(3, erp_height=erp_height), inputs=("rgb", "depth")
+    )
     source = module.source("test")
     panorama = source.read(1)
     pano = synthia.sequence(root, "04") / "pano"
@@ -87,12 +90,12 @@ def test_reads_what_was_written(root: Path, strips: Any, erp_height: int) -> Non
 # --- making --------------------------------------------------------------------------------------
 
 
-def test_panoramas_are_made_from_views(tmp_path: Path, strips: Any) -> None:
+def test_panoramas_are_made_from_views(tmp_path: Path, erp: Any) -> None:
     root = synthia.write_views(tmp_path, {"01": 3})
     synthia.write_panoramas(root, {"04": 1})
     # Numbers, as YAML reads them.
     sequences = {"train_sequences": [1], "test_sequences": [4]}
-    module = two(root, strips, panorama_height=64, frames=2, **sequences)
+    module = two(root, erp, panorama_height=64, frames=2, **sequences)
     with pytest.raises(DataError, match=r"pano/RGB: found no panoramas.*tangent-prepare"):
         module.setup()
     module.prepare_data()
@@ -102,9 +105,9 @@ def test_panoramas_are_made_from_views(tmp_path: Path, strips: Any) -> None:
     labels = module.source("train").read(0).labels
     assert labels.shape == (16, 32)
     assert set(np.unique(labels).tolist()) == set(range(14))
-    two(root, strips, panorama_height=64, frames=2).make_files()
+    two(root, erp, panorama_height=64, frames=2).make_files()
     with pytest.raises(DataError, match="found height=64"):
-        two(root, strips, frames=2).make_files()
+        two(root, erp, frames=2).make_files()
 
 
 # --- what cannot be used -------------------------------------------------------------------------
@@ -112,10 +115,10 @@ def test_panoramas_are_made_from_views(tmp_path: Path, strips: Any) -> None:
 
 @pytest.mark.parametrize(("part", "dtype"), [("GT/LABELS_Correct", np.uint16), ("Depth", np.uint8)])
 def test_another_bit_depth_is_found_before_training(
-    broken_root: Path, strips: Any, part: str, dtype: Any
+    broken_root: Path, erp: Any, part: str, dtype: Any
 ) -> None:
     place = f"pano/{part}/000001.png"
     path = synthia.sequence(broken_root, "04") / place  # training would never notice
     write_png(path, np.zeros((32, 64), dtype))
     with pytest.raises(DataError, match=f"{place}: found .*-bit grey; expected"):
-        two(broken_root, strips, inputs=("rgb", "depth")).setup("fit")
+        two(broken_root, erp, inputs=("rgb", "depth")).setup("fit")

@@ -37,11 +37,11 @@ def two(root: Path, **settings: Any) -> SynthiaPerspective:
     )
 
 
-def test_the_photos_are_the_views_of_the_panoramas(root: Path, strips: Any, tmp_path: Path) -> None:
+def test_the_photos_are_the_views_of_the_panoramas(root: Path, erp: Any, tmp_path: Path) -> None:
     photos = two(root, frames=2)
     copy = shutil.copytree(root, tmp_path / "copy")
     sequences: Any = {"train_sequences": ["01"], "test_sequences": ["04"]}
-    panoramas = OmniSynthia(copy, strips, frames=2, panorama_height=32, **sequences)
+    panoramas = OmniSynthia(copy, erp, frames=2, panorama_height=32, **sequences)
     panoramas.prepare_data()
     for split in ("train", "val", "test"):
         views = [f"{name}/{view}" for name in names_of(panoramas, split) for view in "FRBL"]

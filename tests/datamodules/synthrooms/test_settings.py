@@ -1,15 +1,11 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 
-from datamodules import SynthRooms
 from datamodules.synthrooms.settings import RoomSettings
 from tangent_train.errors import SettingError
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 def test_rooms_come_in_the_order_of_the_areas() -> None:
@@ -33,8 +29,3 @@ def test_rooms_come_in_the_order_of_the_areas() -> None:
 def test_what_cannot_work_is_named(wrong: dict[str, Any], message: str) -> None:
     with pytest.raises(SettingError, match=message):
         RoomSettings(**wrong)
-
-
-def test_a_fold_without_test_rooms(tmp_path: Path, strips: Any) -> None:
-    with pytest.raises(SettingError, match="fold 2: 2, 4"):
-        SynthRooms(tmp_path, strips, rooms={"rooms": {"1": 2, "5a": 1}}, fold=2)

@@ -1,0 +1,84 @@
+"""Settings of data sets that cannot work are refused by name, before any file is read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from datamodules import (
+    FolderPanoramas,
+    ModelNet40,
+    OmniSynthia,
+    Stanford2D3DS,
+    Stanford2D3DSPerspective,
+    SynthRooms,
+    SynthRoomsPerspective,
+)
+from datamodules.core.inputs import RGB_NORMALIZATION
+from tangent_train.errors import SettingError
+from tangent_train.rendering import EquirectRepresentation, PerspectiveRepresentation
+from tests.datamodules.folder.folder_format import write_classes
+
+ERP: Any = EquirectRepresentation(level=3)
+CROPS: Any = PerspectiveRepresentation(level=5)
+
+
+@pytest.mark.parametrize(
+    ("data", "settings", "name"),
+    [
+        (Stanford2D3DS, {"inputs": ("depth",)}, "inputs"),
+        (Stanford2D3DS, {"panoramas_per_step": 0}, "panoramas_per_step"),
+        (Stanford2D3DS, {"seed": -1}, "seed"),
+        (Stanford2D3DS, {"normalization": RGB_NORMALIZATION}, "normalization"),
+        (Stanford2D3DS, {"color_jitter": 1.1}, "color_jitter"),
+        (Stanford2D3DS, {"upright": "maybe"}, "upright"),
+        (Stanford2D3DS, {"max_tilt_deg": 0}, "max_tilt_deg"),
+        (Stanford2D3DS, {"test_rotation": "yaw"}, "test_rotation"),
+        (Stanford2D3DS, {"test_rotation": 200}, "test_rotation"),
+        (Stanford2D3DS, {"fold": 4}, "fold"),
+        (Stanford2D3DS, {"mask": "black"}, "mask"),
+        (Stanford2D3DS, {"validation_fraction": 1.0}, "validation_fraction"),
+        (Stanford2D3DS, {"areas": ("1", "7")}, "areas"),
+        (Stanford2D3DS, {"areas": ("1", "2")}, "areas"),
+        (Stanford2D3DS, {"areas": ("5a", "5b")}, "areas"),
+        (OmniSynthia, {"train_sequences": ()}, "train_sequences"),
+        (OmniSynthia, {"train_sequences": ("03",)}, "train_sequences"),
+        (OmniSynthia, {"test_sequences": ()}, "test_sequences"),
+        (OmniSynthia, {"test_sequences": ("01",)}, "test_sequences"),
+        (FolderPanoramas, {"test_fraction": 0}, "test_fraction"),
+        (FolderPanoramas, {"split_seed": -1}, "split_seed"),
+        (FolderPanoramas, {"depth_units_per_m": 0}, "depth_units_per_m"),
+        (FolderPanoramas, {"normalization": {"mean": [0]}}, "normalization"),
+        (ModelNet40, {"shapes_per_step": 0}, "shapes_per_step"),
+        (ModelNet40, {"validation_fraction": 1}, "validation_fraction"),
+        (ModelNet40, {"test_rotation": "z"}, "test_rotation"),
+        (ModelNet40, {"normalization": {"mean": [0] * 3, "std": [1] * 3}}, "normalization"),
+    ],
+    ids=lambda value: value.__name__ if isinstance(value, type) else str(value),
+)
+def test_impossible_settings(
+    data: Any, settings: dict[str, Any], name: str, tmp_path: Path
+) -> None:
+    if data is FolderPanoramas:
+        write_classes(tmp_path / "data")
+    with pytest.raises(SettingError, match=rf"data\.{name}"):
+        data(tmp_path / "data", ERP, **settings)
+
+
+@pytest.mark.parametrize(
+    ("data", "representation", "settings", "message"),
+    [
+        (Stanford2D3DSPerspective, ERP, {}, "EquirectRepresentation; expected one for photos"),
+        (Stanford2D3DS, CROPS, {}, "PerspectiveRepresentation; expected one for panoramas"),
+        (ModelNet40, CROPS, {}, "representation=tangent"),
+        (SynthRooms, ERP, {"rooms": {"rooms": {"1": 2}}, "fold": 2}, "fold 2: 2, 4"),
+        (SynthRoomsPerspective, CROPS, {"rooms": {}}, "views_per_camera: found 0"),
+    ],
+)
+def test_what_does_not_go_together(
+    data: Any, representation: Any, settings: dict[str, Any], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(SettingError, match=message):
+        data(tmp_path, representation, **settings)
