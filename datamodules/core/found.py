@@ -57,19 +57,18 @@ class Found(Generic[_Item]):
         """Items of some splits."""
         return [item for split in splits for item in self.splits[split]]
 
-    def check(self, problems: Problems, *, progress: bool) -> int:
+    def check(self, problems: Problems) -> int:
         """Decode every file by itself and note what is broken; nothing is written.
 
         Args:
             problems: Known problems; new ones are added.
-            progress: Whether to show a progress bar.
 
         Returns:
             How many images or shapes were read.
         """
         items = problems.without(self.of())
         parts = getattr(self.read, "parts", partial(_whole, self.read))
-        self._note(problems, parts, items, "Checking", show=progress)
+        self._note(problems, parts, items, "Checking")
         return len(items)
 
     def read_all(self, splits: Sequence[Split], problems: Problems) -> None:
@@ -82,7 +81,7 @@ class Found(Generic[_Item]):
         if missing:
             before = len(items) - len(missing)
             make = partial(_stored, self.read, store)
-            self._note(problems, make, missing, f"Preparing {self.noun}", before=before)
+            self._note(problems, make, missing, f"Preparing {self.noun}", before)
 
     def read_some(self, seed: int, problems: Problems) -> None:
         """Decode some images from all over the data set, for a second or two; note what is broken.
@@ -113,9 +112,7 @@ class Found(Generic[_Item]):
         reads: Callable[[Any], Iterable[Callable[[], object]]],
         items: Sequence[_Item],
         what: str,
-        *,
         before: int = 0,
-        show: bool = True,
     ) -> None:
         """Do what is to be done with every image, and note what is broken."""
 
@@ -126,7 +123,7 @@ class Found(Generic[_Item]):
 
         with closing(self.in_parallel(partial(_failures, reads), items)) as work:
             total = before + len(items)
-            show_progress(noted(), what, self.noun, total, before=before, show=show)
+            show_progress(noted(), what, self.noun, total, before)
 
 
 def _add(problems: Problems, item: Item, errors: Iterable[Exception]) -> None:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import os
 from abc import ABC, abstractmethod
 from itertools import combinations, pairwise
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
-from datamodules.images.gpano import area_of, whole_area
-from datamodules.images.image_files import find_images
+from datamodules.images.gpano import area_of
+from datamodules.images.image_files import find_images, short_names
 from datamodules.images.pixel_files import read_rgb
 from tangent_train.errors import DataError, SettingError
 
@@ -152,12 +151,7 @@ class ImagePairs(PanoramaPairs):
         indices = range(len(paths))
         chosen = pairwise(indices) if pairing == "consecutive" else combinations(indices, 2)
         self._pairs = list(chosen)
-        absolute = [path.absolute() for path in paths]
-        root = os.path.commonpath([path.parent for path in absolute])
-        relative = [path.relative_to(root) for path in absolute]
-        short = [path.with_suffix("").as_posix() for path in relative]
-        unique = len(set(short)) == len(set(paths))
-        self._names = short if unique else [path.as_posix() for path in relative]
+        self._names = short_names(paths)
 
     @property
     def names(self) -> list[str]:
@@ -182,5 +176,4 @@ class ImagePairs(PanoramaPairs):
         path = self._paths[index]
         rgb = read_rgb(path)
         size = (rgb.shape[0], rgb.shape[1])
-        area = area_of(path, size) or whole_area(path, size)
-        return PairedPanorama(self._names[index], area.place(rgb), path)
+        return PairedPanorama(self._names[index], area_of(path, size).place(rgb), path)

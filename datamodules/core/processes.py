@@ -13,35 +13,20 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import cv2
 
-from tangent_train.errors import SettingError
-
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterator, Sequence
 
-__all__ = ["in_processes", "number_of_processes"]
+__all__ = ["in_processes"]
 
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _Result = TypeVar("_Result")
 
 
-def number_of_processes(workers: int | None, pieces: int, least: int = 1) -> int:
-    """Number of processes for a piece of work.
-
-    Args:
-        workers: Requested number; by default one per CPU core.
-        pieces: Number of pieces of work.
-        least: Pieces per process that justify starting it.
-
-    Raises:
-        SettingError: The number asked for is negative.
-    """
-    if workers is not None and workers < 0:
-        raise SettingError("workers", found=workers, expected="0 or more, or None")
-    return min(os.cpu_count() or 1 if workers is None else workers, -(-pieces // least))
-
-
 def in_processes(
-    work: Callable[..., _Result], pieces: Sequence[tuple[Any, ...]], processes: int
+    work: Callable[..., _Result],
+    pieces: Sequence[tuple[Any, ...]],
+    workers: int | None = None,
+    least: int = 1,
 ) -> Generator[_Result]:
     """``work(*piece)`` of all pieces, in the order in which they are done.
 
@@ -50,8 +35,11 @@ def in_processes(
     Args:
         work: A function of a module.
         pieces: Its arguments.
-        processes: Number of processes; 0 and 1 work in this one.
+        workers: Number of processes, by default one per CPU core; 0 and 1 work in this one.
+        least: Pieces per process that justify starting it.
     """
+    cores = os.cpu_count() or 1
+    processes = min(cores if workers is None else workers, -(-len(pieces) // least))
     if processes <= 1:
         for piece in pieces:
             yield work(*piece)

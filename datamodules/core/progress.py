@@ -1,9 +1,10 @@
-"""Progress bars of work on files."""
+"""Progress bars of work on files, on a terminal only."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from rich import get_console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 if TYPE_CHECKING:
@@ -12,12 +13,8 @@ if TYPE_CHECKING:
 __all__ = ["progress_bar", "show_progress"]
 
 
-def progress_bar(*, show: bool = True) -> Progress:
-    """A bar for tasks with a field `rate`.
-
-    Args:
-        show: Whether to show anything.
-    """
+def progress_bar() -> Progress:
+    """A bar for tasks with a field `rate`."""
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -25,7 +22,7 @@ def progress_bar(*, show: bool = True) -> Progress:
         TextColumn("{task.fields[rate]}"),
         TimeRemainingColumn(),
     )
-    return Progress(*columns, disable=not show)
+    return Progress(*columns, disable=not get_console().is_terminal)
 
 
 def show_progress(
@@ -33,11 +30,9 @@ def show_progress(
     description: str,
     unit: str,
     total: int,
-    *,
     before: int = 0,
-    show: bool = True,
 ) -> None:
-    """Consume finished pieces of work and show the progress.
+    """Consume finished pieces of work and show the progress, unless all were done before.
 
     Args:
         done: Yields something whenever a piece is done.
@@ -45,9 +40,10 @@ def show_progress(
         unit: Pieces, in the plural.
         total: Number of pieces.
         before: Pieces that were done before.
-        show: Whether to show anything.
     """
-    with progress_bar(show=show) as bar:
+    if before == total:
+        return
+    with progress_bar() as bar:
         task = bar.add_task(description, total=total, rate="")
         bar.advance(task, before)
         for _ in done:

@@ -19,7 +19,7 @@ from torch.utils.data import DataLoader, Dataset
 from datamodules.core.class_weights import ClassWeights, class_weights
 from datamodules.core.found import SPLITS, Found, Split
 from datamodules.core.inputs import Normalization
-from datamodules.core.loading import at_least, explained, make_loader, this_process
+from datamodules.core.loading import at_least, make_loader, this_process
 from datamodules.core.pipeline import Item, SplitItems, in_threads
 from datamodules.core.problems import Problems
 from datamodules.core.sampling import EpochSampler
@@ -179,11 +179,8 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
             self._found = self._usable()
         return self._found
 
-    def check(self, *, progress: bool = True) -> tuple[Problems, int]:
+    def check(self) -> tuple[Problems, int]:
         """Read the whole data set; nothing is generated or written.
-
-        Args:
-            progress: Whether to show a progress bar.
 
         Returns:
             All problems, and the number of images or shapes read.
@@ -197,7 +194,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
                     expected="the data set",
                     remedy="Run tangent-prepare with the same settings.",
                 )
-            count = self._listed(problems).check(problems, progress=progress)
+            count = self._listed(problems).check(problems)
         return problems, count
 
     def check_classes(self) -> None:
@@ -381,18 +378,6 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
     def test_dataloader(self) -> DataLoader[Any]:
         """Batches for the test."""
         return self._evaluation_loader("test")
-
-    def explained(self, error: Exception) -> Exception:
-        """Explain an error during training or evaluation.
-
-        Args:
-            error: As a loader raised it, perhaps for one of its workers.
-
-        Returns:
-            The error of a worker as raised there; a remedy if a worker was killed; or
-            the same error.
-        """
-        return explained(error, self.num_workers)
 
     def _evaluation_loader(self, split: Split) -> DataLoader[Any]:
         dataset = self.evaluation_samples(split)

@@ -94,7 +94,7 @@ class PanoramaArea:
         return resize_nearest(rows, (height, 1))[:, 0], resize_nearest(columns, (1, width))[0]
 
 
-def area_of(path: Path, size: tuple[int, int]) -> PanoramaArea | None:
+def area_of(path: Path, size: tuple[int, int]) -> PanoramaArea:
     """The place of an image by its own GPano tags.
 
     Images resized after the tags were written are assumed to show the same area.
@@ -104,10 +104,10 @@ def area_of(path: Path, size: tuple[int, int]) -> PanoramaArea | None:
         size: Its rows and columns.
 
     Returns:
-        None if tags are missing.
+        The whole sphere if tags are missing, see `whole_area`.
 
     Raises:
-        DataError: The tags cannot be those of such an image.
+        DataError: The tags cannot be those of such an image, or none say what it shows.
     """
     tags = _gpano_tags(path)
     projection = tags.get("ProjectionType", "equirectangular")
@@ -119,7 +119,7 @@ def area_of(path: Path, size: tuple[int, int]) -> PanoramaArea | None:
             remedy="Export the panorama in that projection.",
         )
     if not all(name in tags for name in _SIZES):
-        return None
+        return whole_area(path, size)
     full_width, full_height, width, height, left, top = (
         _number(path, name, tags[name], 1e9) for name in _SIZES
     )

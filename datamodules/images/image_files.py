@@ -1,21 +1,22 @@
-"""Finding the user's own images and depth maps."""
+"""Finding and naming the user's own images and depth maps."""
 
 from __future__ import annotations
 
 import glob
 import os
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tangent_train.errors import DataError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Sequence
     from contextlib import AbstractContextManager
 
     Noted = Callable[..., AbstractContextManager[None]]
 
-__all__ = ["DEPTH_SUFFIXES", "IMAGE_SUFFIXES", "find_depth", "find_images"]
+__all__ = ["DEPTH_SUFFIXES", "IMAGE_SUFFIXES", "find_depth", "find_images", "short_names"]
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
 """Suffixes of images, in lower case."""
@@ -100,3 +101,22 @@ def find_depth(folder: Path, name: str, remedy: str) -> Path:
             remedy="" if found else remedy,
         )
     return found[0]
+
+
+def short_names(paths: Sequence[Path]) -> list[str]:
+    """A name for every image: its path below the folder all are in, without suffix.
+
+    Images that would share a name keep their suffix.
+
+    >>> short_names([Path("a/x/1.jpg"), Path("a/1.jpg"), Path("a/1.png")])
+    ['x/1', '1.jpg', '1.png']
+    """
+    # Without "..", which would lead out of the output folder.
+    absolute = [Path(os.path.abspath(path)) for path in paths]  # noqa: PTH100
+    shared = len(Path(os.path.commonpath([path.parent for path in absolute])).parts)
+    whole = [Path(*path.parts[shared:]) for path in absolute]
+    short = [path.with_suffix("") for path in whole]
+    # Upper and lower case are the same file on some disks; "1.jpg.png" without suffix is "1.jpg".
+    taken = Counter(str(path).casefold() for path in (*short, *whole))
+    chosen = zip(whole, short, strict=True)
+    return [(a if taken[str(b).casefold()] > 1 else b).as_posix() for a, b in chosen]

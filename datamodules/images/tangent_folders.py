@@ -52,8 +52,8 @@ def read_panorama(path: Path, interpolation: Interpolation) -> NDArray[Any]:
     """
     image = read_pixels(path, indices=interpolation == "nearest")
     size = (image.shape[0], image.shape[1])
-    area = area_of(path, size) if path.suffix.lower() in IMAGE_SUFFIXES else None
-    return (area or whole_area(path, size)).place(image)
+    tagged = path.suffix.lower() in IMAGE_SUFFIXES
+    return (area_of(path, size) if tagged else whole_area(path, size)).place(image)
 
 
 def shrink_to_level(image: NDArray[Any], level: int) -> NDArray[Any]:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from datamodules.core.found import Found, Split
 from datamodules.core.group_drawing import draw_groups
 from datamodules.core.pipeline import SplitItems
-from datamodules.core.processes import in_processes, number_of_processes
+from datamodules.core.processes import in_processes
 from datamodules.core.split_module import Kind, SplitDataModule
 from datamodules.core.store import Store
 from datamodules.modelnet40.shape_files import MODELNET40, ShapeFile, find_shapes
@@ -136,5 +136,4 @@ class ModelNet40(SplitDataModule[ShapeFile]):
 
 def _in_processes(work: Callable[[ShapeFile], Any], meshes: Sequence[ShapeFile]) -> Generator[Any]:
     # Not threads: reading meshes holds the GIL.
-    processes = number_of_processes(None, len(meshes), _PER_PROCESS)
-    return in_processes(work, [(mesh,) for mesh in meshes], processes)
+    return in_processes(work, [(mesh,) for mesh in meshes], least=_PER_PROCESS)

@@ -165,7 +165,6 @@ def make_panoramas(
     *,
     frames: int = FRAMES,
     height: int = HEIGHT,
-    progress: bool = True,
 ) -> int:
     """Write the panoramas of OmniSYNTHIA, as published, from the views of SYNTHIA.
 
@@ -178,7 +177,6 @@ def make_panoramas(
         problems: Broken views are added under the name of the panorama.
         frames: Approximate number per sequence, see `choose_frames`.
         height: Rows of the panoramas.
-        progress: Whether to show a progress bar.
 
     Returns:
         Number of panoramas to generate.
@@ -196,12 +194,10 @@ def make_panoramas(
             chosen = choose_frames(list_frames(sequence_folder(root, sequence)), frames)
             jobs += _unfinished(root, sequence, chosen, height, problems)
             total += len(chosen)
-    if jobs:
-        # Threads: OpenCV leaves the GIL alone, and the tables are shared. As fast as processes.
-        # Closed: an interrupt drops what is queued.
-        with closing(in_threads(lambda make: make(), jobs)) as done:
-            bar: Any = {"before": total - len(jobs), "show": progress}
-            show_progress(done, "Making panoramas", "panoramas", total, **bar)
+    # Threads: OpenCV leaves the GIL alone, and the tables are shared. As fast as processes.
+    # Closed: an interrupt drops what is queued.
+    with closing(in_threads(lambda make: make(), jobs)) as done:
+        show_progress(done, "Making panoramas", "panoramas", total, total - len(jobs))
     return len(jobs)
 
 

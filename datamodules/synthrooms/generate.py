@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from datamodules.core.made_folders import claim_folder
-from datamodules.core.processes import in_processes, number_of_processes
+from datamodules.core.processes import in_processes
 from datamodules.core.progress import show_progress
 from datamodules.stanford2d3ds.files import AREAS
 from datamodules.synthrooms.camera import PanoramaView, PerspectiveView, Pose, draw_view
@@ -60,9 +60,7 @@ def plan_rooms(settings: RoomSettings) -> list[RoomPlan]:
     return plans
 
 
-def generate_rooms(
-    root: Path, settings: RoomSettings, *, workers: int | None = None, progress: bool = True
-) -> None:
+def generate_rooms(root: Path, settings: RoomSettings, *, workers: int | None = None) -> None:
     """Write a data set in Stanford2D3DS's format; finished rooms are kept.
 
     The same settings give the same bytes for any number of workers, whether or not the work was
@@ -72,13 +70,10 @@ def generate_rooms(
         root: Folder of the data set: new, empty, or of the same settings.
         settings: Settings of the generator.
         workers: Processes; 0 and 1 work in this one. By default one per CPU core.
-        progress: Whether to show a progress bar.
 
     Raises:
         DataError: The folder holds other files, or rooms of other settings. Nothing is written.
-        SettingError: The number of workers is negative.
     """
-    number_of_processes(workers, 0)
     claim_folder(root, MANIFEST, "SynthRooms", _VERSION, asdict(settings))
     plans = plan_rooms(settings)
     labels = root / "semantic_labels.json"
@@ -95,12 +90,9 @@ def generate_rooms(
             for kind in SUFFIXES
         )
     ]
-    if not unfinished:
-        return
-    pieces = [(root, settings, plan) for plan in unfinished]
-    making = in_processes(make_room, pieces, number_of_processes(workers, len(pieces)))
+    making = in_processes(make_room, [(root, settings, plan) for plan in unfinished], workers)
     before = len(plans) - len(unfinished)
-    show_progress(making, "Rendering rooms", "rooms", len(plans), before=before, show=progress)
+    show_progress(making, "Rendering rooms", "rooms", len(plans), before)
 
 
 def make_room(root: Path, settings: RoomSettings, plan: RoomPlan) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from trimesh.exchange.off import export_off
 
 from datamodules.core.made_folders import claim_folder
-from datamodules.core.processes import in_processes, number_of_processes
+from datamodules.core.processes import in_processes
 from datamodules.core.progress import show_progress
 from datamodules.synthshapes import furniture, vessels
 from datamodules.synthshapes.parts import Parts
@@ -83,9 +83,7 @@ def plan_shapes(settings: ShapeSettings) -> dict[str, tuple[str, int]]:
     }
 
 
-def generate_shapes(
-    root: Path, settings: ShapeSettings, *, workers: int | None = None, progress: bool = True
-) -> None:
+def generate_shapes(root: Path, settings: ShapeSettings, *, workers: int | None = None) -> None:
     """Write a data set in ModelNet40's tree; finished files are kept.
 
     The same settings give the same bytes for any number of workers, whether or not the work was
@@ -96,23 +94,17 @@ def generate_shapes(
         settings: Settings of the generator.
         workers: Processes; 0 and 1 work in this one. By default one per CPU core, fewer for little
             work.
-        progress: Whether to show a progress bar.
 
     Raises:
         DataError: The folder holds other files, or shapes of other settings. Nothing is written.
-        SettingError: The number of workers is negative.
     """
     plans = plan_shapes(settings)
-    processes = number_of_processes(workers, len(plans), _PER_PROCESS)
     claim_folder(root, MANIFEST, "SynthShapes", _VERSION, asdict(settings))
     missing = [file for file in plans if not (root / file).exists()]
-    if missing:
-        pieces = [(root / file, settings.seed, *plans[file]) for file in missing]
-        making = in_processes(_write, pieces, processes)
-        before = len(plans) - len(missing)
-        show_progress(
-            making, "Generating shapes", "shapes", len(plans), before=before, show=progress
-        )
+    pieces = [(root / file, settings.seed, *plans[file]) for file in missing]
+    making = in_processes(_write, pieces, workers, _PER_PROCESS)
+    before = len(plans) - len(missing)
+    show_progress(making, "Generating shapes", "shapes", len(plans), before)
 
 
 def _write(path: Path, seed: int, label: str, number: int) -> None:

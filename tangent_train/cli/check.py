@@ -31,7 +31,7 @@ def check(settings: Mapping[str, Any]) -> None:
     representation = make(settings["representation"], "representation")
     data = make(settings["data"], "data", representation=representation)
     console = Console(highlight=False)
-    problems, count = data.check(progress=console.is_terminal)
+    problems, count = data.check()
     listed = problems.listed()
     read = f"{count} {data.noun} of {_printable(str(data.root))} were read"
     if listed and console.is_terminal:

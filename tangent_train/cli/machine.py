@@ -6,6 +6,7 @@ import threading
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
+from datamodules.core.loading import explained
 from tangent_train.files import no_room
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ def machine_faults(folder: Path, data: Any) -> Iterator[None]:
     try:
         yield
     except (OSError, EOFError, RuntimeError, ValueError) as error:
-        told = no_room(folder, error) or data.explained(error)
+        told = no_room(folder, error) or explained(error, data.num_workers)
         if told is error:
             raise
         raise told from error

@@ -14,7 +14,7 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from datamodules.images.image_files import find_images
+from datamodules.images.image_files import find_images, short_names
 from tangent_train.checkpoints.trained import load_trained
 from tangent_train.cli.each import each
 from tangent_train.cli.settings import typed
@@ -26,7 +26,6 @@ from tangent_train.results.predictions import (
     Entry,
     PredictionFolder,
     class_shares,
-    output_names,
 )
 
 if TYPE_CHECKING:
@@ -179,7 +178,7 @@ def _find_images(settings: Settings) -> dict[str, Path]:
     ]
     if not paths:
         raise SettingError("input", found=f"only results in {settings.output}", expected="images")
-    return dict(zip(output_names(paths), paths, strict=True))
+    return dict(zip(short_names(paths), paths, strict=True))
 
 
 def _predictor(settings: Settings, trained: TrainedNetwork) -> Predictor:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from rich.console import Console
 
-from datamodules.images.image_files import find_images
+from datamodules.images.image_files import find_images, short_names
 from datamodules.images.pixel_files import LOSSY_SUFFIXES, PIXEL_SUFFIXES, write_pixels
 from datamodules.images.tangent_folders import (
     read_panorama,
@@ -24,7 +24,6 @@ from tangent_train.errors import DataError, SettingError
 from tangent_train.geometry import TangentGrid, nearest_level, random_rotation, rotation_about
 from tangent_train.rendering.camera_files import CAMERAS_FILE, CameraFile, read_cameras
 from tangent_train.rendering.figure import tangent_figure
-from tangent_train.results.predictions import output_names
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -104,7 +103,7 @@ def _forward(settings: Settings) -> tuple[_Work, dict[Path, Path]]:
         raise SettingError("format", found=settings.format, expected=expected)
     rotation = _rotation(settings)
     output = Path() if settings.output is None else settings.output
-    jobs = {output / name: path for name, path in zip(output_names(paths), paths, strict=True)}
+    jobs = {output / name: path for name, path in zip(short_names(paths), paths, strict=True)}
     _refuse_existing(settings, [*(jobs if settings.output else ()), settings.figure])
 
     def work(folder: Path, path: Path, progress: Callable[[float], object]) -> Path:

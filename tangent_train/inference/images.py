@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from datamodules.core.panoramas import meters_to_steps, resize_nearest
-from datamodules.images.gpano import PanoramaArea, area_of, area_of_crop, up_of, whole_area
+from datamodules.images.gpano import PanoramaArea, area_of, area_of_crop, up_of
 from datamodules.images.image_files import find_depth
 from datamodules.images.pixel_files import photo_fov_deg, read_depth_m, read_rgb
 from tangent_train.errors import DataError
@@ -92,10 +92,7 @@ def read_panorama(
     """
     rgb = read_rgb(path)
     size = (rgb.shape[0], rgb.shape[1])
-    if crop is not None:
-        area = area_of_crop(size, crop)
-    else:
-        area = area_of(path, size) or whole_area(path, size)
+    area = area_of(path, size) if crop is None else area_of_crop(size, crop)
     whole = area.place(rgb)
     up = None if upright is None else up_of(path)
     if up is None and upright == "auto":

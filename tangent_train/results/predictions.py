@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -30,7 +28,7 @@ if TYPE_CHECKING:
     from tangent_train.inference.views import InputImage
     from tangent_train.rendering.mosaic import ScoreMosaic
 
-__all__ = ["Entry", "PredictionFolder", "class_shares", "output_names"]
+__all__ = ["Entry", "PredictionFolder", "class_shares"]
 
 _ROWS_AT_ONCE = 64
 _SUMMARY = "summary.json"
@@ -41,25 +39,6 @@ _RESULTS = (
 
 Entry = dict[str, Any]
 """Entry of an image: file, name, rows, columns and ``classes``, or file, name and error."""
-
-
-def output_names(paths: Sequence[Path]) -> list[str]:
-    """A name for every image: its path below the folder all are in, without suffix.
-
-    Images that would share a name keep their suffix.
-
-    >>> output_names([Path("a/x/1.jpg"), Path("a/1.jpg"), Path("a/1.png")])
-    ['x/1', '1.jpg', '1.png']
-    """
-    # Without "..", which would lead out of the output folder.
-    absolute = [Path(os.path.abspath(path)) for path in paths]  # noqa: PTH100
-    shared = len(Path(os.path.commonpath([path.parent for path in absolute])).parts)
-    whole = [Path(*path.parts[shared:]) for path in absolute]
-    short = [path.with_suffix("") for path in whole]
-    # Upper and lower case are the same file on some disks; "1.jpg.png" without suffix is "1.jpg".
-    taken = Counter(str(path).casefold() for path in (*short, *whole))
-    chosen = zip(whole, short, strict=True)
-    return [(a if taken[str(b).casefold()] > 1 else b).as_posix() for a, b in chosen]
 
 
 def class_shares(
@@ -177,7 +156,7 @@ class PredictionFolder:
         """Write labels, coloured labels and overlay of one image, and probabilities if wanted.
 
         Args:
-            name: From `output_names`.
+            name: From `short_names`.
             rgb: ``(h, w, 3)`` the image.
             labels: ``(h, w)`` its labels.
             scores: Those of the photo, or of the whole sphere.

@@ -33,7 +33,7 @@ def erp() -> EquirectRepresentation:
 def tiny_rooms(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Rooms of `TINY_ROOMS`; not to be changed."""
     root = tmp_path_factory.mktemp("data") / "rooms"
-    generate_rooms(root, TINY_ROOMS, workers=0, progress=False)
+    generate_rooms(root, TINY_ROOMS, workers=0)
     return root
 
 
@@ -41,5 +41,5 @@ def tiny_rooms(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def tiny_shapes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Shapes of `TINY_SHAPES`; not to be changed."""
     root = tmp_path_factory.mktemp("data") / "shapes"
-    generate_shapes(root, TINY_SHAPES, workers=0, progress=False)
+    generate_shapes(root, TINY_SHAPES, workers=0)
     return root

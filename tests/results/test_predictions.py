@@ -11,15 +11,11 @@ import numpy as np
 import pytest
 
 from datamodules.images.gpano import area_of_crop
+from datamodules.images.image_files import short_names
 from tangent_train.errors import SettingError
 from tangent_train.geometry import camera_matrix_from_fov
 from tangent_train.inference.views import InputImage
-from tangent_train.results.predictions import (
-    Entry,
-    PredictionFolder,
-    class_shares,
-    output_names,
-)
+from tangent_train.results.predictions import Entry, PredictionFolder, class_shares
 
 NAMES = ("unknown", "up", "down")
 
@@ -37,7 +33,7 @@ NAMES = ("unknown", "up", "down")
     ],
 )
 def test_names_are_short_and_unlike(paths: list[str], names: list[str]) -> None:
-    assert output_names([Path(path) for path in paths]) == names
+    assert short_names([Path(path) for path in paths]) == names
 
 
 def test_earlier_results_are_refused(tmp_path: Path) -> None:

@@ -12,9 +12,10 @@ import torch
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from datamodules.images.image_files import short_names
 from datamodules.images.pixel_files import write_pixels
 from tangent_train.cli.keypoints import file_name
-from tangent_train.results.predictions import PredictionFolder, output_names
+from tangent_train.results.predictions import PredictionFolder
 from tests.cli.tiny_runs import run_command
 from tests.inference.trained import write_checkpoint
 
@@ -28,7 +29,7 @@ _PARTS = st.text(st.characters(exclude_characters="/\0", codec="utf-8"), min_siz
 def test_predictions_stay_in_their_folder(names: list[list[str]]) -> None:
     paths = [Path("images", *parts) for parts in names]
     folder = PredictionFolder(Path("/output"), ("unknown", "wall"), probabilities=True)
-    for name in output_names(paths):
+    for name in short_names(paths):
         for file in folder.files(name).values():
             assert file.is_relative_to("/output")
             assert ".." not in file.parts

@@ -48,7 +48,7 @@ def test_namesakes_are_told_apart(tmp_path: Path) -> None:
     assert ImagePairs(input=pattern).names == ["one/room – two/room"]
     assert ImagePairs(input=str(tmp_path / "two")).names == ["room.jpg – room.png"]
     twice = ImagePairs(left=str(tmp_path / "one/room.png"), right=str(tmp_path / "one/room.png"))
-    assert twice.names == ["room – room"]
+    assert twice.names == ["room.png – room.png"]
 
 
 @pytest.mark.parametrize(

@@ -80,7 +80,7 @@ def test_a_data_set_is_a_reader_and_its_files(tmp_path: Path) -> None:
     expected = cv2.imread(str(tmp_path / "labels" / "c.png"), cv2.IMREAD_UNCHANGED)
     sample = data.evaluation_samples("test")[0, 0]
     np.testing.assert_array_equal(sample.target, expected)
-    problems, count = data.check(progress=False)
+    problems, count = data.check()
     assert not problems.items
     assert count == 3
 
@@ -88,7 +88,7 @@ def test_a_data_set_is_a_reader_and_its_files(tmp_path: Path) -> None:
 def test_labels_past_the_classes_are_found(tmp_path: Path) -> None:
     _write(tmp_path, 4)
     data = _toy(tmp_path)
-    problems, _ = data.check(progress=False)
+    problems, _ = data.check()
     assert problems.items == {"a", "b", "c"}
     with pytest.raises(DataError, match=r"labels/c\.png: found label 4; expected 0 .* to 3"):
         data.source("test").labels(0)
@@ -113,4 +113,4 @@ def test_a_data_set_without_images_is_refused(tmp_path: Path) -> None:
     data = _toy(tmp_path / "nowhere")
     with pytest.raises(DataError, match="nowhere: found no panoramas"):
         data.prepare_data()
-    assert data.check(progress=False)[0]
+    assert data.check()[0]

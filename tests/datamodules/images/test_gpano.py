@@ -88,7 +88,9 @@ def test_images_that_say_nothing(tmp_path: Path) -> None:
         _save(tmp_path / "other.jpg", other),
     ]
     for path in paths:
-        assert area_of(path, (40, 60)) is None, path.name
+        assert area_of(path, (30, 60)) == whole_area(path, (30, 60)), path.name
+        with pytest.raises(DataError, match="a whole panorama"):
+            area_of(path, (40, 60))
         assert up_of(path) is None
 
 

@@ -28,7 +28,7 @@ ROOMS = RoomSettings(rooms={"1": 3}, least_cameras=2, height=64, supersample=1)
 @pytest.fixture(scope="module")
 def rooms(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("pairs") / "rooms"
-    generate_rooms(root, ROOMS, workers=0, progress=False)
+    generate_rooms(root, ROOMS, workers=0)
     return root
 
 

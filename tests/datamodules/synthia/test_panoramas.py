@@ -27,7 +27,7 @@ PARTS = {"rgb": "RGB", "labels": "GT/LABELS_Correct", "depth": "Depth"}
 
 def make(root: Path, *sequences: str, **settings: Any) -> int:
     problems = Problems()
-    arguments = {"height": HEIGHT, "progress": False, **settings}
+    arguments = {"height": HEIGHT, **settings}
     count = make_panoramas(root, sequences, problems, **arguments)
     problems.refuse(root)
     return count

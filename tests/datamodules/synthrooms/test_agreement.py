@@ -69,7 +69,7 @@ def at_nearest(image: NDArray[Any], pixels: NDArray[Any]) -> NDArray[Any]:
 def shots(tmp_path_factory: pytest.TempPathFactory) -> list[Shot]:
     """A panorama and views of the same camera."""
     root = tmp_path_factory.mktemp("data") / "true"
-    generate_rooms(root, TRUE, workers=0, progress=False)
+    generate_rooms(root, TRUE, workers=0)
     (plan,) = plan_rooms(TRUE)
     frames = ("equirectangular", "0", "1", "2")
     return [read(root / plan.file(plan.cameras[0], frame, "rgb")) for frame in frames]

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 def rooms(tmp_path_factory: pytest.TempPathFactory) -> list[NDArray[np.uint8]]:
     root: Path = tmp_path_factory.mktemp("rooms")
     settings = RoomSettings(seed=5, rooms={"1": 8}, height=128, supersample=2)
-    generate_rooms(root, settings, workers=1, progress=False)
+    generate_rooms(root, settings, workers=1)
     paths = sorted(root.glob("area_1/pano/rgb/*.png"))
     return [cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB) for path in paths]
 

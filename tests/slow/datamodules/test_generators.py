@@ -29,5 +29,5 @@ def test_the_same_bytes_for_any_number_of_processes(
 ) -> None:
     monkeypatch.setattr(shapes, "_PER_PROCESS", 1)
     for workers in (0, 2):
-        generate(tmp_path / f"{workers}", settings, workers=workers, progress=bool(workers))
+        generate(tmp_path / f"{workers}", settings, workers=workers)
     assert contents(tmp_path / "2") == contents(tmp_path / "0")

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 def _found(kind: str, root: Path, **settings: Any) -> dict[str, str]:
     """Finding by file, relative to the root."""
-    problems, _ = module(kind, root, **settings).check(progress=False)
+    problems, _ = module(kind, root, **settings).check()
     return {
         os.path.relpath(problem.file, root): f"{problem.finding} | {problem.remedy}"
         for problem in problems.listed()
@@ -45,7 +45,7 @@ def test_a_good_data_set_has_no_problem_whatever_its_folder_is_called(
 ) -> None:
     write(kind, root, fabricate_stanford)
     before = {path: path.stat().st_mtime_ns for path in root.rglob("*")}
-    problems, count = module(kind, root).check(progress=False)
+    problems, count = module(kind, root).check()
     assert not problems.listed()
     assert count == len(colors(kind, root)) > 0
     after = {path: path.stat().st_mtime_ns for path in root.rglob("*")}
@@ -104,7 +104,7 @@ def test_a_damaged_file_is_found(
     second = colors(kind, root)[1]
     path = second if part == "rgb" else partner(kind, second, part)
     damage(path)
-    problems, _ = module(kind, root).check(progress=False)
+    problems, _ = module(kind, root).check()
     by_file = {problem.file: problem for problem in problems.listed()}
     assert str(path) in by_file, by_file
     finding = by_file[str(path)].finding
@@ -154,7 +154,7 @@ def test_values_past_the_list_of_classes(root: Path, fabricate_stanford: Fabrica
 
 def test_rooms_that_are_not_generated(tmp_path: Path) -> None:
     data = SynthRooms(tmp_path / "rooms", sets.ERP, rooms={"rooms": {"area_1": 2, "area_5a": 1}})
-    (problem,) = data.check(progress=False)[0].listed()
+    (problem,) = data.check()[0].listed()
     assert problem.finding == "no such folder; expected the data set"
     assert "tangent-prepare" in problem.remedy
     assert not data.root.exists()

@@ -51,7 +51,7 @@ from pathlib import Path
 from datamodules.synthrooms.generate import generate_rooms
 from datamodules.synthrooms.settings import RoomSettings
 print("begun", flush=True)
-generate_rooms(Path(sys.argv[1]), RoomSettings(height=256), workers=2, progress=False)
+generate_rooms(Path(sys.argv[1]), RoomSettings(height=256), workers=2)
 """
 
 

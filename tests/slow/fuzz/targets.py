@@ -164,11 +164,10 @@ def _read_gpano(path: Path) -> None:
     up = up_of(path)
     assert up is None or abs(np.linalg.norm(up) - 1) < 1e-9
     area = area_of(path, (40, 60))
-    if area is not None:
-        rows, columns = area.places()
-        assert (len(rows), len(columns)) == area.image_shape
-        assert 0 <= rows.min() <= rows.max() < area.full_shape[0] <= 16384
-        assert 0 <= columns.min() <= columns.max() < area.full_shape[1] == 2 * area.full_shape[0]
+    rows, columns = area.places()
+    assert (len(rows), len(columns)) == area.image_shape
+    assert 0 <= rows.min() <= rows.max() < area.full_shape[0] <= 16384
+    assert 0 <= columns.min() <= columns.max() < area.full_shape[1] == 2 * area.full_shape[0]
 
 
 def _pixel_seeds() -> list[bytes]:
