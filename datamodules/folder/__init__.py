@@ -1,1 +1,1 @@
-"""Data sets of your own: a folder of panoramas with labels."""
+"""Data sets of your own: folders of panoramas or photos with labels."""

@@ -137,7 +137,7 @@ def read_classes(path: Path) -> FolderClasses:
         raise DataError(
             path,
             found="no such file" if path.parent.is_dir() else f"no folder {path.parent}",
-            expected="the classes of your panoramas",
+            expected="the classes of your images",
             remedy="Give data.root=<folder>; docs/own_data.md says what is in it.",
         ) from error
     except (OSError, ValueError) as error:

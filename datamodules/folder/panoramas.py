@@ -1,108 +1,22 @@
-"""A user's own panoramas: folders of images and label images, and a list of classes.
-
-On disk::
-
-    root/
-      classes.json                  see `read_classes`
-      images/[scene/]…/name.jpg     or .png, .tif, .webp: 360°×180°, twice as wide as high
-      labels/[scene/]…/name.png     values or colours of the classes, at the size of the image
-      depth/[scene/]…/name.png      or .tif, .npy, .exr, if depth is an input, see `read_depth_m`
-      train.txt val.txt test.txt    if wanted, names one per line, see `FolderSplits`
-"""
+"""A user's own panoramas: 360°×180°, twice as wide as high, in the tree of `labelled`."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-import numpy as np
-
-from datamodules.core.inputs import Input
-from datamodules.core.loading import at_least
 from datamodules.core.panorama_module import PanoramaDataModule
-from datamodules.folder.classes import UNKNOWN_NAME, read_classes
-from datamodules.folder.reader import FolderReader, list_panoramas, read_codes
-from datamodules.folder.splits import FolderSplits
-from tangent_train.errors import DataError, SettingError
+from datamodules.folder.labelled import LabelledFolder
 from tangent_train.registry import registered
 
-if TYPE_CHECKING:
-    from datamodules.core.found import Split
-    from datamodules.core.problems import Problems
-    from datamodules.core.reading import ImageFiles
-
 __all__ = ["FolderPanoramas"]
-
-_TRIED = 4
 
 
 @registered
 @dataclass(kw_only=True, eq=False, repr=False)
-class FolderPanoramas(PanoramaDataModule):
-    """A user's own panoramas, with the classes of ``classes.json``. Depth is clipped to 4 m.
-
-    Args:
-        test_fraction: Share of the scenes for test, unless there are lists, see `FolderSplits`;
-            `validation_fraction` is that of the training scenes, likewise.
-        split_seed: Of the drawing of both. Independent of the run's seed, so that runs with
-            different seeds share their splits.
-        depth_units_per_m: Units in a metre of depth files of whole numbers, 1000 for millimetres.
-
-    Attributes:
-        class_names: "unknown", then those of ``classes.json``.
+class FolderPanoramas(LabelledFolder, PanoramaDataModule):
+    """A user's own panoramas, with the classes of ``classes.json``.
 
     Raises:
         DataError: ``classes.json`` is missing or cannot be used.
         SettingError: A setting is invalid.
     """
-
-    inputs: Sequence[Input] = ("rgb",)
-    test_fraction: float = 0.2
-    split_seed: int = 0
-    depth_units_per_m: float = 1000
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not self.depth_units_per_m > 0:
-            raise SettingError(
-                "data.depth_units_per_m", found=self.depth_units_per_m, expected="more than 0"
-            )
-        if not 0 < self.test_fraction < 1:
-            raise SettingError(
-                "data.test_fraction", found=self.test_fraction, expected="above 0 to below 1"
-            )
-        at_least("data.split_seed", self.split_seed, 0)
-        # Now, not with the files: the network is made for as many classes.
-        self._classes = read_classes(self.root / "classes.json")
-        self.class_names = (UNKNOWN_NAME, *self._classes.names)
-
-    def find_images(self, problems: Problems) -> tuple[FolderReader, dict[Split, list[ImageFiles]]]:
-        """See `ImageDataModule`."""
-        panoramas = list_panoramas(self.root, problems, with_depth="depth" in self.inputs)
-        # Before any are left out: the splits do not depend on what is broken.
-        division = FolderSplits(
-            self.root, self.test_fraction, self.validation_fraction, self.split_seed
-        )
-        splits = division.divide(panoramas, problems)
-        self._check_classes(problems.without(panoramas)[:_TRIED], problems)
-        return FolderReader(self._classes, self.depth_units_per_m), splits
-
-    def _check_classes(self, panoramas: Sequence[ImageFiles], problems: Problems) -> None:
-        """Check the class list against the first few label images."""
-        classes = self._classes
-        seen: set[int] = set()
-        for files in panoramas:
-            with problems.noted(files.name):
-                stored = read_codes(files.labels, in_colors=classes.in_colors)
-                if classes.decode(stored, files.labels).any():
-                    return
-                seen |= set(np.unique(classes.pack(stored)).tolist())
-        if seen:
-            shown = classes.describe(np.array(sorted(seen), np.int32))
-            raise DataError(
-                panoramas[0].labels,
-                found=f"{shown}, in this file and the next",
-                expected=f"{classes.describe(classes.codes)}, as classes.json says",
-                remedy="Correct classes.json: no pixel would have a class.",
-            )

@@ -1,4 +1,4 @@
-"""Decoder of the files of a user's own panoramas."""
+"""Decoder of the files of a user's own images."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from datamodules.core.problems import Problems
     from datamodules.folder.classes import FolderClasses
 
-__all__ = ["FolderReader", "list_panoramas", "read_codes"]
+__all__ = ["FolderReader", "list_images", "read_codes"]
 
 # What label images may be. In grey of 1 to 4 bits the numbers may be meant, or the steps from black
 # to white that they stand for: better asked than guessed. 16 bits beside alpha are not decoded.
@@ -32,7 +32,7 @@ _COLORS = ("8-bit RGB", "8-bit RGBA", "8-bit grey", "8-bit grey with alpha", "pa
 
 @dataclass(frozen=True)
 class FolderReader(ImageReader):
-    """Reads a user's own panoramas.
+    """Reads a user's own images.
 
     Attributes:
         classes: Meaning of their labels.
@@ -71,8 +71,8 @@ class FolderReader(ImageReader):
         return meters_to_steps(read_depth_m(files.parts["depth"], self.depth_units_per_m))
 
 
-def list_panoramas(root: Path, problems: Problems, *, with_depth: bool) -> list[ImageFiles]:
-    """All panoramas of a data set, in the order of their names.
+def list_images(root: Path, problems: Problems, *, with_depth: bool) -> list[ImageFiles]:
+    """All images of a data set, in the order of their names.
 
     A name is the path of the image in ``images/`` without ending.
 

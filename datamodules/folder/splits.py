@@ -28,7 +28,7 @@ class FolderSplits:
 
     Attributes:
         root: Folder of the data set, with or without the lists. Without ``test.txt``, the test
-            panoramas are those in no other list if there is a ``train.txt``, else drawn; without
+            images are those in no other list if there is a ``train.txt``, else drawn; without
             ``train.txt`` all others are for training; without ``val.txt`` some of those for
             training are drawn for validation.
         test_fraction: Share of the scenes for test, if drawn: at least one, never all.
@@ -43,20 +43,20 @@ class FolderSplits:
     seed: int
 
     def divide(
-        self, panoramas: Sequence[ImageFiles], problems: Problems
+        self, images: Sequence[ImageFiles], problems: Problems
     ) -> dict[Split, list[ImageFiles]]:
-        """The panoramas of every split, each in the order given.
+        """The images of every split, each in the order given.
 
         Args:
-            panoramas: All of the data set.
+            images: All of the data set.
             problems: Invalid lines of lists are added.
 
         Raises:
             DataError: A list cannot be used, or there are too few scenes to draw from.
         """
-        listed = self._read_lists(panoramas, problems)
+        listed = self._read_lists(images, problems)
         named = {name for names in listed.values() for name in names}
-        rest = [files for files in panoramas if files.name not in named]
+        rest = [files for files in images if files.name not in named]
         if "test" in listed:
             test = self._some("test", listed["test"])
         elif "train" in listed:
@@ -69,20 +69,20 @@ class FolderSplits:
         if self.validation_fraction and "val" in listed:
             held = self._some("val", listed["val"])
         elif self.validation_fraction:
-            training = [files for files in panoramas if files.name in train]
+            training = [files for files in images if files.name in train]
             held = self._draw("val", training, self.validation_fraction)
         chosen: dict[Split, set[str]] = {"train": train - held, "val": held, "test": test}
         return {
-            split: [files for files in panoramas if files.name in chosen[split]] for split in SPLITS
+            split: [files for files in images if files.name in chosen[split]] for split in SPLITS
         }
 
     def _read_lists(
-        self, panoramas: Sequence[ImageFiles], problems: Problems
+        self, images: Sequence[ImageFiles], problems: Problems
     ) -> dict[Split, set[str]]:
         """Names in each existing list."""
-        names = {files.name: files.name for files in panoramas}
+        names = {files.name: files.name for files in images}
         # With the ending of the image is right as well.
-        names |= {files.name + files.rgb.suffix: files.name for files in panoramas}
+        names |= {files.name + files.rgb.suffix: files.name for files in images}
         listed: dict[Split, set[str]] = {}
         owners: dict[str, Path] = {}
         for split in SPLITS:
@@ -95,9 +95,9 @@ class FolderSplits:
                     listed[split].add(_listed_name(path, line, names, owners))
         return listed
 
-    def _draw(self, split: Split, panoramas: Sequence[ImageFiles], fraction: float) -> set[str]:
+    def _draw(self, split: Split, images: Sequence[ImageFiles], fraction: float) -> set[str]:
         """The names in some scenes, the same for the same seed."""
-        scenes = {_scene(files) for files in panoramas}
+        scenes = {_scene(files) for files in images}
         drawn = draw_groups(scenes, fraction, [self.seed, SPLITS.index(split)])
         if not drawn:
             raise DataError(
@@ -106,14 +106,14 @@ class FolderSplits:
                 expected="two or more: top-level folders, or images outside folders",
                 remedy=f"Add scenes, or name some in {split}.txt.",
             )
-        return {files.name for files in panoramas if _scene(files) in drawn}
+        return {files.name for files in images if _scene(files) in drawn}
 
     def _some(self, split: Split, names: set[str]) -> set[str]:
         """The names, if there are any."""
         if not names:
             raise DataError(
                 self.root,
-                found=f"no panoramas for {split}",
+                found=f"no images for {split}",
                 expected="one or more",
                 remedy=f"Name some in {split}.txt; without validation, set "
                 "data.validation_fraction=0.",
@@ -127,7 +127,7 @@ def _scene(files: ImageFiles) -> str:
 
 
 def _listed_name(path: Path, line: str, names: dict[str, str], owners: dict[str, Path]) -> str:
-    """The panorama that a line of a list names, which is then that list's own."""
+    """The image that a line of a list names, which is then that list's own."""
     if line not in names:
         raise DataError(
             path,
@@ -139,7 +139,7 @@ def _listed_name(path: Path, line: str, names: dict[str, str], owners: dict[str,
         raise DataError(
             path,
             found=f"{line!r}, also in {owners[name]}",
-            expected="every panorama once, in one of the lists",
+            expected="every image once, in one of the lists",
         )
     owners[name] = path
     return name

@@ -92,8 +92,8 @@ def test_lists_of_some_splits(own_root: Path, erp: Any) -> None:
     [
         ({"test": "scene_9/view.0"}, r"test\.txt: found 'scene_9/view\.0', of which there is no"),
         ({"test": "scene_0/view.0", "train": "scene_0/view.0"}, r"also in .*train\.txt"),
-        ({"test": ""}, r"found no panoramas for test; .* Name some in test\.txt"),
-        ({"val": "# none"}, r"no panoramas for val; .*data\.validation_fraction=0"),
+        ({"test": ""}, r"found no images for test; .* Name some in test\.txt"),
+        ({"val": "# none"}, r"no images for val; .*data\.validation_fraction=0"),
         ({"train": "scene_0/view.0"}, r"found 1 scenes to draw those of val .*in val\.txt"),
         ({"test": b"\xff\xfe"}, r"test\.txt: found .*UTF-8"),
     ],

@@ -1,0 +1,127 @@
+"""Folders of one's own images, label images and a list of classes, whatever the images are.
+
+On disk::
+
+    root/
+      classes.json                  see `read_classes`
+      images/[scene/]…/name.jpg     or .png, .tif, .webp
+      labels/[scene/]…/name.png     values or colours of the classes, at the size of the image
+      depth/[scene/]…/name.png      or .tif, .npy, .exr, if depth is an input, see `read_depth_m`
+      train.txt val.txt test.txt    if wanted, names one per line, see `FolderSplits`
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from datamodules.core.inputs import Input
+from datamodules.core.loading import at_least
+from datamodules.core.reading import ImageFiles
+from datamodules.core.split_module import SplitDataModule
+from datamodules.folder.classes import UNKNOWN_NAME, read_classes
+from datamodules.folder.reader import FolderReader, list_images, read_codes
+from datamodules.folder.splits import FolderSplits
+from tangent_train.errors import DataError, SettingError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from datamodules.core.found import Split
+    from datamodules.core.problems import Problems
+
+__all__ = ["LabelledFolder"]
+
+_TRIED = 4
+
+
+@dataclass(kw_only=True, eq=False, repr=False)
+class LabelledFolder(SplitDataModule[ImageFiles]):
+    """The files, splits and classes of a user's own images. Depth is clipped to 4 m.
+
+    Args:
+        inputs: Inputs of the network, `rgb` and optionally others, see `Input`.
+        test_fraction: Share of the scenes for test, unless there are lists, see `FolderSplits`;
+            `validation_fraction` is that of the training scenes, likewise.
+        split_seed: Of the drawing of both. Independent of the run's seed, so that runs with
+            different seeds share their splits.
+        depth_units_per_m: Units in a metre of depth files of whole numbers, 1000 for millimetres.
+
+    Attributes:
+        class_names: "unknown", then those of ``classes.json``.
+
+    Raises:
+        DataError: ``classes.json`` is missing or cannot be used.
+        SettingError: A setting is invalid.
+    """
+
+    inputs: Sequence[Input] = ("rgb",)
+    test_fraction: float = 0.2
+    split_seed: int = 0
+    depth_units_per_m: float = 1000
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.depth_units_per_m > 0:
+            raise SettingError(
+                "data.depth_units_per_m", found=self.depth_units_per_m, expected="more than 0"
+            )
+        if not 0 < self.test_fraction < 1:
+            raise SettingError(
+                "data.test_fraction", found=self.test_fraction, expected="above 0 to below 1"
+            )
+        at_least("data.split_seed", self.split_seed, 0)
+        # Now, not with the files: the network is made for as many classes.
+        self._classes = read_classes(self.classes_from)
+        self.class_names = (UNKNOWN_NAME, *self._classes.names)
+
+    @property
+    def classes_from(self) -> Path:
+        """``classes.json``."""
+        return self.root / "classes.json"
+
+    def find_images(self, problems: Problems) -> tuple[FolderReader, dict[Split, list[ImageFiles]]]:
+        """See `PanoramaDataModule`."""
+        images = list_images(self.root, problems, with_depth="depth" in self.inputs)
+        # Before any are left out: the splits do not depend on what is broken.
+        division = FolderSplits(
+            self.root, self.test_fraction, self.validation_fraction, self.split_seed
+        )
+        splits = division.divide(images, problems)
+        self._check_classes(problems.without(images)[:_TRIED], problems)
+        return self.make_reader(images, problems), splits
+
+    def make_reader(self, images: Sequence[ImageFiles], problems: Problems) -> FolderReader:
+        """The reader of the images.
+
+        Args:
+            images: All of the data set.
+            problems: Problems of what it reads beside them are added.
+
+        Raises:
+            DataError: The data set as a whole cannot be used.
+        """
+        del images, problems
+        return FolderReader(self._classes, self.depth_units_per_m)
+
+    def _check_classes(self, images: Sequence[ImageFiles], problems: Problems) -> None:
+        """Check the class list against the first few label images."""
+        classes = self._classes
+        seen: set[int] = set()
+        for files in images:
+            with problems.noted(files.name):
+                stored = read_codes(files.labels, in_colors=classes.in_colors)
+                if classes.decode(stored, files.labels).any():
+                    return
+                seen |= set(np.unique(classes.pack(stored)).tolist())
+        if seen:
+            shown = classes.describe(np.array(sorted(seen), np.int32))
+            raise DataError(
+                images[0].labels,
+                found=f"{shown}, in this file and the next",
+                expected=f"{classes.describe(classes.codes)}, as classes.json says",
+                remedy="Correct classes.json: no pixel would have a class.",
+            )
