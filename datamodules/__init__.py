@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from datamodules.core.panorama_pairs import ImagePairs
     from datamodules.folder.panoramas import FolderPanoramas
+    from datamodules.folder.photos import FolderPhotos
     from datamodules.modelnet40.datamodule import ModelNet40
     from datamodules.stanford2d3ds.pairs import StanfordPairs
     from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "FolderPanoramas",
+    "FolderPhotos",
     "ImagePairs",
     "ModelNet40",
     "OmniSynthia",
@@ -42,6 +44,7 @@ __all__ = [
 
 _MODULES = {
     "FolderPanoramas": "datamodules.folder.panoramas",
+    "FolderPhotos": "datamodules.folder.photos",
     "ImagePairs": "datamodules.core.panorama_pairs",
     "ModelNet40": "datamodules.modelnet40.datamodule",
     "OmniSynthia": "datamodules.synthia.omnisynthia",

@@ -192,10 +192,13 @@ def check_headers(
                 if erp_height is not None:
                     check_panorama_size(path, size, erp_height)
             elif size not in (None, found):
+                remedy = "Export or copy both at one size."
+                if found[::-1] == size:
+                    remedy = "Export it as the image is displayed, turned as its EXIF data say."
                 raise DataError(
                     path,
                     found=f"{found[0]}×{found[1]} pixels",
                     expected=f"{size[0]}×{size[1]}, as {files.rgb}" if size else "",
-                    remedy="Export or copy both at one size.",
+                    remedy=remedy,
                 )
     return size

@@ -18,10 +18,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from datamodules.core.image_module import ImageDataModule
 from datamodules.core.inputs import Input
 from datamodules.core.loading import at_least
-from datamodules.core.reading import ImageFiles
-from datamodules.core.split_module import SplitDataModule
 from datamodules.folder.classes import UNKNOWN_NAME, read_classes
 from datamodules.folder.reader import FolderReader, list_images, read_codes
 from datamodules.folder.splits import FolderSplits
@@ -32,6 +31,7 @@ if TYPE_CHECKING:
 
     from datamodules.core.found import Split
     from datamodules.core.problems import Problems
+    from datamodules.core.reading import ImageFiles
 
 __all__ = ["LabelledFolder"]
 
@@ -39,11 +39,10 @@ _TRIED = 4
 
 
 @dataclass(kw_only=True, eq=False, repr=False)
-class LabelledFolder(SplitDataModule[ImageFiles]):
+class LabelledFolder(ImageDataModule):
     """The files, splits and classes of a user's own images. Depth is clipped to 4 m.
 
     Args:
-        inputs: Inputs of the network, `rgb` and optionally others, see `Input`.
         test_fraction: Share of the scenes for test, unless there are lists, see `FolderSplits`;
             `validation_fraction` is that of the training scenes, likewise.
         split_seed: Of the drawing of both. Independent of the run's seed, so that runs with
@@ -84,7 +83,7 @@ class LabelledFolder(SplitDataModule[ImageFiles]):
         return self.root / "classes.json"
 
     def find_images(self, problems: Problems) -> tuple[FolderReader, dict[Split, list[ImageFiles]]]:
-        """See `PanoramaDataModule`."""
+        """See `ImageDataModule`."""
         images = list_images(self.root, problems, with_depth="depth" in self.inputs)
         # Before any are left out: the splits do not depend on what is broken.
         division = FolderSplits(

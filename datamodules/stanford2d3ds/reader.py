@@ -14,6 +14,7 @@ from datamodules.images.png import check_png, read_color_png, read_depth_png
 from datamodules.stanford2d3ds.files import MISSING_DEPTH
 from datamodules.stanford2d3ds.label_table import LabelTable
 from tangent_train.errors import DataError
+from tangent_train.geometry import is_camera_matrix
 from tangent_train.json_text import parse_json
 
 if TYPE_CHECKING:
@@ -122,7 +123,6 @@ def read_camera_matrix(path: Path) -> NDArray[np.float64]:
         raise DataError(
             path, found=found, expected=expected, remedy="Copy or extract the file again."
         ) from error
-    pinhole = matrix.shape == (3, 3) and np.isfinite(matrix).all() and (np.diag(matrix) > 0).all()
-    if not pinhole or matrix[2].tolist() != [0, 0, 1] or matrix[0, 1] or matrix[1, 0]:
+    if not is_camera_matrix(matrix):
         raise DataError(path, found=matrix.tolist(), expected=expected)
     return _CENTERS_FROM_CORNERS @ matrix

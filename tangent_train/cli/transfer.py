@@ -7,6 +7,7 @@ import shlex
 import sys
 from collections import defaultdict
 from contextlib import contextmanager
+from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
     from omegaconf import DictConfig
 
 __all__ = ["trained_level", "transfer"]
+
+_MOST_SHOWN = 3
 
 
 def transfer(config: DictConfig) -> None:
@@ -120,16 +123,51 @@ def _check_data(stages: Sequence[Stage]) -> None:
         with _named(stage):
             # No weights are fetched for a network that a checkpoint restores.
             built.append((stage, build({**stage.config, "checkpoint": "P"})[0]))
-            for name in ("class_names", "inputs", "normalization"):
-                first, own = (getattr(data, name) for _, data in (built[0], built[-1]))
-                if first != own:
-                    raise SettingError(
-                        f"data.{name}", found=own, expected=f"{first}, as in the stages before"
-                    )
+            _check_alike(built[0][1], built[-1][1])
     for stage, data in built:  # after all settings: this makes files
         with _named(stage):
             data.make_files()
             data.setup()
+    _tell_shared_scenes(built)
+
+
+def _check_alike(first: Any, own: Any) -> None:
+    """Refuse data that a network of the first stage cannot take, or would take for another."""
+    for number, (before, now) in enumerate(zip_longest(first.class_names, own.class_names)):
+        if before != now:
+            raise SettingError(
+                "data",
+                found=f"{now or 'nothing'} as class {number} in {own.classes_from}",
+                expected=f"{before or 'nothing'}, as in {first.classes_from}",
+                remedy="Photos and panoramas have the same classes in the same order.",
+            )
+    for name in ("inputs", "normalization"):
+        before, now = getattr(first, name), getattr(own, name)
+        if before != now:
+            raise SettingError(
+                f"data.{name}", found=now, expected=f"{before}, as in the stages before"
+            )
+
+
+def _tell_shared_scenes(built: Sequence[tuple[Stage, Any]]) -> None:
+    """Say which scenes P is trained on and S tested: only their names are known to be the same."""
+    trained, tested = (
+        {
+            item.name.partition("/")[0]
+            for stage, data in built
+            if stage.name[0] == kind
+            for item in data.found().of(splits)
+        }
+        for kind, splits in (("P", ("train", "val")), ("S", ("test",)))
+    )
+    shared = sorted(trained & tested)
+    if shared:
+        more = f" and {len(shared) - _MOST_SHOWN} others" if len(shared) > _MOST_SHOWN else ""
+        _say(
+            f"Note: P is trained on photos, and S tested on panoramas, of "
+            f"{', '.join(shared[:_MOST_SHOWN])}{more}. If they show the same places, hold them out "
+            "of both, for example in test.txt."
+        )
 
 
 @contextmanager

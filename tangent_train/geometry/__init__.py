@@ -16,6 +16,7 @@ Convention, stated here once and used everywhere:
 
 from tangent_train.geometry.camera import (
     camera_matrix_from_fov,
+    is_camera_matrix,
     normalize_camera,
     perspective_directions,
     shift_range,
@@ -62,6 +63,7 @@ __all__ = [
     "equirect_solid_angles",
     "equirect_to_lonlat",
     "icosphere",
+    "is_camera_matrix",
     "lonlat_to_equirect",
     "lonlat_to_xyz",
     "nearest_level",

@@ -13,6 +13,7 @@ from tangent_train.errors import SettingError
 __all__ = [
     "NormalizedCamera",
     "camera_matrix_from_fov",
+    "is_camera_matrix",
     "normalize_camera",
     "perspective_directions",
     "shift_range",
@@ -50,6 +51,14 @@ def camera_matrix_from_fov(fov_deg: float, size: tuple[int, int]) -> NDArray[np.
     height, width = size
     focal = width / (2 * math.tan(math.radians(fov_deg) / 2))
     return np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1.0]])
+
+
+def is_camera_matrix(matrix: NDArray[np.float64]) -> bool:
+    """Whether an array of any shape is a ``(3, 3)`` K without skew, with focal lengths above 0."""
+    if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
+        return False
+    plain = matrix[2].tolist() == [0, 0, 1] and matrix[0, 1] == matrix[1, 0] == 0
+    return bool(plain and np.diag(matrix).min() > 0)
 
 
 def perspective_directions(camera_matrix: ArrayLike, size: tuple[int, int]) -> NDArray[np.float64]:

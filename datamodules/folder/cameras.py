@@ -1,0 +1,170 @@
+"""Cameras of a user's own photos: ``cameras.json``, one field of view for all, or EXIF data."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from pathlib import PurePosixPath
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from datamodules.images.pixel_files import photo_fov_deg, read_image_size
+from tangent_train.errors import DataError
+from tangent_train.geometry import camera_matrix_from_fov, is_camera_matrix
+from tangent_train.json_text import parse_json
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from datamodules.core.problems import Problems
+    from datamodules.core.reading import ImageFiles
+
+__all__ = ["FolderCameras", "read_cameras"]
+
+_KEYS = ("fx", "fy", "cx", "cy")
+_EXPECTED = (
+    '{"fx": …, "fy": …, "cx": …, "cy": …} or [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], in pixels, '
+    "without skew and distortion"
+)
+_EXAMPLE = (
+    'an object of cameras by name, {"kitchen/door": K, "hall": K}: of images as in images/ without '
+    'ending, of folders, or "." of all'
+)
+
+
+@dataclass(frozen=True)
+class FolderCameras:
+    """The cameras of photos in one folder.
+
+    Attributes:
+        path: ``cameras.json``, there or not.
+        given: Its content by the name of an image or a folder; ``.`` for all.
+        fov_deg: Horizontal field of view of the photos that it does not name; None for that of
+            their EXIF data.
+    """
+
+    path: Path
+    given: Mapping[str, Any]
+    fov_deg: float | None
+
+    @property
+    def fingerprint(self) -> str:
+        """Changes when photos may get other cameras."""
+        content = json.dumps([self.given, self.fov_deg], sort_keys=True)
+        return hashlib.sha256(content.encode()).hexdigest()[:16]
+
+    def check_names(self, images: Sequence[ImageFiles], problems: Problems) -> None:
+        """Note the cameras of no image.
+
+        Args:
+            images: All of the data set.
+            problems: They are added.
+        """
+        known = {place for files in images for place in _places(files)}
+        for place in self.given.keys() - known:
+            error = DataError(
+                self.path,
+                found=f"{place!r}, of which there is no image or folder",
+                expected=_EXAMPLE,
+            )
+            problems.add(error, f"{self.path.name}: {place}")
+
+    def matrix(self, files: ImageFiles) -> NDArray[np.float64]:
+        """The camera matrix of a photo.
+
+        Args:
+            files: Of the photo.
+
+        Returns:
+            ``(3, 3)`` K of the photo as displayed, its EXIF orientation applied, for integer pixel
+            centres: the entry of ``cameras.json`` for the photo or the nearest folder that it is
+            in; or of `fov_deg`, or of its EXIF data, with the principal point in the middle.
+
+        Raises:
+            DataError: Nothing gives its camera, the entry is no camera matrix of such a photo, or
+                the photo cannot be read.
+        """
+        height, width = size = read_image_size(files.rgb)
+        place = next((place for place in _places(files) if place in self.given), None)
+        if place is None:
+            return camera_matrix_from_fov(self._fov_deg(files.rgb), size)
+        matrix = self._given_matrix(place)
+        x, y = matrix[:2, 2]
+        if not (-0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5):
+            raise DataError(
+                self.path,
+                found=f"the principal point x = {x:g}, y = {y:g} for {files.name}",
+                expected=f"one in the photo as displayed: x of 0 to {width - 1}, y of 0 to "
+                f"{height - 1}",
+                remedy="Scale K where the photo was resized, turn it where EXIF data turn the "
+                "photo.",
+            )
+        return matrix
+
+    def _given_matrix(self, place: str) -> NDArray[np.float64]:
+        given = rows = self.given[place]
+        if isinstance(given, dict) and given.keys() == set(_KEYS):
+            fx, fy, cx, cy = (given[key] for key in _KEYS)
+            rows = [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]
+        try:
+            matrix = np.array(rows, np.float64)
+        except (TypeError, ValueError, OverflowError):
+            matrix = np.empty(0)
+        if not is_camera_matrix(matrix):
+            found = f"{place!r}: {json.dumps(given)}"
+            raise DataError(self.path, found=found, expected=_EXPECTED)
+        return matrix
+
+    def _fov_deg(self, path: Path) -> float:
+        fov_deg = photo_fov_deg(path) if self.fov_deg is None else self.fov_deg
+        if fov_deg is None:
+            raise DataError(
+                path,
+                found="no K in cameras.json, no data.fov and no focal length in its EXIF data",
+                expected="one of the three",
+                remedy="Name it or its folder in cameras.json, give data.fov=<horizontal field of "
+                "view in degrees> (65 to 80 for most phones), or copy the original with its EXIF "
+                "data.",
+            )
+        return fov_deg
+
+
+def read_cameras(path: Path, fov_deg: float | None) -> FolderCameras:
+    """Read a ``cameras.json``; the cameras in it are read with their photos.
+
+    It holds K by the name of an image, as ``kitchen/door``, or of a folder, for all images in it
+    that no longer name stands for; ``.`` or nothing is the name of the whole folder::
+
+        {"kitchen/door": [[1400, 0, 959.5], [0, 1400, 539.5], [0, 0, 1]],
+         "hall": {"fx": 1380, "fy": 1380, "cx": 959.5, "cy": 539.5}}
+
+    Args:
+        path: The file, which may be missing.
+        fov_deg: Horizontal field of view of all other photos, see `FolderCameras`.
+
+    Raises:
+        DataError: It cannot be read, or does not hold such names.
+    """
+    try:
+        content = parse_json(path.read_bytes())
+    except FileNotFoundError:
+        content = {}
+    except (OSError, ValueError) as error:
+        raise DataError(path, found=error, expected=_EXAMPLE) from error
+    if not isinstance(content, dict):
+        raise DataError(path, found=json.dumps(content), expected=_EXAMPLE)
+    given = {PurePosixPath(name).as_posix(): value for name, value in content.items()}
+    if len(given) < len(content):
+        raise DataError(path, found="one name written in two ways", expected="every name once")
+    return FolderCameras(path, given, fov_deg)
+
+
+def _places(files: ImageFiles) -> list[str]:
+    """Name of an image and of the folders that it is in, from the nearest to ``.``."""
+    name = PurePosixPath(files.name)
+    return [place.as_posix() for place in (name, *name.parents)]

@@ -1,0 +1,285 @@
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from datamodules.folder.panoramas import FolderPanoramas
+from datamodules.folder.photos import FolderPhotos
+from tangent_train.errors import DataError, SettingError
+from tangent_train.rendering import PerspectiveRepresentation
+from tests.datamodules.folder.folder_format import (
+    CLASS_OF_STORED,
+    NAMES,
+    names_of,
+    save,
+    save_depth,
+    write_classes,
+    write_data_set,
+)
+from tests.datamodules.folder.photo_format import (
+    displayed,
+    write_cameras,
+    write_photo,
+    write_photos,
+)
+
+if TYPE_CHECKING:
+    from datamodules.core.photos import Photo
+
+CROPS = PerspectiveRepresentation(level=4, fov_deg=20, dim=8)
+K: list[list[float]] = [[70, 0, 30.5], [0, 72, 20], [0, 0, 1]]
+
+
+def _photos(root: Path, **settings: Any) -> FolderPhotos:
+    return FolderPhotos(root, CROPS, validation_fraction=0, **settings)
+
+
+def _only(root: Path, name: str, **settings: Any) -> Photo:
+    """A photo, of a data set with another one for training."""
+    (root / "test.txt").write_text(name)
+    return _photos(root, **settings).source("test").read(0)
+
+
+def _found(root: Path, **settings: Any) -> list[tuple[str, str, str]]:
+    """File, finding and remedy of all problems, as ``tangent-check`` lists them."""
+    problems, _ = _photos(root, **settings).check(progress=False)
+    return [(Path(p.file).name, p.finding, p.remedy) for p in problems.listed()]
+
+
+@pytest.fixture
+def two(tmp_path: Path) -> Path:
+    """Two photos of 48×64 without EXIF data, one of them for test."""
+    write_classes(tmp_path)
+    write_photo(tmp_path, "hall/a.png", 0, film_mm=None)
+    write_photo(tmp_path, "hall/b.png", 1, film_mm=None)
+    (tmp_path / "test.txt").write_text("hall/a")
+    return tmp_path
+
+
+# Pixels
+
+
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+def test_pixels_are_those_that_are_displayed(tmp_path: Path, orientation: int) -> None:
+    write_classes(tmp_path)
+    write_photo(tmp_path, "a.png", 3, (50, 66), orientation=orientation)
+    write_photo(tmp_path, "b.jpg", 4)
+    photo = _only(tmp_path, "a")
+    rgb, values = displayed(3, (50, 66))
+    classes = np.zeros(256, np.uint8)
+    classes[list(CLASS_OF_STORED)] = list(CLASS_OF_STORED.values())
+    np.testing.assert_array_equal(photo.rgb, rgb)
+    np.testing.assert_array_equal(photo.labels, classes[values])
+    assert photo.depth is None
+
+
+def test_z_depth_becomes_distance(two: Path) -> None:
+    for name in "ab":
+        save_depth(two / "depth" / "hall" / f"{name}.png", np.full((48, 64), 2000, np.uint16))
+    write_cameras(two, {"hall": K})
+    photo = _only(two, "hall/a", inputs=["rgb", "depth"])
+    assert photo.depth is not None
+    for row, column in ((0, 0), (20, 30), (47, 63)):
+        x, y = (column - 30.5) / 70, (row - 20) / 72
+        expected = 2 * math.sqrt(1 + x * x + y * y) * 512
+        assert photo.depth[row, column] == pytest.approx(expected, abs=0.51)
+
+
+def test_all_sizes_give_crops_of_one_size(tmp_path: Path) -> None:
+    module = _photos(write_photos(tmp_path), photos_per_step=5)
+    batch = next(iter(module.train_dataloader()))
+    assert batch.images[0].shape == (5, 1, 8, 8, 3)
+    assert module.class_names == ("unknown", *NAMES)
+    assert len(list(module.test_dataloader())) == len(module.source("test")) == 2
+
+
+def test_scenes_are_held_out_as_those_of_panoramas(tmp_path: Path, strips: Any) -> None:
+    photos = FolderPhotos(write_photos(tmp_path / "photos", scenes=7), CROPS)
+    write_data_set(tmp_path / "panoramas", scenes=7)
+    panoramas = FolderPanoramas(tmp_path / "panoramas", strips)
+    for split in ("train", "val", "test"):
+        assert names_of(photos, split) == names_of(panoramas, split)
+        assert names_of(photos, split)
+
+
+# Cameras
+
+
+def test_the_nearest_camera_counts(tmp_path: Path) -> None:
+    """Photo, folder, parent folder, all; then one field of view; then EXIF data."""
+    write_classes(tmp_path)
+    for seed, name in enumerate(("a/b/one", "a/b/two", "a/three", "four", "five")):
+        write_photo(tmp_path, f"{name}.png", seed, (48, 72), film_mm=30)
+    cameras = {"a/b/one": 80, "a/b/": 90, "./a": 100}
+    write_cameras(
+        tmp_path, {name: {"fx": f, "fy": f + 1, "cx": 9, "cy": 8} for name, f in cameras.items()}
+    )
+    (tmp_path / "train.txt").write_text("five")
+
+    def focal_lengths(**settings: Any) -> list[float]:
+        source = _photos(tmp_path, **settings).source("test")
+        by_name = {source.name(i): source.read(i).camera_matrix for i in range(len(source))}
+        for name in ("a/b/one", "a/b/two", "a/three"):
+            assert by_name[name][:2, 2].tolist() == [9, 8]
+            assert by_name[name][1, 1] == by_name[name][0, 0] + 1
+        return [by_name[name][0, 0] for name in ("a/b/one", "a/b/two", "a/three", "four")]
+
+    assert focal_lengths() == pytest.approx([80, 90, 100, 72 * 30 / 36])
+    assert focal_lengths(fov=60) == pytest.approx([80, 90, 100, 36 / math.tan(math.pi / 6)])
+    for everything in ("", "."):
+        same = dict.fromkeys(("fx", "fy"), 110) | {"cx": 0, "cy": 0}
+        own = {n: {"fx": f, "fy": f + 1, "cx": 9, "cy": 8} for n, f in cameras.items()}
+        write_cameras(tmp_path, own | {everything: same})
+        assert focal_lengths(fov=60) == [80, 90, 100, 110]
+
+
+def test_fields_of_view_have_their_centre_in_the_middle_of_the_photo(two: Path) -> None:
+    matrix = _only(two, "hall/a", fov=90).camera_matrix
+    expected = np.array([[32, 0, 31.5], [0, 32, 23.5], [0, 0, 1]])
+    np.testing.assert_allclose(matrix, expected, atol=1e-12)
+
+
+def test_a_camera_is_that_of_the_photo_as_displayed(tmp_path: Path) -> None:
+    write_classes(tmp_path)
+    write_photo(tmp_path, "a.jpg", 0, (60, 40), film_mm=36, orientation=6)
+    write_photo(tmp_path, "b.jpg", 0)
+    # Film upright is 24 mm wide.
+    assert _only(tmp_path, "a").camera_matrix[0, 0] == pytest.approx(40 * 36 / 24)
+    write_cameras(tmp_path, {"a": [[80, 0, 5], [0, 80, 55], [0, 0, 1]]})
+    assert _only(tmp_path, "a").camera_matrix.tolist() == [[80, 0, 5], [0, 80, 55], [0, 0, 1]]
+    write_cameras(tmp_path, {"a": [[80, 0, 55], [0, 80, 5], [0, 0, 1]]})
+    message = r"cameras\.json: found .* x = 55, y = 5 for a; .* x of 0 to 39, y of 0 to 59\. "
+    with pytest.raises(DataError, match=message):
+        _photos(tmp_path).setup()
+
+
+def test_stored_photos_have_the_camera_of_now(two: Path, tmp_path: Path) -> None:
+    for given, expected in (({".": K}, 70), ({}, 32), ({"hall": K}, 70)):
+        write_cameras(two, given)
+        module = _photos(two, fov=90, store=tmp_path / "store")
+        module.prepare_data()
+        assert module.source("test").read(0).camera_matrix[0, 0] == pytest.approx(expected)
+
+
+# What cannot be used
+
+
+def test_a_photo_without_a_camera_is_named_with_all_remedies(two: Path) -> None:
+    for name, finding, remedy in (found := _found(two)):
+        assert name in ("a.png", "b.png")
+        assert finding.startswith("no K in cameras.json, no data.fov and no focal length in its EX")
+        assert all(way in remedy for way in ("cameras.json", "data.fov=", "EXIF"))
+    assert len(found) == 2
+    with pytest.raises(DataError, match=r"(?s)found 2 problems.*hall/a\.png.*hall/b\.png"):
+        _photos(two).setup()
+
+
+def _with(row: int, column: int, value: object) -> list[list[Any]]:
+    matrix: list[list[Any]] = [list(line) for line in K]
+    matrix[row][column] = value
+    return matrix
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        None,
+        70,
+        "70",
+        [],
+        {},
+        [70, 72, 30, 20],
+        K[:2],
+        [[70, 0], [0, 72], [0, 0]],
+        [[70, 0, 30], [0, 72], [0, 0, 1]],
+        _with(0, 0, -70),
+        _with(1, 1, 0),
+        _with(0, 1, 2),
+        _with(1, 0, 2),
+        _with(2, 2, 2),
+        _with(0, 0, float("nan")),
+        _with(0, 2, float("inf")),
+        _with(0, 0, 10**400),
+        _with(0, 0, [70]),
+        {"fx": 70, "fy": 72, "cx": 30},
+        {"fx": 70, "fy": 72, "cx": 30, "cy": 20, "k1": 0.1},
+        {"fx": 70, "fy": None, "cx": 30, "cy": 20},
+    ],
+)
+def test_cameras_that_are_none(two: Path, value: Any) -> None:
+    write_cameras(two, {"hall/a": value, ".": K})
+    ((name, finding, _),) = _found(two, fov=70)
+    assert name == "cameras.json"
+    assert finding.startswith("'hall/a': ")
+    assert '; expected {"fx": …, "fy": …, ' in finding
+
+
+@pytest.mark.parametrize("x_y", [(-0.6, 20), (63.6, 20), (30, -0.6), (30, 47.6)])
+def test_principal_points_outside_the_photo(two: Path, x_y: tuple[float, float]) -> None:
+    write_cameras(two, {"hall/a": _with(0, 2, x_y[0])[:1] + _with(1, 2, x_y[1])[1:], ".": K})
+    ((_, finding, remedy),) = _found(two)
+    assert f"x = {x_y[0]:g}, y = {x_y[1]:g} for hall/a; expected" in finding
+    assert "x of 0 to 63, y of 0 to 47" in finding
+    assert "resized" in remedy
+
+
+def test_all_problems_of_cameras_are_listed(two: Path) -> None:
+    write_cameras(two, {"images/hall/a": K, "hall/a.png": K, "hall": 7, "a": K, ".": K})
+    found = _found(two)
+    assert [name for name, _, _ in found] == ["cameras.json"] * 4
+    named = [finding.partition(",")[0].partition(":")[0] for _, finding, _ in found]
+    assert named == ["'a'", "'hall'", "'hall/a.png'", "'images/hall/a'"]
+    assert "of which there is no image or folder" in found[0][1]
+    with pytest.raises(DataError, match=r"found 4 problems"):
+        _photos(two).setup()
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("[]", r"cameras\.json: found \[\]; expected an object of cameras by name"),
+        ("{", r"cameras\.json: found .*expected an object of cameras by name"),
+        ('{"": 1, ".": 2}', r"cameras\.json: found one name written in two ways"),
+        ('{"hall": 1, "hall/": 2}', r"cameras\.json: found one name written in two ways"),
+    ],
+)
+def test_files_of_cameras_that_cannot_be_read(two: Path, content: str, message: str) -> None:
+    (two / "cameras.json").write_text(content)
+    with pytest.raises(DataError, match=message):
+        _photos(two).setup()
+
+
+def test_broken_cameras_leave_their_photos_out(two: Path) -> None:
+    write_photo(two, "hall/c.png", 2)
+    (two / "test.txt").write_text("hall/b")
+    write_cameras(two, {"hall/a": 7})
+    module = _photos(two, fov=70, skip_broken=True)
+    assert sorted(names_of(module, "train") + names_of(module, "test")) == ["hall/b", "hall/c"]
+
+
+@pytest.mark.parametrize("fov", [0, 180, -60, float("nan")])
+def test_impossible_fields_of_view(two: Path, fov: float) -> None:
+    with pytest.raises(SettingError, match=rf"data\.fov: found {fov}; expected degrees"):
+        _photos(two, fov=fov)
+
+
+def test_labels_of_another_size(tmp_path: Path) -> None:
+    write_classes(tmp_path)
+    for seed, name in enumerate("abc"):
+        write_photo(tmp_path, f"{name}.jpg", seed, (60, 40), orientation=6)
+    save(tmp_path / "labels" / "a.png", np.ones((30, 20), np.uint8))
+    save(tmp_path / "labels" / "b.png", np.ones((40, 60), np.uint8))
+    (_, small, resized), (_, turned, as_displayed) = _found(tmp_path)
+    assert "30×20 pixels; expected 60×40" in small
+    assert "one size" in resized
+    assert "40×60 pixels; expected 60×40" in turned
+    assert "EXIF" in as_displayed
+
+
+def test_a_photo_that_sees_less_than_a_crop(two: Path) -> None:
+    with pytest.raises(DataError, match=r"(?s)a\.png: found 20° × 20° for .* 15° × .*of a crop"):
+        _photos(two, fov=15).setup()
