@@ -11,13 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-<<<<<<< HEAD
-=======
-if TYPE_CHECKING:
-    from datamodules.core.found import Split
-    from datamodules.folder.labelled import LabelledFolder
-
->>>>>>> e40ebf7 (Photos of one's own: data=folder_photos, cameras from cameras.json, fov or EXIF data)
 NAMES = ("wall", "floor", "window")
 VALUES = {"wall": 1, "floor": [2, 3], "window": 255}
 """Value 0 and 4 and others are unknown."""
@@ -76,12 +69,3 @@ def write_data_set(
             name = f"scene_{scene}/view.{number}"
             write_panorama(root, name, seed, height, suffixes[seed % 4], depth=depth)
     return root
-<<<<<<< HEAD
-=======
-
-
-def names_of(module: LabelledFolder, split: Split) -> list[str]:
-    """Names of the images of a split."""
-    source = module.source(split)
-    return [source.name(index) for index in range(len(source))]
->>>>>>> e40ebf7 (Photos of one's own: data=folder_photos, cameras from cameras.json, fov or EXIF data)

@@ -1,4 +1,4 @@
-"""Writes small data sets of one's own photos: images, label images, depth, `classes.json`."""
+"""Writes small data sets of one's own photos: images, label images, classes, cameras."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from PIL import ExifTags, Image
 
-from tests.datamodules.folder.folder_format import blocks, save, save_depth, write_classes
+from tests.datamodules.folder.folder_format import blocks, save, write_classes
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -37,8 +37,6 @@ def write_photo(
     size: tuple[int, int] = (48, 64),
     film_mm: int | None = 24,
     orientation: int = 1,
-    *,
-    depth: bool = False,
 ) -> None:
     """One photo.
 
@@ -49,7 +47,6 @@ def write_photo(
         size: Rows and columns as displayed.
         film_mm: Focal length of film in its EXIF data.
         orientation: In its EXIF data.
-        depth: Whether to write z-depth in millimetres.
     """
     rgb, values = displayed(seed, size)
     exif = Image.Exif()
@@ -58,10 +55,7 @@ def write_photo(
         exif[ExifTags.IFD.Exif] = {ExifTags.Base.FocalLengthIn35mmFilm: film_mm}
     stored = np.ascontiguousarray(_STORED[orientation](rgb))
     save(root / "images" / name, stored, exif=exif)
-    label = (root / "labels" / name).with_suffix(".png")
-    save(label, values)
-    if depth:
-        save_depth((root / "depth" / name).with_suffix(".png"), 500 + 40 * values.astype(np.uint16))
+    save((root / "labels" / name).with_suffix(".png"), values)
 
 
 def write_cameras(root: Path, content: Any) -> None:

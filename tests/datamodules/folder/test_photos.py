@@ -11,10 +11,10 @@ from datamodules.folder.panoramas import FolderPanoramas
 from datamodules.folder.photos import FolderPhotos
 from tangent_train.errors import DataError, SettingError
 from tangent_train.rendering import PerspectiveRepresentation
+from tests.datamodules.data_files import names_of
 from tests.datamodules.folder.folder_format import (
     CLASS_OF_STORED,
     NAMES,
-    names_of,
     save,
     save_depth,
     write_classes,
@@ -46,7 +46,7 @@ def _only(root: Path, name: str, **settings: Any) -> Photo:
 
 def _found(root: Path, **settings: Any) -> list[tuple[str, str, str]]:
     """File, finding and remedy of all problems, as ``tangent-check`` lists them."""
-    problems, _ = _photos(root, **settings).check(progress=False)
+    problems, _ = _photos(root, **settings).check()
     return [(Path(p.file).name, p.finding, p.remedy) for p in problems.listed()]
 
 
