@@ -23,6 +23,7 @@ from datamodules.images.pixel_files import (
 )
 from datamodules.images.png import read_color_png, read_depth_png
 from tangent_train.errors import DataError
+from tests.slow.fuzz.mutation import png_chunk
 
 Read = Callable[[Path], Any]
 
@@ -36,15 +37,11 @@ def _depth(path: Path) -> Any:
 
 
 def _png(path: Path, width: int, height: int, bits: int = 16, color: int = 0) -> Path:
-    def chunk(name: bytes, content: bytes) -> bytes:
-        checked = name + content
-        return struct.pack(">I", len(content)) + checked + struct.pack(">I", zlib.crc32(checked))
-
     header = struct.pack(">IIBBBBB", width, height, bits, color, 0, 0, 0)
     parts = [
-        chunk(b"IHDR", header),
-        chunk(b"IDAT", zlib.compress(bytes(1000))),
-        chunk(b"IEND", b""),
+        png_chunk(b"IHDR", header),
+        png_chunk(b"IDAT", zlib.compress(bytes(1000))),
+        png_chunk(b"IEND", b""),
     ]
     path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(parts))
     return path

@@ -62,20 +62,6 @@ def created(tmp_path: Path) -> Path:
     return tmp_path / "created"
 
 
-def test_these_files_would_do_it(tmp_path: Path, created: Path) -> None:
-    """Else the tests below could not fail."""
-    for make in CREATORS:
-        make(tmp_path / "x", created)
-        if make is _array:
-            np.load(tmp_path / "x", allow_pickle=True)
-        elif make is _pickle:
-            pickle.loads((tmp_path / "x").read_bytes())
-        else:
-            torch.load(tmp_path / "x", weights_only=False)
-        assert created.exists()
-        created.rmdir()
-
-
 COMMANDS = {
     "evaluate": ["checkpoint={file}"],
     "predict": ["checkpoint={file}", "input=image.png", "output=labels"],

@@ -136,24 +136,6 @@ def test_names_of_options_are_no_paths(
             assert not [event for event in happened if "z.yaml" in event]
 
 
-def test_options_in_place_of_stored_sections_keep_what_belongs_to_the_network(
-    content: dict[str, Any], tmp_path: Path
-) -> None:
-    data = content["config"]["data"] | {"fold": 3}
-    path = with_config(content, tmp_path, data=data)
-    settings, source = settled(path, "data=folder", "representation=cubemap", "level=5")
-    assert settings["data"]["_target_"] == "datamodules.FolderPanoramas"
-    assert settings["data"]["inputs"] == ["rgb"]
-    assert "fold" not in settings["data"]
-    assert settings["representation"]["level"] == settings["level"] == 5
-    assert settings["network"]["widths"] == [4, 8]
-    assert not source.owns("data.anything")
-    assert source.owns("network.widths")
-    settings, _ = settled(path, "data.fold=2", "seed=7", "~data.mask")
-    assert (settings["data"]["fold"], settings["data"]["seed"]) == (2, 7)
-    assert "mask" not in settings["data"]
-
-
 @pytest.mark.parametrize("name", ["..", "/", "notes.txt", "/etc/passwd"])
 def test_where_the_best_epoch_is_does_not_come_out_of_a_file(name: str, tmp_path: Path) -> None:
     """Lightning removes the one that was the best before: once the whole folder, by its state."""

@@ -34,15 +34,11 @@ class Shapes(lightning.LightningDataModule):
     Args:
         count: How many there are, of class k % 3.
         batch_size: Of training; evaluation takes two at a time.
-        rank: Process whose part it is.
-        processes: Of all of them.
     """
 
     kind = "classification"
 
-    def __init__(
-        self, count: int = 9, batch_size: int = 3, rank: int = 0, processes: int = 1
-    ) -> None:
+    def __init__(self, count: int = 9, batch_size: int = 3) -> None:
         super().__init__()
         generator = torch.Generator().manual_seed(0)
         self.shapes: list[Shape] = []
@@ -50,14 +46,13 @@ class Shapes(lightning.LightningDataModule):
             images = 0.3 * torch.randn(5, 3, 16, 16, generator=generator)
             images[index % 5, index % 3] += 2
             self.shapes.append(Shape(images, torch.tensor(index % 3), index))
-        self.mine = self.shapes[rank::processes]
         self.batch_size = batch_size
 
     def train_dataloader(self) -> DataLoader[Any]:
-        return DataLoader(self.mine, batch_size=self.batch_size)  # type: ignore[arg-type]
+        return DataLoader(self.shapes, batch_size=self.batch_size)  # type: ignore[arg-type]
 
     def val_dataloader(self) -> DataLoader[Any]:
-        return DataLoader(self.mine, batch_size=2)  # type: ignore[arg-type]
+        return DataLoader(self.shapes, batch_size=2)  # type: ignore[arg-type]
 
     test_dataloader = val_dataloader
 

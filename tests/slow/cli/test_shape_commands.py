@@ -63,7 +63,6 @@ def test_evaluating_repeats_the_numbers_and_rotates_the_shapes(
 @pytest.mark.parametrize(
     ("command", "arguments", "message"),
     [
-        ("evaluate", ["data=synthrooms"], "task: found classification, with panoramas"),
         ("predict", ["input=data", "output=labels"], "found a network for classification; .*"),
         ("export", ["output=x.onnx"], "found a network for classification; expected one for seg"),
     ],

@@ -12,12 +12,16 @@ from tangent_train.inference.export import SUFFIXES, export_network
 from tests.tasks.odd_networks import assert_same, scores_of, some_images
 from tests.tasks.small_networks import UNET, small_trained
 
-_FCN = {"_target_": "models.FCNResNet", "in_channels": 4, "num_classes": 5, "depth": 50}
 NETWORKS: dict[str, dict[str, Any]] = {
     "unet, stride 32": {**UNET, "widths": [4, 4, 8, 8, 8, 8]},
     "hexunet": {"_target_": "models.HexUNet", "in_channels": 4, "num_classes": 5},
-    "fcn": _FCN,
-    "fcn, frozen statistics": {**_FCN, "frozen_statistics": True},
+    "fcn, frozen statistics": {
+        "_target_": "models.FCNResNet",
+        "in_channels": 4,
+        "num_classes": 5,
+        "depth": 50,
+        "frozen_statistics": True,
+    },
     "deeplabv3": {
         "_target_": "models.widen_stem",
         "in_channels": 4,
