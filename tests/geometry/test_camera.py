@@ -66,6 +66,21 @@ def test_shift_range_is_the_papers(
     np.testing.assert_allclose(shift_range(matrix, size, fov_deg), expected, atol=1e-9)
 
 
+@pytest.mark.parametrize("size", [(128, 128), (96, 160), (120, 64)])
+def test_crops_at_the_ends_of_the_range_touch_the_border_of_the_image(
+    size: tuple[int, int],
+) -> None:
+    outer = np.array([[-0.5, -0.5, 1], [size[1] - 0.5, size[0] - 0.5, 1]])
+    border = np.array([[-0.5, -0.5], [SIZE[1] - 0.5, SIZE[0] - 0.5]])
+    for end, (x, y) in enumerate(shift_range(K, SIZE, 20, size)):
+        homography = normalize_camera(K, SIZE, 20, size, (x, y)).homography
+        np.testing.assert_allclose((np.linalg.inv(homography) @ outer[end])[:2], border[end])
+        beyond = (2 * end - 1) * 1e-3
+        for shift in ((x + beyond, y), (x, y + beyond)):
+            with pytest.raises(SettingError, match="shift: found"):
+                normalize_camera(K, SIZE, 20, size, shift)
+
+
 @pytest.mark.parametrize("fov_deg", [0.5, 45.0, 150.0])
 @pytest.mark.parametrize("size", [(4, 6), (11, 7)])
 def test_fov_is_between_the_outer_pixel_edges(fov_deg: float, size: tuple[int, int]) -> None:
