@@ -10,7 +10,7 @@ from tangent_train.errors import SettingError
 from tangent_train.geometry import CubeGrid, TangentGrid, rotation_about
 from tests.geometry.directions import random_directions
 
-TURN = rotation_about((1, 2, -3), 1.1)
+ROTATION = rotation_about((1, 2, -3), 1.1)
 FRONT, RIGHT, BACK, LEFT, UP, DOWN = range(6)
 
 # Top left, top right, bottom left, bottom right, as seen from inside: y is right, z is up.
@@ -33,7 +33,7 @@ def test_the_outer_corners_of_the_pixels_are_the_corners_of_the_cube(face: int, 
     np.testing.assert_allclose(grid.project(CORNERS[face], face), expected, atol=1e-12)
 
 
-@pytest.mark.parametrize("rotation", [None, TURN])
+@pytest.mark.parametrize("rotation", [None, ROTATION])
 def test_every_direction_is_seen_by_its_owner_alone(
     rotation: NDArray[np.float64] | None,
 ) -> None:
@@ -49,15 +49,17 @@ def test_every_direction_is_seen_by_its_owner_alone(
     np.testing.assert_array_equal(grid.owners(directions), largest)
 
 
-@pytest.mark.parametrize("grid", [CubeGrid(5, TURN.T), TangentGrid(0, 4, 20, TURN.T)])
+@pytest.mark.parametrize("grid", [CubeGrid(5, ROTATION.T), TangentGrid(0, 4, 20, ROTATION.T)])
 def test_a_rotation_replaces_the_grids_own(grid: CubeGrid | TangentGrid) -> None:
-    turned = grid.with_rotation(TURN)
-    assert type(turned) is type(grid)
-    assert turned != grid
-    assert turned.with_rotation(TURN.T) == grid
+    rotated = grid.with_rotation(ROTATION)
+    assert type(rotated) is type(grid)
+    assert rotated != grid
+    assert rotated.with_rotation(ROTATION.T) == grid
     plain = grid.with_rotation(None)
     assert (plain.rotation, plain.dim) == (None, grid.dim)
-    np.testing.assert_allclose(turned.directions([2]), plain.directions([2]) @ TURN.T, atol=1e-14)
+    np.testing.assert_allclose(
+        rotated.directions([2]), plain.directions([2]) @ ROTATION.T, atol=1e-14
+    )
 
 
 @pytest.mark.parametrize("dim", [1, -4, 8.0, "8", True])

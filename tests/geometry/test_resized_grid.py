@@ -8,8 +8,12 @@ import pytest
 from tangent_train.errors import SettingError
 from tangent_train.geometry import CubeGrid, PinholeGrid, ResizedGrid, TangentGrid, rotation_about
 
-TURN, OTHER = rotation_about((1, 2, 3), 0.4), rotation_about((0, 1, 0), 1.1)
-GRIDS: list[PinholeGrid] = [CubeGrid(8, TURN), TangentGrid(1, 5), TangentGrid(0, 4, 20, TURN)]
+ROTATION, OTHER = rotation_about((1, 2, 3), 0.4), rotation_about((0, 1, 0), 1.1)
+GRIDS: list[PinholeGrid] = [
+    CubeGrid(8, ROTATION),
+    TangentGrid(1, 5),
+    TangentGrid(0, 4, 20, ROTATION),
+]
 
 
 @pytest.mark.parametrize("original", GRIDS)
@@ -23,6 +27,7 @@ def test_only_the_pixels_are_others(original: PinholeGrid, dim: int) -> None:
     assert grid.rotation is original.rotation
     np.testing.assert_array_equal(grid.neighbors, original.neighbors)
     np.testing.assert_array_equal(grid.world_from_camera, original.world_from_camera)
+    assert grid.with_rotation(OTHER) == ResizedGrid(original.with_rotation(OTHER), dim)
     # The outer edges agree: the middle of d pixels is (d − 1)/2.
     edges = original.project(grid.directions([3])[0, 0, 0], 3)
     np.testing.assert_allclose((edges + 0.5) * dim / original.dim, 0.5, atol=1e-9)

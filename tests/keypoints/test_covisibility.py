@@ -1,4 +1,4 @@
-"""What panoramas see of each other, against rooms whose rays are traced in closed form."""
+"""Areas that two panoramas both see, against rooms whose rays are traced in closed form."""
 
 from __future__ import annotations
 

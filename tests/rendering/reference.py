@@ -113,7 +113,7 @@ def sample_images(images: Array, face: NDArray[np.int64], row: Array, column: Ar
 
 @dataclass(frozen=True)
 class ReferenceGrid:
-    """All tangent images; `rotation` turns the icosahedron."""
+    """All tangent images; `rotation` rotates the icosahedron."""
 
     base_level: int
     level: int
@@ -122,7 +122,7 @@ class ReferenceGrid:
 
     @cached_property
     def centers_lonlat(self) -> Array:
-        """``(N, 2)`` barycentres of the faces, not turned."""
+        """``(N, 2)`` barycentres of the faces, not rotated."""
         centers = subdivided_icosahedron(self.base_level).triangles_center
         return to_lonlat(centers / np.linalg.norm(centers, axis=1, keepdims=True))
 
@@ -160,14 +160,14 @@ class ReferenceGrid:
 
     def nearness(self, shape: tuple[int, int]) -> Array:
         """``(H, W, N)`` cosine of the angle from every panorama pixel to every centre."""
-        return self._unturned(shape) @ to_xyz(self.centers_lonlat).T
+        return self._resting(shape) @ to_xyz(self.centers_lonlat).T
 
-    def _unturned(self, shape: tuple[int, int]) -> Array:
+    def _resting(self, shape: tuple[int, int]) -> Array:
         return np.asarray(to_xyz(panorama_lonlat(shape)) @ self.rotation)
 
     def positions(self, shape: tuple[int, int], face: NDArray[np.int64]) -> tuple[Array, Array]:
         """Row and column of every panorama pixel in the image of a face: gnomonic projection."""
-        lonlat = to_lonlat(self._unturned(shape))
+        lonlat = to_lonlat(self._resting(shape))
         lon, lat = lonlat[..., 0], lonlat[..., 1]
         lon_0, lat_0 = self.centers_lonlat[face, 0], self.centers_lonlat[face, 1]
         turn = np.cos(lon - lon_0)

@@ -21,8 +21,8 @@ from tangent_train.rendering import (
     write_colmap,
 )
 
-TURN = random_rotation(np.random.default_rng(3))
-GRIDS = [TangentGrid(0, 4), TangentGrid(1, 6, dim=25, rotation=TURN)]
+ROTATION = random_rotation(np.random.default_rng(3))
+GRIDS = [TangentGrid(0, 4), TangentGrid(1, 6, dim=25, rotation=ROTATION)]
 FACES = (0, 7, 11, 19)
 
 

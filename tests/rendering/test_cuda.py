@@ -1,4 +1,4 @@
-"""What runs on the CPU gives the same on a GPU."""
+"""Results on a GPU are those on the CPU."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ from tests.rendering.reference import (
 CLASSES = 5
 POSITION_ERROR = 0.0 if int(cv2.__version__.split(".")[0]) >= 5 else 1 / 64
 """OpenCV 4 rounds positions to 1/32 px, up to 1/64 px off each way; OpenCV 5 does not."""
-TURN = rotation_about((1, -2, 0.5), 2.3)
+ROTATION = rotation_about((1, -2, 0.5), 2.3)
 
 
 class Case(NamedTuple):
@@ -44,14 +44,14 @@ class Case(NamedTuple):
     level: int
     dim: int | None
     shape: tuple[int, int]
-    turned: bool = False
+    rotated: bool = False
 
 
 CASES = [
     Case(0, 4, None, (50, 100)),  # the paper's extent
     Case(0, 5, 24, (63, 126)),  # cropped to the least; odd rows: one on the equator
-    Case(0, 3, 12, (33, 67), turned=True),  # with a margin; half a turn is no whole column
-    Case(1, 4, None, (50, 100), turned=True),
+    Case(0, 3, 12, (33, 67), rotated=True),  # with a margin; half a revolution is no whole column
+    Case(1, 4, None, (50, 100), rotated=True),
     Case(1, 5, 13, (63, 126)),
     Case(2, 5, None, (32, 64)),
 ]
@@ -73,8 +73,8 @@ def case(request: pytest.FixtureRequest) -> Case:
 
 @lru_cache
 def pair_of(case: Case) -> Pair:
-    rotation = TURN if case.turned else np.eye(3)
-    ours = TangentGrid(case.base_level, case.level, case.dim, TURN if case.turned else None)
+    rotation = ROTATION if case.rotated else np.eye(3)
+    ours = TangentGrid(case.base_level, case.level, case.dim, ROTATION if case.rotated else None)
     theirs = ReferenceGrid(case.base_level, case.level, ours.dim, rotation)
     return Pair(ours, theirs, theirs.order(ours.centers_xyz))
 
@@ -161,12 +161,12 @@ def test_forward_of_any_number_of_channels(
 
 @pytest.mark.parametrize("interpolation", ["bilinear", "nearest"])
 @pytest.mark.parametrize("shape", [(50, 100), (33, 67)])
-def test_turned_panorama(shape: tuple[int, int], interpolation: Interpolation) -> None:
+def test_rotated_panorama(shape: tuple[int, int], interpolation: Interpolation) -> None:
     image = noise(*shape, 3)
-    seen_from = to_lonlat(to_xyz(panorama_lonlat(shape)) @ TURN)  # R⁻¹ d
+    seen_from = to_lonlat(to_xyz(panorama_lonlat(shape)) @ ROTATION)  # R⁻¹ d
     expected = sample_panorama(image, seen_from, interpolation)
     certain = certain_nearest(seen_from, shape, margin=1e-4) | (interpolation == "bilinear")
-    error = np.abs(rotate_equirect(image, TURN, interpolation) - expected)
+    error = np.abs(rotate_equirect(image, ROTATION, interpolation) - expected)
     assert error[certain].max() < 1e-9
 
 

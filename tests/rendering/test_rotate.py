@@ -1,4 +1,4 @@
-"""Pinhole views and turned panoramas."""
+"""Rotated panoramas."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from tangent_train.rendering import rotate_equirect
 
 
 @pytest.mark.parametrize("columns", [1, 16, 31])
-def test_a_turn_about_the_vertical_shifts_columns(columns: int) -> None:
+def test_a_rotation_about_the_vertical_shifts_columns(columns: int) -> None:
     image = np.random.default_rng(0).integers(0, 255, (16, 32, 3), np.uint8)
     turn = rotation_about([0, 0, 1], columns / 32 * 2 * np.pi)
     for interpolation in ("bilinear", "nearest"):
-        turned = rotate_equirect(image, turn, interpolation)
-        np.testing.assert_array_equal(turned, np.roll(image, columns, axis=1))
+        rotated = rotate_equirect(image, turn, interpolation)
+        np.testing.assert_array_equal(rotated, np.roll(image, columns, axis=1))
 
 
 def test_errors() -> None:

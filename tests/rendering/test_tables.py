@@ -22,7 +22,7 @@ from tangent_train.rendering import (
 )
 from tangent_train.rendering.compiled import over_rows
 
-TURN = random_rotation(np.random.default_rng(2))
+ROTATION = random_rotation(np.random.default_rng(2))
 
 
 @pytest.fixture
@@ -33,7 +33,7 @@ def cache(monkeypatch: pytest.MonkeyPatch) -> tables.TableCache:
 
 
 @pytest.mark.parametrize("base_level", [0, 1, 4])
-@pytest.mark.parametrize(("rotation", "shape"), [(None, (64, 128)), (TURN, (63, 125))])
+@pytest.mark.parametrize(("rotation", "shape"), [(None, (64, 128)), (ROTATION, (63, 125))])
 def test_owners_are_the_nearest_centres(
     base_level: int, rotation: NDArray[np.float64] | None, shape: tuple[int, int]
 ) -> None:
@@ -67,8 +67,8 @@ def test_bands_are_parts_of_the_whole(monkeypatch: pytest.MonkeyPatch, blend: An
         torch.testing.assert_close(band, expected, atol=1e-6, rtol=0)
 
 
-def test_tables_are_made_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The released code made its tables for every panorama."""
+def test_tables_are_computed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The released code made its tables anew for every panorama."""
 
     def render(shape: tuple[int, int]) -> list[NDArray[np.generic]]:
         grid = TangentGrid(0, 4, 15)  # a new, equal grid every time
@@ -78,21 +78,21 @@ def test_tables_are_made_once(monkeypatch: pytest.MonkeyPatch) -> None:
         labels = tangent_to_labels(images, grid, shape)
         return [result.numpy() for result in (images, labels, *both)]
 
-    def made_again(*_: object) -> None:
-        pytest.fail("a table was made again")
+    def computed_again(*_: object) -> None:
+        pytest.fail("a table was computed again")
 
     first = render((40, 80))
     for maker in ("over_rows", "pinhole_equirect_map"):
-        monkeypatch.setattr(tables, maker, made_again)
+        monkeypatch.setattr(tables, maker, computed_again)
     for result, before in zip(render((40, 80)), first, strict=True):
         np.testing.assert_array_equal(result, before)
-    with pytest.raises(pytest.fail.Exception, match="made again"):
+    with pytest.raises(pytest.fail.Exception, match="computed again"):
         render((40, 82))
 
 
 def test_tables_of_rotated_grids_are_not_kept(cache: tables.TableCache) -> None:
-    equirect_to_tangent(np.zeros((32, 64)), TangentGrid(0, 4, rotation=TURN))
-    tangent_to_equirect(torch.zeros(20, 1, 16, 16), TangentGrid(0, 4, rotation=TURN), (8, 16))
+    equirect_to_tangent(np.zeros((32, 64)), TangentGrid(0, 4, rotation=ROTATION))
+    tangent_to_equirect(torch.zeros(20, 1, 16, 16), TangentGrid(0, 4, rotation=ROTATION), (8, 16))
     assert len(cache) == 0
 
 

@@ -150,8 +150,8 @@ def test_impossible_tangent_settings_are_refused(settings: dict[str, object], me
 
 
 @pytest.mark.parametrize("representation", REPRESENTATIONS)
-def test_turned_views_see_the_panorama_turned_back(representation: Representation) -> None:
-    """Independent: turning what is looked at instead, with `rotate_equirect`."""
+def test_rotated_views_see_the_panorama_rotated_back(representation: Representation) -> None:
+    """Independent: rotating what is looked at instead, with `rotate_equirect`."""
     waves = 100 + 50 * np.sin(3 * equirect_directions(SHAPE) @ [[1, 0.3], [0, 1], [1, -0.5]])
     image = waves.astype(np.float32)
     views = representation.turned(TILT).whole().render(image, "bilinear")
@@ -161,10 +161,10 @@ def test_turned_views_see_the_panorama_turned_back(representation: Representatio
 
 
 @pytest.mark.parametrize(("blend", "least"), [("nearest", 0.999), ("feather", 0.95)])
-def test_averaged_turns_have_the_highest_mean_probability(blend: Blend, least: float) -> None:
-    """Against the probabilities of every turn, rendered on their own in double precision.
+def test_averaged_rotations_have_the_highest_mean_probability(blend: Blend, least: float) -> None:
+    """Against the probabilities of every rotation, rendered on their own in double precision.
 
-    Feathered ones are added up with the weights of all turns, there with those of each: almost
+    Feathered ones are added up with the weights of all rotations, there with those of each: almost
     the same.
     """
     representation = TangentRepresentation(0, 4, blend=blend, average_rotations=3).turned(TILT)

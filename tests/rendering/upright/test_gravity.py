@@ -1,4 +1,4 @@
-"""The direction of up by rooms drawn with known turns, and by poses rendered independently."""
+"""The direction of up by rooms drawn with known rotations, and by poses rendered independently."""
 
 from __future__ import annotations
 
@@ -109,11 +109,11 @@ def test_other_arrays_are_refused(panorama: NDArray[Any], found: str) -> None:
         estimate_up(panorama)
 
 
-# Turning upright
+# Rotating upright
 
 
 @given(st.tuples(*[st.floats(-5, 5)] * 3).filter(lambda up: np.linalg.norm(up) > 1e-3))
-def test_the_smallest_turn(up: tuple[float, float, float]) -> None:
+def test_the_smallest_rotation(up: tuple[float, float, float]) -> None:
     turn = upright_rotation(up)
     direction = np.array(up) / np.linalg.norm(up)
     np.testing.assert_allclose(turn @ _UP, direction, atol=1e-9)
@@ -141,8 +141,9 @@ def test_no_direction(up: Any) -> None:
 def _horizon_of_pose(pitch_deg: float, roll_deg: float) -> NDArray[np.float64]:
     """Height in the world, −1 to 1, of what every pixel of a panorama sees.
 
-    By the axes of Google's format: x right, y forward, z up; turned by the heading (clockwise about
-    z), the pitch about x, the roll about y, in that order, each about the axes as already turned.
+    By the axes of Google's format: x right, y forward, z up; rotated by the heading (clockwise
+    about z), the pitch about x, the roll about y, in that order, each about the axes as already
+    rotated.
     """
     turn = Rotation.from_euler("ZXY", [-77, pitch_deg, roll_deg], degrees=True).as_matrix()
     local = equirect_directions((360, 720))[..., [1, 0, 2]]

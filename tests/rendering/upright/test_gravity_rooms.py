@@ -1,4 +1,4 @@
-"""The direction of up in furnished rooms, turned as the test panoramas of a data module are."""
+"""The direction of up in furnished rooms, rotated as the test panoramas of a data module are."""
 
 from __future__ import annotations
 
