@@ -10,7 +10,7 @@ import pytest
 from datamodules.folder.panoramas import FolderPanoramas
 from datamodules.folder.photos import FolderPhotos
 from tangent_train.errors import DataError, SettingError
-from tangent_train.rendering import PerspectiveRepresentation
+from tangent_train.rendering import EquirectRepresentation, PerspectiveRepresentation
 from tests.datamodules.data_files import names_of
 from tests.datamodules.folder.folder_format import (
     CLASS_OF_STORED,
@@ -97,10 +97,10 @@ def test_all_sizes_give_crops_of_one_size(tmp_path: Path) -> None:
     assert len(list(module.test_dataloader())) == len(module.source("test")) == 2
 
 
-def test_scenes_are_held_out_as_those_of_panoramas(tmp_path: Path, strips: Any) -> None:
+def test_scenes_are_held_out_as_those_of_panoramas(tmp_path: Path) -> None:
     photos = FolderPhotos(write_photos(tmp_path / "photos", scenes=7), CROPS)
     write_data_set(tmp_path / "panoramas", scenes=7)
-    panoramas = FolderPanoramas(tmp_path / "panoramas", strips)
+    panoramas = FolderPanoramas(tmp_path / "panoramas", EquirectRepresentation(level=3))
     for split in ("train", "val", "test"):
         assert names_of(photos, split) == names_of(panoramas, split)
         assert names_of(photos, split)
