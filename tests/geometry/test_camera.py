@@ -81,6 +81,12 @@ def test_crops_at_the_ends_of_the_range_touch_the_border_of_the_image(
                 normalize_camera(K, SIZE, 20, size, shift)
 
 
+def test_the_common_camera_is_the_papers() -> None:
+    common = camera_matrix_from_fov(45, (128, 128))
+    np.testing.assert_array_equal(normalize_camera(K, SIZE).camera_matrix, common)
+    np.testing.assert_array_equal(shift_range(K, SIZE), shift_range(K, SIZE, 45))
+
+
 @pytest.mark.parametrize("fov_deg", [0.5, 45.0, 150.0])
 @pytest.mark.parametrize("size", [(4, 6), (11, 7)])
 def test_fov_is_between_the_outer_pixel_edges(fov_deg: float, size: tuple[int, int]) -> None:

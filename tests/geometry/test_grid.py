@@ -34,6 +34,9 @@ def test_project_is_the_inverse_of_directions(rotation: NDArray[np.float64] | No
     rows, columns = np.mgrid[:20, :20]
     expected = np.broadcast_to(np.stack([columns, rows], axis=-1), pixels.shape)
     np.testing.assert_allclose(pixels, expected, atol=1e-11)
+    homogeneous = grid.directions([5])[0] @ grid.world_from_camera[5] @ grid.camera_matrix.T
+    np.testing.assert_allclose(homogeneous[..., :2] / homogeneous[..., 2:], expected[0], atol=1e-11)
+    assert grid.directions([]).shape == (0, 20, 20, 3)
 
 
 @pytest.mark.parametrize("faces", [[20], [-1], [0.5], [[0, 1]], [True, False]])

@@ -173,14 +173,16 @@ def test_forked_workers_render_after_their_parent() -> None:
         np.testing.assert_array_equal(mine, theirs)
 
 
-def test_rows_are_covered_once_and_errors_surface() -> None:
-    visited = np.zeros(1000, int)
-
-    def visit(start: int, stop: int) -> None:
-        visited[start:stop] += 1
-
-    over_rows(visit, 1000, 1000)
-    assert (visited == 1).all()
+@pytest.mark.parametrize("threads", [1, 3])
+def test_rows_are_covered_once_and_errors_surface(
+    monkeypatch: pytest.MonkeyPatch, threads: int
+) -> None:
+    monkeypatch.setattr("torch.get_num_threads", lambda: threads)
+    blocks: list[tuple[int, int]] = []
+    over_rows(lambda *rows: blocks.append(rows), 1000, 1000)
+    assert len(blocks) == (1 if threads == 1 else 8 * threads)
+    covered = [row for start, stop in sorted(blocks) for row in range(start, stop)]
+    assert covered == list(range(1000))
 
     def fail(start: int, stop: int) -> None:
         raise ValueError(start, stop)
