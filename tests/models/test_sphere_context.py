@@ -87,19 +87,13 @@ def test_mirrored_images_give_mirrored_scores() -> None:
         assert not torch.allclose(context(images.flip(-1), rays).flip(-1), scores, atol=1e-3)
 
 
-def test_tokens_of_single_pixels_look_along_the_grid() -> None:
+@pytest.mark.parametrize("size", [(15, 15), (5, 3)])
+def test_tokens_look_along_the_middle_of_their_pixels(size: tuple[int, int]) -> None:
     grid = TangentGrid(0, 4, 15, random_rotation(np.random.default_rng(0)))
-    found = token_directions(tangent_rays(grid)[None], grid.dim, grid.dim)
-    expected = torch.tensor(grid.directions()).movedim(-1, 1)[None]
-    torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
-
-
-def test_tokens_of_several_pixels_look_along_their_middle() -> None:
-    grid = TangentGrid(0, 4)
     pixels = torch.tensor(grid.directions()).movedim(-1, 1)
     along = (pixels * torch.tensor(grid.centers_xyz)[..., None, None]).sum(1, keepdim=True)
-    found = token_directions(tangent_rays(grid)[None], 4, 2)
-    middle = functional.normalize(functional.adaptive_avg_pool2d(pixels / along, (4, 2)), dim=1)
+    found = token_directions(tangent_rays(grid)[None], *size)
+    middle = functional.normalize(functional.adaptive_avg_pool2d(pixels / along, size), dim=1)
     torch.testing.assert_close(found[0], middle, rtol=0, atol=1e-12)
 
 

@@ -205,23 +205,9 @@ def test_other_shapes_are_refused(tmp_path: Path, size: tuple[int, int]) -> None
 # The setting
 
 
-@pytest.mark.parametrize(
-    ("size", "crop", "full_shape", "rows", "columns"),
-    [
-        ((180, 360), (-180, 180, -90, 90), (180, 360), (0, 180), (0, 360)),
-        ((60, 100), (-50, 50, -30, 30), (180, 360), (60, 120), (130, 230)),
-        ((50, 90), (150, -120, -90, -40), (180, 360), (130, 180), (330, 420)),
-        ((20, 20), (180, -170, 80, 90), (360, 720), (0, 20), (0, 20)),
-    ],
-)
-def test_crop(
-    size: tuple[int, int],
-    crop: tuple[float, ...],
-    full_shape: tuple[int, int],
-    rows: tuple[int, int],
-    columns: tuple[int, int],
-) -> None:
-    assert area_of_crop(size, crop) == PanoramaArea(full_shape, rows, columns, size)
+def test_a_crop_across_the_seam_at_the_south_pole() -> None:
+    area = area_of_crop((50, 90), (150, -120, -90, -40))
+    assert area == PanoramaArea((180, 360), (130, 180), (330, 420), (50, 90))
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -270,19 +256,13 @@ def test_a_crop_of_a_panorama_too_large_for_memory() -> None:
 # Pose
 
 
-@pytest.mark.parametrize(
-    ("tags", "pitch_deg", "roll_deg"),
-    [
-        ({"PosePitchDegrees": "-24.49", "PoseRollDegrees": "-121.0"}, -24.49, -121),
-        ({"PosePitchDegrees": "5"}, 5, 0),
-        ({"PoseRollDegrees": "180", "PoseHeadingDegrees": "77"}, 0, 180),
-    ],
-)
-def test_pose(tmp_path: Path, tags: dict[str, str], pitch_deg: float, roll_deg: float) -> None:
-    for written in (_attributes, _elements):
-        up = up_of(_save(tmp_path / "image.jpg", written(tags)))
-        assert up is not None
-        np.testing.assert_array_equal(up, up_from_pose(pitch_deg, roll_deg))
+@pytest.mark.parametrize("written", [_attributes, _elements])
+@pytest.mark.parametrize(("pitch_deg", "roll_deg"), [(-24.49, -121.0), (5.0, 0.0)])
+def test_pose(tmp_path: Path, written: Any, pitch_deg: float, roll_deg: float) -> None:
+    tags = {"PosePitchDegrees": str(pitch_deg), "PoseRollDegrees": str(roll_deg)}
+    up = up_of(_save(tmp_path / "image.jpg", written(tags)))
+    assert up is not None
+    np.testing.assert_array_equal(up, up_from_pose(pitch_deg, roll_deg))
 
 
 def test_zero_pitch_and_roll_is_what_programs_write_that_do_not_know(tmp_path: Path) -> None:

@@ -131,18 +131,6 @@ def test_broken_files(name: str, content: bytes, tmp_path: Path) -> None:
 # Colours
 
 
-@pytest.mark.parametrize("suffix", [".png", ".tif", ".webp"])
-def test_lossless_formats_give_the_pixels_written(tmp_path: Path, suffix: str) -> None:
-    rgb = _noise((301, 7, 3))  # odd sizes
-    path = tmp_path / f"image{suffix}"
-    Image.fromarray(rgb).save(path, lossless=True)
-    read = read_rgb(path)
-    np.testing.assert_array_equal(read, rgb)
-    assert read.flags.c_contiguous
-    assert read.flags.writeable
-    assert read_image_size(path) == (301, 7)
-
-
 def test_jpeg_gives_the_pixels_of_another_decoder(tmp_path: Path) -> None:
     path = tmp_path / "image.jpg"
     Image.fromarray(_smooth(40, 81)).save(path, quality=90)

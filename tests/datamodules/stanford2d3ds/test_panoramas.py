@@ -106,7 +106,7 @@ def test_one_training_room(fabricate_stanford: FabricateStanford, tmp_path: Path
 
 
 @pytest.mark.parametrize("erp_height", [32, 8])
-def test_reads_what_was_written(stanford_root: Path, erp: Any, erp_height: int) -> None:
+def test_reads_what_was_written(stanford_root: Path, erp_height: int) -> None:
     module = Stanford2D3DS(stanford_root, EquirectRepresentation(3, erp_height=erp_height))
     source = module.source("test")
     area, room, camera = source.name(1).split("/")

@@ -60,7 +60,7 @@ def test_splits(root: Path, erp: Any) -> None:
 
 
 @pytest.mark.parametrize("erp_height", [32, 8])
-def test_reads_what_was_written(root: Path, erp: Any, erp_height: int) -> None:
+def test_reads_what_was_written(root: Path, erp_height: int) -> None:
     module = OmniSynthia(
         root, EquirectRepresentation(3, erp_height=erp_height), inputs=("rgb", "depth")
     )

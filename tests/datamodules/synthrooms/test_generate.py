@@ -1,38 +1,15 @@
 from __future__ import annotations
 
-import re
 from collections import Counter
 from pathlib import Path
 
-from datamodules.synthrooms.generate import MANIFEST, plan_rooms
+from datamodules import SynthRoomsPerspective
+from datamodules.core.found import SPLITS
+from datamodules.synthrooms.generate import plan_rooms
 from datamodules.synthrooms.settings import RoomSettings
+from tangent_train.rendering import PerspectiveRepresentation
 from tests.datamodules.conftest import TINY_ROOMS
-from tests.datamodules.data_files import contents, read_png
-
-NAME = re.compile(
-    r"camera_([0-9a-f]{32})_([A-Za-z]+_\d+)_frame_(equirectangular|\d+)_domain_(\w+)\.(png|json)"
-)
-
-
-def test_files_are_those_of_the_real_set(tiny_rooms: Path) -> None:
-    names = [Path(name) for name in contents(tiny_rooms)]
-    pictures = [name for name in names if len(name.parts) > 1]
-    assert {str(n) for n in names} - {str(n) for n in pictures} == {
-        MANIFEST,
-        "semantic_labels.json",
-    }
-    cameras = sum(len(plan.cameras) for plan in plan_rooms(TINY_ROOMS))
-    assert len(pictures) == cameras * 2 * 4
-    for path in pictures:
-        match = NAME.fullmatch(path.name)
-        assert match
-        area, group, kind = path.parts[:3]
-        assert area in {"area_1", "area_5a", "area_5b"}
-        assert (match[3] == "equirectangular") == (group == "pano")
-        assert match[4] == kind
-        assert match[5] == ("json" if kind == "pose" else "png")
-    sizes = {read_png(tiny_rooms / p).shape[:2] for p in pictures if p.suffix == ".png"}
-    assert sizes == {(16, 32), (8, 8)}
+from tests.datamodules.data_files import names_of
 
 
 def test_one_to_three_cameras_in_a_room() -> None:
@@ -48,3 +25,14 @@ def test_rooms_have_as_many_cameras_as_wanted_and_are_the_same_rooms() -> None:
         assert (one.name, one.area) == (other.name, other.area)
         assert len(other.cameras) == max(2, len(one.cameras))
         assert other.cameras[: len(one.cameras)] == one.cameras
+
+
+def test_views_are_read_like_photos_of_the_real_set(tiny_rooms: Path) -> None:
+    crops = PerspectiveRepresentation(level=5, fov_deg=20)
+    module = SynthRoomsPerspective(tiny_rooms, crops, rooms=vars(TINY_ROOMS))
+    module.prepare_data()
+    names = [name for split in SPLITS for name in names_of(module, split)]
+    assert len(set(names)) == len(names) == sum(len(p.cameras) for p in plan_rooms(TINY_ROOMS))
+    photo = module.source("test").read(0)
+    assert photo.rgb.shape == (8, 8, 3)
+    assert photo.labels.max() > 0

@@ -1,16 +1,13 @@
 from __future__ import annotations
 
-import json
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 
 from datamodules.modelnet40.meshes import clean_mesh, mesh_spheres
-from datamodules.modelnet40.shape_files import find_shapes
 from datamodules.synthshapes.generate import (
     CLASSES,
-    MANIFEST,
     ShapeSettings,
     generate_shapes,
     make_shape,
@@ -22,17 +19,6 @@ from tests.datamodules.data_files import contents
 
 if TYPE_CHECKING:
     from pathlib import Path
-
-
-def test_the_tree_is_that_of_the_real_set(tiny_shapes: Path) -> None:
-    shapes = find_shapes(tiny_shapes)
-    assert len(shapes) == 30
-    assert {shape.label for shape in shapes} == set(CLASSES)
-    names = {shape.name for shape in shapes if shape.label == "cup"}
-    assert names == {"cup/train/cup_0001", "cup/train/cup_0002", "cup/test/cup_0003"}
-    manifest = json.loads((tiny_shapes / MANIFEST).read_text())
-    assert manifest["settings"] == {"seed": 3, "train": 2, "test": 1}
-    assert len(contents(tiny_shapes)) == 31
 
 
 def test_another_seed_or_more_shapes(tiny_shapes: Path, tmp_path: Path) -> None:
