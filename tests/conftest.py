@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from datamodules.stanford2d3ds.label_table import CLASSES
+from tests.datamodules.data_files import write_png
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -52,11 +53,6 @@ class FabricateStanford(Protocol):
     ) -> Path: ...
 
 
-def _write_png(path: Path, image: NDArray[Any]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    assert cv2.imwrite(str(path), image)
-
-
 def fabricate(
     root: Path,
     rooms: Mapping[str, Sequence[str]] = ROOMS,
@@ -80,12 +76,12 @@ def fabricate(
             stem = f"camera_{camera}_{room}_frame_equirectangular_domain"
             pano = root / f"area_{area}" / "pano"
             for domain, image in _panorama(rng, height, alpha=number % 2 == 1).items():
-                _write_png(pano / domain / f"{stem}_{domain}.png", image)
+                write_png(pano / domain / f"{stem}_{domain}.png", image)
             for frame in range(photos):
                 stem = f"camera_{camera}_{room}_frame_{frame}_domain"
                 data = root / f"area_{area}" / "data"
                 for domain, image in _panorama(rng, height, alpha=False).items():
-                    _write_png(data / domain / f"{stem}_{domain}.png", image[:, :height])
+                    write_png(data / domain / f"{stem}_{domain}.png", image[:, :height])
                 focal = height / (2 * math.tan(math.radians(60 + 2 * frame) / 2))
                 matrix = [[focal, 0, height / 2], [0, focal, height / 2], [0, 0, 1]]
                 (data / "pose").mkdir(exist_ok=True)

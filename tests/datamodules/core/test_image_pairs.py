@@ -6,17 +6,16 @@ import re
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
 from datamodules.core.panorama_pairs import ImagePairs
 from tangent_train.errors import DataError, SettingError
+from tests.datamodules.data_files import write_png
 
 
 def _write(path: Path, grey: int, shape: tuple[int, int] = (8, 16)) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    assert cv2.imwrite(str(path), np.full((*shape, 3), (grey, 0, 255), np.uint8))
+    write_png(path, np.full((*shape, 3), (grey, 0, 255), np.uint8))
     return path
 
 

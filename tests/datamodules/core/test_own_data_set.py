@@ -15,6 +15,8 @@ from datamodules.core.reading import ImageFiles, ImageReader
 from datamodules.images.png import check_png, read_color_png, read_png
 from tangent_train.errors import DataError, SettingError
 from tangent_train.rendering import EquirectRepresentation
+from tests.datamodules.data_files import read_png as read_as_stored
+from tests.datamodules.data_files import write_png
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -62,10 +64,9 @@ class Nameless(Toy):
 def _write(root: Path, largest: int) -> None:
     rng = np.random.default_rng(0)
     for folder, high, size in (("rgb", 255, (32, 64, 3)), ("labels", largest, (32, 64))):
-        (root / folder).mkdir()
         for name in "abc":
             image = rng.integers(0, high + 1, size, np.uint8)
-            assert cv2.imwrite(str(root / folder / f"{name}.png"), image)
+            write_png(root / folder / f"{name}.png", image)
 
 
 def _toy(root: Path, made: type[Toy] = Toy) -> Toy:
@@ -77,9 +78,8 @@ def test_a_data_set_is_a_reader_and_its_files(tmp_path: Path) -> None:
     data = _toy(tmp_path)
     data.prepare_data()
     assert len(data.source("train")) == 2
-    expected = cv2.imread(str(tmp_path / "labels" / "c.png"), cv2.IMREAD_UNCHANGED)
     sample = data.evaluation_samples("test")[0, 0]
-    np.testing.assert_array_equal(sample.target, expected)
+    np.testing.assert_array_equal(sample.target, read_as_stored(tmp_path / "labels" / "c.png"))
     problems, count = data.check()
     assert not problems.items
     assert count == 3

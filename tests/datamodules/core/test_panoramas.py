@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import pytest
@@ -47,12 +47,6 @@ def test_rgb_is_averaged() -> None:
     stripes = np.zeros((8, 16, 3), np.uint8)
     stripes[:, ::2] = 200
     assert np.unique(resize_area(stripes, (4, 8))).tolist() == [100]
-
-
-@pytest.mark.parametrize("resize", [resize_area, resize_nearest])
-def test_the_same_size_changes_nothing(resize: Any) -> None:
-    image = np.random.default_rng(0).integers(0, 256, (4, 8, 3), np.uint8)
-    np.testing.assert_array_equal(resize(image, (4, 8)), image)
 
 
 def _nearest_valid(depth: NDArray[np.uint16], shape: tuple[int, int]) -> NDArray[np.uint16]:

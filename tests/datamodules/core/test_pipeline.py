@@ -14,7 +14,6 @@ from datamodules.core.pipeline import (
     PosedUp,
     RotatedPanoramas,
     SplitItems,
-    in_threads,
 )
 from datamodules.core.reading import ImageFiles
 from tangent_train.errors import DataError
@@ -128,7 +127,3 @@ def test_what_is_remembered_is_read_once_and_what_is_broken_is_listed() -> None:
     broken = [file._replace(name="broken", rgb=Path(f"b{file.name}")) for file in FILES]
     with pytest.raises(DataError, match=r"data: found 2 problems(.|\n)*b0(.|\n)*b1"):
         SplitItems(broken, decode, Panorama).remember("data")
-
-
-def test_threads_keep_the_order() -> None:
-    assert list(in_threads(lambda n: 2 * n, range(100))) == list(range(0, 200, 2))

@@ -116,8 +116,6 @@ def test_the_elevation_follows_the_measured_channels() -> None:
     assert images.shape == (2, 5, 3, 3)
     assert images[0, 3, 0].tolist() == [0, 1 / 512, 4]
     torch.testing.assert_close(images[:, 4], elevation)
-    without = normalize([rgb, depth], IDENTITY, every[:2])
-    torch.testing.assert_close(without, images[:, :4])
     flat = normalize([rgb, elevation], RGB_NORMALIZATION, ("rgb", "elevation"))
     torch.testing.assert_close(flat[:, 3], elevation)
 

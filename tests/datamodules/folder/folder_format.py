@@ -6,10 +6,11 @@ import json
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
+
+from tests.datamodules.data_files import write_png
 
 NAMES = ("wall", "floor", "window")
 VALUES = {"wall": 1, "floor": [2, 3], "window": 255}
@@ -36,19 +37,13 @@ def write_panorama(
     save(root / "images" / f"{name}{suffix}", rgb)
     save(root / "labels" / f"{name}.png", values)
     if depth:
-        save_depth(root / "depth" / f"{name}.png", 500 + 40 * values.astype(np.uint16))
+        write_png(root / "depth" / f"{name}.png", 500 + 40 * values.astype(np.uint16))
 
 
 def save(path: Path, image: NDArray[np.uint8], **settings: Any) -> None:
     """Write an image as its name says."""
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(image).save(path, **settings)
-
-
-def save_depth(path: Path, units: NDArray[np.uint16]) -> None:
-    """Write 16-bit depth as PNG or TIFF."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    assert cv2.imwrite(str(path), units)
 
 
 def write_classes(root: Path, content: Any = VALUES) -> None:

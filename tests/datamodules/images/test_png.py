@@ -15,6 +15,7 @@ from datamodules.images.png import (
     read_png_header,
 )
 from tangent_train.errors import DataError, SettingError
+from tests.datamodules.data_files import write_png
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -22,9 +23,9 @@ if TYPE_CHECKING:
 READERS = [read_png_header, read_color_png, read_depth_png]
 
 
-def _write(path: Path, image: np.ndarray[Any, Any]) -> Path:
-    assert cv2.imwrite(str(path), image)
-    return path
+def _written(folder: Path, image: np.ndarray[Any, Any]) -> Path:
+    write_png(folder / "image.png", image)
+    return folder / "image.png"
 
 
 @pytest.mark.parametrize(
@@ -37,7 +38,7 @@ def _write(path: Path, image: np.ndarray[Any, Any]) -> Path:
     ],
 )
 def test_header(tmp_path: Path, shape: tuple[int, ...], dtype: Any, bits: int, color: str) -> None:
-    path = _write(tmp_path / "image.png", np.zeros(shape, dtype))
+    path = _written(tmp_path, np.zeros(shape, dtype))
     assert check_png(path, bits, (color,)) == PngHeader(4, 8, bits, color)
     with pytest.raises(DataError, match=rf"found {bits}-bit {color}; expected 8-bit palette"):
         check_png(path, 8, ("palette",))
@@ -59,7 +60,7 @@ def test_files_that_are_not_png(tmp_path: Path, read: Any) -> None:
 @pytest.mark.parametrize("missing", [slice(-20, None), slice(-1, None), slice(1000, 3000)])
 def test_truncated_files_are_named(tmp_path: Path, missing: slice, read: Any) -> None:
     noise = np.random.default_rng(0).integers(0, 256, (64, 128, 3), np.uint8)
-    path = _write(tmp_path / "image.png", noise)
+    path = _written(tmp_path, noise)
     content = bytearray(path.read_bytes())
     del content[missing]
     path.write_bytes(content)
@@ -68,13 +69,13 @@ def test_truncated_files_are_named(tmp_path: Path, missing: slice, read: Any) ->
 
 
 def test_notes_behind_the_end_are_ignored(tmp_path: Path) -> None:
-    path = _write(tmp_path / "image.png", np.ones((4, 8, 3), np.uint8))
+    path = _written(tmp_path, np.ones((4, 8, 3), np.uint8))
     path.write_bytes(path.read_bytes() + b"notes")
     assert read_color_png(path).shape == (4, 8, 3)
 
 
 def test_broken_pixels(tmp_path: Path) -> None:
-    path = _write(tmp_path / "image.png", np.ones((64, 128, 3), np.uint8))
+    path = _written(tmp_path, np.ones((64, 128, 3), np.uint8))
     content = bytearray(path.read_bytes())
     place = content.index(b"IDAT") + 4
     content[place : place + 8] = b"not zlib"

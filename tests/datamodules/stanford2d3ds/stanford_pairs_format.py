@@ -8,12 +8,12 @@ import math
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from datamodules.stanford2d3ds.pairs import published_pairs
 from datamodules.synthrooms.camera import euler_angles
 from tangent_train.geometry import rotation_about
+from tests.datamodules.data_files import write_png
 
 
 def write_paper_pairs(root: Path, rows: int = 8) -> Path:
@@ -55,8 +55,7 @@ def write_panorama(root: Path, camera: str, room: str, grey: int, rows: int = 8)
     }
     pictures["depth"][0] = 65535
     for kind, picture in pictures.items():
-        (pano / kind).mkdir(parents=True, exist_ok=True)
-        assert cv2.imwrite(str(pano / kind / f"{stem}_{kind}.png"), picture)
+        write_png(pano / kind / f"{stem}_{kind}.png", picture)
     (pano / "pose").mkdir(exist_ok=True)
     turn = rotation_about((0, 0, 1), grey / 50) @ rotation_about((1, 0, 0), math.pi / 2)
     rotation = np.diag([1.0, -1, -1]) @ turn.T

@@ -27,14 +27,6 @@ def test_classes_are_numbered_in_alphabetical_order(tmp_path: Path) -> None:
     assert table.class_ids.tolist() == [0, *range(13, 0, -1)]
 
 
-def test_decode_uses_all_three_bytes() -> None:
-    ids = np.zeros(70_000, np.uint8)
-    ids[[0x0A, 0x0A0B, 0x010A0B]] = 1, 2, 3
-    decoded = LabelTable(ids).decode(_colors([0x0A, 0x0A0B, 0x010A0B, 0]))
-    assert decoded.dtype == np.uint8
-    assert decoded.tolist() == [[1, 2, 3, 0]]
-
-
 def test_what_is_past_the_end_of_the_table_is_missing_or_a_mistake() -> None:
     # #0D0D0D without its red byte would be entry 3341 of the table.
     table = LabelTable(np.full(9816, 6, np.uint8))

@@ -153,25 +153,6 @@ def test_a_band_without_gaps_between_blind_poles(height: int) -> None:
 # --- files ---------------------------------------------------------------------------------------
 
 
-def test_the_format_is_that_of_the_published_panoramas(made: Path) -> None:
-    pano = synthia.sequence(made, "01") / "pano"
-    names = {name for name in contents(pano) if name != MANIFEST}
-    assert names == {f"{folder}/{n:06d}.png" for folder in PARTS.values() for n in range(3)}
-    shapes = {part: panorama(made, part).shape for part in PARTS}
-    size = (HEIGHT, 2 * HEIGHT)
-    assert shapes == {"rgb": (*size, 3), "labels": size, "depth": size}
-    assert set(np.unique(panorama(made, "labels")).tolist()) == {*synthia.IDS.tolist(), 255}
-
-
-def test_some_frames_of_many(views: Path) -> None:
-    folder = synthia.sequence(views, "01")
-    for number in range(2, 9):
-        synthia.write_frame(folder, number)
-    assert make(views, "01", frames=4) == 5
-    found = [path.stem for path in sorted((folder / "pano" / "RGB").glob("*.png"))]
-    assert found == ["000000", "000002", "000004", "000006", "000008"]
-
-
 def test_missing_panoramas_are_made_and_others_kept(made: Path, views: Path) -> None:
     make(views, "01")
     pano = synthia.sequence(views, "01") / "pano"
