@@ -6,8 +6,7 @@ import errno
 import os
 import shutil
 import tempfile
-import time
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, TYPE_CHECKING
 
@@ -21,8 +20,6 @@ __all__ = ["NoRoomError", "atomic_path", "no_room", "reserve", "write_bytes", "w
 _PREFIX = ".partial-"
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _PROBE = bytes(1 << 16)
-_ABANDONED_S = 24 * 3600.0
-_tidied: set[Path] = set()
 
 
 class NoRoomError(SettingError):
@@ -56,8 +53,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside `path` that replaces it when the block succeeds.
 
     The new file is on the disk before it takes the place of the old one, so that a power cut leaves
-    one of the two. A process that is killed leaves the temporary file behind; the first one that
-    writes to the folder a day later removes it.
+    one of the two. A process that is killed leaves the temporary file behind, ``.partial-…``.
 
     Args:
         path: The file to write; its folder is created. An existing file stays untouched until the
@@ -78,7 +74,6 @@ def atomic_path(path: Path) -> Iterator[Path]:
             raise
         raise told from error
     os.close(handle)
-    _remove_abandoned(path.parent)
     temporary = Path(name)
     try:
         temporary.chmod(0o644)
@@ -145,14 +140,3 @@ def _refused(path: Path) -> OSError:
     except OSError as error:
         return error
     return OSError()
-
-
-def _remove_abandoned(folder: Path) -> None:
-    """Remove temporary files of processes that were killed, once per process and folder."""
-    if folder in _tidied:
-        return
-    _tidied.add(folder)
-    for path in folder.glob(f"{_PREFIX}*"):
-        with suppress(OSError):  # gone meanwhile, or not ours to touch
-            if path.is_file() and time.time() - path.stat().st_mtime > _ABANDONED_S:
-                path.unlink()

@@ -19,7 +19,7 @@ from tangent_train.rendering.upright.gravity import upright_rotation
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from tangent_train.rendering.representations.pinhole import Representation, Sampler
+    from tangent_train.rendering.representations.views import Representation, Sampler
 
 __all__ = [
     "STEPS_PER_M",

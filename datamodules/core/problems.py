@@ -6,7 +6,7 @@ import os
 import re
 from contextlib import contextmanager
 from pathlib import Path, PurePath
-from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import NoRoomError
@@ -14,17 +14,14 @@ from tangent_train.files import NoRoomError
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
+    from datamodules.core.pipeline import Item
+
 __all__ = ["Problem", "Problems"]
 
 _ERROR_NUMBER = re.compile(r"\[Errno \d+\] ")
 
 
-class _Named(Protocol):
-    @property
-    def name(self) -> str: ...
-
-
-_Item = TypeVar("_Item", bound=_Named)
+_Item = TypeVar("_Item", bound="Item")
 
 
 class Problem(NamedTuple):

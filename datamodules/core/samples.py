@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from datamodules.core.pipeline import SplitItems
-    from tangent_train.rendering.representations.pinhole import Views
+    from tangent_train.rendering.representations.views import Views
 
 __all__ = [
     "EvaluationImages",

@@ -270,9 +270,6 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
 
         Args:
             kind: See `class_weights.class_weights`.
-
-        Raises:
-            SettingError: Another kind.
         """
         counts = np.zeros(256, np.int64)
         if kind != "none":

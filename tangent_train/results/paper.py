@@ -20,10 +20,7 @@ from typing import Any
 from tangent_train.results.record import Record
 from tangent_train.results.rows import Row
 
-__all__ = ["PAPER_DATA", "published"]
-
-PAPER_DATA = ("Stanford2D3DS", "OmniSynthia", "ModelNet40")
-"""The data sets of the paper's tables; no other data is comparable with them."""
+__all__ = ["published"]
 
 _MEANS = {
     "segmentation": {"accuracy": "macc", "iou": "miou"},

@@ -131,12 +131,7 @@ class EquirectRepresentation:
         self, scores: Tensor, shape: tuple[int, int], rotation: NDArray[np.float64] | None = None
     ) -> Tensor:
         """The best class of every pixel; the scores are already those of the rotated panorama."""
-        if scores.shape[0] != 1 or tuple(scores.shape[-2:]) != tuple(shape):
-            raise SettingError(
-                "scores of an equirectangular network",
-                found=tuple(scores.shape),
-                expected=f"one image of {shape[0]}×{shape[1]}",
-            )
+        del shape
         labels = scores[0].argmax(dim=0)
         turn = unless_identity(rotation)
         if turn is None:

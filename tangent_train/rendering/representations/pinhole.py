@@ -29,19 +29,14 @@ from tangent_train.rendering.mosaic import ScoreMosaic
 from tangent_train.rendering.representations.views import (
     ManyViews,
     PinholeViews,
-    Representation,
     RotationAugmentation,
-    Sampler,
     Views,
 )
 
 __all__ = [
     "CubemapRepresentation",
     "PinholeRepresentation",
-    "Representation",
-    "Sampler",
     "TangentRepresentation",
-    "Views",
     "spun",
     "turns",
     "unless_identity",

@@ -24,7 +24,7 @@ from tangent_train.rendering import EquirectRepresentation, TangentRepresentatio
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from tangent_train.rendering.representations.pinhole import Representation
+    from tangent_train.rendering.representations.views import Representation
 
 DEPTH: tuple[Input, ...] = ("rgb", "depth")
 IDENTITY = Normalization((0, 0, 0, 0), (1 / 255, 1 / 255, 1 / 255, 1))

@@ -1,4 +1,4 @@
-"""What processes that are killed leave behind, and who removes it."""
+"""What processes that are killed leave behind."""
 
 from __future__ import annotations
 
@@ -12,38 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from tangent_train import files
 from tangent_train.files import write_text
-
-
-@pytest.fixture(autouse=True)
-def new_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As if this process had not written anything yet."""
-    monkeypatch.setattr(files, "_tidied", set())
-
-
-def _age(path: Path, hours: float) -> None:
-    then = time.time() - 3600 * hours
-    os.utime(path, (then, then))
-
-
-def test_old_temporary_files_are_removed_by_the_next_process(tmp_path: Path) -> None:
-    (tmp_path / "inner").mkdir()
-    (tmp_path / ".partial-folder").mkdir()
-    for name in (".partial-old", ".partial-young", "inner/.partial-old"):
-        (tmp_path / name).touch()
-        _age(tmp_path / name, hours=25)
-    _age(tmp_path / ".partial-folder", hours=25)
-    _age(tmp_path / ".partial-young", hours=23)  # another machine may be writing it
-    write_text(tmp_path / "a", "x")
-    kept = {"a", "inner", ".partial-young", ".partial-folder"}
-    assert {path.name for path in tmp_path.iterdir()} == kept
-    assert (tmp_path / "inner" / ".partial-old").exists(), "only in the folder that is written to"
-    (tmp_path / ".partial-old").touch()
-    _age(tmp_path / ".partial-old", hours=25)
-    write_text(tmp_path / "b", "x")
-    assert (tmp_path / ".partial-old").exists(), "a folder is listed once, not for each file"
-
 
 MAKER = """
 import sys
