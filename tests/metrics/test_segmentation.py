@@ -83,13 +83,13 @@ def test_solid_angle_weighs_a_hemisphere_as_half_whatever_its_rows() -> None:
 
 
 def test_latitude_bands_go_from_north_to_south() -> None:
-    truth = torch.arange(1, 7).repeat_interleave(5)[:, None].expand(30, 60)
+    # Rows of 1°: their centres are half a degree from the edges of the bands.
+    truth = torch.arange(1, 7).repeat_interleave(30)[:, None].expand(180, 4)
     metric = ConfusionMatrix(7)
     metric.update(truth, truth)
     bands = metric.compute().bands
     for k, band in enumerate(bands):
-        assert band[k + 1, k + 1] == 5 * 60
-        assert band.sum() == 5 * 60
+        assert band[k + 1, k + 1] == band.sum() == 30 * 4
 
 
 def test_large_counts_stay_exact() -> None:
