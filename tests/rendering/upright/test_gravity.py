@@ -66,6 +66,14 @@ def test_upside_down() -> None:
     assert angle_deg(estimate_up(room).up, _UP) < 0.5
 
 
+def test_no_direction_beyond_the_largest_tilt() -> None:
+    gravity = estimate_up(draw_room((128, 256), _tilted(20, 0, 45)), max_tilt_deg=5)
+    assert angle_deg(gravity.up, _UP) < 5
+    assert all(angle_deg(one, _UP) < 5 for one in gravity.candidates)
+    with pytest.raises(SettingError, match="max_tilt_deg: found 181"):
+        estimate_up(draw_room((8, 16), np.eye(3)), max_tilt_deg=181)
+
+
 def _without_structure() -> dict[str, NDArray[np.uint8]]:
     noise = np.random.default_rng(0).integers(0, 256, (128, 256, 3), np.uint8)
     part = np.zeros_like(noise)
