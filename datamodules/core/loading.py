@@ -9,7 +9,7 @@ import cv2
 import torch
 from torch.utils.data import DataLoader, Dataset
 
-from datamodules.core.sampling import EpochSampler
+from datamodules.core.order import EpochSampler
 from tangent_train.errors import DataError, SettingError
 
 __all__ = ["at_least", "explained", "make_loader", "this_process"]

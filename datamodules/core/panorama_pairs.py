@@ -9,7 +9,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from datamodules.images.gpano import area_of
-from datamodules.images.image_files import find_images, short_names
+from datamodules.images.image_files import image_paths, short_names
 from datamodules.images.pixel_files import read_rgb
 from tangent_train.errors import DataError, SettingError
 
@@ -115,7 +115,7 @@ class ImagePairs(PanoramaPairs):
     Args:
         left: One panorama; together with `right`.
         right: The other.
-        input: Instead: a folder of panoramas, or a pattern, see `find_images`.
+        input: Instead: a folder of panoramas, or a pattern, see `image_paths`.
         pairing: Of `input`: `consecutive`, each with the next in the order of the paths; or `all`,
             each with each.
 
@@ -141,9 +141,9 @@ class ImagePairs(PanoramaPairs):
         if pairing not in ("consecutive", "all"):
             raise SettingError("pairing", found=pairing, expected="consecutive or all")
         if input is not None:
-            paths = find_images(input)
+            paths = image_paths(input)
         else:
-            paths = [path for side in (str(left), str(right)) for path in find_images(side)]
+            paths = [path for side in (str(left), str(right)) for path in image_paths(side)]
         if len(paths) < 2 or (input is None and len(paths) > 2):
             expected = "two panoramas" + ("" if input is None else " or more")
             raise DataError(input or left, found=f"{len(paths)}", expected=expected)

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any, Generic, Literal, Protocol, TypeVar
 
 import numpy as np
 
+from datamodules.core.order import sample_rng
 from datamodules.core.panoramas import Panorama
 from datamodules.core.problems import Problems
-from datamodules.core.sampling import sample_rng
 from datamodules.images.gpano import up_of
 from tangent_train.geometry import random_rotation, rotation_about
 from tangent_train.rendering import rotate_equirect

@@ -20,8 +20,8 @@ from datamodules.core.inputs import (
     channel_names,
     normalize,
 )
+from datamodules.core.order import Seed, sample_rng
 from datamodules.core.panoramas import STEPS_PER_M
-from datamodules.core.sampling import Seed, sample_rng
 from datamodules.images.colors import jitter_colors
 from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_elevations

@@ -20,9 +20,9 @@ from datamodules.core.class_weights import ClassWeights, class_weights
 from datamodules.core.found import SPLITS, Found, Split
 from datamodules.core.inputs import Normalization
 from datamodules.core.loading import at_least, make_loader, this_process
+from datamodules.core.order import EpochSampler
 from datamodules.core.pipeline import Item, SplitItems, in_threads
 from datamodules.core.problems import Problems
-from datamodules.core.sampling import EpochSampler
 from tangent_train.errors import DataError, SettingError
 
 __all__ = ["SPLITS", "Found", "Kind", "Split", "SplitDataModule"]

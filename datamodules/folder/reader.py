@@ -9,7 +9,7 @@ import numpy as np
 
 from datamodules.core.panoramas import meters_to_steps, resize_nearest
 from datamodules.core.reading import ImageFiles, ImageReader
-from datamodules.images.image_files import find_depth, find_images
+from datamodules.images.image_files import find_depth, image_paths
 from datamodules.images.pixel_files import read_depth_m, read_image_size, read_pixels, read_rgb
 from datamodules.images.png import PngHeader, read_png_header
 from tangent_train.errors import DataError
@@ -89,7 +89,7 @@ def list_images(root: Path, problems: Problems, *, with_depth: bool) -> list[Ima
             expected = "a data set: images/, labels/ and classes.json, see docs/own_data.md"
             raise DataError(folder, found="no such folder", expected=expected)
     found: dict[str, ImageFiles] = {}
-    for rgb in find_images(root / "images", problems.noted):
+    for rgb in image_paths(root / "images", problems.noted):
         name = rgb.relative_to(root / "images").with_suffix("").as_posix()
         depth = None
         with problems.noted(name):

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     Noted = Callable[..., AbstractContextManager[None]]
 
-__all__ = ["DEPTH_SUFFIXES", "IMAGE_SUFFIXES", "find_depth", "find_images", "short_names"]
+__all__ = ["DEPTH_SUFFIXES", "IMAGE_SUFFIXES", "find_depth", "image_paths", "short_names"]
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
 """Suffixes of images, in lower case."""
@@ -25,7 +25,7 @@ DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".npy", ".exr")
 """Suffixes of depth maps."""
 
 
-def find_images(pattern: str | Path, noted: Noted | None = None) -> list[Path]:
+def image_paths(pattern: str | Path, noted: Noted | None = None) -> list[Path]:
     """The images that a setting names.
 
     Args:

@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 
+from datamodules.core.split_module import SplitDataModule
 from tangent_train.checkpoints.trained import completed_settings
 from tangent_train.errors import SettingError
 from tangent_train.registry import SettingsFile, check_registered, make, maker_of
@@ -42,6 +43,9 @@ def build(settings: Settings, source: SettingsFile | None = None) -> tuple[Any, 
     }
     representation = parts["representation"]
     data = make(settings["data"], "data", source, representation=representation)
+    if not isinstance(data, SplitDataModule):
+        expected = "labelled images or shapes; pairs are for tangent-keypoints"
+        raise SettingError("data", found=type(data).__name__, expected=expected)
     data.check_classes()
     kind = getattr(maker_of(settings["task"], "task", source), "kind", data.kind)
     if kind != data.kind:

@@ -14,7 +14,7 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from datamodules.images.image_files import find_images, short_names
+from datamodules.images.image_files import image_paths, short_names
 from tangent_train.checkpoints.trained import load_trained
 from tangent_train.cli.each import each
 from tangent_train.cli.settings import typed
@@ -173,7 +173,7 @@ def _find_images(settings: Settings) -> dict[str, Path]:
     results = [(settings.output / kind).resolve() for kind in ("labels", "color", "overlay")]
     paths = [
         path
-        for path in find_images(settings.input)
+        for path in image_paths(settings.input)
         if not any(path.resolve().is_relative_to(folder) for folder in results)
     ]
     if not paths:

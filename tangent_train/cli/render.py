@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from rich.console import Console
 
-from datamodules.images.image_files import find_images, short_names
+from datamodules.images.image_files import image_paths, short_names
 from datamodules.images.pixel_files import LOSSY_SUFFIXES, PIXEL_SUFFIXES, write_pixels
 from datamodules.images.tangent_folders import (
     read_panorama,
@@ -91,7 +91,7 @@ def render(config: Mapping[str, Any]) -> None:
 
 def _forward(settings: Settings) -> tuple[_Work, dict[Path, Path]]:
     """Function that renders a panorama to a folder, and the panorama of every folder."""
-    found = find_images(settings.input or "")
+    found = image_paths(settings.input or "")
     paths = [path for path in found if not (path.parent / CAMERAS_FILE).exists()]
     if not paths:
         raise DataError(settings.input, found="only tangent images", expected="panoramas")

@@ -47,7 +47,7 @@ __all__ = [
     "SHRUNK",
     "Comparer",
     "Comparison",
-    "Found",
+    "MatchedPair",
     "Row",
     "Ways",
     "shrunk_rows",
@@ -63,7 +63,7 @@ SHRUNK = "ERP ×0.71"
 """The panorama with pixels as large as those of tangent images, see `shrunk_rows`."""
 
 
-class Found(NamedTuple):
+class MatchedPair(NamedTuple):
     """Keypoints of two panoramas, ``(m, 2)`` matches among them, and their geometry."""
 
     left: SphericalKeypoints
@@ -82,7 +82,7 @@ class Comparison(NamedTuple):
     """
 
     rows: list[Row]
-    found: Mapping[str, Mapping[str, Found]]
+    found: Mapping[str, Mapping[str, MatchedPair]]
     images: Mapping[str, tuple[NDArray[np.uint8], NDArray[np.uint8]]]
 
 
@@ -162,7 +162,7 @@ class Comparer:
         views = [_depth_view(side) for side in sides]
         overlap = None if None in views else _defined(fov_overlap(*views))  # type: ignore[arg-type]
         rows: list[Row] = []
-        found: dict[str, dict[str, Found]] = {}
+        found: dict[str, dict[str, MatchedPair]] = {}
         images: dict[str, tuple[NDArray[np.uint8], NDArray[np.uint8]]] = {}
         for condition, rotation in rotations.items():
             images[condition] = (
@@ -199,9 +199,9 @@ class Comparer:
         images: tuple[NDArray[np.uint8], NDArray[np.uint8]],
         level: int,
         condition: str,
-    ) -> dict[str, Found]:
+    ) -> dict[str, MatchedPair]:
         grids = {f"L{b}": TangentGrid(b, level) for b in self.ways.base_level}
-        found: dict[str, Found] = {}
+        found: dict[str, MatchedPair] = {}
         for name in self.ways.representations:
             both = []
             for side, image in zip((pair.left, pair.right), images, strict=True):
@@ -220,7 +220,7 @@ class Comparer:
             )
             rays = left.directions_xyz[matches[:, 0]], right.directions_xyz[matches[:, 1]]
             geometry = estimate_two_view(*rays, self.ways.max_error_deg, seed=self.ways.seed)
-            found[name] = Found(left, right, matches, geometry)
+            found[name] = MatchedPair(left, right, matches, geometry)
         return found
 
     def _detect(
@@ -236,7 +236,7 @@ class Comparer:
 
     def _figures(
         self,
-        found: Found,
+        found: MatchedPair,
         rotation: NDArray[np.float64],
         left: DepthView | None,
         right: DepthView | None,
@@ -265,7 +265,7 @@ _TRUTH = ("rotation_error_deg", "translation_error_deg", "judged", "correct", "c
 
 
 def _truth(
-    found: Found,
+    found: MatchedPair,
     rotation: NDArray[np.float64],
     left: DepthView,
     right: DepthView,

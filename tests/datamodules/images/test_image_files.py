@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from datamodules.images.image_files import find_depth, find_images
+from datamodules.images.image_files import find_depth, image_paths
 from tangent_train.errors import DataError
 
 
@@ -20,28 +20,28 @@ def test_a_folder_is_searched_for_images_only(tmp_path: Path) -> None:
     others = ["notes.txt", ".hidden.jpg", ".thumbnails/a.jpg", "jpg", "deep/x.jpg.part"]
     _touch(*(tmp_path / name for name in names + others))
     (tmp_path / "folder.png").mkdir()
-    found = find_images(tmp_path)
+    found = image_paths(tmp_path)
     assert found == sorted(tmp_path / name for name in names)
-    assert find_images(str(tmp_path)) == found
+    assert image_paths(str(tmp_path)) == found
 
 
 def test_linked_folders_are_searched_once(tmp_path: Path) -> None:
     _touch(tmp_path / "here" / "a.png", tmp_path / "there" / "deep" / "b.png")
     (tmp_path / "here" / "link").symlink_to(tmp_path / "there")
     (tmp_path / "there" / "deep" / "back").symlink_to(tmp_path / "here")
-    found = [str(path.relative_to(tmp_path)) for path in find_images(tmp_path / "here")]
+    found = [str(path.relative_to(tmp_path)) for path in image_paths(tmp_path / "here")]
     assert found == ["here/a.png", "here/link/deep/b.png"]
 
 
 def test_a_file_is_found_whatever_it_is_called(tmp_path: Path) -> None:
     odd = tmp_path / "room [1] *.panorama"
     _touch(odd, tmp_path / "room 1 x.jpg")
-    assert find_images(odd) == [odd]
+    assert image_paths(odd) == [odd]
 
 
 def test_a_folder_with_the_characters_of_a_pattern_is_that_folder(tmp_path: Path) -> None:
     _touch(tmp_path / "[ab]" / "x.png", tmp_path / "a" / "y.png")
-    assert find_images(tmp_path / "[ab]") == [tmp_path / "[ab]" / "x.png"]
+    assert image_paths(tmp_path / "[ab]") == [tmp_path / "[ab]" / "x.png"]
 
 
 def test_patterns(tmp_path: Path) -> None:
@@ -49,7 +49,7 @@ def test_patterns(tmp_path: Path) -> None:
     _touch(tmp_path / "a5.txt", tmp_path / ".a6.jpg")
 
     def names(pattern: str) -> list[str]:
-        return [str(path.relative_to(tmp_path)) for path in find_images(tmp_path / pattern)]
+        return [str(path.relative_to(tmp_path)) for path in image_paths(tmp_path / pattern)]
 
     assert names("a*") == ["a1.jpg", "a2.png"]
     assert names("[ab]1.jpg") == ["a1.jpg", "b1.jpg"]
@@ -60,8 +60,8 @@ def test_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.chdir(tmp_path)
     _touch(tmp_path / "pictures" / "a.jpg", tmp_path / "~b.jpg")
-    assert find_images("~/pictures/*.jpg") == [tmp_path / "pictures" / "a.jpg"]
-    assert find_images("~b.jpg") == [Path("~b.jpg")]
+    assert image_paths("~/pictures/*.jpg") == [tmp_path / "pictures" / "a.jpg"]
+    assert image_paths("~b.jpg") == [Path("~b.jpg")]
 
 
 @pytest.mark.parametrize(
@@ -76,7 +76,7 @@ def test_no_images(tmp_path: Path, pattern: str, found: str) -> None:
     _touch(tmp_path / "notes.txt")
     (tmp_path / "empty").mkdir()
     with pytest.raises(DataError, match=rf"{re.escape(pattern)}: {found}.*\.webp"):
-        find_images(tmp_path / pattern)
+        image_paths(tmp_path / pattern)
 
 
 def test_depth_is_found_by_the_name_of_the_image(tmp_path: Path) -> None:
