@@ -1,4 +1,4 @@
-"""FCN-ResNet against torchvision's own, with weights made here in all the forms files have."""
+"""FCN-ResNet against torchvision's own, with fabricated weights in all the forms of files."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ State = dict[str, Tensor]
 
 @pytest.fixture(scope="module")
 def published() -> nn.Module:
-    """What torchvision publishes: 21 classes, an auxiliary classifier, statistics of some data."""
+    """As torchvision publishes it: 21 classes, an auxiliary classifier, statistics of some data."""
     torch.manual_seed(0)
     network: nn.Module = fcn_resnet50(
         weights=None, weights_backbone=None, num_classes=21, aux_loss=True

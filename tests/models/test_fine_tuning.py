@@ -131,7 +131,7 @@ def _wrapped(layers: str) -> nn.Module:
 
 
 def _kinds(names: Iterable[str]) -> set[str]:
-    """Which of the wrappers' own parts names belong to; others are the UNet's."""
+    """The wrappers' own parts that names belong to; others are the UNet's."""
     parts = ("mixer", "auxiliary_head")
     return {next((part for part in parts if part in name), "unet") for name in names}
 

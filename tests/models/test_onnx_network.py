@@ -1,4 +1,4 @@
-"""ONNX files made by hand, against NumPy."""
+"""ONNX files written by hand, against NumPy."""
 
 from __future__ import annotations
 

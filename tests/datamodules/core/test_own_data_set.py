@@ -69,8 +69,8 @@ def _write(root: Path, largest: int) -> None:
             write_png(root / folder / f"{name}.png", image)
 
 
-def _toy(root: Path, made: type[Toy] = Toy) -> Toy:
-    return made(root, EquirectRepresentation(level=4), inputs=["rgb"], validation_fraction=0)
+def _toy(root: Path, kind: type[Toy] = Toy) -> Toy:
+    return kind(root, EquirectRepresentation(level=4), inputs=["rgb"], validation_fraction=0)
 
 
 def test_a_data_set_is_a_reader_and_its_files(tmp_path: Path) -> None:

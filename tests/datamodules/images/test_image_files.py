@@ -33,15 +33,11 @@ def test_linked_folders_are_searched_once(tmp_path: Path) -> None:
     assert found == ["here/a.png", "here/link/deep/b.png"]
 
 
-def test_a_file_is_found_whatever_it_is_called(tmp_path: Path) -> None:
-    odd = tmp_path / "room [1] *.panorama"
-    _touch(odd, tmp_path / "room 1 x.jpg")
+def test_names_may_have_the_characters_of_a_pattern(tmp_path: Path) -> None:
+    odd, inside = tmp_path / "room [1] *.panorama", tmp_path / "[ab]" / "x.png"
+    _touch(odd, inside, tmp_path / "room 1 x.jpg", tmp_path / "a" / "y.png")
     assert image_paths(odd) == [odd]
-
-
-def test_a_folder_with_the_characters_of_a_pattern_is_that_folder(tmp_path: Path) -> None:
-    _touch(tmp_path / "[ab]" / "x.png", tmp_path / "a" / "y.png")
-    assert image_paths(tmp_path / "[ab]") == [tmp_path / "[ab]" / "x.png"]
+    assert image_paths(tmp_path / "[ab]") == [inside]
 
 
 def test_patterns(tmp_path: Path) -> None:

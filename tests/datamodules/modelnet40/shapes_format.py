@@ -1,4 +1,4 @@
-"""Meshes in the trees of ModelNet40, made on the spot."""
+"""Meshes in the trees of ModelNet40, fabricated."""
 
 from __future__ import annotations
 

@@ -161,15 +161,15 @@ def test_views_are_those_of_the_float_spheres(make_module: MakeModule, root: Pat
     )
 
 
-def test_training_is_turned_anew_every_time_and_evaluation_is_not(make_module: MakeModule) -> None:
-    plain, turned = make_module(), make_module("so3")
+def test_training_is_rotated_anew_every_time_and_evaluation_is_not(make_module: MakeModule) -> None:
+    plain, rotated = make_module(), make_module("so3")
     first = plain.training_samples()
     assert torch.equal(first[0, 4].images, first[1, 4].images)
-    again = turned.training_samples()
+    again = rotated.training_samples()
     assert not torch.equal(again[0, 4].images, again[1, 4].images)
     assert torch.equal(again[0, 4].images, again[0, 4].images)
     for split in SPLITS[1:]:
-        one, other = plain.evaluation_samples(split)[0, 0], turned.evaluation_samples(split)[0, 0]
+        one, other = plain.evaluation_samples(split)[0, 0], rotated.evaluation_samples(split)[0, 0]
         assert torch.equal(one.images, other.images)
 
 
@@ -193,7 +193,7 @@ def test_other_representations(root: Path, representation: Any) -> None:
         assert images.shape[1] == whole.images.shape[1] == 1
 
 
-# --- turned test shapes ------------------------------------------------------------------------
+# --- rotated test shapes ------------------------------------------------------------------------
 
 
 def test_the_same_shape_is_rotated_the_same_way(make_module: MakeModule) -> None:
@@ -224,10 +224,10 @@ def test_views_of_a_rotated_shape_are_views_of_its_rotated_mesh(
     samples = module.evaluation_samples("test")
     assert isinstance(samples, ShapeViews)
     for index in range(2):
-        turn = samples.shape_rotation(index)
-        assert bool(turn[2, 2] > 1 - 1e-12) is (rotation == "yaw")
+        rotated = samples.shape_rotation(index)
+        assert bool(rotated[2, 2] > 1 - 1e-12) is (rotation == "yaw")
         mesh = clean_mesh(read_off(root / f"{module.sample_name('test', index)}.off"))
-        mesh.vertices = mesh.vertices @ turn.T
+        mesh.vertices = mesh.vertices @ rotated.T
         steps = np.rint(mesh_spheres(mesh, (64, 128)) * STEPS).astype(np.uint16)
         views = representation.whole()
         expected = np.concatenate(

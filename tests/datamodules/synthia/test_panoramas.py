@@ -39,7 +39,7 @@ def panorama(root: Path, part: str, sequence: str = "01", frame: int = 0) -> NDA
 
 
 class Seen(NamedTuple):
-    """Where the pixels of the panorama are in the views, pixel by pixel in float64."""
+    """The places of the panorama's pixels in the views, pixel by pixel in float64."""
 
     view: NDArray[np.int64]
     place: NDArray[np.float64]
