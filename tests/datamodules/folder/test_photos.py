@@ -11,12 +11,11 @@ from datamodules.folder.panoramas import FolderPanoramas
 from datamodules.folder.photos import FolderPhotos
 from tangent_train.errors import DataError, SettingError
 from tangent_train.rendering import EquirectRepresentation, PerspectiveRepresentation
-from tests.datamodules.data_files import names_of
+from tests.datamodules.data_files import names_of, write_png
 from tests.datamodules.folder.folder_format import (
     CLASS_OF_STORED,
     NAMES,
     save,
-    save_depth,
     write_classes,
     write_data_set,
 )
@@ -79,7 +78,7 @@ def test_pixels_are_those_that_are_displayed(tmp_path: Path, orientation: int) -
 
 def test_z_depth_becomes_distance(two: Path) -> None:
     for name in "ab":
-        save_depth(two / "depth" / "hall" / f"{name}.png", np.full((48, 64), 2000, np.uint16))
+        write_png(two / "depth" / "hall" / f"{name}.png", np.full((48, 64), 2000, np.uint16))
     write_cameras(two, {"hall": K})
     photo = _only(two, "hall/a", inputs=["rgb", "depth"])
     assert photo.depth is not None
