@@ -27,7 +27,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def content(run: Path) -> dict[str, Any]:
-    """What is in its checkpoint."""
+    """The content of its checkpoint."""
     found: dict[str, Any] = torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)
     return found
 

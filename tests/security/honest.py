@@ -35,7 +35,7 @@ SETTINGS = (
 
 
 def composed(arguments: list[str]) -> dict[str, Any]:
-    """What Hydra makes of the command line of tangent-evaluate."""
+    """The settings that Hydra composes from the command line of tangent-evaluate."""
     with initialize_config_dir(str(config_folder()), version_base="1.3"):
         config = compose("evaluate", [quote_path(argument) for argument in arguments])
     plain: Any = OmegaConf.to_container(config, resolve=True)

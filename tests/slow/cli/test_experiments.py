@@ -55,7 +55,7 @@ def _composed(experiment: str, name: str = "train") -> DictConfig:
 
 
 def _shrunk(config: DictConfig, roots: dict[str, Path]) -> dict[str, Any]:
-    """Settings for images of 32 pixels, few of them, the shallower network and data made here."""
+    """Settings for images of 32 pixels, few of them, the shallower network and small data."""
     kind = config.data._target_.rpartition(".")[2]
     optional = {
         "representation.faces_per_panorama": 3,
@@ -104,7 +104,7 @@ def _one_step(config: DictConfig, task: Any, data: Any, folder: Path) -> lightni
 
 
 def _takes_a_step(config: DictConfig, folder: Path) -> set[str]:
-    """Build what a run is made of and train one step; the names of all tensors."""
+    """Build the parts of a run and train one step; the names of all tensors."""
     data, task = build(_plain(config))
     before = {name: p.detach().clone() for name, p in task.network.named_parameters()}
     trainer = _one_step(config, task, data, folder)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -38,6 +39,10 @@ def _train(folder: Path, *arguments: str, status: int = 0, program: str = "-m") 
     return done.stderr
 
 
+def _names_in_report(run: Path) -> list[str]:
+    return re.findall(r"area_\w+/\w+", (run / "report.html").read_text())
+
+
 def test_two_processes_make_the_steps_and_figures_of_one(
     rooms: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -46,7 +51,7 @@ def test_two_processes_make_the_steps_and_figures_of_one(
     (tmp_path / "own" / "network" / "plain.yaml").write_text(PLAIN)
     settings = [text for text in SETTINGS if not text.startswith("network.")]
     common = ["--config-dir", str(tmp_path / "own"), *settings, rooms, "network=plain"]
-    common += ["trainer.max_steps=3", "optimizer=adam", "data.validation_fraction=0.4"]
+    common += ["trainer.max_steps=3", "optimizer=adam", "data.validation_fraction=0.4", "panels=2"]
     one = ["data.panoramas_per_step=2", "hydra.run.dir=one"]
     run_command(monkeypatch, "train", *common, *one)
     devices = ["trainer.accelerator=cpu", "trainer.devices=2"]
@@ -60,6 +65,9 @@ def test_two_processes_make_the_steps_and_figures_of_one(
     )
     assert first["global_step"] == second["global_step"] == 3
     torch.testing.assert_close(second["state_dict"], first["state_dict"], rtol=0, atol=1e-6)
+    names = [_names_in_report(tmp_path / run) for run in ("one", "two")]
+    assert names[0] == names[1], "panels of all processes, in order"
+    assert len(set(names[0])) == 2
 
     (tmp_path / "cut_short.py").write_text(CUT_SHORT)
     _train(tmp_path, *two, "hydra.run.dir=cut", status=143, program="cut_short.py")

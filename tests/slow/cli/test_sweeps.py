@@ -62,9 +62,9 @@ def test_jobs_of_a_grid_are_runs_of_their_own_on_any_number_of_devices(
         assert f"\n  devices: {devices}\n" in (run / "config.yaml").read_text()
         assert _json(run / "results.json")["images"] == 2
     checkpoint = f"checkpoint={runs[0] / 'checkpoints' / 'last.ckpt'}"
-    turned = ("data.test_rotation=null,so3", "hydra.sweep.dir=turned")
-    run_command(monkeypatch, "evaluate", "-m", checkpoint, settings[-1], *turned)
-    figures = [_json(tmp_path / "turned" / n / "results.json")["confusion"] for n in "01"]
+    rotated = ("data.test_rotation=null,so3", "hydra.sweep.dir=rotated")
+    run_command(monkeypatch, "evaluate", "-m", checkpoint, settings[-1], *rotated)
+    figures = [_json(tmp_path / "rotated" / n / "results.json")["confusion"] for n in "01"]
     assert figures[0] == _json(runs[0] / "results.json")["confusion"] != figures[1]
 
 

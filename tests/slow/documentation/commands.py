@@ -24,7 +24,7 @@ STAND_INS = {
     "input": "panoramas",
     "resume": f"runs/demo/{TIME}",
 }
-"""What is typed for ``…`` and ``<what it is>``."""
+"""Values for ``…`` and ``<placeholder>``."""
 
 SMALL: dict[str, Any] = {
     "level": 6,
@@ -72,7 +72,7 @@ CONFIGS = {
     "tangent-check": "check",
     "tangent-keypoints": "keypoints",
 }
-"""Programs that are made small."""
+"""Programs that get the settings above, and their config."""
 
 _FENCE = re.compile(r"^( *)```+(\w*)\n(.*?)^\1```+$", re.MULTILINE | re.DOTALL)
 _SPAN = re.compile(r"(?<!`)`((?:tangent-|python |pip |make )[^`\n]* [^`\n]+|make \w+)`(?!`)")
@@ -151,7 +151,7 @@ def typed(words: list[str], world: Path) -> list[str]:
 
 
 def small(words: list[str], world: Path) -> list[str]:
-    """What is appended to a command so that it takes seconds."""
+    """Settings appended to a command so that it takes seconds."""
     program, *given = words
     if program == "python":
         return ["--help"] if given[0] == "-m" else []

@@ -101,7 +101,7 @@ def partner(kind: str, path: Path, part: str) -> Path:
 
 
 def names(data: SplitDataModule[Any]) -> dict[str, list[str]]:
-    """What is in every split."""
+    """Names of the images of every split."""
     sources = {split: data.source(split) for split in SPLITS}
     return {split: [s.name(index) for index in range(len(s))] for split, s in sources.items()}
 

@@ -1,4 +1,4 @@
-"""What processes that are killed leave behind."""
+"""Files and child processes that killed processes leave behind."""
 
 from __future__ import annotations
 

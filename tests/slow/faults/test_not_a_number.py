@@ -130,7 +130,7 @@ def test_gradients_that_overflow_are_left_out_and_the_scale_shrinks(
     trainer.fit(small_task(network), datamodule=small_data(stanford_root))
     before, after, later = network.weights[1:4]
     torch.testing.assert_close(before, after, rtol=0, atol=0)
-    assert not torch.equal(after, later), "and the next step is made"
+    assert not torch.equal(after, later), "the next step is taken"
     assert scaler.get_scale() == 2.0**13
 
 

@@ -58,7 +58,7 @@ class OpenReport:
     problems: list[str] = field(default_factory=list)
 
     def text(self, selector: str) -> str:
-        """What stands there."""
+        """Visible text of an element."""
         return self.page.locator(selector).inner_text().strip()
 
     def drawn(self) -> None:
@@ -110,7 +110,7 @@ class OpenReport:
         self.drawn()
 
     def pixels(self) -> NDArray[np.int64]:
-        """What the canvas shows, ``(height, width, 3)``, without what lies on it."""
+        """Pixels of the canvas, ``(height, width, 3)``, without the buttons above it."""
         self.page.locator("canvas").scroll_into_view_if_needed()
         for shown in ("hidden", ""):
             if shown == "":

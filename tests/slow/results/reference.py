@@ -1,4 +1,4 @@
-"""What the pictures of the viewer must be: directions and colours in float64."""
+"""Reference for the pictures of the viewer: directions and colours in float64."""
 
 from __future__ import annotations
 

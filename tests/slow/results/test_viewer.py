@@ -1,4 +1,4 @@
-"""What the viewer shows in a real Chromium is compared with closed forms."""
+"""The viewer in a real Chromium, compared with closed forms."""
 
 from __future__ import annotations
 
