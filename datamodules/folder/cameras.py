@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, Any
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 
 __all__ = ["FolderCameras", "read_cameras"]
 
+_MOST_FOV_DEG = 170  # more in a K that is given in other units, as shares of the photo's width
+_LEAST_FOCAL = 0.5 / math.tan(math.radians(_MOST_FOV_DEG) / 2)
 _KEYS = ("fx", "fy", "cx", "cy")
 _EXPECTED = (
     '{"fx": …, "fy": …, "cx": …, "cy": …} or [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], in pixels, '
@@ -94,13 +97,14 @@ class FolderCameras:
         if place is None:
             return camera_matrix_from_fov(self._fov_deg(files.rgb), size)
         matrix = self._given_matrix(place)
-        x, y = matrix[:2, 2]
-        if not (-0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5):
+        (fx, _, x), (_, fy, y), _ = matrix.tolist()
+        inside = -0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5
+        if not inside or min(fx / width, fy / height) < _LEAST_FOCAL:
             raise DataError(
                 self.path,
-                found=f"the principal point x = {x:g}, y = {y:g} for {files.name}",
-                expected=f"one in the photo as displayed: x of 0 to {width - 1}, y of 0 to "
-                f"{height - 1}",
+                found=f"fx = {fx:g}, fy = {fy:g}, cx = {x:g}, cy = {y:g} for {files.name}",
+                expected=f"pixels of the photo as displayed, {width} across and {height} down: a "
+                f"principal point inside, a field of view below {_MOST_FOV_DEG}°",
                 remedy="Scale K where the photo was resized, turn it where EXIF data turn the "
                 "photo.",
             )

@@ -151,7 +151,7 @@ def test_a_camera_is_that_of_the_photo_as_displayed(tmp_path: Path) -> None:
     write_cameras(tmp_path, {"a": [[80, 0, 5], [0, 80, 55], [0, 0, 1]]})
     assert _only(tmp_path, "a").camera_matrix.tolist() == [[80, 0, 5], [0, 80, 55], [0, 0, 1]]
     write_cameras(tmp_path, {"a": [[80, 0, 55], [0, 80, 5], [0, 0, 1]]})
-    message = r"cameras\.json: found .* x = 55, y = 5 for a; .* x of 0 to 39, y of 0 to 59\. "
+    message = r"cameras\.json: found .* cx = 55, cy = 5 for a; .* 40 across and 60 down"
     with pytest.raises(DataError, match=message):
         _photos(tmp_path).setup()
 
@@ -217,13 +217,29 @@ def test_cameras_that_are_none(two: Path, value: Any) -> None:
     assert '; expected {"fx": …, "fy": …, ' in finding
 
 
-@pytest.mark.parametrize("x_y", [(-0.6, 20), (63.6, 20), (30, -0.6), (30, 47.6)])
-def test_principal_points_outside_the_photo(two: Path, x_y: tuple[float, float]) -> None:
-    write_cameras(two, {"hall/a": _with(0, 2, x_y[0])[:1] + _with(1, 2, x_y[1])[1:], ".": K})
+@pytest.mark.parametrize(
+    ("value", "found"),
+    [
+        (_with(0, 2, -0.6), "fx = 70, fy = 72, cx = -0.6, cy = 20"),
+        (_with(0, 2, 63.6), "fx = 70, fy = 72, cx = 63.6, cy = 20"),
+        (_with(1, 2, -0.6), "fx = 70, fy = 72, cx = 30.5, cy = -0.6"),
+        (_with(1, 2, 47.6), "fx = 70, fy = 72, cx = 30.5, cy = 47.6"),
+        (_with(0, 0, 2.7), "fx = 2.7, fy = 72, cx = 30.5, cy = 20"),
+        (_with(1, 1, 2.0), "fx = 70, fy = 2, cx = 30.5, cy = 20"),
+        ([[1.1, 0, 0.5], [0, 1.5, 0.5], [0, 0, 1]], "fx = 1.1, fy = 1.5, cx = 0.5, cy = 0.5"),
+    ],
+)
+def test_cameras_of_another_size(two: Path, value: Any, found: str) -> None:
+    write_cameras(two, {"hall/a": value, ".": K})
     ((_, finding, remedy),) = _found(two)
-    assert f"x = {x_y[0]:g}, y = {x_y[1]:g} for hall/a; expected" in finding
-    assert "x of 0 to 63, y of 0 to 47" in finding
+    assert finding.startswith(f"{found} for hall/a; expected pixels of the photo as displayed, 64 ")
     assert "resized" in remedy
+
+
+@pytest.mark.parametrize("x_y", [(-0.4, -0.4), (63.4, 47.4)])
+def test_principal_points_at_the_border(two: Path, x_y: tuple[float, float]) -> None:
+    write_cameras(two, {".": {"fx": 2.9, "fy": 2.2, "cx": x_y[0], "cy": x_y[1]}})
+    assert not _found(two)
 
 
 def test_all_problems_of_cameras_are_listed(two: Path) -> None:

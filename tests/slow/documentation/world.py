@@ -22,6 +22,7 @@ from PIL import ExifTags, Image
 
 from tests.conftest import fabricate
 from tests.datamodules.folder.folder_format import write_data_set
+from tests.datamodules.folder.photo_format import write_photos
 from tests.datamodules.stanford2d3ds.stanford_pairs_format import write_paper_pairs
 from tests.datamodules.synthia.synthia_format import write_panoramas, write_views
 from tests.slow.documentation.commands import TIME, small, typed
@@ -39,6 +40,7 @@ def build_world(folder: Path) -> Path:
     write_panoramas(write_views(folder / "data" / "synthia", _SEQUENCES), _SEQUENCES, ROWS)
     write_paper_pairs(folder / "data" / "pairs", ROWS)
     write_data_set(folder / "my_rooms", height=ROWS, depth=True)
+    write_photos(folder / "my_photos")
     _write_pictures(folder)
     demo = f"runs/demo/{TIME}"
     for line in (

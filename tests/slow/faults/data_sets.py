@@ -9,6 +9,7 @@ import numpy as np
 
 from datamodules import (
     FolderPanoramas,
+    FolderPhotos,
     ModelNet40,
     OmniSynthia,
     Stanford2D3DS,
@@ -18,6 +19,7 @@ from datamodules import (
 from datamodules.core.found import SPLITS
 from tangent_train.rendering import EquirectRepresentation, PerspectiveRepresentation
 from tests.datamodules.folder.folder_format import write_data_set
+from tests.datamodules.folder.photo_format import write_photos
 from tests.datamodules.modelnet40.shapes_format import write_tree
 from tests.datamodules.synthia.synthia_format import write_panoramas, write_views
 
@@ -35,13 +37,16 @@ BOTH: Any = ("rgb", "depth")
 SEQUENCES = {"01": 4, "02": 3, "04": 2}
 _OF_SYNTHIA: dict[str, Any] = {"train_sequences": ("01", "02"), "test_sequences": ("04",)}
 
-KINDS = ("folder", "stanford", "stanford photos", "omnisynthia", "synthia photos", "shapes")
+_PHOTOS = ("folder photos", "stanford photos", "synthia photos")
+KINDS = ("folder", "stanford", "omnisynthia", *_PHOTOS, "shapes")
 
 
 def write(kind: str, root: Path, fabricate: FabricateStanford) -> Path:
     """Write a data set of one of `KINDS`; returns its root."""
     if kind == "folder":
         return write_data_set(root, depth=True)
+    if kind == "folder photos":
+        return write_photos(root)
     if kind == "shapes":
         return write_tree(root)
     if kind == "omnisynthia":
@@ -55,6 +60,7 @@ def module(kind: str, root: Path, **settings: Any) -> SplitDataModule[Any]:
     """Its data module, with depth."""
     make: dict[str, Callable[..., SplitDataModule[Any]]] = {
         "folder": lambda **more: FolderPanoramas(root, ERP, inputs=BOTH, **more),
+        "folder photos": lambda **more: FolderPhotos(root, CROPS, **more),
         "stanford": lambda **more: Stanford2D3DS(root, ERP, inputs=BOTH, **more),
         "stanford photos": lambda **more: Stanford2D3DSPerspective(root, CROPS, **more),
         "omnisynthia": lambda **more: OmniSynthia(root, ERP, inputs=BOTH, **_OF_SYNTHIA, **more),
@@ -70,6 +76,7 @@ def colors(kind: str, root: Path) -> list[Path]:
     """The files of the colours, or the meshes, in order."""
     pattern = {
         "folder": "images/**/*.*",
+        "folder photos": "images/**/*.*",
         "stanford": "area_*/pano/rgb/*.png",
         "stanford photos": "area_*/data/rgb/*.png",
         "omnisynthia": "*/pano/RGB/*.png",

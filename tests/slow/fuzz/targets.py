@@ -14,7 +14,9 @@ import numpy as np
 import OpenEXR
 from PIL import Image
 
+from datamodules.core.reading import ImageFiles
 from datamodules.core.store import Store
+from datamodules.folder.cameras import read_cameras as read_photo_cameras
 from datamodules.folder.classes import read_classes
 from datamodules.images.gpano import area_of, up_of
 from datamodules.images.pixel_files import read_depth_m, read_pixels
@@ -128,6 +130,21 @@ def _read_camera_list(path: Path) -> None:
     assert cameras.grid.directions(cameras.faces[:1]).shape[1:] == (cameras.grid.dim,) * 2 + (3,)
 
 
+def _photo_camera_seeds() -> list[bytes]:
+    return _json(
+        {"photo": [[14.5, 0, 7.5], [0, 14.5, 3.5], [0, 0, 1]]},
+        {".": {"fx": 14.5, "fy": 14.25, "cx": 7.5, "cy": 3.5}},
+    )
+
+
+def _read_photo_cameras(path: Path) -> None:
+    photo = path.with_name("photo.png")
+    photo.write_bytes(_image(_RGB))
+    matrix = read_photo_cameras(path, 60.0).matrix(ImageFiles("photo", photo, photo))
+    assert np.isfinite(matrix).all()
+    assert 0 < matrix[0, 0] < np.inf
+
+
 def _label_image_seeds() -> list[bytes]:
     indices = np.zeros_like(_RGB)
     indices[..., 2] = _RGB[..., 2] % 14
@@ -222,6 +239,7 @@ TARGETS: dict[str, tuple[Callable[[], list[bytes]], Callable[[Path], None]]] = {
     "label_table": (_table_seeds, _read_table),
     "classes": (_class_seeds, _read_class_list),
     "cameras": (_camera_seeds, _read_camera_list),
+    "photo_cameras": (_photo_camera_seeds, _read_photo_cameras),
     "pose": (_pose_seeds, _read_pose),
     "off": (_off_seeds, _read_mesh),
     "label_image": (_label_image_seeds, _read_label_image),

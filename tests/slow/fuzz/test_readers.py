@@ -75,6 +75,12 @@ _FOUND = {
         _changed("cameras", source={"file": "a", "height": 10**400, "width": 1}),
         _changed("cameras", icosahedron_rotation=[[1e308] * 3] * 3),
     ],
+    "photo_cameras": [
+        _DEEP,
+        b'{"photo": ' + _DEEP,
+        b'{"photo": [[%b, 0, 7], [0, 9, 3], [0, 0, 1]]}' % _HUGE,
+        json.dumps({"photo": "x" * 100_000}).encode(),
+    ],
     "off": [b"OFF\n3 1 0\n0 0 0\n1 0 0\n1 1 0\n3 0 1 " + b"x" * 100_000],
     "gpano": [TARGETS["gpano"][0]()[0].replace(b'Pixels="180"', b'Pixels="1e9"')],
 }
