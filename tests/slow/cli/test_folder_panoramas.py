@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import torch
 
 from tests.cli.tiny_runs import results, run_command
 from tests.datamodules.folder.folder_format import (
-    CLASS_OF_STORED,
     NAMES,
+    pixels_of_classes,
     write_data_set,
 )
 
@@ -52,22 +51,11 @@ def own_run(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "finished"
 
 
-def _pixels_of_classes(root: Path, names: list[str]) -> list[int]:
-    """Of the label files, read by another program; the unknown class, first, does not count."""
-    counts = np.zeros(len(NAMES) + 1, np.int64)
-    for name in names:
-        stored = cv2.imread(str(root / "labels" / f"{name}.png"), cv2.IMREAD_UNCHANGED)
-        assert stored is not None
-        for value, count in zip(*np.unique(stored, return_counts=True), strict=True):
-            counts[CLASS_OF_STORED[int(value)]] += count
-    return [0, *counts[1:].tolist()]
-
-
 def test_results_and_checkpoint_are_of_the_own_classes(root: Path, own_run: Path) -> None:
     found = results(own_run)
     assert found["images"] == 2
     assert [row["class"] for row in found["classes"]] == list(NAMES)
-    assert np.array(found["confusion"]).sum(axis=1).tolist() == _pixels_of_classes(root, _TEST)
+    assert np.array(found["confusion"]).sum(axis=1).tolist() == pixels_of_classes(root, _TEST)
     assert len(list((own_run / "panels").glob("*.png"))) == 1
     content = torch.load(own_run / "checkpoints" / "best.ckpt", weights_only=True)
     assert content["class_names"] == ["unknown", *NAMES]
@@ -86,7 +74,7 @@ def test_the_checkpoint_is_evaluated_again_and_on_other_files(
     (own / "train.txt").write_text("scene_0/view.0\n")
     (own / "val.txt").write_text("scene_1/view.0\n")
     run_command(monkeypatch, "evaluate", checkpoint, f"data.root={own}", "hydra.run.dir=more")
-    expected = _pixels_of_classes(own, ["scene_2/view.0", "scene_3/view.0"])
+    expected = pixels_of_classes(own, ["scene_2/view.0", "scene_3/view.0"])
     assert np.array(results(tmp_path / "more")["confusion"]).sum(axis=1).tolist() == expected
 
 

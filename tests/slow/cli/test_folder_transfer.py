@@ -5,14 +5,13 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
 from tests.cli.tiny_runs import results, run_command
 from tests.datamodules.folder.folder_format import (
-    CLASS_OF_STORED,
     NAMES,
+    pixels_of_classes,
     write_classes,
     write_data_set,
 )
@@ -46,17 +45,6 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def _pixels_of_classes(root: Path, names: list[str]) -> list[int]:
-    """Of the label files, read by another program; the unknown class, first, does not count."""
-    counts = np.zeros(len(NAMES) + 1, np.int64)
-    for name in names:
-        stored = cv2.imread(str(root / "labels" / f"{name}.png"), cv2.IMREAD_UNCHANGED)
-        assert stored is not None
-        for value in np.unique(stored):
-            counts[CLASS_OF_STORED[int(value)]] += np.count_nonzero(stored == value)
-    return [0, *counts[1:].tolist()]
-
-
 def test_from_photos_to_panoramas(
     here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -69,7 +57,7 @@ def test_from_photos_to_panoramas(
     data = {row["row"]: row["data"] for row in rows}
     photos, panoramas = "FolderPhotos", "FolderPanoramas"
     assert data == {"P": photos, "S": panoramas, "P-FT-1": photos, "S-FT-1": panoramas}
-    expected = _pixels_of_classes(here / "my_rooms", ["scene_3/view.0", "scene_3/view.1"])
+    expected = pixels_of_classes(here / "my_rooms", ["scene_3/view.0", "scene_3/view.1"])
     for name in data:
         found = results(_SEED_0 / name)
         assert found["images"] == 2
