@@ -45,6 +45,13 @@ def test_scores_equal_torchmetrics_over_the_whole_data_set() -> None:
     assert scores.counts.sum() == 38
 
 
+def test_a_class_of_a_single_image_counts_like_others() -> None:
+    scores = classification_scores([[1, 0, 0], [1, 3, 0], [0, 0, 0]])
+    np.testing.assert_array_equal(scores.of_class, [1, 3 / 4, np.nan])
+    assert scores.class_accuracy == (1 + 3 / 4) / 2
+    assert scores.accuracy == 4 / 5
+
+
 def test_nothing_counted_has_no_scores() -> None:
     scores = classification_scores(np.zeros((3, 3), np.int64))
     assert np.isnan([scores.accuracy, scores.class_accuracy, *scores.of_class]).all()

@@ -12,10 +12,10 @@ CLASSES = 5
 
 
 def _panoramas() -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-    """Prediction and truth of panoramas of uneven sizes; truth has unknown pixels."""
+    """Prediction and truth of panoramas of uneven sizes; both have unknown pixels."""
     rng = np.random.default_rng(3)
     shapes = [(12, 24), (30, 60), (7, 15)]
-    return [(rng.integers(1, CLASSES, shape), rng.integers(0, CLASSES, shape)) for shape in shapes]
+    return [(rng.integers(0, CLASSES, shape), rng.integers(0, CLASSES, shape)) for shape in shapes]
 
 
 def _counted(pairs: list[tuple[NDArray[np.int64], NDArray[np.int64]]]) -> ConfusionMatrix:
