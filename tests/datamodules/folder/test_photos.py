@@ -187,13 +187,9 @@ def _with(row: int, column: int, value: object) -> list[list[Any]]:
     "value",
     [
         None,
-        70,
         "70",
         [],
-        {},
-        [70, 72, 30, 20],
         K[:2],
-        [[70, 0], [0, 72], [0, 0]],
         [[70, 0, 30], [0, 72], [0, 0, 1]],
         _with(0, 0, -70),
         _with(1, 1, 0),
@@ -201,12 +197,9 @@ def _with(row: int, column: int, value: object) -> list[list[Any]]:
         _with(1, 0, 2),
         _with(2, 2, 2),
         _with(0, 0, float("nan")),
-        _with(0, 2, float("inf")),
         _with(0, 0, 10**400),
-        _with(0, 0, [70]),
         {"fx": 70, "fy": 72, "cx": 30},
         {"fx": 70, "fy": 72, "cx": 30, "cy": 20, "k1": 0.1},
-        {"fx": 70, "fy": None, "cx": 30, "cy": 20},
     ],
 )
 def test_cameras_that_are_none(two: Path, value: Any) -> None:

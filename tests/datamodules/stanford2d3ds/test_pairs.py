@@ -46,8 +46,6 @@ def test_the_table_is_the_papers() -> None:
     assert [pair.number for pair in pairs] == list(range(60))
     assert Counter(pair.split for pair in pairs) == {"easy": 30, "hard": 30}
     for pair in pairs:
-        for side in (pair.left, pair.right):
-            assert re.fullmatch(r"[0-9a-f]{7}_(hallway|office|WC|conferenceRoom)_\d+", side)
         assert pair.left != pair.right
         assert pair.left.partition("_")[2] == pair.right.partition("_")[2]
     assert len({frozenset((pair.left, pair.right)) for pair in pairs}) == 60
