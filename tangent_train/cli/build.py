@@ -42,10 +42,11 @@ def build(settings: Settings, source: SettingsFile | None = None) -> tuple[Any, 
         if settings.get(name) is not None
     }
     representation = parts["representation"]
-    data = make(settings["data"], "data", source, representation=representation)
-    if not isinstance(data, SplitDataModule):
+    data_set = maker_of(settings["data"], "data", source)
+    if isinstance(data_set, type) and not issubclass(data_set, SplitDataModule):
         expected = "labelled images or shapes; pairs are for tangent-keypoints"
-        raise SettingError("data", found=type(data).__name__, expected=expected)
+        raise SettingError("data", found=data_set.__name__, expected=expected)
+    data = make(settings["data"], "data", source, representation=representation)
     data.check_classes()
     kind = getattr(maker_of(settings["task"], "task", source), "kind", data.kind)
     if kind != data.kind:
