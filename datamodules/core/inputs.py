@@ -22,6 +22,7 @@ __all__ = [
     "Normalization",
     "channel_names",
     "normalize",
+    "normalize_channels",
 ]
 
 Input = Literal["rgb", "depth", "elevation"]
@@ -150,12 +151,28 @@ def normalize(
     images[..., :3, :, :] = rgb.movedim(-1, -3)
     if "depth" in parts:
         images[..., 3, :, :] = parts["depth"]
-    # One multiplication and one addition per value: (v / unit − mean) / std.
-    unit = [255] * 3 + [STEPS_PER_M] * (measured - 3)
-    scale = zip(unit, normalization.mean, normalization.std, strict=True)
-    values = images.new_tensor([(1 / (step * std), mean / std) for step, mean, std in scale])
-    factor, offset = values.T[..., None, None]
-    images[..., :measured, :, :].mul_(factor).sub_(offset)
+    units = [255] * 3 + [STEPS_PER_M] * (measured - 3)
+    normalize_channels(images[..., :measured, :, :], units, normalization)
     if "elevation" in inputs:
         images[..., -1, :, :] = parts["elevation"]
     return images
+
+
+def normalize_channels(
+    images: Tensor, units: Sequence[float], normalization: Normalization
+) -> Tensor:
+    """Normalize stored values in place, ``(v / unit − mean) / std``.
+
+    Args:
+        images: ``(..., C, h, w)`` float32.
+        units: Of every channel, its stored value for 1.
+        normalization: Of C channels.
+
+    Returns:
+        The images.
+    """
+    # One multiplication and one addition per value.
+    scale = zip(units, normalization.mean, normalization.std, strict=True)
+    values = images.new_tensor([(1 / (unit * std), mean / std) for unit, mean, std in scale])
+    factor, offset = values.T[..., None, None]
+    return images.mul_(factor).sub_(offset)

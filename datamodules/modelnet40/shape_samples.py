@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from datamodules.core.inputs import Normalization
+from datamodules.core.inputs import Normalization, normalize_channels
 from datamodules.core.order import Seed, sample_rng
 from datamodules.modelnet40.meshes import CHANNELS, clean_mesh, mesh_spheres, read_off
 from tangent_train.geometry import random_rotation, rotation_about
@@ -193,8 +193,4 @@ def normalize_spheres(images: Tensor, normalization: Normalization) -> Tensor:
     *batch, height, width, channels = images.shape
     values = images.new_empty((*batch, channels, height, width), dtype=torch.float32)
     values.copy_(images.movedim(-1, -3))
-    # One multiplication and one addition per value: (v / STEPS − mean) / std.
-    scale = zip(normalization.mean, normalization.std, strict=True)
-    factors = values.new_tensor([(1 / (STEPS * std), mean / std) for mean, std in scale])
-    factor, offset = factors.T[..., None, None]
-    return values.mul_(factor).sub_(offset)
+    return normalize_channels(values, [STEPS] * channels, normalization)
