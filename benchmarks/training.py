@@ -192,7 +192,7 @@ def evaluation(quick: bool) -> Iterator[Table]:
         data, task = _built(overrides, f"{root}/rooms", 2 ** (level + 1), rooms=1)
         network, grid = task.network.eval(), data.representation.grid
         images = torch.randn(16, 3, grid.dim, grid.dim)
-        task.network = _Constant(len(data.class_names))
+        task.network = _Constant(data.num_classes)
         trainer = lightning.Trainer(accelerator="cpu", logger=False, default_root_dir=root)
         data.setup("test")
         panoramas = len(data.test_dataloader())

@@ -27,7 +27,7 @@ class AuxiliaryHead(nn.Module):
             ``"out"``.
         stage: Name of a submodule, whose result is features ``(B, C', h', w')``.
         in_channels: Channels C of the images.
-        num_classes: Classes, the unknown class 0 included.
+        num_classes: Classes K.
 
     Raises:
         SettingError: There is no such stage (the message lists the stages), or the network takes

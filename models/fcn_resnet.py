@@ -45,7 +45,7 @@ class FCNResNet(nn.Module):
 
     Args:
         in_channels: Channels of the image: 3 for RGB, 4 for RGB-D.
-        num_classes: Classes, the unknown class 0 included.
+        num_classes: Classes K.
         depth: 50 or 101.
         weights: Pretrained RGB weights. ``coco``: torchvision's FCN, trained on COCO; ``imagenet``:
             its ResNet; both are downloaded on first use. Or a file: a state dict of the FCN or of

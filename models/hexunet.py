@@ -49,7 +49,7 @@ class HexUNet(nn.Module):
 
     Args:
         in_channels: Channels of the image: 3 for RGB, 4 for RGB-D.
-        num_classes: Classes, the unknown class 0 included.
+        num_classes: Classes K.
 
     Example:
         >>> sum(p.numel() for p in HexUNet(3, 14).parameters())

@@ -83,7 +83,7 @@ class UNet(nn.Module):
 
     Args:
         in_channels: Channels of the image: 3 for RGB, 4 for RGB-D.
-        num_classes: Classes, the unknown class 0 included.
+        num_classes: Classes K.
         widths: Channels at full, half, quarter … resolution.
 
     Example:

@@ -35,20 +35,18 @@ def class_weights(counts: NDArray[np.int64], kind: ClassWeights) -> Tensor:
     mean weigh about as ``1 / r``, more frequent ones nearly the same.
 
     Args:
-        counts: ``(classes,)`` pixels of every label, the unknown one first.
+        counts: ``(K,)`` pixels of every class.
         kind: Kind of weighting.
 
     Returns:
-        ``(classes,)`` float32, 0 for the unknown label and, but for `none`, for classes never seen.
+        ``(K,)`` float32; but for `none`, 0 for classes never seen.
     """
     weights = np.ones(len(counts))
     if kind != "none":
         seen = counts > 0
-        seen[0] = False
         weights[~seen] = 0
         if seen.any():
-            weights[seen] = _of_shares(counts[seen] / counts[1:].sum(), kind)
-    weights[0] = 0
+            weights[seen] = _of_shares(counts[seen] / counts.sum(), kind)
     return torch.from_numpy(weights.astype(np.float32))
 
 

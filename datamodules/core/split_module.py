@@ -62,7 +62,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
         skip_broken: Leave broken items out, after reading all once, instead of refusing.
 
     Attributes:
-        class_names: Name of every class.
+        class_names: Name of every label; in segmentation the first is unknown, which is no class.
         kind: Kind of its labels.
         noun: Name of the items, in the plural.
         samples: Makes the samples of a split and the input of the network, see `ImageSamples`.
@@ -265,6 +265,11 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
         samples: Dataset[Any] = self.samples.evaluation(self.source(split), self.representation)
         return samples
 
+    @property
+    def num_classes(self) -> int:
+        """Classes K: the scores of a network."""
+        return len(self.class_names) - (self.kind == "segmentation")
+
     def class_weights(self, kind: ClassWeights) -> Tensor:
         """Weights of the classes in the loss, from the labels of the training split.
 
@@ -276,7 +281,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
             source = self.source("train")
             for labels in in_threads(source.labels, range(len(source))):
                 counts += np.bincount(labels.ravel(), minlength=256)
-        return class_weights(counts[: len(self.class_names)], kind)
+        return class_weights(counts[1 : len(self.class_names)], kind)
 
     def source(self, split: Split) -> SplitItems[_Item, Any]:
         """The images of one split: in memory, if asked for."""

@@ -49,9 +49,9 @@ class TrainedNetwork:
     """A trained network with everything needed to use it.
 
     Attributes:
-        network: In evaluation mode; ``(B, C, h, w)`` float32, normalized, to scores ``(B, K+1, h,
-            w)``, the unknown class first.
-        class_names: K + 1 names, the unknown class first.
+        network: In evaluation mode; ``(B, C, h, w)`` float32, normalized, to scores ``(B, K, h, w)``.
+        class_names: K + 1 names of the labels, the unknown class first: that of class k is label
+            k + 1.
         inputs: Its inputs, see `datamodules.core.inputs.Input`.
         normalization: Of RGB and depth.
         level: Level s it was trained at.
@@ -123,7 +123,7 @@ def completed_settings(
     Args:
         settings: Resolved; ``in_channels``, and ``num_classes`` or ``classes`` may be null.
         in_channels: Channels of the images.
-        num_classes: Classes, the unknown one included where there is one.
+        num_classes: Scores of the network.
         restored: Whether a checkpoint will bring the tensors: no others are fetched first.
     """
     known = dict.fromkeys(("num_classes", "classes"), num_classes) | {"in_channels": in_channels}
@@ -230,7 +230,7 @@ def _network(
     """A network with the tensors of its file; its settings are completed in place."""
     if described["settings"] is None:
         raise DataError(source.path, found="no settings of the network", expected=_EXPORTED)
-    channels, classes = len(channel_names(described["inputs"])), len(described["class_names"])
+    channels, classes = len(channel_names(described["inputs"])), len(described["class_names"]) - 1
     settings = completed_settings(described["settings"], channels, classes, restored=True)
     described["settings"] = settings
     network: nn.Module = make(settings, "network", source)

@@ -56,7 +56,7 @@ def build(settings: Settings, source: SettingsFile | None = None) -> tuple[Any, 
             _check_registered(settings[place], place)
     restored = settings.get("resume") is not None or settings.get("checkpoint") is not None
     network = completed_settings(
-        settings["network"], data.in_channels, len(data.class_names), restored=restored
+        settings["network"], data.in_channels, data.num_classes, restored=restored
     )
     parts["network"] = make(network, "network", source)
     task = make(settings["task"], "task", source, class_names=data.class_names, **parts)

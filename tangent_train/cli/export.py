@@ -60,7 +60,7 @@ def export(config: Mapping[str, Any]) -> None:
     sides += f", multiples of {multiple}" if multiple > 1 and not fixed else ""
     console.print(
         f"{output}: {output.stat().st_size / 1e6:.1f} MB\n"
-        f"images: {trained.in_channels} channels, {sides}; scores: {len(trained.class_names)} "
+        f"images: {trained.in_channels} channels, {sides}; scores: {len(trained.class_names) - 1} "
         f"classes\nlargest difference to PyTorch: {written.difference:.1e} of the range of the "
         "scores",
         markup=False,

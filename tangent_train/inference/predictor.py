@@ -45,8 +45,8 @@ def view_scores(
     """Scores of the views of one image, a few views at a time.
 
     Args:
-        network: Maps images ``(n, C, h, w)`` to scores ``(n, K + 1, h, w)``, or to a dict with
-            these under ``"out"``.
+        network: Maps images ``(n, C, h, w)`` to scores ``(n, K, h, w)``, or to a dict with these
+            under ``"out"``.
         views: Gives some of the views as images, normalized.
         count: Number of views N.
         per_forward: Views per call of the network.
@@ -54,14 +54,14 @@ def view_scores(
             called once with all views as ``network(images, rays[None])``.
 
     Yields:
-        Some of the views and their float32 scores ``(n, K, h, w)``, without the unknown class.
+        Some of the views and their float32 scores ``(n, K, h, w)``.
     """
     step = per_forward if rays is None else count
     for start in range(0, count, step):
         part = slice(start, min(start + step, count))
         returned = network(views(part), *(() if rays is None else (rays[None],)))
         scores: Tensor = returned["out"] if isinstance(returned, dict) else returned
-        yield part, scores[:, 1:].float()
+        yield part, scores.float()
 
 
 class Predictor:

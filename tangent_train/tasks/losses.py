@@ -7,8 +7,6 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 from torch.nn import functional
 
-from tangent_train.metrics.segmentation import UNKNOWN
-
 __all__ = ["auxiliary_sum", "cross_entropy_norm", "cross_entropy_sum"]
 
 
@@ -18,23 +16,23 @@ def cross_entropy_sum(
     class_weights: Float[Tensor, " classes"],
     label_smoothing: float = 0.0,
 ) -> Tensor:
-    """Weighted cross-entropy, summed; unknown pixels (class 0) are ignored.
+    """Weighted cross-entropy, summed; unknown pixels (label 0) are ignored.
 
     Divided by the `cross_entropy_norm` of the same images it is torch's weighted mean. Divided by
     the norm of *all* images, chunks and processes instead, it is their share of one mean.
 
     Args:
-        scores: Logits.
-        labels: Class indices; 0 is unknown.
+        scores: Logits of the K classes.
+        labels: 1 … K; 0 is unknown.
         class_weights: Weight of every class.
         label_smoothing: Fraction of the target that is spread evenly over the classes.
     """
     exact = _exact(scores)
     return functional.cross_entropy(
         exact,
-        labels.long(),
+        labels.long() - 1,
         class_weights.to(exact),
-        ignore_index=UNKNOWN,
+        ignore_index=-1,
         reduction="sum",
         label_smoothing=label_smoothing,
     )
@@ -44,9 +42,9 @@ def cross_entropy_norm(
     labels: UInt8[Tensor, "images height width"], class_weights: Float[Tensor, " classes"]
 ) -> Tensor:
     """Sum of the class weights of the labelled pixels, known before the forward pass."""
-    pixels = torch.bincount(labels.flatten(), minlength=len(class_weights))
+    pixels = torch.bincount(labels.flatten(), minlength=len(class_weights) + 1)[1:]
     # Not a matrix product, which autocast would compute in half precision.
-    return (pixels * _exact(class_weights))[UNKNOWN + 1 :].sum()
+    return (pixels * _exact(class_weights)).sum()
 
 
 def auxiliary_sum(
@@ -62,7 +60,7 @@ def auxiliary_sum(
 
     Args:
         scores: Logits of the cells, of any size.
-        labels: Class indices of the pixels; 0 is unknown and ignored.
+        labels: 1 … K of the pixels; 0 is unknown and ignored.
         class_weights: Weight of every class.
     """
     exact = _exact(scores)
@@ -73,10 +71,11 @@ def auxiliary_sum(
         for side, cells in zip(labels.shape[1:], size, strict=True)
     )
     image = torch.arange(images, device=labels.device)[:, None, None]
-    bins = ((image * size[0] + rows[:, None]) * size[1] + columns) * classes + labels
-    counts = torch.bincount(bins.flatten(), minlength=scores.numel())
+    cell = (image * size[0] + rows[:, None]) * size[1] + columns
+    known = labels > 0
+    bins = cell[known] * classes + labels[known] - 1
+    counts = torch.bincount(bins, minlength=scores.numel())
     histograms = counts.view(images, *size, classes).movedim(-1, 1).to(exact)
-    histograms[:, UNKNOWN] = 0
     # Counts instead of probabilities: every pixel weighs the same, however many a cell has.
     return functional.cross_entropy(exact, histograms, class_weights.to(exact), reduction="sum")
 

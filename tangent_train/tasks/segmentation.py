@@ -32,16 +32,15 @@ class SegmentationTask(Task):
     scores are rendered back and compared with the original labels.
 
     Args:
-        network: Any module ``(B, C, h, w) -> (B, K+1, h, w)`` or a dict with that under ``"out"``,
-            and optionally auxiliary scores under ``"aux"``; the first score belongs to the
-            unknown class, which is never predicted. One whose `forward` also takes ``rays`` and
-            ``images_per_chunk`` gets the viewing rays of its images and bounds its memory
-            itself (`models.SphereContext`).
+        network: Any module ``(B, C, h, w) -> (B, K, h, w)`` or a dict with that under ``"out"``,
+            and optionally auxiliary scores under ``"aux"``; the score of label k is that of class
+            k - 1. One whose `forward` also takes ``rays`` and ``images_per_chunk`` gets the viewing
+            rays of its images and bounds its memory itself (`models.SphereContext`).
         representation: Representation of the images; it assembles the scores.
         class_names: K + 1 names, the unknown class first.
         *arguments: Optimizer and scheduler, see `Task`.
         class_weights: Weights of the loss: a name that the data module knows (``none``, ``log``,
-            ``sqrt``, ``effective``) or K + 1 numbers.
+            ``sqrt``, ``effective``) or K numbers.
         auxiliary_weight: Weight of the loss of the scores under ``"aux"``.
         images_per_forward: Images per forward pass in evaluation, which bounds memory.
         absent_class: Treatment of classes absent from the ground truth in the means.
@@ -50,7 +49,7 @@ class SegmentationTask(Task):
 
     kind: ClassVar[Kind] = "segmentation"
     monitor: ClassVar[str] = "val/miou"
-    takes: ClassVar[str] = "images (n, C, h, w) to scores of every pixel (n, K + 1, h, w)"
+    takes: ClassVar[str] = "images (n, C, h, w) to scores of every pixel (n, K, h, w)"
     metric = ConfusionMatrix
     class_weights: Tensor
     representation: Assembler
@@ -68,7 +67,7 @@ class SegmentationTask(Task):
         **settings: Any,
     ) -> None:
         super().__init__(network, representation, class_names, *arguments, **settings)
-        names, count = get_args(ClassWeights), len(self.class_names)
+        names, classes = get_args(ClassWeights), self.class_names[1:]
         for name, value, fits, expected in (
             ("images_per_forward", images_per_forward, images_per_forward >= 1, "1 or more"),
             ("absent_class", absent_class, absent_class in get_args(AbsentClass), "skip or zero"),
@@ -78,8 +77,8 @@ class SegmentationTask(Task):
                 class_weights,
                 class_weights in names
                 if isinstance(class_weights, str)
-                else len(class_weights) == count,
-                f"{', '.join(names)}; or {count} numbers, for {', '.join(self.class_names)}",
+                else len(class_weights) == len(classes),
+                f"{', '.join(names)}; or {len(classes)} numbers, for {', '.join(classes)}",
             ),
         ):
             if not fits:
@@ -96,7 +95,7 @@ class SegmentationTask(Task):
         self.auxiliary_weight = auxiliary_weight
         self.images_per_forward = images_per_forward
         self.absent_class: AbsentClass = absent_class
-        self.register_buffer("class_weights", torch.ones(count))
+        self.register_buffer("class_weights", torch.ones(len(classes)))
 
     def setup(self, stage: str) -> None:
         """Fix the class weights before training; a checkpoint brings its own."""
@@ -112,7 +111,7 @@ class SegmentationTask(Task):
         images: Float[Tensor, "images channels height width"],
         rays: Float[Tensor, "spheres of_each 3 3"] | None = None,
     ) -> Float[Tensor, "images classes height width"]:
-        """Scores of every pixel, the unknown class first.
+        """Scores of every pixel.
 
         Args:
             images: Of one or several spheres.
@@ -132,7 +131,7 @@ class SegmentationTask(Task):
             at_once = self.images_per_chunk if self.training else self.images_per_forward
             returned = self.network(images, rays, at_once)
         outputs = returned if isinstance(returned, Mapping) else {"out": returned}
-        expected = (len(images), len(self.class_names), *images.shape[-2:])
+        expected = (len(images), len(self.class_weights), *images.shape[-2:])
         self.checked_scores(outputs["out"], expected)
         return outputs
 
