@@ -9,10 +9,16 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn import functional
 
 from tangent_train.errors import DataError, SettingError
 
 __all__ = ["OnnxNetwork"]
+
+_TYPES = {"tensor(float)": torch.float32, "tensor(float16)": torch.float16}
+_COLORS = 3
+_LABEL_MAP = 3
+"""Dimensions of label maps."""
 
 _ERRORS_ONLY = 3
 """Of onnxruntime's log levels: its warnings are about speed."""
@@ -25,10 +31,13 @@ class OnnxNetwork(nn.Module):
     scores are on the device of the images in any case. It has no parameters and no gradients.
 
     Args:
-        path: The file; one input ``(B, C, h, w)`` float32, one output.
+        path: The file; one input ``(B, C, h, w)`` or ``(B, h, w, 3)``, float32 or float16, and one
+            output: scores, channels first or last, or label maps, of any resolution.
 
     Attributes:
+        path: The file.
         metadata: The file's own, text by key.
+        image_size: The only rows and columns it takes; None where it takes others.
 
     Raises:
         DataError: There is no such file, it is no network of this kind, it needs other files, or
@@ -37,7 +46,7 @@ class OnnxNetwork(nn.Module):
 
     def __init__(self, path: Path) -> None:
         super().__init__()
-        self._path = path
+        self.path = path
         if not path.is_file():
             raise DataError(path, found="no such file", expected="an ONNX file")
         try:
@@ -78,27 +87,79 @@ class OnnxNetwork(nn.Module):
                 expected="images (B, C, h, w) as the only input, scores as the only output",
             )
         self._input = inputs[0]
+        if self._input.type not in _TYPES:
+            found, expected = f"images as {self._input.type}", " or ".join(_TYPES)
+            raise DataError(path, found=found, expected=expected)
+        shape = self._input.shape
+        self._channels_last = shape[3] == _COLORS and shape[1] != _COLORS
+        self._batch = shape[0] if isinstance(shape[0], int) else None
+        rows, columns = shape[1:3] if self._channels_last else shape[2:]
+        known = isinstance(rows, int) and isinstance(columns, int)
+        self.image_size: tuple[int, int] | None = (rows, columns) if known else None
         self.metadata: dict[str, str] = dict(self._session.get_modelmeta().custom_metadata_map)
 
     def forward(
         self, images: Float[Tensor, "batch channels height width"]
     ) -> Float[Tensor, "batch classes height width"]:
-        """Scores of every pixel.
+        """Scores of every pixel; of a network that gives label maps, these ``(B, h, w)``.
 
         Raises:
-            SettingError: The file was made for images of another shape.
+            SettingError: The file was made for images of another shape, or gives something else.
         """
-        array = images.detach().to("cpu", torch.float32).contiguous().numpy()
+        array = images.movedim(1, -1) if self._channels_last else images
+        array = array.detach().to("cpu", _TYPES[self._input.type])
+        size = self._batch or max(1, len(array))
+        parts = [self._run(part, images) for part in array.split(size)]
+        return torch.cat(parts).to(images.device)
+
+    def _run(self, part: Tensor, images: Tensor) -> Tensor:
+        """Scores or labels of some images, of the size of the images."""
+        missing = 0 if self._batch is None else self._batch - len(part)
+        whole = torch.cat([part, part[-1:].expand(missing, -1, -1, -1)]).contiguous().numpy()
         try:
-            (scores,) = self._session.run(None, {self._input.name: array})
+            (returned,) = self._session.run(None, {self._input.name: whole})
         except Exception as error:
             raise SettingError(
-                f"images for {self._path.name}",
+                f"images for {self.path.name}",
                 found="×".join(map(str, images.shape)),
                 expected="×".join(map(str, self._input.shape)),
                 remedy=f"onnxruntime says: {str(error).partition(chr(10))[0]}",
             ) from error
-        return torch.from_numpy(scores).to(images.device)
+        size = (images.shape[2], images.shape[3])
+        scores = _channels_first(torch.from_numpy(returned)[: len(part)], size, self._channels_last)
+        if scores is None:
+            raise SettingError(
+                f"output of {self.path.name}",
+                found="×".join(map(str, returned.shape)),
+                expected="scores (B, K, h, w) or (B, h, w, K), or labels (B, h, w)",
+            )
+        if not scores.is_floating_point():
+            return functional.interpolate(scores.float(), size)[:, 0].long()
+        if scores.shape[2:] == size:
+            return scores.float()
+        return functional.interpolate(scores.float(), size, mode="bilinear")
+
+
+def _channels_first(returned: Tensor, size: tuple[int, int], last: bool) -> Tensor | None:
+    """What a network returns, as ``(B, K, h, w)``; labels with K = 1; None for anything else.
+
+    The axis of the classes is the one without which rows and columns have one stride.
+
+    Args:
+        returned: By the network.
+        size: Rows and columns of the images.
+        last: Whether the channels of the images are last, to decide where both axes could be.
+    """
+    if returned.ndim == _LABEL_MAP and not returned.is_floating_point():
+        returned = returned[:, None]
+    if returned.ndim != _LABEL_MAP + 1:
+        return None
+    shapes = {1: returned.shape[2:], -1: returned.shape[1:3]}
+    fitting = [a for a, (h, w) in shapes.items() if abs(h * size[1] - w * size[0]) <= max(size)]
+    if not fitting:
+        return None
+    axis = (-1 if last else 1) if len(fitting) > 1 else fitting[0]
+    return returned.movedim(axis, 1)
 
 
 def _tensors(message: Any) -> Iterator[Any]:

@@ -78,7 +78,7 @@ def fetch_tensors(weights: WeightsEnum) -> dict[str, Tensor]:
 
 
 def load_tensors(
-    network: nn.Module, tensors: Mapping[str, Tensor], source: object, fresh: str
+    network: nn.Module, tensors: Mapping[str, Tensor], source: object, fresh: str | None = None
 ) -> None:
     """Load a network's tensors; every one must be there and fit.
 
@@ -86,12 +86,16 @@ def load_tensors(
         network: The network, changed in place.
         tensors: Names and values.
         source: Their source, for the message.
-        fresh: Prefix of the names of tensors that are not loaded.
+        fresh: Prefix of the names of tensors that are not loaded; None where all are.
 
     Raises:
         DataError: Tensors are missing, unexpected or of another shape.
     """
-    own = {n: t for n, t in network.state_dict().items() if n.startswith(fresh) or _COUNTER in n}
+    own = {
+        name: tensor
+        for name, tensor in network.state_dict().items()
+        if _COUNTER in name or (fresh is not None and name.startswith(fresh))
+    }
     try:
         network.load_state_dict({**own, **tensors})
     except RuntimeError as error:

@@ -14,7 +14,14 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
     from pathlib import Path
 
-__all__ = ["INPUTS", "NORMALIZATION", "read_checkpoint", "read_settings", "write_settings"]
+__all__ = [
+    "GROUPS",
+    "INPUTS",
+    "NORMALIZATION",
+    "read_checkpoint",
+    "read_settings",
+    "write_settings",
+]
 
 INPUTS = list[Literal["rgb", "depth", "elevation"]]
 """Inputs of a network, see `datamodules.core.inputs.Input`, which is slow to import."""
@@ -22,9 +29,13 @@ INPUTS = list[Literal["rgb", "depth", "elevation"]]
 NORMALIZATION = dict[str, list[float]]
 """Its ``mean`` and ``std``."""
 
+GROUPS = list[list[int]] | None
+"""Of every class the scores of a photo network, see `Groups`."""
+
 _FIELDS = {
     "config": dict,
     "class_names": list[Text],
+    "groups": GROUPS,
     "inputs": INPUTS | None,  # None of shapes, whose six channels are all there is
     "kind": Literal["segmentation", "classification"],
     "normalization": NORMALIZATION,
@@ -39,7 +50,7 @@ def read_checkpoint(path: Path, needed: Collection[str] = tuple(_FIELDS)) -> dic
     Args:
         path: The file; tensors are memory-mapped.
         needed: Which of its fields: ``config`` (the resolved settings of the run, plain values),
-            ``class_names``, ``inputs``, ``kind``, ``normalization``, ``state_dict``.
+            ``class_names``, ``groups``, ``inputs``, ``kind``, ``normalization``, ``state_dict``.
 
     Raises:
         DataError: The file is missing, no checkpoint, or of another program.

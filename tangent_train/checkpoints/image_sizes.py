@@ -34,8 +34,10 @@ def size_multiple_of(network: nn.Module, in_channels: int) -> int | None:
     Returns:
         1, 2, 4, 8, 14, 16, 32, 64 or 128; None when it takes no such size.
     """
-    shapes_only: nn.Module = copy.deepcopy(network).to("meta")
-    found = _least_multiple(shapes_only, in_channels, "meta")
+    found = None
+    if any(True for _ in network.parameters()):  # none of an ONNX file
+        shapes_only: nn.Module = copy.deepcopy(network).to("meta")
+        found = _least_multiple(shapes_only, in_channels, "meta")
     # Some networks depend on values, which the meta device does not have.
     return found or _least_multiple(network, in_channels, "cpu")
 

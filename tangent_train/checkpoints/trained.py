@@ -10,20 +10,22 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
 from datamodules.core.inputs import Input, Normalization, channel_names
 from models.onnx_network import OnnxNetwork
-from tangent_train.checkpoints.content import INPUTS, NORMALIZATION, read_checkpoint
+from tangent_train.checkpoints.content import GROUPS, INPUTS, NORMALIZATION, read_checkpoint
 from tangent_train.checkpoints.image_sizes import size_multiple_of
+from tangent_train.checkpoints.scores import Groups, Scores
 from tangent_train.errors import DataError, SettingError
 from tangent_train.json_text import parse_json
 from tangent_train.registry import SettingsFile, Text, check_fields, check_plain, make
 
 __all__ = [
     "METADATA_KEY",
-    "Scores",
     "TrainedNetwork",
     "completed_settings",
     "inputs_in",
@@ -49,7 +51,8 @@ class TrainedNetwork:
     """A trained network with everything needed to use it.
 
     Attributes:
-        network: In evaluation mode; ``(B, C, h, w)`` float32, normalized, to scores ``(B, K, h, w)``.
+        network: In evaluation mode; ``(B, C, h, w)`` float32, normalized, to the scores of K
+            classes ``(B, K, h, w)``, and perhaps of nothing, see `groups`.
         class_names: K + 1 names of the labels, the unknown class first: that of class k is label
             k + 1.
         inputs: Its inputs, see `datamodules.core.inputs.Input`.
@@ -58,13 +61,16 @@ class TrainedNetwork:
         representation: The section of the config it was trained with.
         image_size: Rows and columns of the images that representation evaluates on.
         size_multiple: Height and width of its images must be multiples of this.
-        fixed_size: The only rows and columns it takes; None where it takes others.
+        fixed_size: The only rows and columns it takes, into which larger images are divided; None
+            where it takes others.
+        groups: Scores of a photo network that make up every class, and in a last group those that
+            mean nothing: where they win, the label is 0. None where every score is a class.
         settings: The section of the config that makes it, complete; None where only the computation
             is known (ONNX).
         source: The file that `representation` and `settings` come from.
     """
 
-    network: nn.Module
+    network: Scores
     class_names: tuple[str, ...]
     inputs: tuple[Input, ...]
     normalization: Normalization
@@ -73,6 +79,7 @@ class TrainedNetwork:
     image_size: tuple[int, int]
     size_multiple: int = 1
     fixed_size: tuple[int, int] | None = None
+    groups: Groups | None = None
     settings: Mapping[str, Any] | None = None
     source: SettingsFile | None = None
 
@@ -80,6 +87,12 @@ class TrainedNetwork:
     def in_channels(self) -> int:
         """Channels of its images."""
         return len(channel_names(self.inputs))
+
+    def labels(self, best: NDArray[np.unsignedinteger]) -> NDArray[np.unsignedinteger]:
+        """Labels 1 … K of the best scores 0 … K - 1, and 0 where nothing won."""
+        labels = best + best.dtype.type(1)
+        labels[labels == len(self.class_names)] = 0
+        return labels
 
 
 _KINDS = {
@@ -91,28 +104,10 @@ _KINDS = {
     "image_size": list[int],
     "size_multiple": int,
     "fixed_size": list[int] | None,
+    "groups": GROUPS,
     "settings": dict | None,
 }
 """Metadata of an exported network."""
-
-
-class Scores(nn.Module):
-    """A network whose result is always a tensor.
-
-    Args:
-        network: Maps images ``(B, C, h, w)`` to scores ``(B, K, h, w)``, or to a dict with those
-            under ``"out"`` (torchvision's).
-    """
-
-    def __init__(self, network: nn.Module) -> None:
-        super().__init__()
-        self.network = network
-
-    def forward(self, images: Tensor) -> Tensor:
-        """Scores of every pixel."""
-        scores = self.network(images)
-        result: Tensor = scores["out"] if isinstance(scores, dict) else scores
-        return result
 
 
 def completed_settings(
@@ -212,6 +207,7 @@ def _from_checkpoint(source: SettingsFile) -> TrainedNetwork:
     config["settings"] = config.pop("network")
     names = ("class_names", "inputs", "normalization")
     described = config | {name: content[name] or [] for name in names}
+    described["groups"] = content["groups"]
     tensors = {
         name.removeprefix(_PREFIX): tensor
         for name, tensor in content["state_dict"].items()
@@ -219,7 +215,8 @@ def _from_checkpoint(source: SettingsFile) -> TrainedNetwork:
     }
     size = make(config["representation"], "representation", source).image_size
     network = _network(described, tensors, source)
-    multiple = size_multiple_of(network, len(channel_names(described["inputs"])))
+    scores = Scores(network, len(described["class_names"]) - 1, described["groups"])
+    multiple = size_multiple_of(scores, len(channel_names(described["inputs"])))
     described |= {"image_size": size, "size_multiple": multiple or 1}
     return _trained(described | {"fixed_size": None if multiple else size}, network, source)
 
@@ -243,7 +240,7 @@ def _network(
             expected=f"the tensors of {settings['_target_']}",
             remedy="Is the package of the network of another version than in training?",
         ) from error
-    return Scores(network).eval()
+    return network.eval()
 
 
 def _trained(
@@ -252,16 +249,19 @@ def _trained(
     make(described["representation"], "representation", source)  # refused now, not when it is used
     normalization, fixed = described["normalization"], described["fixed_size"]
     rows, columns = described["image_size"]
+    names, groups = tuple(described["class_names"]), described["groups"]
+    tile = None if fixed is None else (fixed[0], fixed[1])
     return TrainedNetwork(
-        network=network.eval(),
-        class_names=tuple(described["class_names"]),
+        network=Scores(network, len(names) - 1, groups, tile).eval(),
+        class_names=names,
         inputs=tuple(described["inputs"]),
         normalization=Normalization(normalization.get("mean", ()), normalization.get("std", ())),
         level=described["level"],
         representation=described["representation"],
         image_size=(rows, columns),
         size_multiple=described["size_multiple"],
-        fixed_size=None if fixed is None else (fixed[0], fixed[1]),
+        fixed_size=tile,
+        groups=groups,
         settings=described["settings"],
         source=source,
     )

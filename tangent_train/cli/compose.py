@@ -16,17 +16,22 @@ if TYPE_CHECKING:
 __all__ = ["compose_option", "config_folder", "quote_path", "quoted"]
 
 _PATHS = (
-    *("back", "cameras", "checkpoint", "depth", "figure", "init_from"),
-    *("input", "left", "output", "resume", "right"),
+    *("back", "cameras", "checkpoint", "classes", "depth", "figure", "file", "init_from"),
+    *("input", "left", "model", "output", "resume", "right", "weights"),
 )
 """Settings that name files or folders."""
 
 
-def config_folder() -> Path:
-    """The Hydra tree: the copy inside the wheel first, the checkout's second."""
+def config_folder(command: str = "") -> Path:
+    """The Hydra tree: the copy inside the wheel first, the checkout's second.
+
+    Args:
+        command: One that has a folder of its own there, as its settings have names of groups.
+    """
     package = Path(__file__).resolve().parents[1]
     packaged = package / "configs"
-    return packaged if packaged.is_dir() else package.parent / "configs"
+    folder = packaged if packaged.is_dir() else package.parent / "configs"
+    return folder / command if (folder / command).is_dir() else folder
 
 
 def quote_path(argument: str) -> str:

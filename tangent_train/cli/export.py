@@ -60,12 +60,10 @@ def export(config: Mapping[str, Any]) -> None:
     sides += f", multiples of {multiple}" if multiple > 1 and not fixed else ""
     console.print(
         f"{output}: {output.stat().st_size / 1e6:.1f} MB\n"
-        f"images: {trained.in_channels} channels, {sides}; scores: {len(trained.class_names) - 1} "
+        f"images: {trained.in_channels} channels, {sides}; scores: {trained.network.num_scores} "
         f"classes\nlargest difference to PyTorch: {written.difference:.1e} of the range of the "
         "scores",
         markup=False,
     )
-    if output.suffix.lower() == ".onnx" and sees_rays(
-        getattr(trained.network, "network", trained.network)
-    ):
+    if output.suffix.lower() == ".onnx" and sees_rays(trained.network.network):
         console.print(f"{output.name} has no cross-image attention; .safetensors keeps it.")

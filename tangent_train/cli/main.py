@@ -26,6 +26,7 @@ __all__ = [
     "check",
     "evaluate",
     "export",
+    "import_network",
     "keypoints",
     "predict",
     "prepare",
@@ -61,7 +62,7 @@ def _main(command: str) -> None:
             arguments = stored.arguments
         sys.argv[1:] = map(quote_path, arguments)
         try:
-            folder = str(config_folder())
+            folder = str(config_folder(command))
             os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises what it would print
             hydra.main(version_base="1.3", config_path=folder, config_name=command)(job)()
         except (HydraException, OmegaConfBaseException) as error:
@@ -86,6 +87,7 @@ transfer = partial(_main, "transfer")
 predict = partial(_main, "predict")
 render = partial(_main, "render")
 export = partial(_main, "export")
+import_network = partial(_main, "import_network")
 keypoints = partial(_main, "keypoints")
 
 

@@ -39,8 +39,8 @@ if TYPE_CHECKING:
 __all__ = ["predict"]
 
 _DECISIVE = (
-    "checkpoint", "depth_scale", "projection", "crop", "fov", "level", "base_level", "blend",
-    "rotations", "upright", "max_tilt_deg",
+    "checkpoint", "depth_scale", "projection", "crop", "fov", "level", "levels", "base_level",
+    "blend", "rotations", "upright", "max_tilt_deg",
 )  # fmt: skip
 """Settings that labels depend on: those of resumed predictions must be the same."""
 
@@ -61,6 +61,7 @@ class Settings:
     crop: tuple[float, ...] | None
     fov: float | None
     level: int | None
+    levels: tuple[int, ...] | None
     base_level: int | None
     blend: Literal["feather", "nearest"]
     rotations: int
@@ -90,9 +91,8 @@ def predict(config: Mapping[str, Any]) -> None:
     images = _find_images(settings)
     trained = load_trained(settings.checkpoint, settings.trust)
     folder = PredictionFolder(settings.output, trained.class_names, settings.probabilities)
-    label = _Labeller(
-        settings, _predictor(settings, trained), _depth_folder(settings, trained), folder
-    )
+    depth = _depth_folder(settings, trained)
+    label = _Labeller(settings, trained, _predictor(settings, trained), depth, folder)
     earlier = folder.earlier(decisive) if settings.resume else {}
     if not (settings.overwrite or earlier):
         folder.check()
@@ -128,13 +128,15 @@ class _Labeller:
 
     Attributes:
         settings: Of the command.
-        predictor: The network.
+        trained: The network.
+        predictor: Labels images with it.
         depth: Depth images, for networks that take depth.
         folder: Output folder.
         shown: Images for the report: the first ones done.
     """
 
     settings: Settings
+    trained: TrainedNetwork
     predictor: Predictor
     depth: DepthFolder | None
     folder: PredictionFolder
@@ -144,7 +146,7 @@ class _Labeller:
         """Label one image and return its entry of the summary."""
         image, area = self._read(name.removesuffix(path.suffix), path)
         scores = self.predictor.predict(image, progress, probabilities=self.settings.probabilities)
-        rgb, labels = image.rgb, scores.labels() + np.uint8(1)  # 0 is the unknown class
+        rgb, labels = image.rgb, self.trained.labels(scores.labels())
         if area is not None:
             rgb, labels = area.cut(rgb), area.cut(labels)
         self.folder.write(name, rgb, labels, scores, area)
@@ -182,12 +184,14 @@ def _find_images(settings: Settings) -> dict[str, Path]:
 
 
 def _predictor(settings: Settings, trained: TrainedNetwork) -> Predictor:
-    how = trained, settings.level, settings.base_level, settings.blend
+    how = settings.base_level, settings.blend
+    levels = settings.levels or (settings.level,)
     views: PhotoViews | PanoramaViews
     if settings.projection == "perspective":
-        views = PhotoViews(*how)
+        views = PhotoViews(trained, settings.level, *how)
     else:
-        views = PanoramaViews(*how, settings.rotations, upright=settings.upright is not None)
+        upright = settings.upright is not None
+        views = PanoramaViews(trained, levels, *how, settings.rotations, upright=upright)
     device = settings.device
     if device == "auto":
         device = "cuda" if torch.cuda.is_available() else "cpu"

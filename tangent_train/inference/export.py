@@ -151,7 +151,9 @@ def _write_onnx(trained: TrainedNetwork, path: Path, opset: int | None) -> None:
     written = program.model.opset_imports[""]
     if opset not in (None, written):
         raise SettingError("opset", found=opset, expected=f"{written} for this network")
-    program.model.metadata_props[METADATA_KEY] = metadata_json(replace(trained, settings=None))
+    groups = [[k] for k in range(trained.network.num_scores)] if trained.groups else None
+    written_as = replace(trained, settings=None, groups=groups)  # the graph adds them up
+    program.model.metadata_props[METADATA_KEY] = metadata_json(written_as)
     program.save(path, external_data=False)
 
 
@@ -170,9 +172,9 @@ def _quiet_exporter() -> Iterator[None]:
 
 
 def _write_safetensors(trained: TrainedNetwork, path: Path) -> None:
-    network: Any = trained.network
     # Copies: the format knows neither tensors that share memory nor other memory formats.
-    tensors = {n: t.contiguous().clone() for n, t in network.network.state_dict().items()}
+    tensors = trained.network.network.state_dict()
+    tensors = {name: tensor.contiguous().clone() for name, tensor in tensors.items()}
     save_file(tensors, path, metadata={"format": "pt", METADATA_KEY: metadata_json(trained)})
     path.chmod(0o644)  # it was replaced by one that only its owner may read
 

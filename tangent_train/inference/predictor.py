@@ -96,10 +96,9 @@ class Predictor:
         rows, columns = view_sets.image_size
         self._per_forward = images_per_forward or max(1, _PIXELS_PER_FORWARD // (rows * columns))
         self._network: Any = network
-        inner = getattr(network, "network", network)
-        self._sees_rays = sees_rays(inner)
+        self._sees_rays = sees_rays(trained.network.network)
         if self._sees_rays:
-            self._network = partial(inner, images_per_chunk=self._per_forward)
+            self._network = partial(network, images_per_chunk=self._per_forward)
         self._trained, self._view_sets = trained, view_sets
 
     def predict(
@@ -117,13 +116,14 @@ class Predictor:
             probabilities: Whether `ScoreMosaic.probabilities` is needed.
 
         Returns:
-            The scores; class k of them is label k + 1.
+            The scores; score k is that of label k + 1, the last one perhaps of nothing, see
+            `TrainedNetwork.groups`.
         """
         sets = self._view_sets(image)
         height, width = image.rgb.shape[:2]
         mosaic = ScoreMosaic(
             (height, width),
-            len(self._trained.class_names) - 1,
+            self._trained.network.num_scores,
             self._view_sets.blend,
             averaged=probabilities or len(sets) > 1,
         )

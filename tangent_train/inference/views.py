@@ -22,7 +22,7 @@ from tangent_train.rendering.representations.views import NO_RAYS, PinholeViews
 from tangent_train.rendering.upright.gravity import upright_rotation
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
     from torch import Tensor
@@ -104,7 +104,7 @@ class PanoramaViews:
 
     Args:
         trained: The network.
-        level: Level s, the angular resolution; None as trained.
+        levels: Levels s to average over, the angular resolution; None as trained.
         base_level: Base level b of tangent images; None as trained.
         blend: Blending of overlapping views.
         rotations: Number of icosahedra, rotated about the vertical, to average over.
@@ -117,32 +117,37 @@ class PanoramaViews:
     def __init__(
         self,
         trained: TrainedNetwork,
-        level: int | None = None,
+        levels: Sequence[int | None] = (None,),
         base_level: int | None = None,
         blend: Blend = "feather",
         rotations: int = 1,
         *,
         upright: bool = False,
     ) -> None:
-        self._seen = _panorama_representation(trained, level, base_level)
+        self._seen = [_panorama_representation(trained, level, base_level) for level in levels]
         self._turns = turns(rotations, "rotations")
-        self.image_size = self._seen.image_size
+        self.image_size = max(seen.image_size for seen in self._seen)
         self.blend: Blend = blend
-        if isinstance(self._seen, EquirectRepresentation):
-            if rotations > 1 or upright:
-                raise SettingError(
-                    "rotations and upright",
-                    found=f"{rotations}, {upright}",
-                    expected="1 and null for a network that takes equirectangular images",
-                    remedy="Give base_level= to use tangent images.",
-                )
-            self.blend = "nearest"
-        elif not self._seen.grid.overlapping:
-            self.blend = "nearest"
+        for seen in self._seen:
+            if isinstance(seen, EquirectRepresentation):
+                if rotations > 1 or upright or len(levels) > 1:
+                    raise SettingError(
+                        "rotations, upright and levels",
+                        found=f"{rotations}, {upright}, {len(levels)} levels",
+                        expected="1, null and one for a network that takes equirectangular images",
+                        remedy="Give base_level= to use tangent images.",
+                    )
+                self.blend = "nearest"
+            elif not seen.grid.overlapping:
+                self.blend = "nearest"
 
     def __call__(self, image: InputImage) -> list[ViewSet]:
-        """One set for every rotation."""
-        seen = self._seen
+        """One set for every level and rotation."""
+        return [views for seen in self._seen for views in self._sets(image, seen)]
+
+    def _sets(
+        self, image: InputImage, seen: PinholeRepresentation | EquirectRepresentation
+    ) -> list[ViewSet]:
         if isinstance(seen, EquirectRepresentation):
             return [_equirect_set(image, seen)]
         grid = seen.grid
@@ -215,6 +220,12 @@ def _panorama_representation(
     if level not in (None, trained.level):
         settings |= {"erp_height": None} | ({"dim": None} if "dim" in settings else {})
     settings["level"] = trained.level if level is None else level
+    if settings["_target_"] == _TANGENT and trained.fixed_size is not None:
+        side = max(trained.fixed_size)
+        if base_level is None and settings.get("dim") is None:
+            settings["base_level"] = max(0, math.ceil(settings["level"] - math.log2(side)))
+        own = settings.get("dim") or 2 ** (settings["level"] - settings["base_level"])
+        settings["dim"] = max(own, side)  # larger ones are divided
     made: Any = make(settings, "representation", trained.source)
     _check_size(trained, made.image_size)
     return made
@@ -240,11 +251,12 @@ def _photo_representation(
 
 def _check_size(trained: TrainedNetwork, size: tuple[int, int]) -> None:
     fixed, multiple = trained.fixed_size, trained.size_multiple
-    if fixed not in (None, size) or any(side % multiple for side in size):
+    small = fixed is not None and any(n < own for n, own in zip(size, fixed, strict=True))
+    if small or (fixed is None and any(side % multiple for side in size)):
         raise SettingError(
             "level and base_level",
             found="images of {}×{}".format(*size),
-            expected="those of {}×{} of the network's file".format(*fixed)
+            expected="at least {}×{}, as the network's file takes".format(*fixed)
             if fixed
             else f"multiples of {multiple}, as the network needs",
             remedy="Choose other levels, or leave both as trained.",

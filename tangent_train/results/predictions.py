@@ -174,7 +174,7 @@ class PredictionFolder:
         with array_file(files["probabilities"], shape, np.float16) as array:
             for start in range(0, len(rows), _ROWS_AT_ONCE):
                 part = slice(start, start + _ROWS_AT_ONCE)
-                array[part] = scores.probabilities(rows[part])[:, columns]
+                array[part] = scores.probabilities(rows[part])[:, columns, : shape[-1]]
 
     def write_summary(self, settings: Mapping[str, Any], entries: Sequence[Entry]) -> None:
         """Write ``summary.json``, ``summary.csv`` and ``classes.json`` (label values by name).

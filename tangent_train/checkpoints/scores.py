@@ -1,0 +1,105 @@
+"""The scores of any network as those of its classes, at every pixel of the image."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from tangent_train.errors import SettingError
+
+__all__ = ["Groups", "Scores"]
+
+_CERTAIN = 20.0
+"""Score of a pixel's class where the network gives nothing but labels."""
+
+Groups = Sequence[Sequence[int]]
+"""Of every class the scores whose probabilities add up to its own."""
+
+
+class Scores(nn.Module):
+    """A network whose result is the score of every class.
+
+    Args:
+        network: Maps images ``(B, C, h, w)`` to scores ``(B, K, h, w)``, to a dict with those under
+            ``"out"`` (torchvision's), or to label maps ``(B, h, w)`` of whole numbers.
+        num_classes: K.
+        groups: Of every class the network's scores that make it up; scores in no group never win.
+        tile: Rows and columns of the only images that the network takes: larger ones are divided.
+
+    Attributes:
+        num_scores: Scores of a pixel: K, or the number of groups.
+    """
+
+    def __init__(
+        self,
+        network: nn.Module,
+        num_classes: int,
+        groups: Groups | None = None,
+        tile: tuple[int, int] | None = None,
+    ) -> None:
+        super().__init__()
+        self.network = network
+        self.num_scores = num_classes if groups is None else len(groups)
+        self._groups = groups
+        self._tile = tile
+
+    def forward(self, images: Tensor, *arguments: Any, **settings: Any) -> Tensor:
+        """Scores ``(B, num_scores, h, w)``.
+
+        Args:
+            images: ``(B, C, h, w)``, normalized.
+            *arguments: For the network.
+            **settings: For the network.
+
+        Raises:
+            SettingError: The network has another number of scores.
+        """
+        size = (images.shape[-2], images.shape[-1])
+        if self._tile in (None, size):
+            return self._of(images, *arguments, **settings)
+        return _tiled(self._of, images, self._tile)
+
+    def _of(self, images: Tensor, *arguments: Any, **settings: Any) -> Tensor:
+        returned = self.network(images, *arguments, **settings)
+        scores: Tensor = returned["out"] if isinstance(returned, dict) else returned
+        groups = self._groups
+        needed = self.num_scores if groups is None else 1 + max(map(max, groups))
+        if not scores.is_floating_point():  # label maps
+            scores = functional.one_hot(scores, max(needed, 1 + int(scores.max()))).movedim(-1, 1)
+            scores = scores * _CERTAIN
+        count = scores.shape[1]
+        if count < needed or (groups is None and count > needed):
+            raise SettingError(
+                "class names of the network",
+                found=f"{self.num_scores}, for {count} scores",
+                expected="one for every score",
+            )
+        if groups is None:
+            return scores
+        # The logarithm of a sum of probabilities, up to what all classes of a pixel share.
+        of_groups = [scores[:, list(group)] for group in groups]
+        return torch.cat([s if s.shape[1] == 1 else s.logsumexp(1, True) for s in of_groups], dim=1)
+
+
+def _tiled(network: Any, images: Tensor, tile: tuple[int, int]) -> Tensor:
+    """The mean scores of the evenly spaced tiles that cover larger images."""
+    starts = [
+        torch.linspace(0, side - own, -(-side // own)).round().int().tolist()
+        for side, own in zip(images.shape[-2:], tile, strict=True)
+    ]
+    total: Any = 0
+    count = images.new_zeros(images.shape[-2:])
+    for top in starts[0]:
+        for left in starts[1]:
+            place = (..., slice(top, top + tile[0]), slice(left, left + tile[1]))
+            scores = network(images[place])
+            if not count.any():
+                total = scores.new_zeros(*scores.shape[:2], *images.shape[-2:])
+            total[place] += scores
+            count[place] += 1
+    result: Tensor = total / count
+    return result

@@ -1,0 +1,118 @@
+"""``tangent-import``: a photo network as a checkpoint that every command takes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+
+from tangent_train.cli.compose import compose_option, config_folder
+from tangent_train.cli.settings import typed
+from tangent_train.errors import SettingError
+
+if TYPE_CHECKING:
+    from tangent_train.inference.photo_networks import Imported, PhotoNetwork
+
+__all__ = ["import_network"]
+
+_LIBRARIES = ("torchvision", "huggingface", "smp", "timm", "onnx")
+"""Each a file of `tangent_train.inference.photo_networks` with a function `load`."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """See ``configs/import_network.yaml``; `normalization` may also be a mapping."""
+
+    network: str
+    model: str | None
+    weights: str | None
+    file: Path | None
+    classes: Path | None
+    nothing: tuple[str, ...]
+    nothing_wins: bool
+    fov: float
+    level: int | None
+    base_level: int | None
+    output: Path
+    overwrite: bool
+
+
+def import_network(config: Mapping[str, Any]) -> None:
+    """Write a photo network as a checkpoint and print what was understood.
+
+    Args:
+        config: The composed ``import_network.yaml``.
+
+    Raises:
+        DataError: A file cannot be used.
+        SettingError: A setting is missing or impossible, or the file exists.
+    """
+    from tangent_train.inference import photo_networks
+
+    settings = typed(Settings, config)
+    output = settings.output
+    if output.is_dir() or (output.exists() and not settings.overwrite):
+        raise SettingError(
+            "output",
+            found=f"{output}, which exists",
+            expected="a new file",
+            remedy="" if output.is_dir() else "Give another name, or set overwrite=true.",
+        )
+    console = Console(soft_wrap=True, highlight=False)
+    with console.status(f"Writing {output.name} …"):
+        imported = photo_networks.import_network(
+            _load(settings, config["normalization"]),
+            output,
+            fov_deg=settings.fov,
+            level=settings.level,
+            base_level=settings.base_level,
+            nothing=settings.nothing,
+            nothing_wins=settings.nothing_wins,
+        )
+    console.print(_understood(output, imported, settings), markup=False)
+
+
+def _load(settings: Settings, normalization: Any) -> PhotoNetwork:
+    """The network, from the library that the settings name."""
+    name = settings.network
+    if name in _LIBRARIES:
+        library = import_module(f"tangent_train.inference.photo_networks.{name}")
+        network: PhotoNetwork = library.load(
+            model=settings.model,
+            weights=settings.weights,
+            file=settings.file,
+            classes=settings.classes,
+            normalization=normalization,
+        )
+        return network
+    from tangent_train.inference.photo_networks import of_config
+
+    section = compose_option("network", name, [f"hydra.searchpath=[file://{config_folder()}]"])
+    return of_config.load(section, settings.weights, settings.classes, normalization)
+
+
+def _understood(path: Path, imported: Imported, settings: Settings) -> str:
+    """Description of an imported network."""
+    trained, view = imported.trained, imported.view
+    names = trained.class_names[1:]
+    mean, std = trained.normalization.mean, trained.normalization.std
+    numbers = [" ".join(f"{value:.4g}" for value in values) for values in (mean, std)]
+    size = "{}×{}".format(*trained.fixed_size) if trained.fixed_size else "any"
+    multiple = f", multiples of {trained.size_multiple}" if trained.size_multiple > 1 else ""
+    lines = [
+        f"{path}: {path.stat().st_size / 1e6:.1f} MB",
+        f"{len(names)} classes: {', '.join(names)}",
+        f"normalization of images from 0 to 1: mean {numbers[0]}, std {numbers[1]}",
+        f"image size: {size}{multiple}",
+        f"photos of {settings.fov:g}° → panoramas of level {view.level} as "
+        f"{20 * 4**view.base_level} tangent images (base level {view.base_level}) of "
+        f"{view.dim}×{view.dim}",
+    ]
+    if imported.nothing:
+        said = "are written as unknown" if settings.nothing_wins else "never win"
+        lines.insert(2, f"{', '.join(imported.nothing)}: mean nothing, {said}")
+    return "\n".join(lines)

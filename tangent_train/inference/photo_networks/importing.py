@@ -1,0 +1,234 @@
+"""Writing a photo network as a checkpoint of this package."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from models.onnx_network import OnnxNetwork
+from tangent_train.checkpoints.image_sizes import size_multiple_of
+from tangent_train.checkpoints.scores import Groups, Scores
+from tangent_train.checkpoints.trained import (
+    METADATA_KEY,
+    TrainedNetwork,
+    load_trained,
+    metadata_json,
+)
+from tangent_train.errors import SettingError
+from tangent_train.files import atomic_path
+from tangent_train.geometry import vertex_resolution
+from tangent_train.inference.photo_networks.network import PhotoNetwork
+
+__all__ = ["Imported", "View", "import_network", "view_of"]
+
+_TANGENT = "tangent_train.rendering.TangentRepresentation"
+_LEVELS = (5, 13)
+
+
+@dataclass(frozen=True)
+class View:
+    """Tangent images for a photo network.
+
+    Attributes:
+        level: Level s, their angular resolution.
+        base_level: Base level b.
+        dim: Side in pixels.
+    """
+
+    level: int
+    base_level: int
+    dim: int
+
+
+@dataclass(frozen=True)
+class Imported:
+    """A network as its file gives it back.
+
+    Attributes:
+        trained: The network.
+        nothing: Names of the scores that mean nothing.
+        view: Its tangent images.
+    """
+
+    trained: TrainedNetwork
+    nothing: tuple[str, ...]
+    view: View
+
+
+def import_network(
+    network: PhotoNetwork,
+    path: Path,
+    *,
+    fov_deg: float = 60.0,
+    level: int | None = None,
+    base_level: int | None = None,
+    nothing: Collection[str] = (),
+    nothing_wins: bool = True,
+) -> Imported:
+    """Write a photo network as a checkpoint, read it again and label one image with it.
+
+    Args:
+        network: The network.
+        path: The file: ``.ckpt``, or ``.onnx`` of a network from such a file.
+        fov_deg: Horizontal field of view of the photos it was trained on.
+        level: Level s of the panoramas; None for the angular resolution of those photos.
+        base_level: Base level b of the tangent images; None for the size of those photos.
+        nothing: Names of scores that mean nothing, such as a background.
+        nothing_wins: Whether these may win, which is then written as unknown (label 0).
+
+    Raises:
+        SettingError: A setting is impossible, or the names do not fit the scores.
+        NoRoomError: The disk is full.
+    """
+    onnx = isinstance(network.network, OnnxNetwork)
+    suffix = ".onnx" if onnx else ".ckpt"
+    if path.suffix.lower() != suffix:
+        raise SettingError("output", found=path.name, expected=f"a name ending in {suffix}")
+    view = view_of(network.image_size, fov_deg, level, base_level)
+    _try(network)
+    names, groups = _groups(network.score_names, nothing, nothing_wins)
+    with atomic_path(path) as temporary:
+        if onnx:
+            _write_onnx(network, temporary, names, groups, view)
+        else:
+            _write_checkpoint(network, temporary, names, groups, view)
+        trained = load_trained(temporary)
+        _use(trained, view)
+    source = None if trained.source is None else replace(trained.source, path=path)
+    return Imported(replace(trained, source=source), tuple(nothing), view)
+
+
+def view_of(
+    image_size: tuple[int, int],
+    fov_deg: float,
+    level: int | None = None,
+    base_level: int | None = None,
+) -> View:
+    """The tangent images that look most like the photos a network was trained on.
+
+    Level s has the focal length nearest to theirs, ``2^s / R_v(−1)`` pixels (DESIGN, section 3);
+    base level b the largest images that are not larger than theirs. Their side is that of the
+    photos' shorter one: what is beyond the default side overlaps with other images.
+
+    Args:
+        image_size: Rows and columns of the photos.
+        fov_deg: Their horizontal field of view.
+        level: Given level s.
+        base_level: Given base level b.
+
+    Raises:
+        SettingError: An impossible field of view, or levels that do not fit.
+    """
+    if not 0 < fov_deg < 180:
+        raise SettingError("fov", found=fov_deg, expected="more than 0 and less than 180 degrees")
+    if level is None:
+        focal = image_size[1] / 2 / math.tan(math.radians(fov_deg) / 2)
+        level = round(math.log2(focal * vertex_resolution(-1)))
+        level = min(max(level, _LEVELS[0]), _LEVELS[1])
+    side = min(image_size)
+    if base_level is None:
+        base_level = max(0, math.ceil(level - math.log2(side)))
+    return View(level, base_level, max(side, 2 ** (level - base_level)))
+
+
+@torch.no_grad()
+def _try(network: PhotoNetwork) -> None:
+    """Refuse names that do not fit the scores."""
+    images = torch.zeros(1, 3, *network.image_size)
+    try:
+        Scores(network.network.eval(), len(network.score_names))(images)
+    except RuntimeError as error:
+        raise SettingError(
+            "network",
+            found=f"one that does not take images of {'×'.join(map(str, network.image_size))} "
+            f"({str(error).partition(chr(10))[0]})",
+            expected="one for RGB images of that size",
+        ) from error
+
+
+def _groups(
+    score_names: Collection[str], nothing: Collection[str], wins: bool
+) -> tuple[list[str], Groups | None]:
+    """Names of the labels, and the scores of each; see `TrainedNetwork.groups`."""
+    places = list(enumerate(score_names))
+    missing = set(nothing) - set(score_names)
+    if missing:
+        raise SettingError(
+            "nothing", found=", ".join(sorted(missing)), expected=f"of {', '.join(score_names)}"
+        )
+    kept = [(k, name) for k, name in places if name not in nothing]
+    if not kept:
+        raise SettingError("nothing", found="all classes", expected="some of them")
+    names = ["unknown", *(name for _, name in kept)]
+    if not nothing:
+        return names, None
+    empty = [[k for k, name in places if name in nothing]] if wins else []
+    return names, [[k] for k, _ in kept] + empty
+
+
+def _use(trained: TrainedNetwork, view: View) -> None:
+    """Label one image as the commands will."""
+    with torch.no_grad():
+        trained.network(torch.zeros(1, 3, view.dim, view.dim))
+
+
+def _representation(view: View) -> dict[str, Any]:
+    own = {"base_level": view.base_level, "level": view.level, "dim": view.dim}
+    return {"_target_": _TANGENT, **own}
+
+
+def _write_checkpoint(
+    network: PhotoNetwork, path: Path, names: list[str], groups: Groups | None, view: View
+) -> None:
+    config = {
+        "network": network.settings,
+        "representation": _representation(view),
+        "level": view.level,
+    }
+    mean, std = network.normalization.mean, network.normalization.std
+    tensors = network.network.state_dict()
+    content = {
+        "config": config,
+        "kind": "segmentation",
+        "class_names": names,
+        "groups": groups,
+        "inputs": ["rgb"],
+        "normalization": {"mean": list(mean), "std": list(std)},
+        "state_dict": {f"network.{n}": t.contiguous().float() if t.is_floating_point() else t
+                       for n, t in tensors.items()},
+        "tangent_train_version": version("tangent-train"),
+    }  # fmt: skip
+    torch.save(content, path)
+    path.chmod(0o644)
+
+
+def _write_onnx(
+    network: PhotoNetwork, path: Path, names: list[str], groups: Groups | None, view: View
+) -> None:
+    import onnx
+
+    inner: Any = network.network
+    scores = Scores(inner, len(names) - 1, groups)
+    fixed = inner.image_size
+    described = TrainedNetwork(
+        network=scores,
+        class_names=tuple(names),
+        inputs=("rgb",),
+        normalization=network.normalization,
+        level=view.level,
+        representation=_representation(view),
+        image_size=(view.dim, view.dim),
+        size_multiple=1 if fixed else size_multiple_of(scores, 3) or 1,
+        fixed_size=fixed,
+        groups=groups,
+    )
+    graph = onnx.load(inner.path)
+    entry = graph.metadata_props.add()
+    entry.key, entry.value = METADATA_KEY, metadata_json(described)
+    onnx.save(graph, path)

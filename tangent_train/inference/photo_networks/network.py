@@ -1,0 +1,101 @@
+"""What is known of a photo network, whatever library it comes from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from torch import nn
+
+from datamodules.core.inputs import Normalization
+from tangent_train.errors import DataError, SettingError
+from tangent_train.json_text import parse_json
+
+__all__ = ["PhotoNetwork", "class_names_in", "normalization_of"]
+
+_NORMALIZATIONS = {
+    "imagenet": Normalization((0.485, 0.456, 0.406), (0.229, 0.224, 0.225)),
+    "unit": Normalization((0, 0, 0), (1, 1, 1)),
+    "symmetric": Normalization((0.5, 0.5, 0.5), (0.5, 0.5, 0.5)),
+}
+"""Of images from 0 to 1: torchvision's, none, and to -1 … 1."""
+
+
+@dataclass(frozen=True)
+class PhotoNetwork:
+    """A trained network for photos.
+
+    Attributes:
+        network: Maps normalized RGB images ``(B, 3, h, w)`` to scores ``(B, K, h, w)``, to a dict
+            with these under ``"out"``, or to label maps ``(B, h, w)``.
+        settings: The section of a config that makes it, plain values; None of an ONNX file.
+        score_names: Name of every score.
+        normalization: Of the images.
+        image_size: Rows and columns that it was trained for.
+    """
+
+    network: nn.Module
+    settings: Mapping[str, Any] | None
+    score_names: Sequence[str]
+    normalization: Normalization
+    image_size: tuple[int, int]
+
+
+def normalization_of(given: Any) -> Normalization:
+    """The normalization that a setting names.
+
+    Args:
+        given: ``imagenet``, ``unit`` (0 to 1), ``symmetric`` (-1 to 1), or a mapping with ``mean``
+            and ``std`` of images from 0 to 1.
+
+    Raises:
+        SettingError: It is something else.
+    """
+    if isinstance(given, Mapping):
+        return Normalization.of(given, 3)
+    if given not in _NORMALIZATIONS:
+        raise SettingError(
+            "normalization",
+            found="none" if given is None else given,
+            expected=f"{', '.join(_NORMALIZATIONS)}, or {{mean: […], std: […]}} of 0 to 1",
+            remedy="Take what the network was trained with; labels are poor with another one.",
+        )
+    return _NORMALIZATIONS[given]
+
+
+def class_names_in(path: Path | None) -> tuple[str, ...]:
+    """The names of a network's scores, in their order.
+
+    Args:
+        path: A JSON file: a list of names, or an object with the place of each name, as
+            ``{"wall": 0}``, or with the name of each place, as ``{"0": "wall"}`` (``id2label``).
+
+    Raises:
+        SettingError: No file is given.
+        DataError: It holds something else.
+    """
+    expected = 'a JSON list of class names in the order of the scores, ["wall", "floor"]'
+    if path is None:
+        raise SettingError("classes", found="none", expected=f"a file with {expected}")
+    try:
+        content = parse_json(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise DataError(path, found=f"an unreadable file ({error})", expected=expected) from error
+    if isinstance(content, dict):
+        names = _by_place(content)
+    else:
+        names = content if isinstance(content, list) else []
+    if not names or not all(isinstance(name, str) and name for name in names):
+        raise DataError(path, found=str(content)[:80], expected=expected)
+    return tuple(names)
+
+
+def _by_place(content: dict[str, Any]) -> list[Any]:
+    """Names in their order; empty where places are missing."""
+    if all(key.isdecimal() for key in content):
+        content = {str(name): int(place) for place, name in content.items()}
+    places = sorted(content.items(), key=lambda item: str(item[1]).zfill(8))
+    whole = [place for _, place in places] == list(range(len(places)))
+    return [name for name, _ in places] if whole else []

@@ -1,0 +1,45 @@
+"""Networks that a config describes, with weights from a file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from models.pretrained import load_tensors, read_tensors
+from tangent_train.checkpoints.trained import completed_settings
+from tangent_train.errors import SettingError
+from tangent_train.inference.photo_networks.network import (
+    PhotoNetwork,
+    class_names_in,
+    normalization_of,
+)
+from tangent_train.registry import make
+
+__all__ = ["load"]
+
+_SIZE = (512, 512)
+
+
+def load(
+    settings: Mapping[str, Any], weights: str | None, classes: Path | None, normalization: Any
+) -> PhotoNetwork:
+    """A network of ``configs/network``.
+
+    Args:
+        settings: Its section.
+        weights: File of its state dict.
+        classes: JSON file of the class names.
+        normalization: See `normalization_of`.
+
+    Raises:
+        DataError: A file cannot be used.
+        SettingError: A setting is missing.
+    """
+    if weights is None:
+        raise SettingError("weights", found="none", expected="a file with the network's tensors")
+    names = class_names_in(classes)
+    whole = completed_settings(settings, 3, len(names), restored=True)
+    network = make(whole, "network")
+    load_tensors(network, read_tensors(Path(weights).expanduser()), weights)
+    return PhotoNetwork(network, whole, names, normalization_of(normalization), _SIZE)

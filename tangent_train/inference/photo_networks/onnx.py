@@ -1,0 +1,43 @@
+"""Networks in ONNX files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from models.onnx_network import OnnxNetwork
+from tangent_train.errors import SettingError
+from tangent_train.inference.photo_networks.network import (
+    PhotoNetwork,
+    class_names_in,
+    normalization_of,
+)
+
+__all__ = ["load"]
+
+_SIZE = (512, 512)
+"""Of photos, where the file takes images of any size."""
+
+
+def load(*, file: Path | None, classes: Path | None, normalization: Any, **_: Any) -> PhotoNetwork:
+    """The network of an ONNX file, see `OnnxNetwork`.
+
+    Args:
+        file: The file.
+        classes: JSON file of the class names.
+        normalization: See `normalization_of`.
+
+    Raises:
+        DataError: A file cannot be used.
+        SettingError: A setting is missing.
+    """
+    if file is None:
+        raise SettingError("file", found="none", expected="an ONNX file")
+    network = OnnxNetwork(file)
+    return PhotoNetwork(
+        network=network,
+        settings=None,
+        score_names=class_names_in(classes),
+        normalization=normalization_of(normalization),
+        image_size=network.image_size or _SIZE,
+    )

@@ -1,0 +1,73 @@
+"""Segmentation networks of torchvision."""
+
+from __future__ import annotations
+
+import inspect
+from pathlib import Path
+from typing import Any
+
+from torchvision import models
+from torchvision.models import WeightsEnum
+
+from datamodules.core.inputs import Normalization
+from models.pretrained import fetch_tensors, load_tensors, read_tensors
+from tangent_train.errors import SettingError
+from tangent_train.inference.photo_networks.network import (
+    PhotoNetwork,
+    class_names_in,
+    normalization_of,
+)
+
+__all__ = ["load"]
+
+_AUXILIARY = "aux_classifier."
+
+
+def load(
+    *, model: str | None, weights: str | None, classes: Path | None, normalization: Any, **_: Any
+) -> PhotoNetwork:
+    """A network of ``torchvision.models.segmentation``, with published weights or one's own.
+
+    Args:
+        model: Its name.
+        weights: Published weights by name, or a file of a state dict, to which the classes and
+            normalization of the default weights belong.
+        classes: JSON file of the class names; None for those of the weights.
+        normalization: See `normalization_of`; None for that of the weights.
+
+    Raises:
+        DataError: The weights cannot be fetched or read, or do not fit.
+        SettingError: There is no such model, or no such weights.
+    """
+    known = models.list_models(models.segmentation)
+    if model not in known:
+        raise SettingError("model", found=model or "none", expected=", ".join(known))
+    published = models.get_model_weights(model)
+    is_file = weights is not None and Path(weights).expanduser().is_file()
+    if weights is None or not (is_file or weights in published.__members__):
+        names = ", ".join(published.__members__)
+        raise SettingError("weights", found=weights or "none", expected=f"{names}, or a file")
+    chosen: WeightsEnum = published["DEFAULT" if is_file else weights]
+    preset: Any = chosen.transforms()
+    names = tuple(chosen.meta["categories"]) if classes is None else class_names_in(classes)
+    tensors = read_tensors(Path(weights).expanduser()) if is_file else fetch_tensors(chosen)
+    tensors = {name: t for name, t in tensors.items() if not name.startswith(_AUXILIARY)}
+    settings = {
+        "_target_": f"torchvision.models.segmentation.{model}",
+        "num_classes": len(names),
+        "weights": None,
+        "weights_backbone": None,
+    }
+    builder = models.get_model_builder(model)
+    if "aux_loss" in inspect.signature(builder).parameters:
+        settings["aux_loss"] = False
+    network = builder(**{name: value for name, value in settings.items() if name != "_target_"})
+    load_tensors(network, tensors, weights)
+    own = Normalization(preset.mean, preset.std)
+    return PhotoNetwork(
+        network=network,
+        settings=settings,
+        score_names=names,
+        normalization=own if normalization is None else normalization_of(normalization),
+        image_size=(preset.resize_size[0], preset.resize_size[0]),
+    )
