@@ -157,10 +157,10 @@ class _StepClock(Callback):
     def _step(self) -> None:
         batch = next(self._batches)
         images = self._data.samples.normalized(batch).flatten(0, 1)
-        labels = batch.labels.flatten(0, 1).long()
+        labels = batch.labels.flatten(0, 1).long() - 1
         self._optimizer.zero_grad()
         scores = self._network(images.contiguous(memory_format=self._format))
-        loss = functional.cross_entropy(scores, labels, ignore_index=0)
+        loss = functional.cross_entropy(scores, labels, ignore_index=-1)
         torch.autograd.backward(loss)
         self._optimizer.step()
         loss.item()  # as whoever watches a training does

@@ -109,7 +109,7 @@ class OnnxNetwork(nn.Module):
         array = images.movedim(1, -1) if self._channels_last else images
         array = array.detach().to("cpu", _TYPES[self._input.type])
         size = self._batch or max(1, len(array))
-        parts = [self._run(part, images) for part in array.split(size)]
+        parts = [self._run(part, images) for part in torch.split(array, size)]
         return torch.cat(parts).to(images.device)
 
     def _run(self, part: Tensor, images: Tensor) -> Tensor:

@@ -53,7 +53,7 @@ class TrainedNetwork:
     Attributes:
         network: In evaluation mode; ``(B, C, h, w)`` float32, normalized, to the scores of K
             classes ``(B, K, h, w)``, and perhaps of nothing, see `groups`.
-        class_names: K + 1 names of the labels, the unknown class first: that of class k is label
+        class_names: K + 1 names of the labels, the unknown class first; score k is that of label
             k + 1.
         inputs: Its inputs, see `datamodules.core.inputs.Input`.
         normalization: Of RGB and depth.

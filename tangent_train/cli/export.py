@@ -65,5 +65,5 @@ def export(config: Mapping[str, Any]) -> None:
         "scores",
         markup=False,
     )
-    if output.suffix.lower() == ".onnx" and sees_rays(trained.network.network):
+    if output.suffix.lower() == ".onnx" and sees_rays(trained.network):
         console.print(f"{output.name} has no cross-image attention; .safetensors keeps it.")

@@ -10,6 +10,7 @@ import torch
 
 from datamodules.core.inputs import normalize
 from datamodules.core.samples import render_inputs
+from tangent_train.checkpoints.scores import Scores
 from tangent_train.errors import SettingError
 from tangent_train.rendering.mosaic import ScoreMosaic
 
@@ -31,7 +32,8 @@ _PIXELS_PER_FORWARD = 2**20
 
 def sees_rays(network: nn.Module) -> bool:
     """Whether a network takes viewing rays, as for cross-image attention."""
-    return "rays" in inspect.signature(network.forward).parameters
+    inner = network.network if isinstance(network, Scores) else network
+    return "rays" in inspect.signature(inner.forward).parameters
 
 
 @torch.no_grad()
@@ -96,7 +98,7 @@ class Predictor:
         rows, columns = view_sets.image_size
         self._per_forward = images_per_forward or max(1, _PIXELS_PER_FORWARD // (rows * columns))
         self._network: Any = network
-        self._sees_rays = sees_rays(trained.network.network)
+        self._sees_rays = sees_rays(trained.network)
         if self._sees_rays:
             self._network = partial(network, images_per_chunk=self._per_forward)
         self._trained, self._view_sets = trained, view_sets

@@ -72,10 +72,9 @@ def auxiliary_sum(
     )
     image = torch.arange(images, device=labels.device)[:, None, None]
     cell = (image * size[0] + rows[:, None]) * size[1] + columns
-    known = labels > 0
-    bins = cell[known] * classes + labels[known] - 1
-    counts = torch.bincount(bins, minlength=scores.numel())
-    histograms = counts.view(images, *size, classes).movedim(-1, 1).to(exact)
+    bins = cell * (classes + 1) + labels
+    counts = torch.bincount(bins.flatten(), minlength=images * size[0] * size[1] * (classes + 1))
+    histograms = counts.view(images, *size, classes + 1)[..., 1:].movedim(-1, 1).to(exact)
     # Counts instead of probabilities: every pixel weighs the same, however many a cell has.
     return functional.cross_entropy(exact, histograms, class_weights.to(exact), reduction="sum")
 

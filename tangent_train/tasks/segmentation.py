@@ -33,11 +33,11 @@ class SegmentationTask(Task):
 
     Args:
         network: Any module ``(B, C, h, w) -> (B, K, h, w)`` or a dict with that under ``"out"``,
-            and optionally auxiliary scores under ``"aux"``; the score of label k is that of class
-            k - 1. One whose `forward` also takes ``rays`` and ``images_per_chunk`` gets the viewing
-            rays of its images and bounds its memory itself (`models.SphereContext`).
+            and optionally auxiliary scores under ``"aux"``; score k is that of label k + 1. One
+            whose `forward` also takes ``rays`` and ``images_per_chunk`` gets the viewing rays of
+            its images and bounds its memory itself (`models.SphereContext`).
         representation: Representation of the images; it assembles the scores.
-        class_names: K + 1 names, the unknown class first.
+        class_names: K + 1 names of the labels, the unknown class first.
         *arguments: Optimizer and scheduler, see `Task`.
         class_weights: Weights of the loss: a name that the data module knows (``none``, ``log``,
             ``sqrt``, ``effective``) or K numbers.
@@ -131,7 +131,9 @@ class SegmentationTask(Task):
             at_once = self.images_per_chunk if self.training else self.images_per_forward
             returned = self.network(images, rays, at_once)
         outputs = returned if isinstance(returned, Mapping) else {"out": returned}
-        expected = (len(images), len(self.class_weights), *images.shape[-2:])
+        # More than there are classes where an imported network also knows nothing, see `Groups`.
+        count = getattr(self.network, "num_scores", len(self.class_weights))
+        expected = (len(images), count, *images.shape[-2:])
         self.checked_scores(outputs["out"], expected)
         return outputs
 
@@ -170,7 +172,7 @@ class SegmentationTask(Task):
         rays: Float[Tensor, "images 3 3"] | None = None,
         rotations: Float[Tensor, "rotations 3 3"] | None = None,
     ) -> Integer[Tensor, ...]:
-        """Class index (never unknown) of every pixel of one panorama, or of the crops of a photo.
+        """Class index of every pixel of one panorama, or of the crops of a photo.
 
         Args:
             images: The representation's views of the whole.
@@ -179,18 +181,29 @@ class SegmentationTask(Task):
             rotations: Of the views; none by default.
 
         Returns:
-            Class indices 1 … K of that shape.
+            Class indices 1 … K of that shape; 0 where an imported network says that there is nothing.
         """
+        best = self._best(images, shape, rays, rotations)
+        return (best + 1).where(best < len(self.class_weights), 0)
+
+    def _best(
+        self,
+        images: Tensor,
+        shape: tuple[int, ...],
+        rays: Tensor | None,
+        rotations: Tensor | None,
+    ) -> Tensor:
+        """Place of the best score of every pixel; see `predict_labels`."""
         count = 1 if rotations is None else len(rotations)
         of_turns = [None] * count if rays is None else rays.chunk(count)
         scores = (self._scores(*part) for part in zip(images.chunk(count), of_turns, strict=True))
         turns = None if rotations is None else rotations.cpu().double().numpy()
         if turns is None or count == 1:
             turn = None if turns is None else turns[0]
-            return self.representation.to_labels(next(scores), shape, turn) + 1
+            return self.representation.to_labels(next(scores), shape, turn)
         representation: Any = self.representation  # one whose `whole` has several rotations
         labels: Tensor = representation.to_averaged_labels(scores, shape, turns)
-        return labels.to(images.device) + 1
+        return labels.to(images.device)
 
     def _scores(self, images: Tensor, rays: Tensor | None) -> Tensor:
         """Scores of all views of one rotation, see `view_scores`."""

@@ -12,7 +12,8 @@ from torch import Tensor, nn
 
 from tangent_train.checkpoints.content import read_checkpoint
 from tangent_train.checkpoints.image_sizes import size_multiple_of
-from tangent_train.checkpoints.trained import Scores, completed_settings, load_trained
+from tangent_train.checkpoints.scores import Scores
+from tangent_train.checkpoints.trained import completed_settings, load_trained
 from tangent_train.errors import DataError
 from tests.tasks.small_networks import save_checkpoint
 
@@ -77,7 +78,7 @@ def test_tensors_of_the_file_are_used_and_no_others_fetched(tmp_path: Path) -> N
     settings |= dict.fromkeys(PRETRAINED, "published")
     del settings["widths"]
     content["state_dict"] = {
-        "network.weight": torch.ones(14, 4, 1, 1),
+        "network.weight": torch.ones(13, 4, 1, 1),
         "class_weights": torch.ones(2),
     }
     torch.save(content, path)
@@ -86,11 +87,11 @@ def test_tensors_of_the_file_are_used_and_no_others_fetched(tmp_path: Path) -> N
     network = trained.network.network
     assert isinstance(network, Remembering)
     assert network.settings == dict.fromkeys(PRETRAINED)
-    assert torch.equal(network.weight.detach(), torch.ones(14, 4, 1, 1))
+    assert torch.equal(network.weight.detach(), torch.ones(13, 4, 1, 1))
     assert trained.settings == {
         "_target_": f"{__name__}.Remembering",
         "in_channels": 4,
-        "num_classes": 14,
+        "num_classes": 13,
         **dict.fromkeys(PRETRAINED),
     }
 
@@ -107,8 +108,8 @@ class OneSize(nn.Conv2d):
     """A network with something learned for every pixel."""
 
     def __init__(self) -> None:
-        super().__init__(3, 5, 1)
-        self.places = nn.Parameter(torch.randn(5, 24, 40))
+        super().__init__(3, 13, 1)
+        self.places = nn.Parameter(torch.randn(13, 24, 40))
 
     def forward(self, images: Tensor) -> Tensor:
         return super().forward(images) + self.places
@@ -174,7 +175,7 @@ def test_nulls_of_networks_inside_networks_are_completed() -> None:
 
 
 def _network(**settings: Any) -> dict[str, Any]:
-    return {"_target_": "models.UNet", "in_channels": 4, "num_classes": 14, **settings}
+    return {"_target_": "models.UNet", "in_channels": 4, "num_classes": 13, **settings}
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from datamodules import Stanford2D3DS
 from datamodules.core.inputs import normalize
 from datamodules.core.photos import distance_from_z_depth
 from datamodules.core.samples import render_inputs
-from tangent_train.checkpoints.trained import Scores
+from tangent_train.checkpoints.scores import Scores
 from tangent_train.errors import SettingError
 from tangent_train.geometry import (
     TangentGrid,
@@ -106,7 +106,7 @@ def test_cross_image_attention_is_that_of_an_evaluation(per_forward: int) -> Non
     network = small_context().eval()
     awake(network)
     image, made = InputImage(_sphere(32)), make(TANGENT, "representation")
-    trained = trained_network(TANGENT, network=Scores(network))
+    trained = trained_network(TANGENT, network=Scores(network, 3))
     labels = _labels(trained, image, per_forward, blend="nearest")
     task = SegmentationTask(network, made, trained.class_names, SGD).eval()
     whole = made.whole()
@@ -115,18 +115,18 @@ def test_cross_image_attention_is_that_of_an_evaluation(per_forward: int) -> Non
     expected = task.predict_labels(images, (32, 64), torch.tensor(whole.rays())).numpy() - 1
     np.testing.assert_array_equal(labels, expected)
     with torch.no_grad():
-        alone = task.representation.to_labels(task(images)[:, 1:], (32, 64)).numpy()
+        alone = task.representation.to_labels(task(images), (32, 64)).numpy()
     assert (alone != expected).any(), "attention does something"
 
 
 def test_elevation_follows_the_zenith() -> None:
     """A network that sees nothing but elevation: up is one class, down another."""
-    network = torch.nn.Conv2d(4, 4, 1)
+    network = torch.nn.Conv2d(4, 3, 1)
     with torch.no_grad():
         network.weight.zero_()
-        network.weight[1, 3], network.weight[3, 3] = -1, 1
-        network.bias.copy_(torch.tensor([9.0, 0, -9, 0]))  # type: ignore[union-attr]
-    trained = trained_network(TANGENT, network=network, inputs=("rgb", "elevation"))
+        network.weight[0, 3], network.weight[2, 3] = -1, 1
+        network.bias.copy_(torch.tensor([0.0, -9, 0]))  # type: ignore[union-attr]
+    trained = trained_network(TANGENT, network=Scores(network, 3), inputs=("rgb", "elevation"))
     labels = _labels(trained, InputImage(_sphere(32)))
     assert (labels[:15] == 2).all()
     assert (labels[17:] == 0).all()
@@ -211,7 +211,7 @@ def test_level_and_base_level_choose_the_views() -> None:
         return found.count, found.views(slice(0, 1)).render(found.image.rgb, "bilinear").shape[1]
 
     assert views(TANGENT) == (20, 16)
-    assert views(TANGENT, level=5) == (20, 32)
+    assert views(TANGENT, levels=(5,)) == (20, 32)
     assert views(TANGENT, base_level=1) == (80, 8)
     assert views(ERP, base_level=1) == (80, 8)
     assert views(PERSPECTIVE) == (80, 32), "of networks trained on photos, base level 1"
@@ -246,7 +246,7 @@ def test_photos_with_the_networks_pixels_are_labelled_pixel_by_pixel(
 ) -> None:
     """Crops that lie on the photo's pixels, a network of single pixels: nothing may move."""
     network = color_network(channels, kernel=1)
-    trained = trained_network(PERSPECTIVE, channels, network=network)
+    trained = trained_network(PERSPECTIVE, channels, network=Scores(network, 3))
     pixel = 2 * math.tan(math.radians(22.5)) / 24
     image = _photo(_blocks(*size), 2 * math.degrees(math.atan(pixel * size[1] / 2)))
     inputs = [torch.from_numpy(image.rgb)[None]]
@@ -258,7 +258,7 @@ def test_photos_with_the_networks_pixels_are_labelled_pixel_by_pixel(
         image = InputImage(image.rgb, z_depth, camera_matrix=image.camera_matrix)
     with torch.no_grad():
         images = normalize(inputs, trained.normalization, trained.inputs)
-        expected = network(images)[0, 1:].argmax(0).numpy()
+        expected = network(images)[0].argmax(0).numpy()
     labels = _labels(trained, image, blend=blend)
     if blend == "nearest" and size != (10, 61):
         np.testing.assert_array_equal(labels, expected)
@@ -287,7 +287,7 @@ def test_crops_have_the_angular_resolution_the_network_was_trained_with() -> Non
 
 def test_a_photo_of_a_telescope_needs_little_memory() -> None:
     """Far smaller than a crop: mirrored at full resolution it would have 14,000² pixels."""
-    trained = trained_network(PERSPECTIVE, network=color_network(kernel=1))
+    trained = trained_network(PERSPECTIVE, network=Scores(color_network(kernel=1), 3))
     rgb = np.zeros((600, 800, 3), np.uint8)
     rgb[:, 400:] = 255
     (views,) = PhotoViews(trained)(_photo(rgb, 2.5))
@@ -305,13 +305,15 @@ def test_impossible_settings_are_refused() -> None:
     trained = trained_network(TANGENT)
     with pytest.raises(SettingError, match="rotations: found 0"):
         PanoramaViews(trained, rotations=0)
-    for settings in ({"rotations": 2}, {"upright": True}):
-        with pytest.raises(SettingError, match=r"rotations and upright: .*base_level="):
+    for settings in ({"rotations": 2}, {"upright": True}, {"levels": (4, 5)}):
+        with pytest.raises(SettingError, match=r"rotations, upright and levels: .*base_level="):
             PanoramaViews(trained_network(ERP), **settings)
-    for kind in (PanoramaViews, PhotoViews):
-        with pytest.raises(SettingError, match="multiples of 16"):
-            kind(trained_network(TANGENT, size_multiple=16), level=3)
-        with pytest.raises(SettingError, match=r"those of 16×16"):
-            kind(trained_network(TANGENT, fixed_size=(16, 16)), level=5)
+    strided = trained_network(TANGENT, size_multiple=16)
+    with pytest.raises(SettingError, match="multiples of 16"):
+        PanoramaViews(strided, levels=(3,))
+    with pytest.raises(SettingError, match="multiples of 16"):
+        PhotoViews(strided, level=3)
+    with pytest.raises(SettingError, match="at least 24×48"):
+        PanoramaViews(trained_network(ERP, fixed_size=(24, 48)), levels=(3,))
     with pytest.raises(SettingError, match="device"):
         Predictor(trained, PanoramaViews(trained), "nonsense")

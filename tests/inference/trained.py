@@ -8,6 +8,7 @@ import torch
 from torch import nn
 
 from datamodules.core.inputs import RGB_NORMALIZATION, RGBD_NORMALIZATION
+from tangent_train.checkpoints.scores import Scores
 from tangent_train.checkpoints.trained import TrainedNetwork
 from tangent_train.registry import make
 
@@ -24,16 +25,17 @@ PERSPECTIVE = {"_target_": _RENDERING + "PerspectiveRepresentation", "level": 6,
 
 
 def color_network(channels: int = 3, kernel: int = 3) -> nn.Conv2d:
-    """Scores that tell dark, green and bright apart; the unknown class would win everywhere."""
+    """Scores that tell dark, green and bright apart."""
     generator = torch.Generator().manual_seed(0)
-    network = nn.Conv2d(channels, 4, kernel, padding=kernel // 2, padding_mode="replicate")
+    network = nn.Conv2d(channels, 3, kernel, padding=kernel // 2, padding_mode="replicate")
     with torch.no_grad():
-        network.weight.copy_(0.2 * torch.randn(network.weight.shape, generator=generator))
+        noise = torch.randn(4, *network.weight.shape[1:], generator=generator)[1:]
+        network.weight.copy_(0.2 * noise)
         middle = network.weight[:, :, kernel // 2, kernel // 2]
-        middle[1, :3] -= 1
-        middle[2, :3] += torch.tensor([-1.0, 2, -1])
-        middle[3, :3] += 1
-        network.load_state_dict({"bias": torch.tensor([50.0, 0, 0, 0])}, strict=False)
+        middle[0, :3] -= 1
+        middle[1, :3] += torch.tensor([-1.0, 2, -1])
+        middle[2, :3] += 1
+        network.load_state_dict({"bias": torch.zeros(3)}, strict=False)
     return network.eval()
 
 
@@ -42,7 +44,7 @@ def trained_network(
 ) -> TrainedNetwork:
     """A network that has been trained with this representation."""
     settings = {
-        "network": color_network(channels),
+        "network": Scores(color_network(channels), len(CLASS_NAMES) - 1),
         "class_names": CLASS_NAMES,
         "inputs": ("rgb", "depth")[: channels - 2],
         "normalization": RGB_NORMALIZATION if channels == 3 else RGBD_NORMALIZATION,
@@ -61,7 +63,7 @@ def write_checkpoint(
     settings = {
         "_target_": "torch.nn.Conv2d",
         "in_channels": None,
-        "out_channels": 4,
+        "out_channels": 3,
         "kernel_size": 3,
         "padding": 1,
         "padding_mode": "replicate",

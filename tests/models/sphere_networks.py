@@ -17,7 +17,7 @@ STAGE = "downs.1"
 
 def small_unet() -> UNet:
     """Of stride 4; `STAGE` is its deepest."""
-    return UNet(3, 4, (4, 6, 8))
+    return UNet(3, 3, (4, 6, 8))
 
 
 def awake(module: nn.Module, scale: float = 0.5) -> nn.Module:

@@ -85,11 +85,11 @@ def _seen(module: nn.Module) -> list[Tensor]:
 
 def test_the_auxiliary_head_scores_the_stage_in_training_only() -> None:
     network, images = small_unet(), torch.randn(2, 3, 16, 20)
-    module = AuxiliaryHead(network, STAGE, in_channels=3, num_classes=4)
+    module = AuxiliaryHead(network, STAGE, in_channels=3, num_classes=3)
     features = _seen(network.ups[0])
     outputs = module.train()(images)
     assert list(outputs) == ["out", "aux"]
-    assert outputs["out"].shape == (2, 4, 16, 20)
+    assert outputs["out"].shape == (2, 3, 16, 20)
     weight, bias = module.auxiliary_head.parameters()
     expected = torch.einsum("kc,nchw->nkhw", weight[:, :, 0, 0], features[0])
     torch.testing.assert_close(outputs["aux"], expected + bias[:, None, None])

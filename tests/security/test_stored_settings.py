@@ -28,7 +28,7 @@ from tests.security.honest import SECRET, settled, with_config
 from tests.security.watch import CANARY, watched
 
 _FIRE = f"{CANARY}.fire"
-_UNET = {"_target_": "models.UNet", "in_channels": 3, "num_classes": 14, "widths": [4, 8]}
+_UNET = {"_target_": "models.UNet", "in_channels": 3, "num_classes": 13, "widths": [4, 8]}
 _TIMM = {"_target_": "timm.create_model"}
 WAYS: dict[str, tuple[dict[str, Any], str]] = {
     "code": ({"network": {"_target_": _FIRE}}, rf"network\._target_={_FIRE}.*trust={_FIRE}"),
@@ -239,8 +239,8 @@ OWN = f"{__name__}.Own"
 
 
 def _own(content: dict[str, Any], path: Path, **settings: Any) -> Path:
-    network = {"_target_": OWN, "in_channels": 3, "num_classes": 14, **settings}
-    tensors = {f"network.{n}": t for n, t in Own(3, 14).state_dict().items()}
+    network = {"_target_": OWN, "in_channels": 3, "num_classes": 13, **settings}
+    tensors = {f"network.{n}": t for n, t in Own(3, 13).state_dict().items()}
     changed = content | {"config": content["config"] | {"network": network}}
     torch.save(changed | {"state_dict": tensors}, path)
     return path

@@ -18,7 +18,7 @@ class Tied(nn.Module):
         super().__init__()
         self.first = nn.Conv2d(4, 4, 1)
         self.second = self.first
-        self.head = nn.Conv2d(4, 5, 1)
+        self.head = nn.Conv2d(4, 4, 1)
 
     def forward(self, images: Tensor) -> dict[str, Tensor]:
         return {"out": self.head(self.second(self.first(images)).relu())}
@@ -28,8 +28,8 @@ class OneSize(nn.Conv2d):
     """Something learned for every pixel."""
 
     def __init__(self) -> None:
-        super().__init__(4, 5, 1)
-        self.places = nn.Parameter(torch.randn(5, 24, 40))
+        super().__init__(4, 4, 1)
+        self.places = nn.Parameter(torch.randn(4, 24, 40))
 
     def forward(self, images: Tensor) -> Tensor:
         return super().forward(images) + self.places
@@ -39,7 +39,7 @@ class TwoSizes(nn.Conv2d):
     """Another computation for wide images: a trace knows only one of them."""
 
     def __init__(self) -> None:
-        super().__init__(4, 5, 1)
+        super().__init__(4, 4, 1)
 
     def forward(self, images: Tensor) -> Tensor:
         return super().forward(images) * (2 if images.shape[-1] > 35 else 1)
@@ -49,7 +49,7 @@ class Counting(nn.Conv2d):
     """Another computation for two images: no exporter leaves their number open."""
 
     def __init__(self) -> None:
-        super().__init__(4, 5, 1)
+        super().__init__(4, 4, 1)
 
     def forward(self, images: Tensor) -> Tensor:
         return super().forward(images) * (2 if images.shape[0] == 2 else 1)
@@ -59,7 +59,7 @@ class Tracing(nn.Conv2d):
     """Another computation while it is traced."""
 
     def __init__(self) -> None:
-        super().__init__(4, 5, 1)
+        super().__init__(4, 4, 1)
 
     def forward(self, images: Tensor) -> Tensor:
         return super().forward(images) * (2 if torch.compiler.is_compiling() else 1)
@@ -69,7 +69,7 @@ class Looking(nn.Conv2d):
     """Another computation for other values: no exporter knows both."""
 
     def __init__(self) -> None:
-        super().__init__(4, 5, 1)
+        super().__init__(4, 4, 1)
 
     def forward(self, images: Tensor) -> Tensor:
         return super().forward(images) * (2 if bool(images.sum() > 0) else 1)

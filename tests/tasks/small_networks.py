@@ -13,7 +13,8 @@ from torch import nn
 
 from datamodules.core.inputs import Input, Normalization
 from tangent_train.checkpoints.image_sizes import size_multiple_of
-from tangent_train.checkpoints.trained import Scores, TrainedNetwork, completed_settings
+from tangent_train.checkpoints.scores import Scores
+from tangent_train.checkpoints.trained import TrainedNetwork, completed_settings
 from tangent_train.cli.build import build
 from tangent_train.cli.compose import config_folder
 from tangent_train.registry import SettingsFile, make
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from tangent_train.tasks import SegmentationTask
 
 NAMES = ("unknown", "beam", "board", "sofa", "wall")
-UNET = {"_target_": "models.UNet", "in_channels": 4, "num_classes": 5, "widths": [4, 8, 8]}
+UNET = {"_target_": "models.UNet", "in_channels": 4, "num_classes": 4, "widths": [4, 8, 8]}
 
 
 def with_statistics(network: nn.Module, seed: int = 0) -> nn.Module:
@@ -48,7 +49,8 @@ def small_trained(
 ) -> TrainedNetwork:
     """As it comes out of a checkpoint, with random numbers; `network` instead of the settings'."""
     torch.manual_seed(1)
-    scores = Scores(with_statistics(network or make(settings, "network"))).eval()
+    inner = with_statistics(network or make(settings, "network"))
+    scores = Scores(inner, len(NAMES) - 1).eval()
     multiple = size_multiple_of(scores, channels)
     depth: tuple[Input, ...] = ("rgb", "depth")
     return TrainedNetwork(
@@ -88,8 +90,9 @@ def save_checkpoint(path: Path, *overrides: str, **changes: Any) -> Segmentation
     settings: Any = OmegaConf.to_container(config, resolve=True)
     torch.manual_seed(2)
     data, task = build(settings)
-    classes = len(data.class_names)
-    settings["network"] = completed_settings(settings["network"], data.in_channels, classes)
+    settings["network"] = completed_settings(
+        settings["network"], data.in_channels, data.num_classes
+    )
     with_statistics(task.network)
     normalization = data.normalization
     content = {

@@ -21,7 +21,7 @@ from tests.tasks.shapes import quiet_trainer
 pytestmark = pytest.mark.filterwarnings("ignore:You defined a `validation_step`:UserWarning")
 
 NAMES = ("unknown", "a", "b")
-WEIGHTS = torch.tensor([0.0, 1.0, 3.0])
+WEIGHTS = torch.tensor([1.0, 3.0])
 TANGENT = TangentRepresentation(base_level=0, level=4)
 
 
@@ -67,15 +67,15 @@ class Data(lightning.LightningDataModule):
     test_dataloader = val_dataloader
 
     def class_weights(self, kind: str) -> Tensor:
-        return {"none": torch.ones(3), "log": WEIGHTS}[kind]
+        return {"none": torch.ones(2), "log": WEIGHTS}[kind]
 
 
 class SignNetwork(nn.Module):
-    """Scores that are right everywhere, the unknown class the highest."""
+    """Scores that are right everywhere."""
 
     def forward(self, images: Tensor) -> dict[str, Tensor]:
         signal = images[:, :1]
-        return {"out": torch.cat([signal.abs() + 1, -signal, signal], dim=1)}
+        return {"out": torch.cat([-signal, signal], dim=1)}
 
 
 def _task(network: nn.Module, **settings: Any) -> SegmentationTask:
@@ -96,13 +96,13 @@ def test_evaluation_scores_every_panorama_against_its_own_labels() -> None:
 
 def test_the_batch_of_spheres_gives_one_gradient() -> None:
     data = Data(count=2)
-    network = nn.Conv2d(2, 3, 1)
-    task = _task(network, class_weights=[0.0, 1.0, 3.0], label_smoothing=0.1)
+    network = nn.Conv2d(2, 2, 1)
+    task = _task(network, class_weights=[1.0, 3.0], label_smoothing=0.1)
     images = torch.cat([sample.images for sample in data.train])
     labels = torch.cat([sample.labels for sample in data.train]).long()
-    loss = functional.cross_entropy(
-        network(images), labels, torch.tensor([0.0, 1.0, 3.0]), ignore_index=0, label_smoothing=0.1
-    )
+    known = labels > 0
+    scores = network(images).movedim(1, -1)[known]
+    loss = functional.cross_entropy(scores, labels[known] - 1, WEIGHTS, label_smoothing=0.1)
     expected = torch.autograd.grad(loss, list(network.parameters()))
     before = [p.detach().clone() for p in network.parameters()]
     quiet_trainer(max_steps=1, limit_val_batches=0).fit(task, datamodule=data)
@@ -112,12 +112,12 @@ def test_the_batch_of_spheres_gives_one_gradient() -> None:
 
 def test_class_weights_come_from_the_data_or_the_settings() -> None:
     data = Data()
-    task = _task(nn.Conv2d(2, 3, 1), class_weights="log")
+    task = _task(nn.Conv2d(2, 2, 1), class_weights="log")
     quiet_trainer(max_steps=1, limit_val_batches=0).fit(task, datamodule=data)
-    assert task.class_weights.tolist() == [0.0, 1.0, 3.0]
-    given = _task(nn.Conv2d(2, 3, 1), class_weights=[0.0, 2.0, 1.0])
+    assert task.class_weights.tolist() == [1.0, 3.0]
+    given = _task(nn.Conv2d(2, 2, 1), class_weights=[2.0, 1.0])
     quiet_trainer(max_steps=1, limit_val_batches=0).fit(given, datamodule=data)
-    assert given.class_weights.tolist() == [0.0, 2.0, 1.0]
+    assert given.class_weights.tolist() == [2.0, 1.0]
 
 
 class TwoHeads(nn.Module):
@@ -125,8 +125,8 @@ class TwoHeads(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.pixels = nn.Conv2d(2, 3, 1)
-        self.cells = nn.Conv2d(2, 3, 4, stride=4)
+        self.pixels = nn.Conv2d(2, 2, 1)
+        self.cells = nn.Conv2d(2, 2, 4, stride=4)
 
     def forward(self, images: Tensor) -> Any:
         scores = self.pixels(images)
@@ -149,9 +149,13 @@ def test_the_auxiliary_head_adds_the_loss_of_its_cells(weight: float) -> None:
     task.class_weights.copy_(WEIGHTS)
     found = task.loss_sum((images,), labels) / task.loss_norm(labels)
     outputs = task.network(images)
-    mean = partial(functional.cross_entropy, weight=WEIGHTS, ignore_index=0)
     enlarged = outputs["aux"].repeat_interleave(4, 2).repeat_interleave(4, 3)
-    expected = mean(outputs["out"], labels.long()) + weight * mean(enlarged, labels.long())
+    known = labels > 0
+    of_pixels, of_cells = (
+        functional.cross_entropy(scores.movedim(1, -1)[known], labels[known].long() - 1, WEIGHTS)
+        for scores in (outputs["out"], enlarged)
+    )
+    expected = of_pixels + weight * of_cells
     torch.testing.assert_close(found, expected)
 
 
@@ -173,7 +177,7 @@ class Looking(nn.Module):
         y, x = torch.meshgrid(_centers(height), _centers(width), indexing="ij")
         pixels = torch.stack([x, y, torch.ones_like(x)], dim=-1)
         up = torch.einsum("nwc,ijc->nijw", rays.flatten(0, 1), pixels)[..., 2]
-        return self.scale * torch.stack([up.abs() + 1, up, -up], dim=1)
+        return self.scale * torch.stack([up, -up], dim=1)
 
 
 def _centers(count: int) -> Tensor:
@@ -182,7 +186,7 @@ def _centers(count: int) -> Tensor:
 
 def test_such_a_network_is_told_where_its_images_look_and_divides_them_itself() -> None:
     network = Looking()
-    task = _task(network, class_weights=[0.0, 1.0, 1.0], images_per_chunk=3, images_per_forward=7)
+    task = _task(network, class_weights=[1.0, 1.0], images_per_chunk=3, images_per_forward=7)
     quiet_trainer(max_steps=1, limit_val_batches=0).fit(task, datamodule=Data(2))
     assert network.told == [((2, 20, 3, 3), 3)]
     network.told.clear()
@@ -202,8 +206,9 @@ def test_such_a_network_is_told_where_its_images_look_and_divides_them_itself() 
 
 
 def test_scores_that_do_not_fit_are_refused() -> None:
-    task = _task(nn.Conv2d(2, 4, 1))
-    with pytest.raises(SettingError, match=r"scores of the network: found \(1, 4, 16, 16\)"):
+    task = _task(nn.Conv2d(2, 3, 1))  # as if unknown were a class
+    told = r"scores of the network: found \(1, 3, 16, 16\); expected \(1, 2, 16, 16\)"
+    with pytest.raises(SettingError, match=told):
         task(torch.zeros(1, 2, 16, 16))
 
 
@@ -216,9 +221,9 @@ def test_scores_that_do_not_fit_are_refused() -> None:
         ("absent_class", "drop"),
         ("auxiliary_weight", float("nan")),
         ("class_weights", "logg"),
-        ("class_weights", [1.0, 2.0]),
+        ("class_weights", [0.0, 1.0, 2.0]),
     ],
 )
 def test_impossible_settings_are_refused(name: str, value: object) -> None:
     with pytest.raises(SettingError, match=rf"task\.{name}"):
-        _task(nn.Conv2d(2, 3, 1), **{name: value})
+        _task(nn.Conv2d(2, 2, 1), **{name: value})

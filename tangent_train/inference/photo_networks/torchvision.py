@@ -45,8 +45,8 @@ def load(
     published = models.get_model_weights(model)
     is_file = weights is not None and Path(weights).expanduser().is_file()
     if weights is None or not (is_file or weights in published.__members__):
-        names = ", ".join(published.__members__)
-        raise SettingError("weights", found=weights or "none", expected=f"{names}, or a file")
+        known = ", ".join(published.__members__)
+        raise SettingError("weights", found=weights or "none", expected=f"{known}, or a file")
     chosen: WeightsEnum = published["DEFAULT" if is_file else weights]
     preset: Any = chosen.transforms()
     names = tuple(chosen.meta["categories"]) if classes is None else class_names_in(classes)

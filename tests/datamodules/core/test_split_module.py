@@ -99,7 +99,7 @@ def test_in_memory_reads_no_file_twice(
     list(module.train_dataloader())
     monkeypatch.setattr("datamodules.stanford2d3ds.reader.read_color_png", None)
     assert len(list(module.train_dataloader())) > 0
-    assert module.class_weights("log").shape == (14,)
+    assert module.class_weights("log").shape == (13,)
 
 
 def test_rotated_panoramas_are_seen_upright_where_up_is_known(make_module: MakeModule) -> None:

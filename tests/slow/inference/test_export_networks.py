@@ -14,11 +14,11 @@ from tests.tasks.small_networks import UNET, small_trained
 
 NETWORKS: dict[str, dict[str, Any]] = {
     "unet, stride 32": {**UNET, "widths": [4, 4, 8, 8, 8, 8]},
-    "hexunet": {"_target_": "models.HexUNet", "in_channels": 4, "num_classes": 5},
+    "hexunet": {"_target_": "models.HexUNet", "in_channels": 4, "num_classes": 4},
     "fcn, frozen statistics": {
         "_target_": "models.FCNResNet",
         "in_channels": 4,
-        "num_classes": 5,
+        "num_classes": 4,
         "depth": 50,
         "frozen_statistics": True,
     },
@@ -27,7 +27,7 @@ NETWORKS: dict[str, dict[str, Any]] = {
         "in_channels": 4,
         "network": {
             "_target_": "torchvision.models.segmentation.deeplabv3_mobilenet_v3_large",
-            "num_classes": 5,
+            "num_classes": 4,
             "weights": None,
             "weights_backbone": None,
             "aux_loss": False,
@@ -45,7 +45,7 @@ NETWORKS: dict[str, dict[str, Any]] = {
         "encoder_name": "resnet18",
         "encoder_weights": None,
         "in_channels": 4,
-        "classes": 5,
+        "classes": 4,
     },
 }
 

@@ -75,7 +75,7 @@ def _labels(checkpoint: Path, rgb: np.ndarray, depth_mm: np.ndarray) -> np.ndarr
     images = (np.concatenate([color, depth[..., None]], axis=-1) - mean) / std
     with torch.no_grad():
         scores = trained.network(torch.tensor(images, dtype=torch.float32).movedim(-1, 1))
-    labels = 1 + scores[:, 1:].argmax(dim=1).numpy()
+    labels = 1 + scores.argmax(dim=1).numpy()
     xyz = equirect_directions((rgb.shape[0], rgb.shape[1]))
     owner = (xyz @ grid.centers_xyz.T).argmax(axis=-1)
     pixel = np.einsum("hwji,hwj->hwi", grid.world_from_camera[owner], xyz) @ grid.camera_matrix.T
