@@ -181,7 +181,7 @@ class SegmentationTask(Task):
             rotations: Of the views; none by default.
 
         Returns:
-            Class indices 1 … K of that shape; 0 where an imported network says that there is nothing.
+            Class indices 1 … K of that shape; 0 where an imported network sees nothing.
         """
         best = self._best(images, shape, rays, rotations)
         return (best + 1).where(best < len(self.class_weights), 0)

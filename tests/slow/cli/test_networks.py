@@ -31,7 +31,7 @@ def test_every_network_takes_the_data_s_channels_and_classes(network: str) -> No
     for inputs, channels in (("[rgb]", 3), ("[rgb,depth]", 4)):
         _, task = build(_composed(f"network={network}", f"data.inputs={inputs}", *shallow))
         scores = task(torch.randn(2, channels, 32, 32))
-        assert scores.shape == (2, 14, 32, 32)
+        assert scores.shape == (2, 13, 32, 32)
     outputs = task.outputs(torch.randn(2, channels, 32, 32)).values()
     sum(output.square().mean() for output in outputs).backward()
     unused = [n for n, p in task.named_parameters() if p.grad is None and ".mixer." not in n]
