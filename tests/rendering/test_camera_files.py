@@ -98,6 +98,7 @@ def test_colmap_has_the_same_cameras(seed: int, tmp_path: Path) -> None:
         ({"dim": 2}, "at least"),
         ({"dim": "gone"}, "no dim"),
         ({"source": {"file": "a.png", "height": 0, "width": 4}}, r"\(0, 4\) pixels"),
+        ({"source": {"file": "a.png", "height": 4, "width": 2**20 + 1}}, "pixels"),
         ({"icosahedron_rotation": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}, "rotation"),
         ({"images": [{"file": "a.png"}]}, "no face"),
         ({"images": [{"file": "a.png", "face": 20}]}, "0 to 19"),

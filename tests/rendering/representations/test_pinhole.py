@@ -142,6 +142,7 @@ def test_cropping_takes_the_least_covering_side_that_is_a_multiple() -> None:
         ({"faces_per_panorama": 0}, "1 to 20"),
         ({"rotation": "tilt"}, "'none' or 'yaw' or 'so3'"),
         ({"blend": "average"}, "'nearest' or 'feather'"),
+        ({"average_rotations": 0}, "average_rotations: found 0"),
     ],
 )
 def test_impossible_tangent_settings_are_refused(settings: dict[str, object], message: str) -> None:
@@ -158,6 +159,30 @@ def test_rotated_views_see_the_panorama_rotated_back(representation: Representat
     expected = representation.whole().render(rotate_equirect(image, TILT.T), "bilinear")
     np.testing.assert_allclose(views, expected, atol=2)
     np.testing.assert_array_equal(representation.turned(TILT).whole().rotations(), TILT[None])
+
+
+@pytest.mark.parametrize(
+    "representation",
+    [
+        TangentRepresentation(0, 5, rotation="so3"),
+        CubemapRepresentation(5, rotation="yaw"),
+        EquirectRepresentation(5, rotation="so3"),
+    ],
+)
+def test_samples_are_rotated_with_the_whole(representation: Representation) -> None:
+    plain, rotated = (r.sample(_rng()) for r in (representation, representation.turned(TILT)))
+    np.testing.assert_allclose(rotated.rotations(), TILT @ plain.rotations(), atol=1e-12)
+
+
+def test_the_identity_is_no_rotation() -> None:
+    """Tables of rotated images are not kept."""
+    assert TangentRepresentation(0, 5).turned(np.eye(3)).grid == TangentGrid(0, 5)
+
+
+@pytest.mark.parametrize("crop_deg", [0, 361])
+def test_impossible_crops_are_refused(crop_deg: float) -> None:
+    with pytest.raises(SettingError, match=f"crop_deg: found {crop_deg}; expected 0 to 360"):
+        EquirectRepresentation(5, crop_deg)
 
 
 @pytest.mark.parametrize(("blend", "least"), [("nearest", 0.999), ("feather", 0.95)])
