@@ -114,6 +114,8 @@ def test_the_cache_is_bounded_by_bytes() -> None:
     assert get("c") == 5
     get("too large", 101)
     assert cache.nbytes == 80
+    get("just fits", 100)
+    assert (len(cache), cache.nbytes) == (1, 100)
     cache.set_limit(0)
     assert (len(cache), cache.nbytes) == (0, 0)
 
@@ -122,6 +124,8 @@ def test_the_limit_can_be_set(cache: tables.TableCache) -> None:
     set_table_cache_limit(50_000)
     equirect_to_tangent(np.zeros((64, 128), np.float32), TangentGrid(0, 5), range(8))
     assert 0 < cache.nbytes <= 50_000
+    set_table_cache_limit(0)
+    assert len(cache) == 0
     with pytest.raises(SettingError, match="cache limit"):
         set_table_cache_limit(-1)
 
