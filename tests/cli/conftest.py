@@ -1,12 +1,20 @@
-"""A run of a second, finished once for all tests of the commands."""
+"""Commands, and a run of a second, finished once for all their tests."""
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import pytest
 
-from tests.cli.tiny_runs import SETTINGS, run_command
+from tests.cli.tiny_runs import SETTINGS, Run, run_command
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
+    """Runs a command in this process, in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    return partial(run_command, monkeypatch)
 
 
 @pytest.fixture(scope="session")

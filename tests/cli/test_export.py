@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import re
-import sys
 from pathlib import Path
 
 import pytest
 import torch
 
 from tangent_train.checkpoints.trained import load_trained
-from tangent_train.cli import main
+from tests.cli.tiny_runs import Run
 from tests.tasks.small_networks import save_checkpoint
 
 
@@ -21,21 +20,11 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def _export(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None:
-    monkeypatch.setattr(sys, "argv", ["tangent-export", *arguments])
-    main.export()
-
-
 @pytest.mark.parametrize("name", ["a, b.onnx", "new/folder/model.SAFETENSORS"])
 def test_the_suffix_says_the_format(
-    name: str,
-    checkpoint: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capfd: pytest.CaptureFixture[str],
+    name: str, checkpoint: Path, tmp_path: Path, run: Run, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    _export(monkeypatch, f"checkpoint={checkpoint}", f"output={name}")
+    run("export", f"checkpoint={checkpoint}", f"output={name}")
     said, errors = capfd.readouterr()
     assert errors == ""
     path = tmp_path / name
@@ -55,20 +44,18 @@ def test_the_suffix_says_the_format(
     assert kept == [path]  # and no folder of Hydra's
 
 
-def test_a_file_is_overwritten_only_when_told(
-    checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_is_overwritten_only_when_told(checkpoint: Path, tmp_path: Path, run: Run) -> None:
     output = tmp_path / "model.safetensors"
     output.write_text("mine")
     typed = [f"checkpoint={checkpoint}", f"output={output}"]
     with pytest.raises(SystemExit, match=r"^tangent-export: output: .*set overwrite=true\."):
-        _export(monkeypatch, *typed)
+        run("export", *typed)
     assert output.read_text() == "mine"
-    _export(monkeypatch, *typed, "overwrite=true")
+    run("export", *typed, "overwrite=true")
     assert load_trained(output).level == 4
     (tmp_path / "folder.onnx").mkdir()
     with pytest.raises(SystemExit, match=r"folder\.onnx, which exists; expected a new file\.$"):
-        _export(monkeypatch, typed[0], f"output={tmp_path}/folder.onnx", "overwrite=true")
+        run("export", typed[0], f"output={tmp_path}/folder.onnx", "overwrite=true")
 
 
 @pytest.mark.parametrize(
@@ -84,13 +71,8 @@ def test_a_file_is_overwritten_only_when_told(
     ],
 )
 def test_errors(
-    arguments: list[str],
-    message: str,
-    checkpoint: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    arguments: list[str], message: str, checkpoint: Path, tmp_path: Path, run: Run
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit, match=f"^tangent-export: {message}"):
-        _export(monkeypatch, *(text.format(checkpoint) for text in arguments))
+        run("export", *(text.format(checkpoint) for text in arguments))
     assert list(tmp_path.iterdir()) == []

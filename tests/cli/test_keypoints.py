@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import csv
-import json
 import re
+import shutil
 import sys
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +14,13 @@ import cv2
 import numpy as np
 import pytest
 
-from tangent_train.cli import main
 from tangent_train.results.keypoints.compare import Comparer, Comparison
+from tests.cli.tiny_runs import Run, results
 from tests.results.keypoints.ball_room import ball_pair
 
 pycolmap = pytest.importorskip("pycolmap")
 
-Run = Callable[..., None]
-SMALL = ["base_level=0", "controls=false", "pictures=0", "level=5"]
+SMALL = ("base_level=0", "controls=false", "pictures=0", "level=5")
 
 
 @pytest.fixture(scope="module")
@@ -35,35 +34,20 @@ def panoramas(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def run(tmp_path: Path, panoramas: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
-    """Runs the command as it is typed, in a folder of its own."""
-    monkeypatch.chdir(tmp_path)
-
-    def typed(*arguments: str) -> None:
-        words = [argument.replace("$PANORAMAS", str(panoramas)) for argument in arguments]
-        monkeypatch.setattr(sys, "argv", ["tangent-keypoints", *words])
-        main.keypoints()
-
-    return typed
-
-
-def results(folder: Path) -> dict[str, Any]:
-    content: dict[str, Any] = json.loads((folder / "results.json").read_text())
-    return content
+def run(run: Run) -> Run:
+    """Runs ``tangent-keypoints``."""
+    return partial(run, "keypoints")
 
 
 def pairs_in(folder: Path) -> list[str]:
     return list(dict.fromkeys(row["pair"] for row in results(folder)["rows"]))
 
 
-def test_two_panoramas(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run(
-        "left=$PANORAMAS/a.png",
-        "right=$PANORAMAS/b.png",
-        "base_level=[0]",
-        "level=5",
-        "output=out (1)",
-    )
+def test_two_panoramas(
+    run: Run, panoramas: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pair = (f"left={panoramas}/a.png", f"right={panoramas}/b.png")
+    run(*pair, "base_level=[0]", "level=5", "output=out (1)")
     output = tmp_path / "out (1)"
     assert [path.name for path in tmp_path.iterdir()] == ["out (1)"]
     names = ["keypoints.md", "matches", "pairs.csv", "results.json"]
@@ -80,7 +64,7 @@ def test_two_panoramas(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[s
 
 
 def test_export_for_colmap(run: Run, tmp_path: Path, panoramas: Path) -> None:
-    run("input=$PANORAMAS", *SMALL, "output=out", "export=true")
+    run(f"input={panoramas}", *SMALL, "output=out", "export=true")
     rows = results(tmp_path / "out")["rows"]
     for k, name in enumerate(("ERP", "L0")):
         with pycolmap.Database.open(tmp_path / f"out/export/{name}/database.db") as database:
@@ -91,9 +75,13 @@ def test_export_for_colmap(run: Run, tmp_path: Path, panoramas: Path) -> None:
 
 
 def test_an_interrupted_run_goes_on(
-    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    run: Run,
+    panoramas: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    arguments = ("input=$PANORAMAS", "pairing=all", *SMALL, "output=out")
+    arguments = (f"input={panoramas}", "pairing=all", *SMALL, "output=out")
     true_compare = Comparer.compare
     compared: list[str] = []
 
@@ -122,12 +110,14 @@ def test_an_interrupted_run_goes_on(
 
 
 @pytest.mark.parametrize("content", [None, "[]"])
-def test_foreign_folders_are_left_alone(run: Run, tmp_path: Path, content: str | None) -> None:
+def test_foreign_folders_are_left_alone(
+    run: Run, panoramas: Path, tmp_path: Path, content: str | None
+) -> None:
     (tmp_path / "out").mkdir()
     name = "holiday.jpg" if content is None else "results.json"
     (tmp_path / "out" / name).write_text(content or "picture")
     with pytest.raises(SystemExit, match="with other files"):
-        run("input=$PANORAMAS", "output=out")
+        run(f"input={panoramas}", "output=out")
     assert [path.name for path in (tmp_path / "out").iterdir()] == [name]
 
 
@@ -136,7 +126,7 @@ def test_a_broken_pair_is_named_and_the_others_are_compared(
 ) -> None:
     (tmp_path / "in").mkdir()
     for name in ("a.png", "b.png"):
-        (tmp_path / "in" / name).write_bytes((panoramas / name).read_bytes())
+        shutil.copy(panoramas / name, tmp_path / "in")
     whole = (panoramas / "c.png").read_bytes()
     (tmp_path / "in" / "d.png").write_bytes(whole[:900])
     with pytest.raises(SystemExit, match="1 of 2 pairs could not be used"):
@@ -158,7 +148,7 @@ def test_a_broken_pair_is_named_and_the_others_are_compared(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["input=$PANORAMAS"], "output: found none"),
+        (["input=in"], "output: found none"),
         (["data=synthrooms", "output=o"], "found datamodules.SynthRooms; expected pairs:"),
         (["detector=surf", "output=o"], "detector: found surf"),
         (["margin=-1", "output=o"], "margin: found -1"),
@@ -177,5 +167,5 @@ def test_pycolmap_is_missed_before_any_work(
 ) -> None:
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     with pytest.raises(SystemExit, match=re.escape("tangent-train[keypoints]")):
-        run("input=$PANORAMAS", "output=out")
+        run("input=in", "output=out")
     assert not list(tmp_path.iterdir())

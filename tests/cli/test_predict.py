@@ -1,10 +1,9 @@
-"""`tangent-predict` end to end on pictures made here."""
+"""`tangent-predict` end to end on synthetic images."""
 
 from __future__ import annotations
 
 import csv
 import json
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,27 +13,26 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tangent_train.cli import main
 from tangent_train.geometry import equirect_directions
 from tangent_train.inference.images import read_panorama
+from tests.cli.tiny_runs import Run
 from tests.inference.trained import PERSPECTIVE, TANGENT, write_checkpoint
 
 Predict = Callable[..., dict[str, Any]]
 
 
 @pytest.fixture
-def predict(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Predict:
+def predict(tmp_path: Path, run: Run) -> Predict:
     """Runs the command on ``in`` into ``out``; returns the entries of the images by name."""
     checkpoint = write_checkpoint(tmp_path / "model.ckpt")
 
-    def run(**settings: Any) -> dict[str, Any]:
+    def typed(**settings: Any) -> dict[str, Any]:
         given = {"checkpoint": checkpoint, "input": tmp_path / "in", "output": tmp_path / "out"}
-        arguments = [f"{name}={value}" for name, value in (given | settings).items()]
-        monkeypatch.setattr(sys, "argv", ["tangent-predict", *arguments])
-        main.predict()
-        return _entries(Path((given | settings)["output"]))
+        given |= settings
+        run("predict", *(f"{name}={value}" for name, value in given.items()))
+        return _entries(Path(given["output"]))
 
-    return run
+    return typed
 
 
 def _entries(folder: Path) -> dict[str, Any]:

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
-from tangent_train.cli import main
+from tests.cli.tiny_runs import Run
 from tests.results.made_records import made_record, write_run
 
 FILES = {"report.json", "report.md", "report.csv", "report.png"}
@@ -23,20 +21,11 @@ def runs(tmp_path: Path) -> Path:
     return tmp_path / "runs"
 
 
-def _report(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:
-    monkeypatch.setattr(sys, "argv", ["tangent-report", *map(str, arguments)])
-    main.report()
-
-
 def test_the_files_hold_the_runs(
-    runs: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    runs: Path, tmp_path: Path, run: Run, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     (runs / "cut" / "checkpoints").mkdir(parents=True)
-    _report(monkeypatch, runs)
+    run("report", str(runs))
     assert {path.name for path in (tmp_path / "report").iterdir()} == FILES
     read = json.loads((tmp_path / "report" / "report.json").read_text())
     (wall,) = (
@@ -52,27 +41,14 @@ def test_the_files_hold_the_runs(
         assert words in said
         assert words in text
     (tmp_path / "report" / "report.md").unlink()
-    _report(monkeypatch, runs / "1")  # a report may be written over
+    run("report", str(runs / "1"))  # a report may be written over
     assert "mine: fold 2 and 3 missing" in (tmp_path / "report" / "report.md").read_text()
 
 
 def test_what_cannot_be_reported_is_said_and_nothing_written(
-    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    runs: Path, tmp_path: Path, run: Run
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     (runs / "2" / "results.json").write_text("{")
     with pytest.raises(SystemExit, match=r"^tangent-report: .*2/results\.json: found JSONDecode"):
-        _report(monkeypatch, runs)
+        run("report", str(runs))
     assert not (tmp_path / "report").exists()
-
-
-def test_help_answers_before_anything_heavy_is_imported() -> None:
-    code = (
-        "import sys; from tangent_train.cli.main import report\n"
-        "sys.argv = ['tangent-report', '--help']\n"
-        "try: report()\n"
-        "finally: assert not {'torch', 'matplotlib', 'omegaconf'} & set(sys.modules), 'heavy'"
-    )
-    done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert "runs/paper/semseg_s7_b0_rgbd --output" in done.stdout

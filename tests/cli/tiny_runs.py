@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,10 @@ import pytest
 
 from tangent_train.cli import main
 
-__all__ = ["SETTINGS", "results", "run_command"]
+__all__ = ["SETTINGS", "Run", "results", "run_command"]
+
+Run = Callable[..., None]
+"""Runs a command with arguments."""
 
 _ROOMS = {"1": 2, "2": 2, "3": 1, "4": 1, "5a": 1, "5b": 1, "6": 1}
 SETTINGS = (
