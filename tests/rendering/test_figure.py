@@ -39,9 +39,13 @@ def test_parts_are_in_their_places(base_level: int) -> None:
     assert (z[:-1].min(axis=1) >= z[1:].max(axis=1) - 1e-6).all()
 
 
-def test_grey_of_16_bits() -> None:
+def test_grey_of_16_bits_and_numbers() -> None:
     page = tangent_figure(np.full((32, 64), 100 * 257, np.uint16), TangentGrid(0, 4))
     assert page[TOP + 6, 6].tolist() == [100, 100, 100]
+    # Images of 156 px every 160; in the middle of each its number, white on black.
+    middles = page[TOP + 4 :].reshape(2, 160, 10, 160, 3)[:, 66:90, :, 66:94]
+    assert (middles.max(axis=(1, 3, 4)) == 255).all()
+    assert (middles.min(axis=(1, 3, 4)) < 50).all()
 
 
 @pytest.mark.parametrize(
