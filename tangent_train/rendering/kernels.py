@@ -52,7 +52,7 @@ class Sight(NamedTuple):
         images: ``(n,)`` their numbers, as they stand in `owner`.
         matrices: ``(n, 3, 3)`` from rays to homogeneous pixels.
         spans: ``(n, H, 2)`` in every row the first column that may see something of an image, and
-            how many may, across the seam.
+            how many may, across the seam. Not read where there are owners.
         columns: ``(W, 2)`` factors of the rays.
         rows: ``(H, 2)`` factors of the rays.
         owner: ``(H, W)``: an image has weight 1 where it is the owner, else 0. Empty for feather
@@ -191,9 +191,9 @@ def _count(sight: Sight) -> int:
 
 @njit_fast
 def _mark_owners(tile: Tile, owner: Array, owns: Array) -> None:
-    """Mark the images that own a pixel of a tile, unless they are feathered."""
+    """Mark the images that own a pixel of a tile; all of them if they are feathered."""
     top, bottom, left, right = tile
-    owns[:] = False
+    owns[:] = len(owner) == 0
     if len(owner) == 0:
         return
     for i in range(top, bottom):
@@ -255,9 +255,7 @@ def _list_seen(tile: Tile, m: int, side: tuple[int, int], sight: Sight, seen: _S
 
 
 @njit_fast
-def _list_pixels(
-    tile: Tile, m: int, side: tuple[int, int], sight: Sight, owns: Array, seen: _Seen
-) -> int:
+def _list_pixels(tile: Tile, m: int, side: tuple[int, int], sight: Sight, seen: _Seen) -> int:
     """List the pixels of a tile that image m contributes to; returns how many.
 
     Args:
@@ -265,12 +263,11 @@ def _list_pixels(
         m: Index of the image in `sight`.
         side: Rows and columns of the image.
         sight: Geometry of images and canvas.
-        owns: From `_mark_owners`.
         seen: The list, written.
     """
     if len(sight.owner) == 0:
         return _list_seen(tile, m, side, sight, seen)
-    return _list_owned(tile, m, side, sight, seen) if owns[sight.images[m]] else 0
+    return _list_owned(tile, m, side, sight, seen)
 
 
 @njit_fast
@@ -437,7 +434,9 @@ def add_images(
             sums[:] = 0
             _mark_owners(tile, sight.owner, owns)
             for m in range(len(scores)):
-                n = _list_pixels(tile, m, side, sight, owns, seen)
+                if not owns[sight.images[m]]:
+                    continue
+                n = _list_pixels(tile, m, side, sight, seen)
                 if n == 0:
                     continue
                 first, last = _split(u[:n], side[1], column, right)
@@ -489,7 +488,9 @@ def seen_table(
         tile = i, i + 1, 0, width
         _mark_owners(tile, sight.owner, owns)
         for m in range(len(sight.matrices)):
-            for p in range(_list_pixels(tile, m, side, sight, owns, seen)):
+            if not owns[sight.images[m]]:
+                continue
+            for p in range(_list_pixels(tile, m, side, sight, seen)):
                 j = seen.pixel[p]
                 rank = count[i, j]
                 count[i, j] += 1

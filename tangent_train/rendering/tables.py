@@ -215,8 +215,11 @@ def sight_of(
     axes = grid.world_from_camera[faces]
     matrices = np.ascontiguousarray(grid.camera_matrix @ axes.transpose(0, 2, 1))
     columns, lines = kernels.sphere_rays(shape)
-    seen_columns = _spans(grid, faces, shape[1], equirect_latitudes(shape[0])[rows])
-    return kernels.Sight(faces, matrices, seen_columns, columns, lines[rows], owner)
+    if owner.size > 0:
+        spans = np.empty((len(faces), 0, 2), np.int32)
+    else:
+        spans = _spans(grid, faces, shape[1], equirect_latitudes(shape[0])[rows])
+    return kernels.Sight(faces, matrices, spans, columns, lines[rows], owner)
 
 
 def _spans(
