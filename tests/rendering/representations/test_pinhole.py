@@ -17,6 +17,7 @@ from tangent_train.rendering import (
     TangentRepresentation,
     rotate_equirect,
     tangent_to_equirect,
+    tangent_to_labels,
 )
 from tangent_train.rendering.representations.views import PinholeViews
 from tests.geometry.directions import unit
@@ -172,6 +173,15 @@ def test_rotated_views_see_the_panorama_rotated_back(representation: Representat
 def test_samples_are_rotated_with_the_whole(representation: Representation) -> None:
     plain, rotated = (r.sample(_rng()) for r in (representation, representation.turned(TILT)))
     np.testing.assert_allclose(rotated.rotations(), TILT @ plain.rotations(), atol=1e-12)
+
+
+@pytest.mark.parametrize("blend", ["nearest", "feather"])
+def test_scores_are_interpolated_and_probabilities_feathered(blend: Blend) -> None:
+    representation, shape = TangentRepresentation(0, 4, blend=blend), (32, 64)
+    scores = 5 * torch.randn(20, 5, 16, 16, generator=torch.Generator().manual_seed(0))
+    blended = scores.softmax(dim=1) if blend == "feather" else scores
+    expected = tangent_to_labels(blended, representation.grid, shape, blend)
+    torch.testing.assert_close(representation.to_labels(scores, shape), expected)
 
 
 def test_the_identity_is_no_rotation() -> None:
