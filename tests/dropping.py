@@ -23,7 +23,7 @@ class Dropping(nn.Conv2d):
 _CONFIG = """
 _target_: dropping.Dropping
 in_channels: 4
-out_channels: 14
+out_channels: 13
 kernel_size: 3
 padding: 1
 """

@@ -19,7 +19,6 @@ from tangent_train.callbacks.checkpoints import (
     CheckpointContents,
     LastCheckpoint,
 )
-from tangent_train.errors import SettingError
 
 DECAY = 0.3  # from the fourth step on: (1 + t) / (10 + t) is less before
 STEPS = 4
@@ -183,9 +182,3 @@ def test_a_run_cut_short_goes_on_as_if_nothing_had_happened(tmp_path: Path, step
         torch.testing.assert_close(found[part], expected[part], rtol=0, atol=0)
     best, whole = (_read(tmp_path / name / "best.ckpt") for name in ("parts", "whole"))
     torch.testing.assert_close(best["state_dict"], whole["state_dict"], rtol=0, atol=0)
-
-
-@pytest.mark.parametrize("decay", [0.0, 1.0, float("nan")])
-def test_impossible_decays_are_refused(decay: float) -> None:
-    with pytest.raises(SettingError, match="ema: found"):
-        averaged_weights(decay, torch.device("cpu"))

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import cv2
 import numpy as np
 import torch
 
 from tangent_train.callbacks.panels import PredictionPanels
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from tests.decoded import decoded
 
 NAMES = ("unknown", "wall", "floor")
 SHAPE, CROPS = (8, 16), (3, 4, 5)
@@ -52,12 +49,6 @@ def _tested(folder: Path, count: int, *shape: int) -> PredictionPanels:
     return panels
 
 
-def _decoded(content: bytes | None) -> NDArray[np.uint8]:
-    assert content is not None
-    pixels: Any = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-    return pixels
-
-
 def test_the_panoramas_of_the_panels_are_kept_for_the_report(tmp_path: Path) -> None:
     panels = _tested(tmp_path, 4, *SHAPE)
     chosen = (0, 3, 6, 9)
@@ -65,9 +56,9 @@ def test_the_panoramas_of_the_panels_are_kept_for_the_report(tmp_path: Path) -> 
     assert {path.stem for path in tmp_path.iterdir()} == {f"area_room {k}" for k in chosen}
     for image, k in zip(panels.images, chosen, strict=True):
         assert image.sphere
-        assert np.abs(_decoded(image.jpeg).astype(int) - 20 * k).max() <= 1
-        assert np.all(_decoded(image.truth) == 1)
-        prediction = _decoded(image.prediction)
+        assert np.abs(decoded(image.jpeg).astype(int) - 20 * k).max() <= 1
+        assert np.all(decoded(image.truth) == 1)
+        prediction = decoded(image.prediction)
         assert prediction[0, 0] == 2
         assert np.count_nonzero(prediction == 1) == 127
         assert image.note == f"mIoU {100 * 127 / 128:.1f}\u00a0%", "the floor is not in the truth"
@@ -78,9 +69,9 @@ def test_the_crops_of_photos_lie_side_by_side(tmp_path: Path) -> None:
     assert not image.sphere
     count, height, width = CROPS
     assert (image.width, image.height) == (count * width, height)
-    means = _decoded(image.jpeg)[..., 0].reshape(height, count, width).mean(axis=(0, 2))
+    means = decoded(image.jpeg)[..., 0].reshape(height, count, width).mean(axis=(0, 2))
     np.testing.assert_allclose(means, [0, 60, 120], atol=12)
-    assert _decoded(image.truth).shape == (height, count * width)
+    assert decoded(image.truth).shape == (height, count * width)
 
 
 def test_no_panels_no_images(tmp_path: Path) -> None:

@@ -5,15 +5,13 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import cv2
 import lightning
 import numpy as np
 import pytest
 import torch
 from lightning.pytorch.loggers import TensorBoardLogger
-from numpy.typing import NDArray
 from tensorboard.backend.event_processing.event_accumulator import (  # type: ignore[import-untyped]
     EventAccumulator,
 )
@@ -21,17 +19,13 @@ from torch import nn
 
 from datamodules import Stanford2D3DS
 from tangent_train.callbacks.tensorboard import ClassScores, ValidationPictures
-from tangent_train.errors import SettingError
-from tangent_train.rendering import PerspectiveRepresentation, TangentRepresentation
+from tangent_train.rendering import TangentRepresentation
 from tangent_train.results.pictures import prediction_panel
 from tangent_train.tasks import SegmentationTask
+from tests.decoded import decoded
 from tests.tasks.shapes import Shapes, shape_task
 
-if TYPE_CHECKING:
-    pass
-
 TANGENT = TangentRepresentation(base_level=0, level=4, faces_per_panorama=5)
-PHOTOS = PerspectiveRepresentation(level=5, evaluation="grid", crops_per_photo=2)
 STEPS = 3  # of an epoch: 6 panoramas, 2 at a time
 
 
@@ -77,12 +71,6 @@ def _steps(events: EventAccumulator, tag: str) -> list[int]:
     return [event.step for event in kind(tag)]
 
 
-def _picture(event: Any) -> NDArray[np.uint8]:
-    bgr = cv2.imdecode(np.frombuffer(event.encoded_image_string, np.uint8), cv2.IMREAD_COLOR)
-    assert bgr is not None
-    return np.asarray(bgr[..., ::-1], np.uint8)
-
-
 def _tags(events: EventAccumulator, kind: str, group: str) -> list[str]:
     return sorted(tag for tag in events.Tags()[kind] if tag.startswith(group))
 
@@ -122,7 +110,8 @@ def test_the_same_images_are_shown_after_every_validation(
             scores = task.network((values - mean[:, None, None]) / std[:, None, None])
         labels = TANGENT.to_labels(scores, (32, 64)).numpy() + 1
         expected = prediction_panel(panorama.rgb, panorama.labels, labels, data.class_names)
-        np.testing.assert_array_equal(_picture(events.Images(tag)[-1]), expected)
+        shown = decoded(events.Images(tag)[-1].encoded_image_string)
+        np.testing.assert_array_equal(shown, expected)
 
 
 def test_figures_of_every_class_are_those_of_numpy(
@@ -170,8 +159,3 @@ def test_nothing_is_drawn_by_other_processes_or_without_tensorboard(tmp_path: Pa
         pictures.on_validation_batch_end(trainer, unused, None, unused, 0)
         ClassScores().on_validation_end(trainer, unused)
     assert not list(tmp_path.rglob("events*"))
-
-
-def test_a_negative_number_of_images_is_refused() -> None:
-    with pytest.raises(SettingError, match="tensorboard_images: found -1"):
-        ValidationPictures(-1)

@@ -9,14 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from tangent_train.checkpoints.content import write_settings
-from tangent_train.cli import main
 from tangent_train.cli.compose import config_folder
 from tangent_train.cli.transfer import transfer
 from tangent_train.metrics.segmentation import ConfusionMatrices
@@ -85,12 +83,6 @@ class PretendedRuns:
         results = segmentation_record(matrices, ("unknown", "wall", "floor"), "skip")
         write_results(results, folder)
         return 0
-
-
-def run_command(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None:
-    """The command ``tangent-transfer`` with the settings above, and these."""
-    monkeypatch.setattr(sys, "argv", ["tangent-transfer", *SETTINGS, *arguments])
-    main.transfer()
 
 
 @lru_cache

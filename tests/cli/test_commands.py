@@ -172,6 +172,10 @@ def test_a_run_starts_from_the_network_of_another(
         (["network.num_classes=5"], "scores of the network"),
         (["network.in_channels=3"], "network: found UNet, which does not take"),
         (["task=classification"], "task: found classification, with panoramas"),
+        (["checkpoint_every_n_steps=0"], "checkpoint_every_n_steps: found 0"),
+        (["tensorboard_images=-1"], "tensorboard_images: found -1"),
+        (["ema=0"], "ema: found 0"),
+        (["ema=1"], "ema: found 1"),
     ],
 )
 def test_impossible_settings_are_refused_before_any_data_is_made(

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -8,6 +8,7 @@ import pytest
 
 from tangent_train.results.html import EncodedImage, encode_image, write_report
 from tangent_train.results.html.images import BUDGET_BYTES
+from tests.decoded import decoded
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -16,13 +17,6 @@ if TYPE_CHECKING:
 
 CLASSES = 14
 NAMES = tuple(f"class {k}" for k in range(CLASSES))
-
-
-def _decoded(content: bytes | None) -> NDArray[np.uint8]:
-    assert content is not None
-    pixels: Any = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-    assert pixels is not None
-    return pixels if pixels.ndim == 2 else pixels[..., ::-1]
 
 
 def _noise(height: int, budget: int = BUDGET_BYTES) -> tuple[NDArray[np.uint8], EncodedImage]:
@@ -58,17 +52,17 @@ def test_an_ordinary_panorama_keeps_all_its_pixels() -> None:
     rgb = _smooth(2048)
     labels = (rgb[..., 0] // 20).astype(np.uint8)
     image = encode_image("smooth", rgb, CLASSES, prediction=labels)
-    assert cv2.PSNR(_decoded(image.jpeg), rgb) > 38
-    np.testing.assert_array_equal(_decoded(image.prediction), labels)
+    assert cv2.PSNR(decoded(image.jpeg), rgb) > 38
+    np.testing.assert_array_equal(decoded(image.prediction), labels)
     assert image.truth is None
-    assert _decoded(image.thumbnail).shape == (108, 216, 3)
+    assert decoded(image.thumbnail).shape == (108, 216, 3)
 
 
 @pytest.mark.parametrize("budget", [150_000, 400_000])
 def test_noisy_labels_are_halved_and_the_picture_made_coarser_until_they_fit(budget: int) -> None:
     truth, image = _noise(512, budget)
     assert _base64_size(image) <= budget
-    labels = _decoded(image.truth)
+    labels = decoded(image.truth)
     factor = 512 // len(labels)
     assert factor > 1
     # Nearest: every label is one of those below it, no mixture.
@@ -88,11 +82,11 @@ def test_a_larger_image_is_shrunk_by_area_and_its_labels_to_the_nearest() -> Non
     labels[100:200, 2000:5000] = 7
     image = encode_image("large", rgb, CLASSES, prediction=labels, sphere=False)
     assert (image.width, image.height) == (8192, 256)
-    shrunk = _decoded(image.jpeg)
+    shrunk = decoded(image.jpeg)
     assert shrunk.shape == (128, 4096, 3)
     assert np.abs(shrunk.astype(int) - 100).max() <= 2
-    np.testing.assert_array_equal(_decoded(image.prediction)[50:100, 1000:2500], 7)
-    assert np.count_nonzero(_decoded(image.prediction)) == 50 * 1500
+    np.testing.assert_array_equal(decoded(image.prediction)[50:100, 1000:2500], 7)
+    assert np.count_nonzero(decoded(image.prediction)) == 50 * 1500
 
 
 def test_shares_are_of_the_solid_angle_on_panoramas_and_of_the_pixels_on_photos() -> None:

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import numpy as np
 import pytest
 
 from datamodules.stanford2d3ds.pairs import published_pairs
 from tangent_train.results.keypoints.compare import AS_GIVEN, ROTATED, SHRUNK, Comparer, Row, Ways
 from tangent_train.results.keypoints.report import KeypointReport, matches_png, with_splits
+from tests.decoded import decoded
 from tests.results.keypoints.ball_room import ball_pair
 
 PUBLISHED = {str(pair.number): pair for pair in published_pairs()}
@@ -136,10 +136,7 @@ def test_a_picture_joins_keypoints_across_the_seam() -> None:
     pytest.importorskip("pycolmap")
     pair = ball_pair(shape=(64, 128))
     comparison = Comparer(Ways((0,), controls=False)).compare(pair)
-    picture = cv2.imdecode(
-        np.frombuffer(matches_png(comparison, AS_GIVEN), np.uint8), cv2.IMREAD_COLOR
-    )
-    assert picture is not None
+    picture = decoded(matches_png(comparison, AS_GIVEN))
     assert picture.shape == (800, 1600, 3)
-    hsv = cv2.cvtColor(picture, cv2.COLOR_BGR2HSV)
+    hsv = cv2.cvtColor(picture, cv2.COLOR_RGB2HSV)
     assert (hsv[..., 1] > 200).sum() > 1000  # coloured lines on grey panoramas

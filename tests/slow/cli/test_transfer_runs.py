@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.cli.pretended_runs import HERE, OF_SEED_0, run_command
+from tests.cli.pretended_runs import HERE, OF_SEED_0, SETTINGS
+from tests.cli.tiny_runs import run_command
 
 
 def test_real_runs_from_photos_to_panoramas(
@@ -18,10 +19,10 @@ def test_real_runs_from_photos_to_panoramas(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "my" / "network").mkdir(parents=True)
     (tmp_path / "my" / "network" / "plain.yaml").write_text(
-        "_target_: torch.nn.Conv2d\nin_channels: 4\nout_channels: 14\nkernel_size: 1\n"
+        "_target_: torch.nn.Conv2d\nin_channels: 4\nout_channels: 13\nkernel_size: 1\n"
     )
-    network = ("network=plain", "compare=[]", "trainer.max_epochs=2", "--config-dir=my")
-    run_command(monkeypatch, *network)
+    network = (*SETTINGS, "network=plain", "compare=[]", "trainer.max_epochs=2", "--config-dir=my")
+    run_command(monkeypatch, "transfer", *network)
     stages = ["P", "S", "P-FT-1", "S-FT-1"]
     found = {name: json.loads((OF_SEED_0 / name / "results.json").read_text()) for name in stages}
     assert [found[name]["images"] for name in stages] == [4, 2, 4, 2], "photos, panoramas"
@@ -41,7 +42,7 @@ def test_real_runs_from_photos_to_panoramas(
     (OF_SEED_0 / "S-FT-1" / "results.json").unlink()
     shutil.rmtree(OF_SEED_0 / "S")
     capsys.readouterr()
-    run_command(monkeypatch, *network)
+    run_command(monkeypatch, "transfer", *network)
     out = capsys.readouterr().out
     assert out.count("finished before") == 2
     assert (HERE / "transfer.csv").read_text() == before, "the same figures again"
@@ -53,10 +54,10 @@ def test_stages_that_differ_in_inputs_are_refused_before_the_first(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    dims = ("level=6", "representation.base_level=2", "compare=[]")
+    dims = (*SETTINGS, "level=6", "representation.base_level=2", "compare=[]")
     alike = (
         r"stage S: data\.inputs: found \('rgb', 'depth'\); expected \('rgb',\), as in the stages"
     )
     with pytest.raises(SystemExit, match=alike):
-        run_command(monkeypatch, *dims, "photos.data.inputs=[rgb]")
+        run_command(monkeypatch, "transfer", *dims, "photos.data.inputs=[rgb]")
     assert not (tmp_path / "data").exists()

@@ -155,7 +155,7 @@ def test_what_tensorboard_cannot_write_stops_with_a_checkpoint_to_go_on_from(
 NETWORK = """
 _target_: torch.nn.Conv2d
 in_channels: 4
-out_channels: 14
+out_channels: 13
 kernel_size: 49
 padding: 24
 """

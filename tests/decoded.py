@@ -1,0 +1,21 @@
+"""Pixels of encoded images."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+__all__ = ["decoded"]
+
+
+def decoded(content: bytes | None) -> NDArray[np.uint8]:
+    """``(H, W, 3)`` RGB or ``(H, W)`` grey pixels of an encoded image, without transparency."""
+    assert content is not None
+    pixels: Any = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_ANYCOLOR)
+    assert pixels is not None
+    return pixels if pixels.ndim == 2 else pixels[..., ::-1]
