@@ -98,10 +98,8 @@ class OnnxNetwork(nn.Module):
         self.image_size: tuple[int, int] | None = (rows, columns) if known else None
         self.metadata: dict[str, str] = dict(self._session.get_modelmeta().custom_metadata_map)
 
-    def forward(
-        self, images: Float[Tensor, "batch channels height width"]
-    ) -> Float[Tensor, "batch classes height width"]:
-        """Scores of every pixel; of a network that gives label maps, these ``(B, h, w)``.
+    def forward(self, images: Float[Tensor, "batch channels height width"]) -> Tensor:
+        """Scores ``(B, K, h, w)`` of every pixel; of a network that gives label maps, these ``(B, h, w)``.
 
         Raises:
             SettingError: The file was made for images of another shape, or gives something else.

@@ -8,9 +8,11 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from hydra import compose
+from omegaconf import OmegaConf
 from rich.console import Console
 
-from tangent_train.cli.compose import compose_option, config_folder
+from tangent_train.cli.compose import config_folder
 from tangent_train.cli.settings import typed
 from tangent_train.errors import SettingError
 
@@ -25,7 +27,7 @@ _LIBRARIES = ("torchvision", "huggingface", "smp", "timm", "onnx")
 
 @dataclass(frozen=True)
 class Settings:
-    """See ``configs/import_network.yaml``; `normalization` may also be a mapping."""
+    """See ``configs/import/import.yaml``; `normalization` may also be a mapping."""
 
     network: str
     model: str | None
@@ -45,7 +47,7 @@ def import_network(config: Mapping[str, Any]) -> None:
     """Write a photo network as a checkpoint and print what was understood.
 
     Args:
-        config: The composed ``import_network.yaml``.
+        config: The composed ``import.yaml``.
 
     Raises:
         DataError: A file cannot be used.
@@ -91,7 +93,9 @@ def _load(settings: Settings, normalization: Any) -> PhotoNetwork:
         return network
     from tangent_train.inference.photo_networks import of_config
 
-    section = compose_option("network", name, [f"hydra.searchpath=[file://{config_folder()}]"])
+    search = f"hydra.searchpath=[file://{config_folder()}]"
+    config: Any = compose("import", [f"+network@section={name}", search])
+    section: Any = OmegaConf.to_container(config.section)
     return of_config.load(section, settings.weights, settings.classes, normalization)
 
 

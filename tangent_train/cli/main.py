@@ -87,7 +87,7 @@ transfer = partial(_main, "transfer")
 predict = partial(_main, "predict")
 render = partial(_main, "render")
 export = partial(_main, "export")
-import_network = partial(_main, "import_network")
+import_network = partial(_main, "import")
 keypoints = partial(_main, "keypoints")
 
 
@@ -110,7 +110,8 @@ def _run(command: str, config: DictConfig, stored: Any, visible_gpus: str | None
     if "SUBMITIT_EXECUTOR" in os.environ:
         # SLURM warns every process; submitit's ends this one, with SIGTERM, for a last checkpoint.
         signal.signal(signal.SIGUSR2, signal.SIG_IGN)
-    run = getattr(import_module(f"tangent_train.cli.{command}"), command)
+    name = "import_network" if command == "import" else command  # a word of Python
+    run = getattr(import_module(f"tangent_train.cli.{name}"), name)
     if command == "transfer":  # its stages keep the references of the config
         return run(config)
     settings: Any = OmegaConf.to_container(config, resolve=True)

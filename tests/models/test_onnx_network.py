@@ -88,3 +88,66 @@ def test_other_files_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     with pytest.raises(DataError, match=r"onnxruntime.*pip install 'tangent-train\[export\]'"):
         OnnxNetwork(whole)
+
+
+def _of_nodes(path: Path, shape: Any, *nodes: Any, kind: int = TensorProto.FLOAT) -> OnnxNetwork:
+    """A network of nodes from "pictures" to "a"."""
+    images = helper.make_tensor_value_info("pictures", kind, shape)
+    last = {"ArgMax": TensorProto.INT64}.get(nodes[-1].op_type, kind)
+    graph = helper.make_graph(
+        nodes,
+        "by hand",
+        [images],
+        [helper.make_tensor_value_info("a", last, None)],
+        [numpy_helper.from_array(np.array([2], np.int64), "half")],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
+    onnx.save(model, path)
+    return OnnxNetwork(path)
+
+
+_IDENTITY = helper.make_node("Identity", ["pictures"], ["a"])
+
+
+def test_channels_may_be_last(tmp_path: Path) -> None:
+    images = torch.randn(2, 3, 4, 5)
+    last = _of_nodes(tmp_path / "last.onnx", ("b", "h", "w", 3), _IDENTITY)
+    torch.testing.assert_close(last(images), images)
+    to_last = helper.make_node("Transpose", ["pictures"], ["a"], perm=[0, 2, 3, 1])
+    mixed = _of_nodes(tmp_path / "mixed.onnx", ("b", 3, 4, 5), to_last)
+    assert mixed.image_size == (4, 5)
+    torch.testing.assert_close(mixed(images), images)
+
+
+def test_coarser_scores_are_interpolated_and_labels_repeated(tmp_path: Path) -> None:
+    images = torch.randn(2, 3, 8, 12)
+    pool = helper.make_node("AveragePool", ["pictures"], ["p"], kernel_shape=[4, 4], strides=[4, 4])
+    scores = helper.make_node("Identity", ["p"], ["a"])
+    coarse = torch.nn.functional.avg_pool2d(images, 4)
+    network = _of_nodes(tmp_path / "coarse.onnx", ("b", 3, "h", "w"), pool, scores)
+    expected = torch.nn.functional.interpolate(coarse, (8, 12), mode="bilinear")
+    torch.testing.assert_close(network(images), expected)
+    for keep in (0, 1):
+        best = helper.make_node("ArgMax", ["p"], ["a"], axis=1, keepdims=keep)
+        labels = _of_nodes(tmp_path / f"labels{keep}.onnx", ("b", 3, "h", "w"), pool, best)(images)
+        assert labels.dtype == torch.int64
+        torch.testing.assert_close(labels[:, 1::4, 2::4], coarse.argmax(dim=1))
+        assert labels.shape == (2, 8, 12)
+
+
+def test_files_of_a_fixed_batch_and_of_half_precision(tmp_path: Path) -> None:
+    images = torch.randn(5, 3, 4, 4)
+    fixed = _of_nodes(tmp_path / "fixed.onnx", (2, 3, 4, 4), _IDENTITY)
+    torch.testing.assert_close(fixed(images), images)
+    half = _of_nodes(tmp_path / "half.onnx", ("b", 3, 4, 4), _IDENTITY, kind=TensorProto.FLOAT16)
+    assert half(images).dtype == torch.float32
+    torch.testing.assert_close(half(images), images.half().float())
+
+
+def test_what_is_no_network_of_photos_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"found images as tensor\(int64\); expected tensor"):
+        _of_nodes(tmp_path / "whole.onnx", ("b", 3, 4, 4), _IDENTITY, kind=TensorProto.INT64)
+    flat = helper.make_node("Flatten", ["pictures"], ["a"])
+    network = _of_nodes(tmp_path / "flat.onnx", ("b", 3, 4, 4), flat)
+    with pytest.raises(SettingError, match=r"output of flat\.onnx: found 1×48; expected scores"):
+        network(torch.zeros(1, 3, 4, 4))

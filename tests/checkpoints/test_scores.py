@@ -1,0 +1,66 @@
+"""Scores of the classes of any network."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from tangent_train.checkpoints.scores import Scores
+from tangent_train.errors import SettingError
+
+
+class LabelMaps(nn.Module):
+    """A network that says the class of a pixel, which is its red channel, and no scores."""
+
+    def forward(self, images: Tensor) -> Tensor:
+        return images[:, 0].long()
+
+
+def test_probabilities_of_a_group_add_up() -> None:
+    network, images = nn.Conv2d(3, 5, 1), torch.randn(2, 3, 4, 6)
+    groups = [[3], [0, 2], [1]]  # the last score never wins
+    with torch.no_grad():
+        found = Scores(network, 3, groups)(images).softmax(dim=1).numpy()
+        own = np.exp(network(images).double().numpy())
+    sums = np.stack([own[:, group].sum(axis=1) for group in groups], axis=1)
+    np.testing.assert_allclose(found, sums / sums.sum(axis=1, keepdims=True), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("num_classes", "groups", "told"),
+    [(4, None, "found 4, for 5 scores"), (6, None, "6, for 5"), (1, [[5]], "1, for 5")],
+)
+def test_other_numbers_of_names_than_of_scores_are_refused(
+    num_classes: int, groups: list[list[int]] | None, told: str
+) -> None:
+    with pytest.raises(SettingError, match=told):
+        Scores(nn.Conv2d(3, 5, 1), num_classes, groups)(torch.zeros(1, 3, 2, 2))
+
+
+def test_label_maps_are_certain() -> None:
+    images = torch.tensor([0.0, 2.0, 1.0]).expand(1, 3, 2, 3)
+    scores = Scores(LabelMaps(), 3)(images)
+    assert scores.argmax(dim=1).tolist() == [[[0, 2, 1]] * 2]
+    assert float(scores.softmax(dim=1).amax(dim=1).min()) > 0.999
+    with pytest.raises(SettingError, match="found 2, for 3 scores"):
+        Scores(LabelMaps(), 2)(images)
+
+
+@pytest.mark.parametrize("size", [(4, 6), (5, 6), (11, 13)])
+def test_larger_images_are_divided(size: tuple[int, int]) -> None:
+    """A network of single pixels: dividing changes nothing, and every part has the right size."""
+    network, images = nn.Conv2d(3, 2, 1), torch.randn(2, 3, *size)
+    seen = []
+    network.register_forward_pre_hook(lambda _, given: seen.append(given[0].shape[-2:]))
+    with torch.no_grad():
+        torch.testing.assert_close(
+            Scores(network, 2, tile=(4, 6))(images), nn.functional.conv2d(images, *_of(network))
+        )
+    assert set(seen) == {(4, 6)}
+    assert len(seen) == -(-size[0] // 4) * -(-size[1] // 6)
+
+
+def _of(network: nn.Conv2d) -> tuple[Tensor, Tensor | None]:
+    return network.weight, network.bias

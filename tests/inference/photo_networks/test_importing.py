@@ -1,0 +1,196 @@
+"""Photo networks as checkpoints, through `tangent-import`."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from onnx import TensorProto, helper, numpy_helper
+from torchvision import models as torchvision_models
+
+from models import UNet
+from tangent_train.checkpoints.trained import load_trained
+from tangent_train.cli import main
+from tangent_train.errors import SettingError
+from tangent_train.geometry import TangentGrid, camera_matrix_from_fov
+from tangent_train.inference.photo_networks.importing import View, view_of
+from tangent_train.inference.predictor import Predictor
+from tangent_train.inference.views import InputImage, PanoramaViews
+
+NAMES = ["background", "dark", "green", "bright"]
+WEIGHT = np.array([[0, 0, 0], [-1, -1, -1], [-1, 2, -1], [1, 1, 1]], np.float32)
+BIAS = np.array([0.1, 1, 0, -1.5], np.float32)
+
+
+def _onnx(path: Path, size: tuple[Any, Any] = (32, 32)) -> Path:
+    """A network of single pixels of 0 to 1, in a file of another program."""
+    images = helper.make_tensor_value_info("image", TensorProto.FLOAT, ("n", 3, *size))
+    scores = helper.make_tensor_value_info("scores", TensorProto.FLOAT, None)
+    weights = [
+        numpy_helper.from_array(WEIGHT[:, :, None, None], "w"),
+        numpy_helper.from_array(BIAS, "b"),
+    ]
+    node = helper.make_node("Conv", ["image", "w", "b"], ["scores"])
+    graph = helper.make_graph([node], "theirs", [images], [scores], weights)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
+    onnx.save(model, path)
+    return path
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The current folder, with a network and the names of its scores."""
+    monkeypatch.chdir(tmp_path)
+    _onnx(tmp_path / "net.onnx")
+    (tmp_path / "classes.json").write_text(json.dumps(NAMES))
+    return tmp_path
+
+
+def _run(command: str, monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None:
+    monkeypatch.setattr(sys, "argv", [f"tangent-{command}", *arguments])
+    getattr(main, "import_network" if command == "import" else command)()
+
+
+OF_ONNX = ("network=onnx", "file=net.onnx", "classes=classes.json", "normalization=unit")
+
+
+@pytest.mark.parametrize("wins", [True, False])
+def test_an_onnx_file_labels_panoramas(
+    wins: bool, here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Blocks of one colour: the labels are those of every pixel's own scores."""
+    nothing = ("nothing=[background]", f"nothing_wins={wins}".lower())
+    _run("import", monkeypatch, *OF_ONNX, *nothing, "fov=90", "output=ours.onnx")
+    said = capsys.readouterr().out
+    assert "3 classes: dark, green, bright\n" in said
+    assert f"background: mean nothing, {'are written as unknown' if wins else 'never win'}" in said
+    trained = load_trained(here / "ours.onnx")
+    assert trained.class_names == ("unknown", "dark", "green", "bright")
+    assert (trained.fixed_size, trained.level) == ((32, 32), 5)
+    colors = np.array([[0, 0, 0], [0, 255, 0], [255, 255, 255], [110, 90, 110]], np.uint8)
+    rgb = colors[np.arange(8) % 4].repeat(16, axis=0)[None].repeat(64, axis=0)
+    scores = Predictor(trained, PanoramaViews(trained, levels=(7,))).predict(InputImage(rgb))
+    labels = trained.labels(scores.labels())
+    own = rgb / 255 @ WEIGHT.T + BIAS
+    expected = own.argmax(axis=-1) if wins else own[..., 1:].argmax(axis=-1) + 1
+    middle = np.arange(128).reshape(8, 16)[:, 6:10].ravel()  # away from the edges of the blocks
+    np.testing.assert_array_equal(labels[16:48][:, middle], expected[16:48][:, middle])
+    assert set(np.unique(expected)) == ({0, 1, 2, 3} if wins else {1, 2, 3})
+
+
+def test_a_network_of_a_config_and_its_export_compute_the_same(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    torch.manual_seed(0)
+    network = UNet(3, 4, (16, 32, 64, 128, 256)).eval()
+    torch.save(network.state_dict(), here / "state.pt")
+    given = ("weights=state.pt", "classes=classes.json", "normalization=imagenet")
+    size = ("level=6", "base_level=1", "nothing=[background]")
+    _run("import", monkeypatch, "network=unet_small", *given, *size, "output=net.ckpt")
+    trained = load_trained(here / "net.ckpt")
+    assert trained.normalization.mean == (0.485, 0.456, 0.406)
+    images = torch.randn(2, 3, 32, 48)
+    with torch.no_grad():
+        expected = network(images)[:, [1, 2, 3, 0]]
+        torch.testing.assert_close(trained.network(images), expected)
+        for name in ("again.onnx", "again.safetensors"):
+            _run("export", monkeypatch, "checkpoint=net.ckpt", f"output={name}")
+            again = load_trained(here / name)
+            assert again.class_names == trained.class_names
+            torch.testing.assert_close(again.network(images), expected, atol=1e-4, rtol=1e-4)
+
+
+def test_torchvision_gives_the_scores_of_its_own_transform(
+    here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    torch.manual_seed(0)
+    name = "lraspp_mobilenet_v3_large"
+    network = torchvision_models.get_model(name, weights=None, weights_backbone=None).eval()
+    torch.save(network.state_dict(), here / "state.pt")
+    (here / "classes.json").unlink()
+    arguments = ("network=torchvision", f"model={name}", "weights=state.pt")
+    _run("import", monkeypatch, *arguments, "output=net.ckpt")
+    weights = torchvision_models.get_model_weights(name)["DEFAULT"]
+    assert f"21 classes: {', '.join(weights.meta['categories'])}\n" in capsys.readouterr().out
+    trained = load_trained(here / "net.ckpt")
+    photo = torch.randint(0, 256, (3, 520, 520), dtype=torch.uint8)
+    mean, std = (torch.tensor(v)[:, None, None] for v in vars(trained.normalization).values())
+    with torch.no_grad():
+        expected = network(weights.transforms()(photo)[None])["out"]
+        found = trained.network(((photo / 255 - mean) / std)[None])
+    torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("size", "fov", "expected"),
+    [
+        ((512, 512), 60.0, View(10, 1, 512)),
+        ((384, 384), 60.0, View(10, 2, 384)),
+        ((512, 1024), 60.0, View(11, 2, 512)),
+        ((128, 128), 45.0, View(8, 1, 128)),
+    ],
+)
+def test_tangent_images_have_the_angular_resolution_of_the_photos(
+    size: tuple[int, int], fov: float, expected: View
+) -> None:
+    view = view_of(size, fov)
+    assert view == expected
+    grid = TangentGrid(view.base_level, view.level, view.dim)
+    focal = camera_matrix_from_fov(fov, size)[0, 0]
+    assert abs(math.log2(1 / grid.pitch / focal)) < 0.6, "within half a level, and the base level's"
+
+
+def test_impossible_views_are_refused() -> None:
+    with pytest.raises(SettingError, match="fov: found 180"):
+        view_of((64, 64), 180.0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        (("classes=three.json",), r"found 3, for 4 scores; expected one for every score"),
+        (("classes=null",), "classes: found none; expected a file with a JSON list"),
+        (("classes=gone.json",), r"gone\.json: found an unreadable file"),
+        (("classes=holes.json",), r"holes\.json: found .*; expected a JSON list"),
+        (("normalization=null",), "normalization: found none; expected imagenet, unit, symmetric"),
+        (("normalization=coco",), "normalization: found coco"),
+        (("nothing=[sky]",), "nothing: found sky; expected of background, dark"),
+        (("nothing=[background,dark,green,bright]",), "nothing: found all classes"),
+        (("output=net.ckpt",), r"output: found net\.ckpt; expected a name ending in \.onnx"),
+        (("output=net.onnx",), "which exists; expected a new file"),
+        (("file=null",), "file: found none; expected an ONNX file"),
+        (("network=torchvision", "model=resnet50"), "model: found resnet50; expected deeplabv3"),
+        (
+            ("network=torchvision", "model=lraspp_mobilenet_v3_large", "weights=VOC"),
+            "weights: found VOC; expected COCO_WITH_VOC_LABELS_V1, DEFAULT, or a file",
+        ),
+        (("network=unet_small",), "weights: found none; expected a file with the network's"),
+        (("network=unet_smal",), "unet_smal"),
+    ],
+)
+def test_what_does_not_fit_is_one_clear_message(
+    changes: tuple[str, ...], told: str, here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (here / "three.json").write_text(json.dumps(NAMES[1:]))
+    (here / "holes.json").write_text(json.dumps({"0": "wall", "2": "floor"}))
+    before = set(here.iterdir())
+    with pytest.raises(SystemExit, match=told):
+        _run("import", monkeypatch, *OF_ONNX, "output=ours.onnx", *changes)
+    assert set(here.iterdir()) == before
+
+
+@pytest.mark.parametrize("content", [{"0": "a", "1": "b"}, {"a": 0, "b": 1}])
+def test_classes_may_be_given_by_place(
+    content: dict[str, Any], here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    more = {"0": {"2": "c", "3": "d"}, "a": {"c": 2, "d": 3}}[next(iter(content))]
+    (here / "classes.json").write_text(json.dumps(content | more))
+    _run("import", monkeypatch, *OF_ONNX, "output=ours.onnx")
+    assert load_trained(here / "ours.onnx").class_names == ("unknown", "a", "b", "c", "d")
