@@ -99,7 +99,7 @@ class OnnxNetwork(nn.Module):
         self.metadata: dict[str, str] = dict(self._session.get_modelmeta().custom_metadata_map)
 
     def forward(self, images: Float[Tensor, "batch channels height width"]) -> Tensor:
-        """Scores ``(B, K, h, w)`` of every pixel; label maps ``(B, h, w)`` of networks that give those.
+        """Scores ``(B, K, h, w)`` of every pixel, or label maps ``(B, h, w)`` where it gives those.
 
         Raises:
             SettingError: The file was made for images of another shape, or gives something else.
