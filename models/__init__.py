@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from models.fcn_resnet import FCNResNet
     from models.fine_tuning import initialize
     from models.hexunet import HexUNet
+    from models.huggingface import HuggingFaceNetwork
     from models.multi_view import MultiView
     from models.shape_classifier import ShapeClassifier
     from models.sphere_attention import SphereAttention
@@ -22,6 +23,7 @@ __all__ = [
     "AuxiliaryHead",
     "FCNResNet",
     "HexUNet",
+    "HuggingFaceNetwork",
     "MultiView",
     "ShapeClassifier",
     "SphereAttention",
@@ -35,6 +37,7 @@ _FILES = {
     "AuxiliaryHead": "auxiliary_head",
     "FCNResNet": "fcn_resnet",
     "HexUNet": "hexunet",
+    "HuggingFaceNetwork": "huggingface",
     "MultiView": "multi_view",
     "ShapeClassifier": "shape_classifier",
     "SphereAttention": "sphere_attention",

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = ["import_network"]
 
-_LIBRARIES = ("torchvision", "huggingface", "smp", "timm", "onnx")
+_LIBRARIES = ("torchvision", "huggingface", "smp", "onnx")
 """Each a file of `tangent_train.inference.photo_networks` with a function `load`."""
 
 
@@ -66,8 +66,9 @@ def import_network(config: Mapping[str, Any]) -> None:
         )
     console = Console(soft_wrap=True, highlight=False)
     with console.status(f"Writing {output.name} …"):
+        network = _load(settings, config["normalization"])
         imported = photo_networks.import_network(
-            _load(settings, config["normalization"]),
+            network,
             output,
             fov_deg=settings.fov,
             level=settings.level,
@@ -76,6 +77,8 @@ def import_network(config: Mapping[str, Any]) -> None:
             nothing_wins=settings.nothing_wins,
         )
     console.print(_understood(output, imported, settings), markup=False)
+    for remark in network.remarks:
+        console.print(remark, markup=False)
 
 
 def _load(settings: Settings, normalization: Any) -> PhotoNetwork:
@@ -91,6 +94,13 @@ def _load(settings: Settings, normalization: Any) -> PhotoNetwork:
             normalization=normalization,
         )
         return network
+    if name == "timm":
+        raise SettingError(
+            "network",
+            found="timm, which has no networks for segmentation",
+            expected=f"{', '.join(_LIBRARIES)}, or an option of configs/network",
+            remedy="Networks on its encoders (encoder_name=tu-…) are those of network=smp.",
+        )
     from tangent_train.inference.photo_networks import of_config
 
     search = f"hydra.searchpath=[file://{config_folder()}]"

@@ -34,6 +34,7 @@ class PhotoNetwork:
         score_names: Name of every score.
         normalization: Of the images.
         image_size: Rows and columns that it was trained for.
+        remarks: What else the user should know, a sentence each.
     """
 
     network: nn.Module
@@ -41,6 +42,7 @@ class PhotoNetwork:
     score_names: Sequence[str]
     normalization: Normalization
     image_size: tuple[int, int]
+    remarks: Sequence[str] = ()
 
 
 def normalization_of(given: Any) -> Normalization:

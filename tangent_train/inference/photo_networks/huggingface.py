@@ -1,0 +1,196 @@
+"""Segmentation networks of transformers, from the hub or a folder."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from datamodules.core.inputs import Normalization
+from models.huggingface import HuggingFaceNetwork, architecture
+from tangent_train.errors import DataError, SettingError
+from tangent_train.inference.photo_networks.network import (
+    PhotoNetwork,
+    class_names_in,
+    normalization_of,
+)
+from tangent_train.inference.photo_networks.saved import json_in, saved_folder, tensors_in
+from tangent_train.registry import SettingsFile, make
+
+__all__ = ["load"]
+
+_TASK = "the task is semantic"
+_BYTE = 255
+_MISSING = 5
+"""Names of missing tensors in a message."""
+
+
+def load(*, model: str | None, classes: Path | None, normalization: Any, **_: Any) -> PhotoNetwork:
+    """A network of transformers for semantic or universal segmentation.
+
+    No code of its author is run, and weights are read from safetensors only.
+
+    Args:
+        model: Its name on the hub, or a folder written by ``save_pretrained``.
+        classes: JSON file of the class names; None for those of its config.
+        normalization: See `normalization_of`; None for that of its image processor.
+
+    Raises:
+        DataError: A file is missing, cannot be fetched or used.
+        SettingError: A setting is impossible, or transformers is missing.
+    """
+    folder = saved_folder(model)
+    config = json_in(folder, "config.json")
+    names = _names(config, folder / "config.json")
+    processor = _processor(folder)
+    settings = {
+        "_target_": "models.HuggingFaceNetwork",
+        "config": architecture(config | {"use_auxiliary_head": False}),
+        "num_classes": len(names),
+        "bgr": bool(processor.get("do_flip_channel_order")),
+    }
+    if config.get("model_type") == "oneformer":
+        settings["task"] = _task(folder, config)
+    network = make(settings, "network", SettingsFile(folder / "config.json"))
+    tensors, remarks = tensors_in(folder)
+    _load_tensors(network, tensors, folder)
+    settings["config"] = architecture(network.network.config.to_dict())
+    given = None if normalization is None else normalization_of(normalization)
+    return PhotoNetwork(
+        network=network,
+        settings=settings,
+        score_names=names if classes is None else class_names_in(classes),
+        normalization=given or _normalization(processor, folder),
+        image_size=_image_size(processor, folder),
+        remarks=remarks,
+    )
+
+
+def _names(config: Mapping[str, Any], path: Path) -> list[str]:
+    """Names of the scores, in their order."""
+    by_place = config.get("id2label")
+    places = by_place if isinstance(by_place, Mapping) else {}
+    names = [str(places.get(str(place), "")).strip() for place in range(len(places))]
+    if not names or not all(names):
+        raise DataError(
+            path,
+            found=f"id2label: {by_place}",
+            expected='the name of every score, {"0": "wall", "1": "floor"}',
+        )
+    return names
+
+
+def _processor(folder: Path) -> dict[str, Any]:
+    """Settings of the image processor; it is not made, for that may fetch files."""
+    own, shared = "preprocessor_config.json", "processor_config.json"
+    if (folder / shared).is_file():
+        inside = json_in(folder, shared).get("image_processor")
+        if isinstance(inside, dict):
+            return inside
+    if not (folder / own).is_file():
+        raise DataError(
+            folder,
+            found=f"no {own}",
+            expected="the image processor of the network: its normalization and image size",
+            remedy="Copy that file from the model that this one was fine-tuned from.",
+        )
+    return json_in(folder, own)
+
+
+def _normalization(processor: Mapping[str, Any], folder: Path) -> Normalization:
+    """Of images from 0 to 1, what the image processor does with those from 0 to 255."""
+    mean, std = (0, 0, 0), (1, 1, 1)
+    try:
+        scale = _BYTE * (processor.get("rescale_factor", 1 / _BYTE))
+        if not processor.get("do_rescale", True):
+            scale = _BYTE
+        if processor.get("do_normalize", False):  # MobileViT's has a mean, and no such setting
+            mean, std = processor["image_mean"], processor["image_std"]
+        return Normalization.of(
+            {"mean": [value / scale for value in mean], "std": [value / scale for value in std]}, 3
+        )
+    except (ArithmeticError, KeyError, TypeError, SettingError) as error:
+        raise DataError(
+            folder / "preprocessor_config.json",
+            found=f"no normalization in {dict(processor)} ({error})",
+            expected="rescale_factor, image_mean and image_std of three channels",
+        ) from error
+
+
+def _image_size(processor: Mapping[str, Any], folder: Path) -> tuple[int, int]:
+    """Rows and columns of the images that the image processor makes."""
+    given = processor.get("size")
+    if processor.get("do_center_crop") and processor.get("crop_size"):
+        given = processor["crop_size"]
+    sides = given if isinstance(given, Mapping) else {"shortest_edge": given}
+    shortest = sides.get("shortest_edge", sides.get("longest_edge"))
+    rows, columns = sides.get("height", shortest), sides.get("width", shortest)
+    if not (isinstance(rows, int) and isinstance(columns, int) and min(rows, columns) > 0):
+        raise DataError(
+            folder / "preprocessor_config.json",
+            found=f"size: {given}",
+            expected="height and width, or shortest_edge, in pixels",
+        )
+    return rows, columns
+
+
+def _task(folder: Path, config: Mapping[str, Any]) -> list[int]:
+    """The tokens that ask OneFormer for classes (``OneFormerProcessor``)."""
+    from transformers import AutoTokenizer
+
+    length = config.get("task_seq_len", 77)
+    try:
+        tokenizer = AutoTokenizer.from_pretrained(
+            folder, local_files_only=True, trust_remote_code=False
+        )
+        text = tokenizer(_TASK, padding="max_length", max_length=length, truncation=True)
+    except Exception as error:  # whatever a tokenizer raises about its files
+        raise DataError(
+            folder,
+            found=f"no tokenizer ({type(error).__name__}: {str(error).partition(chr(10))[0]})",
+            expected="the tokenizer of OneFormer, which takes its task as text",
+        ) from error
+    masked = zip(text["input_ids"], text["attention_mask"], strict=True)
+    return [token * mask for token, mask in masked]
+
+
+def _load_tensors(network: HuggingFaceNetwork, tensors: dict[str, Tensor], folder: Path) -> None:
+    """Load weights through transformers, which knows their names in its older versions."""
+    inner = network.network
+    try:
+        with _silence():
+            loaded, found = type(inner).from_pretrained(
+                None, config=inner.config, state_dict=tensors, output_loading_info=True
+            )
+    except (RuntimeError, ValueError) as error:
+        missing = [str(error)]
+    else:
+        missing = sorted(found["missing_keys"])
+    if missing:
+        raise DataError(
+            folder,
+            found=f"weights without {', '.join(missing[:_MISSING])}",
+            expected=f"all of {type(inner).__name__} as config.json describes it",
+        )
+    inner.load_state_dict(loaded.state_dict())
+
+
+@contextmanager
+def _silence() -> Iterator[None]:
+    """Without transformers' warnings and progress bars."""
+    from transformers import utils
+
+    logging: Any = utils.logging
+    before = logging.get_verbosity()
+    bars = logging.is_progress_bar_enabled()
+    logging.set_verbosity_error()
+    logging.disable_progress_bar()
+    try:
+        yield
+    finally:
+        logging.set_verbosity(before)
+        if bars:
+            logging.enable_progress_bar()

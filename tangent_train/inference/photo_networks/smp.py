@@ -1,0 +1,82 @@
+"""Networks of segmentation-models-pytorch, from the hub or a folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from datamodules.core.inputs import Normalization
+from models.pretrained import load_tensors
+from tangent_train.errors import DataError, SettingError
+from tangent_train.inference.photo_networks.network import (
+    PhotoNetwork,
+    class_names_in,
+    normalization_of,
+)
+from tangent_train.inference.photo_networks.saved import json_in, saved_folder, tensors_in
+from tangent_train.registry import SettingsFile, make
+
+__all__ = ["load"]
+
+_SIZE = (512, 512)
+_CLASS = "_model_class"
+_NORMALIZATION = "imagenet, unit, symmetric, or {mean: […], std: […]} of RGB from 0 to 1"
+
+
+def load(*, model: str | None, classes: Path | None, normalization: Any, **_: Any) -> PhotoNetwork:
+    """A network that segmentation-models-pytorch saved with ``save_pretrained``.
+
+    Args:
+        model: A folder, or its name on the hub.
+        classes: JSON file of the class names.
+        normalization: See `normalization_of`; None for that of the encoder's own weights.
+
+    Raises:
+        DataError: A file is missing, cannot be fetched or used.
+        SettingError: A setting is missing, or the package is.
+    """
+    folder = saved_folder(model)
+    path = folder / "config.json"
+    config = json_in(folder, path.name)
+    settings = {
+        "_target_": f"segmentation_models_pytorch.{config.get(_CLASS)}",
+        **{name: value for name, value in config.items() if not name.startswith("_")},
+        "encoder_weights": None,
+        "activation": None,  # scores, not probabilities
+    }
+    network = make(settings, "network", SettingsFile(path))
+    if config.get("classes") == 1:
+        raise DataError(
+            path,
+            found="a network with one score, of one class or not",
+            expected="a score for every class, at least two",
+        )
+    given = None if normalization is None else normalization_of(normalization)
+    tensors, remarks = tensors_in(folder)
+    load_tensors(network, tensors, folder)
+    return PhotoNetwork(
+        network=network,
+        settings=settings,
+        score_names=class_names_in(classes),
+        normalization=given or _of_encoder(config),
+        image_size=_SIZE,
+        remarks=remarks,
+    )
+
+
+def _of_encoder(config: dict[str, Any]) -> Normalization:
+    """The normalization that belongs to the encoder's published weights."""
+    from segmentation_models_pytorch import encoders  # type: ignore[import-untyped]
+
+    name, weights = config.get("encoder_name"), config.get("encoder_weights") or "imagenet"
+    try:
+        given = encoders.get_preprocessing_params(name, weights)
+    except Exception as error:  # of the library, the hub, or the connection
+        found = f"none, and none known of {name} ({str(error).partition(chr(10))[0]})"
+        raise SettingError("normalization", found=found, expected=_NORMALIZATION) from error
+    if given["input_space"] != "RGB":
+        found = f"none, and {name} takes {given['input_space']}"
+        raise SettingError("normalization", found=found, expected=_NORMALIZATION)
+    _, largest = given["input_range"]
+    mean, std = ([value / largest for value in given[key]] for key in ("mean", "std"))
+    return Normalization(mean, std)
