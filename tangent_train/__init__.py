@@ -10,13 +10,31 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from tangent_train.geometry import TangentGrid
-    from tangent_train.rendering import equirect_to_tangent, tangent_to_equirect, tangent_to_labels
+    from tangent_train.inference.network import load
+    from tangent_train.rendering import (
+        apply,
+        equirect_to_tangent,
+        tangent_to_equirect,
+        tangent_to_labels,
+    )
 
-__all__ = ["TangentGrid", "equirect_to_tangent", "tangent_to_equirect", "tangent_to_labels"]
+__all__ = [
+    "TangentGrid",
+    "apply",
+    "equirect_to_tangent",
+    "load",
+    "tangent_to_equirect",
+    "tangent_to_labels",
+]
+
+_HOMES = {"TangentGrid": "geometry", "load": "inference.network"}
 
 
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    home = "geometry" if name == "TangentGrid" else "rendering"
-    return getattr(import_module(f"tangent_train.{home}"), name)
+    return getattr(import_module(f"tangent_train.{_HOMES.get(name, 'rendering')}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -12,14 +12,22 @@ import tangent_train
 
 def test_names_come_from_their_packages() -> None:
     from tangent_train import geometry, rendering
+    from tangent_train.inference import network
 
     assert tangent_train.TangentGrid is geometry.TangentGrid
-    for name in ("equirect_to_tangent", "tangent_to_equirect", "tangent_to_labels"):
+    assert tangent_train.load is network.load
+    for name in ("apply", "equirect_to_tangent", "tangent_to_equirect", "tangent_to_labels"):
         assert getattr(tangent_train, name) is getattr(rendering, name)
+    assert set(tangent_train.__all__) <= set(dir(tangent_train))
     with pytest.raises(AttributeError, match="no attribute 'missing'"):
         _ = tangent_train.missing
 
 
 def test_importing_the_package_imports_nothing_heavy() -> None:
-    code = "import sys, tangent_train; sys.exit(bool({'numpy', 'torch'} & set(sys.modules)))"
+    """Nor does listing its names, as notebooks do to complete them."""
+    code = """if True:
+        import sys, tangent_train
+        dir(tangent_train)
+        sys.exit(bool({'numpy', 'torch'} & set(sys.modules)))
+    """
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

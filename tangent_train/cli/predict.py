@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import torch
 from rich.console import Console
 from rich.table import Table
 
@@ -192,10 +191,7 @@ def _predictor(settings: Settings, trained: TrainedNetwork) -> Predictor:
     else:
         upright = settings.upright is not None
         views = PanoramaViews(trained, levels, *how, settings.rotations, upright=upright)
-    device = settings.device
-    if device == "auto":
-        device = "cuda" if torch.cuda.is_available() else "cpu"
-    return Predictor(trained, views, device, settings.images_per_forward)
+    return Predictor(trained, views, settings.device, settings.images_per_forward)
 
 
 def _depth_folder(settings: Settings, trained: TrainedNetwork) -> DepthFolder | None:

@@ -72,7 +72,7 @@ class Predictor:
     Args:
         trained: The network; it is moved to the device.
         view_sets: Its views: `PanoramaViews` or `PhotoViews`.
-        device: A torch device.
+        device: A torch device, or ``auto``: a GPU if there is one.
         images_per_forward: Views per call of the network, which bounds memory; None for 2^20
             pixels' worth. A network with cross-image attention takes all views of a panorama
             at once, and their scores are held.
@@ -88,6 +88,8 @@ class Predictor:
         device: str = "cpu",
         images_per_forward: int | None = None,
     ) -> None:
+        if device == "auto":
+            device = "cuda" if torch.cuda.is_available() else "cpu"
         try:
             self._device = torch.device(device)
             network = trained.network.to(self._device).to(memory_format=_FORMAT)

@@ -4,6 +4,7 @@ NumPy panoramas are sampled by OpenCV, tensors by differentiable sparse sums on 
 by compiled kernels. The geometry of all of them is `tangent_train.geometry`'s.
 """
 
+from tangent_train.rendering.applying import apply
 from tangent_train.rendering.backward import Blend, tangent_to_equirect, tangent_to_labels
 from tangent_train.rendering.camera_files import (
     CameraFile,
@@ -35,6 +36,7 @@ __all__ = [
     "PerspectiveRepresentation",
     "Representation",
     "TangentRepresentation",
+    "apply",
     "equirect_to_tangent",
     "read_cameras",
     "rotate_equirect",

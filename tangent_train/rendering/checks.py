@@ -21,6 +21,11 @@ __all__ = [
     "check_shape",
 ]
 
+_MOST_COLORS = 4
+"""Channels of an image of colours."""
+
+_COLOR_DIMENSIONS = 3
+
 
 def check_interpolation(interpolation: str, blend: str = "nearest") -> None:
     """Raise SettingError unless the interpolation is known and goes with the blend."""
@@ -68,7 +73,34 @@ def check_panorama(image: Tensor | NDArray[np.generic], interpolation: str) -> N
     if not fits or 0 in image.shape[-2:]:
         expected = "(H, W) or (H, W, C)" if array else "(..., C, H, W)"
         raise SettingError("panorama", found=f"shape {tuple(image.shape)}", expected=expected)
+    _check_layout(image)
     _check_numbers("panorama", image, interpolation)
+
+
+def _check_layout(image: Tensor | NDArray[np.generic]) -> None:
+    """Raise SettingError where the channels are certainly at the wrong end.
+
+    They would be taken for columns, and the columns for channels: of a panorama of 2048 × 4096
+    pixels, gigabytes.
+    """
+    if isinstance(image, Tensor):
+        if image.shape[-1] <= _MOST_COLORS < image.shape[-2]:
+            raise SettingError(
+                "panorama",
+                found=f"a tensor of shape {tuple(image.shape)}",
+                expected="(..., C, H, W), channels before rows and columns",
+                remedy="Of (H, W, C), .permute(2, 0, 1) makes (C, H, W).",
+            )
+    elif image.ndim == _COLOR_DIMENSIONS:
+        channels, height, width = image.shape
+        tiny = height == 2 * channels  # perhaps a panorama of so few rows, with many channels
+        if channels <= _MOST_COLORS < height and width == 2 * height and not tiny:
+            raise SettingError(
+                "panorama",
+                found=f"an array of shape {image.shape}",
+                expected="(H, W) or (H, W, C), channels last",
+                remedy="Of (C, H, W), .transpose(1, 2, 0) makes (H, W, C).",
+            )
 
 
 def check_images(

@@ -8,15 +8,12 @@ only the labels are kept.
 from __future__ import annotations
 
 import math
-import tempfile
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tangent_train.errors import SettingError
-from tangent_train.files import reserve
 from tangent_train.rendering import kernels
-from tangent_train.rendering.accumulate import NO_OWNERS, add_to_panorama
+from tangent_train.rendering.accumulate import NO_OWNERS, add_to_panorama, zero_sums
 from tangent_train.rendering.checks import check_blend
 from tangent_train.rendering.compiled import over_rows
 from tangent_train.rendering.tables import owners
@@ -32,9 +29,6 @@ if TYPE_CHECKING:
     from tangent_train.rendering.representations.perspective import PhotoCrops
 
 __all__ = ["ScoreMosaic"]
-
-_IN_MEMORY_BYTES = 2**31
-"""Sums of more bytes are kept in a temporary file."""
 
 
 class ScoreMosaic:
@@ -61,7 +55,7 @@ class ScoreMosaic:
         self.blend = blend
         self._labels = np.zeros(shape, np.uint8 if num_classes < 256 else np.uint16)
         averaged = averaged or blend == "feather"
-        self._total = _zeros((*shape, num_classes + 1) if averaged else (0, 0, num_classes + 1))
+        self._total = zero_sums(shape if averaged else (0, 0), num_classes)
         self._owned: tuple[object, NDArray[np.integer]] = None, NO_OWNERS
 
     def add(self, scores: Tensor, grid: PinholeGrid, faces: NDArray[np.int64]) -> None:
@@ -145,21 +139,3 @@ class ScoreMosaic:
         if self._owned[0] is not images:
             self._owned = images, build()
         return self._owned[1]
-
-
-def _zeros(shape: tuple[int, ...]) -> NDArray[np.float32]:
-    nbytes = math.prod(shape) * 4
-    if nbytes <= _IN_MEMORY_BYTES:
-        return np.zeros(shape, np.float32)
-    # The file has no name: it is gone with the array, whatever happens.
-    with tempfile.TemporaryFile() as file:
-        try:  # now: of a full disk the system says nothing later, it ends the process
-            reserve(file, nbytes)
-        except OSError as error:
-            raise SettingError(
-                f"temporary folder {tempfile.gettempdir()}",
-                found=error,
-                expected=f"room for {nbytes / 1e9:.1f} GB of scores",
-                remedy="Set TMPDIR to a folder on a larger disk, or choose blend=nearest.",
-            ) from error
-        return np.memmap(file, np.float32, "r+", shape=shape)

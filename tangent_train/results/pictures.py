@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import colorsys
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,10 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from datamodules.images.palette import class_colors
 from tangent_train.metrics.segmentation import UNKNOWN
 
 __all__ = [
-    "class_colors",
     "colorize",
     "overlay_picture",
     "prediction_panel",
@@ -26,22 +25,6 @@ _LEAST_ROWS = 256
 _PANORAMA_DIMENSIONS = 2
 _LEGEND_WIDTH = 1200
 """Pixels of width per step of a legend's size."""
-
-
-def class_colors(num_classes: int) -> _Image:
-    """Distinct colours, black for the unknown class 0.
-
-    Args:
-        num_classes: K + 1.
-
-    Returns:
-        ``(K+1, 3)`` RGB: hues a golden ratio apart, in three brightnesses.
-    """
-    colors = [
-        colorsys.hsv_to_rgb(k * 0.618034 % 1, 0.45 + 0.4 * (k % 2), 0.95 - 0.15 * (k % 3))
-        for k in range(1, num_classes)
-    ]
-    return (np.array([(0, 0, 0), *colors]) * 255).round().astype(np.uint8)
 
 
 def colorize(labels: NDArray[np.integer], num_classes: int) -> _Image:

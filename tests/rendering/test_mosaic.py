@@ -19,7 +19,7 @@ from tangent_train.geometry import (
 )
 from tangent_train.rendering import (
     PerspectiveRepresentation,
-    mosaic,
+    accumulate,
     tangent_to_equirect,
     tangent_to_labels,
 )
@@ -102,7 +102,7 @@ def test_large_sums_live_in_a_file_and_are_the_same(monkeypatch: pytest.MonkeyPa
     grid, shape = GRIDS[0]
     scores = _scores(grid)
     expected = _added(ScoreMosaic(shape, 7, "feather"), scores, grid).probabilities(slice(None))
-    monkeypatch.setattr(mosaic, "_IN_MEMORY_BYTES", 0)
+    monkeypatch.setattr(accumulate, "_IN_MEMORY_BYTES", 0)
     result = _added(ScoreMosaic(shape, 7, "feather"), scores, grid)
     assert isinstance(result._total, np.memmap)
     np.testing.assert_array_equal(result.probabilities(slice(None)), expected)

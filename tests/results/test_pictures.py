@@ -3,7 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tangent_train.results.pictures import class_colors, colorize, prediction_panel
+from datamodules.images.palette import class_colors
+from tangent_train.results.pictures import colorize, prediction_panel
 
 NAMES = ("unknown", "wall", "floor", "sofa")
 

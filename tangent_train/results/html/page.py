@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
+from datamodules.images.palette import class_colors
 from tangent_train.files import atomic_path
 from tangent_train.results.html.images import EncodedImage
-from tangent_train.results.pictures import class_colors
 from tangent_train.results.tables import Table
 
 if TYPE_CHECKING:

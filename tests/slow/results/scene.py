@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from datamodules.images.palette import class_colors
 from tangent_train.results.html import EncodedImage, encode_image
-from tangent_train.results.pictures import class_colors
 from tests.slow.results.reference import classes_of, colors_of, erp_directions, rays
 
 if TYPE_CHECKING:

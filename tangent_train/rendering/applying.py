@@ -1,0 +1,195 @@
+"""Any function of images, applied to a panorama through its tangent images."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tangent_train.errors import SettingError
+from tangent_train.rendering.accumulate import NO_OWNERS, add_to_panorama, zero_sums
+from tangent_train.rendering.backward import Blend, tangent_to_equirect
+from tangent_train.rendering.checks import check_blend, check_panorama
+from tangent_train.rendering.forward import Pixels, equirect_to_tangent
+from tangent_train.rendering.tables import owners
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    from tangent_train.geometry import PinholeGrid
+
+__all__ = ["apply"]
+
+_PIXELS_PER_CALL = 2**20
+
+
+@torch.no_grad()
+def apply(
+    function: Callable[[Pixels], Pixels],
+    panorama: Pixels,
+    grid: PinholeGrid,
+    blend: Blend = "feather",
+    *,
+    images_per_call: int | None = None,
+) -> Pixels:
+    """Apply a function of images to a panorama: scores, depth, features, masks.
+
+    The images are rendered a few at a time, as by `equirect_to_tangent`, and their results are
+    added to the panorama as by `tangent_to_equirect`. What is held besides the result is one call;
+    sums of more than 2 GiB are in a temporary file. Without gradients.
+
+    Args:
+        function: Maps some images of the panorama's kind and dtype to a result of as many pixels:
+            arrays ``(n, d, d[, C])`` to ``(n, d, d[, K])``, or tensors ``(n, C, d, d)`` to
+            ``(n, d, d)`` or ``(n, K, d, d)``. Called with all images of the grid, in its order.
+        panorama: An array ``(H, W[, C])``, or a floating-point tensor ``(C, H, W)``.
+        grid: The images.
+        blend: Blending of results that are floats, as in `tangent_to_equirect`. Whole numbers and
+            booleans (labels, masks) need ``nearest``: each pixel is copied from its owner.
+        images_per_call: Images per call of the function; None for 2^20 pixels' worth.
+
+    Returns:
+        An array ``(H, W[, K])``, or a tensor ``(H, W)`` or ``(K, H, W)`` on the panorama's device:
+        float32 of floats, else of the function's dtype.
+
+    Raises:
+        SettingError: The panorama or the blend cannot be used, or the function returns something
+            else.
+
+    >>> brightness = lambda images: images.mean(axis=-1)
+    >>> from tangent_train.geometry import TangentGrid
+    >>> apply(brightness, np.full((32, 64, 3), 0.5), TangentGrid(0, 4))[0, 0]
+    np.float32(0.5)
+    """
+    check_blend(blend, grid)
+    check_panorama(panorama, "bilinear")
+    if isinstance(panorama, Tensor) and panorama.ndim > 3:
+        raise SettingError(
+            "panorama",
+            found=f"shape {tuple(panorama.shape)}",
+            expected="(C, H, W)",
+            remedy="Call apply for each panorama of a batch.",
+        )
+    if images_per_call is not None and images_per_call < 1:
+        raise SettingError("images_per_call", found=images_per_call, expected="1 or more")
+    step = images_per_call or max(1, _PIXELS_PER_CALL // grid.dim**2)
+    rows, columns = panorama.shape[-2:] if isinstance(panorama, Tensor) else panorama.shape[:2]
+
+    def results_of(faces: NDArray[np.int64]) -> NDArray[Any]:
+        images = equirect_to_tangent(panorama, grid, faces)
+        return _as_array(function(images), images)
+
+    first, *others = np.split(np.arange(grid.num_images), range(step, grid.num_images, step))
+    results = results_of(first)
+    made = _Means if results.dtype.kind == "f" else _Copies
+    canvas = made(grid, (rows, columns), blend, results)
+    canvas.add(results, first)
+    for faces in others:
+        canvas.add(results_of(faces), faces)
+    return _like(panorama, canvas.panorama())
+
+
+class _Means:
+    """Adds up results that are floats.
+
+    Args:
+        grid: Their grid.
+        shape: ``(H, W)`` of the panorama.
+        blend: Their blending.
+        first: ``(n, d, d[, K])`` some of them.
+    """
+
+    def __init__(
+        self, grid: PinholeGrid, shape: tuple[int, int], blend: Blend, first: NDArray[Any]
+    ) -> None:
+        self._grid, self._shape, self._channels = grid, shape, first.shape[3:]
+        self._owner = NO_OWNERS if blend == "feather" else owners(grid, shape)
+        self._sums = zero_sums(shape, math.prod(self._channels))
+
+    def add(self, results: NDArray[Any], faces: NDArray[np.int64]) -> None:
+        """Add those of some images."""
+        _check_alike(results, self._channels, "f")
+        stack = results.reshape(*results.shape[:3], -1).astype(np.float32, copy=False)
+        stack = np.ascontiguousarray(np.moveaxis(stack, -1, 1))
+        rows = slice(0, self._shape[0])
+        add_to_panorama(stack, self._grid, faces, self._shape, rows, self._owner, self._sums)
+
+    def panorama(self) -> NDArray[np.float32]:
+        """``(H, W[, K])``, in the memory of the sums: row by row, what is written was read."""
+        flat, size = self._sums.reshape(-1), self._shape[1] * math.prod(self._channels)
+        for number, row in enumerate(self._sums):
+            weights = np.maximum(row[:, -1:], np.float32(1e-37))
+            flat[number * size : (number + 1) * size] = (row[:, :-1] / weights).ravel()
+        whole = np.asarray(flat[: self._shape[0] * size])
+        return whole.reshape(*self._shape, *self._channels)
+
+
+class _Copies:
+    """Keeps results that are whole numbers or booleans, to copy their pixels; see `_Means`."""
+
+    def __init__(
+        self, grid: PinholeGrid, shape: tuple[int, int], blend: Blend, first: NDArray[Any]
+    ) -> None:
+        if blend != "nearest":
+            raise SettingError(
+                "blend",
+                found=f"{blend!r} of results of {first.dtype}",
+                expected="'nearest': labels and masks cannot be averaged",
+                remedy="To average numbers, return them as floats.",
+            )
+        self._grid, self._shape = grid, shape
+        self._images = np.empty((grid.num_images, *first.shape[1:]), first.dtype)
+
+    def add(self, results: NDArray[Any], faces: NDArray[np.int64]) -> None:
+        """Add those of some images."""
+        _check_alike(results, self._images.shape[3:], self._images.dtype.kind)
+        self._images[faces] = results
+
+    def panorama(self) -> NDArray[Any]:
+        """``(H, W[, K])``."""
+        return tangent_to_equirect(self._images, self._grid, self._shape, interpolation="nearest")
+
+
+def _check_alike(results: NDArray[Any], channels: tuple[int, ...], kind: str) -> None:
+    if (results.shape[3:], results.dtype.kind) != (channels, kind):
+        raise SettingError(
+            "result of the function",
+            found=f"K = {results.shape[3:]} of {results.dtype} for some images",
+            expected=f"K = {channels} of the first ones' kind of numbers",
+        )
+
+
+def _as_array(returned: Any, images: Tensor | NDArray[Any]) -> NDArray[Any]:
+    """What the function returned for some images, as ``(n, d, d[, K])`` on the CPU."""
+    kind = Tensor if isinstance(images, Tensor) else np.ndarray
+    count, side = len(images), images.shape[-1] if kind is Tensor else images.shape[1]
+    found = f"a {type(returned).__name__}"
+    if isinstance(returned, kind):
+        found = f"shape {tuple(returned.shape)} of {returned.dtype}"
+        array: NDArray[Any] = returned  # type: ignore[assignment]
+        if isinstance(returned, Tensor):
+            array = (returned.float() if returned.is_floating_point() else returned).cpu().numpy()
+            array = array if returned.ndim < 4 else np.moveaxis(array, 1, -1)
+        fits = array.ndim in (3, 4) and array.shape[:3] == (count, side, side)
+        if fits and array.dtype.kind in "buif":
+            return array
+    layout = "({0}[, K], {1}, {1})" if kind is Tensor else "({0}, {1}, {1}[, K])"
+    raise SettingError(
+        "result of the function",
+        found=found,
+        expected=f"a {kind.__name__} of numbers {layout.format(count, side)} "
+        f"for {count} images of {side}×{side} pixels",
+    )
+
+
+def _like(panorama: Any, array: NDArray[Any]) -> Any:
+    """The result ``(H, W[, K])`` as an array, or as a tensor where the panorama is one."""
+    if not isinstance(panorama, Tensor):
+        return array
+    result = torch.from_numpy(array)
+    return (result if array.ndim == 2 else result.movedim(-1, 0)).to(panorama.device)

@@ -1,0 +1,204 @@
+"""Labels and scores of arrays and tensors: those of `tangent-predict`."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+import tangent_train as tt
+from tangent_train.errors import DataError, SettingError
+from tangent_train.geometry import equirect_directions
+from tests.cli.tiny_runs import run_command
+from tests.inference.trained import CLASS_NAMES, CUBE, ERP, PERSPECTIVE, TANGENT, write_checkpoint
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from tangent_train.inference.network import Network
+
+
+def _sphere(height: int) -> NDArray[np.uint8]:
+    """Colours that are smooth on the sphere."""
+    x, y, z = np.moveaxis(equirect_directions((height, 2 * height)), -1, 0)
+    return np.stack([128 + 120 * x, 128 + 120 * y * z, 128 + 120 * z], axis=-1).astype(np.uint8)
+
+
+@pytest.fixture
+def network(tmp_path: Path) -> Network:
+    return tt.load(write_checkpoint(tmp_path / "net.ckpt"))
+
+
+@pytest.mark.parametrize(
+    ("representation", "typed", "settings"),
+    [
+        (TANGENT, [], {}),
+        (TANGENT, ["rotations=2", "level=5"], {"rotations": 2, "level": 5}),
+        (TANGENT, ["levels=[4,5]", "base_level=1"], {"levels": (4, 5), "base_level": 1}),
+        (CUBE, ["blend=nearest"], {"blend": "nearest"}),
+        (ERP, [], {}),
+        (PERSPECTIVE, ["level=5"], {"level": 5}),
+    ],
+)
+def test_panoramas_get_the_labels_and_scores_of_tangent_predict(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    representation: dict[str, Any],
+    typed: list[str],
+    settings: dict[str, Any],
+) -> None:
+    checkpoint = write_checkpoint(tmp_path / "net.ckpt", representation)
+    panorama = _sphere(50)
+    cv2.imwrite(str(tmp_path / "room.png"), panorama[..., ::-1])
+    monkeypatch.chdir(tmp_path)
+    given = [f"checkpoint={checkpoint}", "input=room.png", "output=out", "probabilities=true"]
+    run_command(monkeypatch, "predict", *given, "report=0", *typed)
+    expected = cv2.imread("out/labels/room.png", cv2.IMREAD_UNCHANGED)
+    network = tt.load(checkpoint, **settings)
+    labels = network.labels(panorama)
+    assert labels.dtype == np.uint8
+    np.testing.assert_array_equal(labels, expected)
+    assert len(np.unique(labels)) == 3
+    scores = network.scores(panorama)
+    assert scores.dtype == np.float32
+    assert scores.shape == (50, 100, 3)
+    np.testing.assert_allclose(scores, np.load("out/probabilities/room.npy"), atol=1e-3)
+    np.testing.assert_allclose(scores.sum(axis=-1), 1, atol=1e-5)
+
+
+@pytest.mark.parametrize("fov", [65, 120.5])
+def test_photos_get_the_labels_of_tangent_predict(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fov: float, network: Network
+) -> None:
+    photo = _sphere(40)[:, :57]
+    cv2.imwrite(str(tmp_path / "photo.png"), photo[..., ::-1])
+    monkeypatch.chdir(tmp_path)
+    given = ["checkpoint=net.ckpt", "input=photo.png", "output=out", "report=0", f"fov={fov}"]
+    run_command(monkeypatch, "predict", *given, "projection=perspective")
+    expected = cv2.imread("out/labels/photo.png", cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(network.labels(photo, fov=fov), expected)
+    assert network.scores(photo, fov=fov).shape == (40, 57, 3)
+
+
+def test_tensors_get_what_arrays_get(network: Network) -> None:
+    panorama = _sphere(33)
+    tensor = torch.from_numpy(panorama).permute(2, 0, 1)
+    labels, scores = network.labels(tensor), network.scores(tensor)
+    assert (labels.dtype, labels.shape) == (torch.int64, (33, 66))
+    assert (scores.dtype, scores.shape) == (torch.float32, (3, 33, 66))
+    np.testing.assert_array_equal(labels.numpy(), network.labels(panorama))
+    np.testing.assert_array_equal(scores.movedim(0, -1).numpy(), network.scores(panorama))
+    photo = tensor[:, :20, :30]
+    expected = network.labels(panorama[:20, :30], fov=60)
+    np.testing.assert_array_equal(network.labels(photo, fov=60).numpy(), expected)
+
+
+def test_nothing_changes_at_180_degrees(network: Network) -> None:
+    panorama = _sphere(64)
+    there = network.labels(np.roll(panorama, 64, axis=1))
+    assert (np.roll(there, -64, axis=1) == network.labels(panorama)).mean() > 0.97
+
+
+@pytest.mark.parametrize("height", [1, 16, 75])
+def test_panoramas_of_any_size_get_labels_of_their_size(height: int, network: Network) -> None:
+    assert network.labels(_sphere(height)).shape == (height, 2 * height)
+
+
+def test_depth_is_in_metres(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Missing where 0 or NaN; in 16-bit files of 1/512 m it is exactly the same."""
+    network = tt.load(write_checkpoint(tmp_path / "net.ckpt", TANGENT, channels=4))
+    panorama = _sphere(32)
+    steps = np.random.default_rng(0).integers(0, 2000, (32, 64), np.uint16)
+    depth_m = steps / 512
+    (tmp_path / "depth").mkdir()
+    cv2.imwrite(str(tmp_path / "depth" / "room.png"), steps)
+    cv2.imwrite(str(tmp_path / "room.png"), panorama[..., ::-1])
+    monkeypatch.chdir(tmp_path)
+    given = ["checkpoint=net.ckpt", "input=room.png", "output=out", "report=0", "depth=depth"]
+    run_command(monkeypatch, "predict", *given, "depth_scale=512")
+    expected = cv2.imread("out/labels/room.png", cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(network.labels(panorama, depth=depth_m), expected)
+    depth_m[depth_m == 0] = np.nan
+    tensors = torch.from_numpy(panorama).permute(2, 0, 1), torch.from_numpy(depth_m)
+    np.testing.assert_array_equal(network.labels(tensors[0], depth=tensors[1]), expected)
+    assert (network.labels(panorama, depth=depth_m * 0) != expected).any()
+    for wrong in (None, depth_m[:16], steps):
+        with pytest.raises(SettingError, match=r"depth: .*expected 32×64 floats, in metres"):
+            network.labels(panorama, depth=wrong)
+
+
+def test_names_and_colors_of_the_labels(network: Network) -> None:
+    assert network.class_names == CLASS_NAMES
+    assert network.palette.dtype == np.uint8
+    assert network.palette.shape == (4, 3)
+    assert network.palette[0].tolist() == [0, 0, 0]
+    assert len(np.unique(network.palette, axis=0)) == 4
+    picture = network.palette[network.labels(_sphere(16))]
+    assert (picture.shape, picture.dtype) == ((16, 32, 3), np.uint8)
+    assert repr(network) == "<Network of 3 classes, sees rgb>"
+
+
+_RGB = np.zeros((16, 32, 3), np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("image", "message"),
+    [
+        (_RGB[:, :31], "found 16×31 pixels; expected the whole sphere.*fov="),
+        (_RGB[..., 0], r"ndarray \(16, 32\) of uint8"),
+        (np.zeros((16, 32, 4), np.uint8), r"array \(H, W, 3\)"),
+        (_RGB.transpose(2, 0, 1), r"transpose\(1, 2, 0\)"),
+        (_RGB.astype(np.float32), "times 255"),
+        (torch.zeros(16, 32, 3, dtype=torch.uint8), r"tensor \(3, H, W\).*permute\(2, 0, 1\)"),
+        (torch.zeros(3, 16, 32), "found Tensor.*float32.*times 255"),
+        (torch.zeros(1, 3, 16, 32, dtype=torch.uint8), r"\(1, 3, 16, 32\)"),
+        (_RGB[:0, :0], r"\(0, 0, 3\)"),
+        ("room.jpg", "found str"),
+    ],
+)
+def test_other_images_are_refused(image: Any, message: str, network: Network) -> None:
+    with pytest.raises(SettingError, match=message):
+        network.labels(image)
+
+
+def test_impossible_settings_are_refused(tmp_path: Path, network: Network) -> None:
+    with pytest.raises(SettingError, match="None: the network sees rgb"):
+        network.labels(_RGB, depth=np.zeros((16, 32)))
+    with pytest.raises(SettingError, match="fov_deg: found 180"):
+        network.scores(_RGB, fov=180)
+    with pytest.raises(DataError, match=r"missing\.ckpt"):
+        tt.load(tmp_path / "missing.ckpt")
+    for settings, message in (
+        ({"rotations": 0}, "rotations"),
+        ({"device": "nonsense"}, "device"),
+        ({"base_level": 9}, "base_level"),
+    ):
+        with pytest.raises(SettingError, match=message):
+            tt.load(tmp_path / "net.ckpt", **settings)
+
+
+def test_auto_is_a_device_of_this_machine(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, network: Network
+) -> None:
+    labels = network.labels(_sphere(16))
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    found = tt.load(str(tmp_path / "net.ckpt"), device="auto").labels(_sphere(16))
+    np.testing.assert_array_equal(found, labels)
+
+
+def test_a_name_of_trusted_code_is_one_name(tmp_path: Path) -> None:
+    content = torch.load(write_checkpoint(tmp_path / "net.ckpt"), weights_only=True)
+    content["config"]["network"] = {
+        "_target_": "tests.inference.trained.color_network",
+        "channels": 3,
+    }
+    torch.save(content, tmp_path / "net.ckpt")
+    with pytest.raises(DataError, match="trust"):
+        tt.load(tmp_path / "net.ckpt", trust="the.tests.inference.trained.color_network")
+    trusted = tt.load(tmp_path / "net.ckpt", trust="tests.inference.trained.color_network")
+    assert trusted.labels(_RGB).shape == (16, 32)

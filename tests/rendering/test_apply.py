@@ -1,0 +1,199 @@
+"""Functions of images applied to panoramas: those of `equirect_to_tangent` and back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from tangent_train.errors import SettingError
+from tangent_train.geometry import CubeGrid, TangentGrid, equirect_directions, rotation_about
+from tangent_train.rendering import (
+    Blend,
+    accumulate,
+    apply,
+    equirect_to_tangent,
+    tangent_to_equirect,
+)
+
+TURNED = TangentGrid(0, 5, rotation=rotation_about((1, 2, 3), 1.0))
+Function = Callable[[Any], Any]
+
+
+def _smooth(height: int) -> NDArray[np.float32]:
+    return equirect_directions((height, 2 * height)).astype(np.float32)
+
+
+def _features(images: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Five features of every pixel and its neighbours."""
+    blurred = (images + np.roll(images, 1, axis=2)) / 2
+    return np.concatenate([blurred, np.sin(3 * images[..., :2])], axis=-1).astype(np.float64)
+
+
+@pytest.mark.parametrize("grid", [TangentGrid(0, 5), TangentGrid(1, 5, 20), TURNED])
+@pytest.mark.parametrize("height", [64, 33])
+def test_the_identity_gives_the_panorama_back(grid: TangentGrid, height: int) -> None:
+    panorama = _smooth(height)
+    result = apply(lambda images: images, panorama, grid)
+    np.testing.assert_allclose(result, panorama, atol=0.01)
+
+
+@pytest.mark.parametrize("grid", [TangentGrid(0, 5), TURNED, TangentGrid(2, 5)])
+@pytest.mark.parametrize("blend", ["nearest", "feather"])
+@pytest.mark.parametrize("images_per_call", [1, 7, None])
+def test_results_are_those_of_all_images_at_once(
+    grid: TangentGrid, blend: Blend, images_per_call: int | None
+) -> None:
+    panorama = _smooth(33)
+    found = apply(_features, panorama, grid, blend, images_per_call=images_per_call)
+    images = _features(equirect_to_tangent(panorama, grid))
+    expected = tangent_to_equirect(images, grid, (33, 66), blend)
+    assert found.dtype == np.float32
+    assert found.shape == (33, 66, 5)
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+def test_images_come_in_order_and_no_more_than_asked_for() -> None:
+    grid, counts, seen = TangentGrid(1, 5), [], []
+
+    def noted(images: NDArray[np.uint8]) -> NDArray[np.float32]:
+        counts.append(len(images))
+        seen.append(images)
+        return np.zeros(images.shape[:3], np.float32)
+
+    panorama = np.random.default_rng(0).integers(0, 256, (64, 128, 3), np.uint8)
+    apply(noted, panorama, grid, images_per_call=32)
+    assert counts == [32, 32, 16]
+    np.testing.assert_array_equal(np.concatenate(seen), equirect_to_tangent(panorama, grid))
+
+
+def test_large_images_come_one_at_a_time() -> None:
+    counts = []
+
+    def noted(images: NDArray[np.float32]) -> NDArray[np.float32]:
+        counts.append(len(images))
+        return images[:, :, :, 0]
+
+    apply(noted, _smooth(16), TangentGrid(0, 9))
+    assert counts == [4] * 5  # 4 · 512² = 2^20
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.int64, bool])
+@pytest.mark.parametrize("channels", [(), (2,)])
+def test_labels_and_masks_are_copied_from_the_owner(dtype: Any, channels: tuple[int, ...]) -> None:
+    grid, panorama = TangentGrid(1, 5), _smooth(33)
+
+    def labels(images: NDArray[np.float32]) -> NDArray[Any]:
+        kept = images[..., 0] if not channels else images[..., :2]
+        return (kept > 0.2).astype(dtype)
+
+    found = apply(labels, panorama, grid, "nearest", images_per_call=9)
+    images = labels(equirect_to_tangent(panorama, grid))
+    expected = tangent_to_equirect(images, grid, (33, 66), interpolation="nearest")
+    assert (found.dtype, found.shape) == (np.dtype(dtype), (33, 66, *channels))
+    np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize("blend", ["nearest", "feather"])
+def test_tensors_and_arrays_agree(blend: Blend) -> None:
+    grid, panorama = TangentGrid(0, 5), _smooth(32)
+    tensor = torch.from_numpy(panorama).movedim(-1, 0)
+    expected = apply(lambda images: images[..., :2] ** 2, panorama, grid, blend)
+    found = apply(lambda images: images[:, :2] ** 2, tensor, grid, blend)
+    assert isinstance(found, torch.Tensor)
+    assert found.shape == (2, 32, 64)
+    np.testing.assert_allclose(found.movedim(0, -1).numpy(), expected, atol=1e-5)
+    depth = apply(lambda images: images[:, 0].bfloat16(), tensor, grid, blend)
+    assert (depth.dtype, depth.shape) == (torch.float32, (32, 64))
+    np.testing.assert_allclose(depth.numpy(), panorama[..., 0], atol=0.05)
+
+
+def test_labels_of_tensors_keep_their_dtype() -> None:
+    tensor = torch.from_numpy(_smooth(32)).movedim(-1, 0)
+    labels = apply(lambda images: images.argmax(dim=1), tensor, TangentGrid(0, 5), "nearest")
+    assert (labels.dtype, labels.shape) == (torch.int64, (32, 64))
+    masks = apply(lambda images: images > 0, tensor, TangentGrid(0, 5), "nearest")
+    assert (masks.dtype, masks.shape) == (torch.bool, (3, 32, 64))
+    assert (labels == tensor.argmax(dim=0)).double().mean() > 0.97
+    assert (masks == (tensor > 0)).double().mean() > 0.97
+
+
+def test_nothing_is_kept_for_gradients() -> None:
+    network = torch.nn.Conv2d(3, 4, 3, padding=1)
+    result = apply(network, torch.rand(3, 16, 32), TangentGrid(0, 4))
+    assert not result.requires_grad
+
+
+def test_sums_in_a_file_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    grid, panorama = TangentGrid(0, 5), _smooth(33)
+    expected = apply(_features, panorama, grid)
+    monkeypatch.setattr(accumulate, "_IN_MEMORY_BYTES", 0)
+    found = apply(_features, panorama, grid)
+    np.testing.assert_array_equal(found, expected)
+    assert found.flags.c_contiguous
+
+
+def test_faces_of_a_cube() -> None:
+    """Half a pixel at their edges is clamped."""
+    panorama = _smooth(32)
+    found = apply(lambda images: images, panorama, CubeGrid(32), "nearest")
+    np.testing.assert_allclose(found, panorama, atol=0.02)
+
+
+def _other_after_the_first(shapes: list[tuple[int, ...]], dtypes: list[Any]) -> Function:
+    results = iter([np.zeros(s, t) for s, t in zip(shapes, dtypes, strict=True)])
+    return lambda _: next(results)
+
+
+_ARRAY = np.zeros((8, 16, 3), np.float32)
+
+
+@pytest.mark.parametrize(
+    ("function", "message"),
+    [
+        (lambda images: images[1:], r"expected a ndarray of numbers \(10, 16, 16\[, K\]\)"),
+        (lambda images: images[:, ::2, ::2], r"found shape \(10, 8, 8, 3\)"),
+        (lambda images: images.mean(axis=(1, 2, 3)), "10 images of 16×16 pixels"),
+        (lambda images: images.astype(complex), "complex"),
+        (torch.from_numpy, "found a Tensor"),
+        (lambda _: None, "found a NoneType"),
+        (lambda images: images.astype(np.uint8), "blend: found 'feather' of results of uint8"),
+        (
+            _other_after_the_first([(10, 16, 16, 2), (10, 16, 16, 3)], [float, float]),
+            r"found K = \(3,\)",
+        ),
+        (_other_after_the_first([(10, 16, 16), (10, 16, 16)], [float, int]), "int64"),
+    ],
+)
+def test_other_results_are_refused(function: Function, message: str) -> None:
+    with pytest.raises(SettingError, match=message):
+        apply(function, _ARRAY, TangentGrid(0, 4), images_per_call=10)
+
+
+def test_other_results_of_tensors_are_refused() -> None:
+    panorama = torch.zeros(3, 8, 16)
+    for function in (lambda x: x[1:], lambda x: x.movedim(1, -1), lambda x: x.numpy()):
+        with pytest.raises(SettingError, match=r"Tensor of numbers \(20\[, K\], 16, 16\)"):
+            apply(function, panorama, TangentGrid(0, 4))
+
+
+@pytest.mark.parametrize(
+    ("panorama", "settings", "message"),
+    [
+        (torch.zeros(2, 3, 8, 16), {}, "each panorama of a batch"),
+        (torch.zeros(3, 8, 16, dtype=torch.uint8), {}, "uint8"),
+        (torch.zeros(8, 16, 3), {}, "permute"),
+        (_ARRAY, {"blend": "linear"}, "blend"),
+        (_ARRAY, {"images_per_call": 0}, "images_per_call: found 0"),
+        (_ARRAY, {"grid": CubeGrid(8)}, "do not overlap"),
+    ],
+)
+def test_what_cannot_be_rendered_is_refused(
+    panorama: Any, settings: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(SettingError, match=message):
+        apply(lambda images: images, panorama, **{"grid": TangentGrid(0, 4)} | settings)
