@@ -5,8 +5,9 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -34,23 +35,15 @@ ROOMS = {
 }
 
 
+FabricateStanford = Callable[..., Path]
+"""Writes a small data set; returns its root. See `fabricate`."""
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """What lies in `tests/slow` is for `make test-all`."""
+    """Mark the tests in `tests/slow`, which are for `make test-all`."""
     for item in items:
         if SLOW in item.path.parents:
             item.add_marker("slow")
-
-
-class FabricateStanford(Protocol):
-    """Writes a small data set; returns its root."""
-
-    def __call__(
-        self,
-        root: Path,
-        rooms: Mapping[str, Sequence[str]] = ROOMS,
-        height: int = 32,
-        photos: int = 0,
-    ) -> Path: ...
 
 
 def fabricate(

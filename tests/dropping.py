@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 __all__ = ["TRUST", "write_dropout"]
 
 TRUST = "trust=dropping.Dropping"
-"""What has to be said to go on with a run of it."""
+"""The setting with which a run of it is resumed."""
 
 _MODULE = """
 from torch import nn

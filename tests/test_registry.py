@@ -1,4 +1,4 @@
-"""What settings may name, and what is said about a name that they may not."""
+"""Names that settings may have, and errors about others."""
 
 from __future__ import annotations
 

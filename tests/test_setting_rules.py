@@ -1,4 +1,4 @@
-"""What may differ between runs."""
+"""Settings that may differ between runs."""
 
 from __future__ import annotations
 

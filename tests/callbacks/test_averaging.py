@@ -100,7 +100,7 @@ class Reference(Callback):
 
 
 class Ending(Callback):
-    """What a SIGTERM after a step does."""
+    """Ends training after a step, as SIGTERM does."""
 
     def __init__(self, last: LastCheckpoint, step: int) -> None:
         self.last, self.step = last, step

@@ -1,4 +1,4 @@
-"""What a small real training leaves in TensorBoard's files, read back with its own reader."""
+"""TensorBoard's files of a small training, read with its own reader."""
 
 from __future__ import annotations
 
@@ -142,10 +142,6 @@ def test_shapes_have_accuracies_and_no_unknown_class(tmp_path: Path) -> None:
 
 
 def test_nothing_is_drawn_by_other_processes_or_without_tensorboard(tmp_path: Path) -> None:
-    class Unused:
-        def __getattr__(self, name: str) -> Any:
-            raise AssertionError(name)
-
     logger = TensorBoardLogger(tmp_path, name="", version="tensorboard")
     for rank_0, loggers in ((False, [logger]), (True, [])):
         trainer: Any = SimpleNamespace(
@@ -154,8 +150,7 @@ def test_nothing_is_drawn_by_other_processes_or_without_tensorboard(tmp_path: Pa
             loggers=loggers,
             num_val_batches=[3],
         )
-        pictures = ValidationPictures(3)
-        unused: Any = Unused()
-        pictures.on_validation_batch_end(trainer, unused, None, unused, 0)
+        unused: Any = object()  # without attributes
+        ValidationPictures(3).on_validation_batch_end(trainer, unused, None, unused, 0)
         ClassScores().on_validation_end(trainer, unused)
     assert not list(tmp_path.rglob("events*"))

@@ -111,19 +111,18 @@ def test_a_run_is_not_resumed_as_another(
 
 def test_settings_of_an_evaluation(run_folder: Path, rooms: str, run: Run) -> None:
     arguments = [f"checkpoint={run_folder / 'checkpoints' / 'best.ckpt'}", rooms]
+    same = [text for text in SETTINGS if text.startswith("data.rooms.")]
+    changes = (
+        ["data.test_rotation=so3", "seed=1"],
+        ["data.test_rotation=so3", "seed=2"],
+        [*same, "data=synthrooms", "representation=erp"],
+    )
     confusions = [results(run_folder)["confusion"]]
-    for number, changed in enumerate(
-        (
-            ["data.test_rotation=so3", "seed=1"],
-            ["data.test_rotation=so3", "seed=2"],
-            ["data=synthrooms", "representation=erp"],
-        )
-    ):
-        same = [text for text in SETTINGS if text.startswith("data.rooms.")]
-        same = same if "data=synthrooms" in changed else []
-        run("evaluate", *arguments, *same, *changed, f"hydra.run.dir={number}")
-        assert results(Path(str(number)))["confusion"] not in confusions
-        confusions.append(results(Path(str(number)))["confusion"])
+    for number, changed in enumerate(changes):
+        run("evaluate", *arguments, *changed, f"hydra.run.dir={number}")
+        confusion = results(Path(str(number)))["confusion"]
+        assert confusion not in confusions
+        confusions.append(confusion)
     config = read_settings(Path("2/config.yaml"))
     assert config["data"]["panoramas_per_step"] == 4, "the option's own, not the run's"
     assert "base_level" not in config["representation"]

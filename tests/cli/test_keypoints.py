@@ -150,7 +150,6 @@ def test_a_broken_pair_is_named_and_the_others_are_compared(
     [
         (["input=in"], "output: found none"),
         (["data=synthrooms", "output=o"], "found datamodules.SynthRooms; expected pairs:"),
-        (["detector=surf", "output=o"], "detector: found surf"),
         (["margin=-1", "output=o"], "margin: found -1"),
     ],
 )

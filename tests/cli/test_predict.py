@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -83,9 +82,6 @@ def test_a_folder_of_panoramas(tmp_path: Path, predict: Predict) -> None:
     for remedy in ("16×16", "crop=", "GPano", "projection=perspective"):
         assert remedy in entries["square"]["error"]
     assert sum(entries["a=b"]["classes"].values()) == pytest.approx(1)
-    assert json.loads((output / "classes.json").read_text()) == {"dark": 1, "green": 2, "bright": 3}
-    with (output / "summary.csv").open(newline="") as file:
-        assert len(list(csv.DictReader(file))) == 5
     page = (output / "report.html").read_text()
     assert "flat/küche #1" in page
     assert "http://" not in page.replace("http://www.w3.org", "")

@@ -1,4 +1,4 @@
-"""What a transfer is to run: its stages and their configs."""
+"""The stages of a transfer and their configs."""
 
 from __future__ import annotations
 

@@ -12,24 +12,27 @@ import pytest
 
 from tangent_train.cli import main
 
-__all__ = ["SETTINGS", "Run", "results", "run_command"]
+__all__ = ["SETTINGS", "SMALL_ROOMS", "Run", "results", "run_command"]
 
 Run = Callable[..., None]
 """Runs a command with arguments."""
 
 _ROOMS = {"1": 2, "2": 2, "3": 1, "4": 1, "5a": 1, "5b": 1, "6": 1}
-SETTINGS = (
-    "experiment=rooms/demo",
+SMALL_ROOMS = (
     "level=4",
-    "representation.crop_multiple=null",
-    "network.widths=[4,8]",
     "data.panoramas_per_step=2",
     "data.validation_fraction=0.2",
     "data.rooms.height=32",
     *(f"data.rooms.rooms.area_{area}={n}" for area, n in _ROOMS.items()),
+    "trainer.accelerator=cpu",
+)
+SETTINGS = (
+    "experiment=rooms/demo",
+    *SMALL_ROOMS,
+    "representation.crop_multiple=null",
+    "network.widths=[4,8]",
     "trainer.max_epochs=2",
     "trainer.check_val_every_n_epoch=1",
-    "trainer.accelerator=cpu",
     "panels=1",
 )
 
@@ -41,6 +44,6 @@ def run_command(monkeypatch: pytest.MonkeyPatch, command: str, *arguments: str) 
 
 
 def results(folder: Path) -> dict[str, Any]:
-    """What a run wrote."""
+    """The ``results.json`` of a run."""
     content: dict[str, Any] = json.loads((folder / "results.json").read_text())
     return content

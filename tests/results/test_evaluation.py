@@ -10,8 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tangent_train.callbacks.results import evaluated, pictures, write_evaluation
-from tangent_train.callbacks.tensorboard import ClassScores
 from tangent_train.metrics.segmentation import ConfusionMatrices
 from tangent_train.results.evaluation import (
     classification_record,
@@ -23,7 +21,6 @@ from tangent_train.results.evaluation import (
     write_results,
 )
 from tangent_train.results.record import Record
-from tests.tasks.shapes import Shapes, quiet_trainer, shape_task
 
 NAMES = ("unknown", "wall", "floor", "=sofa")
 SHAPES = ("bottle", "chair [old]", "mug", "plant")
@@ -135,19 +132,3 @@ def test_the_heat_map_has_shares_of_the_true_class(kind: Any) -> None:
     np.testing.assert_array_equal(np.array(table.shades), expected)
     percents = [[f"{100 * share:.0f}" if share else "" for share in row] for row in expected]
     assert table.rows == [(name, *row) for name, row in zip(names, percents, strict=True)]
-
-
-def test_an_evaluated_task_leaves_files_and_a_page(tmp_path: Path) -> None:
-    task = shape_task()
-    trainer = quiet_trainer()
-    trainer.test(task, datamodule=Shapes(), verbose=False)
-    record = evaluated(task, "shapes")
-    assert record.images == 9
-    write_evaluation(task, record, tmp_path / "x.ckpt", tmp_path)
-    written = {"results.json", "results.csv", "results.md", "report.html"}
-    assert {path.name for path in tmp_path.iterdir()} == written
-    page = (tmp_path / "report.html").read_text()
-    assert f"<p>{headline(record)}</p>" in page
-    for title in ("Per class", "Confusion"):
-        assert f"<h2>{title}</h2>" in page
-    assert [type(c) for c in pictures(task.kind, tmp_path, {})] == [ClassScores]

@@ -114,8 +114,3 @@ def test_tables_for_the_terminal_and_markdown_take_any_text() -> None:
     shown = console.export_text()
     assert all(text in shown for text in ("[t]", "[red]", "[/]", "[note]"))
     assert r"| a\|b | [/] |" in table.markdown()
-
-
-def test_rows_of_another_length_are_an_error() -> None:
-    with pytest.raises((IndexError, ValueError)):
-        Table("t", ("a", "b"), [("1", "2", "3", "4")]).html()

@@ -27,14 +27,6 @@ def test_a_record_is_read_as_it_was_written(tmp_path: Path) -> None:
     assert read.score("iou", "sofa") is None
 
 
-def test_settings_are_what_is_written_and_nothing_is_looked_up(tmp_path: Path) -> None:
-    folder = write_run(tmp_path / "a", made_record(SCORES))
-    with (folder / "config.yaml").open("a") as file:
-        file.write("lr: ${optimizer.lr}\nhome: ${oc.env:HOME}\n")
-    settings = load_record(folder).settings
-    assert [settings[name] for name in ("lr", "home")] == ["${optimizer.lr}", "${oc.env:HOME}"]
-
-
 def test_runs_are_found_once_and_unfinished_ones_named(tmp_path: Path) -> None:
     for name in ("b", "a"):
         write_run(tmp_path / name, made_record(SCORES))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import pytest
 
@@ -90,16 +89,6 @@ def test_other_settings_make_other_groups_named_by_what_differs() -> None:
         ("mine (optimizer.lr=0.02)", 2),
         ("other", 1),
     ]
-
-
-@pytest.mark.parametrize(
-    "changes", [{"init_from": "b.ckpt"}, {"task__channels_last": True}, {"data__store": "/s"}]
-)
-def test_where_and_how_a_run_was_computed_makes_no_other_group(changes: dict[str, Any]) -> None:
-    first = made_record([0.1, 0.2, 0.3], init_from="a.ckpt", task__channels_last=False)
-    settings: dict[str, Any] = {"init_from": "a.ckpt", "task__channels_last": False} | changes
-    second = made_record([0.1, 0.2, 0.3], seed=1, **settings)
-    assert len(group_runs([first, second])) == 1
 
 
 def test_groups_that_differ_in_much_have_labels_of_their_own() -> None:

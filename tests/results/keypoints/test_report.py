@@ -32,7 +32,7 @@ def row(pair: str = "a", representation: str = "ERP", **figures: Any) -> Row:
 
 
 def of_paper() -> list[Row]:
-    """What a run would give that reproduced the paper's single figures."""
+    """Rows of a run that reproduces the paper's figures of every pair."""
     rows = []
     for name, pair in PUBLISHED.items():
         given: Any = {"split": pair.split, "fov_overlap": pair.fov_overlap}
