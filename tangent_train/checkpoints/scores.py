@@ -27,7 +27,8 @@ class Scores(nn.Module):
         network: Maps images ``(B, C, h, w)`` to scores ``(B, K, h, w)``, to a dict with those under
             ``"out"`` (torchvision's), or to label maps ``(B, h, w)`` of whole numbers.
         num_classes: K.
-        groups: Of every class the network's scores that make it up; scores in no group never win.
+        groups: Of every class the network's scores that make it up; scores in no group never win,
+            nor do classes without scores.
         tile: Rows and columns of the only images that the network takes: larger ones are divided.
 
     Attributes:
@@ -67,7 +68,7 @@ class Scores(nn.Module):
         returned = self.network(images, *arguments, **settings)
         scores: Tensor = returned["out"] if isinstance(returned, dict) else returned
         groups = self._groups
-        needed = self.num_scores if groups is None else 1 + max(map(max, groups))
+        needed = self.num_scores if groups is None else 1 + max(k for g in groups for k in g)
         if not scores.is_floating_point():  # label maps
             scores = functional.one_hot(scores, max(needed, 1 + int(scores.max()))).movedim(-1, 1)
             scores = scores * _CERTAIN
@@ -80,9 +81,17 @@ class Scores(nn.Module):
             )
         if groups is None:
             return scores
-        # The logarithm of a sum of probabilities, up to what all classes of a pixel share.
-        of_groups = [scores[:, list(group)] for group in groups]
-        return torch.cat([s if s.shape[1] == 1 else s.logsumexp(1, True) for s in of_groups], dim=1)
+        return torch.cat([_sum(scores, group) for group in groups], dim=1)
+
+
+def _sum(scores: Tensor, group: Sequence[int]) -> Tensor:
+    """The logarithm of a sum of probabilities, up to what all classes of a pixel share."""
+    if not group:
+        # Below all others at every pixel, and so in every mean of pixels. Not minus infinity, which
+        # is not a number when it is weighted by 0.
+        return scores.amin(1, keepdim=True) - _CERTAIN
+    own = scores[:, list(group)]
+    return own if len(group) == 1 else own.logsumexp(1, keepdim=True)
 
 
 def _tiled(network: Any, images: Tensor, tile: tuple[int, int]) -> Tensor:

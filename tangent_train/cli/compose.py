@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 __all__ = ["compose_option", "config_folder", "quote_path", "quoted"]
 
 _PATHS = (
-    *("back", "cameras", "checkpoint", "classes", "depth", "figure", "file", "init_from"),
-    *("input", "left", "model", "output", "resume", "right", "weights"),
+    *("back", "cameras", "checkpoint", "class_map", "classes", "depth", "figure", "file"),
+    *("init_from", "input", "left", "model", "output", "resume", "right", "weights"),
 )
 """Settings that name files or folders."""
 

@@ -18,6 +18,7 @@ from tangent_train.checkpoints.trained import load_trained
 from tangent_train.cli.each import each
 from tangent_train.cli.settings import typed
 from tangent_train.errors import SettingError
+from tangent_train.inference.class_maps import Unmapped, load_class_map, map_classes
 from tangent_train.inference.images import DepthFolder, read_panorama, read_photo
 from tangent_train.inference.predictor import Predictor
 from tangent_train.inference.views import PanoramaViews, PhotoViews
@@ -38,8 +39,8 @@ if TYPE_CHECKING:
 __all__ = ["predict"]
 
 _DECISIVE = (
-    "checkpoint", "depth_scale", "projection", "crop", "fov", "level", "levels", "base_level",
-    "blend", "rotations", "upright", "max_tilt_deg",
+    "checkpoint", "class_map", "unmapped", "depth_scale", "projection", "crop", "fov", "level",
+    "levels", "base_level", "blend", "rotations", "upright", "max_tilt_deg",
 )  # fmt: skip
 """Settings that labels depend on: those of resumed predictions must be the same."""
 
@@ -54,6 +55,8 @@ class Settings:
     checkpoint: Path
     input: str
     output: Path
+    class_map: str | None
+    unmapped: Unmapped
     depth: Path | None
     depth_scale: float
     projection: Literal["equirectangular", "perspective"]
@@ -88,7 +91,7 @@ def predict(config: Mapping[str, Any]) -> None:
     settings = typed(Settings, config)
     decisive = {name: config[name] for name in _DECISIVE}
     images = _find_images(settings)
-    trained = load_trained(settings.checkpoint, settings.trust)
+    trained = _network(settings)
     folder = PredictionFolder(settings.output, trained.class_names, settings.probabilities)
     depth = _depth_folder(settings, trained)
     label = _Labeller(settings, trained, _predictor(settings, trained), depth, folder)
@@ -167,6 +170,17 @@ class _Labeller:
 def _save(folder: PredictionFolder, settings: Mapping[str, Any], entries: list[Entry]) -> None:
     if any("classes" in entry for entry in entries):  # else nothing is in the way of another try
         folder.write_summary(settings, entries)
+
+
+def _network(settings: Settings) -> TrainedNetwork:
+    """The network, with the classes of the class map."""
+    if settings.class_map is None:
+        return load_trained(settings.checkpoint, settings.trust)
+    class_map = load_class_map(settings.class_map)
+    trained = load_trained(settings.checkpoint, settings.trust)
+    mapped = map_classes(trained, class_map, settings.unmapped)
+    _say(f"Class map {class_map.name}: {mapped}.")
+    return mapped.trained
 
 
 def _find_images(settings: Settings) -> dict[str, Path]:

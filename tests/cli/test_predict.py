@@ -171,6 +171,32 @@ def test_a_part_of_a_panorama_is_labelled_as_that_part(
         assert (found == expected)[inner, inner].mean() > 0.98
 
 
+@pytest.mark.parametrize("unmapped", ["unknown", "never"])
+def test_labels_of_a_class_map(
+    unmapped: str, tmp_path: Path, predict: Predict, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Those of the network, renamed, up to interpolation at the borders between classes."""
+    _write(tmp_path / "in" / "a.png", _sphere(32))
+    predict()
+    path = Path("labels") / "a.png"
+    plain = _labels(tmp_path / "out" / path)
+    given = tmp_path / "a=b (1).json"
+    given.write_text('{"classes": {"light": ["Bright"], "sofa": [], "shade": ["dark"]}}')
+    output = tmp_path / "mapped"
+    (entry,) = predict(output=output, class_map=given, unmapped=unmapped).values()
+    assert "light ← bright; shade ← dark; never given: sofa; " in capsys.readouterr().out
+    assert json.loads((output / "classes.json").read_text()) == {"light": 1, "sofa": 2, "shade": 3}
+    assert entry["classes"]["sofa"] == 0
+    found = _labels(output / path)
+    np.testing.assert_array_equal(found[plain == 3], 1)
+    np.testing.assert_array_equal(found[plain == 1], 3)
+    green = found[plain == 2]
+    assert green.size
+    assert set(np.unique(green)) <= ({0} if unmapped == "unknown" else {1, 3})
+    with pytest.raises(SystemExit, match="resume: found class_map=None, another setting"):
+        predict(output=output, resume="true")
+
+
 @pytest.mark.parametrize("representation", [TANGENT, PERSPECTIVE])
 def test_photos(
     representation: dict[str, Any],
@@ -218,6 +244,9 @@ def test_depth_is_that_of_the_image_in_its_folder(tmp_path: Path, predict: Predi
         ({"blend": "mean"}, "blend: found mean; expected feather or nearest"),
         ({"base_level": 9}, "base_level"),
         ({"device": "abacus"}, "device"),
+        ({"class_map": "night"}, "class_map: found night; expected ade20k_to_stanford2d3ds"),
+        ({"class_map": "cityscapes_to_synthia"}, "found no class of Cityscapes in a network of"),
+        ({"class_map": "voc_to_stanford2d3ds", "unmapped": "0"}, "unmapped: found 0; expected unk"),
     ],
 )
 def test_impossible_settings_are_refused_before_any_work(

@@ -1,0 +1,188 @@
+"""Class maps: the classes of one data set as those of another.
+
+A map is a JSON file with the names of source classes for every target class::
+
+    {"source": "ADE20K", "classes": {"wall": ["wall", "painting"], "floor": ["floor", "rug"]}}
+
+The probability of a target class is the sum of those of its source classes. Names fit whatever
+their case, and with hyphens or underscores as spaces; of a list of synonyms ("windowpane, window")
+the first one counts. A map names synonyms as well (``"windowpane", "window"``), and a network may
+lack some of the source classes: a target class without any is a label that is never given.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from tangent_train.checkpoints.scores import Scores
+from tangent_train.checkpoints.trained import TrainedNetwork
+from tangent_train.errors import DataError, SettingError
+from tangent_train.json_text import parse_json
+from tangent_train.registry import Text, check_fields
+
+__all__ = ["ClassMap", "MappedNetwork", "Unmapped", "load_class_map", "map_classes"]
+
+Unmapped = Literal["unknown", "never"]
+"""Whether a source class that a map does not name may win, which is label 0, or never wins."""
+
+_FOLDER = Path(__file__).with_suffix("")
+"""The maps of this package: ``class_maps/<name>.json``."""
+
+_EXPECTED = 'a class map: {"classes": {"wall": ["wall", "painting"], "floor": ["floor"]}}'
+_MOST_CLASSES = 255  # labels are uint8, and 0 is unknown
+
+
+@dataclass(frozen=True)
+class ClassMap:
+    """The classes of a source data set as those of a target.
+
+    Attributes:
+        name: Of the map, or its file.
+        source: Name of the source data set; None where the file does not say.
+        classes: Of every target class the names of its source classes.
+    """
+
+    name: str
+    source: str | None
+    classes: Mapping[str, Sequence[str]]
+
+
+@dataclass(frozen=True)
+class MappedNetwork:
+    """A network whose classes are those of a map.
+
+    Attributes:
+        trained: The network.
+        classes: Of every target class the classes of the original network that make it up.
+        unmapped: Its other classes.
+        unmapped_wins: Whether these may win.
+    """
+
+    trained: TrainedNetwork
+    classes: Mapping[str, Sequence[str]]
+    unmapped: Sequence[str]
+    unmapped_wins: bool
+
+    def __str__(self) -> str:
+        """What was understood, in one line."""
+        parts = [f"{n} ← {', '.join(names)}" for n, names in self.classes.items() if names]
+        missing = [name for name, names in self.classes.items() if not names]
+        if missing:
+            parts.append(f"never given: {', '.join(missing)}")
+        if self.unmapped:
+            said = "unknown where they win" if self.unmapped_wins else "never win"
+            parts.append(f"{said}: {', '.join(self.unmapped)}")
+        return "; ".join(parts)
+
+
+def load_class_map(given: str) -> ClassMap:
+    """A class map.
+
+    Args:
+        given: The name of one of this package, such as ``ade20k_to_stanford2d3ds``, or a JSON file,
+            by its suffix ``.json``.
+
+    Raises:
+        SettingError: There is no map of this name.
+        DataError: The file cannot be used.
+    """
+    shipped = sorted(path.stem for path in _FOLDER.glob("*.json"))
+    if given in shipped:
+        path = _FOLDER / f"{given}.json"
+    elif given.lower().endswith(".json"):
+        path = Path(given).expanduser()
+    else:
+        raise SettingError(
+            "class_map", found=given, expected=f"{', '.join(shipped)}; or a file my_map.json"
+        )
+    try:
+        content = parse_json(path.read_text(encoding="utf-8"), object_pairs_hook=_once_each)
+    except (OSError, ValueError) as error:
+        raise DataError(path, found=error, expected=_EXPECTED) from error
+    fields = check_fields(path, content, {"source": Text | None, "classes": dict}, _EXPECTED)
+    classes = fields["classes"]
+    check_fields(path, {"names": list(classes)}, {"names": list[Text]}, _EXPECTED, "classes")
+    check_fields(path, classes, dict.fromkeys(classes, list[Text]), _EXPECTED, "classes")
+    named = Counter(_plain(name) for names in classes.values() for name in names)
+    twice = [name for name, count in named.items() if count > 1]
+    if twice or not named or len(classes) > _MOST_CLASSES:
+        found = f"{len(classes)} classes" if named else "no source class"
+        raise DataError(
+            path,
+            found=f"{', '.join(twice)} more than once" if twice else found,
+            expected=f"1 to {_MOST_CLASSES} classes, every source class in one of them",
+        )
+    return ClassMap(given, fields["source"], classes)
+
+
+def map_classes(
+    trained: TrainedNetwork,
+    class_map: ClassMap,
+    unmapped: Unmapped = "unknown",
+    targets: Sequence[str] | None = None,
+) -> MappedNetwork:
+    """A network with the classes of a map in place of its own.
+
+    Args:
+        trained: The network.
+        class_map: The map.
+        unmapped: What becomes of classes that the map does not name. What an imported network took
+            for nothing stays that.
+        targets: All classes wanted, in their order, without unknown; None for those of the map.
+
+    Raises:
+        SettingError: The map names no class of the network, or a target that is not wanted.
+    """
+    targets = list(class_map.classes) if targets is None else targets
+    foreign = class_map.classes.keys() - set(targets)
+    if foreign:
+        raise SettingError(
+            f"class_map={class_map.name}",
+            found=f"target classes {', '.join(sorted(foreign))}",
+            expected=f"of {', '.join(targets)}",
+        )
+    target_of = {_plain(n): target for target, names in class_map.classes.items() for n in names}
+    own = trained.class_names[1:]
+    groups = trained.groups or [[k] for k in range(len(own))]
+    places: dict[str | None, list[int]] = {name: [] for name in (*targets, None)}
+    for k, name in enumerate(own):
+        places[target_of.get(_plain(name))].append(k)
+    left = places.pop(None)
+    if len(left) == len(own):
+        raise SettingError(
+            f"class_map={class_map.name}",
+            found=f"no class of {class_map.source or 'the map'} in a network of {', '.join(own)}",
+            expected="a map whose source classes are the network's",
+        )
+    scores = [[k for place in group for k in groups[place]] for group in places.values()]
+    nothing = [k for group in groups[len(own) :] for k in group]
+    if unmapped == "unknown":
+        nothing += [k for place in left for k in groups[place]]
+    scores += [nothing] if nothing else []
+    network = Scores(trained.network.network, len(targets), scores, trained.fixed_size).eval()
+    names = ("unknown", *targets)
+    found = {str(target): [own[k] for k in group] for target, group in places.items()}
+    return MappedNetwork(
+        trained=replace(trained, network=network, class_names=names, groups=scores),
+        classes=found,
+        unmapped=[own[k] for k in left],
+        unmapped_wins=unmapped == "unknown",
+    )
+
+
+def _plain(name: str) -> str:
+    """The first synonym of a name, as names are compared."""
+    first = name.partition(",")[0].replace("-", " ").replace("_", " ")
+    return " ".join(first.casefold().split())
+
+
+def _once_each(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    names = Counter(name for name, _ in pairs)
+    twice = [name for name, count in names.items() if count > 1]
+    if twice:
+        raise ValueError(f"{', '.join(twice)} more than once")
+    return dict(pairs)

@@ -1,0 +1,208 @@
+"""Class maps: those of this package against the published lists, and what they compute."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from datamodules.stanford2d3ds.label_table import CLASSES as STANFORD
+from datamodules.synthia.reader import CLASSES as SYNTHIA
+from tangent_train.checkpoints.scores import Groups, Scores
+from tangent_train.checkpoints.trained import TrainedNetwork
+from tangent_train.errors import DataError, SettingError
+from tangent_train.inference import class_maps
+from tangent_train.inference.class_maps import ClassMap, Unmapped, load_class_map, map_classes
+from tests.inference.published_classes import PUBLISHED
+from tests.inference.trained import TANGENT, trained_network
+
+LAYOUT = ("ceiling", "floor", "wall", "door", "window")
+SHIPPED = {
+    "ade20k_to_stanford2d3ds": ("ADE20K", 150, STANFORD),
+    "ade20k_to_zind_layout": ("ADE20K", 150, LAYOUT),
+    "coco_stuff_to_stanford2d3ds": ("COCO-Stuff", 182, STANFORD),
+    "cityscapes_to_synthia": ("Cityscapes", 19, SYNTHIA),
+    "voc_to_stanford2d3ds": ("Pascal VOC", 21, STANFORD),
+}
+ADE20K_31 = [
+    *("wall", "building", "sky", "floor", "tree", "ceiling", "road", "bed", "window", "grass"),
+    *("cabinet", "sidewalk", "person", "earth", "door", "table", "mountain", "plant", "curtain"),
+    *("chair", "car", "water", "painting", "sofa", "shelf", "house", "sea", "mirror", "rug"),
+    *("field", "armchair"),
+]
+
+
+class Passing(nn.Module):
+    """A network whose scores are its images."""
+
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        return images
+
+
+def _trained(names: Sequence[str], groups: Groups | None = None) -> TrainedNetwork:
+    network = Scores(Passing(), len(names), groups)
+    return trained_network(TANGENT, network=network, class_names=("unknown", *names), groups=groups)
+
+
+def _written(path: Path, content: Any) -> str:
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    return str(path)
+
+
+def test_every_map_of_the_package_is_tested() -> None:
+    folder = Path(class_maps.__file__).with_suffix("")
+    assert {path.stem for path in folder.iterdir()} == SHIPPED.keys()
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_a_map_names_published_classes(name: str) -> None:
+    source, count, targets = SHIPPED[name]
+    published = PUBLISHED[source]
+    assert len(published) == count
+    found = load_class_map(name)
+    assert (found.name, found.source) == (name, source)
+    assert tuple(found.classes) == targets
+    synonyms = {part.strip() for text in published for part in text.split(",")}
+    synonyms |= {"dining table", "potted plant", "tv monitor"}  # VOC's, as others write them
+    assert not {n for names in found.classes.values() for n in names} - synonyms
+    mapped = map_classes(_trained(published), found)
+    for target, names in found.classes.items():
+        assert bool(names) == bool(mapped.classes[target])
+        firsts = {text.split(",")[0].strip() for text in mapped.classes[target]}
+        assert firsts <= set(names)
+    assert len(mapped.unmapped) + sum(map(len, mapped.classes.values())) == count
+
+
+@pytest.mark.parametrize("name", ["ade20k_to_stanford2d3ds", "ade20k_to_zind_layout"])
+def test_short_names_of_a_part_of_the_classes(name: str) -> None:
+    mapped = map_classes(_trained(ADE20K_31), load_class_map(name))
+    assert mapped.classes["window"] == ["window", "curtain"]
+    assert mapped.classes["wall"] == ["wall", "painting", "mirror"]
+    assert mapped.classes["floor"] == ["floor", "rug"]
+    if name == "ade20k_to_stanford2d3ds":
+        assert mapped.classes["bookcase"] == ["shelf"]
+        assert mapped.classes["beam"] == []
+        assert mapped.unmapped[:3] == ["building", "sky", "tree"]
+        text = str(mapped)
+        assert "chair ← chair, armchair; clutter ← bed" in text
+        assert "never given: beam, board, column; unknown where they win: building, sky" in text
+    else:
+        assert "bed" in mapped.unmapped
+
+
+def test_names_are_compared_without_case_hyphens_and_further_synonyms() -> None:
+    names = ["Swivel_Chair", "WINDOWPANE, window ", "floor-wood", "floor"]
+    given = ClassMap("m", None, {"seat": ["swivel chair"], "hole": ["window", "windowpane"],
+                                 "ground": ["floor wood"]})  # fmt: skip
+    mapped = map_classes(_trained(names), given)
+    assert mapped.classes == {"seat": names[:1], "hole": names[1:2], "ground": names[2:3]}
+    assert mapped.unmapped == ["floor"]
+
+
+@pytest.mark.parametrize("nothing", [None, [6]], ids=["all", "nothing"])
+@pytest.mark.parametrize("unmapped", ["unknown", "never"])
+def test_probabilities_of_a_class_add_up(unmapped: Unmapped, nothing: list[int] | None) -> None:
+    """Against NumPy: labels, and the shares of the classes in what may win."""
+    names = ["bed", "wall", "painting", "floor", "sky", "tree"]
+    groups = None if nothing is None else [*([k] for k in range(6)), nothing]
+    given = ClassMap("m", None, {"wall": ["painting", "wall"], "beam": ["rafter"],
+                                 "floor": ["floor", "rug"], "rest": ["bed"]})  # fmt: skip
+    trained = map_classes(_trained(names, groups), given, unmapped).trained
+    assert trained.class_names == ("unknown", "wall", "beam", "floor", "rest")
+    scores = torch.randn(2, 6 + (nothing is not None), 16, 16, dtype=torch.float64)
+    scores[0] *= 8
+    found = trained.network(scores)
+    exponents = np.exp(scores.numpy())
+    sums = [exponents[:, [1, 2]].sum(1), 0 * exponents[:, 0], exponents[:, 3], exponents[:, 0]]
+    blank = ([6] if nothing is not None else []) + ([4, 5] if unmapped == "unknown" else [])
+    sums += [exponents[:, blank].sum(1)] if blank else []
+    expected = np.stack(sums, 1) / np.sum(sums, 0)[:, None]
+    np.testing.assert_allclose(torch.softmax(found, 1).numpy(), expected, atol=1e-8)
+    best = expected.argmax(1)
+    wanted = np.where(best == 4, 0, best + 1)
+    assert (wanted == 0).any() == bool(blank)
+    labels = trained.labels(found.argmax(1).numpy().astype(np.uint8))
+    np.testing.assert_array_equal(labels, wanted)
+
+
+def test_a_class_without_scores_wins_in_no_mean_of_pixels() -> None:
+    """Scores of pixels and images are averaged with weights that may be 0."""
+    trained = map_classes(
+        _trained(["a", "b"]), ClassMap("m", None, {"none": [], "b": ["b"]}), "never"
+    ).trained
+    found = trained.network(1e4 * torch.randn(64, 2, 1, 1))[..., 0, 0]
+    weights = torch.rand(256, 64) * (torch.rand(256, 64) < 0.5)
+    assert bool((weights @ found).argmax(1).bool().all())
+    assert bool(found.isfinite().all())
+
+
+def test_the_order_and_the_number_of_classes_can_be_those_of_data() -> None:
+    given = ClassMap("m", None, {"floor": ["floor"], "wall": ["wall"]})
+    trained = map_classes(_trained(["wall", "floor"]), given, targets=("wall", "sofa", "floor"))
+    assert trained.trained.class_names == ("unknown", "wall", "sofa", "floor")
+    assert trained.trained.groups == [[0], [], [1]]
+    with pytest.raises(SettingError, match="target classes wall; expected of floor, sofa"):
+        map_classes(_trained(["wall"]), given, targets=("floor", "sofa"))
+
+
+def test_a_map_of_a_map() -> None:
+    """Scores of the innermost network, with its image size."""
+    first = ClassMap("m", None, {"indoor": ["bed", "wall"], "outdoor": ["sky"]})
+    names = ["bed", "wall", "sky", "tree"]
+    trained = replace(_trained(names, [[3], [2], [1], [0]]), fixed_size=(8, 8))
+    once = map_classes(trained, first).trained
+    assert once.groups == [[3, 2], [1], [0]]
+    twice = map_classes(once, ClassMap("n", None, {"all": ["outdoor"]})).trained
+    assert twice.groups == [[1], [0, 3, 2]]
+    assert twice.network(torch.randn(1, 4, 12, 20)).shape == (1, 2, 12, 20)
+
+
+def test_own_maps(tmp_path: Path) -> None:
+    path = _written(tmp_path / "My Map.JSON", {"classes": {"Möbel": ["chair"], "none": []}})
+    found = load_class_map(path)
+    assert (found.source, dict(found.classes)) == (None, {"Möbel": ["chair"], "none": []})
+    with pytest.raises(SettingError, match="found no class of the map in a network of cat, dog"):
+        map_classes(_trained(["cat", "dog"]), found)
+    with pytest.raises(SettingError, match="found no class of ADE20K in a network of cat"):
+        map_classes(_trained(["cat"]), load_class_map("ade20k_to_zind_layout"))
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "found No such file"),
+        ("{", "expected a class map"),
+        ("[" * 100000, "nested too deeply"),
+        (["wall"], "found list instead of a mapping"),
+        ({"wall": ["wall"]}, "found no classes inside"),
+        ({"source": 1, "classes": {"wall": ["wall"]}}, "found source=1"),
+        ({"classes": {"wall": "wall"}}, "found wall='wall' in classes"),
+        ({"classes": {"wall": [1]}}, r"found wall=\[1\] in classes"),
+        ({"classes": {"wall\n": ["wall"]}}, "found names="),
+        ({"classes": {"wall": ["a\u001b[2J"]}}, "found wall="),
+        ({"classes": {}}, "found no source class"),
+        ({"classes": {"wall": []}}, "found no source class; expected 1 to"),
+        ({"classes": {str(k): [f"c{k}"] for k in range(256)}}, "found 256 classes"),
+        ({"classes": {"wall": ["wall", "mirror"], "glass": ["Mirror"]}}, "found mirror more than"),
+        ('{"classes": {"wall": ["a"], "wall": ["b"]}}', "found wall more than once"),
+    ],
+)
+def test_unusable_files(content: Any, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "map.json"
+    if content is not None:
+        _written(path, content)
+    with pytest.raises(DataError, match=message) as caught:
+        load_class_map(str(path))
+    assert caught.value.subject == path
+
+
+def test_a_name_of_no_map_is_refused() -> None:
+    with pytest.raises(SettingError, match="found ade20k; expected ade20k_to_stanford2d3ds, "):
+        load_class_map("ade20k")
