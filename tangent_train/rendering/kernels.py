@@ -168,18 +168,39 @@ def owners(
 
 
 @njit_fast
-def _project(side: tuple[int, int], m: Array, feather: bool, u: Array, v: Array, w: Array) -> None:
-    """Project rays ``(u, v, w)`` into an image, in place: to columns, rows and weights."""
-    for p in range(len(u)):
-        x, y, z = u[p], v[p], w[p]
-        depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z
-        u[p] = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z) / depth
-        v[p] = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z) / depth
-        w[p] = 1.0
+def _project(
+    side: tuple[int, int], m: Array, row: Array, columns: Array, feather: bool,
+    start: int, stop: int, at: int, u: Array, v: Array, weight: Array,
+) -> None:  # fmt: skip
+    """Project neighbors in a row of the canvas into an image.
+
+    Args:
+        side: Rows and columns of the image.
+        m: ``(3, 3)`` from rays to homogeneous pixels.
+        row: ``(2,)`` factors of the row.
+        columns: ``(W, 2)`` factors of the columns.
+        feather: Whether weights fall to 0 at the image's borders, instead of being 1.
+        start: First column.
+        stop: One past the last column.
+        at: Where the first one is written.
+        u: Columns in the image, written.
+        v: Rows in the image, written.
+        weight: Weights, written.
+    """
+    ux, uy, uz = row[0] * m[0, 0], row[0] * m[0, 1], row[1] * m[0, 2]
+    vx, vy, vz = row[0] * m[1, 0], row[0] * m[1, 1], row[1] * m[1, 2]
+    wx, wy, wz = row[0] * m[2, 0], row[0] * m[2, 1], row[1] * m[2, 2]
+    ahead = np.uint64(at - start)  # unsigned indices spare numba's test for negative ones
+    for j in range(np.uint64(start), np.uint64(stop)):
+        x, y, p = columns[j, 0], columns[j, 1], ahead + j
+        depth = wx * x + wy * y + wz
+        u[p] = (ux * x + uy * y + uz) / depth
+        v[p] = (vx * x + vy * y + vz) / depth
+        weight[p] = 1.0
         if feather:
             across, down = (2 * u[p] + 1) / side[1] - 1, (2 * v[p] + 1) / side[0] - 1
             seen = depth > 0 and abs(across) < 1 and abs(down) < 1
-            w[p] = ((1 - across**2) * (1 - down**2)) ** FEATHER_POWER if seen else 0.0
+            weight[p] = ((1 - across**2) * (1 - down**2)) ** FEATHER_POWER if seen else 0.0
 
 
 @njit_fast
@@ -209,7 +230,6 @@ def _list_owned(tile: Tile, m: int, side: tuple[int, int], sight: Sight, seen: _
     count, image = 0, sight.images[m]
     for i in range(top, bottom):
         owner, at = sight.owner[i], (i - top) * (right - left) - left
-        x, z = sight.rows[i, 0], sight.rows[i, 1]
         stop = left
         while stop < right:
             start = stop
@@ -218,12 +238,13 @@ def _list_owned(tile: Tile, m: int, side: tuple[int, int], sight: Sight, seen: _
             stop = start
             while stop < right and owner[stop] == image:
                 stop += 1
-            for j in range(start, stop):
-                p = count + j - start
-                pixel[p], weight[p] = at + j, z
-                u[p], v[p] = x * sight.columns[j, 0], x * sight.columns[j, 1]
+            _project(
+                side, sight.matrices[m], sight.rows[i], sight.columns, False,
+                start, stop, count, u, v, weight,
+            )  # fmt: skip
+            for p in range(np.uint64(stop - start)):
+                pixel[np.uint64(count) + p] = at + start + p
             count += stop - start
-    _project(side, sight.matrices[m], False, u[:count], v[:count], weight[:count])
     return count
 
 
@@ -235,23 +256,22 @@ def _list_seen(tile: Tile, m: int, side: tuple[int, int], sight: Sight, seen: _S
     count = 0
     for i in range(top, bottom):
         begin, span = sight.spans[m, i, 0], sight.spans[m, i, 1]
-        ahead = left - begin if left >= begin else left - begin + len(columns)
-        if span == 0 or (ahead >= span and ahead + right - left <= len(columns)):
-            continue
         at = (i - top) * (right - left) - left
-        x, z = sight.rows[i, 0], sight.rows[i, 1]
         for back in range(0, len(columns) + 1, len(columns)):
-            for j in range(max(left, begin - back), min(right, begin + span - back)):
-                pixel[count], u[count], v[count] = at + j, x * columns[j, 0], x * columns[j, 1]
-                weight[count] = z
-                count += 1
-    _project(side, sight.matrices[m], True, u[:count], v[:count], weight[:count])
-    kept = 0
-    for p in range(count):
-        if weight[p] > 0:
-            pixel[kept], u[kept], v[kept], weight[kept] = pixel[p], u[p], v[p], weight[p]
-            kept += 1
-    return kept
+            start, stop = max(left, begin - back), min(right, begin + span - back)
+            if start >= stop:
+                continue
+            _project(
+                side, sight.matrices[m], sight.rows[i], columns, True,
+                start, stop, count, u, v, weight,
+            )  # fmt: skip
+            first = count
+            for p in range(first, first + stop - start):
+                if weight[p] > 0:
+                    u[count], v[count], weight[count] = u[p], v[p], weight[p]
+                    pixel[count] = at + start + p - first
+                    count += 1
+    return count
 
 
 @njit_fast
@@ -356,13 +376,21 @@ def _add_patch(
 
 
 @njit_fast
+def _rank(score: np.float32, k: int) -> np.int64:
+    """Larger for a larger score and, of equal ones, for the first class k; NaN's is the least."""
+    bits = np.float32(score).view(np.int32)
+    size = np.int64(bits & np.int32(0x7FFFFFFF))
+    order = -size if bits < 0 else size
+    return (order << np.int64(32)) - np.int64(k) if score == score else np.int64(-(2**63))
+
+
+@njit_fast
 def _best_class(sums: Array, num_classes: int) -> int:
     """Of the largest sum: the first of equal ones, and NaN never wins."""
-    best, found = np.float32(-np.inf), 0
-    for k in range(num_classes):
-        if sums[k] > best:
-            best, found = sums[k], k
-    return found
+    best = _rank(np.float32(-np.inf), 0)
+    for k in range(np.uint64(num_classes)):  # without branches, which compiles to vector code
+        best = max(best, _rank(sums[k], k))
+    return int(-best & np.int64(0xFFFFFFFF))
 
 
 @njit_fast

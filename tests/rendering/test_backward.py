@@ -47,9 +47,13 @@ def test_equal_infinite_and_nan_scores(dtype: Any, blend: Any) -> None:
     grid = TangentGrid(0, 4)
     scores = np.zeros((20, 18, 16, 16), dtype)
     assert not tangent_to_labels(scores, grid, (16, 32), blend).any()
+    scores[:, 0] = -0.0
+    assert not tangent_to_labels(scores, grid, (16, 32), blend).any()
     scores[:, 0] = -np.inf
     assert (tangent_to_labels(scores, grid, (16, 32), blend) == 1).all()
     scores[:] = np.nan
+    assert not tangent_to_labels(scores, grid, (16, 32), blend).any()
+    scores[:, 17] = -np.inf
     assert not tangent_to_labels(scores, grid, (16, 32), blend).any()
     scores[:, 17] = -5
     assert (tangent_to_labels(scores, grid, (16, 32), blend) == 17).all()
