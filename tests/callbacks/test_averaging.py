@@ -19,6 +19,7 @@ from tangent_train.callbacks.checkpoints import (
     CheckpointContents,
     LastCheckpoint,
 )
+from tests.tasks.shapes import quiet_trainer
 
 DECAY = 0.3  # from the fourth step on: (1 + t) / (10 + t) is less before
 STEPS = 4
@@ -115,19 +116,14 @@ def _trainer(
     last = LastCheckpoint(folder)
     averaging = [] if decay is None else [averaged_weights(decay, torch.device("cpu"))]
     contents = CheckpointContents({"config": {}})
-    quiet: dict[str, Any] = {
-        "max_epochs": 3,
-        "logger": False,
-        "enable_progress_bar": False,
-        "enable_model_summary": False,
-        "accelerator": "cpu",
-        "num_sanity_val_steps": 0,
-        "plugins": [AtomicCheckpointIO()],
-        "callbacks": [
-            *averaging, BestCheckpoint(folder), last, Ending(last, end), contents, *callbacks
-        ],
-    }  # fmt: skip
-    return lightning.Trainer(**(quiet | settings))
+    checkpoints = [BestCheckpoint(folder), last, Ending(last, end), contents]
+    return quiet_trainer(
+        max_epochs=3,
+        enable_checkpointing=True,
+        plugins=[AtomicCheckpointIO()],
+        callbacks=[*averaging, *checkpoints, *callbacks],
+        **settings,
+    )
 
 
 def _read(path: Path) -> dict[str, Any]:

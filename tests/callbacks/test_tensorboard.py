@@ -7,7 +7,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import lightning
 import numpy as np
 import pytest
 import torch
@@ -23,7 +22,7 @@ from tangent_train.rendering import TangentRepresentation
 from tangent_train.results.pictures import prediction_panel
 from tangent_train.tasks import SegmentationTask
 from tests.decoded import decoded
-from tests.tasks.shapes import Shapes, shape_task
+from tests.tasks.shapes import Shapes, quiet_trainer, shape_task
 
 TANGENT = TangentRepresentation(base_level=0, level=4, faces_per_panorama=5)
 STEPS = 3  # of an epoch: 6 panoramas, 2 at a time
@@ -40,24 +39,16 @@ def _panoramas(root: Path) -> Stanford2D3DS:
     return Stanford2D3DS(root, TANGENT, panoramas_per_step=2, validation_fraction=0.35, seed=3)
 
 
-def _fit(
-    folder: Path, data: Any, task: Any, *, count: int = 2, **settings: Any
-) -> lightning.Trainer:
-    trainer = lightning.Trainer(
-        **{"max_epochs": 2} | settings,
-        accelerator="cpu",
+def _fit(folder: Path, data: Any, task: Any, count: int = 2) -> None:
+    trainer = quiet_trainer(
+        max_epochs=2,
         logger=TensorBoardLogger(folder, name="", version="tensorboard"),
         callbacks=[ValidationPictures(count), ClassScores()],
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
         num_sanity_val_steps=1,
-        use_distributed_sampler=False,
         log_every_n_steps=1,
         default_root_dir=folder,
     )
     trainer.fit(task, datamodule=data)
-    return trainer
 
 
 def _events(folder: Path) -> EventAccumulator:
