@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,7 +15,8 @@ from tangent_train.errors import DataError, SettingError, printable
 
 __all__ = ["Origins", "initialize"]
 
-_LISTED = 8
+_NOT_ALL = 0.999
+"""The share is not rounded to all of a network whose small last layer is new."""
 
 
 class Origins(NamedTuple):
@@ -37,12 +38,16 @@ class Origins(NamedTuple):
 
     def __str__(self) -> str:
         """A few lines for the terminal."""
-        lines = [f"loaded: {len(self.loaded)} tensors, {self.share:.0%} of the network's numbers"]
-        for kind, reasons in (("adapted", self.adapted), ("untrained", self.fresh)):
+        share = min(self.share, _NOT_ALL) if self.fresh else self.share
+        lines = [f"loaded: {len(self.loaded)} tensors, {share:.1%} of the network's numbers"]
+        everything = (*self.loaded, *self.adapted, *self.fresh, *self.unused)
+        for kind, reasons in (
+            ("adapted", self.adapted),
+            ("untrained", self.fresh),
+            ("not used", dict.fromkeys(self.unused, "not in the network")),
+        ):
             lines += [f"{kind}: {len(reasons)}"] * bool(reasons)
-            lines += _some([f"  {name}: {reason}" for name, reason in reasons.items()])
-        lines += [f"not used: {len(self.unused)}"] * bool(self.unused)
-        lines += _some([f"  {name}" for name in self.unused])
+            lines += _grouped(reasons, everything)
         return printable("\n".join(lines))
 
 
@@ -50,6 +55,7 @@ def initialize(
     network: nn.Module,
     path: Path | str,
     channels: tuple[Sequence[str], Sequence[str]] | None = None,
+    of_other_classes: Collection[str] = (),
 ) -> Origins:
     """Load matching tensors from a checkpoint, state dict or safetensors file, in place.
 
@@ -65,6 +71,8 @@ def initialize(
         path: The file; only tensors and plain values are read.
         channels: Names of the input channels of the file's network and of this one; filters of the
             first convolution are matched by them. By default they are matched by position.
+        of_other_classes: Names of tensors to leave as they are even where those of the file fit:
+            their scores are of other classes.
 
     Raises:
         DataError: The file cannot be read, or nothing in it fits.
@@ -80,6 +88,8 @@ def initialize(
         given = found.get(name)
         if given is None:
             fresh[name] = "not in the file"
+        elif name in of_other_classes and given.shape == tensor.shape:
+            fresh[name] = "of other classes in the file"
         elif name == stem and _is_stem_of(given, tensor):
             before, now = _channel_names(given, tensor, channels)
             loaded[name], changes = _by_channel(given, before, now)
@@ -102,7 +112,8 @@ def initialize(
         adapted=adapted,
         fresh=fresh,
         unused=tuple(name for name in found if name not in own),
-        share=sum(t.numel() for t in loaded.values()) / sum(t.numel() for t in own.values()),
+        share=sum(min(found[name].numel(), t.numel()) for name, t in loaded.items())
+        / sum(t.numel() for t in own.values()),
     )
 
 
@@ -166,6 +177,21 @@ def _prefix(names: Iterable[str], ends: Mapping[str, object]) -> str:
     return min(counts, key=lambda prefix: (-counts[prefix], len(prefix)), default="")
 
 
-def _some(lines: list[str]) -> list[str]:
-    more = len(lines) - _LISTED
-    return lines[:_LISTED] + ([f"  and {more} more"] if more > 0 else [])
+def _grouped(reasons: Mapping[str, str], everything: Collection[str]) -> list[str]:
+    """A line per tensor, or per module whose tensors all have the same reason."""
+    sizes = Counter(module for name in everything for module in _modules(name))
+    alike = Counter((module, why) for name, why in reasons.items() for module in _modules(name))
+    groups: defaultdict[tuple[str, str], list[str]] = defaultdict(list)
+    for name, why in reasons.items():
+        whole = (m for m in _modules(name) if alike[m, why] == sizes[m])
+        groups[next(whole, name), why].append(name)
+    return [
+        f"  {names[0]}: {why}" if len(names) == 1 else f"  {place} ({len(names)} tensors): {why}"
+        for (place, why), names in groups.items()
+    ]
+
+
+def _modules(name: str) -> list[str]:
+    """Names of the modules that a tensor is in, the largest first."""
+    parts = name.split(".")
+    return [".".join(parts[:k]) for k in range(1, len(parts))]

@@ -130,7 +130,7 @@ def make(settings: Any, place: str, file: SettingsFile | None = None, **given: A
     except (DataError, SettingError):
         raise
     except Exception as error:
-        if file is None:
+        if file is None or not file.owns(place):
             raise
         raise DataError(
             file.path,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from importlib.metadata import version
@@ -26,11 +26,12 @@ from tangent_train.registry import SettingsFile, Text, check_fields, check_plain
 
 __all__ = [
     "METADATA_KEY",
+    "Start",
     "TrainedNetwork",
     "completed_settings",
-    "inputs_in",
     "load_trained",
     "metadata_json",
+    "start_in",
 ]
 
 METADATA_KEY = "tangent_train"
@@ -41,6 +42,9 @@ _PREFIX = "network."
 
 _PRETRAINED = ("weights", "weights_backbone", "encoder_weights", "pretrained")
 """Settings that name trained weights, in models, torchvision, segmentation-models-pytorch, timm."""
+
+_OF_THE_DATA = ("num_classes", "classes", "in_channels")
+"""Settings that the data decides."""
 
 _EXPORTED = "a network written by tangent-export"
 _TRAINED = "a checkpoint written by tangent-train"
@@ -95,6 +99,24 @@ class TrainedNetwork:
         return labels
 
 
+@dataclass(frozen=True)
+class Start:
+    """What a file says of the network that training starts from.
+
+    Attributes:
+        class_names: Names of its labels.
+        inputs: Its inputs; None of shapes.
+        normalization: Their ``mean`` and ``std``.
+        settings: The section of a config that makes it, for any data: null where the data decides
+            (see `completed_settings`), and without other pretrained weights.
+    """
+
+    class_names: tuple[str, ...]
+    inputs: tuple[Input, ...] | None
+    normalization: Mapping[str, Sequence[float]]
+    settings: dict[str, Any]
+
+
 _KINDS = {
     "class_names": list[Text],
     "inputs": INPUTS,
@@ -121,7 +143,7 @@ def completed_settings(
         num_classes: Scores of the network.
         restored: Whether a checkpoint will bring the tensors: no others are fetched first.
     """
-    known = dict.fromkeys(("num_classes", "classes"), num_classes) | {"in_channels": in_channels}
+    known = dict.fromkeys(_OF_THE_DATA, num_classes) | {"in_channels": in_channels}
     unwanted = _PRETRAINED if restored else ()
 
     def complete(value: Any) -> Any:
@@ -168,15 +190,35 @@ def load_trained(path: Path, trust: Collection[str] = ()) -> TrainedNetwork:
         raise DataError(path, found=f"{error}", expected=_TRAINED) from error
 
 
-def inputs_in(path: Path) -> tuple[Input, ...] | None:
-    """Inputs of the network in a checkpoint or safetensors file, if stored."""
+def start_in(path: Path) -> Start | None:
+    """What a checkpoint or safetensors file of this package says of its network; None of others."""
     try:
         if path.suffix.lower() == ".safetensors":
             with _safetensors(path) as file:
-                return tuple(_described(path, (file.metadata() or {}).get(METADATA_KEY))["inputs"])
-        return tuple(read_checkpoint(path, ("inputs",))["inputs"] or ()) or None
+                content = _described(path, (file.metadata() or {}).get(METADATA_KEY))
+        else:
+            content = read_checkpoint(path, ("class_names", "config", "inputs", "normalization"))
+            content["settings"] = content["config"].get("network")
     except DataError:
         return None
+    if not isinstance(content["settings"], Mapping):
+        return None
+    return Start(
+        class_names=tuple(content["class_names"]),
+        inputs=tuple(content["inputs"] or ()) or None,
+        normalization=content["normalization"],
+        settings=_for_any_data(content["settings"]),
+    )
+
+
+def _for_any_data(section: Any) -> Any:
+    """Settings of a network, and of networks inside them, without what the data decides."""
+    if not isinstance(section, Mapping):
+        return section
+    open_ones = (*_OF_THE_DATA, *_PRETRAINED)
+    return {
+        name: None if name in open_ones else _for_any_data(value) for name, value in section.items()
+    }
 
 
 def metadata_json(trained: TrainedNetwork) -> str:

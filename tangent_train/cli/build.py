@@ -15,6 +15,8 @@ from tangent_train.registry import SettingsFile, check_registered, make, maker_o
 
 __all__ = ["Settings", "build"]
 
+_RGB = 3
+
 Settings = Mapping[str, Any]
 """All settings of a run, resolved: plain values in nested sections."""
 
@@ -36,10 +38,16 @@ def build(settings: Settings, source: SettingsFile | None = None) -> tuple[Any, 
     Raises:
         SettingError: A setting, or a combination of settings, is invalid.
     """
+    optimizer = dict(settings["optimizer"])
+    backbone_lr_factor = optimizer.pop("backbone_lr_factor", 1.0)
     parts = {
-        name: make(settings[name], name, source)
-        for name in ("representation", "optimizer", "scheduler")
-        if settings.get(name) is not None
+        name: make(section, name, source)
+        for name, section in (
+            ("representation", settings["representation"]),
+            ("optimizer", optimizer),
+            ("scheduler", settings.get("scheduler")),
+        )
+        if section is not None
     }
     representation = parts["representation"]
     data_set = maker_of(settings["data"], "data", source)
@@ -51,15 +59,22 @@ def build(settings: Settings, source: SettingsFile | None = None) -> tuple[Any, 
     kind = getattr(maker_of(settings["task"], "task", source), "kind", data.kind)
     if kind != data.kind:
         raise SettingError("task", found=f"{kind}, with {data.noun}", expected=data.kind)
-    if source is None:
-        for place in ("data", "network"):
+    for place in ("data", "network"):
+        if source is None or not source.owns(place):
             _check_registered(settings[place], place)
     restored = settings.get("resume") is not None or settings.get("checkpoint") is not None
     network = completed_settings(
         settings["network"], data.in_channels, data.num_classes, restored=restored
     )
     parts["network"] = make(network, "network", source)
-    task = make(settings["task"], "task", source, class_names=data.class_names, **parts)
+    task = make(
+        settings["task"],
+        "task",
+        source,
+        class_names=data.class_names,
+        backbone_lr_factor=backbone_lr_factor,
+        **parts,
+    )
     _try_network(task, data.in_channels)
     return data, task
 
@@ -84,10 +99,13 @@ def _try_network(task: Any, channels: int) -> None:
             except NotImplementedError:  # by an operation that only computes
                 probe = copy.deepcopy(task).eval()
                 probe(images)
-        except RuntimeError as error:
+        except SettingError:
+            raise
+        except (RuntimeError, ValueError) as error:
             raise SettingError(
                 "network",
                 found=f"{type(task.network).__name__}, which does not take {tuple(images.shape)} "
                 f"({str(error).partition(chr(10))[0]})",
                 expected=f"one that maps {task.takes}",
+                remedy="A network for photos takes data.inputs=[rgb]." if channels > _RGB else "",
             ) from error

@@ -15,18 +15,14 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint
-from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import SIGTERMException
-from rich.console import Console
 
-from datamodules.core.inputs import channel_names
-from models import initialize
 from tangent_train.callbacks.averaging import averaged_weights
 from tangent_train.callbacks.checkpoints import BestCheckpoint, LastCheckpoint
 from tangent_train.checkpoints.content import read_checkpoint
-from tangent_train.checkpoints.trained import inputs_in
 from tangent_train.cli.build import Settings
 from tangent_train.cli.evaluate import Run
+from tangent_train.cli.fine_tuning import begin_from, load_start
 from tangent_train.cli.machine import machine_faults
 from tangent_train.cli.sweep import OBJECTIVE_FILE
 from tangent_train.errors import DataError, SettingError
@@ -50,16 +46,22 @@ def train(settings: Settings, source: SettingsFile | None = None) -> float | Non
     Returns:
         The best validation score, which sweeps compare; None without a validation split.
     """
-    resumed = None
+    resumed = start = None
     if settings["resume"] is not None:
         resumed = Path(settings["resume"]) / "checkpoints" / "last.ckpt"
         _check_resumed(settings, read_checkpoint(resumed, ("config",))["config"])
-    run = Run.begin(settings, source)
-    if settings["init_from"] is not None and resumed is None:
+    elif settings["init_from"] is not None:
         start = Path(settings["init_from"])
-        origins = initialize(run.task.network, start, _channels(start, run.data))
-        console = Console(soft_wrap=True, highlight=False)
-        rank_zero_only(console.print)(f"Tensors from {start}\n{origins}", markup=False)
+        settings, source = begin_from(start, settings)
+    run = Run.begin(settings, source)
+    if start is not None:
+        load_start(start, run)
+    elif resumed is None and run.task.backbone_lr_factor != 1:
+        raise SettingError(
+            "optimizer.backbone_lr_factor",
+            found=run.task.backbone_lr_factor,
+            expected="1 without init_from=, which says what the backbone is",
+        )
     checkpoints = run.folder / "checkpoints"
     last = LastCheckpoint(checkpoints, settings["checkpoint_every_n_steps"], _typed_local())
     callbacks = [last, LearningRateMonitor()]
@@ -138,9 +140,3 @@ def _typed_local() -> list[str]:
     names = [said.partition("=")[0] for said in typed]
     pairs = zip(names, typed, strict=True)
     return [said for name, said in pairs if name == "trust" or not from_file(name)]
-
-
-def _channels(path: Path, data: Any) -> Any:
-    """Names of the input channels of a file's network, and of the data."""
-    before, now = inputs_in(path), getattr(data, "inputs", None)
-    return None if before is None or now is None else (channel_names(before), channel_names(now))

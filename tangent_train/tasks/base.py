@@ -5,8 +5,8 @@ from __future__ import annotations
 import inspect
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any, ClassVar, Self
 
 import lightning
 import torch
@@ -17,6 +17,7 @@ from torch.optim.lr_scheduler import LRScheduler
 from datamodules.core.split_module import Kind
 from tangent_train.errors import SettingError
 from tangent_train.tasks.divergence import check_weights, refuse_loss
+from tangent_train.tasks.fine_tuning import freeze, groups_of, rates_of
 
 __all__ = ["Part", "Task"]
 
@@ -43,6 +44,9 @@ class Task(lightning.LightningModule, ABC):
             whole batch. Batch normalization sees one chunk at a time.
         channels_last: Memory format of network and images, often faster.
         compile: Arguments of `torch.compile`, empty for its defaults; None to disable it.
+        frozen: Names of modules and parameters of the network that are not trained; such modules
+            stay in evaluation mode.
+        backbone_lr_factor: Of the learning rate of the parameters that are not `fresh`.
 
     Attributes:
         kind: Kind of labels learned.
@@ -50,6 +54,8 @@ class Task(lightning.LightningModule, ABC):
         takes: Input and output of a network for this task, for messages.
         metric: The torchmetrics class that counts predictions, made from the number of classes.
         matrices: Confusion matrices of `metric` in the last evaluation.
+        fresh: Names of the network's tensors that did not come from the file that the training
+            started from; None where it started from none. Kept in checkpoints.
 
     Raises:
         SettingError: A setting is invalid.
@@ -72,12 +78,21 @@ class Task(lightning.LightningModule, ABC):
         images_per_chunk: int | None = None,
         channels_last: bool = False,
         compile: Mapping[str, Any] | None = None,  # noqa: A002 - torch's own word
+        frozen: Sequence[str] = (),
+        backbone_lr_factor: float = 1.0,
     ) -> None:
         super().__init__()
         if not 0 <= label_smoothing < 1:
             raise SettingError("task.label_smoothing", found=label_smoothing, expected="0 to 1")
         if images_per_chunk is not None and images_per_chunk < 1:
             raise SettingError("task.images_per_chunk", found=images_per_chunk, expected="from 1")
+        if not (isinstance(backbone_lr_factor, int | float) and 0 < backbone_lr_factor < math.inf):
+            raise SettingError(
+                "optimizer.backbone_lr_factor",
+                found=backbone_lr_factor,
+                expected="a number greater than 0",
+                remedy="What is not to be trained at all: task.frozen=[…].",
+            )
         self.memory_format = torch.channels_last if channels_last else torch.contiguous_format
         self.network: nn.Module = network.to(memory_format=self.memory_format)
         if compile is not None:
@@ -88,6 +103,10 @@ class Task(lightning.LightningModule, ABC):
         self.make_scheduler = scheduler
         self.label_smoothing = label_smoothing
         self.images_per_chunk = images_per_chunk
+        self.backbone_lr_factor = backbone_lr_factor
+        self.fresh: Collection[str] | None = None
+        # A tuple: in a list of modules their tensors would have second names.
+        self._frozen = tuple(freeze(self.network, frozen))
         self.confusion: Any = self.metric(len(self.class_names))
         self._pending: tuple[Tensor, Any, Any] | None = None
 
@@ -189,9 +208,23 @@ class Task(lightning.LightningModule, ABC):
         if not math.isfinite(loss):
             refuse_loss(self, float(loss), batch)
 
+    def train(self, mode: bool = True) -> Self:
+        """Switch between training and evaluation; frozen modules stay in evaluation mode."""
+        super().train(mode)
+        for module in self._frozen:
+            module.eval()
+        return self
+
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """See `check_weights`."""
+        """Add `fresh`; see also `check_weights`."""
         check_weights(self)
+        if self.fresh is not None:
+            checkpoint["fresh"] = sorted(self.fresh)
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Take `fresh`, before the optimizer is made."""
+        fresh = checkpoint.get("fresh")
+        self.fresh = None if fresh is None else frozenset(map(str, fresh))
 
     def optimizer_zero_grad(self, *_: Any) -> None:
         """Nothing: `training_step` clears the gradients before its first part."""
@@ -226,13 +259,24 @@ class Task(lightning.LightningModule, ABC):
 
     def optimization(self, count_steps: Callable[[], int]) -> Any:
         """Optimizer and scheduler for any number of steps, asked for only if it is needed."""
-        optimizer = self.make_optimizer(self.parameters())
+        factor = self.backbone_lr_factor
+        trained = {n: p for n, p in self.network.named_parameters() if p.requires_grad}
+        if factor == 1:
+            groups: Any = [{"params": list(trained.values())}]
+        else:
+            groups = groups_of(trained, self.fresh or ())
+        optimizer = self.make_optimizer(groups)
+        factors = [factor if group.get("name") == "backbone" else 1 for group in groups]
+        for group, of_group in zip(optimizer.param_groups, factors, strict=True):
+            group["lr"] *= of_group
         if self.make_scheduler is None:
             return optimizer
         by_step = "total_steps" in inspect.signature(self.make_scheduler).parameters
-        length = {"total_steps": count_steps()} if by_step else {}
+        settings: dict[str, Any] = {"total_steps": count_steps()} if by_step else {}
+        if factor != 1:
+            settings |= rates_of(self.make_scheduler, factors)
         scheduler = {
-            "scheduler": self.make_scheduler(optimizer, **length),
+            "scheduler": self.make_scheduler(optimizer, **settings),
             "interval": "step" if by_step else "epoch",
         }
         return {"optimizer": optimizer, "lr_scheduler": scheduler}

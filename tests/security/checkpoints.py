@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from tangent_train.checkpoints.trained import inputs_in, load_trained
+from tangent_train.checkpoints.trained import load_trained, start_in
 from tangent_train.cli.build import build
 from tangent_train.cli.stored import stored_run
 from tangent_train.errors import DataError, SettingError
@@ -55,5 +55,5 @@ def attack_checkpoints(content: dict[str, Any], forbidden: Path) -> None:
     all_places += [("normalization",), ("normalization", "mean")]
     for place, value in sampled(list(attacks(forbidden)), all_places):
         torch.save(replaced(lighter, place, value), path)
-        for use in (load_trained, evaluated, inputs_in):
+        for use in (load_trained, evaluated, start_in):
             nothing_happens(use, path, forbidden, (place, value))

@@ -13,7 +13,7 @@ import yaml  # type: ignore[import-untyped]
 from safetensors.torch import load_file, save_file
 
 from tangent_train.checkpoints.content import read_settings
-from tangent_train.checkpoints.trained import METADATA_KEY, inputs_in, load_trained
+from tangent_train.checkpoints.trained import METADATA_KEY, load_trained, start_in
 from tangent_train.cli.keypoints import earlier_results
 from tangent_train.rendering.camera_files import read_cameras
 from tangent_train.results.record import load_record
@@ -40,7 +40,7 @@ def test_in_the_metadata_of_an_exported_network(run: Path, forbidden: Path) -> N
         onnx.save(model, other)
         for path in (one, other):
             nothing_happens(load_trained, path, forbidden, (place, value))
-        nothing_happens(inputs_in, one, forbidden, (place, value))
+        nothing_happens(start_in, one, forbidden, (place, value))
 
 
 def test_in_the_settings_of_a_run(run: Path, forbidden: Path) -> None:
