@@ -165,3 +165,44 @@ def test_part_of_a_network_can_be_given(tmp_path: Path) -> None:
     assert set(initialize(network, tmp_path / "x.pt").fresh) == {"head.weight", "head.bias"}
     found = network["encoder"].state_dict()
     torch.testing.assert_close(found, encoder.state_dict(), rtol=0, atol=0)
+
+
+def test_scores_of_other_classes_are_left_out_though_they_fit(tmp_path: Path) -> None:
+    other, network = _network(), _network()
+    torch.save(other.state_dict(), tmp_path / "x.pt")
+    head = {"3.weight": network.state_dict()["3.weight"].clone()}
+    origins = initialize(network, tmp_path / "x.pt", of_other_classes=head)
+    assert origins.fresh == {"3.weight": "of other classes in the file"}
+    assert torch.equal(network.state_dict()["3.weight"], head["3.weight"])
+    assert torch.equal(network.state_dict()["3.bias"], other.state_dict()["3.bias"])
+
+
+def test_every_tensor_that_is_not_loaded_is_named(tmp_path: Path) -> None:
+    """By module where all of one have the same fate."""
+    network = nn.ModuleDict({"encoder": _network(64), "head": nn.Sequential(nn.Linear(2, 2))})
+    found = {f"encoder.{name}": t for name, t in _network(64).state_dict().items()}
+    found["encoder.1.weight"] = torch.ones(7)
+    del found["encoder.3.bias"]
+    found |= {f"aux.{name}": tensor for name, tensor in _network().state_dict().items()}
+    torch.save(found | {"encoder.odd": torch.ones(2)}, tmp_path / "x.pt")
+    lines = str(initialize(network, tmp_path / "x.pt")).splitlines()
+    assert lines[1:] == [
+        "untrained: 4",
+        "  encoder.1.weight: (7,) in the file, (4,) here",
+        "  encoder.3.bias: not in the file",
+        "  head (2 tensors): not in the file",
+        "not used: 12",
+        "  aux (11 tensors): not in the network",
+        "  encoder.odd: not in the network",
+    ]
+
+
+def test_a_network_without_its_last_layer_is_never_all_of_it(tmp_path: Path) -> None:
+    sizes = [nn.Linear(1000, 200), nn.Linear(1, 1, bias=False)]
+    torch.save({"0.weight": sizes[0].weight, "0.bias": sizes[0].bias}, tmp_path / "x.pt")
+    origins = initialize(nn.Sequential(*sizes), tmp_path / "x.pt")
+    assert origins.share == pytest.approx(200_200 / 200_201)
+    assert "loaded: 2 tensors, 99.9% of" in str(origins)
+    torch.save(nn.Sequential(*sizes).state_dict(), tmp_path / "all.pt")
+    whole = initialize(nn.Sequential(*sizes), tmp_path / "all.pt")
+    assert "loaded: 3 tensors, 100.0% of" in str(whole)

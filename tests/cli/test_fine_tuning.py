@@ -1,0 +1,179 @@
+"""What a run takes from the file that it starts from, and what is its own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import OmegaConf
+
+from datamodules.core.inputs import RGBD_NORMALIZATION
+from tangent_train.checkpoints.trained import load_trained
+from tangent_train.cli.build import build
+from tangent_train.cli.compose import config_folder
+from tangent_train.cli.fine_tuning import begin_from
+from tangent_train.errors import DataError, SettingError
+from tangent_train.inference.export import export_network
+from tangent_train.inference.photo_networks import normalization_of
+from tests.cli.imported import UNET, write_imported
+from tests.cli.tiny_runs import SETTINGS, Run, results
+
+IMAGENET = {"mean": [0.485, 0.456, 0.406], "std": [0.229, 0.224, 0.225]}
+
+
+@pytest.fixture
+def imported(tmp_path: Path) -> Path:
+    return write_imported(tmp_path / "net.ckpt")
+
+
+def _begun(monkeypatch: pytest.MonkeyPatch, path: Path, *overrides: str) -> tuple[Any, Any]:
+    """What such a command line begins with: settings, and where they come from."""
+    with initialize_config_dir(str(config_folder()), version_base="1.3"):
+        config = compose("train", ["level=5", *overrides], return_hydra_config=True)
+    monkeypatch.setattr(HydraConfig, "get", lambda: config.hydra)
+    everything: Any = OmegaConf.to_container(config, resolve=False)
+    del everything["hydra"]
+    settings: Any = OmegaConf.to_container(OmegaConf.create(everything), resolve=True)
+    return begin_from(path, settings)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "widths"),
+    [
+        ([], [4, 8, 12]),
+        (["experiment=rooms/demo"], [4, 8, 12]),
+        (["network=unet_small"], [16, 32, 64, 128, 256]),
+        (["network.widths=[4,4]"], [4, 4]),
+        (["experiment=rooms/demo", "+network.widths=[4,4]"], [4, 4]),
+    ],
+)
+def test_the_network_is_the_file_s_unless_one_is_typed(
+    overrides: list[str],
+    widths: list[int],
+    imported: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    export_network(load_trained(imported), tmp_path / "net.safetensors")
+    for path in (imported, tmp_path / "net.safetensors"):
+        settings, source = _begun(monkeypatch, path, *overrides, "data.inputs=[rgb]")
+        assert settings["network"]["widths"] == widths
+        assert settings["data"]["normalization"] == IMAGENET
+        taken = widths == UNET["widths"]
+        said = f"Network of {path}: models.UNet" if taken else "Network of the config: models.UNet"
+        assert said in capsys.readouterr().out
+        assert (source is None) != taken
+        if source is None:
+            continue
+        assert [name for name in settings if source.owns(name)] == ["network"]
+        _, task = build(settings, source)
+        assert task(torch.zeros(1, 3, 32, 32)).shape == (1, 13, 32, 32)
+
+
+def test_depth_is_added_to_a_network_for_photos(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings, _ = _begun(monkeypatch, write_imported(tmp_path / "own.ckpt"))
+    assert settings["network"] == UNET | {"in_channels": None, "num_classes": None}
+    mean, std = RGBD_NORMALIZATION.mean[3], RGBD_NORMALIZATION.std[3]
+    expected = {"mean": [*IMAGENET["mean"], mean], "std": [*IMAGENET["std"], std]}
+    assert settings["data"]["normalization"] == expected
+    other = {
+        "_target_": "torchvision.models.segmentation.lraspp_mobilenet_v3_large",
+        "num_classes": 21,
+        "weights": None,
+        "weights_backbone": None,
+    }
+    path = write_imported(tmp_path / "other.ckpt", other)
+    settings, source = _begun(monkeypatch, path)
+    assert settings["network"]["network"] == other | {"num_classes": None}
+    _, task = build(settings, source)
+    assert task(torch.zeros(1, 4, 32, 32)).shape == (1, 13, 32, 32)
+    settings, _ = _begun(monkeypatch, path, "data.inputs=[rgb]")
+    assert settings["network"] == other | {"num_classes": None}
+
+
+def test_a_network_that_holds_the_file_s_is_kept(
+    imported: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As an experiment with cross-image context that starts from a network without."""
+    with initialize_config_dir(str(config_folder()), version_base="1.3"):
+        config = compose("train", ["level=5"], return_hydra_config=True)
+        context = compose("train", ["network=unet_small_context"])
+    monkeypatch.setattr(HydraConfig, "get", lambda: config.hydra)
+    settings: Any = OmegaConf.to_container(context, resolve=True)
+    begun, source = begin_from(imported, settings)
+    assert begun["network"] == settings["network"]
+    assert source is None
+
+
+def test_one_s_own_normalization_is_kept(imported: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    typed = "+data.normalization={mean: [0.5, 0.5, 0.5], std: [1, 1, 1]}"
+    settings, _ = _begun(monkeypatch, imported, typed, "data.inputs=[rgb]")
+    assert settings["data"]["normalization"]["mean"] == [0.5] * 3
+
+
+def test_files_that_do_not_describe_their_network_change_nothing(
+    imported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tensors = torch.load(imported, weights_only=True)["state_dict"]
+    torch.save(tensors, tmp_path / "state.pt")
+    settings, source = _begun(monkeypatch, tmp_path / "state.pt")
+    assert settings["network"]["widths"] == [16, 32, 64, 128, 256, 256]
+    assert "normalization" not in settings["data"]
+    assert source is None
+    with pytest.raises(DataError, match=r"net\.onnx: found an ONNX file, .*exported from"):
+        _begun(monkeypatch, tmp_path / "net.onnx")
+
+
+def test_classes_of_files_are_called_only_where_they_are_known(
+    imported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    content = torch.load(imported, weights_only=True)
+    content["config"]["network"] = {"_target_": "torch.nn.Flatten"}
+    torch.save(content, tmp_path / "odd.ckpt")
+    begun = _begun(monkeypatch, tmp_path / "odd.ckpt")
+    with pytest.raises(DataError, match=r"odd\.ckpt: found network\..*_target_=torch.nn.Flatten"):
+        build(*begun)
+    begun = _begun(monkeypatch, tmp_path / "odd.ckpt", "trust=[torch.nn.Flatten]")
+    with pytest.raises(SettingError, match=r"scores of the network: found \(1, "):
+        build(*begun)
+
+
+def test_errors_of_one_s_own_settings_do_not_blame_the_file(
+    imported: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun = _begun(monkeypatch, imported, "+task.oddity=1")
+    with pytest.raises(TypeError, match="oddity"):
+        build(*begun)
+
+
+def test_fine_tuning_leaves_a_run_of_its_own(
+    tmp_path: Path, rooms: str, run: Run, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Here with the data's number of classes, but of other names."""
+    path = write_imported(tmp_path / "net.ckpt", UNET | {"num_classes": 13}, 13)
+    typed = [text for text in SETTINGS if "network" not in text]
+    tuned = ["data.inputs=[rgb]", "trainer.max_epochs=1", "task.frozen=[stem,downs]"]
+    slower = ["optimizer.backbone_lr_factor=0.1", "hydra.run.dir=tuned", f"init_from={path}"]
+    run("train", *typed, rooms, *tuned, *slower)
+    assert "  head (2 tensors): of other classes in the file\n" in capsys.readouterr().out
+    path.unlink()
+    checkpoint = tmp_path / "tuned" / "checkpoints" / "best.ckpt"
+    content = torch.load(checkpoint, weights_only=True)
+    assert content["fresh"] == ["head.bias", "head.weight"]
+    trained = load_trained(checkpoint)
+    assert trained.class_names == tuple(content["class_names"])
+    assert trained.normalization == normalization_of("imagenet")
+    run("evaluate", f"checkpoint={checkpoint}", rooms, "hydra.run.dir=again")
+    assert results(tmp_path / "again") == results(tmp_path / "tuned")
+
+
+def test_a_factor_needs_something_to_start_from(rooms: str, run: Run) -> None:
+    with pytest.raises(SystemExit, match=r"backbone_lr_factor: found 0\.5; .*without init_from="):
+        run("train", *SETTINGS, rooms, "optimizer.backbone_lr_factor=0.5")

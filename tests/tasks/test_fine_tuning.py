@@ -1,0 +1,161 @@
+"""Frozen parts of a network, and the learning rates of what was loaded and what is new."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import lightning
+import pytest
+import torch
+from torch import Tensor, nn
+from torch.optim import SGD, Adam
+from torch.optim.lr_scheduler import CosineAnnealingLR, CyclicLR, OneCycleLR, StepLR
+
+from tangent_train.errors import SettingError
+from tests.tasks.shapes import Shapes, quiet_trainer, shape_task
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+pytestmark = pytest.mark.filterwarnings("ignore:Found .* in eval mode")
+FRESH = frozenset({"head.weight", "head.bias"})
+
+
+class WithStatistics(nn.Module):
+    """A small network with batch normalization."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        self.encoder = nn.Sequential(nn.Conv2d(3, 8, 3, stride=2), nn.BatchNorm2d(8), nn.ReLU())
+        self.neck = nn.Sequential(nn.Conv2d(8, 8, 1), nn.BatchNorm2d(8), nn.ReLU())
+        self.head = nn.Linear(8, 3)
+
+    def forward(self, images: Tensor) -> Tensor:
+        features = self.neck(self.encoder(images.flatten(0, 1))).mean(dim=(2, 3))
+        scores: Tensor = self.head(features.unflatten(0, images.shape[:2]).mean(dim=1))
+        return scores
+
+
+def _tensors(task: Any) -> dict[str, Tensor]:
+    return {name: tensor.clone() for name, tensor in task.network.state_dict().items()}
+
+
+def _changed(task: Any, before: dict[str, Tensor]) -> set[str]:
+    now = task.network.state_dict()
+    return {name for name, tensor in before.items() if not torch.equal(tensor, now[name])}
+
+
+@pytest.mark.parametrize("optimizer", [SGD, partial(Adam, weight_decay=0.1)])
+def test_frozen_parts_stay_as_they_are(optimizer: Any) -> None:
+    frozen = ["encoder", "neck.0.weight"]
+    task = shape_task(WithStatistics(), optimizer=partial(optimizer, lr=0.1), frozen=frozen)
+    before = _tensors(task)
+    quiet_trainer(max_epochs=2).fit(task, datamodule=Shapes())
+    still = {name for name in before if name.startswith("encoder")} | {"neck.0.weight"}
+    assert _changed(task, before) == before.keys() - still
+    task.eval()
+    task.train()
+    assert task.network.neck.training
+    assert not any(module.training for module in task.network.encoder.modules())  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        (["enc"], r"task\.frozen: found enc; .* such as encoder, neck, head"),
+        (["encoder.7"], r"found encoder\.7"),
+        ([""], "found an empty name"),
+        (["encoder", "neck", "head"], "found all of the network"),
+    ],
+)
+def test_what_cannot_be_frozen_is_refused(names: list[str], message: str) -> None:
+    with pytest.raises(SettingError, match=message):
+        shape_task(WithStatistics(), frozen=names)
+
+
+def test_names_are_told_inside_what_holds_the_whole_network() -> None:
+    wrapped = nn.ModuleDict({"model": WithStatistics()})
+    with pytest.raises(SettingError, match=r"such as model\.encoder, model\.neck, model\.head"):
+        shape_task(wrapped, frozen=["backbone"])
+
+
+def test_what_was_loaded_takes_smaller_steps() -> None:
+    moved = {}
+    for factor in (1, 0.25):
+        task = shape_task(backbone_lr_factor=factor)
+        task.fresh = FRESH
+        before = _tensors(task)
+        quiet_trainer(max_steps=1, limit_val_batches=0).fit(task, datamodule=Shapes())
+        moved[factor] = {n: t - before[n] for n, t in task.network.state_dict().items()}
+    for name, full in moved[1].items():
+        share = 1 if name in FRESH else 0.25
+        torch.testing.assert_close(moved[0.25][name], share * full, rtol=1e-4, atol=1e-7)
+        assert full.any()
+
+
+@pytest.mark.parametrize(
+    "scheduler",
+    [
+        None,
+        partial(StepLR, step_size=1, gamma=0.5),
+        partial(CosineAnnealingLR, T_max=3),
+        partial(OneCycleLR, max_lr=0.1),
+        partial(CyclicLR, base_lr=0.01, max_lr=0.1, step_size_up=1, cycle_momentum=False),
+    ],
+)
+def test_schedules_move_both_rates(scheduler: Any) -> None:
+    seen: dict[float, list[list[float]]] = {1: [], 0.1: []}
+
+    class Watch(lightning.Callback):
+        def on_train_batch_start(self, trainer: Any, pl_module: Any, *_: Any) -> None:
+            rates = [group["lr"] for group in trainer.optimizers[0].param_groups]
+            seen[pl_module.backbone_lr_factor].append(rates)
+
+    for factor in seen:
+        task = shape_task(scheduler=scheduler, backbone_lr_factor=factor)
+        task.fresh = FRESH
+        quiet_trainer(max_epochs=3, limit_val_batches=0, callbacks=[Watch()]).fit(
+            task, datamodule=Shapes()
+        )
+    assert len(seen[1]) == 9
+    for (whole,), rates in zip(seen[1], seen[0.1], strict=True):
+        assert rates == pytest.approx([0.1 * whole, whole])
+
+
+def test_frozen_and_loaded_parts_together() -> None:
+    for frozen, groups in ((["features"], ["new"]), (["head"], ["backbone"])):
+        task = shape_task(frozen=frozen, backbone_lr_factor=0.5)
+        task.fresh = FRESH
+        found = task.optimization(lambda: 1).param_groups
+        assert [group["name"] for group in found] == groups
+        trained = [p for p in task.network.parameters() if p.requires_grad]
+        assert [id(p) for p in found[0]["params"]] == [id(p) for p in trained]
+
+
+@pytest.mark.parametrize("factor", [0, -1, float("inf"), "small"])
+def test_impossible_factors_are_refused(factor: Any) -> None:
+    with pytest.raises(SettingError, match=r"optimizer\.backbone_lr_factor: .*task\.frozen"):
+        shape_task(backbone_lr_factor=factor)
+
+
+def test_a_resumed_training_has_the_same_groups(tmp_path: Path) -> None:
+    def made(epochs: int) -> tuple[Any, Any]:
+        settings: Any = {"optimizer": partial(Adam, lr=0.01), "frozen": ["encoder.0"]}
+        scheduler = partial(StepLR, step_size=1, gamma=0.5)
+        task = shape_task(WithStatistics(), scheduler=scheduler, backbone_lr_factor=0.1, **settings)
+        return task, quiet_trainer(max_epochs=epochs, limit_val_batches=0)
+
+    whole, trainer = made(2)
+    whole.fresh = FRESH
+    trainer.fit(whole, datamodule=Shapes())
+    half, trainer = made(1)
+    half.fresh = FRESH
+    trainer.fit(half, datamodule=Shapes())
+    trainer.save_checkpoint(tmp_path / "half.ckpt")
+    resumed, trainer = made(2)
+    path = str(tmp_path / "half.ckpt")
+    trainer.fit(resumed, datamodule=Shapes(), ckpt_path=path, weights_only=True)
+    assert resumed.fresh == FRESH
+    torch.testing.assert_close(resumed.state_dict(), whole.state_dict(), rtol=0, atol=0)
