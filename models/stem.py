@@ -75,4 +75,5 @@ def _unfit(network: nn.Module, found: object) -> SettingError:
         f"first convolution of {type(network).__name__}",
         found=found,
         expected="one that takes the three channels of an RGB image",
+        remedy="Networks that only take those need data.inputs=[rgb].",
     )

@@ -137,11 +137,16 @@ def test_classes_of_files_are_called_only_where_they_are_known(
     content = torch.load(imported, weights_only=True)
     content["config"]["network"] = {"_target_": "torch.nn.Flatten"}
     torch.save(content, tmp_path / "odd.ckpt")
-    begun = _begun(monkeypatch, tmp_path / "odd.ckpt")
+    begun = _begun(monkeypatch, tmp_path / "odd.ckpt", "data.inputs=[rgb]")
     with pytest.raises(DataError, match=r"odd\.ckpt: found network\..*_target_=torch.nn.Flatten"):
         build(*begun)
-    begun = _begun(monkeypatch, tmp_path / "odd.ckpt", "trust=[torch.nn.Flatten]")
+    begun = _begun(
+        monkeypatch, tmp_path / "odd.ckpt", "trust=[torch.nn.Flatten]", "data.inputs=[rgb]"
+    )
     with pytest.raises(SettingError, match=r"scores of the network: found \(1, "):
+        build(*begun)
+    begun = _begun(monkeypatch, tmp_path / "odd.ckpt", "trust=[torch.nn.Flatten]")
+    with pytest.raises(SettingError, match=r"of Flatten: found none; .*data\.inputs=\[rgb\]"):
         build(*begun)
 
 

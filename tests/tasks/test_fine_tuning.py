@@ -57,8 +57,9 @@ def test_frozen_parts_stay_as_they_are(optimizer: Any) -> None:
     assert _changed(task, before) == before.keys() - still
     task.eval()
     task.train()
-    assert task.network.neck.training
-    assert not any(module.training for module in task.network.encoder.modules())  # type: ignore[union-attr]
+    network: Any = task.network
+    assert network.neck.training
+    assert not any(module.training for module in network.encoder.modules())
 
 
 @pytest.mark.parametrize(
