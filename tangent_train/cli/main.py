@@ -67,7 +67,7 @@ def _main(command: str) -> None:
             hydra.main(version_base="1.3", config_path=folder, config_name=command)(job)()
         except (HydraException, OmegaConfBaseException) as error:
             cause = str(error.__cause__ or "").partition("\n")[0]
-            sys.exit(f"tangent-{command.partition('_')[0]}: {error}" + f"\n{cause}" * bool(cause))
+            sys.exit(f"tangent-{command}: {error}" + f"\n{cause}" * bool(cause))
         except (NotADirectoryError, PermissionError) as error:
             raise SettingError(
                 error.filename or "output",
@@ -124,7 +124,7 @@ def _refusals(command: str) -> Iterator[None]:
     try:
         yield
     except (DataError, SettingError) as error:
-        sys.exit(f"tangent-{command.partition('_')[0]}: {error}")
+        sys.exit(f"tangent-{command}: {error}")
     except KeyboardInterrupt:
         sys.exit(130)  # as a shell says it; runs have said how to go on
 

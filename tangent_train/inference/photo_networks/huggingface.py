@@ -23,9 +23,10 @@ from tangent_train.registry import SettingsFile, make
 __all__ = ["load"]
 
 _TASK = "the task is semantic"
+_VOCABULARIES = ("tokenizer.json", "vocab.json")
 _BYTE = 255
-_MISSING = 5
-"""Names of missing tensors in a message."""
+_LISTED = 4
+"""Wrong tensors in a message."""
 
 
 def load(*, model: str | None, classes: Path | None, normalization: Any, **_: Any) -> PhotoNetwork:
@@ -141,6 +142,9 @@ def _task(folder: Path, config: Mapping[str, Any]) -> list[int]:
     """The tokens that ask OneFormer for classes (``OneFormerProcessor``)."""
     from transformers import AutoTokenizer
 
+    expected = "the tokenizer of OneFormer, which takes its task as text"
+    if not any((folder / name).is_file() for name in _VOCABULARIES):
+        raise DataError(folder, found=f"no {' or '.join(_VOCABULARIES)}", expected=expected)
     length = config.get("task_seq_len", 77)
     try:
         tokenizer = AutoTokenizer.from_pretrained(
@@ -150,8 +154,8 @@ def _task(folder: Path, config: Mapping[str, Any]) -> list[int]:
     except Exception as error:  # whatever a tokenizer raises about its files
         raise DataError(
             folder,
-            found=f"no tokenizer ({type(error).__name__}: {str(error).partition(chr(10))[0]})",
-            expected="the tokenizer of OneFormer, which takes its task as text",
+            found=f"an unusable tokenizer ({str(error).partition(chr(10))[0]})",
+            expected=expected,
         ) from error
     masked = zip(text["input_ids"], text["attention_mask"], strict=True)
     return [token * mask for token, mask in masked]
@@ -160,20 +164,23 @@ def _task(folder: Path, config: Mapping[str, Any]) -> list[int]:
 def _load_tensors(network: HuggingFaceNetwork, tensors: dict[str, Tensor], folder: Path) -> None:
     """Load weights through transformers, which knows their names in its older versions."""
     inner = network.network
-    try:
-        with _silence():
-            loaded, found = type(inner).from_pretrained(
-                None, config=inner.config, state_dict=tensors, output_loading_info=True
-            )
-    except (RuntimeError, ValueError) as error:
-        missing = [str(error)]
-    else:
-        missing = sorted(found["missing_keys"])
-    if missing:
+    with _silence():
+        loaded, found = type(inner).from_pretrained(
+            None,
+            config=inner.config,
+            state_dict=tensors,
+            output_loading_info=True,
+            ignore_mismatched_sizes=True,
+        )
+    wrong = [f"no {name}" for name in sorted(found["missing_keys"])]
+    for name, given, needed in sorted(found["mismatched_keys"]):
+        wrong.append(f"{name} of shape {tuple(given)} instead of {tuple(needed)}")
+    if wrong:
         raise DataError(
             folder,
-            found=f"weights without {', '.join(missing[:_MISSING])}",
-            expected=f"all of {type(inner).__name__} as config.json describes it",
+            found=f"other weights: {', '.join(wrong[:_LISTED])}",
+            expected=f"those of {type(inner).__name__} as config.json describes it, for the "
+            "classes in its id2label",
         )
     inner.load_state_dict(loaded.state_dict())
 

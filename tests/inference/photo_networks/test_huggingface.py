@@ -1,0 +1,216 @@
+"""Networks of transformers: their library's own scores, from a checkpoint."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import huggingface_hub
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from models import HuggingFaceNetwork
+from models.huggingface import architecture
+from tangent_train.checkpoints.trained import load_trained
+from tangent_train.errors import DataError, SettingError
+from tests.inference.photo_networks import huggingface_networks as networks
+from tests.security.watch import CANARY, watched
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A SegFormer as its library saves it."""
+    networks.saved(networks.segformer, tmp_path / "net")
+    return tmp_path / "net"
+
+
+def test_segformer(tmp_path: Path) -> None:
+    """With a processor that multiplies and normalizes in its own way."""
+    own = {"rescale_factor": 1 / 128, "image_mean": [0.4, 0.5, 0.6], "image_std": [0.2, 0.3, 0.4]}
+    network, processor = networks.saved(networks.segformer, tmp_path, **own)
+    trained = networks.imported(tmp_path)
+    assert trained.class_names == ("unknown", *networks.NAMES)
+    assert trained.image_size == (64, 64)
+    expected = networks.own_scores(network, processor)
+    scores = networks.imported_scores(trained)
+    networks.assert_same(scores, expected)
+
+
+def test_mask2former(tmp_path: Path) -> None:
+    """Its scores are logarithms of shares."""
+    network, processor = networks.saved(networks.mask2former, tmp_path)
+    scores = networks.imported_scores(networks.imported(tmp_path))
+    expected = networks.own_scores(network, processor)
+    networks.assert_same(scores.exp(), expected)
+
+
+def test_float16_weights_are_stored_as_float32(folder: Path) -> None:
+    from tangent_train.inference.photo_networks import huggingface
+
+    weights = folder / "model.safetensors"
+    save_file({n: t.half() for n, t in load_file(weights).items()}, weights, {"format": "pt"})
+    network = huggingface.load(model=str(folder), classes=None, normalization="imagenet")
+    assert network.remarks == ["weights as float16 are stored as float32"]
+    tensors = networks.imported(folder).network.state_dict()
+    assert {t.dtype for t in tensors.values() if t.is_floating_point()} == {torch.float32}
+
+
+def test_another_number_of_classes_for_training(folder: Path) -> None:
+    settings = dict(networks.imported(folder).settings or {})
+    network = HuggingFaceNetwork(settings["config"], num_classes=3)
+    assert network(torch.zeros(2, 3, 33, 40)).shape == (2, 3, 33, 40)
+
+
+def test_a_network_reads_whole_patches_only() -> None:
+    made = networks.beit()[0]
+    network = HuggingFaceNetwork(architecture(made.config.to_dict()), 6)
+    with pytest.raises(SettingError, match="found 64×70; expected multiples of 16 pixels"):
+        network(torch.zeros(1, 3, 64, 70))
+
+
+@pytest.mark.parametrize(
+    ("file", "changes", "message"),
+    [
+        ("config.json", {"id2label": {"0": "wall", "2": "floor"}}, "id2label.*name of every score"),
+        ("config.json", {"id2label": None}, "id2label: None"),
+        (
+            "config.json",
+            {"id2label": {"0": "wall", "1": "floor"}},
+            r"classifier.weight of shape \(6, 16, 1, 1\) instead of \(2,",
+        ),
+        (
+            "config.json",
+            {"depths": [1, 1, 1, 2]},
+            "other weights: no segformer.*expected those of SegformerFor",
+        ),
+        ("config.json", {"model_type": "bert"}, "model_type: found bert; expected a network for"),
+        ("config.json", {"depths": "many"}, "config.json: found network"),
+        ("config.json", {"hidden_act": "https://x.org/gelu"}, "config.json: found network.config"),
+        ("preprocessor_config.json", {"image_mean": [0.5]}, "no normalization in"),
+        ("preprocessor_config.json", {"image_mean": None}, "no normalization in"),
+        ("preprocessor_config.json", {"image_std": [0, 1, 1]}, "no normalization in"),
+        ("preprocessor_config.json", {"rescale_factor": 0}, "no normalization in"),
+        ("preprocessor_config.json", {"size": {"height": 0, "width": 4}}, "found size: "),
+        ("preprocessor_config.json", {"size": None}, "found size: None"),
+    ],
+)
+def test_settings_that_do_not_fit(
+    file: str, changes: dict[str, Any], message: str, folder: Path
+) -> None:
+    networks.change_json(folder / file, **changes)
+    with pytest.raises((DataError, SettingError), match=message):
+        networks.imported(folder)
+
+
+def test_files_that_are_missing(folder: Path, tmp_path: Path) -> None:
+    weights = folder / "model.safetensors"
+    weights.rename(folder / "pytorch_model.bin")
+    with pytest.raises(DataError, match=r"found pytorch_model\.bin, no model\.safetensors.*save_"):
+        networks.imported(folder)
+    (folder / "pytorch_model.bin").rename(weights)
+    (folder / "preprocessor_config.json").rename(tmp_path / "elsewhere.json")
+    with pytest.raises(DataError, match=r"no preprocessor_config\.json.*Copy that file"):
+        networks.imported(folder)
+    nested = {"image_processor": json.loads((tmp_path / "elsewhere.json").read_text())}
+    (folder / "processor_config.json").write_text(json.dumps(nested))
+    assert networks.imported(folder).image_size == (64, 64)
+    (folder / "config.json").write_text("[1, 2]")
+    with pytest.raises(DataError, match=r"config\.json: found list; expected a JSON object"):
+        networks.imported(folder)
+    (folder / "config.json").unlink()
+    with pytest.raises(DataError, match=r"config\.json: found no such file"):
+        networks.imported(folder)
+
+
+def test_names_of_another_number_of_scores(folder: Path, tmp_path: Path) -> None:
+    classes = tmp_path / "classes.json"
+    classes.write_text('["wall", "floor"]')
+    with pytest.raises(SettingError, match="found 2, for 6 scores"):
+        networks.imported(folder, classes=classes)
+
+
+def test_a_model_that_cannot_be_fetched(monkeypatch: pytest.MonkeyPatch) -> None:
+    def gated(name: str, **_: Any) -> None:
+        raise OSError(f"403: you must accept the terms of {name}\nand more")
+
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", gated)
+    with pytest.raises(DataError) as refused:
+        networks.imported(Path("someone/net"))
+    said = str(refused.value)
+    assert "someone/net: found no such folder, and no way to fetch it (OSError: 403:" in said
+    assert "run `hf download someone/net --local-dir net`" in said
+
+
+def test_a_model_of_the_hub(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: dict[str, Any] = {}
+
+    def fetch(name: str, *, allow_patterns: list[str]) -> str:
+        asked[name] = allow_patterns
+        return str(folder)
+
+    from tangent_train.inference.photo_networks import huggingface
+
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", fetch)
+    network = huggingface.load(model="someone/net", classes=None, normalization=None)
+    assert tuple(network.score_names) == networks.NAMES
+    (patterns,) = asked.values()
+    assert not [p for p in patterns if p.endswith((".py", ".bin", "*"))]
+
+
+def test_without_transformers(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "transformers", None)
+    with pytest.raises(SettingError, match=r"pip install 'tangent-train\[huggingface\]'"):
+        networks.imported(folder)
+
+
+def test_nothing_in_a_folder_or_checkpoint_runs_or_fetches(folder: Path, tmp_path: Path) -> None:
+    """Settings of transformers that name code, kernels, and backbones on the hub."""
+    attack = {
+        "auto_map": {"AutoConfig": f"{CANARY}.Config", "AutoModelForSemanticSegmentation": CANARY},
+        "trust_remote_code": True,
+        "backbone": CANARY,
+        "use_timm_backbone": False,
+        "use_pretrained_backbone": True,
+        "attn_implementation": f"{CANARY}/kernel",
+        "_attn_implementation": f"{CANARY}/kernel",
+        "quantization_config": {"quant_method": CANARY},
+        "_name_or_path": str(tmp_path / "forbidden"),
+    }
+    networks.change_json(folder / "config.json", **attack)
+    networks.change_json(
+        folder / "preprocessor_config.json",
+        auto_map={"AutoImageProcessor": f"{CANARY}.Processor"},
+        image_processor_type=f"{CANARY}Processor",
+    )
+    (folder / f"{CANARY}.py").write_text("raise SystemExit")
+    path = folder / "imported.ckpt"
+    with watched(tmp_path / "forbidden") as happened:
+        networks.imported(folder)
+        content = torch.load(path, weights_only=True)
+        inner = content["config"]["network"]["config"]
+        assert not {"auto_map", "backbone", "_attn_implementation"} & set(inner)
+        inner.update(backbone=CANARY, use_timm_backbone=False, attn_implementation=CANARY)
+        torch.save(content, path)
+        load_trained(path)
+    assert happened == []
+    for name, value in (("auto_map", {"AutoConfig": {"_target_": "os.system"}}), ("_x", 1)):
+        torch.save(content | {"config": _with(content["config"], name, value)}, path)
+        with pytest.raises(DataError, match=r"network\.config"):
+            load_trained(path)
+
+
+def test_backbones_are_not_looked_up_by_name(tmp_path: Path) -> None:
+    config: dict[str, Any] = {"model_type": "dpt", "is_hybrid": True, "backbone": CANARY}
+    config |= {"use_timm_backbone": False, "use_pretrained_backbone": True}
+    with watched(tmp_path) as happened, torch.device("meta"):
+        HuggingFaceNetwork(config, num_classes=2)
+    assert happened == []
+
+
+def _with(config: dict[str, Any], name: str, value: Any) -> dict[str, Any]:
+    """A config with another setting of transformers."""
+    network = config["network"]
+    return config | {"network": network | {"config": network["config"] | {name: value}}}
