@@ -114,8 +114,9 @@ class _Means:
     def add(self, results: NDArray[Any], faces: NDArray[np.int64]) -> None:
         """Add those of some images."""
         _check_alike(results, self._channels, "f")
-        stack = results.reshape(*results.shape[:3], -1).astype(np.float32, copy=False)
-        stack = np.ascontiguousarray(np.moveaxis(stack, -1, 1))
+        stack = np.moveaxis(results.reshape(*results.shape[:3], -1), -1, 1)
+        # Writeable: of others numba would compile the kernel anew.
+        stack = np.require(stack, np.float32, ["C", "W"])
         rows = slice(0, self._shape[0])
         add_to_panorama(stack, self._grid, faces, self._shape, rows, self._owner, self._sums)
 

@@ -98,6 +98,15 @@ def test_tensors_get_what_arrays_get(network: Network) -> None:
     np.testing.assert_array_equal(network.labels(photo, fov=60).numpy(), expected)
 
 
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_a_gpu_gives_what_the_cpu_gives(tmp_path: Path, network: Network) -> None:
+    panorama = torch.from_numpy(_sphere(33)).permute(2, 0, 1)
+    on_gpu = tt.load(tmp_path / "net.ckpt", device="cuda").labels(panorama.cuda())
+    assert on_gpu.is_cuda
+    assert (on_gpu.cpu() == network.labels(panorama)).double().mean() > 0.99
+
+
 def test_nothing_changes_at_180_degrees(network: Network) -> None:
     panorama = _sphere(64)
     there = network.labels(np.roll(panorama, 64, axis=1))

@@ -11,6 +11,7 @@ from tangent_train.metrics import ConfusionMatrix
 from tangent_train.rendering import (
     Blend,
     Interpolation,
+    apply,
     equirect_to_tangent,
     tangent_to_equirect,
     tangent_to_labels,
@@ -61,6 +62,15 @@ def test_labels_of_any_precision(blend: Blend, classes: int, dtype: torch.dtype)
     on_gpu = tangent_to_labels(scores.cuda(), GRID, SHAPE, blend).cpu()
     least = 0.9999 if dtype == torch.float32 else 0.98  # what is rounded ties more often
     assert (on_gpu == expected).double().mean() > least
+
+
+@pytest.mark.parametrize("blend", ["nearest", "feather"])
+def test_functions_of_images(blend: Blend) -> None:
+    panorama = _random(3, *SHAPE)
+    expected = apply(torch.sin, panorama, GRID, blend)
+    on_gpu = apply(torch.sin, panorama.cuda(), GRID, blend)
+    assert on_gpu.is_cuda
+    torch.testing.assert_close(on_gpu.cpu(), expected)
 
 
 def test_confusion_matrices() -> None:
