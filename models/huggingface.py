@@ -124,7 +124,7 @@ class HuggingFaceNetwork(nn.Module):
         self.register_buffer("_task", tokens, persistent=False)
 
     def forward(
-        self, images: Float[Tensor, "batch 3 height width"]
+        self, images: Float[Tensor, "batch channels height width"]
     ) -> Float[Tensor, "batch classes height width"]:
         """Scores of every pixel of the images.
 

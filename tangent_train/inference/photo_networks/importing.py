@@ -99,7 +99,7 @@ def import_network(
         else:
             _write_checkpoint(network, temporary, names, groups, view)
         trained = load_trained(temporary)
-        _use(trained, view)
+        _use(trained, view, network.image_size)
     source = None if trained.source is None else replace(trained.source, path=path)
     return Imported(replace(trained, source=source), tuple(nothing), view)
 
@@ -172,10 +172,19 @@ def _groups(
     return names, [[k] for k, _ in kept] + empty
 
 
-def _use(trained: TrainedNetwork, view: View) -> None:
+@torch.no_grad()
+def _use(trained: TrainedNetwork, view: View, photos: tuple[int, int]) -> None:
     """Label one image as the commands will."""
-    with torch.no_grad():
+    try:
         trained.network(torch.zeros(1, 3, view.dim, view.dim))
+    except (RuntimeError, ValueError) as error:
+        raise SettingError(
+            "level, base_level",
+            found=f"tangent images of {view.dim}×{view.dim}, which the network does not take "
+            f"({str(error).partition(chr(10))[0]})",
+            expected=f"its own images, of {'×'.join(map(str, photos))}",
+            remedy="Leave base_level null, or make it larger.",
+        ) from error
 
 
 def _representation(view: View) -> dict[str, Any]:

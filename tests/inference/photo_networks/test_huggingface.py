@@ -16,6 +16,7 @@ from models import HuggingFaceNetwork
 from models.huggingface import architecture
 from tangent_train.checkpoints.trained import load_trained
 from tangent_train.errors import DataError, SettingError
+from tangent_train.inference.photo_networks import huggingface, import_network
 from tests.inference.photo_networks import huggingface_networks as networks
 from tests.security.watch import CANARY, watched
 
@@ -47,9 +48,17 @@ def test_mask2former(tmp_path: Path) -> None:
     networks.assert_same(scores.exp(), expected)
 
 
-def test_float16_weights_are_stored_as_float32(folder: Path) -> None:
-    from tangent_train.inference.photo_networks import huggingface
+def test_a_network_for_images_of_one_size(tmp_path: Path) -> None:
+    networks.saved(networks.eomt, tmp_path)
+    trained = networks.imported(tmp_path)
+    assert trained.fixed_size == trained.image_size == (64, 64)
+    network = huggingface.load(model=str(tmp_path), classes=None, normalization=None)
+    with pytest.raises(SettingError, match=r"256×256, which .*; expected its own images, of 64×64"):
+        import_network(network, tmp_path / "large.ckpt", level=8, base_level=0)
+    assert not (tmp_path / "large.ckpt").exists()
 
+
+def test_float16_weights_are_stored_as_float32(folder: Path) -> None:
     weights = folder / "model.safetensors"
     save_file({n: t.half() for n, t in load_file(weights).items()}, weights, {"format": "pt"})
     network = huggingface.load(model=str(folder), classes=None, normalization="imagenet")
@@ -150,8 +159,6 @@ def test_a_model_of_the_hub(folder: Path, tmp_path: Path, monkeypatch: pytest.Mo
     def fetch(name: str, *, allow_patterns: list[str]) -> str:
         asked[name] = allow_patterns
         return str(folder)
-
-    from tangent_train.inference.photo_networks import huggingface
 
     monkeypatch.setattr(huggingface_hub, "snapshot_download", fetch)
     network = huggingface.load(model="someone/net", classes=None, normalization=None)
