@@ -71,15 +71,27 @@ def test_panoramas_get_the_labels_and_scores_of_tangent_predict(
     np.testing.assert_allclose(scores.sum(axis=-1), 1, atol=1e-5)
 
 
-@pytest.mark.parametrize("fov", [65, 120.5])
+@pytest.mark.parametrize(
+    ("fov", "typed", "settings"),
+    [
+        (65, [], {}),
+        (120.5, ["level=5", "blend=nearest"], {"level": 5, "blend": "nearest"}),
+        (65, ["base_level=1"], {"base_level": 1}),
+    ],
+)
 def test_photos_get_the_labels_of_tangent_predict(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fov: float, network: Network
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    fov: float,
+    typed: list[str],
+    settings: dict[str, Any],
 ) -> None:
+    network = tt.load(write_checkpoint(tmp_path / "net.ckpt"), **settings)
     photo = _sphere(40)[:, :57]
     cv2.imwrite(str(tmp_path / "photo.png"), photo[..., ::-1])
     monkeypatch.chdir(tmp_path)
     given = ["checkpoint=net.ckpt", "input=photo.png", "output=out", "report=0", f"fov={fov}"]
-    run_command(monkeypatch, "predict", *given, "projection=perspective")
+    run_command(monkeypatch, "predict", *given, "projection=perspective", *typed)
     expected = cv2.imread("out/labels/photo.png", cv2.IMREAD_UNCHANGED)
     np.testing.assert_array_equal(network.labels(photo, fov=fov), expected)
     assert network.scores(photo, fov=fov).shape == (40, 57, 3)
@@ -111,6 +123,16 @@ def test_nothing_changes_at_180_degrees(network: Network) -> None:
     panorama = _sphere(64)
     there = network.labels(np.roll(panorama, 64, axis=1))
     assert (np.roll(there, -64, axis=1) == network.labels(panorama)).mean() > 0.97
+
+
+def test_no_more_images_than_asked_for_are_in_memory(tmp_path: Path) -> None:
+    network = tt.load(write_checkpoint(tmp_path / "net.ckpt"), images_per_forward=7)
+    counts: list[int] = []
+    network.trained.network.register_forward_pre_hook(
+        lambda _, images: counts.append(len(images[0]))
+    )
+    network.labels(_sphere(32))
+    assert counts == [7, 7, 6]
 
 
 @pytest.mark.parametrize("height", [1, 16, 75])
