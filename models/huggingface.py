@@ -135,7 +135,7 @@ class HuggingFaceNetwork(nn.Module):
             SettingError: The images are not divisible into the network's patches.
         """
         if self._bgr:
-            images = images.flip(1)
+            images = torch.cat([images[:, :3].flip(1), images[:, 3:]], dim=1)
         size = (images.shape[-2], images.shape[-1])
         if any(side % self._patch for side in size):
             raise SettingError(

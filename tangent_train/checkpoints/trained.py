@@ -213,7 +213,7 @@ def start_in(path: Path) -> Start | None:
 
 def _for_any_data(section: Any) -> Any:
     """Settings of a network, and of networks inside them, without what the data decides."""
-    if not isinstance(section, Mapping):
+    if not isinstance(section, Mapping) or "_target_" not in section:
         return section
     open_ones = (*_OF_THE_DATA, *_PRETRAINED)
     return {

@@ -118,9 +118,11 @@ def _of_channels(start: Start, data: Mapping[str, Any]) -> dict[str, Any]:
     return {"_target_": "models.widen_stem", "in_channels": None, "network": start.settings}
 
 
-def _has(section: Mapping[str, Any], name: str) -> bool:
-    inner = [value for value in section.values() if isinstance(value, Mapping)]
-    return name in section or any(_has(value, name) for value in inner)
+def _has(section: Any, name: str) -> bool:
+    """Whether a network, or one inside it, has a setting."""
+    if not isinstance(section, Mapping) or "_target_" not in section:
+        return False
+    return name in section or any(_has(value, name) for value in section.values())
 
 
 def _normalization(start: Start, data: Mapping[str, Any]) -> dict[str, list[float]] | None:

@@ -35,7 +35,7 @@ def freeze(network: nn.Module, names: Iterable[str]) -> list[nn.Module]:
             raise SettingError(
                 "task.frozen",
                 found=name or "an empty name",
-                expected=f"names of modules or parameters, such as {', '.join(_parts(network))}",
+                expected=f"modules or parameters, such as {', '.join(_near(name, modules))}",
             )
         if name in modules:
             frozen.append(modules[name].requires_grad_(False).eval())
@@ -44,6 +44,13 @@ def freeze(network: nn.Module, names: Iterable[str]) -> list[nn.Module]:
     if parameters and not any(parameter.requires_grad for parameter in parameters.values()):
         raise SettingError("task.frozen", found="all of the network", expected="parts of it")
     return frozen
+
+
+def _near(name: str, modules: Mapping[str, nn.Module]) -> list[str]:
+    """What there is where a name is wrong: the parts of the last module in it that exists."""
+    while name not in modules:
+        name = name.rpartition(".")[0]
+    return _parts(modules[name], f"{name}." if name else "") or [name]
 
 
 def _parts(network: nn.Module, prefix: str = "") -> list[str]:

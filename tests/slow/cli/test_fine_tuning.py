@@ -1,0 +1,131 @@
+"""From an imported photo network to a fine-tuned one in other programs' formats."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from transformers import SegformerConfig
+
+from models.huggingface import architecture
+from tangent_train.checkpoints.trained import load_trained
+from tests.cli.imported import write_imported
+from tests.cli.test_commands import CUT_SHORT
+from tests.cli.tiny_runs import SETTINGS, results, run_command
+
+TYPED = [text for text in SETTINGS if "network" not in text]
+TUNED = (
+    "task.frozen=[stem,downs.0]",
+    "optimizer.backbone_lr_factor=0.1",
+    "data.inputs=[rgb]",
+    "ema=0.9",
+    "init_from=net.ckpt",
+)
+
+
+@pytest.fixture(scope="module")
+def tuned(rooms: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a run that was fine-tuned, ``whole``; the imported network is gone."""
+    folder = tmp_path_factory.mktemp("tuned")
+    write_imported(folder / "net.ckpt")
+    (folder / "cut_short.py").write_text(CUT_SHORT)
+    command = [sys.executable, "cut_short.py", *TYPED, *TUNED, rooms, "hydra.run.dir=cut"]
+    cut = subprocess.run(command, check=False, cwd=folder, capture_output=True, text=True)
+    assert "all up to here; resume with" in cut.stderr, cut.stderr
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        run_command(patch, "train", *TYPED, *TUNED, rooms, "hydra.run.dir=whole")
+    (folder / "net.ckpt").unlink()
+    return folder
+
+
+def _last(run: Path) -> dict[str, Any]:
+    content: dict[str, Any] = torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)
+    return content
+
+
+def test_it_is_resumed_exactly_without_the_imported_file(
+    tuned: Path, rooms: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tuned)
+    before = _last(tuned / "cut")
+    assert before["global_step"] == 2
+    run_command(monkeypatch, "train", "resume=cut", rooms, "trainer.accelerator=cpu")
+    found, expected = _last(tuned / "cut"), _last(tuned / "whole")
+    torch.testing.assert_close(found["state_dict"], expected["state_dict"], rtol=0, atol=0)
+    now, then = (content["optimizer_states"][0] for content in (found, expected))
+    torch.testing.assert_close(now["state"], then["state"], rtol=0, atol=0)
+    assert now["param_groups"] == then["param_groups"]
+    for part in ("lr_schedulers", "fresh"):
+        assert found[part] == expected[part]
+    assert results(tuned / "cut") == results(tuned / "whole")
+    groups = expected["optimizer_states"][0]["param_groups"]
+    assert [group["name"] for group in groups] == ["backbone", "new"]
+    assert groups[0]["lr"] == pytest.approx(groups[1]["lr"] / 10)
+    frozen = [name for name in before["state_dict"] if ".stem." in name or ".downs.0." in name]
+    assert len(frozen) > 10
+    for name in frozen:
+        assert torch.equal(before["state_dict"][name], expected["state_dict"][name]), name
+
+
+def _labels(folder: Path) -> NDArray[np.uint8]:
+    labels = cv2.imread(str(folder / "labels" / "x.png"), cv2.IMREAD_UNCHANGED)
+    assert labels is not None
+    return labels.astype(np.uint8)
+
+
+def test_it_is_exported_without_the_imported_file(
+    tuned: Path, rooms: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tuned)
+    checkpoint = Path("whole") / "checkpoints" / "best.ckpt"
+    run_command(monkeypatch, "evaluate", f"checkpoint={checkpoint}", rooms, "hydra.run.dir=again")
+    assert results(tuned / "again") == results(tuned / "whole")
+    colours = np.random.default_rng(0).integers(0, 256, (32, 64, 3), np.uint8)
+    Path("in").mkdir()
+    cv2.imwrite("in/x.png", colours)
+    labels = {}
+    for name in ("best.ckpt", "x.onnx", "x.safetensors"):
+        if name != checkpoint.name:
+            run_command(monkeypatch, "export", f"checkpoint={checkpoint}", f"output={name}")
+        given = checkpoint if name == checkpoint.name else name
+        run_command(
+            monkeypatch, "predict", f"checkpoint={given}", "input=in", f"output=labels_{name}"
+        )
+        labels[name] = _labels(Path(f"labels_{name}"))
+    assert len(np.unique(labels["best.ckpt"])) > 1
+    assert (labels["best.ckpt"] == labels["x.safetensors"]).all()
+    assert (labels["best.ckpt"] == labels["x.onnx"]).mean() > 0.999
+    again = ["init_from=x.safetensors", "hydra.run.dir=tuned_again", "trainer.max_epochs=1"]
+    run_command(monkeypatch, "train", *TYPED, rooms, "data.inputs=[rgb]", *again)
+    assert _last(tuned / "tuned_again")["fresh"] == []
+
+
+def test_a_network_of_transformers_learns_other_classes_from_depth_too(
+    rooms: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sizes = {"hidden_sizes": [8, 8, 16, 16], "depths": [1] * 4, "decoder_hidden_size": 16}
+    heads = {"num_attention_heads": [1] * 4, "sr_ratios": [2, 1, 1, 1]}
+    config = architecture(SegformerConfig(**sizes, **heads).to_dict())
+    section = {"_target_": "models.HuggingFaceNetwork", "config": config, "num_classes": 21}
+    monkeypatch.chdir(tmp_path)
+    write_imported(Path("net.ckpt"), section)
+    typed = ["network.segformer.stages.1", "optimizer.backbone_lr_factor=0.1"]
+    tuned = [f"task.frozen=[{typed[0]}]", typed[1], "trainer.max_epochs=1", "hydra.run.dir=run"]
+    run_command(monkeypatch, "train", *TYPED, rooms, *tuned, "init_from=net.ckpt")
+    said = capsys.readouterr().out
+    assert "patch_embeddings.proj.weight: starts at zero: depth" in said
+    assert "network.decode_head.classifier.weight: (21, 16, 1, 1) in the file" in said
+    Path("net.ckpt").unlink()
+    content = _last(Path("run"))
+    assert len(content["fresh"]) == 2
+    assert all("decode_head.classifier" in name for name in content["fresh"])
+    trained = load_trained(Path("run") / "checkpoints" / "best.ckpt")
+    assert trained.network(torch.zeros(1, 4, 64, 64)).shape == (1, 13, 64, 64)
