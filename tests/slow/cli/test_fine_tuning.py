@@ -111,8 +111,8 @@ def test_it_is_exported_without_the_imported_file(
 def test_a_network_of_transformers_learns_other_classes_from_depth_too(
     rooms: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    sizes = {"hidden_sizes": [8, 8, 16, 16], "depths": [1] * 4, "decoder_hidden_size": 16}
-    heads = {"num_attention_heads": [1] * 4, "sr_ratios": [2, 1, 1, 1]}
+    sizes: Any = {"hidden_sizes": [8, 8, 16, 16], "depths": [1] * 4, "decoder_hidden_size": 16}
+    heads: Any = {"num_attention_heads": [1] * 4, "sr_ratios": [2, 1, 1, 1]}
     config = architecture(SegformerConfig(**sizes, **heads).to_dict())
     section = {"_target_": "models.HuggingFaceNetwork", "config": config, "num_classes": 21}
     monkeypatch.chdir(tmp_path)
