@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import torch
@@ -17,9 +17,11 @@ from datamodules.images.palette import class_colors
 from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
 from tangent_train.errors import SettingError
 from tangent_train.geometry import camera_matrix_from_fov
+from tangent_train.inference.class_maps import Unmapped, load_class_map, map_classes
 from tangent_train.inference.predictor import Predictor
 from tangent_train.inference.views import InputImage, PanoramaViews, PhotoViews
 from tangent_train.rendering import Blend
+from tangent_train.rendering.checks import check_choice
 from tangent_train.rendering.forward import Pixels
 from tangent_train.rendering.mosaic import ScoreMosaic
 
@@ -32,6 +34,8 @@ Depth = Tensor | NDArray[Any] | None
 def load(
     path: str | Path,
     *,
+    class_map: str | Path | None = None,
+    unmapped: Unmapped = "unknown",
     device: str = "cpu",
     level: int | None = None,
     levels: Sequence[int] | None = None,
@@ -47,6 +51,10 @@ def load(
 
     Args:
         path: A checkpoint, or what ``tangent-export`` or ``tangent-import`` wrote.
+        class_map: Labels of another data set: the name of a map, or a JSON file, see
+            `class_maps.load_class_map`.
+        unmapped: Classes that the map does not name are ``unknown``, label 0, where they win; or
+            they ``never`` win.
         device: A torch device, or ``auto``: a GPU if there is one.
         level: Level s, the angular resolution; None as trained.
         levels: Several to average over, instead; of panoramas.
@@ -58,10 +66,13 @@ def load(
         trust: Full names of classes of other packages that the file may name.
 
     Raises:
-        DataError: The file cannot be used.
+        DataError: A file cannot be used.
         SettingError: A setting does not suit the network.
     """
+    check_choice("unmapped", unmapped, get_args(Unmapped))
     trained = load_trained(Path(path), (trust,) if isinstance(trust, str) else trust)
+    if class_map is not None:
+        trained = map_classes(trained, load_class_map(str(class_map)), unmapped).trained
     views = PanoramaViews(trained, levels or (level,), base_level, blend, rotations)
     return Network(
         trained,

@@ -16,17 +16,35 @@ from tests.cli.tiny_runs import run_command
 from tests.inference.trained import CLASS_NAMES, CUBE, ERP, PERSPECTIVE, TANGENT, write_checkpoint
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from numpy.typing import NDArray
 
     from tangent_train.inference.network import Network
 
+    Predicted = Callable[..., tuple[NDArray[Any], NDArray[Any]]]
+
 
 def _sphere(height: int) -> NDArray[np.uint8]:
     """Colours that are smooth on the sphere."""
     x, y, z = np.moveaxis(equirect_directions((height, 2 * height)), -1, 0)
     return np.stack([128 + 120 * x, 128 + 120 * y * z, 128 + 120 * z], axis=-1).astype(np.uint8)
+
+
+@pytest.fixture
+def predicted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Predicted:
+    """Labels and probabilities that `tangent-predict` writes of an image, with ``net.ckpt``."""
+
+    def run(rgb: NDArray[np.uint8], *typed: str) -> tuple[NDArray[Any], NDArray[Any]]:
+        monkeypatch.chdir(tmp_path)
+        cv2.imwrite("room.png", rgb[..., ::-1])
+        given = ["checkpoint=net.ckpt", "input=room.png", "output=out", "probabilities=true"]
+        run_command(monkeypatch, "predict", *given, "report=0", *typed)
+        labels: Any = cv2.imread("out/labels/room.png", cv2.IMREAD_UNCHANGED)
+        return labels, np.load("out/probabilities/room.npy")
+
+    return run
 
 
 @pytest.fixture
@@ -47,19 +65,14 @@ def network(tmp_path: Path) -> Network:
 )
 def test_panoramas_get_the_labels_and_scores_of_tangent_predict(
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    predicted: Predicted,
     representation: dict[str, Any],
     typed: list[str],
     settings: dict[str, Any],
 ) -> None:
-    checkpoint = write_checkpoint(tmp_path / "net.ckpt", representation)
+    network = tt.load(write_checkpoint(tmp_path / "net.ckpt", representation), **settings)
     panorama = _sphere(50)
-    cv2.imwrite(str(tmp_path / "room.png"), panorama[..., ::-1])
-    monkeypatch.chdir(tmp_path)
-    given = [f"checkpoint={checkpoint}", "input=room.png", "output=out", "probabilities=true"]
-    run_command(monkeypatch, "predict", *given, "report=0", *typed)
-    expected = cv2.imread("out/labels/room.png", cv2.IMREAD_UNCHANGED)
-    network = tt.load(checkpoint, **settings)
+    expected, probabilities = predicted(panorama, *typed)
     labels = network.labels(panorama)
     assert labels.dtype == np.uint8
     np.testing.assert_array_equal(labels, expected)
@@ -67,7 +80,7 @@ def test_panoramas_get_the_labels_and_scores_of_tangent_predict(
     scores = network.scores(panorama)
     assert scores.dtype == np.float32
     assert scores.shape == (50, 100, 3)
-    np.testing.assert_allclose(scores, np.load("out/probabilities/room.npy"), atol=1e-3)
+    np.testing.assert_allclose(scores, probabilities, atol=1e-3)
     np.testing.assert_allclose(scores.sum(axis=-1), 1, atol=1e-5)
 
 
@@ -81,20 +94,16 @@ def test_panoramas_get_the_labels_and_scores_of_tangent_predict(
 )
 def test_photos_get_the_labels_of_tangent_predict(
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    predicted: Predicted,
     fov: float,
     typed: list[str],
     settings: dict[str, Any],
 ) -> None:
     network = tt.load(write_checkpoint(tmp_path / "net.ckpt"), **settings)
     photo = _sphere(40)[:, :57]
-    cv2.imwrite(str(tmp_path / "photo.png"), photo[..., ::-1])
-    monkeypatch.chdir(tmp_path)
-    given = ["checkpoint=net.ckpt", "input=photo.png", "output=out", "report=0", f"fov={fov}"]
-    run_command(monkeypatch, "predict", *given, "projection=perspective", *typed)
-    expected = cv2.imread("out/labels/photo.png", cv2.IMREAD_UNCHANGED)
+    expected, probabilities = predicted(photo, f"fov={fov}", "projection=perspective", *typed)
     np.testing.assert_array_equal(network.labels(photo, fov=fov), expected)
-    assert network.scores(photo, fov=fov).shape == (40, 57, 3)
+    np.testing.assert_allclose(network.scores(photo, fov=fov), probabilities, atol=1e-3)
 
 
 def test_tensors_get_what_arrays_get(network: Network) -> None:
@@ -140,7 +149,7 @@ def test_panoramas_of_any_size_get_labels_of_their_size(height: int, network: Ne
     assert network.labels(_sphere(height)).shape == (height, 2 * height)
 
 
-def test_depth_is_in_metres(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_depth_is_in_metres(tmp_path: Path, predicted: Predicted) -> None:
     """Missing where 0 or NaN; in 16-bit files of 1/512 m it is exactly the same."""
     network = tt.load(write_checkpoint(tmp_path / "net.ckpt", TANGENT, channels=4))
     panorama = _sphere(32)
@@ -148,11 +157,7 @@ def test_depth_is_in_metres(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     depth_m = steps / 512
     (tmp_path / "depth").mkdir()
     cv2.imwrite(str(tmp_path / "depth" / "room.png"), steps)
-    cv2.imwrite(str(tmp_path / "room.png"), panorama[..., ::-1])
-    monkeypatch.chdir(tmp_path)
-    given = ["checkpoint=net.ckpt", "input=room.png", "output=out", "report=0", "depth=depth"]
-    run_command(monkeypatch, "predict", *given, "depth_scale=512")
-    expected = cv2.imread("out/labels/room.png", cv2.IMREAD_UNCHANGED)
+    expected, _ = predicted(panorama, "depth=depth", "depth_scale=512")
     np.testing.assert_array_equal(network.labels(panorama, depth=depth_m), expected)
     depth_m[depth_m == 0] = np.nan
     tensors = torch.from_numpy(panorama).permute(2, 0, 1), torch.from_numpy(depth_m)
@@ -161,6 +166,21 @@ def test_depth_is_in_metres(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     for wrong in (None, depth_m[:16], steps):
         with pytest.raises(SettingError, match=r"depth: .*expected 32×64 floats, in metres"):
             network.labels(panorama, depth=wrong)
+
+
+@pytest.mark.parametrize("unmapped", ["unknown", "never"])
+def test_classes_of_another_data_set(tmp_path: Path, predicted: Predicted, unmapped: Any) -> None:
+    checkpoint = write_checkpoint(tmp_path / "net.ckpt")
+    (tmp_path / "map.json").write_text('{"classes": {"light": ["bright"], "shade": ["dark"]}}')
+    network = tt.load(checkpoint, class_map=tmp_path / "map.json", unmapped=unmapped)
+    assert network.class_names == ("unknown", "light", "shade")
+    assert len(network.palette) == 3
+    expected, probabilities = predicted(_sphere(32), "class_map=map.json", f"unmapped={unmapped}")
+    labels, scores = network.labels(_sphere(32)), network.scores(_sphere(32))
+    np.testing.assert_array_equal(labels, expected)
+    np.testing.assert_allclose(scores, probabilities, atol=1e-3)
+    assert (scores.sum(axis=-1).min() < 0.9) == (unmapped == "unknown")
+    assert (labels == 0).any() == (unmapped == "unknown")
 
 
 def test_names_and_colors_of_the_labels(network: Network) -> None:
@@ -208,6 +228,8 @@ def test_impossible_settings_are_refused(tmp_path: Path, network: Network) -> No
         ({"rotations": 0}, "rotations"),
         ({"device": "nonsense"}, "device"),
         ({"base_level": 9}, "base_level"),
+        ({"class_map": "night"}, "class_map: found night"),
+        ({"unmapped": "0"}, "unmapped: found '0'"),
     ):
         with pytest.raises(SettingError, match=message):
             tt.load(tmp_path / "net.ckpt", **settings)
