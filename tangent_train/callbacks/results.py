@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +53,9 @@ def evaluated(task: Any, noun: str) -> Record:
     return segmentation_record(task.matrices, task.class_names, task.absent_class, noun)
 
 
-def write_evaluation(task: Any, record: Record, checkpoint: Path, folder: Path) -> None:
+def write_evaluation(
+    task: Any, record: Record, checkpoint: Path, folder: Path, notes: Sequence[str] = ()
+) -> None:
     """Write ``results.*`` and ``report.html``.
 
     Args:
@@ -61,8 +63,10 @@ def write_evaluation(task: Any, record: Record, checkpoint: Path, folder: Path) 
         record: From `evaluated`.
         checkpoint: Its weights.
         folder: Output folder.
+        notes: Further lines.
     """
-    write_results(record, folder)
+    notes = [f"Checkpoint: {checkpoint}", *notes]
+    write_results(record, folder, notes)
     callbacks = task.trainer.callbacks
     write_report(
         folder / "report.html",
@@ -70,5 +74,5 @@ def write_evaluation(task: Any, record: Record, checkpoint: Path, folder: Path) 
         tables=[*result_tables(record), confusion_table(record)],
         images=[i for c in callbacks if isinstance(c, PredictionPanels) for i in c.images],
         class_names=task.class_names,
-        notes=[headline(record), f"Checkpoint: {checkpoint}"],
+        notes=[headline(record), *notes],
     )

@@ -7,13 +7,14 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
+from torch import nn
 
 from datamodules.core.split_module import SplitDataModule
 from tangent_train.checkpoints.trained import completed_settings
 from tangent_train.errors import SettingError
 from tangent_train.registry import SettingsFile, check_registered, make, maker_of
 
-__all__ = ["Settings", "build"]
+__all__ = ["Settings", "build", "build_data", "build_task"]
 
 _RGB = 3
 
@@ -38,18 +39,21 @@ def build(settings: Settings, source: SettingsFile | None = None) -> tuple[Any, 
     Raises:
         SettingError: A setting, or a combination of settings, is invalid.
     """
-    optimizer = dict(settings["optimizer"])
-    backbone_lr_factor = optimizer.pop("backbone_lr_factor", 1.0)
-    parts = {
-        name: make(section, name, source)
-        for name, section in (
-            ("representation", settings["representation"]),
-            ("optimizer", optimizer),
-            ("scheduler", settings.get("scheduler")),
-        )
-        if section is not None
-    }
-    representation = parts["representation"]
+    data = build_data(settings, source)
+    if source is None or not source.owns("network"):
+        _check_registered(settings["network"], "network")
+    restored = settings.get("resume") is not None or settings.get("checkpoint") is not None
+    section = completed_settings(
+        settings["network"], data.in_channels, data.num_classes, restored=restored
+    )
+    task = build_task(settings, data, make(section, "network", source), source)
+    _try_network(task, data.in_channels)
+    return data, task
+
+
+def build_data(settings: Settings, source: SettingsFile | None = None) -> Any:
+    """The data module of a run, of the kind that its task takes; see `build`."""
+    representation = make(settings["representation"], "representation", source)
     data_set = maker_of(settings["data"], "data", source)
     if isinstance(data_set, type) and not issubclass(data_set, SplitDataModule):
         expected = "labelled images or shapes; pairs are for tangent-keypoints"
@@ -59,24 +63,30 @@ def build(settings: Settings, source: SettingsFile | None = None) -> tuple[Any, 
     kind = getattr(maker_of(settings["task"], "task", source), "kind", data.kind)
     if kind != data.kind:
         raise SettingError("task", found=f"{kind}, with {data.noun}", expected=data.kind)
-    for place in ("data", "network"):
-        if source is None or not source.owns(place):
-            _check_registered(settings[place], place)
-    restored = settings.get("resume") is not None or settings.get("checkpoint") is not None
-    network = completed_settings(
-        settings["network"], data.in_channels, data.num_classes, restored=restored
-    )
-    parts["network"] = make(network, "network", source)
-    task = make(
+    if source is None or not source.owns("data"):
+        _check_registered(settings["data"], "data")
+    return data
+
+
+def build_task(
+    settings: Settings, data: Any, network: nn.Module, source: SettingsFile | None = None
+) -> Any:
+    """The task of a run with its network; see `build`."""
+    optimizer = dict(settings["optimizer"])
+    backbone_lr_factor = optimizer.pop("backbone_lr_factor", 1.0)
+    scheduler = settings.get("scheduler")
+    parts = {} if scheduler is None else {"scheduler": make(scheduler, "scheduler", source)}
+    return make(
         settings["task"],
         "task",
         source,
+        network=network,
+        representation=data.representation,
         class_names=data.class_names,
+        optimizer=make(optimizer, "optimizer", source),
         backbone_lr_factor=backbone_lr_factor,
         **parts,
     )
-    _try_network(task, data.in_channels)
-    return data, task
 
 
 def _check_registered(section: Any, place: str) -> None:

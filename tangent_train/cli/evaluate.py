@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,10 +19,14 @@ from tangent_train.callbacks.checkpoints import AtomicCheckpointIO, CheckpointCo
 from tangent_train.callbacks.panels import ProgressBar
 from tangent_train.callbacks.results import evaluated, pictures, write_evaluation
 from tangent_train.checkpoints.content import read_checkpoint, write_settings
-from tangent_train.cli.build import Settings, build
+from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
+from tangent_train.cli.build import Settings, build, build_data, build_task
 from tangent_train.cli.machine import machine_faults
+from tangent_train.cli.settings import typed
 from tangent_train.cli.stored import GROUPS
 from tangent_train.errors import SettingError
+from tangent_train.inference.class_maps import ClassMap, Unmapped, load_class_map, map_classes
+from tangent_train.inference.views import check_size
 from tangent_train.registry import SettingsFile, make
 from tangent_train.results.evaluation import headline, result_tables
 from tangent_train.results.record import Record
@@ -30,21 +34,42 @@ from tangent_train.results.record import Record
 __all__ = ["Run", "evaluate"]
 
 
-def evaluate(settings: Settings, source: SettingsFile | None = None) -> None:
+def evaluate(
+    settings: Settings,
+    source: SettingsFile | None = None,
+    trained: TrainedNetwork | None = None,
+) -> None:
     """Evaluate a checkpoint on the test fold of its data.
 
     Args:
-        settings: Of the run, and ``checkpoint``.
+        settings: Of the run, and ``checkpoint``, ``class_map`` and ``unmapped``.
         source: The file they come from, see `registry.make`.
+        trained: The network of a file that has no settings of a run.
 
     Raises:
-        SettingError: No checkpoint is given.
+        SettingError: No checkpoint is given, or it does not fit the data.
     """
     if settings["checkpoint"] is None:
         raise SettingError("checkpoint", found="none", expected="checkpoints/best.ckpt of a run")
-    run = Run.begin(settings, source)
+    checkpoint = Path(settings["checkpoint"])
+    class_map = None
+    if settings.get("class_map") is None:
+        settings = {name: value for name, value in settings.items() if name != "unmapped"}
+    else:
+        class_map = load_class_map(typed(_Mapping, settings).class_map)
+        if trained is None:
+            trained = load_trained(checkpoint, () if source is None else source.trust)
+    run = Run.begin(settings, source, trained, class_map)
     with machine_faults(run.folder, run.data):
-        run.test(run.trainer([]), Path(settings["checkpoint"]))
+        run.test(run.trainer([]), checkpoint)
+
+
+@dataclass(frozen=True)
+class _Mapping:
+    """See ``configs/evaluate.yaml``."""
+
+    class_map: str
+    unmapped: Unmapped
 
 
 @dataclass(frozen=True)
@@ -57,6 +82,8 @@ class Run:
         source: File they come from; None for the user's own.
         data: The data module.
         task: The task.
+        trained: Its network, if that is not made from the settings.
+        notes: On the classes of that network.
     """
 
     folder: Path
@@ -64,26 +91,47 @@ class Run:
     source: SettingsFile | None
     data: Any
     task: Any
+    trained: TrainedNetwork | None = None
+    notes: Sequence[str] = ()
 
     @staticmethod
-    def begin(settings: Settings, source: SettingsFile | None) -> Run:
-        """Build the objects, and write the settings to the run's folder."""
+    def begin(
+        settings: Settings,
+        source: SettingsFile | None,
+        trained: TrainedNetwork | None = None,
+        class_map: ClassMap | None = None,
+    ) -> Run:
+        """Build the objects, and write the settings to the run's folder.
+
+        Args:
+            settings: Of the run.
+            source: The file they come from.
+            trained: Network to evaluate; None to make it from the settings.
+            class_map: Of that network to the classes of the data.
+        """
         folder = Path(HydraConfig.get().runtime.output_dir)
         lightning.seed_everything(settings["seed"], workers=True, verbose=False)
-        data, task = build(settings, source)
+        notes = []
+        if trained is None:
+            data, task = build(settings, source)
+        else:
+            data = build_data(settings, source)
+            if class_map is not None:
+                targets = data.class_names[1:]
+                mapped = map_classes(trained, class_map, settings["unmapped"], targets)
+                trained, notes = mapped.trained, [f"Class map {class_map.name}: {mapped}."]
+            check_size(trained, data.representation.image_size)
+            task = build_task(settings, data, trained.network, source)
         chosen = HydraConfig.get().runtime.choices
         choices = {group: chosen[group] for group in GROUPS if chosen.get(group)}
         kept = {name: value for name, value in settings.items() if name != "trust"}
-        run = Run(folder, {"choices": choices, **kept}, source, data, task)
+        run = Run(folder, {"choices": choices, **kept}, source, data, task, trained, notes)
         write_settings(folder / "config.yaml", run.settings)
         return run
 
     def shown(self) -> dict[str, Any]:
         """Inputs and classes of the network, as plain values."""
-        mean, std = list(self.data.normalization.mean), list(self.data.normalization.std)
-        inputs = {"inputs": list(self.data.inputs)} if hasattr(self.data, "inputs") else {}
-        names = list(self.data.class_names)
-        return {"class_names": names, **inputs, "normalization": {"mean": mean, "std": std}}
+        return _shown(self.data)
 
     def trainer(self, callbacks: Sequence[Callback]) -> lightning.Trainer:
         """The trainer of the config, with callbacks besides those of every run."""
@@ -118,22 +166,17 @@ class Run:
         Raises:
             SettingError: The data or the network do not match the weights.
         """
-        content = read_checkpoint(checkpoint)
+        content = read_checkpoint(checkpoint) if self.trained is None else _shown(self.trained)
         for name, value in self.shown().items():
             if content[name] != value:
                 raise SettingError(
                     f"data, for {checkpoint}",
                     found=f"{name.replace('_', ' ')} {value}",
                     expected=f"{content[name]}, which the network was trained with",
+                    remedy="class_map= says which are the same." if name == "class_names" else "",
                 )
-        try:
-            self.task.load_state_dict(content["state_dict"])
-        except RuntimeError as error:
-            raise SettingError(
-                "network",
-                found=f"other tensors than in {checkpoint} ({error})",
-                expected="the network and inputs of the checkpoint",
-            ) from error
+        if self.trained is None:
+            self._load(content["state_dict"], checkpoint)
         trainer.test(self.task, datamodule=self.data, verbose=False)
         record = evaluated(self.task, self.data.noun)
         total = len(self.data.source("test"))
@@ -141,11 +184,31 @@ class Run:
             raise RuntimeError(f"{record.images} of {total} test {self.data.noun} were counted")
         self._report(record, checkpoint)
 
+    def _load(self, tensors: Mapping[str, Any], checkpoint: Path) -> None:
+        try:
+            self.task.load_state_dict(tensors)
+        except RuntimeError as error:
+            raise SettingError(
+                "network",
+                found=f"other tensors than in {checkpoint} ({error})",
+                expected="the network and inputs of the checkpoint",
+            ) from error
+
     @rank_zero_only
     def _report(self, record: Record, checkpoint: Path) -> None:
-        write_evaluation(self.task, record, checkpoint, self.folder)
+        write_evaluation(self.task, record, checkpoint, self.folder, self.notes)
         console = Console(soft_wrap=True, highlight=False)
+        for note in self.notes:
+            console.print(note, markup=False)
         console.print(headline(record), markup=False)
         console.print(result_tables(record)[0].terminal())
         told = f"Results, pictures and logs: {self.folder}; report.html opens in a browser."
         console.print(told, markup=False)
+
+
+def _shown(of: Any) -> dict[str, Any]:
+    """Inputs and classes of a data module or a trained network, as plain values."""
+    mean, std = list(of.normalization.mean), list(of.normalization.std)
+    inputs = {"inputs": list(of.inputs)} if hasattr(of, "inputs") else {}
+    names = list(of.class_names)
+    return {"class_names": names, **inputs, "normalization": {"mean": mean, "std": std}}

@@ -1,4 +1,4 @@
-"""Settings inside a checkpoint, to resume a run or to evaluate it.
+"""Settings inside a checkpoint, to resume a run or to evaluate it or any other network.
 
 Hydra composes the user's own config, with the options of the run where the user has options of
 these names. The settings of the file are plain data: they are laid over the composed ones, except
@@ -22,7 +22,7 @@ from tangent_train.setting_rules import OF_THIS_MACHINE, from_file
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-__all__ = ["GROUPS", "StoredRun", "stored_run"]
+__all__ = ["GROUPS", "StoredNetwork", "StoredRun", "stored_run"]
 
 _SECTIONS = ("data", "representation", "network", "task", "optimizer", "scheduler", "trainer")
 GROUPS = ("experiment", *_SECTIONS)
@@ -42,6 +42,8 @@ _RUN = {
 """Settings outside of the sections."""
 
 _EXPECTED = "the settings of a run"
+
+_PIXELS_PER_FORWARD = 2**20
 
 
 @dataclass(frozen=True)
@@ -82,8 +84,7 @@ class StoredRun:
             DataError: The file lacks settings.
             SettingError: A setting of this machine has to be typed.
         """
-        own = {a.lstrip("+~").partition("=")[0] for a in self.typed if a[0] != "-"}
-        own = {name for name in own if not name.startswith("hydra")}
+        own = _named(self.typed)
         own |= {"representation.level"} if "level" in own else set()
         own |= {"data.seed"} if "seed" in own else set()
         of_run = check_fields(self.path, self.config, _RUN, _EXPECTED)
@@ -125,12 +126,77 @@ class StoredRun:
         return {n: value for n, value in before.items() if value is not None and n in known}
 
 
-def stored_run(command: str, arguments: Sequence[str]) -> StoredRun | None:
+@dataclass(frozen=True)
+class StoredNetwork:
+    """A network to evaluate whose file knows no run (imported, exported), and the command line.
+
+    Attributes:
+        path: The file.
+        typed: Overrides of the user, without the file.
+        added: None, see `StoredRun`.
+    """
+
+    path: Path
+    typed: Sequence[str]
+    added: Sequence[str] = ()
+
+    @property
+    def arguments(self) -> list[str]:
+        """The command line for Hydra."""
+        return [*self.typed, f"checkpoint={self.path}"]
+
+    def settings(self, said: Mapping[str, Any]) -> tuple[dict[str, Any], SettingsFile, Any]:
+        """All settings of the evaluation.
+
+        Args:
+            said: The composed config, resolved.
+
+        Returns:
+            The settings, where they come from, and the `TrainedNetwork`.
+
+        Raises:
+            DataError: The file cannot be used.
+        """
+        from tangent_train.checkpoints.trained import load_trained
+        from tangent_train.inference.views import panorama_settings
+
+        own = _named(self.typed)
+        trust = typed(Trust, said).trust
+        trained = load_trained(self.path, trust)
+        settings = dict(said)
+        level = said["level"] if "level" in own else None
+        settings["level"] = trained.level if level is None else level
+        if "representation" not in own:
+            stored = dict(trained.representation)
+            settings["representation"] = (
+                stored if level is None else panorama_settings(trained, level)
+            )
+            for name in own:
+                if name.startswith("representation."):
+                    _lay(settings, said, name.split("."))
+        elif not own & {"level", "representation.level"}:
+            settings["representation"] = dict(said["representation"]) | {"level": trained.level}
+        in_file = {"_target_": "models.OnnxNetwork", "path": str(self.path)}
+        settings["network"] = in_file if trained.settings is None else trained.settings
+        mean, std = list(trained.normalization.mean), list(trained.normalization.std)
+        tied = {"inputs": list(trained.inputs), "normalization": {"mean": mean, "std": std}}
+        known = {name: v for name, v in tied.items() if f"data.{name}" not in own}
+        settings["data"] = dict(said["data"]) | known
+        rows, columns = trained.image_size
+        if "task.images_per_forward" not in own:  # photo networks have many classes, large images
+            at_once = max(1, _PIXELS_PER_FORWARD // (rows * columns))
+            settings["task"] = dict(said["task"]) | {"images_per_forward": at_once}
+        of_user = (said.keys() - {"representation"}) | own
+        return settings, SettingsFile(self.path, trust, of_user), trained
+
+
+def stored_run(command: str, arguments: Sequence[str]) -> StoredRun | StoredNetwork | None:
     """Start from a stored config if the command continues from one.
 
     ``tangent-train resume=<run folder>`` takes the settings inside the run's last checkpoint,
     ``tangent-evaluate checkpoint=<file>`` those inside that; ``data=<option>`` (or another section)
-    takes the user's own option in place of the stored section.
+    takes the user's own option in place of the stored section. A network without a run is evaluated
+    with the user's settings.
 
     Args:
         command: Any command.
@@ -164,7 +230,11 @@ def stored_run(command: str, arguments: Sequence[str]) -> StoredRun | None:
                 expected="the folder of a started run",
                 remedy="Give resume= the folder that tangent-train printed.",
             )
-    config = read_checkpoint(path, ("config",))["config"]
+    exported = path.suffix.lower() in (".onnx", ".safetensors")
+    config = {} if exported else read_checkpoint(path, ("config",))["config"]
+    if command == "evaluate" and "data" not in config:
+        _check_network(path, _named(left))
+        return StoredNetwork(path, left)
     kinds = {name: _RUN[name] for name in ("choices", "level", "seed")}
     known = check_fields(path, config, kinds, _EXPECTED)
     choices = {g: name for g, name in (known["choices"] or {}).items() if _is_own(g, name)}
@@ -174,6 +244,26 @@ def stored_run(command: str, arguments: Sequence[str]) -> StoredRun | None:
     added = [f"level={known['level']}", f"seed={known['seed']}"]
     added += [f"{group}={name}" for group, name in choices.items() if group not in own]
     return StoredRun(path, config, left, added, place)
+
+
+def _named(arguments: Sequence[str]) -> set[str]:
+    """Names of the settings in overrides, without those of Hydra."""
+    names = {a.lstrip("+~").partition("=")[0] for a in arguments if a[0] != "-"}
+    return {name for name in names if not name.startswith("hydra")}
+
+
+def _check_network(path: Path, own: set[str]) -> None:
+    """Refuse to evaluate a network without data, or with settings of another network."""
+    if not own & {"data", "experiment"}:
+        raise SettingError(
+            "data",
+            found=f"none, and {path} has no settings of a run",
+            expected="the data set to evaluate it on: data=stanford2d3ds data.root=…",
+            remedy="class_map= gives the network the classes of the data.",
+        )
+    others = sorted(name for name in own if name.partition(".")[0] == "network")
+    if others:
+        raise SettingError(others[0], found="a value", expected=f"none: the network is in {path}")
 
 
 def _is_own(group: str, option: str) -> bool:

@@ -32,7 +32,15 @@ if TYPE_CHECKING:
     from tangent_train.rendering import Blend
     from tangent_train.rendering.mosaic import ScoreMosaic
 
-__all__ = ["InputImage", "PanoramaViews", "PhotoViews", "ViewSet", "ViewSets"]
+__all__ = [
+    "InputImage",
+    "PanoramaViews",
+    "PhotoViews",
+    "ViewSet",
+    "ViewSets",
+    "check_size",
+    "panorama_settings",
+]
 
 _TANGENT = "tangent_train.rendering.TangentRepresentation"
 _PERSPECTIVE = "tangent_train.rendering.PerspectiveRepresentation"
@@ -208,9 +216,16 @@ class PhotoViews:
         return [ViewSet(padded, len(numbers), views, add)]
 
 
-def _panorama_representation(
-    trained: TrainedNetwork, level: int | None, base_level: int | None
-) -> PinholeRepresentation | EquirectRepresentation:
+def panorama_settings(
+    trained: TrainedNetwork, level: int | None = None, base_level: int | None = None
+) -> dict[str, Any]:
+    """The section of a config for the representation of panoramas, see `PanoramaViews`.
+
+    Args:
+        trained: The network.
+        level: Level s; None as trained.
+        base_level: Base level b of tangent images; None as trained.
+    """
     settings: dict[str, Any] = dict(trained.representation)
     kind = settings["_target_"]
     if kind == _PERSPECTIVE or (base_level is not None and kind != _TANGENT):
@@ -226,8 +241,15 @@ def _panorama_representation(
             settings["base_level"] = max(0, math.ceil(settings["level"] - math.log2(side)))
         own = settings.get("dim") or 2 ** (settings["level"] - settings["base_level"])
         settings["dim"] = max(own, side)  # larger ones are divided
+    return settings
+
+
+def _panorama_representation(
+    trained: TrainedNetwork, level: int | None, base_level: int | None
+) -> PinholeRepresentation | EquirectRepresentation:
+    settings = panorama_settings(trained, level, base_level)
     made: Any = make(settings, "representation", trained.source)
-    _check_size(trained, made.image_size)
+    check_size(trained, made.image_size)
     return made
 
 
@@ -245,11 +267,20 @@ def _photo_representation(
         if isinstance(seen, EquirectRepresentation):
             return _photo_representation(trained, level, _BASE_LEVEL)
         size, half_extent = seen.image_size, seen.grid.dim / 2 * seen.grid.pitch
-    _check_size(trained, size)
+    check_size(trained, size)
     return PerspectiveRepresentation(wanted, 2 * math.degrees(math.atan(half_extent)), size)
 
 
-def _check_size(trained: TrainedNetwork, size: tuple[int, int]) -> None:
+def check_size(trained: TrainedNetwork, size: tuple[int, int]) -> None:
+    """Refuse images that a network does not take.
+
+    Args:
+        trained: The network.
+        size: Rows and columns of the images.
+
+    Raises:
+        SettingError: It does not take them.
+    """
     fixed, multiple = trained.fixed_size, trained.size_multiple
     small = fixed is not None and any(n < own for n, own in zip(size, fixed, strict=True))
     if small or (fixed is None and any(side % multiple for side in size)):

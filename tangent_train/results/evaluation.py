@@ -213,14 +213,16 @@ def confusion_table(record: Record) -> Table:
     return Table("Confusion", ("", *record.class_names), rows, note, shades=shares.tolist())
 
 
-def write_results(record: Record, folder: Path) -> None:
+def write_results(record: Record, folder: Path, notes: Sequence[str] = ()) -> None:
     """Write ``results.json``, ``.csv`` and ``.md``, each atomically.
 
     Args:
         record: Of an evaluation.
         folder: Output folder.
+        notes: Paragraphs of ``.md`` below the headline.
     """
     write_text(folder / RESULTS_FILE, record.json())
     write_text(folder / "results.csv", csv_text(list(record.classes[0]), record.classes))
     tables = "\n".join(table.markdown() for table in result_tables(record))
-    write_text(folder / "results.md", f"# Results\n\n{headline(record)}\n\n{tables}")
+    text = "\n\n".join(["# Results", headline(record), *notes, tables])
+    write_text(folder / "results.md", text)

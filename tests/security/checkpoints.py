@@ -11,7 +11,7 @@ import torch
 
 from tangent_train.checkpoints.trained import load_trained, start_in
 from tangent_train.cli.build import build
-from tangent_train.cli.stored import stored_run
+from tangent_train.cli.stored import StoredRun, stored_run
 from tangent_train.errors import DataError, SettingError
 from tangent_train.registry import make
 from tests.security.attacks import attacks, places, replaced, sampled
@@ -39,12 +39,12 @@ def attack_checkpoints(content: dict[str, Any], forbidden: Path) -> None:
     honest, path = forbidden.parent / "honest.ckpt", forbidden.parent / "x.ckpt"
     torch.save(content, honest)
     stored = stored_run("evaluate", [f"checkpoint={honest}", "data.root=rooms"])
-    assert stored is not None
+    assert isinstance(stored, StoredRun)
     said = composed(stored.arguments)
 
     def evaluated(path: Path) -> None:
         stored = stored_run("evaluate", [f"checkpoint={path}", "data.root=rooms"])
-        assert stored is not None
+        assert isinstance(stored, StoredRun)
         settings, source = stored.settings(said)
         build(settings, source)
         make(settings["trainer"], "trainer", source, logger=False)

@@ -10,7 +10,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from tangent_train.cli.compose import config_folder, quote_path
-from tangent_train.cli.stored import stored_run
+from tangent_train.cli.stored import StoredRun, stored_run
 from tangent_train.registry import SettingsFile
 
 __all__ = ["SECRET", "SETTINGS", "composed", "settled", "with_config"]
@@ -48,7 +48,7 @@ def settled(
     """The settings of ``tangent-evaluate checkpoint=<path> …``, and where they come from."""
     typed = [*said, *([] if root is None else [f"data.root={root}"])]
     stored = stored_run("evaluate", [f"checkpoint={path}", *typed])
-    assert stored is not None
+    assert isinstance(stored, StoredRun)
     return stored.settings(composed(stored.arguments))
 
 

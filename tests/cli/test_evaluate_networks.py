@@ -1,0 +1,162 @@
+"""`tangent-evaluate` of networks whose files know no run, and with class maps."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from datamodules.stanford2d3ds.label_table import CLASSES
+from tangent_train.checkpoints.content import read_settings
+from tests.cli.tiny_runs import SMALL_ROOMS, Run, results
+from tests.inference.trained import write_checkpoint
+
+ROOMS = [
+    "data=synthrooms",
+    "panels=1",
+    *(text for text in SMALL_ROOMS if text.startswith(("data.rooms.", "trainer."))),
+]
+MAP = {"source": "painters", "classes": {"floor": ["dark"], "ceiling": ["bright"]}}
+
+
+@pytest.fixture(scope="module")
+def network(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """An imported network of the classes dark, green and bright, trained at level 4."""
+    return f"checkpoint={write_checkpoint(tmp_path_factory.mktemp('network') / 'photo.ckpt')}"
+
+
+def _written(path: Path, content: Any) -> str:
+    path.write_text(json.dumps(content))
+    return f"class_map={path}"
+
+
+def _confusion(folder: Path) -> Any:
+    return np.asarray(results(folder)["confusion"])
+
+
+def test_what_a_map_leaves_is_missed_or_never_wins(
+    network: str,
+    rooms: str,
+    run_folder: Path,
+    tmp_path: Path,
+    run: Run,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    given = _written(tmp_path / "my map.json", MAP)
+    for unmapped in ("unknown", "never"):
+        arguments = [network, *ROOMS, rooms, given, f"unmapped={unmapped}"]
+        run("evaluate", *arguments, f"hydra.run.dir={unmapped}")
+    said = "ceiling ← bright; floor ← dark; never given: beam, board, bookcase, chair, clutter, "
+    assert said in capsys.readouterr().out
+    matrices = {name: _confusion(tmp_path / name) for name in ("unknown", "never")}
+    floor, ceiling = (1 + CLASSES.index(name) for name in ("floor", "ceiling"))
+    for name, matrix in matrices.items():
+        truth = _confusion(run_folder).sum(axis=1)
+        np.testing.assert_array_equal(matrix.sum(axis=1), truth)
+        given_labels = {0, floor, ceiling} if name == "unknown" else {floor, ceiling}
+        assert set(np.flatnonzero(matrix.sum(axis=0))) == given_labels
+        for entry in results(tmp_path / name)["classes"]:
+            label = 1 + CLASSES.index(entry["class"])
+            if truth[label]:
+                assert entry["accuracy"] == pytest.approx(matrix[label, label] / truth[label])
+    unknown, never = matrices["unknown"], matrices["never"]
+    assert (never[:, 1:] >= unknown[:, 1:]).all(), "pixels of green go to what is left"
+    assert unknown[1:, 0].any()
+    config = read_settings(tmp_path / "never" / "config.yaml")
+    assert (config["class_map"], config["unmapped"]) == (str(tmp_path / "my map.json"), "never")
+    assert config["network"]["_target_"] == "torch.nn.Conv2d"
+    assert config["data"]["inputs"] == ["rgb"]
+    assert config["level"] == config["representation"]["level"] == 4
+    for page in ("report.html", "results.md"):
+        text = (tmp_path / "never" / page).read_text()
+        assert "photo.ckpt" in text
+        assert "ceiling ← bright" in text
+        assert "never win: green" in text
+    assert len(list((tmp_path / "unknown" / "panels").glob("*.png"))) == 1
+
+
+@pytest.mark.parametrize(
+    ("typed", "kind", "expected"),
+    [
+        (["representation=erp"], "EquirectRepresentation", {"level": 4}),
+        (["representation=erp", "level=3"], "EquirectRepresentation", {"level": 3}),
+        (["level=3"], "TangentRepresentation", {"level": 3, "base_level": 0}),
+        (
+            ["representation.blend=feather", "representation.base_level=1"],
+            "TangentRepresentation",
+            {"level": 4, "base_level": 1, "blend": "feather"},
+        ),
+    ],
+)
+def test_the_file_gives_what_is_not_typed(
+    typed: list[str],
+    kind: str,
+    expected: dict[str, Any],
+    network: str,
+    rooms: str,
+    tmp_path: Path,
+    run: Run,
+) -> None:
+    given = _written(tmp_path / "map.json", MAP)
+    run("evaluate", network, *ROOMS, rooms, given, *typed, "hydra.run.dir=out")
+    section = read_settings(tmp_path / "out" / "config.yaml")["representation"]
+    assert section["_target_"].endswith(f".{kind}")
+    assert {name: section.get(name) for name in expected} == expected
+    assert results(tmp_path / "out")["images"] == 2
+
+
+def test_a_class_map_of_a_run(rooms: str, run_folder: Path, tmp_path: Path, run: Run) -> None:
+    """One that changes nothing but the order, and one that merges classes."""
+    arguments = [f"checkpoint={run_folder / 'checkpoints' / 'best.ckpt'}", rooms]
+    same = _written(tmp_path / "same.json", {"classes": {n: [n] for n in reversed(CLASSES)}})
+    run("evaluate", *arguments, same, "trainer.accelerator=cpu", "hydra.run.dir=same")
+    np.testing.assert_array_equal(_confusion(tmp_path / "same"), _confusion(run_folder))
+    merging = {n: [n] for n in CLASSES if n not in ("wall", "door")} | {"wall": ["wall", "door"]}
+    merged = _written(tmp_path / "merged.json", {"classes": merging})
+    run("evaluate", *arguments, merged, "trainer.accelerator=cpu", "hydra.run.dir=merged")
+    found, before = _confusion(tmp_path / "merged"), _confusion(run_folder)
+    wall, door = (1 + CLASSES.index(name) for name in ("wall", "door"))
+    assert not found[:, door].any()
+    assert (found[:, wall] >= before[:, wall] + before[:, door]).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"data": None}, r"data: found none, and .*photo\.ckpt has no settings of a run.*data="),
+        ({"class_map": None}, r"found class names .*'beam'.*; expected .*'dark'.*class_map="),
+        ({"class_map": {"classes": {"roof": ["dark"]}}}, "found target classes roof; expected of"),
+        ({"class_map": {"classes": {"floor": ["pink"]}}}, "found no class of the map in a network"),
+        ({"network": "network.widths=[4]"}, r"network\.widths: found .*the network is in"),
+        ({"inputs": "data.inputs=[rgb,depth]"}, "found inputs|normalization"),
+        ({"unmapped": "unmapped=often"}, "unmapped: found often; expected unknown or never"),
+        ({"checkpoint": "checkpoint=none.onnx"}, r"none\.onnx: found no such file"),
+    ],
+)
+def test_what_cannot_be_evaluated_is_refused(
+    changes: dict[str, Any], message: str, network: str, rooms: str, tmp_path: Path, run: Run
+) -> None:
+    given = {"checkpoint": network, "data": rooms, "class_map": MAP} | changes
+    arguments = [text for name, text in given.items() if name != "class_map" and text]
+    arguments += ROOMS if given["data"] else []
+    if given["class_map"]:
+        arguments.append(_written(tmp_path / "map.json", given["class_map"]))
+    with pytest.raises(SystemExit, match=message):
+        run("evaluate", *arguments)
+
+
+def test_classes_of_other_packages_are_trusted_by_name(
+    network: str, rooms: str, tmp_path: Path, run: Run
+) -> None:
+    content = torch.load(network.partition("=")[2], weights_only=True)
+    content["config"]["network"]["_target_"] = "torch.nn.modules.conv.Conv2d"
+    torch.save(content, tmp_path / "other.ckpt")
+    arguments = ["checkpoint=other.ckpt", *ROOMS, rooms, _written(tmp_path / "map.json", MAP)]
+    with pytest.raises(SystemExit, match=r"trust=torch\.nn\.modules\.conv\.Conv2d"):
+        run("evaluate", *arguments)
+    run("evaluate", *arguments, "trust=torch.nn.modules.conv.Conv2d", "hydra.run.dir=out")
+    assert results(tmp_path / "out")["images"] == 2
