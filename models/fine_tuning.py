@@ -13,7 +13,7 @@ from models.pretrained import read_tensors
 from models.stem import first_convolution, select_channels
 from tangent_train.errors import DataError, SettingError, printable
 
-__all__ = ["Origins", "initialize"]
+__all__ = ["Origins", "initialize", "tensors_for"]
 
 _NOT_ALL = 0.999
 """The share is not rounded to all of a network whose small last layer is new."""
@@ -79,7 +79,7 @@ def initialize(
     """
     path = Path(path)
     own = network.state_dict()
-    found = _renamed(read_tensors(path), own)
+    found = tensors_for(network, path)
     stem = _stem(network)
     loaded: dict[str, Tensor] = {}
     adapted: dict[str, str] = {}
@@ -115,6 +115,15 @@ def initialize(
         share=sum(min(found[name].numel(), t.numel()) for name, t in loaded.items())
         / sum(t.numel() for t in own.values()),
     )
+
+
+def tensors_for(network: nn.Module, path: Path) -> dict[str, Tensor]:
+    """The tensors of a file by the names that a network has for them, see `initialize`.
+
+    Raises:
+        DataError: The file cannot be read.
+    """
+    return _renamed(read_tensors(path), network.state_dict())
 
 
 def _stem(network: nn.Module) -> str | None:

@@ -107,6 +107,7 @@ class Start:
         class_names: Names of its labels.
         inputs: Its inputs; None of shapes.
         normalization: Their ``mean`` and ``std``.
+        groups: See `TrainedNetwork`.
         settings: The section of a config that makes it, for any data: null where the data decides
             (see `completed_settings`), and without other pretrained weights.
     """
@@ -114,6 +115,7 @@ class Start:
     class_names: tuple[str, ...]
     inputs: tuple[Input, ...] | None
     normalization: Mapping[str, Sequence[float]]
+    groups: Groups | None
     settings: dict[str, Any]
 
 
@@ -197,7 +199,8 @@ def start_in(path: Path) -> Start | None:
             with _safetensors(path) as file:
                 content = _described(path, (file.metadata() or {}).get(METADATA_KEY))
         else:
-            content = read_checkpoint(path, ("class_names", "config", "inputs", "normalization"))
+            names = ("class_names", "config", "groups", "inputs", "normalization")
+            content = read_checkpoint(path, names)
             content["settings"] = content["config"].get("network")
     except DataError:
         return None
@@ -207,6 +210,7 @@ def start_in(path: Path) -> Start | None:
         class_names=tuple(content["class_names"]),
         inputs=tuple(content["inputs"] or ()) or None,
         normalization=content["normalization"],
+        groups=content["groups"],
         settings=_for_any_data(content["settings"]),
     )
 

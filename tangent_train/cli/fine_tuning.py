@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,12 +13,15 @@ from rich.console import Console
 
 from datamodules.core.inputs import RGBD_NORMALIZATION, channel_names
 from models import initialize
+from models.fine_tuning import tensors_for
 from tangent_train.checkpoints.trained import Start, completed_settings, start_in
 from tangent_train.cli.settings import Trust, typed
 from tangent_train.errors import DataError, printable
 from tangent_train.registry import SettingsFile, make
 
 if TYPE_CHECKING:
+    from torch import nn
+
     from tangent_train.cli.build import Settings
     from tangent_train.cli.evaluate import Run
 
@@ -85,16 +88,23 @@ def load_start(path: Path, run: Run) -> None:
         run: Its network is changed in place; its task learns which tensors are new.
 
     Raises:
-        DataError: The file cannot be read, or nothing in it fits.
+        DataError: The file cannot be read, nothing in it fits, or its scores are not as many as its
+            class names.
     """
-    start, network, inputs = start_in(path), run.task.network, getattr(run.data, "inputs", None)
+    start, network = start_in(path), run.task.network
     channels = None
-    heads: Collection[str] = ()
-    if start is not None and start.inputs is not None and inputs is not None:
-        channels = (channel_names(start.inputs), channel_names(inputs))
-    if start is not None and start.class_names != tuple(run.data.class_names):
-        heads = _of_classes(run)
-    origins = initialize(network, path, channels, heads)
+    others: Collection[str] = ()
+    if start is not None:
+        heads = _heads(run)
+        names = tuple(run.data.class_names)
+        if start.groups is None:
+            _check_heads(path, heads, network, len(start.class_names) - len(names))
+        if start.groups is not None or start.class_names != names:
+            others = heads
+        inputs = getattr(run.data, "inputs", None)
+        if start.inputs is not None and inputs is not None:
+            channels = (channel_names(start.inputs), channel_names(inputs))
+    origins = initialize(network, path, channels, others)
     run.task.fresh = frozenset(origins.fresh)
     _print(f"Tensors from {path}\n{origins}")
 
@@ -138,11 +148,30 @@ def _normalization(start: Start, data: Mapping[str, Any]) -> dict[str, list[floa
     }
 
 
-def _of_classes(run: Run) -> Collection[str]:
-    """Names of the network's tensors whose shapes are others for another number of classes."""
+def _heads(run: Run) -> dict[str, list[int]]:
+    """By how much every dimension of a tensor grows with another class, of tensors that do."""
     more = completed_settings(
         run.settings["network"], run.data.in_channels, run.data.num_classes + 1, restored=True
     )
-    others = make(more, "network", run.source).state_dict()
-    own = run.task.network.state_dict()
-    return [name for name, t in own.items() if name in others and others[name].shape != t.shape]
+    larger = make(more, "network", run.source).state_dict()
+    growth = {
+        name: [b - a for a, b in zip(tensor.shape, larger[name].shape, strict=True)]
+        for name, tensor in run.task.network.state_dict().items()
+    }
+    return {name: by for name, by in growth.items() if any(by)}
+
+
+def _check_heads(
+    path: Path, heads: Mapping[str, Sequence[int]], network: nn.Module, more: int
+) -> None:
+    """Refuse a file with so many more classes than the data, if it has not the scores of these."""
+    own, found = network.state_dict(), tensors_for(network, path)
+    for name in heads.keys() & found.keys():
+        shape = tuple(found[name].shape)
+        for size, now, by in zip(shape, own[name].shape, heads[name], strict=False):
+            if by and size != now + more * by:
+                raise DataError(
+                    path,
+                    found=f"{size} scores in {name} {shape}",
+                    expected=f"{now + more * by}, one for each of its class names",
+                )
