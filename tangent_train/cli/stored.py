@@ -180,8 +180,9 @@ class StoredNetwork:
         settings["network"] = in_file if trained.settings is None else trained.settings
         mean, std = list(trained.normalization.mean), list(trained.normalization.std)
         tied = {"inputs": list(trained.inputs), "normalization": {"mean": mean, "std": std}}
-        known = {name: v for name, v in tied.items() if f"data.{name}" not in own}
-        settings["data"] = dict(said["data"]) | known
+        if "inputs" in said["data"]:  # images, not shapes
+            known = {name: v for name, v in tied.items() if f"data.{name}" not in own}
+            settings["data"] = dict(said["data"]) | known
         rows, columns = trained.image_size
         if "task.images_per_forward" not in own:  # photo networks have many classes, large images
             at_once = max(1, _PIXELS_PER_FORWARD // (rows * columns))

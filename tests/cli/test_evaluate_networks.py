@@ -134,6 +134,7 @@ def test_a_class_map_of_a_run(rooms: str, run_folder: Path, tmp_path: Path, run:
         ({"network": "network.widths=[4]"}, r"network\.widths: found .*the network is in"),
         ({"inputs": "data.inputs=[rgb,depth]"}, "found inputs|normalization"),
         ({"unmapped": "unmapped=often"}, "unmapped: found often; expected unknown or never"),
+        ({"data": "data=synthshapes"}, "task: found segmentation, with shapes"),
         ({"checkpoint": "checkpoint=none.onnx"}, r"none\.onnx: found no such file"),
     ],
 )
@@ -142,7 +143,7 @@ def test_what_cannot_be_evaluated_is_refused(
 ) -> None:
     given = {"checkpoint": network, "data": rooms, "class_map": MAP} | changes
     arguments = [text for name, text in given.items() if name != "class_map" and text]
-    arguments += ROOMS if given["data"] else []
+    arguments += ROOMS if given["data"] == rooms else []
     if given["class_map"]:
         arguments.append(_written(tmp_path / "map.json", given["class_map"]))
     with pytest.raises(SystemExit, match=message):
