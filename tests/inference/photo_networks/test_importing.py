@@ -166,6 +166,7 @@ def test_impossible_views_are_refused() -> None:
         (("output=net.ckpt",), r"output: found net\.ckpt; expected a name ending in \.onnx"),
         (("output=net.onnx",), "which exists; expected a new file"),
         (("file=null",), "file: found none; expected an ONNX file"),
+        (("network=timm", "model=vit"), "found timm, which has no networks for segmentation"),
         (("network=torchvision", "model=resnet50"), "model: found resnet50; expected deeplabv3"),
         (
             ("network=torchvision", "model=lraspp_mobilenet_v3_large", "weights=VOC"),
