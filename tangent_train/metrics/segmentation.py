@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Integer
+from jaxtyping import Float, Integer
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 from torchmetrics import Metric
+from torchmetrics.utilities import dim_zero_cat
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_latitudes, equirect_solid_angles
@@ -20,7 +21,9 @@ __all__ = [
     "AbsentClass",
     "ConfusionMatrices",
     "ConfusionMatrix",
+    "Interval",
     "SegmentationScores",
+    "bootstrap_intervals",
     "segmentation_scores",
 ]
 
@@ -33,7 +36,11 @@ UNKNOWN = 0
 BAND_EDGES_DEG = (90, 60, 30, 0, -30, -60, -90)
 """Latitude bands, from north to south."""
 
+Interval = tuple[float, float]
+"""Lower and upper end of a score, shares of 1."""
+
 _PANORAMA_DIMENSIONS = 2
+_DRAWS_AT_ONCE = 100
 
 
 class SegmentationScores(NamedTuple):
@@ -68,19 +75,78 @@ def segmentation_scores(
     Returns:
         The scores; means are NaN when nothing is labelled and absent classes are skipped.
     """
-    matrix = np.asarray(confusion, np.float64)[1:]
-    truth, hits = matrix.sum(axis=1), matrix[:, 1:].diagonal()
-    predicted = matrix[:, 1:].sum(axis=0)
-    present = truth > 0
-    missing = np.nan if absent_class == "skip" else 0.0
-    iou = np.full(len(truth), missing)
-    accuracy = iou.copy()
-    iou[present] = (hits / np.maximum(truth + predicted - hits, 1e-300))[present]
-    accuracy[present] = hits[present] / truth[present]
-    used = present | (absent_class == "zero")
-    miou, macc = (float(v[used].mean()) if used.any() else np.nan for v in (iou, accuracy))
-    share = truth / truth.sum() if present.any() else np.zeros_like(truth)
+    sums = np.stack(_class_sums(np.asarray(confusion, np.float64)))
+    iou, accuracy = _class_scores(sums, absent_class)
+    truth = sums[0]
+    share = truth / truth.sum() if truth.any() else np.zeros_like(truth)
+    miou, macc = float(_mean_of_classes(iou)), float(_mean_of_classes(accuracy))
     return SegmentationScores(miou, macc, iou, accuracy, share)
+
+
+def _class_sums(confusion: Any) -> tuple[Any, Any, Any]:
+    """Of each class what is labelled, what is predicted, and hits; of an array or a tensor."""
+    known = confusion[1:]
+    return known.sum(1), known[:, 1:].sum(0), known[:, 1:].diagonal()
+
+
+def _class_scores(
+    sums: NDArray[np.float64], absent_class: AbsentClass
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """IoU and accuracy ``(..., K)`` of sums ``(..., 3, K)``."""
+    truth, predicted, hits = np.moveaxis(sums, -2, 0)
+    missing = np.nan if absent_class == "skip" else 0.0
+    iou = hits / np.maximum(truth + predicted - hits, 1e-300)
+    accuracy = hits / np.maximum(truth, 1e-300)
+    return np.where(truth > 0, iou, missing), np.where(truth > 0, accuracy, missing)
+
+
+def _mean_of_classes(scores: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Mean over the last axis of what is not NaN; NaN where nothing is."""
+    count = np.sum(~np.isnan(scores), axis=-1)
+    total = np.nansum(scores, axis=-1)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def bootstrap_intervals(
+    of_images: Float[np.ndarray, "images 3 classes"],
+    absent_class: AbsentClass = "skip",
+    draws: int = 1000,
+    seed: int = 0,
+) -> dict[str, Interval]:
+    """95 % percentile bootstrap intervals of mIoU and mAcc, with images as the unit.
+
+    Every draw takes as many images as there are, with replacement, and scores them as one data set
+    (Efron and Tibshirani, An Introduction to the Bootstrap, 1993, chapter 13). The order of the
+    images, and the number of processes that counted them, does not matter.
+
+    Args:
+        of_images: See `ConfusionMatrices.of_images`: pixels or solid angles.
+        absent_class: Treatment of classes absent from the ground truth of a draw.
+        draws: Number of draws.
+        seed: Of the draws.
+
+    Returns:
+        Intervals of ``miou`` and ``macc``; none of a single image, or where nothing is labelled.
+    """
+    count = len(of_images)
+    if count <= 1:
+        return {}
+    flat = of_images.reshape(count, -1)
+    flat = flat[np.lexsort(flat.T)]
+    generator = np.random.default_rng(seed)
+    drawn = []
+    for start in range(0, draws, _DRAWS_AT_ONCE):
+        size = min(_DRAWS_AT_ONCE, draws - start)
+        times = generator.multinomial(count, np.full(count, 1 / count), size=size)
+        drawn.append(times.astype(np.float64) @ flat)
+    sums = np.concatenate(drawn).reshape(draws, *of_images.shape[1:])
+    intervals = {}
+    for name, scores in zip(("miou", "macc"), _class_scores(sums, absent_class), strict=True):
+        means = _mean_of_classes(scores)
+        if not np.isnan(means).all():
+            low, high = np.nanquantile(means, (0.025, 0.975))
+            intervals[name] = (float(low), float(high))
+    return intervals
 
 
 class ConfusionMatrices(NamedTuple):
@@ -91,12 +157,16 @@ class ConfusionMatrices(NamedTuple):
         solid_angle: ``(K+1, K+1)`` steradians of panoramas; all 0 for photos.
         bands: ``(6, K+1, K+1)`` pixels of the latitude bands `BAND_EDGES_DEG`, likewise.
         images: Panoramas or photos counted.
+        of_images: ``(images, 2, 3, K)`` of each image, in pixels and in steradians, what is
+            labelled, what is predicted and hits of each class: enough for its scores, and less
+            than its matrices.
     """
 
     pixels: NDArray[np.int64]
     solid_angle: NDArray[np.float64]
     bands: NDArray[np.int64]
     images: int
+    of_images: NDArray[np.float64]
 
 
 class ConfusionMatrix(Metric):
@@ -113,6 +183,7 @@ class ConfusionMatrix(Metric):
         bands: ``(6, K+1, K+1)`` pixels per latitude band of 30°, north first.
         steradians: ``(K+1, K+1)`` the same over all latitudes, in steradians.
         images: Panoramas and photos seen.
+        of_images: See `ConfusionMatrices`; a part for each image.
     """
 
     full_state_update = False
@@ -120,6 +191,7 @@ class ConfusionMatrix(Metric):
     bands: Tensor
     steradians: Tensor
     images: Tensor
+    of_images: list[Tensor]
 
     def __init__(self, num_classes: int) -> None:
         super().__init__()
@@ -133,6 +205,15 @@ class ConfusionMatrix(Metric):
             ("images", torch.zeros((), dtype=torch.int64)),
         ):
             self.add_state(name, default, dist_reduce_fx="sum")
+        self.add_state("of_images", [], dist_reduce_fx="cat")
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all images."""
+        super().reset()
+        # Processes without images join the others with a part of the same type and shape.
+        shape = (0, 2, 3, self.num_classes - 1)
+        self.of_images.append(torch.zeros(shape, dtype=torch.float64, device=self.device))
 
     def update(
         self,
@@ -157,11 +238,17 @@ class ConfusionMatrix(Metric):
         pairs = _checked(truth[known], k) * k + _checked(prediction[known], k)
         self.images += 1
         if truth.ndim == _PANORAMA_DIMENSIONS:
-            self._count_panorama(pairs, known)
+            pixels, steradians = self._count_panorama(pairs, known)
         else:
-            self.pixels += torch.bincount(pairs, minlength=k * k).reshape(k, k)
+            pixels = torch.bincount(pairs, minlength=k * k).reshape(k, k)
+            steradians = torch.zeros_like(self.steradians)
+        self.pixels += pixels
+        self.steradians += steradians
+        sums = [torch.stack(_class_sums(matrix.double())) for matrix in (pixels, steradians)]
+        self.of_images.append(torch.stack(sums)[None])
 
-    def _count_panorama(self, pairs: Tensor, known: Tensor) -> None:
+    def _count_panorama(self, pairs: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
+        """Add to the bands; returns the panorama's matrices of pixels and of steradians."""
         k = self.num_classes
         rows = known.nonzero()[:, 0]
         height, width = known.shape
@@ -171,10 +258,9 @@ class ConfusionMatrix(Metric):
         by_row = torch.bincount(rows * k * k + pairs, minlength=height * k * k).reshape(
             height, k, k
         )
-        self.pixels += by_row.sum(dim=0)
         self.bands.index_add_(0, torch.as_tensor(band_of_row, device=known.device), by_row)
         angles = torch.as_tensor(equirect_solid_angles((height, width)), device=known.device)
-        self.steradians += torch.tensordot(angles, by_row.double(), dims=1)
+        return by_row.sum(dim=0), torch.tensordot(angles, by_row.double(), dims=1)
 
     def compute(self) -> ConfusionMatrices:
         """The matrices of all processes, as arrays."""
@@ -183,6 +269,7 @@ class ConfusionMatrix(Metric):
             solid_angle=self.steradians.cpu().numpy(),
             bands=self.bands.cpu().numpy(),
             images=int(self.images),
+            of_images=dim_zero_cat(self.of_images).cpu().numpy(),
         )
 
 

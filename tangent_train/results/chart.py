@@ -28,7 +28,8 @@ _LONGEST_LABEL = 60
 def report_png(title: str, rows: Sequence[Row]) -> bytes:
     """Bars of the means over the classes and of every class, lines over the latitude.
 
-    Error bars are the standard deviation over folds, else over seeds; hatched bars are published.
+    Error bars are the standard deviation over folds, else over seeds, else the 95 % interval over
+    the images of a single run; hatched bars are published.
 
     Args:
         title: Of the chart.
@@ -44,7 +45,8 @@ def report_png(title: str, rows: Sequence[Row]) -> bytes:
     figure = Figure(figsize=(width, 3.6 * panels + 0.2 * len(rows)), dpi=120, layout="constrained")
     FigureCanvasAgg(figure)
     means, classes, *latitude = figure.subplots(panels, 1)
-    means.set_title(f"{title} (± standard deviation over folds, else over seeds)", loc="left")
+    bars = "standard deviation over folds, else over seeds, else 95 % interval over images"
+    means.set_title(f"{title} (bars: {bars})", loc="left")
     _bars(
         means, rows, list(scores.means.values()), [[r.score(n) for n in scores.means] for r in rows]
     )
@@ -68,12 +70,11 @@ def _bars(
     width = 0.8 / len(rows)
     names = list(dict.fromkeys(row.label.removesuffix(" (paper)") for row in rows))
     for k, (row, found) in enumerate(zip(rows, scores, strict=True)):
-        spreads = [s.over_seeds if s.over_folds is None else s.over_folds for s in found]
         axes.bar(
             np.arange(len(ticks)) + (k - (len(rows) - 1) / 2) * width,
             _percents([score.mean for score in found]),
             0.92 * width,
-            yerr=_percents(spreads),
+            yerr=np.transpose([_error_bar(score) for score in found]),
             color=_COLORS[names.index(row.label.removesuffix(" (paper)")) % len(_COLORS)],
             hatch="//" if row.published else "",
             label=_short(row.label),
@@ -93,6 +94,16 @@ def _band_lines(axes: Axes, rows: Sequence[Row]) -> None:
     axes.legend(frameon=False, fontsize=8)
     _percent_axis(axes)
     axes.set_xlim(-90, 90)
+
+
+def _error_bar(score: Statistic) -> list[float]:
+    """Percent below and above the mean."""
+    spread = score.over_seeds if score.over_folds is None else score.over_folds
+    if spread is not None or score.mean is None or score.interval is None:
+        return _percents([spread, spread])
+    low, high = score.interval
+    # The mean of few images may lie outside.
+    return _percents([max(score.mean - low, 0), max(high - score.mean, 0)])
 
 
 def _percents(shares: Sequence[float | None]) -> list[float]:

@@ -17,6 +17,7 @@ from tangent_train.metrics.segmentation import (
     BAND_EDGES_DEG,
     AbsentClass,
     ConfusionMatrices,
+    bootstrap_intervals,
     segmentation_scores,
 )
 from tangent_train.results.record import RESULTS_FILE, SCORES, Record
@@ -95,9 +96,20 @@ def segmentation_record(
         "miou_solid_angle": _plain(solid.miou),
         "macc_solid_angle": _plain(solid.macc),
     }
-    confusion = matrices.pixels.tolist()
+    intervals = bootstrap_intervals(matrices.of_images[:, 0], absent_class)
+    if on_sphere:
+        by_angle = bootstrap_intervals(matrices.of_images[:, 1], absent_class)
+        intervals |= {f"{name}_solid_angle": ends for name, ends in by_angle.items()}
     return Record(
-        "segmentation", noun, matrices.images, means, classes, bands, confusion, absent_class
+        "segmentation",
+        noun,
+        matrices.images,
+        means,
+        classes,
+        bands,
+        matrices.pixels.tolist(),
+        absent_class,
+        intervals,
     )
 
 
@@ -146,11 +158,12 @@ def _plain(value: float) -> float | None:
 def headline(record: Record) -> str:
     """The scores over all classes in one line."""
     means = [
-        f"{heading} {percent(record.means[name])}\u00a0%"
+        f"{heading} {percent(record.means[name], record.intervals.get(name))}\u00a0%"
         for name, heading in SCORES[record.kind].means.items()
         if record.means[name] is not None
     ]
-    return f"{', '.join(means)} over {record.images} {record.noun}".strip()
+    told = " (in brackets: 95\u00a0% intervals)" if record.intervals else ""
+    return f"{', '.join(means)} over {record.images} {record.noun}".strip() + told
 
 
 def largest_loss(record: Record) -> str:
@@ -182,7 +195,8 @@ def result_tables(record: Record) -> list[Table]:
     ]
     headings = {**_HEADINGS, **{name: f"{text} %" for name, text in scores.per_class.items()}}
     rows = [[e["class"], *(_cell(e[name]) for name in columns)] for e in record.classes]
-    means = (_cell(record.means[mean_of[c]]) if c in mean_of else "" for c in columns)
+    names = (mean_of.get(column) for column in columns)
+    means = (percent(record.means[n], record.intervals.get(n)) if n else "" for n in names)
     rows.append(["mean", *means])
     texts = [0, *(1 + k for k, name in enumerate(columns) if name == "taken_for")]
     header = ["class", *(headings[name] for name in columns)]

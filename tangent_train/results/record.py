@@ -15,6 +15,7 @@ from typing import Any, Literal, NamedTuple
 from tangent_train.checkpoints.content import INPUTS, read_settings
 from tangent_train.errors import DataError
 from tangent_train.json_text import parse_json
+from tangent_train.metrics.segmentation import Interval
 from tangent_train.registry import check_fields
 from tangent_train.setting_rules import flat_settings
 
@@ -102,6 +103,7 @@ class Record:
         latitude_bands: For every band ``latitude_deg`` (south, north) and scores; none for photos.
         confusion: Integer counts, rows truth, columns prediction.
         absent_class: Treatment of classes absent from the ground truth in the means.
+        intervals: 95 % bootstrap intervals over the images, of those means that have one.
         settings: The resolved config of the run, as ``section.setting``.
         folder: Of the run.
     """
@@ -114,6 +116,7 @@ class Record:
     latitude_bands: Sequence[Mapping[str, Any]] = ()
     confusion: Sequence[Sequence[int]] = ()
     absent_class: str | None = None
+    intervals: Mapping[str, Interval] = field(default_factory=dict)
     settings: Mapping[str, Any] = field(default_factory=dict)
     folder: Path = Path()
 
@@ -169,6 +172,7 @@ class Record:
             "noun": self.noun,
             "images": self.images,
             **self.means,
+            **({"intervals": self.intervals} if self.intervals else {}),
             **({} if self.absent_class is None else {"absent_class": self.absent_class}),
             "classes": self.classes,
             "latitude_bands": self.latitude_bands,
@@ -213,6 +217,7 @@ def _parsed(content: Any) -> dict[str, Any]:
     return {
         **{name: content[name] for name in ("kind", "noun", "images", "confusion")},
         "absent_class": content.get("absent_class"),
+        "intervals": {k: _interval(v) for k, v in content.get("intervals", {}).items()},
         "means": means,
         "classes": classes,
         "latitude_bands": bands,
@@ -225,6 +230,13 @@ def _share(value: Any) -> float | None:
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= 1:
         raise ValueError(f"{value!r} instead of a share of 1, or null")
     return float(value)
+
+
+def _interval(value: Any) -> Interval:
+    low, high = map(_share, value)
+    if low is None or high is None:
+        raise ValueError(f"{value!r} instead of two shares of 1")
+    return low, high
 
 
 def _edges(band: Mapping[str, Any]) -> Band:

@@ -23,6 +23,7 @@ _LEGEND = (
     "Percent. Mean over folds of the mean over seeds; ± the sample standard deviation over folds, "
     "in brackets that over seeds within a fold."
 )
+_LEGEND_OF_INTERVALS = "[…] of a single run: 95 % bootstrap interval over its images."
 
 
 @dataclass(frozen=True)
@@ -85,7 +86,9 @@ class Report:
                 cells += [_change(row.kept(name).mean)] if name in changes else []
             rows.append(cells)
         common = "; ".join(f"{name} {values[name][0]}" for name in alike)
-        note = " ".join(filter(None, (f"{common}." if alike else "", _LEGEND, self.compared)))
+        shown = any(row.score(name).interval for row in self.rows for name in scores)
+        told = _LEGEND_OF_INTERVALS if shown else ""
+        note = " ".join(filter(None, (f"{common}." if alike else "", _LEGEND, told, self.compared)))
         return Table(self.title, header, rows, note, range(1 + len(facts)))
 
     def _per_class(self) -> Iterator[Table]:
@@ -192,7 +195,7 @@ def _cell(found: Statistic, folds: int) -> str:
     over_folds = "" if found.over_folds is None else f" ± {percent(found.over_folds)}"
     over_seeds = "" if found.over_seeds is None else f" (± {percent(found.over_seeds)})"
     lacking = f" of {found.folds}" if found.folds < folds else ""
-    return percent(found.mean) + over_folds + over_seeds + lacking
+    return percent(found.mean, found.interval) + over_folds + over_seeds + lacking
 
 
 def _change(kept: float | None) -> str:

@@ -16,6 +16,7 @@ from statistics import fmean, stdev
 from typing import Any, NamedTuple
 
 from tangent_train.errors import DataError
+from tangent_train.metrics.segmentation import Interval
 from tangent_train.results.record import RESULTS_FILE, Band, Record
 from tangent_train.setting_rules import may_differ
 
@@ -30,12 +31,22 @@ class Statistic(NamedTuple):
         over_folds: Standard deviation of the folds' means; None with one fold.
         over_seeds: Pooled standard deviation within folds; None with one seed for each.
         folds: Number of folds with the score: a class may be absent from a fold.
+        low: Lower end of the 95 % bootstrap interval over the images of a single run; None with
+            several runs.
+        high: Its upper end.
     """
 
     mean: float | None
     over_folds: float | None
     over_seeds: float | None
     folds: int
+    low: float | None = None
+    high: float | None = None
+
+    @property
+    def interval(self) -> Interval | None:
+        """The interval, where there is one."""
+        return None if self.low is None or self.high is None else (self.low, self.high)
 
 
 @dataclass(frozen=True)
@@ -74,13 +85,17 @@ class Row:
         return replace(self, records=records, partner=partner)
 
     def score(self, name: str, part: str | Band | None = None) -> Statistic:
-        """Mean over folds of the mean over seeds, with both spreads.
+        """Mean over folds of the mean over seeds, with both spreads; of one run, its interval.
 
         Args:
             name: As in `Record.score`.
             part: As in `Record.score`.
         """
-        return average((fold, value) for (fold, _), value in self._values(name, part))
+        found = average((fold, value) for (fold, _), value in self._values(name, part))
+        if part is not None or len(self.records) != 1:
+            return found
+        low, high = self.records[0].intervals.get(name, (None, None))
+        return found._replace(low=low, high=high)
 
     def kept(self, name: str, part: str | Band | None = None) -> Statistic:
         """The ratio of its score to its partner's, over the folds and seeds that both have.

@@ -98,10 +98,11 @@ def markdown_line(cells: Sequence[str]) -> str:
     return "| " + " | ".join(text.replace("|", r"\|") for text in cells) + " |"
 
 
-def percent(share: float | None) -> str:
+def percent(share: float | None, interval: tuple[float, float] | None = None) -> str:
     """A share of 1 in percent, without the sign; a dash where it is undefined.
 
-    >>> percent(0.4562), percent(None)
-    ('45.6', '–')
+    >>> percent(0.4562), percent(None), percent(0.4562, (0.42, 0.5))
+    ('45.6', '–', '45.6 [42.0, 50.0]')
     """
-    return "–" if share is None else f"{100 * share:.1f}"
+    ends = "" if interval is None else f" [{percent(interval[0])}, {percent(interval[1])}]"
+    return ("–" if share is None else f"{100 * share:.1f}") + ends

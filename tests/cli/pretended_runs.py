@@ -70,7 +70,7 @@ class PretendedRuns:
         pixels = np.diag([0, hits, hits])
         pixels[1:, 0] = 100 - hits
         bands = np.zeros((6, 3, 3), np.int64)
-        matrices = ConfusionMatrices(pixels, pixels / 10, bands, 4)
+        matrices = ConfusionMatrices(pixels, pixels / 10, bands, 4, np.zeros((0, 2, 3, 2)))
         results = segmentation_record(matrices, ("unknown", "wall", "floor"), "skip")
         write_results(results, folder)
         return 0

@@ -1,12 +1,18 @@
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
 
 from tangent_train.errors import SettingError
-from tangent_train.metrics.segmentation import ConfusionMatrix, segmentation_scores
+from tangent_train.metrics.segmentation import (
+    ConfusionMatrix,
+    bootstrap_intervals,
+    segmentation_scores,
+)
 
 CLASSES = 5
 
@@ -119,6 +125,119 @@ def test_all_is_summed_over_processes() -> None:
     np.testing.assert_array_equal(whole.bands, 3 * own.bands)
     np.testing.assert_allclose(whole.solid_angle, 3 * own.solid_angle, rtol=1e-12)
     assert whole.images == 9
+
+
+@pytest.mark.filterwarnings("ignore:The ``compute`` method .* was called before")
+def test_parts_of_images_are_joined_over_processes_each_once() -> None:
+    """Of three processes, one with two panoramas, one with a third, one without any."""
+    whole = _counted(_panoramas())
+    parts = [_counted(_panoramas()[:2]), _counted(_panoramas()[2:]), ConfusionMatrix(CLASSES)]
+    expected = whole.compute().of_images
+    assert expected.shape == (3, 2, 3, CLASSES - 1)
+    for part in parts:
+        others = [torch.cat(other.of_images) for other in parts if other is not part]
+
+        def gather(
+            state: torch.Tensor, group: object = None, others: list[torch.Tensor] = others
+        ) -> list[torch.Tensor]:
+            return [state, *others] if state.ndim == 4 else [state]
+
+        part.dist_sync_fn, part.distributed_available_fn = gather, lambda: True
+        found = part.compute().of_images
+        order = np.argsort(found[:, 0, 0].sum(axis=-1))
+        of_size = np.argsort(expected[:, 0, 0].sum(axis=-1))
+        np.testing.assert_array_equal(found[order], expected[of_size])
+
+
+def test_every_image_is_kept_until_the_next_evaluation() -> None:
+    pairs = _panoramas()
+    metric = _counted(pairs)
+    matrices = metric.compute()
+    for k, pair in enumerate(pairs):
+        alone = _counted([pair]).compute()
+        for own, matrix in zip(
+            matrices.of_images[k], (alone.pixels, alone.solid_angle), strict=True
+        ):
+            truth, predicted, hits = own
+            np.testing.assert_allclose(truth, matrix[1:].sum(axis=1), rtol=1e-12)
+            np.testing.assert_allclose(predicted, matrix[:, 1:].sum(axis=0), rtol=1e-12)
+            np.testing.assert_allclose(hits, matrix.diagonal()[1:], rtol=1e-12)
+    metric.reset()
+    metric.update(*map(torch.from_numpy, pairs[1]))
+    np.testing.assert_array_equal(metric.compute().of_images, matrices.of_images[1:2])
+
+
+def _random_images(count: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Confusion matrices, and their sums as `ConfusionMatrix` keeps them; class 4 is rare."""
+    rng = np.random.default_rng(11)
+    confusions = rng.integers(0, 90, (count, CLASSES, CLASSES))
+    confusions[:, 0] = 0
+    confusions[1:, 4] = 0
+    sums = [(c[1:].sum(1), c[:, 1:].sum(0), c.diagonal()[1:]) for c in confusions]
+    return confusions, np.array(sums, np.float64)
+
+
+@pytest.mark.parametrize("absent", ["skip", "zero"])
+def test_intervals_are_those_of_data_sets_drawn_one_after_another(absent: Any) -> None:
+    confusions, of_images = _random_images(6)
+    flat = of_images.reshape(6, -1)
+    confusions = confusions[np.lexsort(flat.T)]
+    rng = np.random.default_rng(5)
+    scores = []
+    for _ in range(250):
+        whole = np.zeros((CLASSES, CLASSES))
+        times = rng.multinomial(6, [1 / 6] * 6)
+        for count, confusion in zip(times, confusions, strict=True):
+            whole += count * confusion
+        scores.append(segmentation_scores(whole, absent)[:2])
+    low, high = np.percentile(scores, [2.5, 97.5], axis=0)
+    found = bootstrap_intervals(of_images, absent, draws=250, seed=5)
+    assert found["miou"] == pytest.approx((low[0], high[0]), rel=1e-12)
+    assert found["macc"] == pytest.approx((low[1], high[1]), rel=1e-12)
+    assert low[0] < high[0]
+
+
+def test_intervals_are_the_same_in_any_order() -> None:
+    _, of_images = _random_images(9)
+    assert bootstrap_intervals(of_images) == bootstrap_intervals(of_images[::-1])
+
+
+def test_images_alike_have_intervals_of_no_width() -> None:
+    _, of_images = _random_images(1)
+    confusion, _ = _random_images(1)
+    expected = segmentation_scores(confusion[0])
+    found = bootstrap_intervals(of_images.repeat(4, axis=0))
+    assert found["miou"] == pytest.approx([expected.miou] * 2, rel=1e-12)
+    assert found["macc"] == pytest.approx([expected.macc] * 2, rel=1e-12)
+
+
+def test_draws_without_labels_are_left_out() -> None:
+    _, of_images = _random_images(1)
+    unlabelled = np.zeros_like(of_images)
+    with_one = bootstrap_intervals(np.concatenate([of_images, unlabelled]))
+    assert with_one == {
+        k: pytest.approx(v) for k, v in bootstrap_intervals(of_images.repeat(2, axis=0)).items()
+    }
+
+
+def test_there_is_no_interval_of_one_image_or_of_nothing_labelled() -> None:
+    _, of_images = _random_images(1)
+    assert bootstrap_intervals(of_images) == {}
+    assert bootstrap_intervals(of_images[:0]) == {}
+    assert bootstrap_intervals(np.zeros((3, 3, 4))) == {}
+    assert bootstrap_intervals(np.zeros((3, 3, 4)), "zero") == {"miou": (0, 0), "macc": (0, 0)}
+
+
+def test_intervals_cover_the_accuracy_of_the_population() -> None:
+    """About 95 of 100 samples of 40 images: the ends are where they should be."""
+    rng = np.random.default_rng(2)
+    covered = 0
+    for _ in range(200):
+        hits = rng.beta(6, 2, (40, 1)) * 100
+        of_images = np.stack([np.full_like(hits, 100), np.full_like(hits, 100), hits], axis=1)
+        low, high = bootstrap_intervals(of_images, draws=300)["macc"]
+        covered += low <= 0.75 <= high
+    assert 0.88 < covered / 200 < 0.99
 
 
 def test_bad_input_is_refused() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,7 @@ def _matrices(pixels: dict[tuple[int, int], int] | None = None) -> ConfusionMatr
         erp[place] = count
     bands = np.zeros((6, 4, 4), np.int64)
     bands[2] = erp
-    return ConfusionMatrices(erp, erp / 10, bands, 7)
+    return ConfusionMatrices(erp, erp / 10, bands, 7, np.zeros((0, 2, 3, 3)))
 
 
 def _record(absent: Any = "skip", noun: str = "panoramas") -> Record:
@@ -75,13 +76,43 @@ def test_csv_and_markdown_hold_the_same_scores(tmp_path: Path) -> None:
 
 def test_photos_have_neither_solid_angles_nor_latitudes() -> None:
     none = np.zeros((4, 4))
-    matrices = _matrices()._replace(solid_angle=none, bands=np.zeros((6, 4, 4), np.int64))
+    of_images = np.zeros((2, 2, 3, 3))
+    of_images[:, 0] = 1
+    matrices = _matrices()._replace(
+        solid_angle=none, bands=np.zeros((6, 4, 4), np.int64), of_images=of_images
+    )
     record = segmentation_record(matrices, NAMES, "zero", "photos")
     assert record.means["miou_solid_angle"] is None
     assert record.latitude_bands == []
     (table,) = result_tables(record)
     assert not [name for name in table.header if "solid angle" in name]
-    assert headline(record) == "mAcc 46.7\u00a0%, mIoU 35.2\u00a0% over 7 photos"
+    assert set(record.intervals) == {"macc", "miou"}
+    plain = replace(record, intervals={})
+    assert headline(plain) == "mAcc 46.7\u00a0%, mIoU 35.2\u00a0% over 7 photos"
+
+
+def test_means_stand_with_their_intervals(tmp_path: Path) -> None:
+    """Two images, of one class each: a draw has either, or both."""
+    of_images = np.zeros((2, 2, 3, 3))
+    of_images[0, :, :, 0] = [100, 100, 90]  # labelled, predicted, hits
+    of_images[1, 0, :, 1] = [100, 100, 50]
+    of_images[1, 1, :, 1] = [10, 10, 4]
+    record = segmentation_record(_matrices()._replace(of_images=of_images), NAMES, "skip")
+    expected = {
+        "macc": (0.5, 0.9),
+        "miou": (50 / 150, 90 / 110),
+        "macc_solid_angle": (0.4, 0.9),
+        "miou_solid_angle": (4 / 16, 90 / 110),
+    }
+    assert record.intervals == {name: pytest.approx(ends) for name, ends in expected.items()}
+    text = "mAcc 70.0 [50.0, 90.0]\u00a0%, mIoU 52.7 [33.3, 81.8]\u00a0%, "
+    assert headline(record).startswith(text)
+    assert headline(record).endswith(" over 7 panoramas (in brackets: 95\u00a0% intervals)")
+    write_results(record, tmp_path)
+    mean = "| mean | 52.7 [33.3, 81.8] | 70.0 [50.0, 90.0] | 52.7 [25.0, 81.8] | 70.0 [40.0, 90.0]"
+    assert mean in (tmp_path / "results.md").read_text()
+    read = json.loads((tmp_path / "results.json").read_text())["intervals"]
+    assert {name: tuple(ends) for name, ends in read.items()} == record.intervals
 
 
 @pytest.mark.parametrize(

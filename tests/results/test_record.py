@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -16,9 +17,11 @@ SCORES = (0.1, 0.2, None)
 
 def test_a_record_is_read_as_it_was_written(tmp_path: Path) -> None:
     record = made_record(SCORES, bands=(0.5, 0.25))
+    record = replace(record, intervals={"miou": (0.125, 0.5), "macc_solid_angle": (0.0, 1.0)})
     read = load_record(write_run(tmp_path / "a", record))
     assert read.json() == record.json()
     assert read.settings == record.settings
+    assert read.intervals == record.intervals
     assert (read.fold, read.seed, read.data) == (1, 0, "Stanford2D3DS")
     assert read.bands == BANDS
     assert read.score("miou", BANDS[1]) == 0.25
@@ -71,6 +74,21 @@ def test_scores_must_be_shares(value: object, place: str, tmp_path: Path) -> Non
         results[place][0]["iou" if place == "classes" else "miou"] = value
     path.write_text(json.dumps(results))
     with pytest.raises(DataError, match=r"results\.json: found .*instead of a share of 1"):
+        load_record(path.parent)
+
+
+def test_results_without_intervals_are_read(tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "a", made_record(SCORES))
+    assert "intervals" not in json.loads((folder / "results.json").read_text())
+    assert load_record(folder).intervals == {}
+
+
+@pytest.mark.parametrize("interval", [[0.5], [0.1, 0.2, 0.3], [None, 0.5], [0.1, 1.5], 0.5, "01"])
+def test_broken_intervals_are_refused(interval: object, tmp_path: Path) -> None:
+    path = write_run(tmp_path / "a", made_record(SCORES)) / "results.json"
+    results = json.loads(path.read_text())
+    path.write_text(json.dumps({**results, "intervals": {"miou": interval}}))
+    with pytest.raises(DataError, match=r"results\.json: found (Value|Type)Error"):
         load_record(path.parent)
 
 

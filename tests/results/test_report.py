@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -59,6 +60,40 @@ def test_the_tables_show_means_spreads_and_what_is_missing() -> None:
         "mine: fold 3, seed 1 more than once, also in /runs/3_1.",
         "a note",
     ]
+
+
+def test_a_single_run_is_shown_with_its_interval_over_images(tmp_path: Path) -> None:
+    intervals = {"miou": (0.25, 0.31)}  # a mean of few images may lie outside
+    single = replace(made_record([0.1, 0.5, 0.5], name="single"), intervals=intervals)
+    several = [
+        replace(made_record([0.1, 0.5, 0.5], data__fold=fold), intervals=intervals)
+        for fold in (1, 2)
+    ]
+    report = _runs_report(single, *several)
+    cells = _cells(report)
+    assert cells["single"]["mIoU %"] == "36.7 [25.0, 31.0]"
+    assert cells["single"]["mAcc %"] == "36.7"
+    assert cells["mine"]["mIoU %"] == "36.7 ± 0.0"
+    explained = "95 % bootstrap interval over its images"
+    assert explained in report.tables()[0].note
+    assert explained not in _runs_report(*several).tables()[0].note
+    report.write(tmp_path, "x")
+    with_bar, without = (
+        decoded(report_png("", [Row("", (replace(single, intervals=found),))]))
+        for found in (intervals, {})
+    )
+    assert (with_bar != without).any()
+    with (tmp_path / "x.csv").open(newline="") as file:
+        ends_of = {
+            (row["row"], row["fold"]): (row["low"], row["high"])
+            for row in csv.DictReader(file)
+            if row["score"] == "miou" and row["class"] == "mean"
+        }
+    ends, none = ("0.25", "0.31"), ("", "")
+    assert ends_of == {
+        ("single", "1"): ends, ("single", "mean"): ends,
+        ("mine", "1"): ends, ("mine", "2"): ends, ("mine", "mean"): none,
+    }  # fmt: skip
 
 
 def test_all_files_hold_the_same_scores(tmp_path: Path) -> None:
