@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 import pytest
 from PIL import ExifTags, Image
+from transformers import SegformerConfig, SegformerForSemanticSegmentation, SegformerImageProcessor
 
 from tests.conftest import fabricate
 from tests.datamodules.folder.folder_format import write_data_set
@@ -30,6 +31,7 @@ from tests.slow.documentation.commands import TIME, small, typed
 ROOT = Path(__file__).resolve().parents[3]
 SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
 ROWS = 128
+SEGFORMER = "nvidia/segformer-b0-finetuned-ade-512-512"
 _SEQUENCES = dict.fromkeys(("01", "02", "04", "05", "06"), 2)
 _TWO_BATCHES = {"PL_TRAINER_LIMIT_TRAIN_BATCHES": "2", "PL_TRAINER_LIMIT_VAL_BATCHES": "2"}
 
@@ -42,6 +44,7 @@ def build_world(folder: Path) -> Path:
     write_data_set(folder / "my_rooms", height=ROWS, depth=True)
     write_photos(folder / "my_photos")
     _write_pictures(folder)
+    _write_segformer(folder / SEGFORMER)
     demo = f"runs/demo/{TIME}"
     for line in (
         f"tangent-train experiment=rooms/demo hydra.run.dir={demo}",
@@ -51,6 +54,7 @@ def build_world(folder: Path) -> Path:
         "tangent-export checkpoint=runs/rgb/…/checkpoints/best.ckpt output=model.onnx",
         "tangent-export checkpoint=runs/rgb/…/checkpoints/best.ckpt output=model.safetensors",
         "tangent-render input=room.jpg output=tangent",
+        f"tangent-import network=huggingface model={SEGFORMER} output=segformer.ckpt",
     ):
         run(line.split(), {}, folder)
     for root in ("synthrooms", "rooms_standard"):
@@ -88,6 +92,20 @@ def _write_pictures(folder: Path) -> None:
     for name in ("photo.jpg", "photos/garden.jpg"):
         (folder / name).parent.mkdir(exist_ok=True)
         Image.fromarray(panorama[:, : 3 * ROWS // 2]).save(folder / name, exif=exif)
+
+
+def _write_segformer(folder: Path) -> None:
+    """A photo network as the hub has it, where its name on the hub is a path."""
+    names = dict(enumerate(("wall", "floor", "ceiling", "windowpane", "door", "sky")))
+    config = SegformerConfig(
+        depths=[1, 1, 1, 1],
+        hidden_sizes=[8, 8, 16, 16],
+        num_attention_heads=[1, 1, 2, 2],
+        decoder_hidden_size=16,
+        id2label=names,
+    )
+    SegformerForSemanticSegmentation(config).save_pretrained(folder)
+    SegformerImageProcessor(size={"height": 32, "width": 32}).save_pretrained(folder)
 
 
 def run(words: list[str], variables: dict[str, str], world: Path) -> None:
