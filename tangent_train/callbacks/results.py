@@ -65,7 +65,8 @@ def write_evaluation(
         folder: Output folder.
         notes: Further lines.
     """
-    notes = [f"Checkpoint: {checkpoint}", *notes]
+    own = checkpoint.is_relative_to(folder)  # so that a run tells the same wherever it is
+    notes = [f"Checkpoint: {checkpoint.relative_to(folder) if own else checkpoint}", *notes]
     write_results(record, folder, notes)
     callbacks = task.trainer.callbacks
     write_report(

@@ -32,7 +32,7 @@ class Faulty(nn.Module):
     ) -> None:
         super().__init__()
         torch.manual_seed(0)
-        self.layer = nn.Conv2d(3, 14, 3, padding=1)
+        self.layer = nn.Conv2d(3, 13, 3, padding=1)
         self.at = at
         self.wrong = wrong
         self.seen: list[Tensor] = []

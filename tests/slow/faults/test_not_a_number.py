@@ -87,7 +87,7 @@ def test_nan_weights_never_replace_a_good_checkpoint(stanford_root: Path, tmp_pa
 def test_a_statistic_of_batch_normalization_counts_as_a_weight(
     stanford_root: Path, tmp_path: Path
 ) -> None:
-    normalization: Any = torch.nn.BatchNorm2d(14)
+    normalization: Any = torch.nn.BatchNorm2d(13)
     normalization.running_var[3] = torch.nan
     network = torch.nn.Sequential(Faulty(), normalization)
     network.register_buffer("mask", torch.full((2,), -torch.inf))  # is one a network may have
