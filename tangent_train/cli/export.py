@@ -10,8 +10,7 @@ from typing import Any
 from rich.console import Console
 
 from tangent_train.checkpoints.trained import load_trained
-from tangent_train.cli.settings import typed
-from tangent_train.errors import SettingError
+from tangent_train.cli.settings import check_new, typed
 from tangent_train.inference.export import export_network
 from tangent_train.inference.predictor import sees_rays
 
@@ -43,13 +42,7 @@ def export(config: Mapping[str, Any]) -> None:
     """
     settings = typed(Settings, config)
     output = settings.output
-    if output.is_dir() or (output.exists() and not settings.overwrite):
-        raise SettingError(
-            "output",
-            found=f"{output}, which exists",
-            expected="a new file",
-            remedy="" if output.is_dir() else "Give another name, or set overwrite=true.",
-        )
+    check_new(output, overwrite=settings.overwrite)
     console = Console(soft_wrap=True, highlight=False)
     with console.status(f"Writing {output.name} …"):
         trained = load_trained(settings.checkpoint, settings.trust)

@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 from rich.console import Console
 
 from tangent_train.cli.compose import config_folder
-from tangent_train.cli.settings import typed
+from tangent_train.cli.settings import check_new, typed
 from tangent_train.errors import SettingError
 
 if TYPE_CHECKING:
@@ -57,13 +57,7 @@ def import_network(config: Mapping[str, Any]) -> None:
 
     settings = typed(Settings, config)
     output = settings.output
-    if output.is_dir() or (output.exists() and not settings.overwrite):
-        raise SettingError(
-            "output",
-            found=f"{output}, which exists",
-            expected="a new file",
-            remedy="" if output.is_dir() else "Give another name, or set overwrite=true.",
-        )
+    check_new(output, overwrite=settings.overwrite)
     console = Console(soft_wrap=True, highlight=False)
     with console.status(f"Writing {output.name} …"):
         network = _load(settings, config["normalization"])

@@ -12,7 +12,7 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 
 from tangent_train.errors import SettingError
 
-__all__ = ["Trust", "typed"]
+__all__ = ["Trust", "check_new", "typed"]
 
 _Settings = TypeVar("_Settings")
 
@@ -49,6 +49,21 @@ def typed(kind: type[_Settings], config: Mapping[str, Any]) -> _Settings:
     """
     hints = get_type_hints(kind)
     return kind(**{name: _converted(name, config[name], hint) for name, hint in hints.items()})
+
+
+def check_new(output: Path, *, overwrite: bool) -> None:
+    """Refuse to replace a file without being told, and a folder in any case.
+
+    Raises:
+        SettingError: There is one.
+    """
+    if output.is_dir() or (output.exists() and not overwrite):
+        raise SettingError(
+            "output",
+            found=f"{output}, which exists",
+            expected="a new file",
+            remedy="" if output.is_dir() else "Give another name, or set overwrite=true.",
+        )
 
 
 def _converted(name: str, value: Any, hint: Any) -> Any:

@@ -214,7 +214,6 @@ def _write_checkpoint(
         "tangent_train_version": version("tangent-train"),
     }  # fmt: skip
     torch.save(content, path)
-    path.chmod(0o644)
 
 
 def _write_onnx(

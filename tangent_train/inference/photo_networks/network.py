@@ -13,7 +13,10 @@ from datamodules.core.inputs import Normalization
 from tangent_train.errors import DataError, SettingError
 from tangent_train.json_text import parse_json
 
-__all__ = ["PhotoNetwork", "class_names_in", "normalization_of"]
+__all__ = ["USUAL_SIZE", "PhotoNetwork", "class_names_in", "normalization_of"]
+
+USUAL_SIZE = (512, 512)
+"""Rows and columns of the photos, where nothing says what they were."""
 
 _NORMALIZATIONS = {
     "imagenet": Normalization((0.485, 0.456, 0.406), (0.229, 0.224, 0.225)),

@@ -10,6 +10,7 @@ from models.pretrained import load_tensors, read_tensors
 from tangent_train.checkpoints.trained import completed_settings
 from tangent_train.errors import SettingError
 from tangent_train.inference.photo_networks.network import (
+    USUAL_SIZE,
     PhotoNetwork,
     class_names_in,
     normalization_of,
@@ -17,8 +18,6 @@ from tangent_train.inference.photo_networks.network import (
 from tangent_train.registry import make
 
 __all__ = ["load"]
-
-_SIZE = (512, 512)
 
 
 def load(
@@ -42,4 +41,4 @@ def load(
     whole = completed_settings(settings, 3, len(names), restored=True)
     network = make(whole, "network")
     load_tensors(network, read_tensors(Path(weights).expanduser()), weights)
-    return PhotoNetwork(network, whole, names, normalization_of(normalization), _SIZE)
+    return PhotoNetwork(network, whole, names, normalization_of(normalization), USUAL_SIZE)

@@ -8,15 +8,13 @@ from typing import Any
 from models.onnx_network import OnnxNetwork
 from tangent_train.errors import SettingError
 from tangent_train.inference.photo_networks.network import (
+    USUAL_SIZE,
     PhotoNetwork,
     class_names_in,
     normalization_of,
 )
 
 __all__ = ["load"]
-
-_SIZE = (512, 512)
-"""Of photos, where the file takes images of any size."""
 
 
 def load(*, file: Path | None, classes: Path | None, normalization: Any, **_: Any) -> PhotoNetwork:
@@ -39,5 +37,5 @@ def load(*, file: Path | None, classes: Path | None, normalization: Any, **_: An
         settings=None,
         score_names=class_names_in(classes),
         normalization=normalization_of(normalization),
-        image_size=network.image_size or _SIZE,
+        image_size=network.image_size or USUAL_SIZE,
     )

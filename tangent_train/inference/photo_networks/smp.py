@@ -9,6 +9,7 @@ from datamodules.core.inputs import Normalization
 from models.pretrained import load_tensors
 from tangent_train.errors import DataError, SettingError
 from tangent_train.inference.photo_networks.network import (
+    USUAL_SIZE,
     PhotoNetwork,
     class_names_in,
     normalization_of,
@@ -18,7 +19,6 @@ from tangent_train.registry import SettingsFile, make
 
 __all__ = ["load"]
 
-_SIZE = (512, 512)
 _CLASS = "_model_class"
 _NORMALIZATION = "imagenet, unit, symmetric, or {mean: […], std: […]} of RGB from 0 to 1"
 
@@ -59,7 +59,7 @@ def load(*, model: str | None, classes: Path | None, normalization: Any, **_: An
         settings=settings,
         score_names=class_names_in(classes),
         normalization=given or _of_encoder(config),
-        image_size=_SIZE,
+        image_size=USUAL_SIZE,
         remarks=remarks,
     )
 
