@@ -53,25 +53,21 @@ def evaluated(task: Any, noun: str) -> Record:
     return segmentation_record(task.matrices, task.class_names, task.absent_class, noun)
 
 
-def write_evaluation(
-    task: Any, record: Record, checkpoint: Path, folder: Path, notes: Sequence[str] = ()
-) -> None:
+def write_evaluation(task: Any, record: Record, folder: Path, notes: Sequence[str] = ()) -> None:
     """Write ``results.*`` and ``report.html``.
 
     Args:
         task: The evaluated task, still attached to its trainer.
-        record: From `evaluated`.
-        checkpoint: Its weights.
+        record: From `evaluated`, with its checkpoint.
         folder: Output folder.
         notes: Further lines.
     """
-    own = checkpoint.is_relative_to(folder)  # so that a run tells the same wherever it is
-    notes = [f"Checkpoint: {checkpoint.relative_to(folder) if own else checkpoint}", *notes]
+    notes = [f"Checkpoint: {record.checkpoint}", *notes]
     write_results(record, folder, notes)
     callbacks = task.trainer.callbacks
     write_report(
         folder / "report.html",
-        f"Evaluation of {checkpoint.name}",
+        f"Evaluation of {Path(record.checkpoint).name}",
         tables=[*result_tables(record), confusion_table(record)],
         images=[i for c in callbacks if isinstance(c, PredictionPanels) for i in c.images],
         class_names=task.class_names,

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import nn
 
 from datamodules.core.split_module import SplitDataModule
-from tangent_train.checkpoints.trained import completed_settings
+from tangent_train.checkpoints.trained import TrainedNetwork, completed_settings
+from tangent_train.cli.settings import typed
 from tangent_train.errors import SettingError
+from tangent_train.inference.class_maps import Unmapped, load_class_map, map_classes
+from tangent_train.inference.views import check_size
 from tangent_train.registry import SettingsFile, check_registered, make, maker_of
 
-__all__ = ["Settings", "build", "build_data", "build_task"]
+__all__ = ["Settings", "build", "build_data", "build_trained", "check_fits", "shown"]
 
 _RGB = 3
 
@@ -46,7 +50,7 @@ def build(settings: Settings, source: SettingsFile | None = None) -> tuple[Any, 
     section = completed_settings(
         settings["network"], data.in_channels, data.num_classes, restored=restored
     )
-    task = build_task(settings, data, make(section, "network", source), source)
+    task = _build_task(settings, data, make(section, "network", source), source)
     _try_network(task, data.in_channels)
     return data, task
 
@@ -68,7 +72,72 @@ def build_data(settings: Settings, source: SettingsFile | None = None) -> Any:
     return data
 
 
-def build_task(
+def build_trained(
+    settings: Settings, trained: TrainedNetwork, source: SettingsFile | None = None
+) -> tuple[Any, Any, list[str]]:
+    """The data module and the task that evaluate a network from a file.
+
+    Args:
+        settings: Of the evaluation, perhaps with ``class_map`` and ``unmapped``.
+        trained: The network.
+        source: The file they come from, see `registry.make`.
+
+    Returns:
+        Data module, task, and what the class map was understood to say.
+
+    Raises:
+        SettingError: The network does not suit the data, or they do not suit the class map.
+    """
+    data = build_data(settings, source)
+    notes = []
+    if settings.get("class_map") is not None:
+        given = typed(_Mapping, settings)
+        class_map = load_class_map(given.class_map)
+        mapped = map_classes(trained, class_map, given.unmapped, data.class_names[1:])
+        trained, notes = mapped.trained, [f"Class map {class_map.name}: {mapped}."]
+    check_fits(data, shown(trained), settings["checkpoint"])
+    check_size(trained, data.representation.image_size)
+    return data, _build_task(settings, data, trained.network, source), notes
+
+
+@dataclass(frozen=True)
+class _Mapping:
+    """See ``configs/evaluate.yaml``."""
+
+    class_map: str
+    unmapped: Unmapped
+
+
+def check_fits(data: Any, network: Mapping[str, Any], name: object) -> None:
+    """Refuse data of other inputs or classes than those of a network.
+
+    Args:
+        data: The data module.
+        network: As `shown`, and perhaps more.
+        name: Of the network, for the message.
+
+    Raises:
+        SettingError: They are others.
+    """
+    for what, value in shown(data).items():
+        if network[what] != value:
+            raise SettingError(
+                f"data, for {name}",
+                found=f"{what.replace('_', ' ')} {value}",
+                expected=f"{network[what]}, which the network was trained with",
+                remedy="class_map= says which are the same." if what == "class_names" else "",
+            )
+
+
+def shown(of: Any) -> dict[str, Any]:
+    """Inputs and classes of a data module or a trained network, as plain values."""
+    mean, std = list(of.normalization.mean), list(of.normalization.std)
+    inputs = {"inputs": list(of.inputs)} if hasattr(of, "inputs") else {}
+    names = list(of.class_names)
+    return {"class_names": names, **inputs, "normalization": {"mean": mean, "std": std}}
+
+
+def _build_task(
     settings: Settings, data: Any, network: nn.Module, source: SettingsFile | None = None
 ) -> Any:
     """The task of a run with its network; see `build`."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +20,10 @@ from tangent_train.callbacks.panels import ProgressBar
 from tangent_train.callbacks.results import evaluated, pictures, write_evaluation
 from tangent_train.checkpoints.content import read_checkpoint, write_settings
 from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
-from tangent_train.cli.build import Settings, build, build_data, build_task
+from tangent_train.cli.build import Settings, build, build_trained, check_fits, shown
 from tangent_train.cli.machine import machine_faults
-from tangent_train.cli.settings import typed
-from tangent_train.cli.stored import GROUPS
+from tangent_train.cli.stored import GROUPS, run_settings
 from tangent_train.errors import SettingError
-from tangent_train.inference.class_maps import ClassMap, Unmapped, load_class_map, map_classes
-from tangent_train.inference.views import check_size
 from tangent_train.registry import SettingsFile, make
 from tangent_train.results.evaluation import headline, result_tables
 from tangent_train.results.record import Record
@@ -42,9 +39,10 @@ def evaluate(
     """Evaluate a checkpoint on the test fold of its data.
 
     Args:
-        settings: Of the run, and ``checkpoint``, ``class_map`` and ``unmapped``.
+        settings: Of the run, and ``checkpoint``, ``class_map`` and ``unmapped``; all there are for
+            a stage of a transfer.
         source: The file they come from, see `registry.make`.
-        trained: The network of a file that has no settings of a run.
+        trained: The network of a file that has no settings of a run, if it was loaded for these.
 
     Raises:
         SettingError: No checkpoint is given, or it does not fit the data.
@@ -52,24 +50,14 @@ def evaluate(
     if settings["checkpoint"] is None:
         raise SettingError("checkpoint", found="none", expected="checkpoints/best.ckpt of a run")
     checkpoint = Path(settings["checkpoint"])
-    class_map = None
-    if settings.get("class_map") is None:
+    mapped = settings.get("class_map") is not None
+    if not mapped:
         settings = {name: value for name, value in settings.items() if name != "unmapped"}
-    else:
-        class_map = load_class_map(typed(_Mapping, settings).class_map)
-        if trained is None:
-            trained = load_trained(checkpoint, () if source is None else source.trust)
-    run = Run.begin(settings, source, trained, class_map)
+    if trained is None and (mapped or run_settings(checkpoint) is None):
+        trained = load_trained(checkpoint, settings.get("trust", ()))
+    run = Run.begin(settings, source, trained)
     with machine_faults(run.folder, run.data):
         run.test(run.trainer([]), checkpoint)
-
-
-@dataclass(frozen=True)
-class _Mapping:
-    """See ``configs/evaluate.yaml``."""
-
-    class_map: str
-    unmapped: Unmapped
 
 
 @dataclass(frozen=True)
@@ -99,7 +87,6 @@ class Run:
         settings: Settings,
         source: SettingsFile | None,
         trained: TrainedNetwork | None = None,
-        class_map: ClassMap | None = None,
     ) -> Run:
         """Build the objects, and write the settings to the run's folder.
 
@@ -107,35 +94,23 @@ class Run:
             settings: Of the run.
             source: The file they come from.
             trained: Network to evaluate; None to make it from the settings.
-            class_map: Of that network to the classes of the data.
         """
         folder = Path(HydraConfig.get().runtime.output_dir)
         lightning.seed_everything(settings["seed"], workers=True, verbose=False)
-        notes = []
+        notes: list[str] = []
         if trained is None:
             data, task = build(settings, source)
         else:
-            data = build_data(settings, source)
-            if class_map is not None:
-                targets = data.class_names[1:]
-                mapped = map_classes(trained, class_map, settings["unmapped"], targets)
-                trained, notes = mapped.trained, [f"Class map {class_map.name}: {mapped}."]
-            check_size(trained, data.representation.image_size)
-            task = build_task(settings, data, trained.network, source)
-        chosen = HydraConfig.get().runtime.choices
-        choices = {group: chosen[group] for group in GROUPS if chosen.get(group)}
-        kept = {name: value for name, value in settings.items() if name != "trust"}
-        run = Run(folder, {"choices": choices, **kept}, source, data, task, trained, notes)
+            data, task, notes = build_trained(settings, trained, source)
+        kept = {n: value for n, value in settings.items() if n not in ("choices", "trust")}
+        kept = {"choices": _choices(settings, source), **kept}
+        run = Run(folder, kept, source, data, task, trained, notes)
         write_settings(folder / "config.yaml", run.settings)
         return run
 
-    def shown(self) -> dict[str, Any]:
-        """Inputs and classes of the network, as plain values."""
-        return _shown(self.data)
-
     def trainer(self, callbacks: Sequence[Callback]) -> lightning.Trainer:
         """The trainer of the config, with callbacks besides those of every run."""
-        contents = {"kind": self.task.kind, "config": self.settings, **self.shown()}
+        contents = {"kind": self.task.kind, "config": self.settings, **shown(self.data)}
         common = [CheckpointContents(contents), ProgressBar()]
         section = self.settings["trainer"]
         every, epochs = section.get("check_val_every_n_epoch"), section.get("max_epochs")
@@ -166,16 +141,9 @@ class Run:
         Raises:
             SettingError: The data or the network do not match the weights.
         """
-        content = read_checkpoint(checkpoint) if self.trained is None else _shown(self.trained)
-        for name, value in self.shown().items():
-            if content[name] != value:
-                raise SettingError(
-                    f"data, for {checkpoint}",
-                    found=f"{name.replace('_', ' ')} {value}",
-                    expected=f"{content[name]}, which the network was trained with",
-                    remedy="class_map= says which are the same." if name == "class_names" else "",
-                )
         if self.trained is None:
+            content = read_checkpoint(checkpoint)
+            check_fits(self.data, content, checkpoint)
             self._load(content["state_dict"], checkpoint)
         trainer.test(self.task, datamodule=self.data, verbose=False)
         record = evaluated(self.task, self.data.noun)
@@ -196,7 +164,10 @@ class Run:
 
     @rank_zero_only
     def _report(self, record: Record, checkpoint: Path) -> None:
-        write_evaluation(self.task, record, checkpoint, self.folder, self.notes)
+        own = checkpoint.is_relative_to(self.folder)  # so that a run tells the same wherever it is
+        name = str(checkpoint.relative_to(self.folder) if own else checkpoint)
+        record = replace(record, checkpoint=name, class_map=self.settings.get("class_map"))
+        write_evaluation(self.task, record, self.folder, self.notes)
         console = Console(soft_wrap=True, highlight=False)
         for note in self.notes:
             console.print(note, markup=False)
@@ -206,9 +177,12 @@ class Run:
         console.print(told, markup=False)
 
 
-def _shown(of: Any) -> dict[str, Any]:
-    """Inputs and classes of a data module or a trained network, as plain values."""
-    mean, std = list(of.normalization.mean), list(of.normalization.std)
-    inputs = {"inputs": list(of.inputs)} if hasattr(of, "inputs") else {}
-    names = list(of.class_names)
-    return {"class_names": names, **inputs, "normalization": {"mean": mean, "std": std}}
+def _choices(settings: Settings, source: SettingsFile | None) -> dict[str, str]:
+    """The chosen options of config groups, without those in whose place a file gave a section."""
+    chosen, stored = HydraConfig.get().runtime.choices, settings.get("choices") or ()
+    return {
+        group: chosen[group]
+        for group in GROUPS
+        if chosen.get(group)
+        and (source is None or group in stored or group == "experiment" or not source.owns(group))
+    }

@@ -166,7 +166,7 @@ def _check_heads(
 ) -> None:
     """Refuse a file with so many more classes than the data, if it has not the scores of these."""
     own, found = network.state_dict(), tensors_for(network, path)
-    for name in heads.keys() & found.keys():
+    for name in filter(found.__contains__, heads):
         shape = tuple(found[name].shape)
         for size, now, by in zip(shape, own[name].shape, heads[name], strict=False):
             if by and size != now + more * by:

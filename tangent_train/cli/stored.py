@@ -22,7 +22,7 @@ from tangent_train.setting_rules import OF_THIS_MACHINE, from_file
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-__all__ = ["GROUPS", "StoredNetwork", "StoredRun", "stored_run"]
+__all__ = ["GROUPS", "StoredNetwork", "StoredRun", "run_settings", "stored_run"]
 
 _SECTIONS = ("data", "representation", "network", "task", "optimizer", "scheduler", "trainer")
 GROUPS = ("experiment", *_SECTIONS)
@@ -187,7 +187,7 @@ class StoredNetwork:
         if "task.images_per_forward" not in own:  # photo networks have many classes, large images
             at_once = max(1, _PIXELS_PER_FORWARD // (rows * columns))
             settings["task"] = dict(said["task"]) | {"images_per_forward": at_once}
-        of_user = (said.keys() - {"representation"}) | own
+        of_user = (said.keys() - {"network", "representation"}) | own
         return settings, SettingsFile(self.path, trust, of_user), trained
 
 
@@ -231,11 +231,13 @@ def stored_run(command: str, arguments: Sequence[str]) -> StoredRun | StoredNetw
                 expected="the folder of a started run",
                 remedy="Give resume= the folder that tangent-train printed.",
             )
-    exported = path.suffix.lower() in (".onnx", ".safetensors")
-    config = {} if exported else read_checkpoint(path, ("config",))["config"]
-    if command == "evaluate" and "data" not in config:
-        _check_network(path, _named(left))
-        return StoredNetwork(path, left)
+    if command == "train":
+        config = read_checkpoint(path, ("config",))["config"]
+    else:
+        config = run_settings(path)
+        _check_evaluation(path, _named(left), of_run=config is not None)
+        if config is None:
+            return StoredNetwork(path, left)
     kinds = {name: _RUN[name] for name in ("choices", "level", "seed")}
     known = check_fields(path, config, kinds, _EXPECTED)
     choices = {g: name for g, name in (known["choices"] or {}).items() if _is_own(g, name)}
@@ -247,15 +249,27 @@ def stored_run(command: str, arguments: Sequence[str]) -> StoredRun | StoredNetw
     return StoredRun(path, config, left, added, place)
 
 
+def run_settings(path: Path) -> dict[str, Any] | None:
+    """The settings of a run in a checkpoint; None in a network that knows no run.
+
+    Raises:
+        DataError: It cannot be read.
+    """
+    if path.suffix.lower() in (".onnx", ".safetensors"):
+        return None
+    config: dict[str, Any] = read_checkpoint(path, ("config",))["config"]
+    return config if "data" in config else None
+
+
 def _named(arguments: Sequence[str]) -> set[str]:
     """Names of the settings in overrides, without those of Hydra."""
     names = {a.lstrip("+~").partition("=")[0] for a in arguments if a[0] != "-"}
     return {name for name in names if not name.startswith("hydra")}
 
 
-def _check_network(path: Path, own: set[str]) -> None:
+def _check_evaluation(path: Path, own: set[str], *, of_run: bool) -> None:
     """Refuse to evaluate a network without data, or with settings of another network."""
-    if not own & {"data", "experiment"}:
+    if not of_run and not own & {"data", "experiment"}:
         raise SettingError(
             "data",
             found=f"none, and {path} has no settings of a run",
@@ -263,7 +277,7 @@ def _check_network(path: Path, own: set[str]) -> None:
             remedy="class_map= gives the network the classes of the data.",
         )
     others = sorted(name for name in own if name.partition(".")[0] == "network")
-    if others:
+    if others and (not of_run or "class_map" in own):
         raise SettingError(others[0], found="a value", expected=f"none: the network is in {path}")
 
 

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import cv2
 import numpy as np
-import torch
 
 from datamodules.core.panoramas import resize_area, resize_depth
 from datamodules.core.photos import distance_from_z_depth
@@ -16,6 +15,7 @@ from datamodules.core.samples import world_rays
 from tangent_train.errors import SettingError
 from tangent_train.registry import make
 from tangent_train.rendering import EquirectRepresentation, PerspectiveRepresentation
+from tangent_train.rendering.representations.equirect import as_crop
 from tangent_train.rendering.representations.perspective import PhotoCrops
 from tangent_train.rendering.representations.pinhole import PinholeRepresentation, spun, turns
 from tangent_train.rendering.representations.views import NO_RAYS, PinholeViews
@@ -308,18 +308,11 @@ def _grid_set(image: InputImage, grid: PinholeGrid) -> ViewSet:
 
 
 def _equirect_set(image: InputImage, seen: EquirectRepresentation) -> ViewSet:
-    """The panorama itself; its scores are one crop that wraps around by a pixel on all sides."""
-    (rows, columns), (height, width) = seen.image_size, image.rgb.shape[:2]
-    right, below = width / columns, height / rows
-    box = np.array([[-right, -below, width + right, height + below]])
-    crop = PhotoCrops(box, (rows + 2, columns + 2))
+    """The panorama itself."""
+    height, width = image.rgb.shape[:2]
 
     def add(mosaic: ScoreMosaic, scores: Tensor, _: slice) -> None:
-        first, last = (scores[..., i : i + 1 or None, :].roll(columns // 2, -1) for i in (0, -1))
-        tall = torch.cat([first, scores, last], dim=-2)
-        mosaic.add_crops(
-            torch.cat([tall[..., -1:], tall, tall[..., :1]], dim=-1), crop, np.array([0])
-        )
+        mosaic.add_crops(*as_crop(scores, (height, width)), np.array([0]))
 
     return ViewSet(_resized(image, seen.image_size), 1, lambda _: seen.whole(), add)
 

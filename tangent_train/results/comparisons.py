@@ -117,6 +117,8 @@ def _facts(records: Sequence[Record]) -> dict[str, str]:
         facts["rotated in training / test"] = " / ".join(
             _ROTATIONS.get(name, str(name)) for name in rotations
         )
+    if record.class_map is not None:
+        facts["class map"] = record.class_map
     folds = [str(fold) for fold in dict.fromkeys(r.fold for r in records) if fold is not None]
     return facts | {"folds": ", ".join(folds) or "–", "runs": str(len(records))}
 

@@ -236,7 +236,9 @@ def write_results(record: Record, folder: Path, notes: Sequence[str] = ()) -> No
         notes: Paragraphs of ``.md`` below the headline.
     """
     write_text(folder / RESULTS_FILE, record.json())
-    write_text(folder / "results.csv", csv_text(list(record.classes[0]), record.classes))
+    network = {"checkpoint": record.checkpoint, "class_map": record.class_map}
+    lines = [{**entry, **network} for entry in record.classes]
+    write_text(folder / "results.csv", csv_text(list(lines[0]), lines))
     tables = "\n".join(table.markdown() for table in result_tables(record))
     text = "\n\n".join(["# Results", headline(record), *notes, tables])
     write_text(folder / "results.md", text)

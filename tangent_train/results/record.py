@@ -104,6 +104,8 @@ class Record:
         confusion: Integer counts, rows truth, columns prediction.
         absent_class: Treatment of classes absent from the ground truth in the means.
         intervals: 95 % bootstrap intervals over the images, of those means that have one.
+        checkpoint: File of the network; that of a run itself is relative to its folder.
+        class_map: What gave the network the classes of the data; None for its own classes.
         settings: The resolved config of the run, as ``section.setting``.
         folder: Of the run.
     """
@@ -117,6 +119,8 @@ class Record:
     confusion: Sequence[Sequence[int]] = ()
     absent_class: str | None = None
     intervals: Mapping[str, Interval] = field(default_factory=dict)
+    checkpoint: str = ""
+    class_map: str | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)
     folder: Path = Path()
 
@@ -132,11 +136,14 @@ class Record:
 
     @property
     def data(self) -> str:
-        """The data set, and how the test images were rotated."""
+        """The data set, and how the test images were rotated, and turned upright."""
         name = str(self.settings.get("data._target_")).rpartition(".")[2]
         rotation = self.settings.get("data.test_rotation")
-        rotated = rotation is not None and self.kind == "segmentation"
-        return f"{name}, test rotated: {rotation}" if rotated else name
+        if rotation is None or self.kind != "segmentation":
+            return name
+        upright = self.settings.get("data.upright")
+        aligned = "" if upright is None else f", upright: {upright}"
+        return f"{name}, test rotated: {rotation}{aligned}"
 
     @property
     def fold(self) -> int | None:
@@ -171,6 +178,8 @@ class Record:
             "kind": self.kind,
             "noun": self.noun,
             "images": self.images,
+            "checkpoint": self.checkpoint,
+            "class_map": self.class_map,
             **self.means,
             **({"intervals": self.intervals} if self.intervals else {}),
             **({} if self.absent_class is None else {"absent_class": self.absent_class}),
@@ -212,10 +221,12 @@ def _parsed(content: Any) -> dict[str, Any]:
         _ = str(entry["class"]), [_share(entry[name]) for name in scores.per_class]
     for entry in bands:
         _ = _edges(entry), [_share(entry[name]) for name in scores.per_band]
-    if type(content["images"]) is not int:
-        raise TypeError(f"images={content['images']!r}")
+    for name, kinds in {"images": int, "checkpoint": str, "class_map": str | None}.items():
+        if not isinstance(content[name], kinds):
+            raise TypeError(f"{name}={content[name]!r}")
+    kept = ("kind", "noun", "images", "checkpoint", "class_map", "confusion")
     return {
-        **{name: content[name] for name in ("kind", "noun", "images", "confusion")},
+        **{name: content[name] for name in kept},
         "absent_class": content.get("absent_class"),
         "intervals": {k: _interval(v) for k, v in content.get("intervals", {}).items()},
         "means": means,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 from pathlib import Path
 from typing import Any
@@ -69,6 +70,8 @@ def test_what_a_map_leaves_is_missed_or_never_wins(
     config = read_settings(tmp_path / "never" / "config.yaml")
     assert (config["class_map"], config["unmapped"]) == (str(tmp_path / "my map.json"), "never")
     assert config["network"]["_target_"] == "torch.nn.Conv2d"
+    assert not {"network", "representation"} & config["choices"].keys(), "they are the file's"
+    assert config["choices"]["data"] == "synthrooms"
     assert config["data"]["inputs"] == ["rgb"]
     assert config["level"] == config["representation"]["level"] == 4
     for page in ("report.html", "results.md"):
@@ -76,6 +79,12 @@ def test_what_a_map_leaves_is_missed_or_never_wins(
         assert "photo.ckpt" in text
         assert "ceiling ← bright" in text
         assert "never win: green" in text
+    named = [network.partition("=")[2], str(tmp_path / "my map.json")]
+    content = json.loads((tmp_path / "never" / "results.json").read_text())
+    assert [content["checkpoint"], content["class_map"]] == named
+    first, *lines = csv.reader((tmp_path / "never" / "results.csv").read_text().splitlines())
+    assert first[-2:] == ["checkpoint", "class_map"]
+    assert all(line[-2:] == named for line in lines)
     assert len(list((tmp_path / "unknown" / "panels").glob("*.png"))) == 1
 
 
@@ -122,6 +131,8 @@ def test_a_class_map_of_a_run(rooms: str, run_folder: Path, tmp_path: Path, run:
     wall, door = (1 + CLASSES.index(name) for name in ("wall", "door"))
     assert not found[:, door].any()
     assert (found[:, wall] >= before[:, wall] + before[:, door]).all()
+    with pytest.raises(SystemExit, match=r"network\.widths: found .*the network is in"):
+        run("evaluate", *arguments, merged, "network.widths=[4]")
 
 
 @pytest.mark.parametrize(

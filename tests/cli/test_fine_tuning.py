@@ -12,6 +12,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
 from datamodules.core.inputs import RGBD_NORMALIZATION
+from tangent_train.checkpoints.content import read_settings
 from tangent_train.checkpoints.trained import load_trained
 from tangent_train.cli.build import build
 from tangent_train.cli.compose import config_folder
@@ -172,11 +173,15 @@ def test_fine_tuning_leaves_a_run_of_its_own(
     checkpoint = tmp_path / "tuned" / "checkpoints" / "best.ckpt"
     content = torch.load(checkpoint, weights_only=True)
     assert content["fresh"] == ["head.bias", "head.weight"]
+    choices = content["config"]["choices"]
+    assert "network" not in choices, "it is of no option"
+    assert choices["experiment"] == "rooms/demo"
     trained = load_trained(checkpoint)
     assert trained.class_names == tuple(content["class_names"])
     assert trained.normalization == normalization_of("imagenet")
     run("evaluate", f"checkpoint={checkpoint}", rooms, "hydra.run.dir=again")
     assert results(tmp_path / "again") == results(tmp_path / "tuned")
+    assert read_settings(tmp_path / "again" / "config.yaml")["choices"] == choices
 
 
 def test_a_factor_needs_something_to_start_from(rooms: str, run: Run) -> None:

@@ -6,6 +6,7 @@ import copy
 from dataclasses import dataclass
 from typing import Any, Self
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -16,6 +17,8 @@ from tangent_train.geometry import equirect_shape, random_rotation
 from tangent_train.registry import registered
 from tangent_train.rendering.checks import check_choice
 from tangent_train.rendering.forward import Interpolation
+from tangent_train.rendering.mosaic import ScoreMosaic
+from tangent_train.rendering.representations.perspective import PhotoCrops
 from tangent_train.rendering.representations.pinhole import unless_identity
 from tangent_train.rendering.representations.views import (
     NO_RAYS,
@@ -25,7 +28,7 @@ from tangent_train.rendering.representations.views import (
 )
 from tangent_train.rendering.rotate import rotate_equirect
 
-__all__ = ["EquirectRepresentation", "EquirectViews"]
+__all__ = ["EquirectRepresentation", "EquirectViews", "as_crop"]
 
 Image = NDArray[Any]
 
@@ -38,16 +41,20 @@ class EquirectViews:
         rotation: ``(3, 3)`` rotation of its directions; None for none.
         columns: Start of a crop, as a share of the columns, and its width; None for no crop.
         mirrored: Whether it is mirrored left to right.
+        rows: Its rows; None for those of the panorama.
     """
 
     rotation: NDArray[np.float64] | None = None
     columns: tuple[float, int] | None = None
     mirrored: bool = False
+    rows: int | None = None
 
     def render(self, image: Image, interpolation: Interpolation) -> Image:
         """Render a panorama ``(H, W[, C])`` to one image ``(1, H, w[, C])``, dtype kept."""
         if self.rotation is not None:
             image = rotate_equirect(image, self.rotation.T, interpolation)
+        if self.rows not in (None, image.shape[0]):
+            image = _resized(image, self.rows, interpolation)
         if self.columns is not None:
             start, width = self.columns
             first = int(start * image.shape[1])
@@ -65,6 +72,36 @@ class EquirectViews:
         return NOT_ROTATED if self.rotation is None else self.rotation[None]
 
 
+def _resized(image: Image, rows: int, interpolation: Interpolation) -> Image:
+    """A panorama of other rows: averaged or interpolated, or the pixels at the centres."""
+    height = image.shape[0]
+    if interpolation == "nearest":
+        down, across = ((2 * np.arange(n * rows) + 1) * height // (2 * rows) for n in (1, 2))
+        return image[down][:, across]
+    method = cv2.INTER_AREA if rows < height else cv2.INTER_LINEAR
+    resized: Image = cv2.resize(image, (2 * rows, rows), interpolation=method)
+    return resized
+
+
+def as_crop(scores: Tensor, shape: tuple[int, int]) -> tuple[Tensor, PhotoCrops]:
+    """Scores of a whole equirectangular image, to be interpolated on a panorama of another size.
+
+    Args:
+        scores: ``(1, K, h, w)``.
+        shape: ``(H, W)`` of the panorama.
+
+    Returns:
+        The scores continued by a pixel on all sides, around the sphere, and where that lies.
+    """
+    rows, columns = scores.shape[-2:]
+    right, below = shape[1] / columns, shape[0] / rows
+    box = np.array([[-right, -below, shape[1] + right, shape[0] + below]])
+    first, last = (scores[..., i : i + 1 or None, :].roll(columns // 2, -1) for i in (0, -1))
+    tall = torch.cat([first, scores, last], dim=-2)
+    framed = torch.cat([tall[..., -1:], tall, tall[..., :1]], dim=-1)
+    return framed, PhotoCrops(box, (rows + 2, columns + 2))
+
+
 @registered
 class EquirectRepresentation:
     """The baseline without tangent images: the equirectangular image, or random crops of it.
@@ -78,9 +115,11 @@ class EquirectRepresentation:
         rotation: Rotation of the panorama while training; about the vertical by whole columns.
         mirror: Mirror half of the training samples left to right.
         erp_height: Rows of the panorama, default `equirect_shape(level)`.
+        rows: Rows of the image that the network sees, default those of the panorama. Its scores are
+            interpolated on the panorama.
 
     Raises:
-        SettingError: The crop is no part of the panorama.
+        SettingError: The crop is no part of the panorama, or there are no rows.
     """
 
     def __init__(
@@ -90,14 +129,18 @@ class EquirectRepresentation:
         rotation: RotationAugmentation = "none",
         mirror: bool = False,
         erp_height: int | None = None,
+        rows: int | None = None,
     ) -> None:
         if crop_deg is not None and not 0 < crop_deg <= 360:
             raise SettingError("representation.crop_deg", found=crop_deg, expected="0 to 360")
+        if rows is not None and rows < 1:
+            raise SettingError("representation.rows", found=rows, expected="1 or more, or null")
         check_choice("representation.rotation", rotation, ("none", "yaw", "so3"))
         self.erp_height = equirect_shape(level)[0] if erp_height is None else erp_height
         self.crop_deg = crop_deg
         self.rotation = rotation
         self.mirror = mirror
+        self._rows = rows
         self._turn: NDArray[np.float64] | None = None
 
     def turned(self, rotation: NDArray[np.float64]) -> Self:
@@ -108,31 +151,37 @@ class EquirectRepresentation:
 
     @property
     def image_size(self) -> tuple[int, int]:
-        """Rows and columns of the panorama, as evaluated."""
-        return self.erp_height, 2 * self.erp_height
+        """Rows and columns of the image, as evaluated."""
+        rows = self._rows or self.erp_height
+        return rows, 2 * rows
 
     def sample(self, rng: np.random.Generator) -> Views:
         """The panorama or one crop of it, optionally rotated."""
         columns = None
         if self.crop_deg is not None or self.rotation == "yaw":
-            width = round(2 * self.erp_height * (self.crop_deg or 360) / 360)
+            width = round(self.image_size[1] * (self.crop_deg or 360) / 360)
             columns = (rng.random(), width)
         rotation = self._turn
         if self.rotation == "so3":
             turn = random_rotation(rng).T
             rotation = turn if rotation is None else rotation @ turn
-        return EquirectViews(rotation, columns, self.mirror and bool(rng.random() < 0.5))
+        mirrored = self.mirror and bool(rng.random() < 0.5)
+        return EquirectViews(rotation, columns, mirrored, self._rows)
 
     def whole(self) -> Views:
         """The whole panorama."""
-        return EquirectViews(self._turn)
+        return EquirectViews(self._turn, rows=self._rows)
 
     def to_labels(
         self, scores: Tensor, shape: tuple[int, int], rotation: NDArray[np.float64] | None = None
     ) -> Tensor:
         """The best class of every pixel; the scores are already those of the rotated panorama."""
-        del shape
-        labels = scores[0].argmax(dim=0)
+        if self._rows is None:
+            labels = scores[0].argmax(dim=0)
+        else:
+            mosaic = ScoreMosaic(shape, scores.shape[1], "nearest")
+            mosaic.add_crops(*as_crop(scores, shape), np.array([0]))
+            labels = torch.from_numpy(mosaic.labels().astype(np.int64)).to(scores.device)
         turn = unless_identity(rotation)
         if turn is None:
             return labels

@@ -48,6 +48,8 @@ REPRESENTATIONS: list[Representation] = [
     CubemapRepresentation(5, dim=41, rotation="so3", mirror=True),
     EquirectRepresentation(5),
     EquirectRepresentation(5, crop_deg=90, rotation="yaw", mirror=True),
+    EquirectRepresentation(5, rows=100),
+    EquirectRepresentation(5, rows=60),
 ]
 
 
@@ -182,6 +184,25 @@ def test_scores_are_interpolated_and_probabilities_feathered(blend: Blend) -> No
     blended = scores.softmax(dim=1) if blend == "feather" else scores
     expected = tangent_to_labels(blended, representation.grid, shape, blend)
     torch.testing.assert_close(representation.to_labels(scores, shape), expected)
+
+
+@pytest.mark.parametrize("rows", [24, 100])
+def test_scores_of_other_rows_are_interpolated_around_the_sphere(rows: int) -> None:
+    """Against bilinear interpolation in double precision, across the seam and beyond the poles."""
+    scores = torch.randn(1, 3, rows, 2 * rows, generator=torch.Generator().manual_seed(0))
+    found = EquirectRepresentation(5, rows=rows).to_labels(scores, SHAPE).numpy()
+    y, x = ((np.arange(n) + 0.5) * rows / SHAPE[0] - 0.5 for n in SHAPE)
+    expected = np.zeros((3, *SHAPE))
+    for down, across in np.ndindex(2, 2):
+        i, j = np.floor(y).astype(int) + down, np.floor(x).astype(int) + across
+        weight = np.outer(1 - abs(y - i), 1 - abs(x - j))
+        beyond = (i < 0) | (i >= rows)
+        columns = (j[None] + rows * beyond[:, None]) % (2 * rows)
+        expected += weight * scores[0].double().numpy()[:, i.clip(0, rows - 1)[:, None], columns]
+    ordered = np.sort(expected, axis=0)
+    clear = ordered[-1] - ordered[-2] > 1e-4
+    assert clear.mean() > 0.99
+    np.testing.assert_array_equal(found[clear], expected.argmax(axis=0)[clear])
 
 
 def test_the_identity_is_no_rotation() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -99,7 +100,7 @@ def test_panoramas_without_a_labelled_pixel(
     trainer = run_trainer(tmp_path / "run", callbacks=[panels])
     (logged,) = trainer.test(task, datamodule=data, verbose=False)
     figures = evaluated(task, data.noun)
-    write_evaluation(task, figures, tmp_path / "x.ckpt", tmp_path / "results")
+    write_evaluation(task, replace(figures, checkpoint="x.ckpt"), tmp_path / "results")
     written = json.loads((tmp_path / "results" / "results.json").read_text())
     assert written["images"] == 5
     assert len(list((tmp_path / "panels").iterdir())) == 2
