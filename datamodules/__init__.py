@@ -25,6 +25,8 @@ if TYPE_CHECKING:
         SynthRoomsPerspective,
     )
     from datamodules.synthshapes.datamodule import SynthShapes
+    from datamodules.zind.pairs import ZindPairs
+    from datamodules.zind.panoramas import Zind
 
 __all__ = [
     "FolderPanoramas",
@@ -40,6 +42,8 @@ __all__ = [
     "SynthRoomsPerspective",
     "SynthShapes",
     "SynthiaPerspective",
+    "Zind",
+    "ZindPairs",
 ]
 
 _MODULES = {
@@ -56,6 +60,8 @@ _MODULES = {
     "SynthRoomsPerspective": "datamodules.synthrooms.datamodule",
     "SynthShapes": "datamodules.synthshapes.datamodule",
     "SynthiaPerspective": "datamodules.synthia.perspective",
+    "Zind": "datamodules.zind.panoramas",
+    "ZindPairs": "datamodules.zind.pairs",
 }
 
 

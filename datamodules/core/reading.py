@@ -59,12 +59,15 @@ class ImageReader(ABC):
         """
 
     @abstractmethod
-    def size(self, part: str, path: Path) -> tuple[int, int]:
+    def size(self, part: str, path: Path) -> tuple[int, int] | None:
         """Rows and columns from the header of a file, which must have the data set's format.
 
         Args:
             part: ``rgb``, ``labels`` or ``depth``.
             path: The file; it has to be whole.
+
+        Returns:
+            None for labels that have no pixels of their own, but are drawn at any size.
 
         Raises:
             DataError: It is not.
@@ -187,10 +190,12 @@ def check_headers(
             continue
         with problems.noted(files.name, path):
             found = reader.size(part, path)
+            if found is None:
+                continue
             if part == "rgb":
                 size = found
                 if erp_height is not None:
-                    check_panorama_size(path, size, erp_height)
+                    check_panorama_size(path, found, erp_height)
             elif size not in (None, found):
                 remedy = "Export or copy both at one size."
                 if found[::-1] == size:

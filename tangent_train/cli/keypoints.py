@@ -109,7 +109,7 @@ def _pairs(config: Mapping[str, Any]) -> tuple[Any, PanoramaPairs]:
         raise SettingError(
             "data",
             found=config["data"]["_target_"],
-            expected="pairs: synthrooms_pairs or stanford2d3ds_pairs",
+            expected="pairs: synthrooms_pairs, stanford2d3ds_pairs or zind_pairs",
         )
     return config["data"], make(config["data"], "data")
 

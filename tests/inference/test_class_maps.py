@@ -15,6 +15,7 @@ from torch import nn
 
 from datamodules.stanford2d3ds.label_table import CLASSES as STANFORD
 from datamodules.synthia.reader import CLASSES as SYNTHIA
+from datamodules.zind.layout import CLASSES as ZIND
 from tangent_train.checkpoints.scores import Groups, Scores
 from tangent_train.checkpoints.trained import TrainedNetwork
 from tangent_train.errors import DataError, SettingError
@@ -23,10 +24,9 @@ from tangent_train.inference.class_maps import ClassMap, Unmapped, load_class_ma
 from tests.inference.published_classes import PUBLISHED
 from tests.inference.trained import TANGENT, trained_network
 
-LAYOUT = ("ceiling", "floor", "wall", "door", "window")
 SHIPPED = {
     "ade20k_to_stanford2d3ds": ("ADE20K", 150, STANFORD),
-    "ade20k_to_zind_layout": ("ADE20K", 150, LAYOUT),
+    "ade20k_to_zind_layout": ("ADE20K", 150, ZIND),
     "coco_stuff_to_stanford2d3ds": ("COCO-Stuff", 182, STANFORD),
     "cityscapes_to_synthia": ("Cityscapes", 19, SYNTHIA),
     "voc_to_stanford2d3ds": ("Pascal VOC", 21, STANFORD),

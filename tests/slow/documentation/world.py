@@ -26,6 +26,7 @@ from tests.datamodules.folder.folder_format import write_data_set
 from tests.datamodules.folder.photo_format import write_photos
 from tests.datamodules.stanford2d3ds.stanford_pairs_format import write_paper_pairs
 from tests.datamodules.synthia.synthia_format import write_panoramas, write_views
+from tests.datamodules.zind.zind_format import write_homes
 from tests.slow.documentation.commands import TIME, small, typed
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -41,6 +42,7 @@ def build_world(folder: Path) -> Path:
     fabricate(folder / "data" / "2d3ds", height=ROWS, photos=2)
     write_panoramas(write_views(folder / "data" / "synthia", _SEQUENCES), _SEQUENCES, ROWS)
     write_paper_pairs(folder / "data" / "pairs", ROWS)
+    write_homes(folder / "zind" / "sample_tour", rows=ROWS)
     write_data_set(folder / "my_rooms", height=ROWS, depth=True)
     write_photos(folder / "my_photos")
     _write_pictures(folder)

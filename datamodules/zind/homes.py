@@ -1,0 +1,231 @@
+"""The homes of ZInD: what ``zind_data.json`` says of their panoramas.
+
+Read is its ``merger``: floors, in them complete rooms, in them the parts of rooms that annotators
+drew, in them panoramas. Lengths are in heights of the camera. A place x of a panorama is at
+``scale · R(rotation) x + translation`` of its floor, in units of ``scale_meters_per_coordinate``
+metres; that is null where the length of a unit is not known.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from datamodules.zind.layout import DOOR, OPENING, WINDOW, Fixture, Layout
+from tangent_train.errors import DataError
+from tangent_train.geometry import PanoramaPose, rotation_about
+from tangent_train.json_text import parse_json
+from tangent_train.registry import Text, check_fields
+
+if TYPE_CHECKING:
+    from datamodules.core.problems import Problems
+
+__all__ = ["HomePanorama", "list_panoramas"]
+
+_GET_IT = (
+    "Get the sample tour from https://github.com/zillow/zind or request the whole set there, and "
+    "point data.root at the folder that holds the homes (sample_tour)."
+)
+_EXPECTED = "zind_data.json as released"
+_COPY = "Copy or extract the file again."
+_LEVELS = 4  # floors, complete rooms, partial rooms, panoramas
+_NAME = re.compile(r"\w+", re.ASCII)
+_MOST = 1e6  # camera heights
+_FIXTURES = {"openings": OPENING, "doors": DOOR, "windows": WINDOW}
+_POINTS = list[list[float]]
+_FROM_SPHERE = np.array([[0, -1.0, 0], [1.0, 0, 0], [0, 0, 1.0]])
+"""Axes of a panorama (x to the middle, y right, z up) to ZInD's (x left, y to the middle, z up)."""
+
+
+@dataclass(frozen=True, eq=False)
+class HomePanorama:
+    """A panorama of a home, as its file describes it.
+
+    Attributes:
+        file: ``zind_data.json``.
+        path: Names of floor, complete room, partial room and panorama.
+        record: What the file says of it.
+        unit_m: Metres in a unit of the floor; None where unknown.
+    """
+
+    file: Path
+    path: tuple[str, ...]
+    record: Mapping[str, Any]
+    unit_m: float | None
+
+    @property
+    def name(self) -> str:
+        """As ``000/floor_01/complete_room_06/partial_room_09/pano_5``."""
+        return "/".join((self.home, *self.path))
+
+    @property
+    def home(self) -> str:
+        """As ``000``."""
+        return self.file.parent.name
+
+    @property
+    def room(self) -> str:
+        """The complete room, as ``000/floor_01/complete_room_06``."""
+        return "/".join((self.home, *self.path[:2]))
+
+    @property
+    def has_layout(self) -> bool:
+        """Whether the file says what the camera sees."""
+        return self.record.get("layout_visible") is not None
+
+    @property
+    def is_inside(self) -> bool:
+        """Whether the camera is inside the partial room."""
+        return self.record.get("is_inside") is True
+
+    def image(self) -> Path:
+        """Its picture.
+
+        Raises:
+            DataError: The file does not name one in ``panos``.
+        """
+        path = PurePosixPath(self._fields({"image_path": Text})["image_path"])
+        if path.parent != PurePosixPath("panos"):
+            raise self._wrong(f"image_path={path}", "panos/….jpg")
+        return self.file.parent / path
+
+    def layout(self) -> Layout:
+        """What the camera sees.
+
+        Raises:
+            DataError: The file does not describe a room around the camera.
+        """
+        given = self._fields({"camera_height": float, "ceiling_height": float})
+        camera, ceiling = given["camera_height"], given["ceiling_height"]
+        if not 0 < camera < ceiling <= _MOST:
+            found = f"camera_height={camera}, ceiling_height={ceiling}"
+            raise self._wrong(found, "a camera between floor and ceiling")
+        vertices = self._points("vertices")
+        if len(vertices) < 3 or not _surrounds_origin(vertices):
+            found = f"{len(vertices)} vertices that do not surround the camera at (0, 0)"
+            raise self._wrong(found, "3 or more around it", "layout_visible")
+        fixtures = [
+            fixture for kind, label in _FIXTURES.items() for fixture in self._fixtures(kind, label)
+        ]
+        return Layout(vertices, -camera, ceiling - camera, fixtures)
+
+    def pose(self) -> tuple[PanoramaPose, float]:
+        """Place and orientation on its floor, whose height is 0, and metres in a camera height.
+
+        Raises:
+            DataError: The file does not say.
+        """
+        camera = self._fields({"camera_height": float})["camera_height"]
+        kinds = {"rotation": float, "scale": float, "translation": list[float]}
+        moved = self._fields(kinds, "floor_plan_transformation")
+        unit_m = (self.unit_m or math.nan) * moved["scale"]
+        translation = [*moved["translation"], moved["scale"] * camera]
+        numbers = [moved["rotation"], unit_m, *translation]
+        if len(translation) != 3 or not all(abs(n) <= _MOST for n in numbers) or not unit_m > 0:
+            raise self._wrong(f"{moved}, {self.unit_m} m a unit", "a place on the floor, in metres")
+        turn = rotation_about((0, 0, 1), math.radians(moved["rotation"]))
+        location_m = np.array(translation) * self.unit_m
+        return PanoramaPose(turn @ _FROM_SPHERE, location_m), unit_m
+
+    def _fixtures(self, kind: str, label: int) -> Iterator[Fixture]:
+        points = self._points(kind)
+        if len(points) % 3:
+            found = f"{len(points)} points for {kind}"
+            raise self._wrong(found, "two ends, and [bottom, top], of each", "layout_visible")
+        for *ends, (bottom_z, top_z) in points.reshape(-1, 3, 2):
+            if not bottom_z < top_z or np.array_equal(*ends):
+                found = f"{kind} from {ends[0]} to {ends[1]} with bottom {bottom_z}, top {top_z}"
+                raise self._wrong(found, "a bottom below the top", "layout_visible")
+            yield Fixture(np.stack(ends), bottom_z, top_z, label)
+
+    def _points(self, kind: str) -> NDArray[np.float64]:
+        """Points of a list of the layout, ``(n, 2)``."""
+        points = self._fields({kind: _POINTS}, "layout_visible")[kind]
+        if not all(len(point) == 2 and all(abs(c) <= _MOST for c in point) for point in points):
+            raise self._wrong(f"{kind}={points}", "pairs of finite numbers", "layout_visible")
+        return np.array(points, np.float64).reshape(-1, 2)
+
+    def _fields(self, kinds: Mapping[str, Any], section: str = "") -> dict[str, Any]:
+        """Fields of the record, or of a section of it, each of its kind."""
+        content = self._fields({section: dict})[section] if section else self.record
+        return check_fields(self.file, content, kinds, _EXPECTED, self._place(section))
+
+    def _place(self, section: str) -> str:
+        return ".".join(("merger", *self.path, *[section] * bool(section)))
+
+    def _wrong(self, found: object, expected: str, section: str = "") -> DataError:
+        found = f"{found} in {self._place(section)}"
+        return DataError(self.file, found=found, expected=expected, remedy=_COPY)
+
+
+def list_panoramas(root: Path, problems: Problems) -> list[HomePanorama]:
+    """The panoramas of all homes, in the order of their names.
+
+    Args:
+        root: Folder with a folder for every home.
+        problems: Files that cannot be read are added.
+
+    Raises:
+        DataError: There are no homes.
+    """
+    files = sorted(root.glob("*/zind_data.json"))
+    if not files:
+        raise DataError(
+            root,
+            found="no */zind_data.json" if root.is_dir() else "no such folder",
+            expected="a folder with zind_data.json and panos for every home",
+            remedy=_GET_IT,
+        )
+    found: list[HomePanorama] = []
+    for file in files:
+        with problems.noted(file.parent.name, file):
+            found += _read_home(file)
+    return found
+
+
+def _read_home(file: Path) -> list[HomePanorama]:
+    try:
+        content = parse_json(file.read_bytes())
+    except (OSError, ValueError) as error:
+        raise DataError(file, found=error, expected=_EXPECTED, remedy=_COPY) from error
+    kinds = {"merger": dict, "scale_meters_per_coordinate": dict}
+    given = check_fields(file, content, kinds, _EXPECTED)
+    branches: list[tuple[tuple[str, ...], Any]] = [((), given["merger"])]
+    for _ in range(_LEVELS):
+        branches = [
+            ((*path, name), inner)
+            for path, branch in branches
+            for name, inner in _named(file, path, branch)
+        ]
+    units = dict.fromkeys((path[0] for path, _ in branches), float | None)
+    place = "scale_meters_per_coordinate"
+    unit_m = check_fields(file, given[place], units, _EXPECTED, place)
+    return [
+        HomePanorama(file, path, dict(_named(file, path, record)), unit_m[path[0]])
+        for path, record in branches
+    ]
+
+
+def _named(file: Path, path: Sequence[str], branch: Any) -> Sequence[tuple[str, Any]]:
+    """What a mapping holds, whose names become parts of names of files."""
+    if isinstance(branch, Mapping) and all(_NAME.fullmatch(name) for name in branch):
+        return list(branch.items())
+    place = ".".join(("merger", *path))
+    shown = list(branch) if isinstance(branch, Mapping) else type(branch).__name__
+    expected = "a mapping, with names of letters, digits and _"
+    raise DataError(file, found=f"{shown} in {place}", expected=expected, remedy=_COPY)
+
+
+def _surrounds_origin(vertices: NDArray[np.float64]) -> bool:
+    """Whether a polygon goes round the origin once."""
+    angles = np.arctan2(vertices[:, 1], vertices[:, 0])
+    steps = np.diff(angles, append=angles[:1])
+    turned = (steps + np.pi) % (2 * np.pi) - np.pi
+    return bool(abs(abs(turned.sum()) - 2 * np.pi) < np.pi / 2)

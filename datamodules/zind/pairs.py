@@ -1,0 +1,90 @@
+"""Pairs of ZInD's panoramas of one room, with their poses, and distances from their layouts."""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+
+from datamodules.core.panorama_pairs import PairedPanorama, PanoramaPair, PanoramaPairs
+from datamodules.core.panoramas import resize_area
+from datamodules.core.problems import Problems
+from datamodules.images.pixel_files import read_rgb
+from datamodules.images.png import check_panorama_size
+from datamodules.zind.homes import HomePanorama, list_panoramas
+from tangent_train.errors import DataError
+
+__all__ = ["ZindPairs"]
+
+
+class ZindPairs(PanoramaPairs):
+    """Any two panoramas of a complete room whose cameras are inside.
+
+    On floors whose unit is not known in metres there are no pairs. Distances are those of floor,
+    walls and ceiling of the layout; through doors, windows and openings they are unknown.
+
+    Args:
+        root: Folder with a folder for every home, see `datamodules.zind.panoramas`.
+        max_distance_m: Largest distance of the two cameras; by default any.
+        erp_height: Rows to downsample the panoramas to; by default unchanged.
+    """
+
+    def __init__(
+        self,
+        root: str | Path,
+        max_distance_m: float | None = None,
+        erp_height: int | None = None,
+    ) -> None:
+        self.root = Path(root).expanduser()
+        self._max_distance_m = math.inf if max_distance_m is None else max_distance_m
+        self._height = erp_height
+
+    @property
+    def names(self) -> list[str]:
+        """The room and both panoramas."""
+        return [f"{one.room}/{one.path[-1]} – {other.path[-1]}" for one, other in self._pairs]
+
+    @property
+    def files(self) -> list[Path]:
+        """See `PanoramaPairs`."""
+        return [panorama.image() for pair in self._pairs for panorama in pair]
+
+    def read(self, index: int) -> PanoramaPair:
+        """Read a pair; see `PanoramaPairs`."""
+        left, right = map(self._panorama, self._pairs[index])
+        return PanoramaPair(self.names[index], None, left, right)
+
+    @cached_property
+    def _pairs(self) -> list[tuple[HomePanorama, HomePanorama]]:
+        problems = Problems()
+        listed = list_panoramas(self.root, problems)
+        problems.refuse(self.root)
+        usable = [p for p in listed if p.has_layout and p.is_inside and p.unit_m is not None]
+        location_m = {panorama.name: panorama.pose()[0].location_m for panorama in usable}
+        pairs = [
+            (one, other)
+            for one, other in combinations(usable, 2)
+            if one.room == other.room
+            and math.dist(location_m[one.name], location_m[other.name]) <= self._max_distance_m
+        ]
+        if not pairs:
+            raise DataError(
+                self.root,
+                found="no two panoramas of one room",
+                expected="layout_visible, is_inside and scale_meters_per_coordinate of some",
+                remedy="Set data.max_distance_m=null for any distance.",
+            )
+        return pairs
+
+    def _panorama(self, panorama: HomePanorama) -> PairedPanorama:
+        path = panorama.image()
+        rgb = read_rgb(path)
+        size = (rgb.shape[0], rgb.shape[1])
+        check_panorama_size(path, size, self._height or 1)
+        shape = size if self._height is None else (self._height, 2 * self._height)
+        pose, unit_m = panorama.pose()
+        distance_m = (panorama.layout().distances(shape) * unit_m).astype(np.float32)
+        return PairedPanorama(panorama.name, resize_area(rgb, shape), path, distance_m, pose)

@@ -1,0 +1,203 @@
+"""ZInD, the Zillow Indoor Dataset (Cruz et al. 2021): 67,448 panoramas of 1,575 empty homes.
+
+Features: 1024×2048 RGB, and room layouts of which labels of 5 classes are made, exact at any size.
+The panoramas are upright. A sample tour of one home, 32 panoramas, needs no registration.
+
+On disk, as released::
+
+    root/                         sample_tour, or the folder of the whole set
+      000/                        a folder for every home
+        zind_data.json            layouts, doors, windows, openings, poses: see `homes`
+        panos/floor_01_partial_room_09_pano_5.jpg
+      zind_partition.json         homes of train, val and test; copied from the repository if wanted
+
+A panorama is labelled by `layout_visible`, what its camera sees of the complete room. Left out are
+panoramas without it: those taken outside of the room that was annotated in them, 5 in the sample.
+
+====== ======= ====================================================================================
+label  class   of the layout
+====== ======= ====================================================================================
+0      unknown openings, through which the next room is seen
+1      ceiling level, at `ceiling_height`; others are drawn so too
+2      floor   also the tripod, and what stands on the floor in front of a wall
+3      wall    also kitchens, bathrooms, cupboards, open leaves of doors, frames
+4      door    also open doorways, with what is seen through them; `doors=ignore` makes them unknown
+5      window  also what is seen through it
+====== ======= ====================================================================================
+
+Licence: ZInD terms of use, for academic, non-commercial research:
+https://bridgedataoutput.com/zillowterms.
+
+Citation: S. Cruz, W. Hutchcroft, Y. Li, N. Khosravan, I. Boyadzhiev, S. B. Kang: "Zillow Indoor
+Dataset: Annotated Floor Plans With 360º Panoramas and 3D Room Layouts", CVPR 2021.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+from datamodules.core.found import SPLITS, Split
+from datamodules.core.group_drawing import draw_groups
+from datamodules.core.inputs import Input
+from datamodules.core.loading import at_least
+from datamodules.core.panorama_module import PanoramaDataModule
+from datamodules.core.reading import ImageFiles, ImageReader
+from datamodules.images.pixel_files import read_image_size, read_rgb
+from datamodules.zind.homes import HomePanorama, list_panoramas
+from datamodules.zind.layout import CLASSES, DOOR, Layout
+from tangent_train.errors import DataError, SettingError
+from tangent_train.json_text import parse_json
+from tangent_train.registry import Text, check_fields, registered
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from datamodules.core.problems import Problems
+
+__all__ = ["Zind", "ZindReader"]
+
+Doors = Literal["class", "ignore"]
+"""Whether doors are a class or unknown."""
+
+
+@dataclass(frozen=True, eq=False)
+class ZindReader(ImageReader):
+    """Reads the pictures and labels them by layouts.
+
+    Attributes:
+        layouts: By the name of the panorama.
+        doors: Whether doors are a class.
+    """
+
+    layouts: Mapping[str, Layout]
+    doors: Doors
+
+    @property
+    def settings(self) -> dict[str, str]:
+        """What becomes of doors."""
+        return {"doors": self.doors}
+
+    def size(self, part: str, path: Path) -> tuple[int, int] | None:
+        """See `ImageReader`, as all others; layouts have none."""
+        return read_image_size(path) if part == "rgb" else None
+
+    def rgb(self, files: ImageFiles) -> NDArray[np.uint8]:
+        """Colours."""
+        return read_rgb(files.rgb)
+
+    def labels(self, files: ImageFiles, shape: tuple[int, int] | None = None) -> NDArray[np.uint8]:
+        """Classes, cast anew at every size."""
+        labels = self.layouts[files.name].labels(shape or read_image_size(files.rgb))
+        if self.doors == "ignore":
+            labels[labels == DOOR] = 0
+        return labels
+
+    def depth(self, files: ImageFiles) -> NDArray[np.uint16]:
+        """There is none."""
+        raise NotImplementedError(files.name)
+
+
+@registered
+@dataclass(kw_only=True, eq=False, repr=False)
+class Zind(PanoramaDataModule):
+    """ZInD, 5 classes.
+
+    With ``zind_partition.json`` in `root` the splits are its homes. Without it, as for the sample,
+    complete rooms are drawn: no room is in two splits, though doorways show others.
+
+    Args:
+        doors: `class`, or `ignore`: unknown.
+        test_fraction: Share of the rooms for test, without a partition; 1 for all, to evaluate
+            networks that were trained on something else.
+        split_seed: Of the drawing of rooms, for test and for validation. Independent of the run's
+            seed, so that runs with different seeds share their splits.
+
+    Raises:
+        SettingError: A setting is invalid.
+    """
+
+    class_names = ("unknown", *CLASSES)
+
+    inputs: Sequence[Input] = ("rgb",)
+    doors: Doors = "class"
+    test_fraction: float = 0.2
+    split_seed: int = 0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if "depth" in self.inputs:
+            raise SettingError(
+                "data.inputs", found=list(self.inputs), expected="no depth, ZInD has none"
+            )
+        if self.doors not in ("class", "ignore"):
+            raise SettingError("data.doors", found=self.doors, expected="class or ignore")
+        if not 0 < self.test_fraction <= 1:
+            raise SettingError(
+                "data.test_fraction", found=self.test_fraction, expected="above 0 to 1"
+            )
+        at_least("data.split_seed", self.split_seed, 0)
+
+    def find_images(self, problems: Problems) -> tuple[ZindReader, dict[Split, list[ImageFiles]]]:
+        """See `ImageDataModule`."""
+        panoramas = [p for p in list_panoramas(self.root, problems) if p.has_layout]
+        split_of = self._divided(panoramas)
+        layouts: dict[str, Layout] = {}
+        splits: dict[Split, list[ImageFiles]] = {split: [] for split in SPLITS}
+        for panorama, split in zip(panoramas, split_of, strict=True):
+            with problems.noted(panorama.name):
+                layouts[panorama.name] = panorama.layout()
+                files = ImageFiles(panorama.name, panorama.image(), panorama.file)
+                splits[split].append(files)
+        if not self.validation_fraction:
+            splits["val"] = []
+        return ZindReader(layouts, self.doors), splits
+
+    def _divided(self, panoramas: Sequence[HomePanorama]) -> list[Split]:
+        """The split of every panorama."""
+        partition = self.root / "zind_partition.json"
+        homes = {panorama.home for panorama in panoramas}
+        if partition.is_file():
+            of_home = _read_partition(partition, homes)
+            return [of_home[panorama.home] for panorama in panoramas]
+        groups = [p.home if len(homes) > 1 else p.room for p in panoramas]
+        test = set(groups)
+        if self.test_fraction < 1:
+            test = draw_groups(groups, self.test_fraction, [self.split_seed, 0])
+        rest = [group for group in groups if group not in test]
+        held: set[str] = set()
+        if self.validation_fraction:
+            held = draw_groups(rest, self.validation_fraction, [self.split_seed, 1])
+        if not test or (rest and self.validation_fraction and not held):
+            raise DataError(
+                self.root,
+                found=f"{len(set(groups))} rooms or homes to draw from",
+                expected="some for training, validation and test each",
+                remedy="data.test_fraction=1 takes all for test, data.validation_fraction=0 none "
+                "for validation.",
+            )
+        return ["test" if g in test else "val" if g in held else "train" for g in groups]
+
+
+def _read_partition(path: Path, homes: set[str]) -> dict[str, Split]:
+    """The split of every home in a ``zind_partition.json``."""
+    expected = "lists of homes for train, val and test"
+    try:
+        content = parse_json(path.read_bytes())
+    except (OSError, ValueError) as error:
+        raise DataError(path, found=error, expected=expected) from error
+    lists = check_fields(path, content, dict.fromkeys(SPLITS, list[Text]), expected)
+    split_of = {home: split for split in SPLITS for home in lists[split]}
+    missing = sorted(homes - split_of.keys())
+    if missing:
+        raise DataError(
+            path,
+            found=f"no home {', '.join(missing[:5])}",
+            expected=f"every home of {path.parent} in one of its lists",
+            remedy="Without the file, homes or rooms are drawn.",
+        )
+    return split_of

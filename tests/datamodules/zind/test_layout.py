@@ -1,0 +1,140 @@
+"""Labels and distances of layouts, against brute force and closed forms."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from datamodules.zind.layout import CLASSES, DOOR, OPENING, WINDOW, Fixture, Layout
+from tangent_train.geometry import equirect_directions
+from tests.datamodules.zind.zind_format import (
+    CORNERED,
+    KINDS,
+    SQUARE,
+    Camera,
+    Room,
+    brute_force_labels,
+)
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+LABELS = {"doors": DOOR, "windows": WINDOW, "openings": OPENING}
+SPLIT_WALL = Room(
+    # The upper wall in three pieces, with a window across all of them.
+    [(-2, -1), (2, -1), (2, 1), (1, 1), (-0.5, 1), (-2, 1)],
+    {"windows": [((-1.5, 1), (1.5, 1), (-0.5, 0.5))], "doors": [((2, -1), (2, 1), (-1, 3))]},
+)
+COMB = Room([(-3, -1), (3, -1), (3, 3), (2, 3), (2, 0.5), (0.5, 0.5), (0.5, 3), (-0.5, 3),
+             (-0.5, 1), (-3, 1)])  # fmt: skip
+VIEWS = {
+    "square": (SQUARE, Camera("")),
+    "turned": (SQUARE, Camera("", (0.3, -0.2), 33)),
+    "close to a wall": (SQUARE, Camera("", (1.9999, 0.4), 200)),
+    "in a corner": (SQUARE, Camera("", (-1.999, -1.499), -80)),
+    "concave": (CORNERED, Camera("", (1.1, 0.9), 14)),
+    "concave, doors hidden": (CORNERED, Camera("", (4.5, 1.2), 3)),
+    "fixtures across corners": (SPLIT_WALL, Camera("", (0.1, 0.2), -50)),
+    "comb": (COMB, Camera("", (-1.3, -0.3), 81)),
+}
+
+
+def _layout(given: dict[str, Any], ceiling_z: float) -> Layout:
+    fixtures = [
+        Fixture(np.array([start, end]), low, high, LABELS[kind])
+        for kind in KINDS
+        for start, end, (low, high) in np.array(given[kind]).reshape(-1, 3, 2)
+    ]
+    return Layout(np.array(given["vertices"]), -1.0, ceiling_z, fixtures)
+
+
+@pytest.mark.parametrize("shape", [(64, 128), (33, 66), (50, 37)])
+@pytest.mark.parametrize("view", VIEWS)
+def test_labels_are_those_of_brute_force(view: str, shape: tuple[int, int]) -> None:
+    room, camera = VIEWS[view]
+    given = camera.layout(room)
+    expected = brute_force_labels(given, room.ceiling_z, shape)
+    found = _layout(given, room.ceiling_z).labels(shape)
+    np.testing.assert_array_equal(found, expected)
+    seen = {3, *(KINDS[kind] for kind in room.fixtures)} - ({0, 4} if "hidden" in view else set())
+    assert seen <= set(np.unique(found))
+
+
+def test_random_rooms_around_the_camera() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(40):
+        angles = np.sort(rng.uniform(0, 2 * math.pi, rng.integers(5, 12)))
+        radii = rng.uniform(0.2, 6, len(angles))
+        corners = (radii * [np.cos(angles), np.sin(angles)]).T[:: rng.choice([1, -1])]
+        if np.diff(angles, append=angles[0] + 2 * math.pi).max() > 3:
+            continue  # the camera would be outside
+        walls = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
+        given: dict[str, Any] = {"vertices": corners.tolist()} | {kind: [] for kind in KINDS}
+        for kind, (start, end) in zip(KINDS, walls[rng.permutation(len(walls))], strict=False):
+            places = np.sort(rng.uniform(0, 1, (2, 1)), axis=0)[:: rng.choice([1, -1])]
+            heights = np.sort(rng.uniform(-1.2, 1.0, 2))
+            given[kind] = [*(start + places * (end - start)).tolist(), heights.tolist()]
+        expected = brute_force_labels(given, 0.7, (40, 80))
+        np.testing.assert_array_equal(_layout(given, 0.7).labels((40, 80)), expected)
+
+
+def test_the_frame_is_x_left_y_to_the_middle() -> None:
+    door = Fixture(np.array([[0.2, 1.0], [0.8, 1.0]]), -1.0, 0.5, DOOR)
+    labels = Layout(np.array([[-1.0, -1], [1, -1], [1, 1], [-1, 1]]), -1, 1, [door]).labels(
+        (90, 180)
+    )
+    rows, columns = np.nonzero(labels == DOOR)
+    # From 0.2 to 0.8 left of the middle at distance 1; its sill meets the floor at 45° or less.
+    lowest, highest = (-math.degrees(math.atan(x)) / 2 + 89.5 for x in (0.8, 0.2))
+    assert columns.min() == math.ceil(lowest)
+    assert columns.max() == math.floor(highest)
+    assert rows.max() < 90 * (90 + 45) / 180
+    assert (labels[0] == 1 + CLASSES.index("ceiling")).all()
+    assert (labels[-1] == 1 + CLASSES.index("floor")).all()
+
+
+def test_rays_to_corners_meet_a_wall() -> None:
+    """The corners of the polygon are in the directions of the middles of columns."""
+    directions = equirect_directions((1, 16))[0]
+    corners = np.stack([-directions[:, 1], directions[:, 0]], axis=-1) * 2
+    for vertices in (corners, corners[::-1], corners[::4]):
+        distances = Layout(vertices, -5, 5).distances((1, 16))
+        np.testing.assert_allclose(distances[0, :: 16 // len(vertices)], 2, rtol=1e-8)
+
+
+def test_corners_that_repeat_change_nothing() -> None:
+    given = VIEWS["concave"][1].layout(CORNERED)
+    twice = given | {"vertices": [v for v in given["vertices"] for _ in range(2)]}
+    found, expected = (_layout(some, 0.6).labels((32, 64)) for some in (twice, given))
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_fixtures_a_little_off_their_wall_are_on_it() -> None:
+    shifted = Room(SQUARE.vertices, {"windows": [((-1, 1.52), (0.5, 1.49), (-0.4, 0.4))]})
+    near, exact = (_layout(Camera("").layout(r), 0.6).labels((64, 128)) for r in (shifted, SQUARE))
+    assert (near == 5).sum() == pytest.approx((exact == 5).sum(), rel=0.05)
+
+
+def test_distances_are_those_of_the_planes() -> None:
+    shape = (45, 90)
+    room, camera = VIEWS["concave"]
+    layout = _layout(camera.layout(room), 0.6)
+    labels, distances = layout.labels(shape), layout.distances(shape)
+    x, y, z = np.moveaxis(equirect_directions(shape) * distances[..., None], -1, 0)
+    assert np.isnan(distances[np.isin(labels, (0, 4, 5))]).all()
+    np.testing.assert_allclose(z[labels == 1], 0.6)
+    np.testing.assert_allclose(z[labels == 2], -1)
+    walls = np.stack([-y, x], axis=-1)[labels == 3]
+    np.testing.assert_allclose(_off_polygon(walls, np.array(layout.vertices)), 0, atol=1e-9)
+
+
+def _off_polygon(points: NDArray[Any], vertices: NDArray[Any]) -> NDArray[Any]:
+    """Distance of points to the nearest side of a polygon."""
+    ends = np.roll(vertices, -1, axis=0) - vertices
+    away = points[:, None] - vertices
+    place = np.clip((away * ends).sum(-1) / (ends**2).sum(-1), 0, 1)
+    off: NDArray[Any] = np.linalg.norm(away - place[..., None] * ends, axis=-1).min(axis=1)
+    return off

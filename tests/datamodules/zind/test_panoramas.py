@@ -1,0 +1,271 @@
+"""ZInD as a data set: which panoramas, which splits, which labels, which errors."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from datamodules import Zind
+from datamodules.core.found import SPLITS
+from tangent_train.errors import DataError, SettingError
+from tangent_train.rendering import EquirectRepresentation
+from tests.datamodules.data_files import names_of
+from tests.datamodules.zind.zind_format import brute_force_labels, write_homes
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+ERP = EquirectRepresentation(level=4)
+ROOM = "000/floor_01/complete_room_01/partial_room_01"
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    return write_homes(tmp_path / "zind")
+
+
+def _zind(root: Path, representation: EquirectRepresentation = ERP, **settings: Any) -> Zind:
+    return Zind(root, representation, num_workers=0, **settings)
+
+
+def _record(root: Path, room: int, name: str) -> Any:
+    content = json.loads((root / "000" / "zind_data.json").read_text())
+    return content["merger"]["floor_01"][f"complete_room_{room:02}"][f"partial_room_{room:02}"][
+        name
+    ]
+
+
+@pytest.mark.parametrize("level", [3, 4, 5])
+def test_labels_are_cast_at_the_size_of_the_run(root: Path, level: int) -> None:
+    data = _zind(root, EquirectRepresentation(level=level), test_fraction=1)
+    source = data.source("test")
+    shape = (2 ** (level + 1), 2 ** (level + 2))
+    rooms = {"pano_1": 1, "pano_2": 1, "pano_3": 2, "pano_5": 2, "pano_4": 3, "pano_6": 4}
+    assert [source.name(k).rpartition("/")[2] for k in range(len(source))] == list(rooms)
+    for index, (name, room) in enumerate(rooms.items()):
+        record = _record(root, room, name)
+        expected = brute_force_labels(record["layout_visible"], record["ceiling_height"] - 1, shape)
+        np.testing.assert_array_equal(source.read(index).labels, expected)
+    picture = np.array(Image.open(root / "000" / _record(root, 1, "pano_1")["image_path"]))
+    if level == 5:
+        np.testing.assert_array_equal(source.read(0).rgb, picture)
+
+
+def test_doors_may_be_unknown(root: Path) -> None:
+    both = [
+        _zind(root, doors=doors, test_fraction=1).source("test") for doors in ("class", "ignore")
+    ]
+    labels, ignored = (source.labels(0) for source in both)
+    assert (labels == 4).any()
+    np.testing.assert_array_equal(ignored, np.where(labels == 4, 0, labels))
+
+
+def test_no_room_is_in_two_splits(root: Path) -> None:
+    data = _zind(root, test_fraction=0.3, validation_fraction=0.3, seed=5)
+    rooms = [{n.rpartition("/")[0] for n in names_of(data, split)} for split in SPLITS]
+    assert all(rooms)
+    assert sum(map(len, rooms)) == len(set.union(*rooms)) == 4
+    again = _zind(root, test_fraction=0.3, validation_fraction=0.3, seed=6)
+    assert [names_of(data, s) for s in SPLITS] == [names_of(again, s) for s in SPLITS]
+    drawn = {
+        tuple(names_of(_zind(root, test_fraction=0.3, split_seed=seed), "test"))
+        for seed in range(5)
+    }
+    assert len(drawn) > 1
+
+
+def test_homes_are_drawn_as_a_whole(root: Path) -> None:
+    write_homes(root, ["001", "002"])
+    data = _zind(root)
+    homes = [{n.partition("/")[0] for n in names_of(data, split)} for split in SPLITS]
+    assert sorted(map(len, homes)) == [1, 1, 1]
+    assert set.union(*homes) == {"000", "001", "002"}
+
+
+def test_the_partition_of_the_release_decides(root: Path) -> None:
+    write_homes(root, ["001", "002"])
+    partition = root / "zind_partition.json"
+    partition.write_text(json.dumps({"train": ["002", "9"], "val": ["000"], "test": ["001"]}))
+    data = _zind(root)
+    homes = [{n.partition("/")[0] for n in names_of(data, split)} for split in SPLITS]
+    assert homes == [{"002"}, {"000"}, {"001"}]
+    assert not names_of(_zind(root, validation_fraction=0), "val")
+    partition.write_text(json.dumps({"train": ["002"], "val": [], "test": ["000"]}))
+    with pytest.raises(DataError, match=r"zind_partition\.json: found no home 001; expected every"):
+        _zind(root).setup()
+    partition.write_text(json.dumps({"train": ["002"], "test": ["000"]}))
+    with pytest.raises(DataError, match=r"zind_partition\.json: found no val inside"):
+        _zind(root).setup()
+    partition.write_text("{")
+    with pytest.raises(DataError, match=r"zind_partition\.json: found .*; expected lists of homes"):
+        _zind(root).setup()
+
+
+def test_all_may_be_the_test_set(root: Path) -> None:
+    data = _zind(root, test_fraction=1)
+    assert [len(names_of(data, split)) for split in SPLITS] == [0, 0, 6]
+
+
+def test_the_prepared_store_holds_the_same(root: Path, tmp_path: Path) -> None:
+    settings: dict[str, Any] = {"test_fraction": 1, "store": tmp_path / "store"}
+    stored, plain = _zind(root, **settings), _zind(root, test_fraction=1)
+    stored.prepare_data()
+    for index in range(6):
+        for one, other in zip(
+            *(d.source("test").read(index) for d in (stored, plain)), strict=True
+        ):
+            np.testing.assert_array_equal(one, other)
+    ignoring = _zind(root, doors="ignore", **settings)
+    ignoring.prepare_data()
+    assert not (ignoring.source("test").read(0).labels == 4).any()
+    file = root / "000" / "zind_data.json"
+    file.write_text(file.read_text() + "\n")
+    with pytest.raises(DataError, match=r"labels made from zind_data\.json"):
+        stored.source("test").read(0)
+
+
+def _set(*path: str | int, value: Any) -> Callable[[Any], None]:
+    def change(content: Any) -> None:
+        for name in path[:-1]:
+            content = content[name]
+        if value is None:
+            del content[path[-1]]
+        else:
+            content[path[-1]] = value
+
+    return change
+
+
+LAYOUT = "layout_visible"
+SEEN = r"in merger\.floor_01\..*\.partial_room_01\.pano_1\.layout_visible"
+BROKEN: dict[str, tuple[Callable[[Any], None], str]] = {
+    "no height": (_set("camera_height", value=None), "no camera_height in merger.*pano_1"),
+    "a word for a height": (
+        _set("ceiling_height", value="high"),
+        "ceiling_height='high' in merger",
+    ),
+    "a ceiling below the camera": (
+        _set("ceiling_height", value=0.9),
+        r"camera_height=1, ceiling_height=0\.9 in merger.*pano_1; expected a camera between",
+    ),
+    "an infinite ceiling": (_set("ceiling_height", value=1e999), "ceiling_height=inf in merger"),
+    "no picture named": (_set("image_path", value=None), "no image_path in merger"),
+    "a picture elsewhere": (
+        _set("image_path", value="../other.jpg"),
+        r"image_path=\.\./other\.jpg",
+    ),
+    "a layout that is a list": (_set(LAYOUT, value=[1]), r"layout_visible=\[1\] in merger"),
+    "no windows": (_set(LAYOUT, "windows", value=None), f"no windows {SEEN}"),
+    "two vertices": (_set(LAYOUT, "vertices", value=[[0, 1], [1, 0]]), f"2 vertices .* {SEEN}"),
+    "a room without the camera": (
+        _set(LAYOUT, "vertices", value=[[1, 1], [2, 1], [2, 2], [1, 2]]),
+        f"4 vertices that do not surround the camera at \\(0, 0\\) {SEEN}",
+    ),
+    "a vertex of three": (_set(LAYOUT, "vertices", 0, value=[1, 2, 3]), f"vertices=.* {SEEN}"),
+    "a vertex of words": (_set(LAYOUT, "vertices", 0, value=["a", "b"]), f"vertices=.* {SEEN}"),
+    "a vertex nowhere": (_set(LAYOUT, "vertices", 0, value=[1e999, 0]), f"vertices=.* {SEEN}"),
+    "half a door": (_set(LAYOUT, "doors", value=[[1, 1], [1, 2]]), f"2 points for doors {SEEN}"),
+    "a window upside down": (
+        _set(LAYOUT, "windows", value=[[0, 1.5], [1, 1.5], [0.5, -0.5]]),
+        f"windows from .* with bottom 0.5, top -0.5 {SEEN}; expected .*",
+    ),
+    "a window without width": (
+        _set(LAYOUT, "windows", value=[[0, 1.5], [0, 1.5], [-0.5, 0.5]]),
+        f"windows from .* {SEEN}",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_a_broken_record_is_named_with_its_place(root: Path, name: str) -> None:
+    change, expected = BROKEN[name]
+    file = root / "000" / "zind_data.json"
+    content = json.loads(file.read_text())
+    change(content["merger"]["floor_01"]["complete_room_01"]["partial_room_01"]["pano_1"])
+    file.write_text(json.dumps(content))
+    with pytest.raises(DataError, match=rf"000/zind_data\.json: found .*{expected}"):
+        _zind(root).setup()
+    problems, count = _zind(root).check()
+    assert problems.items == {f"{ROOM}/pano_1"}
+    assert count == 5
+    data = _zind(root, test_fraction=1, skip_broken=True)
+    assert len(names_of(data, "test")) == 5
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        ("{", "found .*; expected zind_data.json as released"),
+        ("[]", "list instead of a mapping inside"),
+        ('{"merger": {}}', "no scale_meters_per_coordinate inside"),
+        ('{"merger": [], "scale_meters_per_coordinate": {}}', r"merger=\[\] inside"),
+        (
+            '{"merger": {"floor_01": {"complete_room_01": 3}}, "scale_meters_per_coordinate": {}}',
+            r"found int in merger\.floor_01\.complete_room_01; expected a mapping",
+        ),
+        (
+            '{"merger": {"../floor": {}}, "scale_meters_per_coordinate": {}}',
+            r"found \['\.\./floor'\] in merger; expected .* letters",
+        ),
+        (
+            '{"merger": {"f": {"c": {"p": {"i": {}}}}}, "scale_meters_per_coordinate": {"f": "1"}}',
+            "f='1' in scale_meters_per_coordinate",
+        ),
+    ],
+)
+def test_a_broken_home_is_named(root: Path, content: str, expected: str) -> None:
+    write_homes(root, ["001", "002"])
+    (root / "001" / "zind_data.json").write_text(content)
+    with pytest.raises(DataError, match=rf"001/zind_data\.json: .*{expected}"):
+        _zind(root).setup()
+    data = _zind(root, test_fraction=1, skip_broken=True)
+    assert len(names_of(data, "test")) == 12
+
+
+def test_a_missing_or_small_picture_is_named(root: Path) -> None:
+    path = root / "000" / _record(root, 1, "pano_2")["image_path"]
+    Image.new("RGB", (64, 64)).save(path)
+    with pytest.raises(DataError, match=r"pano_2\.jpg: found 64×64 pixels; expected twice as wide"):
+        _zind(root).setup()
+    path.unlink()
+    with pytest.raises(DataError, match=r"pano_2\.jpg: found no image .*No such file"):
+        _zind(root).setup()
+    assert _zind(root).check()[0].items == {f"{ROOM}/pano_2"}
+
+
+def test_a_folder_without_homes_is_refused(root: Path) -> None:
+    for wrong, found in ((root / "000", r"no \*/zind_data\.json"), (root / "no", "no such folder")):
+        with pytest.raises(DataError, match=rf"{wrong.name}: found {found}; .*github\.com/zillow"):
+            _zind(wrong).setup()
+
+
+def test_too_few_rooms_are_refused(root: Path) -> None:
+    file = root / "000" / "zind_data.json"
+    content = json.loads(file.read_text())
+    rooms = content["merger"]["floor_01"]
+    for name in ("complete_room_03", "complete_room_04"):
+        del rooms[name]
+    file.write_text(json.dumps(content))
+    with pytest.raises(DataError, match=r"found 2 rooms or homes .*data\.test_fraction=1"):
+        _zind(root).setup()
+    assert len(names_of(_zind(root, validation_fraction=0), "test")) == 2
+
+
+@pytest.mark.parametrize(
+    ("settings", "name"),
+    [
+        ({"inputs": ["rgb", "depth"]}, "inputs"),
+        ({"doors": "open"}, "doors"),
+        ({"test_fraction": 0}, "test_fraction"),
+        ({"test_fraction": 1.1}, "test_fraction"),
+        ({"split_seed": -1}, "split_seed"),
+    ],
+)
+def test_invalid_settings_are_refused(root: Path, settings: dict[str, Any], name: str) -> None:
+    with pytest.raises(SettingError, match=rf"data\.{name}"):
+        _zind(root, **settings)
