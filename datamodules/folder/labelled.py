@@ -22,7 +22,7 @@ from datamodules.core.image_module import ImageDataModule
 from datamodules.core.inputs import Input
 from datamodules.core.loading import at_least
 from datamodules.folder.classes import UNKNOWN_NAME, read_classes
-from datamodules.folder.reader import FolderReader, list_images, read_codes
+from datamodules.folder.reader import FolderReader, list_images, note_ignored, read_codes
 from datamodules.folder.splits import FolderSplits
 from tangent_train.errors import DataError, SettingError
 
@@ -89,9 +89,19 @@ class LabelledFolder(ImageDataModule):
         division = FolderSplits(
             self.root, self.test_fraction, self.validation_fraction, self.split_seed
         )
-        splits = division.divide(images, problems)
-        self._check_classes(problems.without(images)[:_TRIED], problems)
+        splits: dict[Split, list[ImageFiles]] = {"train": images, "val": [], "test": []}
+        # The rest is checked whatever is wrong with these.
+        with problems.noted():
+            splits = division.divide(images, problems)
+        with problems.noted():
+            self._check_classes(problems.without(images)[:_TRIED], problems)
         return self.make_reader(images, problems), splits
+
+    def check(self) -> tuple[Problems, int]:
+        """See `SplitDataModule`; files that training would pass over are named too."""
+        problems, count = super().check()
+        note_ignored(self.root, problems)
+        return problems, count
 
     def make_reader(self, images: Sequence[ImageFiles], problems: Problems) -> FolderReader:
         """The reader of the images.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import glob
+import os
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -9,8 +11,14 @@ import numpy as np
 
 from datamodules.core.panoramas import meters_to_steps, resize_nearest
 from datamodules.core.reading import ImageFiles, ImageReader
-from datamodules.images.image_files import find_depth, image_paths
-from datamodules.images.pixel_files import read_depth_m, read_image_size, read_pixels, read_rgb
+from datamodules.images.image_files import IMAGE_SUFFIXES, find_depth, image_paths, walk_files
+from datamodules.images.pixel_files import (
+    is_grey,
+    read_depth_m,
+    read_image_size,
+    read_pixels,
+    read_rgb,
+)
 from datamodules.images.png import PngHeader, read_png_header
 from tangent_train.errors import DataError
 
@@ -22,7 +30,7 @@ if TYPE_CHECKING:
     from datamodules.core.problems import Problems
     from datamodules.folder.classes import FolderClasses
 
-__all__ = ["FolderReader", "list_images", "read_codes"]
+__all__ = ["FolderReader", "list_images", "note_ignored", "read_codes"]
 
 # What label images may be. In grey of 1 to 4 bits the numbers may be meant, or the steps from black
 # to white that they stand for: better asked than guessed. 16 bits beside alpha are not decoded.
@@ -51,6 +59,7 @@ class FolderReader(ImageReader):
     def size(self, part: str, path: Path) -> tuple[int, int]:
         """See `ImageReader`, as all others."""
         if part == "labels":
+            _check_there(path)
             header = read_png_header(path)
             _check_kind(path, header, in_colors=self.classes.in_colors)
             return header.height, header.width
@@ -90,7 +99,7 @@ def list_images(root: Path, problems: Problems, *, with_depth: bool) -> list[Ima
             raise DataError(folder, found="no such folder", expected=expected)
     found: dict[str, ImageFiles] = {}
     for rgb in image_paths(root / "images", problems.noted):
-        name = rgb.relative_to(root / "images").with_suffix("").as_posix()
+        name = _name(root / "images", rgb)
         depth = None
         with problems.noted(name):
             if name in found:
@@ -105,6 +114,49 @@ def list_images(root: Path, problems: Problems, *, with_depth: bool) -> list[Ima
                 depth = find_depth(root / "depth", name, without)
         found.setdefault(name, ImageFiles(name, rgb, root / "labels" / f"{name}.png", depth))
     return [found[name] for name in sorted(found)]
+
+
+def note_ignored(root: Path, problems: Problems) -> None:
+    """Note files that training passes over, and grey images among coloured ones.
+
+    Args:
+        root: Folder with ``images/`` and ``labels/``, there or not.
+        problems: They are added.
+    """
+    files = {part: list(walk_files(root / part)) for part in ("images", "labels")}
+    names = {part: [_name(root / part, p) for p in paths] for part, paths in files.items()}
+    with_image = set(names["images"])
+    images = [path for path in files["images"] if path.suffix.lower() in IMAGE_SUFFIXES]
+    noted = [
+        (path, "labels of no image", "Name it as its image, or remove it.")
+        for path, name in zip(files["labels"], names["labels"], strict=True)
+        if name not in with_image
+    ]
+    others = sorted(set(files["images"]) - set(images))
+    noted += [(path, "no image", "Convert it; of a video, extract frames.") for path in others]
+    grey = [path for path in images if is_grey(path)]
+    if len(grey) < len(images):
+        told = "grey, others are coloured", "Label images belong in labels/."
+        noted += [(path, *told) for path in grey]
+    expected = f"images ({', '.join(IMAGE_SUFFIXES)}) and labels (.png) of the same names"
+    for path, found, remedy in noted:
+        problems.add(DataError(path, found=found, expected=expected, remedy=remedy), str(path))
+
+
+def _name(folder: Path, path: Path) -> str:
+    return path.relative_to(folder).with_suffix("").as_posix()
+
+
+def _check_there(path: Path) -> None:
+    """Refuse labels that are missing, and name what the user may have taken for them."""
+    if not os.path.lexists(path):
+        beside = sorted(file.name for file in path.parent.glob(f"{glob.escape(path.stem)}*"))
+        raise DataError(
+            path,
+            found=f"no such file, but {', '.join(beside)}" if beside else "no such file",
+            expected="the labels of the image of this name, as PNG",
+            remedy="Draw or copy them, export them as PNG (JPEG changes values), name them so.",
+        )
 
 
 def _check_kind(path: Path, header: PngHeader, *, in_colors: bool) -> None:

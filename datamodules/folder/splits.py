@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from lightning.pytorch.utilities import rank_zero_warn
+
 from datamodules.core.found import SPLITS, Split
 from datamodules.core.group_drawing import draw_groups
 from tangent_train.errors import DataError
@@ -24,7 +26,8 @@ class FolderSplits:
     """The splits that ``train.txt``, ``val.txt`` and ``test.txt`` name, or that are drawn.
 
     Scenes, the top-level folders in ``images/``, are drawn as a whole: images of one room or street
-    resemble each other. Images outside folders are drawn individually.
+    resemble each other. Images outside folders are drawn individually, and so are, with a warning,
+    those of a single scene.
 
     Attributes:
         root: Folder of the data set, with or without the lists. Without ``test.txt``, the test
@@ -33,7 +36,8 @@ class FolderSplits:
             training are drawn for validation.
         test_fraction: Share of the scenes for test, if drawn: at least one, never all.
         validation_fraction: Share of the training scenes for validation, if drawn: at least one,
-            never all; 0 for no validation, whether there is a list or not.
+            never all, so none of a single image; 0 for no validation, whether there is a list or
+            not.
         seed: Of the drawing.
     """
 
@@ -52,7 +56,7 @@ class FolderSplits:
             problems: Invalid lines of lists are added.
 
         Raises:
-            DataError: A list cannot be used, or there are too few scenes to draw from.
+            DataError: A list cannot be used, or there is one image, or none, to draw the test from.
         """
         listed = self._read_lists(images, problems)
         named = {name for names in listed.values() for name in names}
@@ -97,16 +101,24 @@ class FolderSplits:
 
     def _draw(self, split: Split, images: Sequence[ImageFiles], fraction: float) -> set[str]:
         """The names in some scenes, the same for the same seed."""
-        scenes = {_scene(files) for files in images}
-        drawn = draw_groups(scenes, fraction, [self.seed, SPLITS.index(split)])
-        if not drawn:
+        groups = {files.name: _scene(files) for files in images}
+        if len(set(groups.values())) == 1 < len(groups):
+            rank_zero_warn(
+                f"All {len(groups)} images to draw those of {split} from are in one scene, "
+                f"{groups[images[0].name]}. They are drawn one by one: scores will be better than "
+                "on places that are new to the network.",
+                category=UserWarning,
+            )
+            groups = {name: name for name in groups}
+        drawn = draw_groups(groups.values(), fraction, [self.seed, SPLITS.index(split)])
+        if not drawn and split == "test":
             raise DataError(
                 self.root / "images",
-                found=f"{len(scenes)} scenes to draw those of {split} from",
-                expected="two or more: top-level folders, or images outside folders",
-                remedy=f"Add scenes, or name some in {split}.txt.",
+                found=f"{len(groups)} image to draw those of test from",
+                expected="two or more",
+                remedy="Add images, or name some in test.txt.",
             )
-        return {files.name for files in images if _scene(files) in drawn}
+        return {name for name, group in groups.items() if group in drawn}
 
     def _some(self, split: Split, names: set[str]) -> set[str]:
         """The names, if there are any."""

@@ -16,7 +16,14 @@ if TYPE_CHECKING:
 
     Noted = Callable[..., AbstractContextManager[None]]
 
-__all__ = ["DEPTH_SUFFIXES", "IMAGE_SUFFIXES", "find_depth", "image_paths", "short_names"]
+__all__ = [
+    "DEPTH_SUFFIXES",
+    "IMAGE_SUFFIXES",
+    "find_depth",
+    "image_paths",
+    "short_names",
+    "walk_files",
+]
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
 """Suffixes of images, in lower case."""
@@ -46,7 +53,7 @@ def image_paths(pattern: str | Path, noted: Noted | None = None) -> list[Path]:
     if path.is_file():
         return [path]
     if path.is_dir():
-        found = list(_walk(path, noted))
+        found = list(walk_files(path, noted))
     else:
         found = [Path(name) for name in glob.glob(str(path), recursive=True)]  # noqa: PTH207
     images = sorted({file for file in found if file.suffix.lower() in IMAGE_SUFFIXES})
@@ -62,8 +69,13 @@ def image_paths(pattern: str | Path, noted: Noted | None = None) -> list[Path]:
     return images
 
 
-def _walk(folder: Path, noted: Noted | None) -> Iterator[Path]:
-    """Files of a folder and its subfolders, linked ones included, each folder once."""
+def walk_files(folder: Path, noted: Noted | None = None) -> Iterator[Path]:
+    """Files of a folder and its subfolders, linked ones included, each folder once.
+
+    Args:
+        folder: There or not; hidden files and folders are left out.
+        noted: See `image_paths`.
+    """
     seen = set()
 
     def closed(error: OSError) -> None:

@@ -7,7 +7,7 @@ would cut to 8 bits.
 from __future__ import annotations
 
 import math
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -32,6 +32,7 @@ __all__ = [
     "READABLE_SUFFIXES",
     "array_file",
     "check_writable",
+    "is_grey",
     "photo_fov_deg",
     "read_array",
     "read_depth_m",
@@ -114,6 +115,13 @@ def read_image_size(path: Path) -> tuple[int, int]:
         return height, width
     with _opened(path) as image:
         return _upright_size(image)
+
+
+def is_grey(path: Path) -> bool:
+    """Whether an image has a single channel of colour; not of one that cannot be read."""
+    with suppress(DataError), _opened(path) as image:
+        return image.mode in (*_SINGLE_CHANNEL, "LA")
+    return False
 
 
 def _upright_size(image: Image.Image) -> tuple[int, int]:

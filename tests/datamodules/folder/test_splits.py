@@ -87,6 +87,26 @@ def test_lists_of_some_splits(own_root: Path, erp: Any) -> None:
     assert _together(names) == all_names
 
 
+def test_data_sets_of_few_scenes_train(tmp_path: Path, erp: Any) -> None:
+    two = write_data_set(tmp_path / "two", scenes=2, each=2, height=16)
+    with pytest.warns(UserWarning, match="those of val from are in one scene, scene_"):
+        names = _all_names(FolderPanoramas(two, erp))
+    assert [len(names[split]) for split in SPLITS] == [1, 1, 2]
+    one = write_data_set(tmp_path / "one", scenes=1, each=5, height=16)
+    with pytest.warns(UserWarning, match="are in one scene, scene_0"):
+        names = _all_names(FolderPanoramas(one, erp))
+    assert [len(names[split]) for split in SPLITS] == [3, 1, 1]
+    assert len(_together(names)) == 5
+    least = write_data_set(tmp_path / "least", scenes=2, each=1, height=16)
+    names = _all_names(FolderPanoramas(least, erp))
+    assert [len(names[split]) for split in SPLITS] == [1, 0, 1]
+    single = write_data_set(tmp_path / "single", scenes=1, each=1, height=16)
+    with pytest.raises(
+        DataError, match=r"found 1 image to draw those of test from; expected two or more"
+    ):
+        FolderPanoramas(single, erp).setup()
+
+
 @pytest.mark.parametrize(
     ("lists", "message"),
     [
@@ -94,7 +114,6 @@ def test_lists_of_some_splits(own_root: Path, erp: Any) -> None:
         ({"test": "scene_0/view.0", "train": "scene_0/view.0"}, r"also in .*train\.txt"),
         ({"test": ""}, r"found no images for test; .* Name some in test\.txt"),
         ({"val": "# none"}, r"no images for val; .*data\.validation_fraction=0"),
-        ({"train": "scene_0/view.0"}, r"found 1 scenes to draw those of val .*in val\.txt"),
         ({"test": b"\xff\xfe"}, r"test\.txt: found .*UTF-8"),
     ],
 )
