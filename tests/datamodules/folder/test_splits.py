@@ -101,9 +101,7 @@ def test_data_sets_of_few_scenes_train(tmp_path: Path, erp: Any) -> None:
     names = _all_names(FolderPanoramas(least, erp))
     assert [len(names[split]) for split in SPLITS] == [1, 0, 1]
     single = write_data_set(tmp_path / "single", scenes=1, each=1, height=16)
-    with pytest.raises(
-        DataError, match=r"found 1 image to draw those of test from; expected two or more"
-    ):
+    with pytest.raises(DataError, match="found 1 image to draw those of test from"):
         FolderPanoramas(single, erp).setup()
 
 
