@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-__all__ = ["DataError", "SettingError", "printable"]
+__all__ = ["DataError", "SettingError", "counted", "printable"]
 
 
 _LONGEST = 400  # characters of what was found: a file may hold anything
@@ -19,6 +19,15 @@ def printable(text: str) -> str:
     sofa\x1b[2J
     """
     return _CONTROL.sub(lambda match: repr(match[0])[1:-1], text)
+
+
+def counted(count: int, plural: str) -> str:
+    """A number of things in words; the plural ends in s.
+
+    >>> counted(1, "panoramas"), counted(20, "photos")
+    ('1 panorama', '20 photos')
+    """
+    return f"{count} {plural.removesuffix('s') if count == 1 else plural}"
 
 
 class _ExplainedError(ValueError):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tangent_train.errors import DataError
+from tangent_train.errors import DataError, counted
 from tangent_train.json_text import parse_json
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ class FolderClasses:
             if past.size:
                 raise DataError(
                     path,
-                    found=f"value {past.min()} in {past.size} pixel{'s' * (past.size > 1)}",
+                    found=f"value {past.min()} in {counted(past.size, 'pixels')}",
                     expected=f"0 to {self.length - 1}, the places in the list of classes.json, or "
                     f"{_UNKNOWN_VALUES[0]}",
                     remedy="Name the class, or write null in its place in the list.",

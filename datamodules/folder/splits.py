@@ -9,7 +9,7 @@ from lightning.pytorch.utilities import rank_zero_warn
 
 from datamodules.core.found import SPLITS, Split
 from datamodules.core.group_drawing import draw_groups
-from tangent_train.errors import DataError
+from tangent_train.errors import DataError, counted
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -114,7 +114,7 @@ class FolderSplits:
         if not drawn and split == "test":
             raise DataError(
                 self.root / "images",
-                found=f"{len(groups)} image to draw those of test from",
+                found=f"{counted(len(groups), 'images')} to draw those of test from",
                 expected="two or more",
                 remedy="Add images, or name some in test.txt.",
             )

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tangent_train.errors import DataError
+from tangent_train.errors import DataError, counted
 from tangent_train.json_text import parse_json
 
 if TYPE_CHECKING:
@@ -105,7 +105,7 @@ class LabelTable:
             count = int(np.count_nonzero(strange))
             raise DataError(
                 path,
-                found=f"instance {index[strange].min()} in {count} pixel{'s' * (count > 1)}",
+                found=f"instance {index[strange].min()} in {counted(count, 'pixels')}",
                 expected=f"0 to {end - 1}, the entries of the class table, or #{_MISSING:06X} "
                 "where labels are missing",
                 remedy="Use the file and semantic_labels.json of one release.",

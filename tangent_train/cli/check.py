@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from tangent_train.errors import counted
 from tangent_train.registry import make
 
 if TYPE_CHECKING:
@@ -33,12 +34,12 @@ def check(settings: Mapping[str, Any]) -> None:
     console = Console(highlight=False)
     problems, count = data.check()
     listed = problems.listed()
-    read = f"{count} {data.noun} of {_printable(str(data.root))} were read"
+    read = f"{counted(count, data.noun)} of {_printable(str(data.root))} checked"
     if listed and console.is_terminal:
         console.print(_table(listed))
     for problem in () if console.is_terminal else listed:
         sys.stdout.write("\t".join(map(_printable, problem[:3])) + "\n")
-    found = f"{len(listed)} problem{'s' * (len(listed) > 1)}" if listed else "Nothing is wrong"
+    found = counted(len(listed), "problems") if listed else "Nothing is wrong"
     told = console if console.is_terminal or not listed else Console(stderr=True, highlight=False)
     told.print(Text(f"{found}; {read}."), soft_wrap=True)
     if listed:

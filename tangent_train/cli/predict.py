@@ -17,7 +17,7 @@ from datamodules.images.image_files import image_paths, short_names
 from tangent_train.checkpoints.trained import load_trained
 from tangent_train.cli.each import each
 from tangent_train.cli.settings import typed
-from tangent_train.errors import SettingError
+from tangent_train.errors import SettingError, counted
 from tangent_train.inference.class_maps import Unmapped, load_class_map, map_classes
 from tangent_train.inference.images import DepthFolder, read_panorama, read_photo
 from tangent_train.inference.predictor import Predictor
@@ -100,7 +100,7 @@ def predict(config: Mapping[str, Any]) -> None:
         folder.check()
     entries = [entry for name, entry in earlier.items() if name in images]
     missing = {name: path for name, path in images.items() if name not in earlier}
-    _say(f"{len(images)} images, {len(entries)} of them done already.")
+    _say(f"{counted(len(images), 'images')}, {len(entries)} done already.")
     saved = -math.inf
     try:
         for name, entry, error in each("Predicting", missing, label):

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tangent_train.csv_text import csv_text
+from tangent_train.errors import counted
 from tangent_train.files import write_text
 from tangent_train.metrics.classification import classification_scores
 from tangent_train.metrics.segmentation import (
@@ -163,7 +164,7 @@ def headline(record: Record) -> str:
         if record.means[name] is not None
     ]
     told = " (in brackets: 95\u00a0% intervals)" if record.intervals else ""
-    return f"{', '.join(means)} over {record.images} {record.noun}".strip() + told
+    return f"{', '.join(means)} over {counted(record.images, record.noun)}".strip() + told
 
 
 def largest_loss(record: Record) -> str:

@@ -235,5 +235,5 @@ class PredictionFolder:
             tables=tables,
             images=shown,
             class_names=self.class_names,
-            notes=[f"{len(shown)} of {len(entries)} images are shown."],
+            notes=[f"Shown: {len(shown)} of {len(entries)} images."],
         )
