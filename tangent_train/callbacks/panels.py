@@ -1,4 +1,4 @@
-"""Pictures of the test, and the progress bar."""
+"""Pictures of the test."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import cv2
 import lightning
 import numpy as np
 import torch
-from lightning.pytorch.callbacks import Callback, RichProgressBar
+from lightning.pytorch.callbacks import Callback
 from numpy.typing import NDArray
 
 from datamodules.core.loading import at_least
@@ -19,7 +19,7 @@ from tangent_train.results.html import EncodedImage, encode_image
 from tangent_train.results.pictures import prediction_panel, shown_arrays
 from tangent_train.results.tables import percent
 
-__all__ = ["PredictionPanels", "ProgressBar", "evenly_spread"]
+__all__ = ["PredictionPanels", "evenly_spread"]
 
 _PANORAMA_DIMENSIONS = 2
 
@@ -96,18 +96,3 @@ class PredictionPanels(Callback):
             torch.distributed.all_gather_object(parts, self._encoded)
         together = {index: image for part in parts for index, image in part.items()}
         self.images = [together[index] for index in sorted(together)]
-
-
-class ProgressBar(RichProgressBar):
-    """Lightning's bar with rate and time left, without the logger's version."""
-
-    def __init__(self) -> None:
-        super().__init__(leave=False)
-
-    def get_metrics(
-        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
-    ) -> dict[str, Any]:
-        """Metrics shown behind the bar."""
-        figures = dict(super().get_metrics(trainer, pl_module))
-        figures.pop("v_num", None)
-        return figures

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,7 +17,7 @@ from lightning.pytorch.utilities import rank_zero_only
 from rich.console import Console
 
 from tangent_train.callbacks.checkpoints import AtomicCheckpointIO, CheckpointContents
-from tangent_train.callbacks.panels import ProgressBar
+from tangent_train.callbacks.progress import ProgressBar
 from tangent_train.callbacks.results import evaluated, pictures, write_evaluation
 from tangent_train.checkpoints.content import read_checkpoint, write_settings
 from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
@@ -113,6 +114,8 @@ class Run:
         contents = {"kind": self.task.kind, "config": self.settings, **shown(self.data)}
         common = [CheckpointContents(contents), ProgressBar()]
         section = self.settings["trainer"]
+        # Devices found, advertisements, what the settings say anyway.
+        logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
         every, epochs = section.get("check_val_every_n_epoch"), section.get("max_epochs")
         trainer: lightning.Trainer = make(
             section,

@@ -105,6 +105,8 @@ def _fit(run: Run, trainer: lightning.Trainer, resumed: Path | None, last: LastC
         warnings.filterwarnings("ignore", "Checkpoint directory .* exists and is not empty")
         # Lightning looks for this in the loader; here the data module knows where to go on.
         warnings.filterwarnings("ignore", ".* your dataloader is not resumable")
+        # A small data set has few batches.
+        warnings.filterwarnings("ignore", "The number of training batches")
         # network.frozen_statistics=true
         warnings.filterwarnings("ignore", "Found .* in eval mode at the start of training")
         try:

@@ -1,0 +1,78 @@
+"""Progress of a run: a bar on a terminal, lines elsewhere."""
+
+from __future__ import annotations
+
+import time
+from datetime import timedelta
+from typing import Any
+
+import lightning
+from lightning.pytorch.callbacks import RichProgressBar
+from rich import get_console
+
+from datamodules.core.progress import PlainLines
+
+__all__ = ["ProgressBar"]
+
+
+class ProgressBar(RichProgressBar):
+    """Lightning's bar with rate and time left, without the logger's version.
+
+    Where the output is no terminal, a line is printed after every epoch, and after a minute
+    without one.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(leave=False)
+        if not get_console().is_terminal:
+            self.disable()
+        self._lines = PlainLines()
+        self._begun = 0.0
+        self._epochs = 0
+
+    def get_metrics(
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
+    ) -> dict[str, Any]:
+        """Metrics shown behind the bar."""
+        figures = dict(super().get_metrics(trainer, pl_module))
+        figures.pop("v_num", None)
+        return figures
+
+    def on_train_start(self, *args: Any) -> None:
+        """Time the epochs from here."""
+        super().on_train_start(*args)
+        self._begun = time.monotonic()
+
+    def on_train_batch_end(self, *args: Any) -> None:
+        """A line a minute."""
+        super().on_train_batch_end(*args)
+        self._tell(f"Epoch {args[0].current_epoch + 1}", args[4], args[0].num_training_batches)
+
+    def on_validation_batch_end(self, *args: Any) -> None:
+        """A line a minute."""
+        super().on_validation_batch_end(*args)
+        self._tell("Validation", args[4], args[0].num_val_batches[0])
+
+    def on_test_batch_end(self, *args: Any) -> None:
+        """A line a minute."""
+        super().on_test_batch_end(*args)
+        self._tell("Test", args[4], args[0].num_test_batches[0])
+
+    def on_train_epoch_end(
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
+    ) -> None:
+        """A line with the metrics and the time left."""
+        super().on_train_epoch_end(trainer, pl_module)
+        self._epochs += 1
+        done, last = trainer.current_epoch + 1, trainer.max_epochs or -1
+        parts = [f"Epoch {done} of {last}" if last > 0 else f"Epoch {done}"]
+        metrics = self.get_metrics(trainer, pl_module)
+        parts += [f"{name} {value:.3f}" for name, value in metrics.items()]
+        each = (time.monotonic() - self._begun) / self._epochs
+        parts += [f"{timedelta(seconds=round(each * (last - done)))} left"] * (last > done)
+        if trainer.is_global_zero:
+            self._lines.tell(", ".join(parts), at_once=True)
+
+    def _tell(self, what: str, index: int, total: float) -> None:
+        if self.trainer.is_global_zero:
+            self._lines.tell(f"{what}: {index + 1} of {total} steps")

@@ -1,0 +1,64 @@
+"""Progress where the output is no terminal."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import lightning
+import pytest
+import torch
+from lightning.pytorch.demos.boring_classes import BoringModel
+
+from datamodules.core import progress
+from tangent_train.callbacks.progress import ProgressBar
+
+
+class _Model(BoringModel):
+    def training_step(self, batch: Any, batch_idx: int) -> Any:
+        loss = self.step(batch)
+        self.log("train/loss", torch.tensor(0.25), prog_bar=True)
+        return loss
+
+
+def _trainer() -> lightning.Trainer:
+    return lightning.Trainer(
+        max_epochs=2,
+        limit_train_batches=3,
+        limit_val_batches=1,
+        limit_test_batches=2,
+        callbacks=[ProgressBar()],
+        accelerator="cpu",
+        logger=False,
+        enable_checkpointing=False,
+        enable_model_summary=False,
+    )
+
+
+def test_a_line_per_epoch(capsys: pytest.CaptureFixture[str]) -> None:
+    trainer = _trainer()
+    trainer.fit(_Model())
+    trainer.test(_Model(), verbose=False)
+    first, second = capsys.readouterr().out.splitlines()
+    assert first.startswith("Epoch 1 of 2, train/loss 0.250, 0:00:0")
+    assert first.endswith(" left")
+    assert second == "Epoch 2 of 2, train/loss 0.250"
+
+
+def test_a_line_whenever_a_minute_has_passed(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = 0.0
+
+    def half_a_minute_later() -> float:
+        nonlocal now
+        now += 30
+        return now
+
+    monkeypatch.setattr(progress.time, "monotonic", half_a_minute_later)
+    progress.show_progress(iter(range(4)), "Rendering rooms", "rooms", 5, before=1)
+    lines = capsys.readouterr().out.splitlines()
+    assert 1 <= len(lines) <= 4
+    assert lines[-1].startswith("Rendering rooms: ")
+    trainer = _trainer()
+    trainer.test(_Model(), verbose=False)
+    assert "Test: 2 of 2 steps" in capsys.readouterr().out
