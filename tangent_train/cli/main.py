@@ -13,6 +13,8 @@ import sys
 from contextlib import contextmanager
 from functools import partial
 from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tangent_train.errors import DataError, SettingError
@@ -39,6 +41,7 @@ __all__ = [
 
 def _main(command: str) -> None:
     """Compose the config ``<command>.yaml`` with the command line and hand it to the command."""
+    _import_own_packages()
     import hydra
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
@@ -77,6 +80,21 @@ def _main(command: str) -> None:
             ) from error
         finally:
             sys.argv[1:] = typed
+
+
+def _import_own_packages() -> None:
+    """Import our ``models`` and ``datamodules``, whatever else on PYTHONPATH is called so."""
+    root = str(Path(__file__).parents[2])
+    for name in ("datamodules", "models"):
+        other = find_spec(name)
+        sys.path.insert(0, root)
+        own = import_module(name)
+        sys.path.remove(root)
+        if other is not None and other.origin != own.__file__:
+            sys.stderr.write(
+                f"{other.origin} is not used: tangent-train has a package of this name. Rename its "
+                "folder to use what is in it in a config.\n"
+            )
 
 
 train = partial(_main, "train")

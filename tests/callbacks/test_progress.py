@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 import lightning
@@ -54,7 +55,7 @@ def test_a_line_whenever_a_minute_has_passed(
         now += 30
         return now
 
-    monkeypatch.setattr(progress.time, "monotonic", half_a_minute_later)
+    monkeypatch.setattr(time, "monotonic", half_a_minute_later)
     progress.show_progress(iter(range(4)), "Rendering rooms", "rooms", 5, before=1)
     lines = capsys.readouterr().out.splitlines()
     assert 1 <= len(lines) <= 4

@@ -90,3 +90,19 @@ def test_the_installed_modules_are_those_of_the_wheel(scripts: Path, tmp_path: P
     assert done.returncode == 0, done.stderr
     for file in done.stdout.split():
         assert Path(file).is_relative_to(scripts.parent.resolve()), file
+
+
+def test_packages_of_the_same_names_on_the_path_hide_nothing(
+    scripts: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("models", "datamodules"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "__init__.py").write_text("raise RuntimeError")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    command = [str(scripts / "tangent-check"), "data=folder", "data.root=nowhere"]
+    done = subprocess.run(command, check=False, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 1
+    *notes, refusal = done.stderr.splitlines()
+    for name, note in zip(("datamodules", "models"), notes, strict=True):
+        assert note.startswith(f"{tmp_path / name / '__init__.py'} is not used")
+    assert refusal.startswith("tangent-check: nowhere/classes.json: found no folder nowhere")
