@@ -7,12 +7,13 @@ from http.client import HTTPException
 from pathlib import Path
 from typing import Any
 
-import torch
+from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
 from torchvision.models import WeightsEnum
 
 from tangent_train.errors import DataError
+from tangent_train.files import load_plain
 
 __all__ = ["fetch_tensors", "load_tensors", "read_tensors"]
 
@@ -34,16 +35,14 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
         DataError: There is no such file, or it holds something else.
     """
     expected = "a state dict of tensors, or a checkpoint with one"
-    try:
-        if path.suffix == ".safetensors":
+    if path.suffix == ".safetensors":
+        try:
             content: Any = load_file(path)
-        else:
-            content = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:
-        found = f"an unreadable file ({str(error).partition(chr(10))[0]})"
-        raise DataError(
-            path, found=found if path.is_file() else "no such file", expected=expected
-        ) from error
+        except (SafetensorError, OSError) as error:
+            found = f"an unreadable file ({error})" if path.is_file() else "no such file"
+            raise DataError(path, found=found, expected=expected) from error
+    else:
+        content = load_plain(path, expected)
     if isinstance(content, dict) and isinstance(content.get("state_dict"), dict):
         inside = content["state_dict"]
         ours = {n.removeprefix(_PREFIX): t for n, t in inside.items() if n.startswith(_PREFIX)}

@@ -1,21 +1,31 @@
-"""Atomic writing of files."""
+"""Atomic writing of files, and reading those of torch."""
 
 from __future__ import annotations
 
 import errno
 import os
+import pickle
+import re
 import shutil
 import tempfile
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, TYPE_CHECKING
+from typing import IO, TYPE_CHECKING, Any
 
-from tangent_train.errors import SettingError
+from tangent_train.errors import DataError, SettingError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-__all__ = ["NoRoomError", "atomic_path", "no_room", "reserve", "write_bytes", "write_text"]
+__all__ = [
+    "NoRoomError",
+    "atomic_path",
+    "load_plain",
+    "no_room",
+    "reserve",
+    "write_bytes",
+    "write_text",
+]
 
 _PREFIX = ".partial-"
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
@@ -140,3 +150,31 @@ def _refused(path: Path) -> OSError:
     except OSError as error:
         return error
     return OSError()
+
+
+def load_plain(path: Path, expected: str, *, mmap: bool = False) -> Any:
+    """What `torch.save` wrote, if it is tensors and plain values: nothing else is unpickled.
+
+    Args:
+        path: The file.
+        expected: For the message.
+        mmap: Map the tensors into memory instead of reading them.
+
+    Raises:
+        DataError: It is missing, damaged, or holds other objects.
+    """
+    import torch
+
+    try:
+        return torch.load(path, map_location="cpu", weights_only=True, mmap=mmap)
+    except FileNotFoundError as error:
+        raise DataError(path, found="no such file", expected=expected) from error
+    except Exception as error:
+        named = re.search(r"GLOBAL (\S+)", str(error))
+        if isinstance(error, pickle.UnpicklingError) and named:
+            found = f"{named[1]}, a class"
+            remedy = "Save its state_dict() alone: reading objects can run anything."
+        else:
+            found = "a damaged file, or none of torch.save"
+            remedy = ""
+        raise DataError(path, found=found, expected=expected, remedy=remedy) from error

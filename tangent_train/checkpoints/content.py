@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import yaml  # type: ignore[import-untyped]
 
 from tangent_train.errors import DataError
-from tangent_train.files import write_text
+from tangent_train.files import load_plain, write_text
 from tangent_train.registry import Text, check_fields, check_plain
 
 if TYPE_CHECKING:
@@ -55,17 +55,10 @@ def read_checkpoint(path: Path, needed: Collection[str] = tuple(_FIELDS)) -> dic
     Raises:
         DataError: The file is missing, no checkpoint, or of another program.
     """
-    import torch
-
-    if not path.is_file():
-        what = "a folder" if path.is_dir() else "no such file"
-        remedy = "Give its checkpoints/best.ckpt." if path.is_dir() else ""
-        raise DataError(path, found=what, expected=_EXPECTED, remedy=remedy)
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-    except Exception as error:
-        what = f"an unreadable file ({str(error).partition(chr(10))[0]})"
-        raise DataError(path, found=what, expected=_EXPECTED) from error
+    if path.is_dir():
+        remedy = "Give its checkpoints/best.ckpt."
+        raise DataError(path, found="a folder", expected=_EXPECTED, remedy=remedy)
+    content = load_plain(path, _EXPECTED, mmap=True)
     kinds = {name: kind for name, kind in _FIELDS.items() if name in needed}
     found = check_fields(path, content, kinds, _EXPECTED)
     if "config" in found:
