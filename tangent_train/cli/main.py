@@ -10,10 +10,11 @@ import logging
 import os
 import signal
 import sys
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout, suppress
 from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
+from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -47,6 +48,7 @@ def _main(command: str) -> None:
     from omegaconf.errors import OmegaConfBaseException
 
     from tangent_train.cli.compose import config_folder, quote_path
+    from tangent_train.cli.help import annotate
     from tangent_train.cli.stored import stored_run
 
     typed = sys.argv[1:]
@@ -65,9 +67,15 @@ def _main(command: str) -> None:
             arguments = stored.arguments
         sys.argv[1:] = map(quote_path, arguments)
         try:
-            folder = str(config_folder(command))
+            folder = config_folder(command)
             os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises what it would print
-            hydra.main(version_base="1.3", config_path=folder, config_name=command)(job)()
+            run = hydra.main(version_base="1.3", config_path=str(folder), config_name=command)(job)
+            if {"--help", "-h"}.intersection(arguments):
+                with suppress(SystemExit), redirect_stdout(StringIO()) as told:
+                    run()
+                sys.stdout.write(annotate(told.getvalue(), folder, command))
+            else:
+                run()
         except (HydraException, OmegaConfBaseException) as error:
             cause = str(error.__cause__ or "").partition("\n")[0]
             sys.exit(f"tangent-{command}: {error}" + f"\n{cause}" * bool(cause))
@@ -141,6 +149,10 @@ def _refusals(command: str) -> Iterator[None]:
     """Exit with a one-line message if a setting or a file cannot be used."""
     try:
         yield
+        sys.stdout.flush()
+    except BrokenPipeError:  # "| head" has read enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(128 + signal.SIGPIPE)
     except (DataError, SettingError) as error:
         sys.exit(f"tangent-{command}: {error}")
     except KeyboardInterrupt:

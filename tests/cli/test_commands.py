@@ -188,7 +188,12 @@ def test_impossible_settings_are_refused_before_any_data_is_made(
 @pytest.mark.parametrize(
     ("command", "argument", "said"),
     [
-        ("train", "--help", "tangent-train experiment=rooms/demo"),
+        (
+            "train",
+            "--help",
+            "backbone_lr_factor: 1.0       # of the learning rate",
+        ),
+        ("evaluate", "--help", "class_map: null                 # the network's classes as"),
         ("train", "levl=5", "Key 'levl' is not in struct"),
         ("train", "data=stanford", "stanford2d3ds_perspective"),
         ("report", "--help", "runs/paper/semseg_s7_b0_rgbd --output"),
@@ -210,3 +215,18 @@ def test_answers_before_anything_heavy_is_imported(
     assert said in done.stdout + done.stderr
     assert "heavy 0" in done.stdout
     assert "Traceback" not in done.stderr
+
+
+def test_a_pipe_that_is_closed_early_and_tab_completion(tmp_path: Path) -> None:
+    train = f"{sys.executable} -m tangent_train.cli.main train"
+    typed = "tangent-train data=folder_"
+    completion = f"COMP_LINE='{typed}' COMP_POINT={len(typed)} {train} -sc query=bash"
+    for command, told in (
+        (f"{train} --help | head -n 1", "Train a network"),
+        (completion, "data=folder_photos"),
+    ):
+        done = subprocess.run(
+            command, shell=True, check=True, cwd=tmp_path, capture_output=True, text=True
+        )
+        assert done.stdout.startswith(told)
+        assert not done.stderr
