@@ -215,7 +215,7 @@ class LastCheckpoint(Checkpoint):
 
 
 class BestCheckpoint(ModelCheckpoint):
-    """Keep ``best.ckpt``, the epoch with the highest validation score.
+    """Keep ``best.ckpt``, the epoch with the highest validation score; none without validation.
 
     Args:
         folder: Output folder, of a resumed run whose folder was moved too.
@@ -230,6 +230,7 @@ class BestCheckpoint(ModelCheckpoint):
             mode="max",
             auto_insert_metric_name=False,
             enable_version_counter=False,
+            save_on_train_epoch_end=False,
         )
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:

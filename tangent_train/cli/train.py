@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 import sys
 import warnings
@@ -26,7 +27,7 @@ from tangent_train.cli.fine_tuning import begin_from, load_start
 from tangent_train.cli.machine import machine_faults
 from tangent_train.cli.sweep import OBJECTIVE_FILE
 from tangent_train.errors import DataError, SettingError
-from tangent_train.files import write_text
+from tangent_train.files import atomic_path, write_text
 from tangent_train.registry import SettingsFile
 from tangent_train.setting_rules import differing_settings, from_file
 
@@ -64,10 +65,8 @@ def train(settings: Settings, source: SettingsFile | None = None) -> float | Non
         )
     checkpoints = run.folder / "checkpoints"
     last = LastCheckpoint(checkpoints, settings["checkpoint_every_n_steps"], _typed_local())
-    callbacks = [last, LearningRateMonitor()]
-    if run.data.validation_fraction:
-        callbacks.append(BestCheckpoint(checkpoints, run.task.monitor))
-    trainer = run.trainer(callbacks)
+    best = BestCheckpoint(checkpoints, run.task.monitor)
+    trainer = run.trainer([last, LearningRateMonitor(), best])
     if settings["ema"] is not None:  # first: the last step is in the average that is saved
         average = averaged_weights(settings["ema"], trainer.strategy.root_device)
         trainer.callbacks.insert(0, average)  # type: ignore[attr-defined]
@@ -75,9 +74,18 @@ def train(settings: Settings, source: SettingsFile | None = None) -> float | Non
         _fit(run, trainer, resumed, last)
         # First: an error in the test must not cost a sweep its figure.
         score = best_on_validation(trainer, run.folder)
-        best = checkpoints / "best.ckpt"
-        run.test(trainer, best if best.exists() else last.path)
+        run.test(trainer, _tested(trainer, best, last.path))
     return score
+
+
+def _tested(trainer: lightning.Trainer, best: BestCheckpoint, last: Path) -> Path:
+    """``best.ckpt``, which without validation is a copy of ``last.ckpt``."""
+    tested = last.with_name("best.ckpt")
+    if trainer.is_global_zero and best.best_model_score is None:
+        with atomic_path(tested) as path:
+            shutil.copyfile(last, path)
+    trainer.strategy.barrier()
+    return tested
 
 
 def best_on_validation(trainer: lightning.Trainer, folder: Path) -> float | None:
@@ -105,7 +113,8 @@ def _fit(run: Run, trainer: lightning.Trainer, resumed: Path | None, last: LastC
         warnings.filterwarnings("ignore", "Checkpoint directory .* exists and is not empty")
         # Lightning looks for this in the loader; here the data module knows where to go on.
         warnings.filterwarnings("ignore", ".* your dataloader is not resumable")
-        # A small data set has few batches.
+        # Without validation there is no loader for it; a small data set has few batches.
+        warnings.filterwarnings("ignore", "Total length of `list` across ranks is zero")
         warnings.filterwarnings("ignore", "The number of training batches")
         # network.frozen_statistics=true
         warnings.filterwarnings("ignore", "Found .* in eval mode at the start of training")

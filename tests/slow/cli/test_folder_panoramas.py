@@ -90,3 +90,17 @@ def test_prepare_checks_and_fills_the_store(
     stored = sorted(path.relative_to(tmp_path / "store") for path in tmp_path.rglob("*.npy"))
     assert len(stored) == 10
     assert stored[0].match("32x64_*/scene_0/view.0.npy")
+
+
+def test_two_panoramas_train_and_the_last_epoch_is_tested(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    root = write_data_set(tmp_path / "few", scenes=2, each=1, height=_ROWS)
+    run_command(monkeypatch, "train", *_SETTINGS, f"data.root={root}", "hydra.run.dir=run")
+    checkpoints = tmp_path / "run" / "checkpoints"
+    first = (checkpoints / "best.ckpt").read_bytes()
+    assert first == (checkpoints / "last.ckpt").read_bytes()
+    run_command(monkeypatch, "train", "resume=run", f"data.root={root}", "trainer.max_epochs=2")
+    assert first != (checkpoints / "best.ckpt").read_bytes()
+    assert results(tmp_path / "run")["images"] == 1
