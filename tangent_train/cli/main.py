@@ -157,6 +157,9 @@ def _refusals(command: str) -> Iterator[None]:
         sys.exit(f"tangent-{command}: {error}")
     except KeyboardInterrupt:
         sys.exit(130)  # as a shell says it; runs have said how to go on
+    except SystemExit as error:
+        # Lightning ends an interrupted run with 1.
+        sys.exit(130 if isinstance(error.__context__, KeyboardInterrupt) else error.code)
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ import torch
 
 from tangent_train.checkpoints.content import read_settings
 from tangent_train.results.record import load_record
+from tangent_train.tasks.segmentation import SegmentationTask
 from tests.cli.tiny_runs import SETTINGS, Run, results
 
 CUT_SHORT = """
@@ -77,6 +78,20 @@ def test_a_terminated_run_goes_on_as_if_nothing_had_happened(
         torch.testing.assert_close(found[part], expected[part], rtol=0, atol=0)
     assert found["lr_schedulers"] == expected["lr_schedulers"]
     assert results(tmp_path / "cut") == results(run_folder)
+
+
+def test_ctrl_c_ends_a_run_as_a_shell_says_it(
+    rooms: str, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(SegmentationTask, "training_step", interrupted)
+    before = signal.getsignal(signal.SIGINT)  # Lightning ignores further ones
+    with pytest.raises(SystemExit) as ended:
+        run("train", *SETTINGS, rooms, "hydra.run.dir=cut")
+    signal.signal(signal.SIGINT, before)
+    assert ended.value.code == 128 + signal.SIGINT
 
 
 def test_an_evaluation_repeats_the_figures_exactly(
