@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import colorsys
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 
 if TYPE_CHECKING:
@@ -12,18 +13,45 @@ if TYPE_CHECKING:
 
 __all__ = ["class_colors"]
 
+_STEPS = 12  # values of each channel to choose from
+_LIGHTNESS = (35, 90)  # L*: black is the unknown class, white the page
+_SEEN = np.array(
+    [
+        [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+        # Without L and without M cones: Machado, Oliveira, Fernandes 2009, severity 1.
+        [[0.1523, 1.0526, -0.2049], [0.1145, 0.7863, 0.0992], [-0.0039, -0.0481, 1.0520]],
+        [[0.3673, 0.8606, -0.2280], [0.2801, 0.6725, 0.0474], [-0.0118, 0.0429, 0.9689]],
+    ]
+)
+"""What eyes make of linear RGB."""
 
+
+@lru_cache
 def class_colors(num_classes: int) -> NDArray[np.uint8]:
     """Distinct colours, black for the unknown class 0.
 
+    Each is the one that is farthest from all before it in CIELAB: by full colour vision plus three
+    times by the worse of eyes without red and without green cones. Classes with small numbers,
+    often neighbours, differ most.
+
     Args:
-        num_classes: K + 1.
+        num_classes: K + 1, to 256.
 
     Returns:
-        ``(K+1, 3)`` RGB: hues a golden ratio apart, in three brightnesses.
+        ``(K+1, 3)`` RGB, not writable.
     """
-    colors = [
-        colorsys.hsv_to_rgb(k * 0.618034 % 1, 0.45 + 0.4 * (k % 2), 0.95 - 0.15 * (k % 3))
-        for k in range(1, num_classes)
-    ]
-    return (np.array([(0, 0, 0), *colors]) * 255).round().astype(np.uint8)
+    values = np.linspace(0, 1, _STEPS)
+    srgb = np.stack(np.meshgrid(values, values, values, indexing="ij"), axis=-1).reshape(-1, 3)
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    seen = np.clip(linear @ _SEEN.transpose(0, 2, 1), 0, 1).astype(np.float32)
+    lab = np.stack([cv2.cvtColor(image[None], cv2.COLOR_LRGB2Lab)[0] for image in seen], axis=1)
+    light = lab[:, 0, 0]
+    away = np.where((light >= _LIGHTNESS[0]) & (light <= _LIGHTNESS[1]), np.inf, 0.0)
+    chosen = [0]  # black
+    while len(chosen) < num_classes:
+        distances = np.linalg.norm(lab - lab[chosen[-1]], axis=-1)
+        away = np.minimum(away, distances[:, 0] + 3 * distances[:, 1:].min(axis=1))
+        chosen.append(int(away.argmax()))
+    colors = (srgb[chosen[:num_classes]] * 255).round().astype(np.uint8)
+    colors.setflags(write=False)
+    return colors

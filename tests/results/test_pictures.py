@@ -1,20 +1,42 @@
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import pytest
 
 from datamodules.images.palette import class_colors
 from tangent_train.results.pictures import colorize, prediction_panel
 
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
 NAMES = ("unknown", "wall", "floor", "sofa")
 
 
-@pytest.mark.parametrize("count", [2, 14, 21])
-def test_colours_are_distinct_and_unknown_is_black(count: int) -> None:
-    colors = class_colors(count).astype(int)
+def _lab(srgb: NDArray[np.float64]) -> NDArray[np.float64]:
+    """CIELAB (D65) of sRGB from 0 to 1."""
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    to_xyz = [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
+    ratio = linear @ np.transpose(to_xyz) / [0.9505, 1, 1.089]
+    f = np.where(ratio > 0.008856, np.cbrt(ratio), 7.787 * ratio + 16 / 116)
+    return np.stack(
+        [116 * f[:, 1] - 16, 500 * (f[:, 0] - f[:, 1]), 200 * (f[:, 1] - f[:, 2])], axis=-1
+    )
+
+
+def test_colours_are_distinct_for_colour_blind_readers_too() -> None:
+    colors = class_colors(14)
     assert colors[0].tolist() == [0, 0, 0]
-    distances = np.abs(colors[:, None] - colors[None]).sum(axis=-1) + 999 * np.eye(count, dtype=int)
-    assert distances.min() > 15
+    # Viénot, Brettel, Mollon 1999: without green cones, red and green of RGB^2.2 are mixed.
+    mixed = [[0.293, 0.707, 0], [0.293, 0.707, 0], [-0.022, 0.022, 1]]
+    linear = (colors / 255) ** 2.2
+    blind = np.clip(linear @ np.transpose(mixed), 0, 1) ** (1 / 2.2)
+    for seen, least in ((colors / 255, 30), (blind, 9)):
+        lab = _lab(seen)
+        distances = np.linalg.norm(lab[:, None] - lab, axis=-1) + 999 * np.eye(len(lab))
+        assert distances.min() > least
+    assert len(np.unique(class_colors(256), axis=0)) == 256
 
 
 @pytest.mark.parametrize(("rows", "scale"), [(100, 2), (256, 1), (300, 1)])
