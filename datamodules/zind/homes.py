@@ -125,13 +125,15 @@ class HomePanorama:
         camera = self._fields({"camera_height": float})["camera_height"]
         kinds = {"rotation": float, "scale": float, "translation": list[float]}
         moved = self._fields(kinds, "floor_plan_transformation")
-        unit_m = (self.unit_m or math.nan) * moved["scale"]
-        translation = [*moved["translation"], moved["scale"] * camera]
-        numbers = [moved["rotation"], unit_m, *translation]
-        if len(translation) != 3 or not all(abs(n) <= _MOST for n in numbers) or not unit_m > 0:
-            raise self._wrong(f"{moved}, {self.unit_m} m a unit", "a place on the floor, in metres")
+        lengths = [self.unit_m or math.nan, moved["scale"], camera]
+        numbers = [*lengths, moved["rotation"], *moved["translation"]]
+        usable = len(numbers) == 6 and all(abs(number) <= _MOST for number in numbers)
+        if not usable or min(lengths) <= 0:
+            found = f"{moved}, a unit of {self.unit_m} m and camera_height={camera}"
+            raise self._wrong(found, "a place on the floor, in metres")
+        unit_m = lengths[0] * moved["scale"]
         turn = rotation_about((0, 0, 1), math.radians(moved["rotation"]))
-        location_m = np.array(translation) * self.unit_m
+        location_m = np.array([*moved["translation"], moved["scale"] * camera]) * lengths[0]
         return PanoramaPose(turn @ _FROM_SPHERE, location_m), unit_m
 
     def _fixtures(self, kind: str, label: int) -> Iterator[Fixture]:

@@ -14,6 +14,7 @@ import numpy as np
 import OpenEXR
 from PIL import Image
 
+from datamodules.core.problems import Problems
 from datamodules.core.reading import ImageFiles
 from datamodules.core.store import Store
 from datamodules.folder.cameras import read_cameras as read_photo_cameras
@@ -25,9 +26,11 @@ from datamodules.modelnet40.meshes import read_off
 from datamodules.stanford2d3ds.label_table import CLASSES, LabelTable
 from datamodules.stanford2d3ds.poses import read_panorama_pose
 from datamodules.stanford2d3ds.reader import read_camera_matrix
+from datamodules.zind.homes import list_panoramas
 from tangent_train.errors import DataError
 from tangent_train.geometry import TangentGrid, rotation_about
 from tangent_train.rendering.camera_files import CameraFile, read_cameras, write_cameras
+from tests.datamodules.zind.zind_format import SQUARE, Camera, write_home
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -145,6 +148,29 @@ def _read_photo_cameras(path: Path) -> None:
     assert 0 < matrix[0, 0] < np.inf
 
 
+def _home_seeds() -> list[bytes]:
+    with TemporaryDirectory() as folder:
+        views = [Camera("pano_1"), Camera("pano_2", (0.5, 1), 30)]
+        return [write_home(Path(folder) / "000", [(SQUARE, views)], rows=2).read_bytes()]
+
+
+def _read_home(path: Path) -> None:
+    file = path.parent / "000" / "zind_data.json"
+    file.parent.mkdir(exist_ok=True)
+    path.replace(file)
+    problems = Problems()
+    panoramas = list_panoramas(path.parent, problems)
+    problems.refuse(path.parent)
+    for panorama in panoramas:
+        assert panorama.image().parent == file.parent / "panos"
+        pose, unit_m = panorama.pose()
+        assert np.isfinite([*pose.location_m, unit_m]).all()
+        layout = panorama.layout()
+        assert layout.labels(_SHAPE).max() <= 5
+        distances = layout.distances(_SHAPE)
+        assert ((distances > 0) & (distances < np.inf) | np.isnan(distances)).all()
+
+
 def _label_image_seeds() -> list[bytes]:
     indices = np.zeros_like(_RGB)
     indices[..., 2] = _RGB[..., 2] % 14
@@ -242,6 +268,7 @@ TARGETS: dict[str, tuple[Callable[[], list[bytes]], Callable[[Path], None]]] = {
     "photo_cameras": (_photo_camera_seeds, _read_photo_cameras),
     "pose": (_pose_seeds, _read_pose),
     "off": (_off_seeds, _read_mesh),
+    "home": (_home_seeds, _read_home),
     "label_image": (_label_image_seeds, _read_label_image),
     "gpano": (_gpano_seeds, _read_gpano),
     "pixels": (_pixel_seeds, _read_image),
