@@ -28,6 +28,11 @@ SPLIT_WALL = Room(
     [(-2, -1), (2, -1), (2, 1), (1, 1), (-0.5, 1), (-2, 1)],
     {"windows": [((-1.5, 1), (1.5, 1), (-0.5, 0.5))], "doors": [((2, -1), (2, 1), (-1, 3))]},
 )
+# Fixtures that go on behind the corner of two walls: the other wall has no part of them.
+BEHIND = Room(
+    [(0, 0), (3, 0), (3, 2), (0, 2)],
+    {"doors": [((-0.02, 0), (0.9, 0), (-1, 0.5))], "windows": [((3, 1), (3, 2.03), (-0.5, 0.5))]},
+)
 COMB = Room([(-3, -1), (3, -1), (3, 3), (2, 3), (2, 0.5), (0.5, 0.5), (0.5, 3), (-0.5, 3),
              (-0.5, 1), (-3, 1)])  # fmt: skip
 VIEWS = {
@@ -38,6 +43,8 @@ VIEWS = {
     "concave": (CORNERED, Camera("", (1.1, 0.9), 14)),
     "concave, doors hidden": (CORNERED, Camera("", (4.5, 1.2), 3)),
     "fixtures across corners": (SPLIT_WALL, Camera("", (0.1, 0.2), -50)),
+    "fixtures behind a corner": (BEHIND, Camera("", (0.2, 0.3), 21)),
+    "another": (BEHIND, Camera("", (2.9, 1.9), 111)),
     "comb": (COMB, Camera("", (-1.3, -0.3), 81)),
 }
 

@@ -23,7 +23,7 @@ __all__ = ["KINDS", "Camera", "Room", "brute_force_labels", "write_home", "write
 KINDS = {"doors": 4, "windows": 5, "openings": 0}
 """Fixtures and their labels; 1 is ceiling, 2 floor, 3 wall."""
 
-SCALE, METERS = 0.4, 3.5  # units of the floor in a camera height, metres in such a unit
+SCALE, METERS = 0.4, 3.0  # units of the floor in a camera height, metres in such a unit
 
 Fixtures = dict[str, list[tuple[tuple[float, float], tuple[float, float], tuple[float, float]]]]
 """By kind: both ends, then bottom and top."""
