@@ -173,6 +173,8 @@ def normalize_channels(
     """
     # One multiplication and one addition per value.
     scale = zip(units, normalization.mean, normalization.std, strict=True)
-    values = images.new_tensor([(1 / (unit * std), mean / std) for unit, mean, std in scale])
-    factor, offset = values.T[..., None, None]
+    values = [value for unit, mean, std in scale for value in (1 / (unit * std), mean / std)]
+    # Filled in on the device: copying them to a GPU would wait for all work before.
+    filled = torch.stack([images.new_full((), value) for value in values])
+    factor, offset = filled.view(-1, 2).T[..., None, None]
     return images.mul_(factor).sub_(offset)

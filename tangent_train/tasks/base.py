@@ -182,7 +182,6 @@ class Task(lightning.LightningModule, ABC):
             value += loss.detach()
         loss = self.loss_sum(*last) / norm
         whole: Any = strategy.reduce(value + loss.detach(), reduce_op="mean")
-        self.log("train/loss", whole, prog_bar=True)
         # Copied while a GPU is busy with the backward pass.
         copied = torch.cuda.Event() if whole.is_cuda else None  # type: ignore[no-untyped-call]
         self._pending = (whole.to("cpu", non_blocking=True), copied, batch)
@@ -191,7 +190,7 @@ class Task(lightning.LightningModule, ABC):
         return loss
 
     def on_after_backward(self) -> None:
-        """Stop before a step with a non-finite loss, on all processes.
+        """Log the loss, and stop before a step with a non-finite one, on all processes.
 
         Gradients are not checked: with `trainer.precision=16-mixed` those that overflow are
         skipped and the loss scale shrinks, as intended.
@@ -207,6 +206,8 @@ class Task(lightning.LightningModule, ABC):
             copied.synchronize()
         if not math.isfinite(loss):
             refuse_loss(self, float(loss), batch)
+        # On the CPU: the progress bar reads it every step, and would wait for a GPU.
+        self.log("train/loss", loss, prog_bar=True)
 
     def train(self, mode: bool = True) -> Self:
         """Switch between training and evaluation; frozen modules stay in evaluation mode."""

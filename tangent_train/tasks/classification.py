@@ -64,7 +64,7 @@ class ClassificationTask(Task):
 
     def loss_norm(self, labels: Tensor) -> Tensor:
         """The number of shapes."""
-        return torch.tensor(float(len(labels)), device=labels.device)
+        return torch.full((), float(len(labels)), device=labels.device)
 
     def evaluate(self, batch: Any) -> Tensor:
         """Add a batch of shapes to `confusion`; returns the predictions ``(B,)``."""

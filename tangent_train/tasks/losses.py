@@ -42,9 +42,9 @@ def cross_entropy_norm(
     labels: UInt8[Tensor, "images height width"], class_weights: Float[Tensor, " classes"]
 ) -> Tensor:
     """Sum of the class weights of the labelled pixels, known before the forward pass."""
-    pixels = torch.bincount(labels.flatten(), minlength=len(class_weights) + 1)[1:]
-    # Not a matrix product, which autocast would compute in half precision.
-    return (pixels * _exact(class_weights)).sum()
+    # Not counts of the classes: torch.bincount makes the host wait for a GPU.
+    of_label = functional.pad(_exact(class_weights), (1, 0))
+    return of_label.index_select(0, labels.flatten().int()).sum()
 
 
 def auxiliary_sum(
@@ -73,8 +73,9 @@ def auxiliary_sum(
     image = torch.arange(images, device=labels.device)[:, None, None]
     cell = (image * size[0] + rows[:, None]) * size[1] + columns
     bins = cell * (classes + 1) + labels
-    counts = torch.bincount(bins.flatten(), minlength=images * size[0] * size[1] * (classes + 1))
-    histograms = counts.view(images, *size, classes + 1)[..., 1:].movedim(-1, 1).to(exact)
+    counts = exact.new_zeros(images * size[0] * size[1] * (classes + 1))
+    counts.scatter_add_(0, bins.flatten(), counts.new_ones(()).expand(bins.numel()))
+    histograms = counts.view(images, *size, classes + 1)[..., 1:].movedim(-1, 1)
     # Counts instead of probabilities: every pixel weighs the same, however many a cell has.
     return functional.cross_entropy(exact, histograms, class_weights.to(exact), reduction="sum")
 

@@ -211,7 +211,14 @@ class SegmentationTask(Task):
         parts = view_scores(
             self, lambda part: images[part], len(images), self.images_per_forward, of_sphere
         )
-        return torch.cat([scores for _, scores in parts])
+        # Filled part by part: to concatenate them would hold them twice, and compiled networks may
+        # write every result to the same memory (mode=reduce-overhead).
+        all_scores = images.new_empty(0)
+        for part, scores in parts:
+            if part.start == 0:
+                all_scores = scores.new_empty((len(images), *scores.shape[1:]))
+            all_scores[part] = scores
+        return all_scores
 
     def evaluate(self, batch: Any) -> Tensor:
         """Add a batch of panoramas or photos to `confusion`; returns the predictions."""
