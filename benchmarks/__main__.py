@@ -5,6 +5,8 @@ python -m benchmarks images labels          some of it
 python -m benchmarks compare                measure, then compare with the baseline
 python -m benchmarks compare results.json   compare what was measured
 python -m benchmarks baseline results.json  make it the baseline, better of several runs
+python -m benchmarks gpu                    all that is measured on a GPU, see docs/gpu.md
+python -m benchmarks gpu correct step       some of it
 """
 
 from __future__ import annotations
@@ -36,6 +38,11 @@ MEASURED = {
 }
 """Modules of the rows; each has a function of the same name."""
 
+ON_A_GPU = {
+    name: f"benchmarks.gpu.{name}" for name in ("correct", "step", "predict", "fed", "science")
+}
+"""Likewise, of ``gpu``."""
+
 BASELINE = Path(__file__).with_name("baseline.json")
 _NOISE = 1.1
 """The load of a machine may change a quotient that much."""
@@ -63,44 +70,64 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--output", type=Path, default=Path("runs/bench"), help="folder")
     options = parser.parse_args(arguments)
     command, files = "", [Path(name) for name in options.names if name.endswith(".json")]
-    if options.names[:1] in (["compare"], ["baseline"]):
+    if options.names[:1] in (["compare"], ["baseline"], ["gpu"]):
         command, *options.names = options.names
     if command == "baseline":
         write_baseline(files)
         return
     if not files:
-        unknown = sorted({*options.names} - {*MEASURED})
+        measured = ON_A_GPU if command == "gpu" else MEASURED
+        unknown = sorted({*options.names} - {*measured})
         if unknown:
             parser.error(f"unknown: {', '.join(unknown)}")
-        files = [run(options.names or list(MEASURED), options.output, quick=options.quick)]
+        modules = {name: measured[name] for name in options.names or measured}
+        files = [run(modules, options.output, quick=options.quick)]
     if command == "compare":
         compare(files[0])
 
 
-def run(names: Sequence[str], output: Path, *, quick: bool) -> Path:
-    """Measure, print and write ``results.json``, whose path is returned."""
+def run(modules: Mapping[str, str], output: Path, *, quick: bool) -> Path:
+    """Measure, print and write ``results.json``, whose path is returned, and ``results.md``.
+
+    Written after every table: what is stopped keeps what it has.
+
+    Args:
+        modules: Of the rows, by name.
+        output: Folder.
+        quick: Toy size.
+    """
     start = time.perf_counter()
     tables: list[Table] = []
-    for name in names:
-        for table in getattr(import_module(MEASURED[name]), name)(quick):
-            print(table_text(table), flush=True)
-            tables.append(table)
-    goals = [goal for table in tables for goal in table.goals]
-    met = sum(goal.met for goal in goals)
-    print(f"{met} of {len(goals)} goals met, in {time.perf_counter() - start:.0f} s")
     libraries = ("torch", "numpy", "opencv-python-headless", "numba", "lightning")
-    content = {
+    content: dict[str, Any] = {
         "quick": quick,
         "cores": len(os.sched_getaffinity(0)),
         "machine": f"{platform.processor()} {platform.platform(terse=True)}",
         "versions": {library: version(library) for library in libraries},
-        "tables": [asdict(table) for table in tables],
     }
+    if {*modules} <= {*ON_A_GPU}:
+        gpu = import_module("benchmarks.gpu.attempts")
+        content |= {"quick": gpu.QUICK, "failures": gpu.FAILURES, **gpu.device_facts()}
     output.mkdir(parents=True, exist_ok=True)
     path = output / "results.json"
-    path.write_text(json.dumps(content, indent=1, ensure_ascii=False), encoding="utf-8")
+    for name, module in modules.items():
+        for table in getattr(import_module(module), name)(content["quick"]):
+            print(f"{table_text(table)}\n[{time.perf_counter() - start:.0f} s]", flush=True)
+            tables.append(table)
+            content["tables"] = [asdict(table) for table in tables]
+            path.write_text(json.dumps(content, indent=1, ensure_ascii=False), encoding="utf-8")
+            path.with_suffix(".md").write_text(markdown(content, tables), encoding="utf-8")
+    goals = [goal for table in tables for goal in table.goals]
+    met = sum(goal.met for goal in goals)
+    print(f"{met} of {len(goals)} goals met, in {time.perf_counter() - start:.0f} s")
     print(f"Results are in {path}.")
     return path
+
+
+def markdown(content: Mapping[str, Any], tables: Sequence[Table]) -> str:
+    """The tables, after what is known of the machine."""
+    facts = [f"- {name}: {value}" for name, value in content.items() if name != "tables"]
+    return "\n".join([*facts, *(f"```text{table_text(table)}\n```" for table in tables), ""])
 
 
 def table_text(table: Table) -> str:

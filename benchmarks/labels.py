@@ -17,7 +17,7 @@ from tangent_train.rendering import (
     tangent_to_labels,
 )
 
-__all__ = ["growth", "labels"]
+__all__ = ["NUM_CLASSES", "growth", "labels", "random_scores"]
 
 NUM_CLASSES = 13
 PLAIN = "grid_sample of a mosaic, argmax"
@@ -25,7 +25,7 @@ OURS = "tangent_to_labels"
 
 
 def labels(quick: bool) -> Iterator[Table]:
-    """Time, memory, and the first call; on a GPU where there is one."""
+    """Time, memory, and the first call."""
     level = 6 if quick else 10
     grid, shape = TangentGrid(1, level), equirect_shape(level)
     scores = random_scores(grid)
@@ -50,8 +50,6 @@ def labels(quick: bool) -> Iterator[Table]:
     table.goals = [Goal("as fast as grid_sample", 1 / table.ratio(OURS), 15, True)]
     yield table
     yield _memory(level, scores.nbytes / 2**20)
-    if torch.cuda.is_available():
-        yield _on_gpu(scores.cuda(), grid, shape)
 
 
 def random_scores(grid: TangentGrid, classes: int = NUM_CLASSES) -> torch.Tensor:
@@ -97,21 +95,6 @@ def _images_of(level: int) -> Callable[[], object]:
     shape = equirect_shape(level)
     panorama = np.random.default_rng(0).integers(0, 256, (*shape, 3), np.uint8)
     return partial(equirect_to_tangent, panorama, TangentGrid(1, level))
-
-
-def _on_gpu(scores: torch.Tensor, grid: TangentGrid, shape: tuple[int, int]) -> Table:
-    """Beside reading the scores once."""
-
-    def way(name: str, call: Callable[[], object], *, ours: bool = False) -> Way:
-        def run() -> None:
-            call()
-            torch.cuda.synchronize()
-
-        return Way(name, run, ours)
-
-    render = partial(tangent_to_labels, scores, grid, shape)
-    ways = [way("reading the scores once", scores.sum), way(OURS, render, ours=True)]
-    return Table("labels: on a GPU", measure(ways, 21))
 
 
 def growth(quick: bool) -> Iterator[Table]:

@@ -18,7 +18,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 
-__all__ = ["Goal", "Row", "Table", "Way", "added_mib", "measure"]
+__all__ = ["Goal", "Row", "Table", "Way", "added_mib", "measure", "memory_kib"]
 
 _SHORTEST_S = 0.02
 """Shorter calls are repeated until they take that long."""
@@ -136,12 +136,13 @@ def added_mib(function: Callable[..., Callable[[], object]], *arguments: Any) ->
 
 def _added_mib(function: Callable[..., Callable[[], object]], arguments: tuple[Any, ...]) -> float:
     call = function(*arguments)
-    before = _memory_kib("VmRSS")
+    before = memory_kib("VmRSS")
     call()
-    return max(1, _memory_kib("VmHWM") - before) / 2**10
+    return max(1, memory_kib("VmHWM") - before) / 2**10
 
 
-def _memory_kib(name: str) -> int:
+def memory_kib(name: str) -> int:
+    """A figure of this process: ``VmRSS`` is what it holds, ``VmHWM`` what it held at most."""
     found = re.search(rf"^{name}:\s+(\d+) kB$", Path("/proc/self/status").read_text(), re.MULTILINE)
     if found is None:
         raise LookupError(f"/proc/self/status has no {name}")

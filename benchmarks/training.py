@@ -30,21 +30,22 @@ from tangent_train.callbacks.checkpoints import LastCheckpoint
 from tangent_train.cli.build import build
 from tangent_train.cli.compose import config_folder
 
-__all__ = ["evaluation", "loader", "step"]
+__all__ = ["built", "evaluation", "loader", "quiet", "step"]
 
 OURS = "tangent-train"
 _WARM_UP = 3
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
+def quiet() -> Iterator[None]:
+    """Nothing of Lightning is printed."""
     logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
     with warnings.catch_warnings(), redirect_stdout(io.StringIO()):
         warnings.simplefilter("ignore")
         yield
 
 
-def _built(overrides: Sequence[str], root: str, rows: int, rooms: int = 3) -> tuple[Any, Any]:
+def built(overrides: Sequence[str], root: str, rows: int, rooms: int = 3) -> tuple[Any, Any]:
     """Data and task of an experiment on a few rooms, the data ready."""
     areas = ("1", "2", "3", "4", "5a", "5b", "6")
     counts = dict.fromkeys(areas, 0) | {"1": rooms, "5a": 1}
@@ -66,12 +67,12 @@ def loader(quick: bool) -> Iterator[Table]:
     level = 6 if quick else 10
     settings = [f"level={level}", "representation.base_level=1", "data.num_workers=1"]
     settings += ["representation.faces_per_panorama=4", "data.panoramas_per_step=1"]
-    with tempfile.TemporaryDirectory() as root, _quiet():
+    with tempfile.TemporaryDirectory() as root, quiet():
         ways = []
         stores = {"PNG files": "null", "prepared store": f"{root}/store"}
         for name, store in stores.items():
             overrides = ["experiment=rooms/standard", *settings, f"data.store={store}"]
-            data, _ = _built(overrides, f"{root}/rooms", 2 ** (level + 1))
+            data, _ = built(overrides, f"{root}/rooms", 2 ** (level + 1))
             epochs = 1 if store == "null" or quick else 20
             ways.append(_loading(name, data, epochs, ours=store != "null"))
         table = Table("loader: time", measure(ways, 2 if quick else 5))
@@ -101,9 +102,9 @@ def step(quick: bool) -> Iterator[Table]:
     small = ["level=5", "network=unet_small"] if quick else []
     settings = ("data.panoramas_per_step=3", "task.class_weights=none", "optimizer=adam")
     overrides = ["experiment=rooms/standard", *settings, "scheduler=constant", *small]
-    with tempfile.TemporaryDirectory() as root, _quiet():
+    with tempfile.TemporaryDirectory() as root, quiet():
         rows = 64 if quick else 256
-        data, task = _built(overrides, f"{root}/rooms", rows, rooms=24)
+        data, task = built(overrides, f"{root}/rooms", rows, rooms=24)
         clock = _StepClock(data, task)
         trainer = lightning.Trainer(
             accelerator="cpu",
@@ -188,8 +189,8 @@ def evaluation(quick: bool) -> Iterator[Table]:
     level = 6 if quick else 10
     overrides = ["experiment=paper/semseg_s10_b1_rgb", f"level={level}", "data=synthrooms"]
     overrides += ["network.depth=50", "network.weights=null"]
-    with tempfile.TemporaryDirectory() as root, _quiet():
-        data, task = _built(overrides, f"{root}/rooms", 2 ** (level + 1), rooms=1)
+    with tempfile.TemporaryDirectory() as root, quiet():
+        data, task = built(overrides, f"{root}/rooms", 2 ** (level + 1), rooms=1)
         network, grid = task.network.eval(), data.representation.grid
         images = torch.randn(16, 3, grid.dim, grid.dim)
         task.network = _Constant(data.num_classes)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.__main__ import BASELINE, MEASURED, Interval, main, verdicts
+from benchmarks.__main__ import BASELINE, MEASURED, ON_A_GPU, Interval, main, verdicts
 from benchmarks.images import check_same_views, rivals, striped_panorama
 from tangent_train.geometry import TangentGrid, equirect_shape
 from tangent_train.rendering import equirect_to_tangent
@@ -25,6 +25,16 @@ def test_every_benchmark_runs(name: str, tmp_path: Path) -> None:
     for command in ("compare", "baseline"):
         with pytest.raises(SystemExit, match="found a run with --quick"):
             main([command, str(path)])
+
+
+@pytest.mark.parametrize("name", ON_A_GPU)
+def test_every_benchmark_of_gpus_runs(name: str, tmp_path: Path) -> None:
+    main(["gpu", name, "--output", str(tmp_path)])
+    content = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))
+    assert content["failures"] == []
+    for table in content["tables"]:
+        assert f"\n{table['name']}\n" in (tmp_path / "results.md").read_text(encoding="utf-8")
+        assert all(min(row["values"]) > 0 for row in table["rows"])
 
 
 def test_half_a_pixel_off_is_another_view() -> None:

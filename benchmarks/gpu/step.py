@@ -1,0 +1,115 @@
+"""A training step in several precisions, eager and compiled."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any, NamedTuple
+
+import torch
+from torch import nn
+from torch.utils.flop_counter import FlopCounterMode
+
+from benchmarks.gpu.attempts import DEVICE, QUICK, Attempts, part, segformer, way
+from benchmarks.labels import NUM_CLASSES
+from benchmarks.measuring import Goal, Row, Table, measure
+from models import FCNResNet, UNet
+from tangent_train.rendering import TangentRepresentation
+from tangent_train.tasks import SegmentationTask
+
+__all__ = ["PEAK_FLOPS", "step"]
+
+PEAK_FLOPS = 989e12
+"""Dense bf16 operations a second of an H100 or H200 SXM (NVIDIA's data sheets)."""
+
+
+class _Mode(NamedTuple):
+    """How a step is computed; `compile` are arguments of `torch.compile`."""
+
+    name: str
+    tf32: bool = True
+    half: bool = False
+    compile: dict[str, Any] | None = None
+    takes_s: float = 10
+
+
+_MODES = (
+    _Mode("float32, TF32 off", tf32=False),
+    _Mode("float32, TF32"),
+    _Mode("bf16, channels last", half=True),
+    _Mode("the same, compiled", half=True, compile={}, takes_s=60),
+    _Mode("the same, CUDA graphs", half=True, compile={"mode": "reduce-overhead"}, takes_s=60),
+)
+
+
+@part(270)
+def step(attempts: Attempts) -> Iterator[Table]:
+    """FCN-ResNet101 (paper, level 10), SegFormer-B0, and the UNet of ``rooms/standard``."""
+    quick = attempts.quick
+    side, count = (32, 2) if quick else (512, 16)
+    widths = (4, 8, 8) if quick else (16, 32, 64, 128, 256, 256)
+    fcn = FCNResNet(4, NUM_CLASSES, depth=50 if quick else 101, frozen_statistics=True)
+    cases: tuple[tuple[str, nn.Module, tuple[int, ...]], ...] = (
+        ("UNet", UNet(4, NUM_CLASSES, widths), (2, 4, 32, 32) if quick else (40, 4, 96, 96)),
+        ("FCN-ResNet101", fcn, (count, 4, side, side)),
+        ("SegFormer-B0", segformer(NUM_CLASSES, quick=quick), (count, 3, side, side)),
+    )
+    for name, network, size in cases:
+        rows: list[Row] = []
+        for mode in _MODES:
+            timed = partial(_timed, network, size, mode)
+            rows += attempts.tried(f"{name}, {mode.name}", timed, mode.takes_s) or []
+        flops = attempts.tried(f"{name}: operations", partial(_flops, network, size))
+        if not rows or flops is None:
+            continue
+        table = Table(f"step: {name}, {size[0]} images of {size[-1]}²", rows)
+        if name == "FCN-ResNet101":
+            best = min(rows, key=lambda row: row.median)
+            table.goals = [
+                Goal("times as fast as float32", 1 / table.ratio(best.name), 4, True),
+                Goal("milliseconds", 1000 * best.median, 40),
+            ]
+        yield table
+        share = 100 * flops / PEAK_FLOPS
+        rows = [Row(row.name, [share / s for s in row.values], True) for row in rows]
+        yield Table(f"step: {name}, share of the bf16 peak of {PEAK_FLOPS:.3g}/s", rows, "%")
+
+
+def _timed(network: nn.Module, size: tuple[int, ...], mode: _Mode) -> list[Row]:
+    repeats, rounds = (1, 1) if QUICK else (5, 5)
+    return measure([way(mode.name, _step(network, size, mode), repeats, ours=True)], rounds)
+
+
+def _flops(network: nn.Module, size: tuple[int, ...]) -> int:
+    take = _step(network, size, _MODES[0])
+    with FlopCounterMode(display=False) as counter:
+        take()
+    return int(counter.get_total_flops())
+
+
+def _step(network: nn.Module, size: tuple[int, ...], mode: _Mode) -> Callable[[], object]:
+    """A step of the task, without its loader."""
+    torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = mode.tf32
+    names = ("unknown", *map(str, range(NUM_CLASSES)))
+    task = SegmentationTask(
+        copy.deepcopy(network),
+        TangentRepresentation(base_level=0, level=4),
+        names,
+        partial(torch.optim.Adam, lr=1e-4),
+        channels_last=mode.half,
+        compile={"backend": "eager"} if QUICK and mode.compile is not None else mode.compile,
+    )
+    task = task.to(DEVICE).train()
+    optimizer = task.optimization(lambda: 1)
+    images = torch.randn(size, device=DEVICE)
+    labels = torch.randint(0, NUM_CLASSES + 1, (size[0], *size[2:]), device=DEVICE).byte()
+
+    def take() -> None:
+        optimizer.zero_grad()
+        with torch.autocast(DEVICE.type, torch.bfloat16, enabled=mode.half and not QUICK):
+            loss = task.loss_sum((images,), labels) / task.loss_norm(labels)
+        torch.autograd.backward(loss)
+        optimizer.step()
+
+    return take

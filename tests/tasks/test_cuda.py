@@ -1,0 +1,95 @@
+"""Training and evaluation on a GPU are those on the CPU, and a step waits for nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from models import UNet
+from tangent_train.rendering import TangentRepresentation
+from tangent_train.tasks import SegmentationTask
+from tests.tasks.shapes import quiet_trainer
+from tests.tasks.test_segmentation import NAMES, Data
+
+pytestmark = [
+    pytest.mark.gpu,
+    pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device"),
+    pytest.mark.filterwarnings("ignore:You defined a `validation_step`:UserWarning"),
+    pytest.mark.filterwarnings("ignore:TensorFloat32 tensor cores:UserWarning"),
+]
+
+
+@pytest.fixture(autouse=True)
+def _without_tf32(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", False)
+
+
+def _task(**settings: Any) -> SegmentationTask:
+    torch.manual_seed(0)
+    representation = TangentRepresentation(base_level=0, level=4)
+    optimizer = partial(torch.optim.SGD, lr=0.1)
+    return SegmentationTask(UNet(2, 2, [4, 8]), representation, NAMES, optimizer, **settings)
+
+
+def _trained(accelerator: str, **settings: Any) -> SegmentationTask:
+    task, data = _task(images_per_chunk=17), Data()
+    quiet = {"max_steps": 2, "max_epochs": 2, "limit_val_batches": 0, "devices": 1}
+    trainer = quiet_trainer(accelerator=accelerator, **quiet, **settings)
+    trainer.fit(task, datamodule=data)
+    trainer.test(task, datamodule=data, verbose=False)
+    return task.cpu()
+
+
+def _weights(task: nn.Module) -> Tensor:
+    return torch.cat([parameter.detach().flatten() for parameter in task.parameters()])
+
+
+def test_two_steps_and_a_test() -> None:
+    expected, found = _trained("cpu"), _trained("gpu")
+    torch.testing.assert_close(_weights(found), _weights(expected), rtol=1e-4, atol=1e-5)
+    counted = expected.matrices.pixels
+    assert np.abs(found.matrices.pixels - counted).sum() < 0.01 * counted.sum()
+
+
+@pytest.mark.parametrize("precision", ["bf16-mixed", "16-mixed"])
+def test_mixed_precision(precision: str) -> None:
+    expected, found = _trained("cpu"), _trained("gpu", precision=precision)
+    torch.testing.assert_close(_weights(found), _weights(expected), rtol=0.05, atol=0.05)
+
+
+@pytest.fixture
+def no_waiting() -> Iterator[Any]:
+    """What is called makes every operation an error for which the host waits."""
+    yield lambda: torch.cuda.set_sync_debug_mode("error")
+    torch.cuda.set_sync_debug_mode("default")
+
+
+def test_a_step_does_not_wait(no_waiting: Any) -> None:
+    task = _task(channels_last=True).cuda().train()
+    optimizer = task.optimization(lambda: 1)
+    images = torch.randn(20, 2, 16, 16, device="cuda")
+    labels = torch.randint(0, 3, (20, 16, 16), device="cuda").byte()
+    for step in range(2):
+        if step:  # the first one chooses algorithms
+            no_waiting()
+        optimizer.zero_grad()
+        with torch.autocast("cuda", torch.bfloat16):
+            loss = task.loss_sum((images,), labels) / task.loss_norm(labels)
+        torch.autograd.backward(loss)
+        optimizer.step()
+
+
+def test_cuda_graphs_in_evaluation() -> None:
+    """They write every result to the same memory."""
+    images = torch.randn(20, 2, 16, 16, device="cuda")
+    plain = _task(images_per_forward=5).cuda().eval()
+    graphs = _task(images_per_forward=5, compile={"mode": "reduce-overhead"}).cuda().eval()
+    labels = [task.predict_labels(images, (32, 64)) for task in (plain, graphs, graphs)]
+    for found in labels[1:]:
+        assert (found == labels[0]).double().mean() > 0.99
