@@ -9,12 +9,14 @@ import subprocess
 import time
 import traceback
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import nn
 
 from benchmarks.measuring import Table, Way, memory_kib
+from tangent_train.cli.processes import command_line, run_process
 
 __all__ = [
     "DEVICE",
@@ -24,6 +26,7 @@ __all__ = [
     "device_facts",
     "part",
     "peak_mib",
+    "run_command",
     "segformer",
     "way",
 ]
@@ -132,3 +135,11 @@ def segformer(num_classes: int, *, quick: bool) -> nn.Module:
         config |= {"hidden_sizes": [8, 8, 16, 16], "num_attention_heads": [1, 1, 2, 2]}
         config |= {"depths": [1, 1, 1, 1], "decoder_hidden_size": 16}
     return HuggingFaceNetwork(config, num_classes)
+
+
+def run_command(command: str, arguments: list[str], folder: Path) -> bool:
+    """Run a command of this project in a process of its own."""
+    status = run_process(command_line(command, arguments, folder))
+    if status:
+        raise RuntimeError(f"tangent-{command} ended with status {status}")
+    return True

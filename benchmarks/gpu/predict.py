@@ -16,14 +16,13 @@ import numpy as np
 import torch
 from torch import nn
 
-from benchmarks.gpu.attempts import DEVICE, QUICK, Attempts, part, segformer, way
+from benchmarks.gpu.attempts import DEVICE, QUICK, Attempts, part, run_command, segformer, way
 from benchmarks.labels import NUM_CLASSES
 from benchmarks.measuring import Goal, Row, Table, measure
 from datamodules.core.inputs import RGB_NORMALIZATION
 from models import FCNResNet
 from tangent_train.checkpoints.scores import Scores
 from tangent_train.checkpoints.trained import TrainedNetwork
-from tangent_train.cli.processes import command_line, run_process
 from tangent_train.geometry import TangentGrid, equirect_shape
 from tangent_train.inference.predictor import Predictor, view_scores
 from tangent_train.inference.views import InputImage, PanoramaViews
@@ -34,11 +33,11 @@ __all__ = ["predict"]
 _NAMES = ("unknown", *map(str, range(NUM_CLASSES)))
 
 
-@part(240)
+@part(150)
 def predict(attempts: Attempts) -> Iterator[Table]:
     """2048×1024 and 4096×2048, in bf16, then 200 frames by ``tangent-predict``."""
     quick = attempts.quick
-    networks = {
+    networks: dict[str, Callable[[], nn.Module]] = {
         "SegFormer-B0": lambda: segformer(NUM_CLASSES, quick=quick),
         "FCN-ResNet101": lambda: FCNResNet(3, NUM_CLASSES, depth=50 if quick else 101),
     }
@@ -75,7 +74,7 @@ def _rows(network: nn.Module, level: int) -> list[Row]:
     )
     image = InputImage(np.random.default_rng(0).integers(0, 256, (*shape, 3), np.uint8))
     predictors = {
-        blend: Predictor(trained, PanoramaViews(trained, blend=blend), DEVICE.type)  # type: ignore[arg-type]
+        blend: Predictor(trained, PanoramaViews(trained, blend=blend), DEVICE.type)
         for blend in ("feather", "nearest")
     }
     per_forward = max(1, 2**20 // grid.dim**2)
@@ -127,17 +126,11 @@ def _folder(count: int) -> list[Row]:
             shutil.copy(frames / "0.jpg", frames / f"{number}.jpg")
         given = ["network=huggingface", f"model={folder / 'net'}", f"classes={classes}"]
         given += [f"level={level}", "base_level=1", "normalization=imagenet"]
-        _run("import", [*given, f"output={checkpoint}"], folder)
+        run_command("import", [*given, f"output={checkpoint}"], folder)
         given = [f"checkpoint={checkpoint}", f"input={frames}", f"device={DEVICE.type}"]
         rows = []
         for blend in ("feather", "nearest"):
             start = time.perf_counter()
-            _run("predict", [*given, f"blend={blend}", f"output={folder / blend}"], folder)
+            run_command("predict", [*given, f"blend={blend}", f"output={folder / blend}"], folder)
             rows.append(Row(blend, [(time.perf_counter() - start) / count], True))
         return rows
-
-
-def _run(command: str, arguments: list[str], folder: Path) -> None:
-    status = run_process(command_line(command, arguments, folder))
-    if status:
-        raise RuntimeError(f"tangent-{command} ended with status {status}")

@@ -43,7 +43,7 @@ _MODES = (
 )
 
 
-@part(270)
+@part(220)
 def step(attempts: Attempts) -> Iterator[Table]:
     """FCN-ResNet101 (paper, level 10), SegFormer-B0, and the UNet of ``rooms/standard``."""
     quick = attempts.quick
