@@ -27,11 +27,11 @@ from tests.models.sphere_networks import STAGE, small_context
 SHAPE = (64, 128)
 
 
-class _Transfers(TorchDispatchMode):
+class _Transfers(TorchDispatchMode):  # type: ignore[no-untyped-call]
     """Lists operations whose result is on another device than what they were given."""
 
     def __init__(self) -> None:
-        super().__init__()
+        super().__init__()  # type: ignore[no-untyped-call]
         self.found: list[str] = []
 
     def __torch_dispatch__(self, operation: Any, _: Any, given: Any = (), named: Any = None) -> Any:
