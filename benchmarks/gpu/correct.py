@@ -73,7 +73,7 @@ def _numbers(
         scores = task.eval()(images).to(dtype).detach().requires_grad_()
     found["scores of a UNet"] = scores
     for blend in ("nearest", "feather"):
-        rendered = tangent_to_equirect(scores, grid, shape, blend)  # type: ignore[arg-type]
+        rendered = tangent_to_equirect(scores, grid, shape, blend)
         (gradient,) = torch.autograd.grad((rendered * weights).sum(), scores)
         found |= {f"tangent_to_equirect, {blend}": rendered, f"its gradient, {blend}": gradient}
     task.train()
@@ -156,7 +156,7 @@ def _others(
         means = functional.embedding_bag(source, pixels, per_sample_weights=of_taps, mode="sum")
         return means.argmax(1)
 
-    @torch.compile(dynamic=False, **({"backend": "eager"} if QUICK else {}))
+    @torch.compile(dynamic=False, backend="eager" if QUICK else "inductor")
     def fused(face: Tensor, u: Tensor, v: Tensor, weight: Tensor) -> Tensor:
         source, of_taps = image_taps(face, u, v, grid.dim, weight, classes * size)
         terms = [flat[index + offsets] * of for index, of in zip(source, of_taps, strict=True)]

@@ -20,7 +20,7 @@ from benchmarks.measuring import Goal, Row, Table
 from benchmarks.training import built, quiet
 from datamodules.core.inputs import normalize
 from datamodules.core.samples import TrainingSample
-from tangent_train.callbacks.panels import ProgressBar
+from tangent_train.callbacks.progress import ProgressBar
 from tangent_train.rendering import equirect_to_tangent
 
 __all__ = ["fed"]
