@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from tangent_train.cli.compose import config_folder
 from tangent_train.cli.stored import stored_run
 from tangent_train.errors import DataError
+from tests.running import composed
 
 EXPERIMENTS = sorted(
     path.relative_to(config_folder() / "experiment").with_suffix("").as_posix()
@@ -22,8 +22,7 @@ GROUPS = ("representation", "optimizer", "scheduler", "network", "data", "traine
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_every_experiment_composes(experiment: str) -> None:
     command = "transfer" if Path(experiment).name.startswith("transfer") else "train"
-    with initialize_config_dir(str(config_folder()), version_base="1.3"):
-        config = compose(command, [f"experiment={experiment}"])
+    config = composed(command, f"experiment={experiment}")
     OmegaConf.resolve(config)
     assert config.name in (experiment, experiment.removeprefix("rooms/"))
 
@@ -31,8 +30,7 @@ def test_every_experiment_composes(experiment: str) -> None:
 @pytest.mark.parametrize("group", GROUPS)
 def test_every_option_of_every_group_composes(group: str) -> None:
     for path in (config_folder() / group).glob("*.yaml"):
-        with initialize_config_dir(str(config_folder()), version_base="1.3"):
-            OmegaConf.resolve(compose("train", [f"{group}={path.stem}"]))
+        OmegaConf.resolve(composed("train", f"{group}={path.stem}"))
 
 
 @pytest.mark.parametrize(

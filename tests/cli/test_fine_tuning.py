@@ -15,13 +15,13 @@ from datamodules.core.inputs import RGBD_NORMALIZATION
 from tangent_train.checkpoints.content import read_settings
 from tangent_train.checkpoints.trained import load_trained
 from tangent_train.cli.build import build
-from tangent_train.cli.compose import config_folder
 from tangent_train.cli.fine_tuning import begin_from
 from tangent_train.errors import DataError, SettingError
 from tangent_train.inference.export import export_network
 from tangent_train.inference.photo_networks import normalization_of
 from tests.cli.imported import UNET, write_imported
 from tests.cli.tiny_runs import SETTINGS, Run, results
+from tests.running import composed, composed_settings
 
 IMAGENET = {"mean": [0.485, 0.456, 0.406], "std": [0.229, 0.224, 0.225]}
 
@@ -33,8 +33,7 @@ def imported(tmp_path: Path) -> Path:
 
 def _begun(monkeypatch: pytest.MonkeyPatch, path: Path, *overrides: str) -> tuple[Any, Any]:
     """What such a command line begins with: settings, and where they come from."""
-    with initialize_config_dir(str(config_folder()), version_base="1.3"):
-        config = compose("train", ["level=5", *overrides], return_hydra_config=True)
+    config = composed("train", "level=5", *overrides, return_hydra_config=True)
     monkeypatch.setattr(HydraConfig, "get", lambda: config.hydra)
     everything: Any = OmegaConf.to_container(config, resolve=False)
     del everything["hydra"]
@@ -103,11 +102,9 @@ def test_a_network_that_holds_the_file_s_is_kept(
     imported: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As an experiment with cross-image context that starts from a network without."""
-    with initialize_config_dir(str(config_folder()), version_base="1.3"):
-        config = compose("train", ["level=5"], return_hydra_config=True)
-        context = compose("train", ["network=unet_small_context"])
+    config = composed("train", "level=5", return_hydra_config=True)
     monkeypatch.setattr(HydraConfig, "get", lambda: config.hydra)
-    settings: Any = OmegaConf.to_container(context, resolve=True)
+    settings = composed_settings("train", "network=unet_small_context")
     begun, source = begin_from(imported, settings)
     assert begun["network"] == settings["network"]
     assert source is None

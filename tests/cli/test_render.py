@@ -138,15 +138,6 @@ def test_a_folder_of_panoramas_and_back(tmp_path: Path, refused: Refused) -> Non
     assert "3 of 3 panoramas could not be rendered" in said
 
 
-def test_results_apart_from_the_cameras(room: Path, rendered: Path, tmp_path: Path) -> None:
-    (tmp_path / "results").mkdir()
-    _results(tmp_path / "results" / "room", np.full((8, 8), 7, np.uint8), ".png")
-    _render(back=tmp_path / "results", cameras=tmp_path / "tan", output=tmp_path / "back")
-    labels = _read(tmp_path / "back" / "room.png")
-    assert labels.shape == (64, 128)
-    assert (labels == 7).all()
-
-
 def test_levels_follow_the_rows_and_large_panoramas_are_averaged(tmp_path: Path) -> None:
     write_pixels(tmp_path / "a.png", _smooth(90))
     _render(input=tmp_path / "a.png", output=tmp_path / "tan", base_level=0)
@@ -347,17 +338,6 @@ def test_earlier_images_are_kept_unless_told(room: Path, tmp_path: Path, refused
     assert folder.stat().st_mode & 0o777 == 0o755
 
 
-def test_earlier_panoramas_are_kept_unless_told(
-    rendered: Path, tmp_path: Path, refused: Refused
-) -> None:
-    (tmp_path / "back.png").write_text("mine")
-    back = {"back": rendered, "output": tmp_path / "back.png"}
-    assert "back.png, which exists" in refused(**back)
-    assert (tmp_path / "back.png").read_text() == "mine"
-    _render(overwrite=True, **back)
-    assert _read(tmp_path / "back.png").shape == (64, 128, 3)
-
-
 def test_an_interrupted_run_leaves_the_earlier_images(
     room: Path, rendered: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -484,25 +464,3 @@ def test_settings_that_do_not_fit_the_results(
     monkeypatch.chdir(tmp_path)
     assert re.search(message, refused(**{"back": rendered, "output": "back.png"} | settings))
     assert not list(tmp_path.glob("back*"))
-
-
-def test_the_python_of_the_docs_runs(
-    room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    page = Path(__file__).resolve().parents[2] / "docs" / "rendering.md"
-    first, second = re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)
-    monkeypatch.chdir(tmp_path)
-    _render(input=room, output="tangent", base_level=0)
-    Path("results/room").mkdir(parents=True)
-    for face in range(20):
-        np.save(f"results/room/face_{face:03}.npy", np.full((32, 32), face))
-    names: dict[str, Any] = {}
-    exec(first, names)
-    # The pixel of image 0 that the example asks about, in the image itself.
-    left, up = np.radians([names["left_deg"], names["up_deg"]])
-    direction = np.cos(up) * np.cos(left), -np.cos(up) * np.sin(left), np.sin(up)
-    shown = _read(Path("tangent/room/face_000.png"))[20, 10]
-    assert np.abs(shown - (np.array(direction) + 1) * 127.5).max() < 4
-    exec(second, names)
-    owners = TangentGrid(0, 5).owners(equirect_directions((64, 128)))
-    assert (names["panorama"] == owners).mean() > 0.99

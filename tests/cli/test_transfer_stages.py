@@ -6,19 +6,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hydra import compose, initialize_config_dir
+from hydra import initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
 from tangent_train.cli.compose import compose_option, config_folder
 from tangent_train.cli.transfer_stages import Stage, plan
 from tangent_train.errors import SettingError
+from tests.running import composed
 
 FOLDER = Path("/runs/mine")
-
-
-def _composed(*overrides: str, name: str = "transfer") -> DictConfig:
-    with initialize_config_dir(str(config_folder()), version_base="1.3"):
-        return compose(name, list(overrides))
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +23,7 @@ def rooms() -> DictConfig:
     fixed = ("level=7", "data.rooms.height=256", "fine_tuning.epochs=[1,10]", "seed=3")
     rates = ("optimizer=adamw", "optimizer.lr=3e-3", "scheduler@fine_tuning.scheduler=constant")
     epochs = ("scheduler=one_cycle", "trainer.max_epochs=20")
-    return _composed("experiment=rooms/transfer", *fixed, *rates, *epochs)
+    return composed("transfer", "experiment=rooms/transfer", *fixed, *rates, *epochs)
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +52,7 @@ def test_the_stages_in_their_order(rooms: DictConfig, compared: dict[str, Any]) 
         ("S-FT-10", "train", "P"),
     ]
     assert all(s.folder == FOLDER / "fold_2" / "seed_3" / s.name for s in stages)
-    ordinary = set(_composed(name="train")) - {"sweep", "launcher", "trust"}
+    ordinary = set(composed("train")) - {"sweep", "launcher", "trust"}
     for stage in stages:
         config, photos = stage.config, stage.name[0] == "P"
         assert set(config) == ordinary
@@ -122,7 +118,7 @@ def test_folds_and_seeds_one_after_the_other(rooms: DictConfig) -> None:
 
 
 def test_data_without_folds() -> None:
-    config = _composed("experiment=paper/transfer_omnisynthia_s6")
+    config = composed("transfer", "experiment=paper/transfer_omnisynthia_s6")
     stage = _stages(config)["P"]
     assert (stage.fold, stage.folder) == (None, FOLDER / "seed_0" / "P")
     assert "fold" not in stage.config["data"]

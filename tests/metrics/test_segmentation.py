@@ -202,15 +202,6 @@ def test_intervals_are_the_same_in_any_order() -> None:
     assert bootstrap_intervals(of_images) == bootstrap_intervals(of_images[::-1])
 
 
-def test_images_alike_have_intervals_of_no_width() -> None:
-    _, of_images = _random_images(1)
-    confusion, _ = _random_images(1)
-    expected = segmentation_scores(confusion[0])
-    found = bootstrap_intervals(of_images.repeat(4, axis=0))
-    assert found["miou"] == pytest.approx([expected.miou] * 2, rel=1e-12)
-    assert found["macc"] == pytest.approx([expected.macc] * 2, rel=1e-12)
-
-
 def test_draws_without_labels_are_left_out() -> None:
     _, of_images = _random_images(1)
     unlabelled = np.zeros_like(of_images)
@@ -226,18 +217,6 @@ def test_there_is_no_interval_of_one_image_or_of_nothing_labelled() -> None:
     assert bootstrap_intervals(of_images[:0]) == {}
     assert bootstrap_intervals(np.zeros((3, 3, 4))) == {}
     assert bootstrap_intervals(np.zeros((3, 3, 4)), "zero") == {"miou": (0, 0), "macc": (0, 0)}
-
-
-def test_intervals_cover_the_accuracy_of_the_population() -> None:
-    """About 95 of 100 samples of 40 images: the ends are where they should be."""
-    rng = np.random.default_rng(2)
-    covered = 0
-    for _ in range(200):
-        hits = rng.beta(6, 2, (40, 1)) * 100
-        of_images = np.stack([np.full_like(hits, 100), np.full_like(hits, 100), hits], axis=1)
-        low, high = bootstrap_intervals(of_images, draws=300)["macc"]
-        covered += low <= 0.75 <= high
-    assert 0.88 < covered / 200 < 0.99
 
 
 def test_bad_input_is_refused() -> None:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,6 +12,7 @@ from torch import nn
 from models import HexUNet, UNet
 from models.unet import Down
 from tangent_train.errors import SettingError
+from tests.running import run_python
 
 
 @pytest.mark.parametrize(
@@ -75,14 +75,9 @@ def test_a_side_that_does_not_fit_is_refused() -> None:
         HexUNet(3, 4)(torch.zeros(1, 3, 24, 32))
 
 
-def test_importing_a_network_imports_its_own_file() -> None:
+def test_importing_a_network_imports_its_own_file(tmp_path: Path) -> None:
     program = "import sys, models.unet; print(*(n for n in sys.modules if n[:4] in {}))"
-    done = subprocess.run(
-        [sys.executable, "-c", program.format("('mode', 'tang', 'data')")],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    done = run_python(tmp_path, "-c", program.format("('mode', 'tang', 'data')"))
     assert {name for name in done.stdout.split() if name.partition(".")[0] != "dataclasses"} == {
         "models",
         "models.unet",

@@ -207,42 +207,6 @@ def test_the_papers_transfer_is_the_mean_of_its_printed_folds(
         assert classes == pytest.approx(miou / 100, abs=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("fold", "name", "macc", "miou"),
-    [
-        (1, "S", -2.5, -4.5), (1, "S-FT-1", 2.6, 0.0), (1, "S-FT-10", 8.9, 3.5),
-        (2, "S", -17.2, -10.6), (2, "S-FT-1", -6.7, 2.5), (2, "S-FT-10", -1.9, 7.1),
-        (3, "S", -2.6, -7.5), (3, "S-FT-1", 3.6, 0.6), (3, "S-FT-10", 7.2, 5.6),
-    ],
-)  # fmt: skip
-def test_the_papers_changes_are_those_printed(
-    fold: int, name: str, macc: float, miou: float
-) -> None:
-    """Within the rounding of what they were computed from, here from figures of one decimal."""
-    row = _paper()[name].of_fold(fold)
-    for score, change in (("macc", macc), ("miou", miou)):
-        kept = row.kept(score).mean
-        assert kept is not None
-        assert 100 * (kept - 1) == pytest.approx(change, abs=0.35)
-
-
-@pytest.mark.parametrize(
-    ("name", "score", "changes"),
-    [
-        ("S", "accuracy", "-18.1 -20.2 -19.6 0.9 -0.3 -20.2 16.4 11.4 5.4 -0.1 -27.4 -7.1 -3.7"),
-        ("S-FT-10", "iou", "62.2 -3.4 4.6 13.9 13.2 2.7 2.8 4.9 7.7 22.5 0.3 2.5 -12.7"),
-    ],
-)
-def test_the_papers_changes_of_classes_are_those_printed(
-    name: str, score: str, changes: str
-) -> None:
-    row = _paper()[name]
-    for label, change in zip(REAL, map(float, changes.split()), strict=True):
-        kept = row.kept(score, label).mean
-        assert kept is not None
-        assert 100 * (kept - 1) == pytest.approx(change, abs=1.1)
-
-
 def test_omnisynthia_stands_beside_by_level() -> None:
     settings: dict[str, Any] = {
         "data___target_": "datamodules.OmniSynthia",

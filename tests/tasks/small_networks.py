@@ -7,8 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
 from torch import nn
 
 from datamodules.core.inputs import Input, Normalization
@@ -16,8 +14,8 @@ from tangent_train.checkpoints.image_sizes import size_multiple_of
 from tangent_train.checkpoints.scores import Scores
 from tangent_train.checkpoints.trained import TrainedNetwork, completed_settings
 from tangent_train.cli.build import build
-from tangent_train.cli.compose import config_folder
 from tangent_train.registry import SettingsFile, make
+from tests.running import composed_settings
 
 if TYPE_CHECKING:
     from tangent_train.tasks import SegmentationTask
@@ -85,9 +83,7 @@ def save_checkpoint(path: Path, *overrides: str, **changes: Any) -> Segmentation
     Returns:
         The task in evaluation mode, whose tensors are in the file.
     """
-    with initialize_config_dir(str(config_folder()), version_base="1.3"):
-        config = compose("train", ["level=4", *overrides])
-    settings: Any = OmegaConf.to_container(config, resolve=True)
+    settings = composed_settings("train", "level=4", *overrides)
     torch.manual_seed(2)
     data, task = build(settings)
     settings["network"] = completed_settings(

@@ -11,7 +11,6 @@ import OpenEXR
 import pytest
 
 from datamodules.images.exr import read_exr, read_exr_size
-from datamodules.images.pixel_files import read_depth_m
 from tangent_train.errors import DataError
 
 if TYPE_CHECKING:
@@ -63,14 +62,6 @@ def test_no_single_channel_of_depth(tmp_path: Path, names: tuple[str, str]) -> N
     path = _write(tmp_path / "a.exr", dict.fromkeys(names, _DEPTH))
     with pytest.raises(DataError, match=r"a\.exr: found channels .*; expected one channel, or"):
         read_exr(path)
-
-
-def test_depth_in_metres(tmp_path: Path) -> None:
-    stored, expected = _DEPTH.copy(), _DEPTH.copy()
-    for place, missing in enumerate([np.inf, np.nan, 1e10, -1.0]):
-        stored[place, place], expected[place, place] = missing, 0
-    path = _write(tmp_path / "a.exr", {"Z": stored})
-    np.testing.assert_array_equal(read_depth_m(path, 1000), expected)
 
 
 def test_several_parts_and_deep_pixels(tmp_path: Path) -> None:

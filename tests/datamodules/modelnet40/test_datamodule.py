@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import hashlib
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,7 +18,6 @@ from datamodules.modelnet40.shape_samples import (
 )
 from tangent_train.errors import DataError
 from tangent_train.rendering import (
-    EquirectRepresentation,
     TangentRepresentation,
     equirect_to_tangent,
 )
@@ -51,11 +49,6 @@ def make_module(root: Path) -> MakeModule:
         return ModelNet40(root, TangentRepresentation(0, LEVEL, rotation=rotation), **settings)
 
     return make
-
-
-def _digest(batch: ShapeSample) -> str:
-    content = hashlib.sha256(batch.images.numpy().tobytes()).hexdigest()[:8]
-    return f"{batch.index.tolist()} {batch.label.tolist()} {content}"
 
 
 def _labels(module: ModelNet40, split: Split) -> list[int]:
@@ -171,26 +164,6 @@ def test_training_is_rotated_anew_every_time_and_evaluation_is_not(make_module: 
     for split in SPLITS[1:]:
         one, other = plain.evaluation_samples(split)[0, 0], rotated.evaluation_samples(split)[0, 0]
         assert torch.equal(one.images, other.images)
-
-
-@pytest.mark.parametrize(
-    "representation",
-    [
-        EquirectRepresentation(LEVEL, crop_deg=90, rotation="so3"),
-        TangentRepresentation(0, LEVEL, faces_per_panorama=7, rotation="yaw", mirror=True),
-    ],
-    ids=lambda representation: type(representation).__name__,
-)
-def test_other_representations(root: Path, representation: Any) -> None:
-    module = ModelNet40(root, representation, test_rotation="so3")
-    batch = next(iter(module.train_dataloader()))
-    images = module.on_after_batch_transfer(batch, 0).images
-    assert (images.shape[0], images.shape[2]) == (min(16, len(module.source("train"))), 6)
-    whole = next(iter(module.test_dataloader()))
-    height, width = representation.image_size
-    assert whole.images.shape[2:] == (height, width, 6)
-    if isinstance(representation, EquirectRepresentation):
-        assert images.shape[1] == whole.images.shape[1] == 1
 
 
 # --- rotated test shapes ------------------------------------------------------------------------

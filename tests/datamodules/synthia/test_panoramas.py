@@ -137,19 +137,6 @@ def test_views_never_mix(height: int) -> None:
         np.testing.assert_array_equal(image == elsewhere, labels == 255)
 
 
-@pytest.mark.parametrize("height", [HEIGHT, 63])
-def test_a_band_without_gaps_between_blind_poles(height: int) -> None:
-    stitcher = ViewStitcher(_camera(), SIZE, height)
-    valid = stitcher.labels([np.zeros(SIZE, np.uint8)] * 4) == 0
-    # By its half height a view sees atan(19 / f) ahead, less to the sides.
-    ahead, corner = np.arctan2(19, [synthia.FOCAL, synthia.FOCAL * np.sqrt(2)])
-    latitude = np.abs(np.pi / 2 - (np.arange(height) + 0.5) / height * np.pi)
-    assert valid[latitude < corner].all()  # all around, ±180° included
-    assert not valid[latitude > ahead].any()
-    np.testing.assert_array_equal(valid, valid[:, ::-1])
-    np.testing.assert_array_equal(valid, valid[::-1])
-
-
 # --- files ---------------------------------------------------------------------------------------
 
 

@@ -64,22 +64,3 @@ def test_every_class_covers_enough_pixels_in_enough_rooms(rooms: list[Room]) -> 
     assert (present / len(rooms)).min() > 0.45
     assert unknown > 0
     assert 0.02 < missing / total < 0.15
-
-
-def test_colour_alone_does_not_give_the_class(rooms: list[Room]) -> None:
-    """The nearest mean colour of a class, learned on half the rooms, hardly beats guessing."""
-    samples = [
-        (room.items[part.item], part.material.color, k % 2)
-        for k, room in enumerate(rooms)
-        for part in room.parts
-        if room.items[part.item] != UNKNOWN
-    ]
-    names = np.array([name for name, _, _ in samples])
-    values = np.array([color for _, color, _ in samples])
-    half = np.array([h for _, _, h in samples])
-    means = np.array([values[(names == c) & (half == 0)].mean(axis=0) for c in INSTANCES])
-    nearest = np.linalg.norm(values[half == 1][:, None] - means, axis=-1).argmin(axis=1)
-    truth = names[half == 1]
-    guessed = np.array(list(INSTANCES))[nearest]
-    recall = [np.mean(guessed[truth == c] == c) for c in INSTANCES]
-    assert np.mean(recall) < 0.3  # guessing: 0.08

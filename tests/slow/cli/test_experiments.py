@@ -8,7 +8,6 @@ from typing import Any
 import lightning
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
 from tangent_train.cli.build import build
@@ -16,6 +15,7 @@ from tangent_train.cli.compose import config_folder
 from tangent_train.cli.transfer_stages import plan
 from tangent_train.registry import make
 from tests.datamodules.modelnet40.shapes_format import write_tree
+from tests.running import composed
 
 # network.frozen_statistics=true
 pytestmark = pytest.mark.filterwarnings("ignore:Found .* in eval mode:UserWarning")
@@ -47,11 +47,6 @@ def roots(stanford_root: Path, tmp_path_factory: pytest.TempPathFactory) -> dict
         "ModelNet40": write_tree(folder / "meshes"),
         "SynthShapes": folder / "shapes",
     }
-
-
-def _composed(experiment: str, name: str = "train") -> DictConfig:
-    with initialize_config_dir(str(config_folder()), version_base="1.3"):
-        return compose(name, [f"experiment={experiment}"])
 
 
 def _shrunk(config: DictConfig, roots: dict[str, Path]) -> dict[str, Any]:
@@ -131,7 +126,7 @@ def _builds_at_full_size(config: DictConfig) -> set[str]:
 def test_every_experiment_composes_instantiates_and_takes_a_step(
     experiment: str, roots: dict[str, Path], tmp_path: Path
 ) -> None:
-    config = _composed(experiment)
+    config = composed("train", f"experiment={experiment}")
     assert config.name in (experiment, experiment.removeprefix("rooms/"))
     names = _builds_at_full_size(config)
     for setting, value in _shrunk(config, roots).items():
@@ -145,7 +140,7 @@ def test_every_experiment_composes_instantiates_and_takes_a_step(
 def test_both_kinds_of_images_of_a_transfer_get_one_network(
     experiment: str, tmp_path: Path
 ) -> None:
-    config = _composed(experiment, "transfer")
+    config = composed("transfer", f"experiment={experiment}")
     assert config.name == experiment
     stages = plan(config, tmp_path, {})
     first = [stage for stage in stages if stage.fold == stages[0].fold]

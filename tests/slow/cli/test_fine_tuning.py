@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +17,7 @@ from tangent_train.checkpoints.trained import load_trained
 from tests.cli.imported import write_imported
 from tests.cli.test_commands import CUT_SHORT
 from tests.cli.tiny_runs import SETTINGS, results, run_command
+from tests.running import run_python
 
 TYPED = [text for text in SETTINGS if "network" not in text]
 TUNED = (
@@ -36,8 +35,7 @@ def tuned(rooms: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("tuned")
     write_imported(folder / "net.ckpt")
     (folder / "cut_short.py").write_text(CUT_SHORT)
-    command = [sys.executable, "cut_short.py", *TYPED, *TUNED, rooms, "hydra.run.dir=cut"]
-    cut = subprocess.run(command, check=False, cwd=folder, capture_output=True, text=True)
+    cut = run_python(folder, "cut_short.py", *TYPED, *TUNED, rooms, "hydra.run.dir=cut")
     assert "all up to here; resume with" in cut.stderr, cut.stderr
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)

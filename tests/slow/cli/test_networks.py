@@ -6,12 +6,10 @@ from typing import Any
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
 
 from tangent_train.cli.build import build
 from tangent_train.cli.compose import config_folder
-from tangent_train.errors import SettingError
+from tests.running import composed_settings
 
 NETWORKS = {path.stem for path in (config_folder() / "network").glob("*.yaml")}
 OF_SHAPES = {"multi_view_resnet18", "shape_classifier", "shape_classifier_16"}
@@ -19,10 +17,7 @@ DEPTH = {"fcn_resnet": "network.depth=50", "fcn_resnet_context": "network.networ
 
 
 def _composed(*overrides: str) -> dict[str, Any]:
-    with initialize_config_dir(str(config_folder()), version_base="1.3"):
-        config = compose("train", ["level=5", "representation.erp_height=32", *overrides])
-    settings: Any = OmegaConf.to_container(config, resolve=True)
-    return settings
+    return composed_settings("train", "level=5", "representation.erp_height=32", *overrides)
 
 
 @pytest.mark.parametrize("network", sorted(NETWORKS - OF_SHAPES))
@@ -50,17 +45,6 @@ def test_every_network_of_shapes_takes_their_channels_and_classes(network: str) 
     scores.square().mean().backward()
     unused = [n for n, p in task.named_parameters() if p.grad is None and ".mixer." not in n]
     assert not unused, "parameters without gradient"
-
-
-def test_networks_for_single_images_are_refused_for_shapes() -> None:
-    settings = _composed(*SHAPES)
-    settings["network"] = {"_target_": "torchvision.models.resnet18", "num_classes": None}
-    message = (
-        r"network: found ResNet, which does not take \(1, 20, 6, 32, 32\) \(.*"
-        r"expected one that maps views of shapes"
-    )
-    with pytest.raises(SettingError, match=message):
-        build(settings)
 
 
 class Recorder(torch.nn.Conv2d):

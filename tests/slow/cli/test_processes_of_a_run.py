@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -12,6 +10,7 @@ import torch
 
 from tests.cli.test_commands import CUT_SHORT
 from tests.cli.tiny_runs import SETTINGS, results, run_command
+from tests.running import run_python
 
 # No batch statistics.
 PLAIN = """
@@ -25,13 +24,7 @@ padding: 1
 
 def _train(folder: Path, *arguments: str, status: int = 0, program: str = "-m") -> str:
     command = ["-m", "tangent_train.cli.main", "train"] if program == "-m" else [program]
-    done = subprocess.run(
-        [sys.executable, *command, *arguments],
-        check=False,
-        cwd=folder,
-        capture_output=True,
-        text=True,
-    )
+    done = run_python(folder, *command, *arguments)
     assert done.returncode == status, done.stderr
     return done.stderr
 
@@ -74,8 +67,8 @@ def test_two_processes_make_the_steps_and_figures_of_one(
     checkpoint = f"checkpoint={tmp_path / 'one' / 'checkpoints' / 'last.ckpt'}"
     run_command(monkeypatch, "evaluate", checkpoint, rooms, "hydra.run.dir=again")
     ddp = ["trainer=ddp", *devices, "hydra.run.dir=evaluated"]
-    program = [sys.executable, "-m", "tangent_train.cli.main", "evaluate"]
-    subprocess.run([*program, checkpoint, rooms, *ddp], check=True)
+    evaluate = ("-m", "tangent_train.cli.main", "evaluate", checkpoint, rooms, *ddp)
+    assert run_python(tmp_path, *evaluate).returncode == 0
     figures = [results(tmp_path / folder) for folder in ("again", "evaluated")]
     assert figures[0]["confusion"] == figures[1]["confusion"]
     assert figures[0]["miou_solid_angle"] == pytest.approx(figures[1]["miou_solid_angle"])

@@ -8,10 +8,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from tangent_train.cli.compose import config_folder
+from tests.running import composed
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -165,9 +164,8 @@ def small(words: list[str], world: Path) -> list[str]:
         own = [word for word in own if word.startswith(("data=", "representation="))]
     folders = [world / given[given.index("--config-dir") + 1]] if "--config-dir" in given else []
     search = ",".join(f"file://{folder}" for folder in folders)
-    with initialize_config_dir(str(config_folder()), version_base="1.3"):
-        composed = compose(config, [*own, f"hydra.searchpath=[{search}]"])
-    known = {n: v for n, v in SMALL.items() if OmegaConf.select(composed, n) is not None}
+    found = composed(config, *own, f"hydra.searchpath=[{search}]")
+    known = {n: v for n, v in SMALL.items() if OmegaConf.select(found, n) is not None}
     if program == "tangent-evaluate":
         known = {n: v for n, v in known.items() if n.startswith(("data.rooms", "representation."))}
     return [f"{name}={value}" for name, value in known.items()]

@@ -5,7 +5,6 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-import lightning
 import torch
 from torch import Tensor, nn
 
@@ -13,10 +12,13 @@ from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 from tangent_train.callbacks.checkpoints import AtomicCheckpointIO, LastCheckpoint
 from tangent_train.rendering import TangentRepresentation
 from tangent_train.tasks import SegmentationTask
+from tests.tasks.shapes import quiet_trainer
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
+
+    import lightning
 
 
 class Faulty(nn.Module):
@@ -70,14 +72,12 @@ def run_trainer(folder: Path, **settings: Any) -> lightning.Trainer:
     last = LastCheckpoint(folder / "checkpoints", settings.pop("checkpoint_every", None))
     settings["callbacks"] = [*settings.get("callbacks", []), last]
     plugins = [AtomicCheckpointIO(), *settings.pop("plugins", [])]
-    common: dict[str, Any] = {
-        "accelerator": "cpu",
-        "default_root_dir": str(folder),
-        "enable_model_summary": False,
-        "enable_progress_bar": False,
-        "limit_val_batches": 0,
-        "logger": False,
-        "plugins": plugins,
-        "use_distributed_sampler": False,
-    }
-    return lightning.Trainer(**common | settings)
+    return quiet_trainer(
+        **{
+            "default_root_dir": str(folder),
+            "enable_checkpointing": True,
+            "limit_val_batches": 0,
+            "plugins": plugins,
+            **settings,
+        }
+    )

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from tangent_train.files import write_text
+from tests.running import ROOT, run_python
 
 MAKER = """
 import sys
@@ -29,7 +30,7 @@ def test_workers_end_with_their_parent(tmp_path: Path, how: signal.Signals, afte
     """While they start and while they work; none keeps the pipe open."""
     with subprocess.Popen(
         [sys.executable, "-c", MAKER, str(tmp_path / "rooms")],
-        env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[3])},
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
     ) as process:
@@ -85,12 +86,5 @@ assert np.load("a.npy")[:4].tolist() == [1, 2, 3, 0]
 
 
 def test_no_module_of_one_system_is_needed(tmp_path: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", ELSEWHERE],
-        check=False,
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[3])},
-        capture_output=True,
-        text=True,
-    )
+    done = run_python(tmp_path, "-c", ELSEWHERE)
     assert done.returncode == 0, done.stderr

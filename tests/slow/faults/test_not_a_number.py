@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -13,6 +11,7 @@ from torch import Tensor
 
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 from tangent_train.errors import SettingError
+from tests.running import run_python
 from tests.slow.faults.small_runs import Faulty, run_trainer, small_data, small_task
 
 if TYPE_CHECKING:
@@ -97,22 +96,6 @@ def test_a_statistic_of_batch_normalization_counts_as_a_weight(
         )
 
 
-def test_nan_in_images_is_named(
-    stanford_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    data = small_data(stanford_root)
-    normalized = data.samples.normalized
-
-    def with_hole(batch: Any) -> Tensor:
-        images = normalized(batch)
-        images[0, 3, 1, 2, 5] = torch.nan
-        return images
-
-    monkeypatch.setattr(data.samples, "normalized", with_hole)
-    with pytest.raises(SettingError, match="from images with NaN or infinite values"):
-        run_trainer(tmp_path, max_epochs=1).fit(small_task(Faulty()), datamodule=data)
-
-
 def _half(scaler: torch.amp.GradScaler) -> dict[str, Any]:
     """Real half precision with a scaled loss, which works on a CPU as on a GPU."""
     return {"plugins": [MixedPrecision("16-mixed", "cpu", scaler)], "max_steps": 4}
@@ -172,14 +155,7 @@ def test_all_processes_stop_when_the_loss_of_one_is_nan(
         "trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2", "trainer.max_epochs=2",
         "panels=0", "data.validation_fraction=0.3", "hydra.run.dir=run",
     ]  # fmt: skip
-    done = subprocess.run(
-        [sys.executable, "one_of_two.py", *arguments],
-        check=False,
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
+    done = run_python(tmp_path, "one_of_two.py", *arguments)
     assert done.returncode == 1
     assert "loss of step 2" in done.stderr
     assert "Traceback" not in done.stderr

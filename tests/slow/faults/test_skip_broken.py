@@ -15,7 +15,7 @@ from datamodules.core import found as found_module
 from datamodules.core.found import Found
 from datamodules.core.problems import Problems
 from datamodules.core.reading import ImageFiles
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError
 from tests.cli.tiny_runs import run_command
 from tests.slow.faults import data_sets as sets
 from tests.slow.faults.data_sets import colors, module, names, partner, write
@@ -99,17 +99,6 @@ def test_a_missing_area_cannot_be_left_out(
     sets.truncate(colors("stanford", root)[0])
     with pytest.raises(DataError, match=r"found 2 problems(.|\n)*no area_6"):
         module("stanford", root, skip_broken=True).setup()
-
-
-def test_a_level_that_no_panorama_has_is_said_once(
-    root: Path, fabricate_stanford: FabricateStanford
-) -> None:
-    write("stanford", root, fabricate_stanford)
-    data = module("stanford", root)
-    data.erp_height = 64  # type: ignore[attr-defined]
-    with pytest.raises(SettingError, match=r"representation\.erp_height: found 64") as caught:
-        data.setup()
-    assert "\n" not in str(caught.value)
 
 
 # --- with a store and in memory -----------------------------------------------------------------
@@ -199,35 +188,6 @@ def test_the_look_is_short_and_goes_everywhere(monkeypatch: pytest.MonkeyPatch) 
 
 
 # --- the commands -------------------------------------------------------------------------------
-
-
-def test_a_training_refuses_then_goes_on_without(
-    tmp_path: Path,
-    fabricate_stanford: FabricateStanford,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    root = write("folder", tmp_path / "my rooms", fabricate_stanford)
-    (root / "test.txt").write_text("scene_0/view.0\nscene_0/view.1")
-    broken = [root / "labels" / f"scene_{scene}" / "view.0.png" for scene in (0, 2)]
-    for path in broken:
-        sets.corrupt(path)
-    arguments = ["data=folder", "level=4", "network=unet_small", "network.widths=[4,8]"]
-    arguments += ["representation.base_level=0", "data.num_workers=0", f"data.root='{root}'"]
-    arguments += ["trainer.max_epochs=1", "trainer.accelerator=cpu", "panels=0"]
-    with pytest.raises(SystemExit, match="found 2 problems") as caught:
-        run_command(monkeypatch, "train", *arguments, "hydra.run.dir=run")
-    assert all(str(path) in str(caught.value) for path in broken)
-    assert not list((tmp_path / "run").rglob("*.ckpt"))
-    run_command(monkeypatch, "train", *arguments, "hydra.run.dir=run", "data.skip_broken=true")
-    left_out = "2 of 12 panoramas are broken and left out (data.skip_broken=true)"
-    assert left_out in capsys.readouterr().out
-    checkpoint = f"checkpoint={tmp_path / 'run/checkpoints/last.ckpt'}"
-    run_command(monkeypatch, "evaluate", checkpoint, f"data.root='{root}'", "hydra.run.dir=again")
-    assert left_out in capsys.readouterr().out
-    for folder in ("run", "again"):
-        assert '"images": 1' in (tmp_path / folder / "results.json").read_text()
 
 
 def test_the_command_lists_problems_line_by_line(

@@ -13,7 +13,6 @@ import torch
 
 from datamodules.core.made_folders import claim_folder
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
-from datamodules.synthrooms.generate import generate_rooms
 from datamodules.synthrooms.settings import RoomSettings
 from tangent_train.rendering import TangentRepresentation
 
@@ -101,23 +100,3 @@ def test_two_runs_claim_the_same_folder(tmp_path: Path, monkeypatch: pytest.Monk
 
 def _claim(root: Path) -> None:
     claim_folder(root, "manifest.json", "SynthRooms", 1, {"seed": 0})
-
-
-def _make(root: Path, barrier: Any) -> None:
-    barrier.wait()
-    generate_rooms(root, ROOMS, workers=0)
-
-
-def test_runs_that_make_the_same_rooms_at_once(
-    tmp_path: Path, processes: ForkServerContext
-) -> None:
-    with processes.Manager() as manager, ProcessPoolExecutor(2, processes) as pool:
-        barrier = manager.Barrier(2)
-        for run in [pool.submit(_make, tmp_path / "rooms", barrier) for _ in range(2)]:
-            run.result()
-    generate_rooms(tmp_path / "alone", ROOMS, workers=0)
-    found, expected = (
-        {p.relative_to(root): p.read_bytes() for p in root.rglob("*") if p.is_file()}
-        for root in (tmp_path / "rooms", tmp_path / "alone")
-    )
-    assert found == expected

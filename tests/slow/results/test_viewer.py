@@ -50,25 +50,6 @@ def test_the_first_picture_is_the_overlay_ahead(report: OpenReport) -> None:
     close(report.pixels(), colors_of(view_of(report, 0, 0, START_DEG)))
 
 
-def test_dragging_moves_the_scene_with_the_pointer(report: OpenReport) -> None:
-    report.layer("input")
-    step = math.degrees(step_rad(report))
-    report.drag(-60, 40)
-    close(report.pixels(), colors_of(view_of(report, 60 * step, 40 * step, START_DEG)))
-    assert report.text(".looking").startswith(f"Looking at longitude {60 * step:.1f}°")
-
-
-@pytest.mark.parametrize(("toward", "latitude"), [(1, 90), (-1, -90)])
-def test_poles_are_closed(report: OpenReport, toward: int, latitude: int) -> None:
-    report.layer("input")
-    report.drag(0, toward * 4000)
-    report.press(*["+"] * 13)
-    pixels = report.pixels()
-    close(pixels, colors_of(view_of(report, 0, latitude, 95 / 1.25**13)))
-    # 5° across: no pinwheel of the last row's pixels
-    assert np.ptp(pixels[EDGE:-EDGE, EDGE:-EDGE], axis=(0, 1)).max() <= 12
-
-
 def test_seam_and_poles_are_interpolated_like_the_rest(browser: Browser, tmp_path: Path) -> None:
     """Pixels of 15°: what is wrong with half a pixel at a border shows."""
     grey = np.random.default_rng(0).integers(0, 256, (12, 24, 1), np.uint8)

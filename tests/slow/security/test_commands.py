@@ -32,19 +32,6 @@ def test_a_transfer_takes_tensors_and_the_fold_only(
         assert not happened
 
 
-def test_fine_tuning_takes_tensors_only(
-    content: dict[str, Any], run: Path, forbidden: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(forbidden.parent)
-    path = with_config(content, Path(), **CODE)
-    generated = [f"data.root={run.parent / 'rooms'}", "data.num_workers=0"]  # workers have sockets
-    own = [*SETTINGS, *generated, f"init_from={path}", "hydra.run.dir=tuned"]
-    with watched(forbidden) as happened:
-        run_command(monkeypatch, "train", *own)
-    assert Path("tuned/results.json").is_file()
-    assert not happened
-
-
 def test_names_of_classes_are_names(
     forbidden: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -2,27 +2,21 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import torch
 
 from studies.distorted_digits import distorted_digits, small_digits
-
-ROOT = Path(__file__).resolve().parents[3]
+from tests.running import run_python
 
 
 @pytest.mark.parametrize(
     "name", ["fov", "surface_area", "angular_resolution", "representation_distortion"]
 )
 def test_a_study_leaves_its_files(name: str, tmp_path: Path) -> None:
-    run = [sys.executable, "-m", f"studies.{name}"]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(run, cwd=tmp_path, env=environment, capture_output=True, check=True)
-    assert done.stdout.startswith(b"| ")
+    done = run_python(tmp_path, "-m", f"studies.{name}")
+    assert done.stdout.startswith("| "), done.stderr
     written = sorted((tmp_path / "figures").iterdir())
     assert [path.name for path in written] == [f"{name}.csv", f"{name}.png"]
     assert len(written[0].read_text(encoding="utf-8").splitlines()) > 4
