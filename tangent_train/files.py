@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-import pickle
 import re
 import shutil
 import tempfile
@@ -170,8 +169,7 @@ def load_plain(path: Path, expected: str, *, mmap: bool = False) -> Any:
     except FileNotFoundError as error:
         raise DataError(path, found="no such file", expected=expected) from error
     except Exception as error:
-        named = re.search(r"GLOBAL (\S+)", str(error))
-        if isinstance(error, pickle.UnpicklingError) and named:
+        if named := re.search(r"GLOBAL (\S+)", str(error)):
             found = f"{named[1]}, a class"
             remedy = "Save its state_dict() alone: reading objects can run anything."
         else:

@@ -15,6 +15,7 @@ from tangent_train.checkpoints.image_sizes import size_multiple_of
 from tangent_train.checkpoints.scores import Scores
 from tangent_train.checkpoints.trained import completed_settings, load_trained
 from tangent_train.errors import DataError
+from tests.tasks.odd_networks import Looking, OneSize, own
 from tests.tasks.small_networks import save_checkpoint
 
 SMALL_UNET = ["network=unet", "network.widths=[4,8,8]"]
@@ -104,24 +105,6 @@ class Remembering(nn.Conv2d):
         self.settings = settings
 
 
-class OneSize(nn.Conv2d):
-    """A network with something learned for every pixel."""
-
-    def __init__(self) -> None:
-        super().__init__(3, 13, 1)
-        self.places = nn.Parameter(torch.randn(13, 24, 40))
-
-    def forward(self, images: Tensor) -> Tensor:
-        return super().forward(images) + self.places
-
-
-class Looking(nn.Conv2d):
-    """A network that looks at values, of which there are none where only shapes are computed."""
-
-    def forward(self, images: Tensor) -> Tensor:
-        return super().forward(images) * (2 if bool(images.sum() > 1) else 1)
-
-
 class Coarse(nn.Conv2d):
     """A network whose scores are smaller than its images unless those are multiples of 6."""
 
@@ -134,10 +117,10 @@ class Coarse(nn.Conv2d):
     ("network", "multiple"),
     [
         (nn.Conv2d(3, 5, 3, padding=1), 1),
-        (Looking(3, 5, 1), 1),
+        (Looking(3, 5), 1),
         (nn.Sequential(nn.AvgPool2d(8), nn.Upsample(scale_factor=8)), 8),
         (nn.Sequential(nn.AvgPool2d(14), nn.Upsample(scale_factor=14)), 14),
-        (OneSize(), None),
+        (OneSize(3, 5), None),
         (Coarse(3, 5, 1), None),
         (nn.Conv2d(4, 5, 1), None),
     ],
@@ -159,11 +142,11 @@ def test_a_network_of_one_size_is_said_to_be_one(tmp_path: Path) -> None:
         "representation.dim=[32,48]",
     )
     content = torch.load(path, weights_only=True)
-    content["config"]["network"] = {"_target_": f"{__name__}.OneSize"}
+    content["config"]["network"] = own("OneSize") | {"channels": 3, "classes": 13}
     content["config"]["representation"]["dim"] = [24, 40]
-    content["state_dict"] = {f"network.{n}": t for n, t in OneSize().state_dict().items()}
+    content["state_dict"] = {f"network.{n}": t for n, t in OneSize(3, 13).state_dict().items()}
     torch.save(content, path)
-    trained = load_trained(path, trust=[f"{__name__}.OneSize"])
+    trained = load_trained(path, trust=own("OneSize").values())
     assert (trained.image_size, trained.fixed_size) == ((24, 40), (24, 40))
 
 

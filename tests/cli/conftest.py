@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.cli.tiny_runs import SETTINGS, Run, run_command
+from tests.cli.tiny_runs import SETTINGS, Run, run_command, run_in
 
 
 @pytest.fixture
@@ -21,9 +21,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
 def rooms(tmp_path_factory: pytest.TempPathFactory) -> str:
     """Where its rooms are."""
     folder = tmp_path_factory.mktemp("rooms") / "synthetic rooms"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder.parent)
-        run_command(patch, "prepare", *SETTINGS, f"data.root='{folder}'")
+    run_in(folder.parent, "prepare", *SETTINGS, f"data.root='{folder}'")
     return f"data.root='{folder}'"
 
 
@@ -31,7 +29,5 @@ def rooms(tmp_path_factory: pytest.TempPathFactory) -> str:
 def run_folder(rooms: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run."""
     folder = tmp_path_factory.mktemp("run")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        run_command(patch, "train", *SETTINGS, rooms, "hydra.run.dir=finished")
+    run_in(folder, "train", *SETTINGS, rooms, "hydra.run.dir=finished")
     return folder / "finished"

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 from datamodules.stanford2d3ds.label_table import CLASSES
 from tangent_train.checkpoints.content import read_settings
@@ -159,16 +158,3 @@ def test_what_cannot_be_evaluated_is_refused(
         arguments.append(_written(tmp_path / "map.json", given["class_map"]))
     with pytest.raises(SystemExit, match=message):
         run("evaluate", *arguments)
-
-
-def test_classes_of_other_packages_are_trusted_by_name(
-    network: str, rooms: str, tmp_path: Path, run: Run
-) -> None:
-    content = torch.load(network.partition("=")[2], weights_only=True)
-    content["config"]["network"]["_target_"] = "torch.nn.modules.conv.Conv2d"
-    torch.save(content, tmp_path / "other.ckpt")
-    arguments = ["checkpoint=other.ckpt", *ROOMS, rooms, _written(tmp_path / "map.json", MAP)]
-    with pytest.raises(SystemExit, match=r"trust=torch\.nn\.modules\.conv\.Conv2d"):
-        run("evaluate", *arguments)
-    run("evaluate", *arguments, "trust=torch.nn.modules.conv.Conv2d", "hydra.run.dir=out")
-    assert results(tmp_path / "out")["images"] == 2

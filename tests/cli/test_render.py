@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from omegaconf import OmegaConf
-from PIL import Image
 
 from datamodules.images import tangent_folders
 from datamodules.images.pixel_files import read_pixels, write_pixels
@@ -148,16 +147,6 @@ def test_levels_follow_the_rows_and_large_panoramas_are_averaged(tmp_path: Path)
     _render(input=tmp_path / "board.png", output=tmp_path / "tan", base_level=0, level=5)
     assert set(np.unique(_read(tmp_path / "tan" / "board" / "face_004.png"))) <= {127, 128}
     assert read_cameras(tmp_path / "tan" / "board" / "cameras.json").shape == (128, 256)
-
-
-@pytest.mark.parametrize(("dtype", "channels"), [(np.uint16, ()), (np.float32, (6,))])
-def test_averaging_keeps_the_dtype(dtype: Any, channels: tuple[int, ...]) -> None:
-    blocks = np.random.default_rng(0).random((16, 32, *channels)) * 250
-    blocks = (blocks if np.dtype(dtype).kind in "ui" else blocks / 250).astype(dtype)
-    small = tangent_folders.shrink_to_level(blocks.repeat(3, axis=0).repeat(3, axis=1), 3)
-    assert small.dtype == dtype
-    np.testing.assert_allclose(small, blocks, rtol=1e-6)
-    assert tangent_folders.shrink_to_level(blocks, 3) is blocks
 
 
 def test_labels_are_never_mixed(tmp_path: Path, refused: Refused) -> None:
@@ -368,25 +357,6 @@ def test_a_broken_panorama_does_not_stop_the_others(tmp_path: Path, refused: Ref
     said = refused(back=tmp_path / "tan", output=tmp_path / "back")
     assert re.search(r"face_019.*1 of 2 panoramas could not", said, re.DOTALL)
     assert [path.name for path in (tmp_path / "back").iterdir()] == ["c.png"]
-
-
-def test_parts_of_panoramas_by_their_tags(tmp_path: Path) -> None:
-    tags = {"FullPanoWidth": 128, "FullPanoHeight": 64, "CroppedAreaLeft": 0, "CroppedAreaTop": 16}
-    tags |= {"CroppedAreaImageWidth": 128, "CroppedAreaImageHeight": 32}
-    attributes = " ".join(f'GPano:{name}Pixels="{value}"' for name, value in tags.items())
-    xmp = (
-        '<x:xmpmeta xmlns:x="adobe:ns:meta/">'
-        '<rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#"><rdf:Description '
-        f'xmlns:GPano="http://ns.google.com/photos/1.0/panorama/" {attributes}/>'
-        "</rdf:RDF></x:xmpmeta>"
-    )
-    Image.fromarray(_smooth()[16:48]).save(tmp_path / "part.jpg", quality=95, xmp=xmp.encode())
-    _render(input=tmp_path / "part.jpg", output=tmp_path / "tan", base_level=0)
-    _render(back=tmp_path / "tan" / "part", output=tmp_path / "back.png")
-    again = _read(tmp_path / "back.png").astype(int)
-    assert again.shape == (64, 128, 3)
-    assert np.abs(again[20:44] - _smooth()[20:44]).max() < 25
-    assert again[:12].max() < 10
 
 
 # What is refused.

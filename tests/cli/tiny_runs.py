@@ -12,7 +12,7 @@ import pytest
 
 from tangent_train.cli import main
 
-__all__ = ["SETTINGS", "SMALL_ROOMS", "Run", "results", "run_command"]
+__all__ = ["SETTINGS", "SMALL_ROOMS", "Run", "results", "run_command", "run_in"]
 
 Run = Callable[..., None]
 """Runs a command with arguments."""
@@ -41,6 +41,13 @@ def run_command(monkeypatch: pytest.MonkeyPatch, command: str, *arguments: str) 
     """Run a command in this process."""
     monkeypatch.setattr(sys, "argv", [f"tangent-{command}", *arguments])
     getattr(main, command)()
+
+
+def run_in(folder: Path, command: str, *arguments: str) -> None:
+    """Run a command in a folder, for fixtures that several tests share."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        run_command(patch, command, *arguments)
 
 
 def results(folder: Path) -> dict[str, Any]:

@@ -11,9 +11,16 @@ import torch
 
 import tangent_train as tt
 from tangent_train.errors import DataError, SettingError
-from tangent_train.geometry import equirect_directions
 from tests.cli.tiny_runs import run_command
-from tests.inference.trained import CLASS_NAMES, CUBE, ERP, PERSPECTIVE, TANGENT, write_checkpoint
+from tests.inference.trained import (
+    CLASS_NAMES,
+    CUBE,
+    ERP,
+    PERSPECTIVE,
+    TANGENT,
+    sphere,
+    write_checkpoint,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -24,12 +31,6 @@ if TYPE_CHECKING:
     from tangent_train.inference.network import Network
 
     Predicted = Callable[..., tuple[NDArray[Any], NDArray[Any]]]
-
-
-def _sphere(height: int) -> NDArray[np.uint8]:
-    """Colours that are smooth on the sphere."""
-    x, y, z = np.moveaxis(equirect_directions((height, 2 * height)), -1, 0)
-    return np.stack([128 + 120 * x, 128 + 120 * y * z, 128 + 120 * z], axis=-1).astype(np.uint8)
 
 
 @pytest.fixture
@@ -71,7 +72,7 @@ def test_panoramas_get_the_labels_and_scores_of_tangent_predict(
     settings: dict[str, Any],
 ) -> None:
     network = tt.load(write_checkpoint(tmp_path / "net.ckpt", representation), **settings)
-    panorama = _sphere(50)
+    panorama = sphere(50)
     expected, probabilities = predicted(panorama, *typed)
     labels = network.labels(panorama)
     assert labels.dtype == np.uint8
@@ -100,14 +101,14 @@ def test_photos_get_the_labels_of_tangent_predict(
     settings: dict[str, Any],
 ) -> None:
     network = tt.load(write_checkpoint(tmp_path / "net.ckpt"), **settings)
-    photo = _sphere(40)[:, :57]
+    photo = sphere(40)[:, :57]
     expected, probabilities = predicted(photo, f"fov={fov}", "projection=perspective", *typed)
     np.testing.assert_array_equal(network.labels(photo, fov=fov), expected)
     np.testing.assert_allclose(network.scores(photo, fov=fov), probabilities, atol=1e-3)
 
 
 def test_tensors_get_what_arrays_get(network: Network) -> None:
-    panorama = _sphere(33)
+    panorama = sphere(33)
     tensor = torch.from_numpy(panorama).permute(2, 0, 1)
     labels, scores = network.labels(tensor), network.scores(tensor)
     assert (labels.dtype, labels.shape) == (torch.int64, (33, 66))
@@ -122,7 +123,7 @@ def test_tensors_get_what_arrays_get(network: Network) -> None:
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 def test_a_gpu_gives_what_the_cpu_gives(tmp_path: Path, network: Network) -> None:
-    panorama = torch.from_numpy(_sphere(33)).permute(2, 0, 1)
+    panorama = torch.from_numpy(sphere(33)).permute(2, 0, 1)
     on_gpu = tt.load(tmp_path / "net.ckpt", device="cuda").labels(panorama.cuda())
     assert on_gpu.is_cuda
     assert (on_gpu.cpu() == network.labels(panorama)).double().mean() > 0.99
@@ -134,14 +135,14 @@ def test_no_more_images_than_asked_for_are_in_memory(tmp_path: Path) -> None:
     network.trained.network.register_forward_pre_hook(
         lambda _, images: counts.append(len(images[0]))
     )
-    network.labels(_sphere(32))
+    network.labels(sphere(32))
     assert counts == [7, 7, 6]
 
 
 def test_depth_is_in_metres(tmp_path: Path, predicted: Predicted) -> None:
     """Missing where 0 or NaN; in 16-bit files of 1/512 m it is exactly the same."""
     network = tt.load(write_checkpoint(tmp_path / "net.ckpt", TANGENT, channels=4))
-    panorama = _sphere(32)
+    panorama = sphere(32)
     steps = np.random.default_rng(0).integers(0, 2000, (32, 64), np.uint16)
     depth_m = steps / 512
     (tmp_path / "depth").mkdir()
@@ -164,8 +165,8 @@ def test_classes_of_another_data_set(tmp_path: Path, predicted: Predicted, unmap
     network = tt.load(checkpoint, class_map=tmp_path / "map.json", unmapped=unmapped)
     assert network.class_names == ("unknown", "light", "shade")
     assert len(network.palette) == 3
-    expected, probabilities = predicted(_sphere(32), "class_map=map.json", f"unmapped={unmapped}")
-    labels, scores = network.labels(_sphere(32)), network.scores(_sphere(32))
+    expected, probabilities = predicted(sphere(32), "class_map=map.json", f"unmapped={unmapped}")
+    labels, scores = network.labels(sphere(32)), network.scores(sphere(32))
     np.testing.assert_array_equal(labels, expected)
     np.testing.assert_allclose(scores, probabilities, atol=1e-3)
     assert (scores.sum(axis=-1).min() < 0.9) == (unmapped == "unknown")
@@ -178,7 +179,7 @@ def test_names_and_colors_of_the_labels(network: Network) -> None:
     assert network.palette.shape == (4, 3)
     assert network.palette[0].tolist() == [0, 0, 0]
     assert len(np.unique(network.palette, axis=0)) == 4
-    picture = network.palette[network.labels(_sphere(16))]
+    picture = network.palette[network.labels(sphere(16))]
     assert (picture.shape, picture.dtype) == ((16, 32, 3), np.uint8)
     assert repr(network) == "<Network of 3 classes, sees rgb>"
 
@@ -227,9 +228,9 @@ def test_impossible_settings_are_refused(tmp_path: Path, network: Network) -> No
 def test_auto_is_a_device_of_this_machine(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, network: Network
 ) -> None:
-    labels = network.labels(_sphere(16))
+    labels = network.labels(sphere(16))
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    found = tt.load(str(tmp_path / "net.ckpt"), device="auto").labels(_sphere(16))
+    found = tt.load(str(tmp_path / "net.ckpt"), device="auto").labels(sphere(16))
     np.testing.assert_array_equal(found, labels)
 
 

@@ -20,7 +20,6 @@ from tangent_train.errors import SettingError
 from tangent_train.geometry import (
     TangentGrid,
     camera_matrix_from_fov,
-    equirect_directions,
     rotation_about,
 )
 from tangent_train.inference.predictor import Predictor
@@ -34,6 +33,7 @@ from tests.inference.trained import (
     PERSPECTIVE,
     TANGENT,
     color_network,
+    sphere,
     trained_network,
 )
 from tests.models.sphere_networks import awake, small_context
@@ -57,12 +57,6 @@ def _labels(
     scores = predictor.predict(image, shares.append)
     assert sum(shares) == pytest.approx(1)
     return scores.labels()
-
-
-def _sphere(height: int) -> NDArray[np.uint8]:
-    """Colours that are smooth on the sphere."""
-    x, y, z = np.moveaxis(equirect_directions((height, 2 * height)), -1, 0)
-    return np.stack([128 + 120 * x, 128 + 120 * y * z, 128 + 120 * z], axis=-1).astype(np.uint8)
 
 
 def _blocks(height: int, width: int) -> NDArray[np.uint8]:
@@ -105,7 +99,7 @@ def test_cross_image_attention_is_that_of_an_evaluation(per_forward: int) -> Non
     torch.manual_seed(0)
     network = small_context().eval()
     awake(network)
-    image, made = InputImage(_sphere(32)), make(TANGENT, "representation")
+    image, made = InputImage(sphere(32)), make(TANGENT, "representation")
     trained = trained_network(TANGENT, network=Scores(network, 3))
     labels = _labels(trained, image, per_forward, blend="nearest")
     task = SegmentationTask(network, made, trained.class_names, SGD).eval()
@@ -127,17 +121,17 @@ def test_elevation_follows_the_zenith() -> None:
         network.weight[0, 3], network.weight[2, 3] = -1, 1
         network.bias.copy_(torch.tensor([0.0, -9, 0]))  # type: ignore[union-attr]
     trained = trained_network(TANGENT, network=Scores(network, 3), inputs=("rgb", "elevation"))
-    labels = _labels(trained, InputImage(_sphere(32)))
+    labels = _labels(trained, InputImage(sphere(32)))
     assert (labels[:15] == 2).all()
     assert (labels[17:] == 0).all()
-    tilted = _labels(trained, InputImage(_sphere(32), up=np.array([1.0, 0.0, 0.0])))
+    tilted = _labels(trained, InputImage(sphere(32), up=np.array([1.0, 0.0, 0.0])))
     assert (tilted[:, 20:44] == 2).mean() > 0.85, "around the middle column"
     with pytest.raises(SettingError, match="expected equirectangular"):
         PhotoViews(trained)
 
 
 def test_panoramas_that_are_not_upright_are_seen_upright() -> None:
-    trained, rgb = trained_network(TANGENT), _sphere(64)
+    trained, rgb = trained_network(TANGENT), sphere(64)
     rotation = rotation_about((1, 2, 0), np.radians(40))
     upright = _labels(trained, InputImage(rgb))
     tilted = InputImage(rotate_equirect(rgb, rotation), up=rotation @ [0, 0, 1])
@@ -146,7 +140,7 @@ def test_panoramas_that_are_not_upright_are_seen_upright() -> None:
 
 
 def test_views_per_forward_change_nothing() -> None:
-    image, trained = InputImage(_sphere(32)), trained_network(TANGENT)
+    image, trained = InputImage(sphere(32)), trained_network(TANGENT)
     np.testing.assert_array_equal(_labels(trained, image, 7), _labels(trained, image))
 
 
@@ -156,7 +150,7 @@ def test_panoramas_of_any_size_get_labels_of_their_size(
     representation: dict[str, Any], height: int
 ) -> None:
     """Smooth colours: the labels are those of a network that sees every pixel."""
-    rgb = _sphere(height)
+    rgb = sphere(height)
     labels = _labels(trained_network(representation), InputImage(rgb))
     assert labels.shape == (height, 2 * height)
     expected = _labels(trained_network(ERP | {"erp_height": height}), InputImage(rgb))
@@ -169,7 +163,7 @@ def test_nothing_changes_at_180_degrees(representation: dict[str, Any]) -> None:
 
     Not quite near the poles, where images are rotated in themselves: the network is not symmetric.
     """
-    trained, rgb = trained_network(representation), _sphere(64)
+    trained, rgb = trained_network(representation), sphere(64)
     labels = _labels(trained, InputImage(rgb), blend="nearest")
     there = _labels(trained, InputImage(np.roll(rgb, 64, axis=1).copy()), blend="nearest")
     agreement = (np.roll(there, -64, axis=1) == labels).mean()
@@ -186,7 +180,7 @@ def test_a_larger_panorama_is_shrunk_without_aliasing() -> None:
 
 
 def test_probabilities_of_several_rotations_are_averaged(monkeypatch: pytest.MonkeyPatch) -> None:
-    trained, image = trained_network(TANGENT), InputImage(_sphere(32))
+    trained, image = trained_network(TANGENT), InputImage(sphere(32))
     views = PanoramaViews(trained, blend="nearest", rotations=3)
     scores = Predictor(trained, views).predict(image)
     probabilities = scores.probabilities(slice(None))
@@ -206,7 +200,7 @@ def test_probabilities_of_several_rotations_are_averaged(monkeypatch: pytest.Mon
 def test_level_and_base_level_choose_the_views() -> None:
     def views(representation: dict[str, Any], **settings: Any) -> tuple[int, int]:
         (found,) = PanoramaViews(trained_network(representation), **settings)(
-            InputImage(_sphere(128))
+            InputImage(sphere(128))
         )
         return found.count, found.views(slice(0, 1)).render(found.image.rgb, "bilinear").shape[1]
 

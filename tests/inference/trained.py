@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import nn
 
 from datamodules.core.inputs import RGB_NORMALIZATION, RGBD_NORMALIZATION
 from tangent_train.checkpoints.scores import Scores
 from tangent_train.checkpoints.trained import TrainedNetwork
+from tangent_train.geometry import equirect_directions
 from tangent_train.registry import make
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from numpy.typing import NDArray
 
 CLASS_NAMES = ("unknown", "dark", "green", "bright")
 
@@ -22,6 +26,12 @@ TANGENT = {"_target_": _RENDERING + "TangentRepresentation", "base_level": 0, "l
 ERP = {"_target_": _RENDERING + "EquirectRepresentation", "level": 4}
 CUBE = {"_target_": _RENDERING + "CubemapRepresentation", "level": 4}
 PERSPECTIVE = {"_target_": _RENDERING + "PerspectiveRepresentation", "level": 6, "dim": 24}
+
+
+def sphere(height: int) -> NDArray[np.uint8]:
+    """Colours that are smooth on the sphere."""
+    x, y, z = np.moveaxis(equirect_directions((height, 2 * height)), -1, 0)
+    return np.stack([128 + 120 * x, 128 + 120 * y * z, 128 + 120 * z], axis=-1).astype(np.uint8)
 
 
 def color_network(channels: int = 3, kernel: int = 3) -> nn.Conv2d:

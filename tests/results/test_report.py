@@ -171,20 +171,6 @@ def test_nothing_published_stands_beside_other_data(changes: dict[str, Any]) -> 
     assert not _paper(**changes)
 
 
-def test_the_papers_means_are_those_of_its_classes() -> None:
-    rows = [
-        row
-        for level in (5, 7, 10)
-        for row in published([made_record([0.5] * 13, REAL, level=level)])
-        if row.score("iou", "wall").mean is not None
-    ]
-    assert len(rows) == 5
-    for row in rows:
-        for name, mean, within in (("iou", "miou", 6e-4), ("accuracy", "macc", 1.1e-3)):
-            classes = [row.score(name, label).mean or 0.0 for label in REAL]
-            assert row.score(mean).mean == pytest.approx(fmean(classes), abs=within)
-
-
 @pytest.mark.parametrize(
     ("name", "macc", "miou"),
     [

@@ -27,9 +27,9 @@ class Tied(nn.Module):
 class OneSize(nn.Conv2d):
     """Something learned for every pixel."""
 
-    def __init__(self) -> None:
-        super().__init__(4, 4, 1)
-        self.places = nn.Parameter(torch.randn(4, 24, 40))
+    def __init__(self, channels: int = 4, classes: int = 4) -> None:
+        super().__init__(channels, classes, 1)
+        self.places = nn.Parameter(torch.randn(classes, 24, 40))
 
     def forward(self, images: Tensor) -> Tensor:
         return super().forward(images) + self.places
@@ -68,8 +68,8 @@ class Tracing(nn.Conv2d):
 class Looking(nn.Conv2d):
     """Another computation for other values: no exporter knows both."""
 
-    def __init__(self) -> None:
-        super().__init__(4, 4, 1)
+    def __init__(self, channels: int = 4, classes: int = 4) -> None:
+        super().__init__(channels, classes, 1)
 
     def forward(self, images: Tensor) -> Tensor:
         return super().forward(images) * (2 if bool(images.sum() > 0) else 1)

@@ -82,6 +82,14 @@ def shape_task(
     return ClassificationTask(network or SmallNetwork(), TANGENT, names, optimizer, **settings)
 
 
+class Gradients(lightning.Callback):
+    """Keeps the gradients that the optimizer has used."""
+
+    def on_train_batch_end(self, trainer: Any, pl_module: Any, *_: Any) -> None:
+        self.found = [p.grad.clone() for p in pl_module.parameters()]
+        self.loss = trainer.callback_metrics["train/loss"]
+
+
 def quiet_trainer(**settings: Any) -> lightning.Trainer:
     """A trainer that writes and prints nothing."""
     quiet: dict[str, Any] = {

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import lightning
 import numpy as np
 import pytest
 import torch
@@ -10,15 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from tangent_train.errors import SettingError
-from tests.tasks.shapes import Shapes, SmallNetwork, quiet_trainer, shape_task
-
-
-class Gradients(lightning.Callback):
-    """Keeps the gradients that the optimizer has used."""
-
-    def on_train_batch_end(self, trainer: Any, pl_module: Any, *_: Any) -> None:
-        self.found = [p.grad.clone() for p in pl_module.parameters()]
-        self.loss = trainer.callback_metrics["train/loss"]
+from tests.tasks.shapes import Gradients, Shapes, SmallNetwork, quiet_trainer, shape_task
 
 
 def _gradients(

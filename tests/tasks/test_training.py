@@ -19,7 +19,7 @@ from torch.utils.data import DataLoader
 
 from tangent_train.rendering import TangentRepresentation
 from tangent_train.tasks import SegmentationTask
-from tests.tasks.shapes import quiet_trainer
+from tests.tasks.shapes import Gradients, quiet_trainer
 
 
 class Sample(NamedTuple):
@@ -42,14 +42,6 @@ class Data(lightning.LightningDataModule):
         labels[1] = 0
         samples: Any = [Sample(*pair) for pair in zip(images, labels, strict=True)]
         return DataLoader(samples, self.batch_size)
-
-
-class Gradients(lightning.Callback):
-    """Keeps the gradients that the optimizer has used."""
-
-    def on_train_batch_end(self, trainer: Any, pl_module: Any, *_: Any) -> None:
-        self.found = [p.grad.clone() for p in pl_module.parameters()]
-        self.loss = trainer.callback_metrics["train/loss"]
 
 
 pytestmark = pytest.mark.filterwarnings("ignore:You defined a `validation_step`:UserWarning")

@@ -69,19 +69,6 @@ def upernet() -> Made:
     return transformers.UperNetForSemanticSegmentation(config), processor
 
 
-def dpt() -> Made:
-    config = transformers.DPTConfig(
-        backbone_out_indices=[0, 1, 2, 3],
-        neck_hidden_sizes=[8, 8, 16, 16],
-        fusion_hidden_size=16,
-        **_TRANSFORMER,
-        **_LABELS,
-    )
-    return transformers.DPTForSemanticSegmentation(config), transformers.DPTImageProcessor(
-        size=_SIZE
-    )
-
-
 def beit() -> Made:
     config = transformers.BeitConfig(
         out_indices=[1, 2, 3, 4],

@@ -100,11 +100,10 @@ def test_a_network_of_a_config_and_its_export_compute_the_same(
     with torch.no_grad():
         expected = network(images)[:, [1, 2, 3, 0]]
         torch.testing.assert_close(trained.network(images), expected)
-        for name in ("again.onnx", "again.safetensors"):
-            _run("export", monkeypatch, "checkpoint=net.ckpt", f"output={name}")
-            again = load_trained(here / name)
-            assert again.class_names == trained.class_names
-            torch.testing.assert_close(again.network(images), expected, atol=1e-4, rtol=1e-4)
+        _run("export", monkeypatch, "checkpoint=net.ckpt", "output=again.safetensors")
+        again = load_trained(here / "again.safetensors")
+        assert again.class_names == trained.class_names
+        torch.testing.assert_close(again.network(images), expected)
 
 
 def test_torchvision_gives_the_scores_of_its_own_transform(
@@ -157,13 +156,10 @@ def test_impossible_views_are_refused() -> None:
     [
         (("classes=three.json",), r"found 3, for 4 scores; expected one for every score"),
         (("classes=null",), "classes: found none; expected a file with a JSON list"),
-        (("classes=gone.json",), r"gone\.json: found an unreadable file"),
         (("classes=holes.json",), r"holes\.json: found .*; expected a JSON list"),
         (("normalization=null",), "normalization: found none; expected imagenet, unit, symmetric"),
-        (("normalization=coco",), "normalization: found coco"),
         (("nothing=[sky]",), "nothing: found sky; expected of background, dark"),
         (("nothing=[background,dark,green,bright]",), "nothing: found all classes"),
-        (("output=net.ckpt",), r"output: found net\.ckpt; expected a name ending in \.onnx"),
         (("output=net.onnx",), "which exists; expected a new file"),
         (("file=null",), "file: found none; expected an ONNX file"),
         (("network=timm", "model=vit"), "found timm, which has no networks for segmentation"),

@@ -5,18 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import cv2
-import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 from transformers import SegformerConfig
 
 from models.huggingface import architecture
 from tangent_train.checkpoints.trained import load_trained
 from tests.cli.imported import write_imported
 from tests.cli.test_commands import CUT_SHORT
-from tests.cli.tiny_runs import SETTINGS, results, run_command
+from tests.cli.tiny_runs import SETTINGS, results, run_command, run_in
 from tests.running import run_python
 
 TYPED = [text for text in SETTINGS if "network" not in text]
@@ -37,9 +34,7 @@ def tuned(rooms: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "cut_short.py").write_text(CUT_SHORT)
     cut = run_python(folder, "cut_short.py", *TYPED, *TUNED, rooms, "hydra.run.dir=cut")
     assert "all up to here; resume with" in cut.stderr, cut.stderr
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        run_command(patch, "train", *TYPED, *TUNED, rooms, "hydra.run.dir=whole")
+    run_in(folder, "train", *TYPED, *TUNED, rooms, "hydra.run.dir=whole")
     (folder / "net.ckpt").unlink()
     return folder
 
@@ -71,39 +66,6 @@ def test_it_is_resumed_exactly_without_the_imported_file(
     assert len(frozen) > 10
     for name in frozen:
         assert torch.equal(before["state_dict"][name], expected["state_dict"][name]), name
-
-
-def _labels(folder: Path) -> NDArray[np.uint8]:
-    labels = cv2.imread(str(folder / "labels" / "x.png"), cv2.IMREAD_UNCHANGED)
-    assert labels is not None
-    return labels.astype(np.uint8)
-
-
-def test_it_is_exported_without_the_imported_file(
-    tuned: Path, rooms: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tuned)
-    checkpoint = Path("whole") / "checkpoints" / "best.ckpt"
-    run_command(monkeypatch, "evaluate", f"checkpoint={checkpoint}", rooms, "hydra.run.dir=again")
-    assert results(tuned / "again") == results(tuned / "whole")
-    colours = np.random.default_rng(0).integers(0, 256, (32, 64, 3), np.uint8)
-    Path("in").mkdir()
-    cv2.imwrite("in/x.png", colours)
-    labels = {}
-    for name in ("best.ckpt", "x.onnx", "x.safetensors"):
-        if name != checkpoint.name:
-            run_command(monkeypatch, "export", f"checkpoint={checkpoint}", f"output={name}")
-        given = checkpoint if name == checkpoint.name else name
-        run_command(
-            monkeypatch, "predict", f"checkpoint={given}", "input=in", f"output=labels_{name}"
-        )
-        labels[name] = _labels(Path(f"labels_{name}"))
-    assert len(np.unique(labels["best.ckpt"])) > 1
-    assert (labels["best.ckpt"] == labels["x.safetensors"]).all()
-    assert (labels["best.ckpt"] == labels["x.onnx"]).mean() > 0.999
-    again = ["init_from=x.safetensors", "hydra.run.dir=tuned_again", "trainer.max_epochs=1"]
-    run_command(monkeypatch, "train", *TYPED, rooms, "data.inputs=[rgb]", *again)
-    assert _last(tuned / "tuned_again")["fresh"] == []
 
 
 def test_a_network_of_transformers_learns_other_classes_from_depth_too(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.cli.tiny_runs import results, run_command
+from tests.cli.tiny_runs import results, run_command, run_in
 from tests.datamodules.folder.folder_format import (
     NAMES,
     pixels_of_classes,
@@ -43,11 +43,9 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def own_run(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run with depth."""
     folder = tmp_path_factory.mktemp("run")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        arguments = [*_SETTINGS, f"data.root='{root}'", "data.inputs=[rgb,depth]"]
-        arguments += ["data.normalization={mean:[0.1,0.2,0.3,2],std:[0.5,0.5,0.5,1.5]}"]
-        run_command(patch, "train", *arguments, "hydra.run.dir=finished")
+    arguments = [*_SETTINGS, f"data.root='{root}'", "data.inputs=[rgb,depth]"]
+    arguments += ["data.normalization={mean:[0.1,0.2,0.3,2],std:[0.5,0.5,0.5,1.5]}"]
+    run_in(folder, "train", *arguments, "hydra.run.dir=finished")
     return folder / "finished"
 
 
@@ -76,20 +74,6 @@ def test_the_checkpoint_is_evaluated_again_and_on_other_files(
     run_command(monkeypatch, "evaluate", checkpoint, f"data.root={own}", "hydra.run.dir=more")
     expected = pixels_of_classes(own, ["scene_2/view.0", "scene_3/view.0"])
     assert np.array(results(tmp_path / "more")["confusion"]).sum(axis=1).tolist() == expected
-
-
-def test_prepare_checks_and_fills_the_store(
-    root: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    run_command(monkeypatch, "prepare", *_SETTINGS, f"data.root='{root}'", "data.store=store")
-    assert "Panoramas: 6 train, 2 val, 2 test." in capsys.readouterr().out
-    stored = sorted(path.relative_to(tmp_path / "store") for path in tmp_path.rglob("*.npy"))
-    assert len(stored) == 10
-    assert stored[0].match("32x64_*/scene_0/view.0.npy")
 
 
 def test_two_panoramas_train_and_the_last_epoch_is_tested(

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.cli.tiny_runs import results, run_command
+from tests.cli.tiny_runs import results, run_command, run_in
 
 SETTINGS = (
     "experiment=shapes/default",
@@ -27,9 +27,7 @@ SETTINGS = (
 def shapes_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run, in a folder with its data."""
     folder = tmp_path_factory.mktemp("run")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        run_command(patch, "train", *SETTINGS, "hydra.run.dir=finished")
+    run_in(folder, "train", *SETTINGS, "hydra.run.dir=finished")
     return folder / "finished"
 
 

@@ -22,10 +22,6 @@ if TYPE_CHECKING:
 PROGRAMS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 # WebGL on the processor; no sandbox, as containers often run as root.
 ARGUMENTS = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox")
-NO_WEBGL = """const original = HTMLCanvasElement.prototype.getContext;
-HTMLCanvasElement.prototype.getContext = function (kind, ...rest) {
-  return kind.startsWith("webgl") ? null : original.call(this, kind, ...rest);
-};"""
 # Two frames: what an event asked for has been drawn. Playwright waits for promises without end.
 DRAWN = """() => new Promise((done, failed) => {
   setTimeout(() => failed(new Error("no frame was drawn in 20 s")), 20_000);
@@ -132,16 +128,12 @@ class OpenReport:
 
 
 @contextmanager
-def opened(
-    browser: Browser, path: Path, *, script: str | None = None, **context: Any
-) -> Iterator[OpenReport]:
+def opened(browser: Browser, path: Path, **context: Any) -> Iterator[OpenReport]:
     """A report in a window of its own; afterwards nothing must have gone wrong or been fetched."""
     context.setdefault("viewport", {"width": 600, "height": 800})
     window = browser.new_context(**context)
     window.set_default_timeout(20_000)
     report = OpenReport(window.new_page())
-    if script is not None:
-        report.page.add_init_script(script)
 
     def heard(message: ConsoleMessage) -> None:
         report.problems.append(f"{message.type}: {message.text}")

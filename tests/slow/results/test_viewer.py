@@ -7,16 +7,14 @@ from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
-import pytest
 
 from tangent_train.results.html import encode_image, write_report
-from tests.slow.results.browser import NO_WEBGL, OpenReport, opened
+from tests.slow.results.browser import OpenReport, opened
 from tests.slow.results.reference import (
     classes_of,
     colors_of,
     erp_directions,
     interpolated,
-    rays,
 )
 from tests.slow.results.scene import (
     COLORS,
@@ -140,29 +138,3 @@ def test_photos_are_flat_with_pan_and_zoom(report: OpenReport) -> None:
     shown = factor * scale
     corner = report.pixels()[20, 20]
     close(corner, color(20.5 / PHOTO[1] / shown, 20.5 / PHOTO[0] / shown))
-
-
-def test_without_webgl_images_are_flat_and_it_says_so(browser: Browser, page_path: Path) -> None:
-    with opened(browser, page_path, script=NO_WEBGL) as report:
-        assert "no WebGL 2" in report.text(".message")
-        assert not report.page.locator(".projection").is_visible()
-        x, y, width, height = report.box()
-        scale = min(width / WIDTH, height / HEIGHT)
-        at_45_deg = (int(height / 2 + HEIGHT * scale / 4), int(width / 2 + WIDTH * scale / 8))
-        direction = rays((1, 1), 45, -45, 1, "inside")[0, 0]
-        index = int(classes_of(direction))
-        for layer, color in (
-            ("input", colors_of(direction)),
-            ("truth", COLORS[index]),
-            ("overlay", 0.45 * colors_of(direction) + 0.55 * COLORS[index]),
-        ):
-            report.layer(layer)
-            close(report.pixels()[at_45_deg], color)
-        report.page.mouse.move(x + at_45_deg[1], y + at_45_deg[0])
-        report.drawn()
-        assert f"truth: {NAMES[index]}" in report.text(".readout")
-        report.layer("error")
-        assert report.center() == pytest.approx(UNLABELLED)
-        report.page.mouse.dblclick(x + at_45_deg[1], y + at_45_deg[0])
-        report.drawn()
-        assert report.text(".looking").endswith("× 2.0")

@@ -15,9 +15,6 @@ from tests.slow.results.reference import (
     rays,
 )
 from tests.slow.results.scene import (
-    BARE_PANORAMA,
-    COLORS,
-    FLAT_PHOTO,
     NAMES,
     START_DEG,
     close,
@@ -29,30 +26,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from playwright.sync_api import Browser
-
-
-def test_classes_can_be_hidden(report: OpenReport) -> None:
-    report.drag(150, 0)
-    longitude = -math.degrees(150 * step_rad(report))
-    (direction,) = rays((1, 1), longitude, 0, 1, "inside")[0]
-    index, photo = int(classes_of(direction)), colors_of(direction)
-    dimmed = np.repeat(0.4 * photo @ [0.299, 0.587, 0.114], 3)
-    box = report.page.get_by_label(NAMES[index], exact=False)
-    report.layer("truth")
-    for hide, show in (
-        (box.uncheck, box.check),
-        *[(report.page.get_by_text(name, exact=True).click for name in ("none", "all"))],
-    ):
-        close(report.center(), COLORS[index])
-        hide()
-        report.drawn()
-        close(report.center(), dimmed)
-        report.layer("overlay")
-        close(report.center(), photo)
-        report.layer("truth")
-        show()
-        report.drawn()
-    close(report.center(), COLORS[index])
 
 
 def test_the_class_under_the_pointer_is_named(report: OpenReport) -> None:
@@ -101,22 +74,6 @@ def test_keys_turn_zoom_reset_and_switch(report: OpenReport) -> None:
     assert report.text(".caption") == "bare"
     report.press("PageUp", "PageUp")
     assert report.text(".caption") == "a photo"
-
-
-def test_missing_layers_are_not_offered(report: OpenReport) -> None:
-    def offered() -> list[str]:
-        labels = report.page.locator(".layers label")
-        return [label.inner_text() for label in labels.all() if label.is_visible()]
-
-    assert offered() == ["Input", "Truth", "Prediction", "Error", "Overlay"]
-    report.choose(BARE_PANORAMA)
-    assert offered() == ["Input"]
-    assert not report.page.locator(".legend").is_visible()
-    report.press("2")
-    close(report.pixels(), colors_of(view_of(report, 0, 0, START_DEG)))
-    report.choose(FLAT_PHOTO)
-    assert offered() == ["Input", "Prediction", "Overlay"]
-    assert report.text(".shares") == "share of prediction, %"
 
 
 def test_a_phone_can_reach_everything(browser: Browser, page_path: Path) -> None:

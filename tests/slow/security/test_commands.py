@@ -4,32 +4,13 @@ from __future__ import annotations
 
 import csv
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from tests.cli.tiny_runs import run_command
 from tests.datamodules.folder.folder_format import write_classes, write_data_set
-from tests.security.honest import SECRET, SETTINGS, with_config
+from tests.security.honest import SECRET, SETTINGS
 from tests.security.watch import CANARY, watched
-
-CODE: dict[str, Any] = {"network": {"_target_": f"{CANARY}.fire"}}
-
-
-def test_a_transfer_takes_tensors_and_the_fold_only(
-    content: dict[str, Any], forbidden: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(forbidden.parent)
-    arguments = ["experiment=rooms/transfer", "seeds=[0]", "data.root=rooms"]
-    arguments += ["data.rooms.height=1"]  # refused when the data are about to be generated
-    for sections, message in ((CODE, "height"), ({"data": "text"}, "last.ckpt: found")):
-        path = with_config(content, Path(), **sections)
-        with (
-            watched(forbidden) as happened,
-            pytest.raises(SystemExit, match=message),
-        ):
-            run_command(monkeypatch, "transfer", f"checkpoint={path}", *arguments)
-        assert not happened
 
 
 def test_names_of_classes_are_names(
