@@ -5,6 +5,8 @@ from __future__ import annotations
 import shlex
 import shutil
 import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
