@@ -61,8 +61,9 @@ def fed(attempts: Attempts) -> Iterator[Table]:
             name = f"{workers} workers"
             figures[name] = attempts.tried(name, partial(_fit, task, datamodule=data), 15)
         name = "rendered on the GPU, whole panoramas in pinned memory"
-        rendered = partial(_fit, task, train_dataloaders=_Batches(_Rendered(data), steps))
-        figures[name] = attempts.tried(name, rendered, 15)
+        figures[name] = attempts.tried(
+            name, lambda: _fit(task, train_dataloaders=_Batches(_Rendered(data), steps)), 15
+        )
     found = {name: each for name, each in figures.items() if each is not None}
     yield Table("fed: a training step", [Row(n, [s], True) for n, (s, _) in found.items()])
     rows = [Row(name, [busy], True) for name, (_, busy) in found.items()]

@@ -40,7 +40,7 @@ def science(attempts: Attempts) -> Iterator[Table]:
         if attempts.tried("rooms", rooms) is None:
             return
         for epochs in _ROUNDS:
-            for orientation, settings in _ORIENTATIONS.items():
+            for orientation, settings in list(_ORIENTATIONS.items())[-1 if QUICK else 0 :]:
                 scores, seconds = [], []
                 for method, chosen in _METHODS.items():
                     name = f"{method}, {orientation}"
@@ -68,7 +68,7 @@ def _train(root: Path, epochs: int, settings: tuple[str, ...]) -> tuple[float, f
     start = time.perf_counter()
     run_command("train", given, folder)
     content = json.loads((folder / "results.json").read_text(encoding="utf-8"))
-    return time.perf_counter() - start, content["miou"]
+    return time.perf_counter() - start, max(content["miou"], 1e-6)  # no multiple of 0
 
 
 def _rooms(root: Path) -> list[str]:
