@@ -38,6 +38,9 @@ _COPY = "Copy or extract the file again."
 _LEVELS = 4  # floors, complete rooms, partial rooms, panoramas
 _NAME = re.compile(r"\w+", re.ASCII)
 _MOST = 1e6  # camera heights
+_READ = (
+    "camera_height ceiling_height floor_plan_transformation image_path is_inside layout_visible"
+).split()
 _FIXTURES = {"openings": OPENING, "doors": DOOR, "windows": WINDOW}
 _POINTS = list[list[float]]
 _FROM_SPHERE = np.array([[0, -1.0, 0], [1.0, 0, 0], [0, 0, 1.0]])
@@ -209,9 +212,11 @@ def _read_home(file: Path) -> list[HomePanorama]:
     units = dict.fromkeys((path[0] for path, _ in branches), float | None)
     place = "scale_meters_per_coordinate"
     unit_m = check_fields(file, given[place], units, _EXPECTED, place)
+    panoramas = [(path, dict(_named(file, path, record))) for path, record in branches]
     return [
-        HomePanorama(file, path, dict(_named(file, path, record)), unit_m[path[0]])
-        for path, record in branches
+        # The rest is most of the file, which would fill the memory with a thousand homes.
+        HomePanorama(file, path, {n: record.get(n) for n in _READ}, unit_m[path[0]])
+        for path, record in panoramas
     ]
 
 
