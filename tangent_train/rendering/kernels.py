@@ -36,7 +36,7 @@ _LANES = 16
 """Sums of a pixel are padded to a multiple of this, which compiles to vector code."""
 
 _TILE = 64
-"""Rows and columns added to at once, so that their sums stay in the cache."""
+"""Rows and columns at the equator of what is added to at once: its sums stay in the cache."""
 
 Array = NDArray[Any]
 Rays = tuple[Array, Array]
@@ -71,7 +71,7 @@ class _Seen(NamedTuple):
     """Pixels of a tile that an image contributes to.
 
     Attributes:
-        pixel: Flat indices in the tile.
+        pixel: Flat indices of them where results go.
         u: Columns in the image.
         v: Rows in the image.
         weight: Weights.
@@ -223,13 +223,15 @@ def _mark_owners(tile: Tile, owner: Array, owns: Array) -> None:
 
 
 @njit_fast
-def _list_owned(tile: Tile, m: int, side: tuple[int, int], sight: Sight, seen: _Seen) -> int:
+def _list_owned(
+    tile: Tile, m: int, side: tuple[int, int], sight: Sight, step: tuple[int, int], seen: _Seen
+) -> int:
     """See `_list_pixels`, of images that have weight 1 where they are the owner."""
     top, bottom, left, right = tile
     pixel, u, v, weight = seen
     count, image = 0, sight.images[m]
     for i in range(top, bottom):
-        owner, at = sight.owner[i], (i - top) * (right - left) - left
+        owner, at = sight.owner[i], i * step[0] + step[1]
         stop = left
         while stop < right:
             start = stop
@@ -249,14 +251,16 @@ def _list_owned(tile: Tile, m: int, side: tuple[int, int], sight: Sight, seen: _
 
 
 @njit_fast
-def _list_seen(tile: Tile, m: int, side: tuple[int, int], sight: Sight, seen: _Seen) -> int:
+def _list_seen(
+    tile: Tile, m: int, side: tuple[int, int], sight: Sight, step: tuple[int, int], seen: _Seen
+) -> int:
     """See `_list_pixels`, of images that are feathered."""
     top, bottom, left, right = tile
     columns, (pixel, u, v, weight) = sight.columns, seen
     count = 0
     for i in range(top, bottom):
         begin, span = sight.spans[m, i, 0], sight.spans[m, i, 1]
-        at = (i - top) * (right - left) - left
+        at = i * step[0] + step[1]
         for back in range(0, len(columns) + 1, len(columns)):
             start, stop = max(left, begin - back), min(right, begin + span - back)
             if start >= stop:
@@ -275,7 +279,9 @@ def _list_seen(tile: Tile, m: int, side: tuple[int, int], sight: Sight, seen: _S
 
 
 @njit_fast
-def _list_pixels(tile: Tile, m: int, side: tuple[int, int], sight: Sight, seen: _Seen) -> int:
+def _list_pixels(
+    tile: Tile, m: int, side: tuple[int, int], sight: Sight, step: tuple[int, int], seen: _Seen
+) -> int:
     """List the pixels of a tile that image m contributes to; returns how many.
 
     Args:
@@ -283,11 +289,12 @@ def _list_pixels(tile: Tile, m: int, side: tuple[int, int], sight: Sight, seen: 
         m: Index of the image in `sight`.
         side: Rows and columns of the image.
         sight: Geometry of images and canvas.
+        step: From a row to the next one where results go, and there the place of pixel (0, 0).
         seen: The list, written.
     """
     if len(sight.owner) == 0:
-        return _list_seen(tile, m, side, sight, seen)
-    return _list_owned(tile, m, side, sight, seen)
+        return _list_seen(tile, m, side, sight, step, seen)
+    return _list_owned(tile, m, side, sight, step, seen)
 
 
 @njit_fast
@@ -310,6 +317,15 @@ def _split(places: Array, count: int, whole: Array, share: Array) -> tuple[int, 
         whole[p], share[p] = first, place - first
         least, greatest = min(least, first), max(greatest, first)
     return int(least), int(greatest)
+
+
+@njit_fast
+def _find_corners(
+    row: Array, upper: int, column: Array, first: int, width: int, lanes: int, corner: Array
+) -> None:
+    """Where the first of four pixels starts in a patch of `width` columns."""
+    for p in range(np.uint64(len(row))):
+        corner[p] = ((row[p] - upper) * width + column[p] - first) * lanes
 
 
 @njit_fast
@@ -342,33 +358,42 @@ def _copy_patch(
 
 
 @njit_fast
-def _add_patch(
-    patch: Array, corner: Array, below: np.uint64, lanes: np.uint64,
-    right_share: Array, below_share: Array, weight: Array, pixel: Array, sums: Array,
-) -> None:  # fmt: skip
-    """Add weighted bilinear samples of a patch to the sums of a tile.
+def _four_pixels(
+    p: int, corner: Array, below: np.uint64, lanes: np.uint64,
+    right_share: Array, below_share: Array, weight: np.float32,
+) -> tuple[Any, ...]:  # fmt: skip
+    """Where the scores of the four pixels around a position start in a patch, and their weights.
 
     Unsigned indices spare numba's test for negative ones.
 
     Args:
-        patch: Flat ``(h, w, lanes)``.
+        p: The position.
         corner: ``(n,)`` where the first of four pixels starts.
         below: From there to the pixel below.
         lanes: From there to the pixel to the right.
         right_share: ``(n,)`` of the pixels to the right.
         below_share: ``(n,)`` of the pixels below.
-        weight: ``(n,)`` of the samples.
-        pixel: ``(n,)`` pixels of the tile.
-        sums: Flat ``(pixels, lanes)``, changed.
+        weight: Sum of the weights.
     """
+    a = corner[p]
+    c = a + below
+    lower = weight * below_share[p]
+    upper = weight - lower
+    right, lower_right = right_share[p] * upper, right_share[p] * lower
+    return a, a + lanes, c, c + lanes, upper - right, right, lower - lower_right, lower_right
+
+
+@njit_fast
+def _add_patch(
+    patch: Array, corner: Array, below: np.uint64, lanes: np.uint64,
+    right_share: Array, below_share: Array, weight: Array, pixel: Array, sums: Array,
+) -> None:  # fmt: skip
+    """Add weighted bilinear samples of a patch to the sums of a tile."""
     for p in range(np.uint64(len(corner))):
-        a = corner[p]
-        b, c = a + lanes, a + below
-        d, to = b + below, np.uint64(pixel[p]) * lanes
-        lower = np.float32(weight[p]) * below_share[p]
-        upper = np.float32(weight[p]) - lower
-        wb, wd = right_share[p] * upper, right_share[p] * lower
-        wa, wc = upper - wb, lower - wd
+        a, b, c, d, wa, wb, wc, wd = _four_pixels(
+            p, corner, below, lanes, right_share, below_share, np.float32(weight[p])
+        )
+        to = np.uint64(pixel[p]) * lanes
         for k in range(lanes):
             sums[to + k] += (
                 wa * patch[a + k] + wb * patch[b + k] + wc * patch[c + k] + wd * patch[d + k]
@@ -376,21 +401,32 @@ def _add_patch(
 
 
 @njit_fast
-def _rank(score: np.float32, k: int) -> np.int64:
-    """Larger for a larger score and, of equal ones, for the first class k; NaN's is the least."""
-    bits = np.float32(score).view(np.int32)
-    size = np.int64(bits & np.int32(0x7FFFFFFF))
-    order = -size if bits < 0 else size
-    return (order << np.int64(32)) - np.int64(k) if score == score else np.int64(-(2**63))
+def _label_patch(
+    patch: Array, corner: Array, below: np.uint64, lanes: np.uint64,
+    right_share: Array, below_share: Array, num_classes: np.uint64, pixel: Array, labels: Array,
+) -> None:  # fmt: skip
+    """Write the best class of bilinear samples of a patch; see `_best_class`."""
+    for p in range(np.uint64(len(corner))):
+        a, b, c, d, wa, wb, wc, wd = _four_pixels(
+            p, corner, below, lanes, right_share, below_share, np.float32(1)
+        )
+        label: Any = np.uint64(0)  # as k: with int64 both would become floats
+        best = np.float32(-np.inf)
+        for k in range(num_classes):
+            score = wa * patch[a + k] + wb * patch[b + k] + wc * patch[c + k] + wd * patch[d + k]
+            better = score > best
+            best, label = (score, k) if better else (best, label)
+        labels[pixel[p]] = label
 
 
 @njit_fast
 def _best_class(sums: Array, num_classes: int) -> int:
     """Of the largest sum: the first of equal ones, and NaN never wins."""
-    best = _rank(np.float32(-np.inf), 0)
-    for k in range(np.uint64(num_classes)):  # without branches, which compiles to vector code
-        best = max(best, _rank(sums[k], k))
-    return int(-best & np.int64(0xFFFFFFFF))
+    best, label = np.float32(-np.inf), 0
+    for k in range(num_classes):
+        better = sums[k] > best
+        best, label = (sums[k], k) if better else (best, label)
+    return label
 
 
 @njit_fast
@@ -411,10 +447,9 @@ def _finish(
 ) -> None:
     """Add the sums of a tile's covered pixels to the totals, or write their labels."""
     top, bottom, left, right = tile
-    p = -1
     for i in range(top, bottom):
         for j in range(left, right):
-            p += 1
+            p = (i - top) * (right - left) + j - left
             if not sums[p, num_classes] > 0:
                 continue
             if len(total) == 0:
@@ -427,13 +462,21 @@ def _finish(
 
 
 @njit_fast
+def _tile_size(stretch: float) -> tuple[int, int]:
+    """Rows and columns of a tile that is about square on the sphere, of its first row's cos φ."""
+    rows = max(1, int(_TILE * math.sqrt(stretch)))
+    return rows, _TILE**2 // rows
+
+
+@njit_fast
 def add_images(
     start: int, stop: int, scores: Array, sight: Sight, softmax: bool, total: Array, labels: Array
 ) -> None:
     """Add images to rows ``start:stop`` of a canvas: weighted scores, or at once the best class.
 
     Works tile by tile. The part of an image that a tile sees is copied so that the scores of a
-    pixel lie together, and those of all classes are interpolated at once.
+    pixel lie together, and those of all classes are interpolated at once. Labels of owners are
+    complete with one image: their scores are compared as they are interpolated.
 
     Args:
         start: First row.
@@ -447,39 +490,54 @@ def add_images(
     """
     num_classes = scores.shape[1]
     side = scores.shape[2], scores.shape[3]
+    at_once = len(sight.owner) > 0 and len(total) == 0
     lanes = (num_classes // _LANES + 1) * _LANES
     owns = np.empty(_count(sight), np.bool_)
     u, v, weight = np.empty((3, _TILE**2))
-    seen = _Seen(np.empty(_TILE**2, np.int32), u, v, weight)
+    seen = _Seen(np.empty(_TILE**2, np.int64), u, v, weight)
     column, row = np.empty((2, _TILE**2), np.int32)
     right, below = np.empty((2, _TILE**2), np.float32)
     corner = np.empty(_TILE**2, np.uint64)
     sums = np.empty((_TILE**2, lanes), np.float32)
     patch = np.empty(0, np.float32)
-    for top in range(start, stop, _TILE):
-        for left in range(0, len(sight.columns), _TILE):
-            tile = top, min(stop, top + _TILE), left, min(len(sight.columns), left + _TILE)
-            sums[:] = 0
+    bottom = start
+    while bottom < stop:
+        top = bottom
+        height, across = _tile_size(abs(sight.rows[top, 0]))
+        bottom = min(stop, top + height)
+        for left in range(0, len(sight.columns), across):
+            tile = top, bottom, left, min(len(sight.columns), left + across)
+            step = tile[3] - left, -top * (tile[3] - left) - left
+            if at_once:
+                step = len(sight.columns), 0
+            else:
+                sums[:] = 0
             _mark_owners(tile, sight.owner, owns)
             for m in range(len(scores)):
                 if not owns[sight.images[m]]:
                     continue
-                n = _list_pixels(tile, m, side, sight, seen)
+                n = _list_pixels(tile, m, side, sight, step, seen)
                 if n == 0:
                     continue
                 first, last = _split(u[:n], side[1], column, right)
                 upper, lower = _split(v[:n], side[0], row, below)
-                width, height = last - first + 2, lower - upper + 2
-                if len(patch) < height * width * lanes:
-                    patch = np.empty(height * width * lanes, np.float32)
-                _copy_patch(scores[m], first, upper, height, width, lanes, patch)
-                for p in range(n):
-                    corner[p] = np.uint64(((row[p] - upper) * width + column[p] - first) * lanes)
-                _add_patch(
-                    patch, corner[:n], np.uint64(width * lanes), np.uint64(lanes),
-                    right, below, weight, seen.pixel, sums.reshape(-1),
-                )  # fmt: skip
-            _finish(tile, num_classes, softmax, sums, total, labels)
+                wide, high = last - first + 2, lower - upper + 2
+                if len(patch) < high * wide * lanes:
+                    patch = np.empty(high * wide * lanes, np.float32)
+                _copy_patch(scores[m], first, upper, high, wide, lanes, patch)
+                _find_corners(row[:n], upper, column, first, wide, lanes, corner)
+                if at_once:
+                    _label_patch(
+                        patch, corner[:n], np.uint64(wide * lanes), np.uint64(lanes),
+                        right, below, np.uint64(num_classes), seen.pixel, labels.reshape(-1),
+                    )  # fmt: skip
+                else:
+                    _add_patch(
+                        patch, corner[:n], np.uint64(wide * lanes), np.uint64(lanes),
+                        right, below, weight, seen.pixel, sums.reshape(-1),
+                    )  # fmt: skip
+            if not at_once:
+                _finish(tile, num_classes, softmax, sums, total, labels)
 
 
 @njit_exact
@@ -518,7 +576,7 @@ def seen_table(
         for m in range(len(sight.matrices)):
             if not owns[sight.images[m]]:
                 continue
-            for p in range(_list_pixels(tile, m, side, sight, seen)):
+            for p in range(_list_pixels(tile, m, side, sight, (0, 0), seen)):
                 j = seen.pixel[p]
                 rank = count[i, j]
                 count[i, j] += 1
