@@ -38,9 +38,8 @@ _COPY = "Copy or extract the file again."
 _LEVELS = 4  # floors, complete rooms, partial rooms, panoramas
 _NAME = re.compile(r"\w+", re.ASCII)
 _MOST = 1e6  # camera heights
-_READ = (
-    "camera_height ceiling_height floor_plan_transformation image_path is_inside layout_visible"
-).split()
+_HEIGHTS = ("camera_height", "ceiling_height")
+_READ = (*_HEIGHTS, "floor_plan_transformation", "image_path", "is_inside", "layout_visible")
 _FIXTURES = {"openings": OPENING, "doors": DOOR, "windows": WINDOW}
 _POINTS = list[list[float]]
 _FROM_SPHERE = np.array([[0, -1.0, 0], [1.0, 0, 0], [0, 0, 1.0]])
@@ -105,8 +104,8 @@ class HomePanorama:
         Raises:
             DataError: The file does not describe a room around the camera.
         """
-        given = self._fields({"camera_height": float, "ceiling_height": float})
-        camera, ceiling = given["camera_height"], given["ceiling_height"]
+        heights = self._fields(dict.fromkeys(_HEIGHTS, float))
+        camera, ceiling = heights["camera_height"], heights["ceiling_height"]
         if not 0 < camera < ceiling <= _MOST:
             found = f"camera_height={camera}, ceiling_height={ceiling}"
             raise self._wrong(found, "a camera between floor and ceiling")
