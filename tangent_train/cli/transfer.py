@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import shlex
 import sys
 from collections import defaultdict
@@ -15,7 +16,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 from rich.console import Console
 
-from tangent_train.cli.compose import compose_option
+from tangent_train.cli.stored import StoredNetwork, run_settings
 from tangent_train.cli.transfer_stages import (
     STUDY,
     Stage,
@@ -24,16 +25,20 @@ from tangent_train.cli.transfer_stages import (
     stage_command,
     stage_state,
 )
+from tangent_train.cli.transfer_views import views_of
 from tangent_train.errors import DataError, SettingError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from omegaconf import DictConfig
+
+    from tangent_train.checkpoints.trained import TrainedNetwork
 
 __all__ = ["trained_level", "transfer"]
 
 _MOST_SHOWN = 3
+_OF_TRAINING = ("ema", "fine_tuning", "network", "optimizer", "scheduler")
 
 
 def transfer(config: DictConfig) -> None:
@@ -48,20 +53,25 @@ def transfer(config: DictConfig) -> None:
     """
     folder = Path(HydraConfig.get().runtime.output_dir)
     _check_typed(config)
+    given = trained = None
     if config.checkpoint is not None:
         config.checkpoint = str(Path(config.checkpoint).absolute())
-    stages = plan(config, folder, _compared(config))
-    _check_given(config, stages)
+        given = run_settings(Path(config.checkpoint))
+        if given is None:
+            config, trained = _of_network(config)
+    stages = plan(config, folder, views_of(config, trained))
+    if given is not None:
+        _check_given(Path(config.checkpoint), given, stages)
     missing = [stage for stage in stages if stage_state(stage) != "finished"]
     first = stages[0].fold, stages[0].seed
-    _check_data([stage for stage in missing if (stage.fold, stage.seed) == first])
+    _check_data([stage for stage in missing if (stage.fold, stage.seed) == first], trained)
     try:
         for number, stage in enumerate(stages, start=1):
             _run(stage, f"Stage {number} of {len(stages)}, {stage.name} in {stage.folder}")
     except (KeyboardInterrupt, SystemExit):
         _say("Finished stages are kept; the same command continues.", error=True)
         raise
-    _report(config, folder, stages)
+    _report(config, folder, stages, trained)
 
 
 def _check_typed(config: DictConfig) -> None:
@@ -77,43 +87,49 @@ def _check_typed(config: DictConfig) -> None:
             )
 
 
-def _compared(config: DictConfig) -> dict[str, dict[str, Any]]:
-    """The further representations of the panoramas, without the transfer's own."""
-    hydra = HydraConfig.get()
-    names = config.compare or ()
-    if isinstance(names, str):
-        raise SettingError(
-            "compare", found=names, expected="a list of options of representation, or []"
-        )
-    search = [text for text in hydra.overrides.hydra if text.startswith("hydra.searchpath")]
-    own = hydra.runtime.choices.get("representation")
-    return {name: compose_option("representation", name, search) for name in names if name != own}
+def _of_network(config: DictConfig) -> tuple[DictConfig, TrainedNetwork]:
+    """The transfer of a network whose file knows no run: it is evaluated as it is."""
+    said = list(HydraConfig.get().overrides.task)
+    for text in said:
+        name = text.lstrip("+~").partition("=")[0]
+        if re.split("[.@]", name)[0] in _OF_TRAINING:
+            raise SettingError(
+                text,
+                found=f"a setting of training beside checkpoint={config.checkpoint}",
+                expected="none: a network without settings of a run is only evaluated",
+                remedy="tangent-train init_from= fine-tunes it.",
+            )
+    plain: Any = OmegaConf.to_container(config)
+    settings, _, trained = StoredNetwork(Path(config.checkpoint), said).settings(plain)
+    rows = config.representation.get("erp_height")
+    if rows is not None:  # the panoramas of all views
+        settings["representation"] |= {"erp_height": rows}
+    settings["network"] = None  # it stays in its file, uninterpreted
+    settings["fine_tuning"] |= {"epochs": []}
+    return OmegaConf.create(settings), trained
 
 
-def _check_given(config: DictConfig, stages: Sequence[Stage]) -> None:
+def _check_given(path: Path, given: Mapping[str, Any], stages: Sequence[Stage]) -> None:
     """Refuse a checkpoint that has seen the test rooms of another fold."""
-    from tangent_train.checkpoints.content import read_checkpoint
     from tangent_train.registry import check_fields
 
-    if config.checkpoint is None:
-        return
-    path, expected = Path(config.checkpoint), "the settings of a run"
-    given = read_checkpoint(path, ("config",))["config"]
+    expected = "the settings of a run"
     data = check_fields(path, given, {"data": dict}, expected)["data"]
     fold = check_fields(path, data, {"fold": int | None}, expected, "data")["fold"]
     if fold is not None and {stage.fold for stage in stages} != {fold}:
         raise SettingError(
-            f"checkpoint={config.checkpoint}",
+            f"checkpoint={path}",
             found=f"a network for testing on fold {fold}, of the others it has seen the rooms",
             expected=f"folds=[{fold}]",
         )
 
 
-def _check_data(stages: Sequence[Stage]) -> None:
+def _check_data(stages: Sequence[Stage], trained: TrainedNetwork | None) -> None:
     """Build the data and networks of all stages: errors come before hours of training."""
-    from tangent_train.cli.build import build
+    from tangent_train.cli.build import build, build_trained
 
-    built: list[tuple[Stage, Any]] = []
+    first: Any = None
+    built: dict[Any, tuple[Stage, Any]] = {}
     tried: list[Any] = []
     for stage in stages:
         parts = [stage.config[name] for name in ("data", "representation", "level")]
@@ -122,13 +138,17 @@ def _check_data(stages: Sequence[Stage]) -> None:
         tried.append(parts)
         with _named(stage):
             # No weights are fetched for a network that a checkpoint restores.
-            built.append((stage, build({**stage.config, "checkpoint": "P"})[0]))
-            _check_alike(built[0][1], built[-1][1])
-    for stage, data in built:  # after all settings: this makes files
+            settings = {**stage.config, "checkpoint": str(stage.weights)}
+            data = (build_trained(settings, trained) if trained else build(settings))[0]
+            first = first or data
+            _check_alike(first, data)
+            # Files are the same for all rotations, and for all views of as many rows.
+            built.setdefault((stage.name[0], getattr(data, "erp_height", 0)), (stage, data))
+    for stage, data in built.values():  # after all settings: this makes files
         with _named(stage):
             data.make_files()
             data.setup()
-    _tell_shared_scenes(built)
+    _tell_shared_scenes(list(built.values()))
 
 
 def _check_alike(first: Any, own: Any) -> None:
@@ -194,19 +214,24 @@ def _run(stage: Stage, what: str) -> None:
         sys.exit(status)
 
 
-def _report(config: DictConfig, folder: Path, stages: Sequence[Stage]) -> None:
+def _report(
+    config: DictConfig, folder: Path, stages: Sequence[Stage], trained: TrainedNetwork | None
+) -> None:
     """Write and print the tables and the chart."""
     from tangent_train.results.comparisons import levels_report, transfer_report
     from tangent_train.results.record import load_record
 
     found: dict[Any, list[Any]] = defaultdict(list)
     for stage in stages:
-        if not config.study or stage.level is not None:
-            found[stage.level if config.study else stage.name].append(load_record(stage.folder))
+        if not config.study or stage.view:
+            key = stage.config["level"] if config.study else stage.name
+            found[key].append(load_record(stage.folder))
     if config.study:
-        name, report = STUDY, levels_report(found, trained_level(config))
+        level = trained_level(config) if trained is None else trained.level
+        name, report = STUDY, levels_report(found, level)
     else:
-        name, report = "transfer", transfer_report(found)
+        cells = {s.name: (s.view or "S", s.condition) for s in stages if s.condition}
+        name, report = "transfer", transfer_report(found, cells)
     report.write(folder, name)
     Console(highlight=False).print(report.tables()[0].terminal())
     for note in report.all_notes():

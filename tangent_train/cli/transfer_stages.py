@@ -3,29 +3,32 @@
 ===========  ===============================================================================
 P            trained on photos, tested on photos
 S            P, tested on panoramas
-S-<name>     P, tested on panoramas through another representation
+S-<view>     P, tested on panoramas through another view
+S-…-<name>   the same in another condition, as tilted
 P-FT-n       P, fine-tuned for n epochs on photos, tested on photos
 S-FT-n       P, fine-tuned for n epochs on panoramas, tested on panoramas
 S-level-n    P, tested on panoramas of level n (study of the angular resolution)
 ===========  ===============================================================================
 
 Besides the files of a run, a stage's folder holds ``stage.yaml``, its config for ``tangent-train``
-or ``tangent-evaluate``, and ``stage.json``, a digest of the checkpoint it starts from.
+or ``tangent-evaluate``, and ``stage.json``, a digest of the checkpoint it starts from and of its
+class map.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from filelock import FileLock, Timeout
-from omegaconf import ListConfig, OmegaConf
+from omegaconf import OmegaConf
 
 from tangent_train.checkpoints.content import read_settings
 from tangent_train.cli.processes import command_line, run_process
+from tangent_train.cli.transfer_views import conditions_of, numbers
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import write_text
 from tangent_train.json_text import parse_json
@@ -45,8 +48,8 @@ State = Literal["new", "begun", "finished"]
 """Progress of a stage. One that only evaluates is either new or finished."""
 
 _OF_THE_TRANSFER = (
-    *("photos", "fine_tuning", "compare", "folds", "seeds", "checkpoint"),
-    *("study", "study_levels", "study_max_rows"),
+    *("photos", "fine_tuning", "compare", "conditions", "folds", "seeds", "checkpoint"),
+    *("study", "study_levels", "study_max_rows", "class_map", "unmapped", "trust"),
 )
 """Settings that a stage's config does not have."""
 
@@ -68,7 +71,8 @@ class Stage:
         config: All its settings, resolved, but for where its weights come from.
         weights: Its network: a checkpoint, or the folder of the run that leaves it; None to start
             from scratch.
-        level: Of a study.
+        view: Of a stage that only evaluates on panoramas; "" for the transfer's own.
+        condition: Of the panoramas of such a stage.
     """
 
     name: str
@@ -78,31 +82,37 @@ class Stage:
     command: Literal["train", "evaluate"]
     config: dict[str, Any]
     weights: Path | None
-    level: int | None = None
+    view: str = ""
+    condition: str = ""
 
 
-def plan(
-    config: DictConfig, folder: Path, compared: Mapping[str, Mapping[str, Any]]
-) -> list[Stage]:
+def plan(config: DictConfig, folder: Path, views: Mapping[str, Mapping[str, Any]]) -> list[Stage]:
     """All stages, grouped by fold and seed.
 
     Args:
         config: The composed ``transfer.yaml``; ``checkpoint``, if any, an absolute path.
         folder: The transfer's.
-        compared: Sections ``representation`` of the further representations, by name.
+        views: Changes of settings by the names of the views, see `transfer_views`; in a study all
+            of them, else those besides the transfer's own.
 
     Raises:
         SettingError: A setting of the transfer is invalid.
     """
     if config.study not in (None, STUDY):
         raise SettingError("study", found=repr(config.study), expected=f"{STUDY}, or null")
+    if config.class_map is not None and config.checkpoint is None:
+        raise SettingError(
+            "class_map",
+            found=config.class_map,
+            expected="null for a network that is trained here, on the classes of the data",
+        )
     own_fold = config.data.get("fold")
     if config.folds is not None and own_fold is None:
         raise SettingError("folds", found=config.folds, expected="null: this data has no folds")
-    folds = [own_fold] if config.folds is None else _numbers(config, "folds", 0)
-    seeds = [config.seed] if config.seeds is None else _numbers(config, "seeds", 0)
+    folds = [own_fold] if config.folds is None else numbers(config, "folds", 0)
+    seeds = [config.seed] if config.seeds is None else numbers(config, "seeds", 0)
     planners = [_Planner(config, folder, fold, seed) for fold in folds for seed in seeds]
-    return [stage for p in planners for stage in (p.study() if config.study else p.all(compared))]
+    return [stage for planner in planners for stage in planner.all(views)]
 
 
 class _Planner:
@@ -113,15 +123,32 @@ class _Planner:
         self._folder = (folder if fold is None else folder / f"fold_{fold}") / f"seed_{seed}"
         self._given = config.checkpoint
 
-    def all(self, compared: Mapping[str, Mapping[str, Any]]) -> Iterator[Stage]:
-        settings = self._settings()
-        yield self._first(settings)
-        yield self._stage("S", settings)
-        rows = self._config.representation.get("erp_height")
-        for name, section in compared.items():
-            seen = {**section, **({"erp_height": rows} if "erp_height" in section else {})}
-            yield self._stage(f"S-{name}", self._settings({"representation": seen}))
-        for epochs in _numbers(self._config, "fine_tuning.epochs", 1):
+    def all(self, views: Mapping[str, Mapping[str, Any]]) -> Iterator[Stage]:
+        settings, study = self._settings(), self._config.study
+        if self._has_photos() and not (study and self._given):
+            yield self._stage("P", settings, "evaluate" if self._given else "train")
+        for view, changes in (views if study else {"": {}, **views}).items():
+            for condition, of_data in conditions_of(self._config).items():
+                name = "-".join(filter(None, ("S", view, condition if of_data else "")))
+                stage = self._stage(name, self._settings({**changes, **of_data}))
+                yield replace(stage, view=view, condition=condition)
+        if not study:
+            yield from self._fine_tuned(settings)
+
+    def _has_photos(self) -> bool:
+        if "_target_" in self._config.photos.data:
+            return True
+        if self._given:
+            return False
+        raise SettingError(
+            "data@photos.data",
+            found="none",
+            expected="the photos to train P on: data@photos.data=folder_photos photos.data.root=…",
+            remedy="Or give checkpoint=, a network that was trained on photos.",
+        )
+
+    def _fine_tuned(self, settings: dict[str, Any]) -> Iterator[Stage]:
+        for epochs in numbers(self._config, "fine_tuning.epochs", 1):
             tuned = self._settings({"optimizer": self._slower(settings)})
             tuned["scheduler"] = tuned["fine_tuning"]["scheduler"]
             tuned["trainer"]["max_epochs"] = epochs
@@ -129,22 +156,6 @@ class _Planner:
             tuned["photos"]["data"]["stream"] = 1
             for on in "PS":
                 yield self._stage(f"{on}-FT-{epochs}", tuned, "train")
-
-    def study(self) -> Iterator[Stage]:
-        settings = self._settings()
-        if not self._given:
-            yield self._first(settings)
-        most = self._config.study_max_rows
-        dim = self._config.representation.get("dim")
-        for level in _numbers(self._config, "study_levels", 0):
-            rows = 2 ** (level + 1)
-            changes = {"level": level, "representation.level": level}
-            changes["representation.erp_height"] = rows if most is None else min(rows, most)
-            if dim is not None:  # a side in pixels
-                scale = 2.0 ** (level - self._config.level)
-                changes["representation.dim"] = max(1, round(dim * scale))
-            settings = self._settings(changes)
-            yield self._stage(f"S-level-{level}", settings, level=level)
 
     def _settings(self, changes: Mapping[str, Any] | None = None) -> dict[str, Any]:
         """All settings, resolved after the changes."""
@@ -173,20 +184,19 @@ class _Planner:
             optimizer = optimizer | {"lr": float(f"{before['lr'] / _SLOWER:.12g}")}
         return dict(optimizer)
 
-    def _first(self, settings: dict[str, Any]) -> Stage:
-        return self._stage("P", settings, "evaluate" if self._given else "train")
-
     def _stage(
         self,
         name: str,
         settings: dict[str, Any],
         command: Literal["train", "evaluate"] = "evaluate",
-        level: int | None = None,
     ) -> Stage:
         own = {key: value for key, value in settings.items() if key not in _OF_THE_TRANSFER}
         own |= {"name": f"{settings['name']}/{name}", "init_from": None, "resume": None}
         if name[0] == "P":
             own |= {key: settings["photos"][key] for key in ("data", "representation")}
+        if command == "evaluate":
+            mapping = () if settings["class_map"] is None else ("class_map", "unmapped")
+            own |= {key: settings[key] for key in ("trust", *mapping)}
         weights = Path(self._given) if self._given else self._folder / "P"
         scratch = name == "P" and not self._given
         return Stage(
@@ -197,18 +207,7 @@ class _Planner:
             command=command,
             config=own,
             weights=None if scratch else weights,
-            level=level,
         )
-
-
-def _numbers(config: DictConfig, setting: str, least: int) -> list[int]:
-    found = OmegaConf.select(config, setting)
-    numbers: list[Any] = list(found) if isinstance(found, list | ListConfig) else [None]
-    if not all(type(n) is int and n >= least for n in numbers) or len(set(numbers)) < len(numbers):
-        raise SettingError(
-            setting, found=found, expected=f"a list of different whole numbers from {least}"
-        )
-    return numbers
 
 
 def stage_state(stage: Stage) -> State:
@@ -245,10 +244,10 @@ def stage_state(stage: Stage) -> State:
         )
     weights = stage.weights and _checkpoint_in(stage.weights)
     # A network that was trained again is another one; one that is gone is not missed.
-    if weights is not None and _weights_in(record) != _digest(weights):
+    if weights is not None and _weights_in(record) != _digest(weights, stage.config):
         raise SettingError(
             stage.folder,
-            found=f"stage {stage.name} of another network",
+            found=f"stage {stage.name} of another network, or with another class map",
             expected=f"the one in {weights}",
             remedy=_REMEDY,
         )
@@ -282,7 +281,7 @@ def run_stage(stage: Stage, state: State) -> int:
                 remedy="Delete the stages of this seed to run it all again.",
             )
         config["init_from" if stage.command == "train" else "checkpoint"] = str(weights)
-        digest = _digest(weights)
+        digest = _digest(weights, config)
     stage.folder.mkdir(parents=True, exist_ok=True)
     try:
         with FileLock(stage.folder / ".lock", blocking=False):
@@ -324,6 +323,12 @@ def _weights_in(record: Path) -> Any:
         ) from error
 
 
-def _digest(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "blake2b").hexdigest()[:32]
+def _digest(weights: Path, config: Mapping[str, Any]) -> str:
+    """Of the network's file, and of that of its class map, if it has one."""
+    given = str(config.get("class_map") or "")
+    own_map = [Path(given).expanduser()] if given.lower().endswith(".json") else []
+    hashed = hashlib.blake2b()
+    for path in (weights, *own_map):
+        with path.open("rb") as file:
+            hashed.update(hashlib.file_digest(file, "blake2b").digest())
+    return hashed.hexdigest()[:32]

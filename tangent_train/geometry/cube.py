@@ -36,7 +36,7 @@ _NEIGHBORS.setflags(write=False)
 
 @dataclass(frozen=True, eq=False, init=False)
 class CubeGrid(PinholeGrid):
-    """The six faces of a cube around the centre, pinhole images of 90°.
+    """The six faces of a cube around the centre, pinhole images of 90°, or more with a margin.
 
     In this order: front (+x, the middle of the panorama), right (+y), back (−x), left (−y), up (+z)
     and down (−z). The first four stand upright. Up and down are the front camera tilted up and
@@ -45,13 +45,15 @@ class CubeGrid(PinholeGrid):
 
     The outer *edges* of the outermost pixels meet those of the neighbours: d pixels span the 90°,
     the pitch is ``p = 2/d`` and the outermost pixel centres are half a pixel inside. The images do
-    not overlap; what a face owns reaches half a pixel beyond its outermost pixel centres.
+    not overlap; what a face owns reaches half a pixel beyond its outermost pixel centres. With a
+    margin m on every side, d − 2m pixels span the 90°, and the images overlap.
     `fov_deg`, between pixel centres as everywhere, is a little less than the 70.5° between adjacent
     corners of the cube.
 
     Args:
         dim: Side d in pixels, 2 or more; 2^s is 90° of a panorama of level s.
         rotation: ``(3, 3)`` proper rotation R of the whole cube: directions become R·d.
+        margin: Pixels beyond the 90° on every side.
 
     Raises:
         SettingError: The side is too small or no whole number, or the rotation is none.
@@ -63,11 +65,11 @@ class CubeGrid(PinholeGrid):
 
     dim: int
     rotation: NDArray[np.float64] | None
+    margin: int
 
-    def __init__(self, dim: int, rotation: ArrayLike | None = None) -> None:
-        if not isinstance(dim, int | np.integer) or dim < 2:
-            raise SettingError("dim", found=dim, expected="a whole number, 2 or more")
-        object.__setattr__(self, "dim", int(dim))
+    def __init__(self, dim: int, rotation: ArrayLike | None = None, margin: int = 0) -> None:
+        object.__setattr__(self, "margin", _whole("margin", margin, 0))
+        object.__setattr__(self, "dim", _whole("dim", dim, 2 + 2 * self.margin))
         turn = None if rotation is None else checked_rotation(rotation)
         object.__setattr__(self, "rotation", turn)
 
@@ -78,8 +80,8 @@ class CubeGrid(PinholeGrid):
 
     @property
     def pitch(self) -> float:
-        """Distance of neighbouring pixels on the face, in focal lengths: 2/d."""
-        return 2 / self.dim
+        """Distance of neighbouring pixels on the face, in focal lengths: 2/(d − 2m)."""
+        return 2 / (self.dim - 2 * self.margin)
 
     @property
     def neighbors(self) -> NDArray[np.int32]:
@@ -91,8 +93,8 @@ class CubeGrid(PinholeGrid):
 
     @property
     def overlapping(self) -> bool:
-        """False: neighbours meet at their outer edges."""
-        return False
+        """Whether there is a margin; else neighbours meet at their outer edges."""
+        return self.margin > 0
 
     def with_rotation(self, rotation: ArrayLike | None) -> Self:
         """The same cube, rotated by this instead of its own.
@@ -100,10 +102,16 @@ class CubeGrid(PinholeGrid):
         Raises:
             SettingError: The rotation is none.
         """
-        return type(self)(self.dim, rotation)
+        return type(self)(self.dim, rotation, self.margin)
 
     def _resting_axes(self) -> NDArray[np.float64]:
         return _AXES
 
     def _key(self) -> tuple[object, ...]:
-        return (self.dim,)
+        return self.dim, self.margin
+
+
+def _whole(name: str, value: int, least: int) -> int:
+    if not isinstance(value, int | np.integer) or value < least:
+        raise SettingError(name, found=value, expected=f"a whole number, {least} or more")
+    return int(value)

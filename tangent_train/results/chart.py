@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,12 +17,13 @@ from tangent_train.results.rows import Row, Statistic
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["report_png"]
+__all__ = ["grid_png", "report_png"]
 
 _COLORS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#999999")
 """Okabe and Ito's colours, which people with colour blindness can tell apart."""
 
 _LONGEST_LABEL = 60
+_ERROR_BARS = "bars: standard deviation over folds, else over seeds, else 95 % interval over images"
 
 
 def report_png(title: str, rows: Sequence[Row]) -> bytes:
@@ -42,11 +43,9 @@ def report_png(title: str, rows: Sequence[Row]) -> bytes:
     banded = [row for row in rows if row.bands]
     panels = 2 + bool(banded)
     width = max(10.0, 0.12 * len(names) * len(rows))
-    figure = Figure(figsize=(width, 3.6 * panels + 0.2 * len(rows)), dpi=120, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = _figure(width, 3.6 * panels + 0.2 * len(rows))
     means, classes, *latitude = figure.subplots(panels, 1)
-    bars = "standard deviation over folds, else over seeds, else 95 % interval over images"
-    means.set_title(f"{title} (bars: {bars})", loc="left")
+    means.set_title(f"{title} ({_ERROR_BARS})", loc="left")
     _bars(
         means, rows, list(scores.means.values()), [[r.score(n) for n in scores.means] for r in rows]
     )
@@ -55,7 +54,39 @@ def report_png(title: str, rows: Sequence[Row]) -> bytes:
     for axes in latitude:
         axes.set_title("mIoU by latitude", loc="left")
         _band_lines(axes, banded)
-    handles, labels = means.get_legend_handles_labels()
+    return _png(figure, means)
+
+
+def grid_png(title: str, grid: Mapping[str, Mapping[str, Row]], score: str) -> bytes:
+    """Bars of one score of every view, in groups of one condition.
+
+    Args:
+        title: Of the chart.
+        grid: Rows by view and condition.
+        score: Over all classes.
+
+    Returns:
+        A PNG file.
+    """
+    conditions = list(dict.fromkeys(c for found in grid.values() for c in found))
+    figure = _figure(max(10.0, 0.2 * len(conditions) * len(grid)), 4.2 + 0.12 * len(grid))
+    axes = figure.subplots()
+    axes.set_title(f"{title} ({_ERROR_BARS})", loc="left")
+    nothing = Row("", ())
+    scores = [[found.get(c, nothing).score(score) for c in conditions] for found in grid.values()]
+    _bars(axes, [Row(view, ()) for view in grid], conditions, scores)
+    return _png(figure, axes)
+
+
+def _figure(width: float, height: float) -> Figure:
+    figure = Figure(figsize=(width, height), dpi=120, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _png(figure: Figure, axes: Axes) -> bytes:
+    """The figure with a legend of the bars."""
+    handles, labels = axes.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper left", frameon=False, ncols=2)
     for text in figure.findobj(Text):
         text.set_parse_math(False)  # "$" in a name is no formula
@@ -70,13 +101,15 @@ def _bars(
     width = 0.8 / len(rows)
     names = list(dict.fromkeys(row.label.removesuffix(" (paper)") for row in rows))
     for k, (row, found) in enumerate(zip(rows, scores, strict=True)):
+        number = names.index(row.label.removesuffix(" (paper)"))
+        again = number >= len(_COLORS)  # a second row of a colour
         axes.bar(
             np.arange(len(ticks)) + (k - (len(rows) - 1) / 2) * width,
             _percents([score.mean for score in found]),
             0.92 * width,
             yerr=np.transpose([_error_bar(score) for score in found]),
-            color=_COLORS[names.index(row.label.removesuffix(" (paper)")) % len(_COLORS)],
-            hatch="//" if row.published else "",
+            color=_COLORS[number % len(_COLORS)],
+            hatch="//" if row.published else "xx" if again else "",
             label=_short(row.label),
             error_kw={"elinewidth": 1.2, "capsize": min(4.0, 14 * width), "ecolor": "#333333"},
         )

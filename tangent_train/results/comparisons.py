@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from tangent_train.results.paper import published
 from tangent_train.results.record import Record
-from tangent_train.results.report import Report
+from tangent_train.results.report import Cell, Report
 from tangent_train.results.rows import Row, check_alike, group_runs
 
 __all__ = ["levels_report", "runs_report", "transfer_report"]
@@ -48,12 +48,15 @@ def _repeated(rows: Sequence[Row]) -> Iterator[str]:
             seen.add((record.fold, record.seed))
 
 
-def transfer_report(stages: Mapping[str, Sequence[Record]]) -> Report:
+def transfer_report(
+    stages: Mapping[str, Sequence[Record]], cells: Mapping[str, Cell] | None = None
+) -> Report:
     """The report of a transfer from photos to panoramas, beside the paper's.
 
     Args:
         stages: Evaluations by the names of their stages: S, S-erp and S-FT-10, tested on panoramas,
             are compared with P and P-FT-10, tested on photos, after as much fine-tuning.
+        cells: View and condition of stages that evaluate one network.
     """
     records = [record for found in stages.values() for record in found]
     check_alike(records)
@@ -62,7 +65,8 @@ def transfer_report(stages: Mapping[str, Sequence[Record]]) -> Report:
     rows += published(panoramas, transfer=True)
     by_name = {row.label: row for row in rows}
     rows = [replace(row, partner=by_name.get(_photos_of(row.label))) for row in rows]
-    return Report("Transfer from photos to panoramas", rows, (), _CHANGE_OF_STAGES)
+    compared = _CHANGE_OF_STAGES if any(row.partner for row in rows) else ""
+    return Report("Transfer from photos to panoramas", rows, (), compared, cells or {})
 
 
 def _photos_of(stage: str) -> str:

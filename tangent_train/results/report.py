@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from datamodules.stanford2d3ds.files import FOLDS
 from tangent_train.csv_text import csv_text
 from tangent_train.files import write_bytes, write_text
-from tangent_train.results.chart import report_png
+from tangent_train.results.chart import grid_png, report_png
 from tangent_train.results.record import SCORES, Band
 from tangent_train.results.rows import Row, Statistic
 from tangent_train.results.tables import Table, percent
 
-__all__ = ["Report"]
+__all__ = ["Cell", "Report"]
+
+Cell = tuple[str, str]
+"""View and condition: row and column of the first table."""
+
+_OF_CELLS = "miou_solid_angle"
 
 _LEGEND = (
     "Percent. Mean over folds of the mean over seeds; ± the sample standard deviation over folds, "
@@ -35,12 +40,25 @@ class Report:
         rows: Evaluations, and published figures.
         notes: Sentences about the rows.
         compared: Explains the column "change"; empty without one.
+        cells: Cells of rows, by label, of a first table and the chart; with a single condition
+            there is no such table.
     """
 
     title: str
     rows: Sequence[Row]
     notes: Sequence[str] = ()
     compared: str = ""
+    cells: Mapping[str, Cell] = field(default_factory=dict)
+
+    @property
+    def grid(self) -> dict[str, dict[str, Row]]:
+        """Rows by view and condition; empty with a single condition."""
+        grid: dict[str, dict[str, Row]] = defaultdict(dict)
+        for row in self.rows:
+            if row.label in self.cells:
+                view, condition = self.cells[row.label]
+                grid[view][condition] = row
+        return grid if any(len(found) > 1 for found in grid.values()) else {}
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -53,20 +71,34 @@ class Report:
         return self.rows[0].records[0].kind
 
     def tables(self) -> list[Table]:
-        """All classes, every class, and latitude bands."""
+        """Views in conditions, all classes, every class, and latitude bands."""
         banded = [row for row in self.rows if row.bands]
-        tables = [self._overall(), *self._per_class()]
+        tables = [*self._views(), self._overall(), *self._per_class()]
         if banded:
+            bands = banded[0].bands
             rows = [
-                (
-                    f"{band[0]:g}° … {band[1]:g}°",
-                    *(percent(row.score("miou", band).mean) for row in banded),
-                )
-                for band in banded[0].bands
+                (row.label, *(percent(row.score("miou", band).mean) for band in bands))
+                for row in banded
             ]
-            header = ("latitude", *(row.label for row in banded))
+            header = ("", *(f"{south:g}° … {north:g}°" for south, north in bands))
             tables.append(Table("mIoU % by latitude", header, rows))
         return tables
+
+    def _views(self) -> Iterator[Table]:
+        if not self.grid:
+            return
+        conditions = list(dict.fromkeys(c for found in self.grid.values() for c in found))
+        nothing = Row("", ())
+        rows = [
+            (view, *(_cell(found.get(c, nothing).score(_OF_CELLS), 0) for c in conditions))
+            for view, found in self.grid.items()
+        ]
+        note = f"{_LEGEND} {_LEGEND_OF_INTERVALS}"
+        yield Table(f"{self._title_of_cells} %", ("", *conditions), rows, note)
+
+    @property
+    def _title_of_cells(self) -> str:
+        return f"{self.title}: {SCORES[self.kind].means[_OF_CELLS]}"
 
     def _overall(self) -> Table:
         scores = SCORES[self.kind].means
@@ -128,7 +160,11 @@ class Report:
         figures = list(self.figures())
         columns = list(dict.fromkeys(key for figure in figures for key in figure))
         write_text(folder / f"{name}.csv", csv_text(columns, figures))
-        write_bytes(folder / f"{name}.png", report_png(self.title, self.rows))
+        if self.grid:
+            png = grid_png(self._title_of_cells, self.grid, _OF_CELLS)
+        else:
+            png = report_png(self.title, self.rows)
+        write_bytes(folder / f"{name}.png", png)
 
     def figures(self) -> Iterator[dict[str, Any]]:
         """A line per row, fold ("mean" over all), class or band, and score; shares of 1."""

@@ -12,10 +12,12 @@ import torch
 from filelock import FileLock
 from omegaconf import OmegaConf
 
+from datamodules.core.inputs import RGB_NORMALIZATION
 from tangent_train.cli import transfer, transfer_stages
 from tangent_train.errors import DataError, SettingError
 from tangent_train.results import report
 from tests.cli.pretended_runs import HERE, OF_SEED_0, PretendedRuns, run_transfer
+from tests.inference.trained import write_checkpoint
 
 STAGES = ["P", "S", "S-erp", "S-cubemap", "P-FT-1", "S-FT-1"]
 REFUSED = (DataError, SettingError)
@@ -29,7 +31,7 @@ def runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> PretendedRuns:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(transfer_stages, "run_process", pretended)
     # Tested by itself, and slow.
-    monkeypatch.setattr(transfer, "_check_data", lambda _: None)
+    monkeypatch.setattr(transfer, "_check_data", lambda *_: None)
     monkeypatch.setattr(report, "report_png", lambda *_: b"a picture")
     return pretended
 
@@ -123,12 +125,50 @@ def test_stages_of_a_network_that_was_trained_again_are_refused(runs: PretendedR
     record.write_text(before)
     network = OF_SEED_0 / "P" / "checkpoints" / "last.ckpt"
     network.write_text("another network, longer")
-    with pytest.raises(REFUSED, match=r"seed_0/S: found stage S of another network; expected"):
+    with pytest.raises(REFUSED, match=r"seed_0/S: found stage S of another network, or"):
         run_transfer(*SHORT)
     network.unlink()  # to save space: what was found stays found
     run_transfer(*SHORT)
     with pytest.raises(REFUSED, match=r"seed_0/P: found no checkpoints/best\.ckpt or last"):
         run_transfer("compare=[erp]", "fine_tuning.epochs=[]")
+
+
+def test_a_network_that_knows_no_run_is_only_evaluated(runs: PretendedRuns, tmp_path: Path) -> None:
+    network = write_checkpoint(tmp_path / "photo.ckpt")
+    class_map = tmp_path / "map.json"
+    class_map.write_text('{"classes": {"floor": ["dark"]}}')
+    wide = "{name: wide, level: 3, blend: feather}"
+    arguments = (
+        *(f"checkpoint={network}", f"class_map={class_map}", f"compare=[erp,{wide}]"),
+        "conditions=[upright,{name: tilted, test_rotation: 30}]",
+        *("unmapped=never", "representation.erp_height=20"),
+    )
+    run_transfer(*arguments)
+    views = ("S", "S-tilted", "S-erp", "S-erp-tilted", "S-wide", "S-wide-tilted")
+    assert runs.started == [("evaluate", name) for name in ("P", *views)]
+    for (_, name), config in zip(runs.started, runs.configs, strict=True):
+        assert (config.checkpoint, config.network) == (str(network), None)
+        assert (config.class_map, config.unmapped) == (str(class_map), "never")
+        assert config.data.inputs == ["rgb"]
+        assert tuple(config.data.normalization.mean) == RGB_NORMALIZATION.mean
+        assert config.level == config.representation.level == (3 if "wide" in name else 4)
+        if name != "P":
+            assert config.representation.erp_height == 20
+    first, *lines = (HERE / "transfer.md").read_text().splitlines()
+    assert first == "# Transfer from photos to panoramas: mIoU by solid angle %"
+    grid = [line.strip("| ").split(" | ")[0] for line in lines[1:6]]
+    assert grid == ["upright", "---", "S", "erp", "wide"]
+
+    runs.started.clear()
+    (OF_SEED_0 / "S-erp-tilted" / "results.json").unlink()
+    run_transfer(*arguments)
+    assert runs.started == [("evaluate", "S-erp-tilted")]
+    class_map.write_text('{"classes": {"floor": ["bright"]}}')
+    with pytest.raises(REFUSED, match=r"seed_0/P: found stage P of another .* class map; expected"):
+        run_transfer(*arguments)
+    for typed in ("optimizer.lr=1", "network.widths=[4]", "fine_tuning.epochs=[1]"):
+        with pytest.raises(REFUSED, match=f"{typed.split('=')[0]}=.*a setting of training beside"):
+            run_transfer(*arguments, typed)
 
 
 def test_two_commands_never_run_the_same_stage(runs: PretendedRuns) -> None:

@@ -7,11 +7,16 @@ from typing import Any
 
 import pytest
 from hydra import initialize_config_dir
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from tangent_train.cli.compose import compose_option, config_folder
+from tangent_train.cli.compose import config_folder
 from tangent_train.cli.transfer_stages import Stage, plan
+from tangent_train.cli.transfer_views import views_of
 from tangent_train.errors import SettingError
+from tangent_train.inference.views import check_size
+from tangent_train.registry import make
+from tests.inference.trained import trained_network
 from tests.running import composed
 
 FOLDER = Path("/runs/mine")
@@ -26,21 +31,23 @@ def rooms() -> DictConfig:
     return composed("transfer", "experiment=rooms/transfer", *fixed, *rates, *epochs)
 
 
-@pytest.fixture(scope="module")
-def compared() -> dict[str, dict[str, Any]]:
-    with initialize_config_dir(str(config_folder()), version_base="1.3"):
-        return {name: compose_option("representation", name) for name in ("erp", "cubemap")}
+@pytest.fixture(autouse=True, scope="module")
+def _hydra() -> Any:
+    """What a command finds of Hydra, with the default options."""
+    HydraConfig.instance().set_config(composed("transfer", return_hydra_config=True))
 
 
-def _stages(config: DictConfig, compared: Any = (), **settings: Any) -> dict[str, Stage]:
+def _stages(config: DictConfig, trained: Any = None, **settings: Any) -> dict[str, Stage]:
     config = config.copy()
     for name, value in settings.items():
         OmegaConf.update(config, name.replace("__", "."), value, force_add=True)
-    return {stage.name: stage for stage in plan(config, FOLDER, dict(compared))}
+    with initialize_config_dir(str(config_folder()), version_base="1.3"):
+        views = views_of(config, trained)
+    return {stage.name: stage for stage in plan(config, FOLDER, views)}
 
 
-def test_the_stages_in_their_order(rooms: DictConfig, compared: dict[str, Any]) -> None:
-    stages = _stages(rooms, compared, folds=[2]).values()
+def test_the_stages_in_their_order(rooms: DictConfig) -> None:
+    stages = _stages(rooms, folds=[2]).values()
     assert [(s.name, s.command, s.weights and s.weights.name) for s in stages] == [
         ("P", "train", None),
         ("S", "evaluate", "P"),
@@ -55,7 +62,7 @@ def test_the_stages_in_their_order(rooms: DictConfig, compared: dict[str, Any]) 
     ordinary = set(composed("train")) - {"sweep", "launcher", "trust"}
     for stage in stages:
         config, photos = stage.config, stage.name[0] == "P"
-        assert set(config) == ordinary
+        assert set(config) == ordinary | ({"trust"} if stage.command == "evaluate" else set())
         assert (config["seed"], config["data"]["seed"], config["data"]["fold"]) == (3, 3, 2)
         assert config["name"] == f"rooms/transfer/{stage.name}"
         assert config["data"]["_target_"].endswith("Perspective") == photos
@@ -83,21 +90,90 @@ def test_fine_tuning_with_an_optimizer_of_its_own(rooms: DictConfig) -> None:
     assert tuned["optimizer"] == {**own, "lr": 3e-3}, "AdamW's settings are not SGD's"
 
 
-def test_other_representations_get_the_same_panoramas(
-    rooms: DictConfig, compared: dict[str, Any]
-) -> None:
-    stages = _stages(rooms, compared, representation__erp_height=200)
-    for name in ("S-erp", "S-cubemap"):
-        assert stages[name].config["representation"]["erp_height"] == 200
-        assert stages[name].config["representation"]["level"] == 7
-    assert "base_level" not in stages["S-erp"].config["representation"]
+def _seen(stages: dict[str, Stage], name: str, *settings: str) -> list[Any]:
+    section = stages[name].config["representation"]
+    return [section["_target_"].rpartition(".")[2][:4], *(section.get(n) for n in settings)]
+
+
+def test_all_views_see_the_same_panoramas(rooms: DictConfig) -> None:
+    views: Any = [
+        "erp",
+        {"name": "fine", "option": "erp", "rows": 400},
+        {"name": "cube", "option": "cubemap", "dim": "${level}"},
+        {"name": "wide", "level": 6, "base_level": 0, "blend": "feather"},
+    ]
+    stages = _stages(rooms, compare=views, representation__erp_height=200)
+    assert _seen(stages, "S-erp", "level", "rows", "base_level") == ["Equi", 7, None, None]
+    assert _seen(stages, "S-fine", "level", "rows") == ["Equi", 7, 400]
+    assert _seen(stages, "S-cube", "level", "dim") == ["Cube", 7, 7]
+    assert _seen(stages, "S-wide", "level", "base_level", "blend") == ["Tang", 6, 0, "feather"]
+    assert [stages[f"S-{name}"].config["level"] for name in ("fine", "wide")] == [7, 6]
+    rows = {s.config["representation"].get("erp_height") for n, s in stages.items() if n[0] == "S"}
+    assert rows == {200}
+    coarse = _stages(rooms, compare=views, representation__dim=60)
+    assert _seen(coarse, "S-wide", "dim", "erp_height") == ["Tang", 30, 256], "those of level 7"
+
+
+def test_views_of_a_network_that_takes_images_of_one_size(rooms: DictConfig) -> None:
+    own = {"_target_": "tangent_train.rendering.TangentRepresentation"}
+    trained = trained_network(own | {"base_level": 1, "level": 7, "dim": 64}, fixed_size=(64, 64))
+    views: Any = [
+        {"name": "same", "blend": "feather"},
+        {"name": "wide", "level": 5},
+        {"name": "large", "base_level": 0},
+    ]
+    given = {"checkpoint": "/net.onnx", "representation": trained.representation}
+    stages = _stages(rooms, trained, compare=views, **given, fine_tuning__epochs=[])
+    assert _seen(stages, "S-same", "level", "base_level", "dim") == ["Tang", 7, 1, 64]
+    assert _seen(stages, "S-wide", "level", "base_level", "dim") == ["Tang", 5, 0, 64]
+    assert _seen(stages, "S-large", "level", "base_level", "dim") == ["Tang", 7, 0, 128]
+
+
+def test_every_view_is_evaluated_in_every_condition(rooms: DictConfig) -> None:
+    conditions: Any = [
+        "upright",
+        {"name": "tilted", "test_rotation": 30, "upright": "auto"},
+        {"name": "other", "root": "elsewhere"},
+    ]
+    stages = _stages(rooms, conditions=conditions, compare=["erp"], fine_tuning__epochs=[1])
+    views, names = ("", "erp"), ("", "tilted", "other")
+    expected = ["-".join(filter(None, ("S", view, name))) for view in views for name in names]
+    assert list(stages) == ["P", *expected, "P-FT-1", "S-FT-1"]
+    assert [(s.view, s.condition) for n, s in stages.items() if n.startswith("S-erp")] == [
+        ("erp", name) for name in ("upright", "tilted", "other")
+    ]
+    for name in ("S-tilted", "S-erp-tilted"):
+        data = stages[name].config["data"]
+        assert (data["test_rotation"], data["upright"], data["seed"]) == (30, "auto", 3)
+    assert stages["S-erp-other"].config["data"]["root"] == "elsewhere"
+    assert stages["S-FT-1"].config["data"].get("test_rotation") is None
+
+
+def test_photos_are_needed_to_train_on_but_not_to_test_a_given_network() -> None:
+    without = composed("transfer", "fine_tuning.epochs=[]", "compare=[]")
+    with pytest.raises(SettingError, match=r"data@photos\.data: found none; .*checkpoint="):
+        _stages(without)
+    assert list(_stages(without, checkpoint="/p.ckpt")) == ["S"]
+
+
+def test_the_plan_for_networks_of_photos() -> None:
+    config = composed("transfer", "experiment=zero_shot", "checkpoint=/net.onnx")
+    own = {"_target_": "tangent_train.rendering.TangentRepresentation", "erp_height": 1024}
+    size = {"base_level": 1, "level": 10, "dim": 512}
+    trained = trained_network(own | size, fixed_size=(512, 512))
+    stages = _stages(config, trained, representation=own | size)
+    assert len(stages) == (1 + len(config.compare)) * len(config.conditions)
+    for stage in stages.values():
+        made = make(stage.config["representation"], "representation")
+        assert made.erp_height == 1024
+        check_size(trained, made.image_size)
 
 
 def test_the_study_has_a_stage_for_every_level(rooms: DictConfig) -> None:
     study: Any = {"study": "angular_resolution", "study_levels": [5, 7, 9]}
     stages = _stages(rooms, **study, representation__dim=60)
-    assert [(s.name, s.level) for s in stages.values()] == [
-        *(("P", None), ("S-level-5", 5), ("S-level-7", 7), ("S-level-9", 9))
+    assert [(s.name, s.view) for s in stages.values()] == [
+        *(("P", ""), ("S-level-5", "level-5"), ("S-level-7", "level-7"), ("S-level-9", "level-9"))
     ]
     seen = [stage.config["representation"] for stage in stages.values()][1:]
     assert [r["level"] for r in seen] == [5, 7, 9]
@@ -135,6 +211,13 @@ def test_data_without_folds() -> None:
         ("folds", [1.5]),
         ("seeds", [-1]),
         ("study", "everything"),
+        ("compare", "erp"),
+        ("compare", ["erp", "erp"]),
+        ("compare", [{"option": "erp"}]),
+        ("compare", ["../erp"]),
+        ("conditions", []),
+        ("conditions", [3]),
+        ("class_map", "my_map.json"),
     ],
 )
 def test_impossible_settings(rooms: DictConfig, setting: str, value: Any) -> None:

@@ -49,7 +49,22 @@ def test_every_direction_is_seen_by_its_owner_alone(
     np.testing.assert_array_equal(grid.owners(directions), largest)
 
 
-@pytest.mark.parametrize("grid", [CubeGrid(5, ROTATION.T), TangentGrid(0, 4, 20, ROTATION.T)])
+def test_a_margin_shows_what_is_beyond_the_face() -> None:
+    plain, wide = CubeGrid(8, ROTATION), CubeGrid(14, ROTATION, margin=3)
+    np.testing.assert_allclose(
+        wide.directions()[:, 3:-3, 3:-3], plain.directions(), rtol=0, atol=1e-14
+    )
+    assert (wide.pitch, wide.overlapping, plain.overlapping) == (plain.pitch, True, False)
+    directions = random_directions(500)
+    np.testing.assert_array_equal(wide.owners(directions), plain.owners(directions))
+    for margin in (-1, 7, 0.5):
+        with pytest.raises(SettingError, match=r"margin: found|dim: found 14; expected .* 16 or"):
+            CubeGrid(14, margin=margin)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "grid", [CubeGrid(5, ROTATION.T), CubeGrid(9, ROTATION.T, 2), TangentGrid(0, 4, 20, ROTATION.T)]
+)
 def test_a_rotation_replaces_the_grids_own(grid: CubeGrid | TangentGrid) -> None:
     rotated = grid.with_rotation(ROTATION)
     assert type(rotated) is type(grid)

@@ -62,6 +62,7 @@ def test_grids_are_values() -> None:
         CubeGrid(32),
         CubeGrid(33),
         CubeGrid(32, ROTATION),
+        CubeGrid(32, margin=1),
     ]
     assert len(set(different)) == len({hash(grid) for grid in different}) == len(different)
     for grid in different:

@@ -123,7 +123,7 @@ def test_all_files_hold_the_same_scores(tmp_path: Path) -> None:
     text = (tmp_path / "x.md").read_text()
     assert text.startswith("# Report\n")
     assert r"| a\|b [red] | 10.0 | 40.0 | – |" in text
-    assert "| 45° … 90° | 60.0 |" in text
+    assert "| mine | 60.0 | 20.0 |" in text
     assert "| mine | 2 | 0 | /runs/2_0 |" in text
 
 

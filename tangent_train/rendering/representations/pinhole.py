@@ -24,7 +24,7 @@ from tangent_train.geometry import (
 )
 from tangent_train.registry import registered
 from tangent_train.rendering.backward import Blend, tangent_to_labels
-from tangent_train.rendering.checks import check_choice
+from tangent_train.rendering.checks import check_blend, check_choice
 from tangent_train.rendering.mosaic import ScoreMosaic
 from tangent_train.rendering.representations.views import (
     ManyViews,
@@ -208,13 +208,15 @@ class TangentRepresentation(PinholeRepresentation):
 class CubemapRepresentation(PinholeRepresentation):
     """Cube-map baseline: the six faces of a cube.
 
-    Training and evaluation use all six. They do not overlap, so every pixel of the panorama takes
-    the scores of a single face.
+    Training and evaluation use all six. Without a margin they do not overlap, and every pixel of
+    the panorama takes the scores of a single face.
 
     Args:
         level: Level s of the panorama.
         dim: Side of the faces in pixels, default 2^s: 90° over as many pixels as on the
             panorama's equator.
+        margin: Pixels of a face beyond its 90° on every side, which show its surroundings.
+        blend: Blending of faces with a margin, see `TangentRepresentation`.
         rotation: Rotation of the cube while training.
         mirror: Mirror half of the training samples left to right, every face by itself.
         erp_height: Rows of the panorama, default `equirect_shape(level)`.
@@ -232,10 +234,13 @@ class CubemapRepresentation(PinholeRepresentation):
         rotation: RotationAugmentation = "none",
         mirror: bool = False,
         erp_height: int | None = None,
+        margin: int = 0,
+        blend: Blend = "nearest",
     ) -> None:
         quarter = equirect_shape(level)[1] // 4
-        grid = CubeGrid(quarter if dim is None else dim)
-        super().__init__(grid, level, rotation, mirror, erp_height)
+        grid = CubeGrid(quarter + 2 * margin if dim is None else dim, margin=margin)
+        check_blend(blend, grid)
+        super().__init__(grid, level, rotation, mirror, erp_height, blend)
 
 
 def turns(count: int, setting: str) -> list[NDArray[np.float64]]:

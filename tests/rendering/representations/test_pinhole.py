@@ -46,6 +46,7 @@ REPRESENTATIONS: list[Representation] = [
     TangentRepresentation(0, 5, crop_multiple=8, rotation="so3", mirror=True),
     CubemapRepresentation(5),
     CubemapRepresentation(5, dim=41, rotation="so3", mirror=True),
+    CubemapRepresentation(5, margin=7, blend="feather"),
     EquirectRepresentation(5),
     EquirectRepresentation(5, crop_deg=90, rotation="yaw", mirror=True),
     EquirectRepresentation(5, rows=100),

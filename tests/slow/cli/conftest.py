@@ -1,5 +1,5 @@
 """The same finished run as in `tests.cli`."""
 
-from tests.cli.conftest import rooms, run_folder
+from tests.cli.conftest import rooms, run, run_folder
 
-__all__ = ["rooms", "run_folder"]
+__all__ = ["rooms", "run", "run_folder"]

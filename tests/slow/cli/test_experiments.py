@@ -25,7 +25,7 @@ FOUND = sorted(
     path.relative_to(FOLDER).with_suffix("").as_posix() for path in FOLDER.rglob("*.yaml")
 )
 TRANSFERS = [name for name in FOUND if Path(name).name.startswith("transfer")]
-EXPERIMENTS = [name for name in FOUND if name not in TRANSFERS]
+EXPERIMENTS = [name for name in FOUND if name not in (*TRANSFERS, "zero_shot")]
 AREAS = ("1", "2", "3", "4", "5a", "5b", "6")
 ROWS = 32
 

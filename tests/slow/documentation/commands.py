@@ -55,6 +55,7 @@ SMALL: dict[str, Any] = {
     "photos.data.photos_per_step": 2,
     "photos.data.num_workers": 0,
     "compare": "[]",
+    "conditions": "[upright]",
     "fine_tuning.epochs": "[]",
     "seeds": "[0]",
     "folds": "[1]",
@@ -166,6 +167,8 @@ def small(words: list[str], world: Path) -> list[str]:
     search = ",".join(f"file://{folder}" for folder in folders)
     found = composed(config, *own, f"hydra.searchpath=[{search}]")
     known = {n: v for n, v in SMALL.items() if OmegaConf.select(found, n) is not None}
+    if "experiment=zero_shot" in given:  # which has no training, and says so
+        known = {n: v for n, v in known.items() if not n.startswith(("fine_tuning", "network"))}
     if program == "tangent-evaluate":
         known = {n: v for n, v in known.items() if n.startswith(("data.rooms", "representation."))}
     return [f"{name}={value}" for name, value in known.items()]

@@ -1,0 +1,142 @@
+"""What a transfer evaluates its network on: views of the panoramas, in several conditions.
+
+Both are lists of the user's own settings with names: ``compare`` of the representation,
+``conditions`` of the data. Every view is evaluated in every condition, always on the same
+panoramas, rotated alike.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Any
+
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import ListConfig, OmegaConf
+
+from tangent_train.cli.compose import compose_option
+from tangent_train.errors import SettingError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from omegaconf import DictConfig
+
+    from tangent_train.checkpoints.trained import TrainedNetwork
+
+__all__ = ["conditions_of", "numbers", "views_of"]
+
+_NAME = re.compile(r"\w[\w.+-]*")
+"""It becomes part of a folder's name."""
+
+
+def views_of(config: DictConfig, trained: TrainedNetwork | None) -> dict[str, dict[str, Any]]:
+    """The views by name, each as changes of settings: those of ``compare``, or of the study.
+
+    A view is an option of ``representation`` (a name alone, or ``option``) or, without one, the
+    transfer's own, with the other settings changed. ``level`` is also that of the stage.
+
+    Args:
+        config: The composed ``transfer.yaml``.
+        trained: The given network, if its file knows no run.
+
+    Raises:
+        SettingError: The list is invalid.
+    """
+    if config.study is not None:
+        most = config.study_max_rows
+        levels = {n: 2 ** (n + 1) for n in numbers(config, "study_levels", 0)}
+        rows = {n: own if most is None else min(own, most) for n, own in levels.items()}
+        return {f"level-{n}": _view(config, trained, level=n, erp_height=rows[n]) for n in levels}
+    own = HydraConfig.get().runtime.choices.get("representation")
+    views = {}
+    for name, given in _named(config, "compare").items():
+        if given or name != own:
+            settings = given or {"option": name}
+            views[name] = _view(config, trained, **settings)
+    return views
+
+
+def conditions_of(config: DictConfig) -> dict[str, dict[str, Any]]:
+    """The conditions of the test panoramas by name, each as changes of settings.
+
+    Args:
+        config: The composed ``transfer.yaml``.
+
+    Raises:
+        SettingError: The list is invalid.
+    """
+    found = _named(config, "conditions")
+    if not found:
+        raise SettingError("conditions", found="[]", expected="one or more: [upright]")
+    return {name: {f"data.{n}": v for n, v in given.items()} for name, given in found.items()}
+
+
+def numbers(config: DictConfig, setting: str, least: int) -> list[int]:
+    """The different whole numbers of a list.
+
+    Args:
+        config: The composed ``transfer.yaml``.
+        setting: The list, ``section.setting``.
+        least: The smallest that is allowed.
+
+    Raises:
+        SettingError: It holds something else.
+    """
+    found = OmegaConf.select(config, setting)
+    numbers: list[Any] = list(found) if isinstance(found, list | ListConfig) else [None]
+    if not all(type(n) is int and n >= least for n in numbers) or len(set(numbers)) < len(numbers):
+        raise SettingError(
+            setting, found=found, expected=f"a list of different whole numbers from {least}"
+        )
+    return numbers
+
+
+def _view(
+    config: DictConfig, trained: TrainedNetwork | None, option: str | None = None, **given: Any
+) -> dict[str, Any]:
+    level = given.get("level")
+    own: Any = OmegaConf.to_container(config.representation)
+    if option is not None:
+        search = [s for s in HydraConfig.get().overrides.hydra if s.startswith("hydra.searchpath")]
+        section = compose_option("representation", option, search)
+    elif trained is not None and {"level", "base_level"} & given.keys():
+        section = _of_network(own, trained, level, given.get("base_level"))
+    else:
+        section = own
+        dim = config.representation.get("dim")
+        if level is not None and dim is not None:  # a side in pixels
+            section["dim"] = max(1, round(dim * 2.0 ** (level - config.level)))
+    rows = config.representation.get("erp_height")
+    if rows is None and level is not None:
+        rows = 2 ** (config.level + 1)
+    section |= ({} if rows is None else {"erp_height": rows}) | given
+    return {"representation": section} | ({} if level is None else {"level": level})
+
+
+def _of_network(
+    own: Mapping[str, Any], trained: TrainedNetwork, level: int | None, base_level: int | None
+) -> dict[str, Any]:
+    """Tangent images for a network that takes those of a size."""
+    from tangent_train.inference.views import panorama_settings
+
+    section = panorama_settings(trained, level, base_level)
+    return {**own, **section} if own["_target_"] == section["_target_"] else section
+
+
+def _named(config: DictConfig, setting: str) -> dict[str, dict[str, Any]]:
+    """The settings in a list, by their names."""
+    found = config[setting]
+    entries: Any = OmegaConf.to_container(found) if isinstance(found, ListConfig) else [None]
+    named: dict[str, dict[str, Any]] = {}
+    for entry in entries:
+        given = {"name": entry} if isinstance(entry, str) else entry
+        name = given.get("name") if isinstance(given, dict) else None
+        if not isinstance(name, str) or not _NAME.fullmatch(name) or name in named:
+            raise SettingError(
+                setting,
+                found=entry if isinstance(found, ListConfig) else found,
+                expected="a list of different names, or of settings with such a name: "
+                "[one, {name: another, …}]",
+            )
+        named[name] = {key: value for key, value in given.items() if key != "name"}
+    return named
