@@ -6,6 +6,7 @@ import os
 import shutil
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,21 +21,46 @@ from tangent_train.geometry import equirect_shape
 from tangent_train.rendering import Interpolation, equirect_to_tangent
 from tangent_train.rendering.camera_files import (
     CAMERAS_FILE,
+    RIG_FILE,
     CameraFile,
     read_cameras,
+    read_rig,
     write_cameras,
-    write_colmap,
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     from numpy.typing import NDArray
 
-__all__ = ["read_panorama", "shrink_to_level", "write_tangent_folder"]
+    from datamodules.images.gpano import PanoramaArea
+    from tangent_train.geometry import TangentGrid
 
-_COLMAP = "sparse"
+__all__ = [
+    "face_name",
+    "in_threads",
+    "panorama_area",
+    "read_panorama",
+    "replaced_folder",
+    "shrink_to_level",
+    "write_tangent_folder",
+]
+
 _RESIZABLE = (np.uint8, np.uint16, np.float32, np.float64)
+
+
+def panorama_area(path: Path, size: tuple[int, int]) -> PanoramaArea:
+    """The part of the sphere that an image shows by its tags; arrays have none.
+
+    Args:
+        path: An image or a ``.npy`` file.
+        size: Its rows and columns.
+
+    Raises:
+        DataError: It is neither a whole panorama nor tagged as a part of one.
+    """
+    tagged = path.suffix.lower() in IMAGE_SUFFIXES
+    return area_of(path, size) if tagged else whole_area(path, size)
 
 
 def read_panorama(path: Path, interpolation: Interpolation) -> NDArray[Any]:
@@ -51,9 +77,12 @@ def read_panorama(path: Path, interpolation: Interpolation) -> NDArray[Any]:
         DataError: The file cannot be used.
     """
     image = read_pixels(path, indices=interpolation == "nearest")
-    size = (image.shape[0], image.shape[1])
-    tagged = path.suffix.lower() in IMAGE_SUFFIXES
-    return (area_of(path, size) if tagged else whole_area(path, size)).place(image)
+    return panorama_area(path, (image.shape[0], image.shape[1])).place(image)
+
+
+def face_name(grid: TangentGrid, face: int) -> str:
+    """Name of a tangent image, ``face_007``; names are in the order of the images."""
+    return f"face_{face:0{max(3, len(str(grid.num_images - 1)))}}"
 
 
 def shrink_to_level(image: NDArray[Any], level: int) -> NDArray[Any]:
@@ -84,8 +113,6 @@ def write_tangent_folder(
     cameras: CameraFile,
     interpolation: Interpolation,
     progress: Callable[[float], object],
-    *,
-    colmap: bool,
 ) -> None:
     """Render tangent images to a folder, which appears once complete.
 
@@ -95,40 +122,63 @@ def write_tangent_folder(
         cameras: Content of its ``cameras.json``.
         interpolation: As of `equirect_to_tangent`.
         progress: Called with the share of the images written since its last call.
-        colmap: Whether to write COLMAP's text files too.
 
     Raises:
         SettingError: The panorama cannot be rendered, the files cannot hold its pixels, or the
             folder holds other files.
     """
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = Path(tempfile.mkdtemp(dir=folder.parent, prefix=".partial-"))
 
     def render(face: int, file: str) -> None:
         (pixels,) = equirect_to_tangent(image, cameras.grid, [face], interpolation)
         write_pixels(unfinished / file, pixels)
 
-    pool = ThreadPoolExecutor(os.cpu_count() or 1)
+    with replaced_folder(folder) as unfinished:
+        in_threads(render, progress, cameras.faces, cameras.files)
+        write_cameras(unfinished / CAMERAS_FILE, cameras)
+
+
+@contextmanager
+def replaced_folder(folder: Path) -> Iterator[Path]:
+    """A folder to be filled by the block; it appears once that has succeeded.
+
+    Args:
+        folder: A new one, or one that holds only what an earlier run wrote.
+
+    Raises:
+        SettingError: It holds other files.
+    """
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = Path(tempfile.mkdtemp(dir=folder.parent, prefix=".partial-"))
     try:
         unfinished.chmod(0o755)
-        for _ in pool.map(render, cameras.faces, cameras.files):
-            progress(1 / len(cameras.files))
-        if colmap:
-            write_colmap(unfinished / _COLMAP, cameras)
-        write_cameras(unfinished / CAMERAS_FILE, cameras)
+        yield unfinished
         _remove_earlier(folder)
         unfinished.rename(folder)
     finally:
-        pool.shutdown(cancel_futures=True)
         shutil.rmtree(unfinished, ignore_errors=True)
+
+
+def in_threads(work: Callable[..., None], progress: Callable[[float], object], *of: Any) -> None:
+    """Call a function in threads with the elements of sequences, as `map` does.
+
+    Args:
+        work: The function.
+        progress: Called with the share of the calls done since its last call.
+        of: Sequences, all of one length.
+    """
+    pool = ThreadPoolExecutor(os.cpu_count() or 1)
+    try:
+        for _ in pool.map(work, *of):
+            progress(1 / len(of[0]))
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def _remove_earlier(folder: Path) -> None:
     """Remove a folder that holds only the files of an earlier run."""
     there = {path.relative_to(folder) for path in folder.rglob("*") if not path.is_dir()}
     if there:
-        ours = {Path(CAMERAS_FILE), *map(Path, read_cameras(folder / CAMERAS_FILE).files)}
-        ours |= {Path(_COLMAP, f"{name}.txt") for name in ("cameras", "images", "points3D")}
+        ours = _written(folder)
         if there - ours:
             raise SettingError(
                 "output",
@@ -138,3 +188,11 @@ def _remove_earlier(folder: Path) -> None:
             )
     if folder.exists():
         shutil.rmtree(folder)
+
+
+def _written(folder: Path) -> set[Path]:
+    if (folder / RIG_FILE).is_file():
+        images = read_rig(folder / RIG_FILE).images
+        masks = (Path("masks", f"{image}.png") for image in images)
+        return {Path(RIG_FILE), *(Path("images", image) for image in images), *masks}
+    return {Path(CAMERAS_FILE), *map(Path, read_cameras(folder / CAMERAS_FILE).files)}

@@ -3,36 +3,57 @@
 from __future__ import annotations
 
 import sys
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
 from rich.console import Console
 
+from datamodules.folder.masks import Masks
+from datamodules.images.colmap_project import ColmapProject, flat_names
 from datamodules.images.image_files import image_paths, short_names
-from datamodules.images.pixel_files import LOSSY_SUFFIXES, PIXEL_SUFFIXES, write_pixels
+from datamodules.images.pixel_files import (
+    LOSSY_SUFFIXES,
+    PIXEL_SUFFIXES,
+    read_image_size,
+    write_pixels,
+)
 from datamodules.images.tangent_folders import (
+    face_name,
+    panorama_area,
     read_panorama,
+    replaced_folder,
     shrink_to_level,
     write_tangent_folder,
 )
 from datamodules.images.tangent_results import Kind, TangentResults, result_files
 from tangent_train.cli.each import each
 from tangent_train.cli.settings import typed
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError, SettingError, counted
 from tangent_train.geometry import TangentGrid, nearest_level, random_rotation, rotation_about
-from tangent_train.rendering.camera_files import CAMERAS_FILE, CameraFile, read_cameras
+from tangent_train.keypoints.colmap import panorama_poses
+from tangent_train.rendering.camera_files import (
+    CAMERAS_FILE,
+    RIG_FILE,
+    CameraFile,
+    read_cameras,
+    read_rig,
+    write_poses,
+)
 from tangent_train.rendering.figure import tangent_figure
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
-    _Work = Callable[[Path, Path, Callable[[float], object]], Path]
+    _Work = Callable[[_Item, Path, Callable[[float], object]], Path]
 
 __all__ = ["render"]
+
+_Item = TypeVar("_Item")
 
 
 @dataclass(frozen=True)
@@ -51,8 +72,11 @@ class Settings:
     format: str
     interpolation: Literal["bilinear", "nearest"]
     colmap: bool
+    mask: Path | None
+    mask_classes: tuple[str, ...] | None
     figure: Path | None
     back: Path | None
+    poses: Path | None
     cameras: Path | None
     blend: Literal["feather", "nearest"]
     height: int | None
@@ -71,37 +95,49 @@ def render(config: Mapping[str, Any]) -> None:
         SettingError: A setting is invalid, or a file would be overwritten.
     """
     settings = typed(Settings, config)
-    if (settings.input is None) == (settings.back is None):
+    modes = [name for name in ("input", "back", "poses") if getattr(settings, name) is not None]
+    if len(modes) != 1:
         raise SettingError(
-            "input and back",
-            found="none of them" if settings.input is None else "both",
-            expected="input=<panoramas>, or back=<results for tangent images>",
+            "input, back and poses",
+            found=" and ".join(modes) or "none of them",
+            expected="input=<panoramas>, back=<results for tangent images>, or poses=<COLMAP's>",
         )
-    if settings.output is None and (settings.back or not settings.figure):
+    if settings.output is None and (modes != ["input"] or not settings.figure or settings.colmap):
         raise SettingError("output", found="none", expected="a folder, or with back= a file")
-    work, jobs = _forward(settings) if settings.input is not None else _back(settings)
-    done = [result for _, result, _ in each("Rendering", jobs, work) if result is not None]
-    if done:
-        listed = f"{done[0]}" + (f" and {len(done) - 1} more" if done[1:] else "")
+    if settings.mask is not None and not settings.colmap:
+        raise SettingError("mask", found=settings.mask, expected="none without colmap=true")
+    if settings.poses is not None:
+        _poses(settings, settings.poses)
+    elif settings.colmap:
+        _colmap(settings)
+    else:
+        work, jobs = _forward(settings) if settings.input is not None else _back(settings)
+        done = _each(jobs, work)
+        _tell(done)
+        _exit_if_some_failed(len(jobs) - len(done), len(jobs))
+
+
+def _each(jobs: Mapping[_Item, Path], work: _Work[_Item]) -> list[Path]:
+    """Results of the panoramas that could be rendered."""
+    return [result for _, result, _ in each("Rendering", jobs, work) if result is not None]
+
+
+def _tell(written: Sequence[Path]) -> None:
+    if written:
+        listed = f"{written[0]}" + (f" and {len(written) - 1} more" if written[1:] else "")
         Console(highlight=False).print(f"Written: {listed}", soft_wrap=True, markup=False)
-    if len(done) < len(jobs):
-        failed = f"{len(jobs) - len(done)} of {len(jobs)} panoramas"
-        sys.exit(f"tangent-render: {failed} could not be rendered, see above")
 
 
-def _forward(settings: Settings) -> tuple[_Work, dict[Path, Path]]:
+def _exit_if_some_failed(failed: int, count: int) -> None:
+    if failed:
+        sys.exit(f"tangent-render: {failed} of {count} panoramas could not be rendered, see above")
+
+
+def _forward(settings: Settings) -> tuple[_Work[Path], dict[Path, Path]]:
     """Function that renders a panorama to a folder, and the panorama of every folder."""
-    found = image_paths(settings.input or "")
-    paths = [path for path in found if not (path.parent / CAMERAS_FILE).exists()]
-    if not paths:
-        raise DataError(settings.input, found="only tangent images", expected="panoramas")
+    paths, suffix = _panoramas(settings), _suffix(settings)
     if settings.figure is not None and len(paths) > 1:
         raise SettingError("figure", found=f"{len(paths)} panoramas", expected="one")
-    suffix = f".{settings.format}"
-    if settings.interpolation == "nearest" and suffix in LOSSY_SUFFIXES:
-        expected = "png, tif or npy with interpolation=nearest: others change pixels"
-        raise SettingError("format", found=settings.format, expected=expected)
-    rotation = _rotation(settings)
     output = Path() if settings.output is None else settings.output
     jobs = {output / name: path for name, path in zip(short_names(paths), paths, strict=True)}
     _refuse_existing(settings, [*(jobs if settings.output else ()), settings.figure])
@@ -109,24 +145,93 @@ def _forward(settings: Settings) -> tuple[_Work, dict[Path, Path]]:
     def work(folder: Path, path: Path, progress: Callable[[float], object]) -> Path:
         image = read_panorama(path, settings.interpolation)
         shape = image.shape[0], image.shape[1]
-        level = nearest_level(shape[0]) if settings.level is None else settings.level
-        grid = TangentGrid(settings.base_level, level, settings.dim, rotation)
-        faces = tuple(int(face) for face in grid.face_indices(settings.faces))
+        grid, faces = _grid(settings, shape[0])
         if settings.figure is not None:
             write_pixels(settings.figure, tangent_figure(image, grid))
             if settings.output is None:
                 return settings.figure
-        digits = max(3, len(str(grid.num_images - 1)))
-        files = tuple(f"face_{face:0{digits}}{suffix}" for face in faces)
+        files = tuple(f"{face_name(grid, face)}{suffix}" for face in faces)
         if settings.interpolation == "bilinear":
-            image = shrink_to_level(image, level)
+            image = shrink_to_level(image, grid.level)
         cameras = CameraFile(path.name, shape, grid, faces, files)
-        write_tangent_folder(
-            folder, image, cameras, settings.interpolation, progress, colmap=settings.colmap
-        )
+        write_tangent_folder(folder, image, cameras, settings.interpolation, progress)
         return folder
 
     return work, jobs
+
+
+def _panoramas(settings: Settings) -> list[Path]:
+    """The panoramas of `input`, without tangent images that are among them."""
+    found = image_paths(settings.input or "")
+    paths = [
+        path
+        for path in found
+        if not (path.parent / CAMERAS_FILE).exists()
+        and not any((folder / RIG_FILE).exists() for folder in path.absolute().parents[2:3])
+    ]
+    if not paths:
+        raise DataError(settings.input, found="only tangent images", expected="panoramas")
+    return paths
+
+
+def _suffix(settings: Settings) -> str:
+    suffix = f".{settings.format}"
+    if settings.interpolation == "nearest" and suffix in LOSSY_SUFFIXES:
+        expected = "png, tif or npy with interpolation=nearest: others change pixels"
+        raise SettingError("format", found=settings.format, expected=expected)
+    return suffix
+
+
+def _grid(settings: Settings, rows: int) -> tuple[TangentGrid, tuple[int, ...]]:
+    """The images of panoramas with so many rows, and the indices of those to write."""
+    level = nearest_level(rows) if settings.level is None else settings.level
+    grid = TangentGrid(settings.base_level, level, settings.dim, _rotation(settings))
+    return grid, tuple(int(face) for face in grid.face_indices(settings.faces))
+
+
+def _colmap(settings: Settings) -> None:
+    """Render panoramas to one project for COLMAP."""
+    paths, suffix, output = _panoramas(settings), _suffix(settings), settings.output or Path()
+    if suffix == ".npy":
+        raise SettingError("format", found="npy", expected="png, jpg, webp or tif for COLMAP")
+    _refuse_existing(settings, [output])
+    masks = Masks(settings.mask, settings.mask_classes)
+    names = dict(zip(flat_names(paths), short_names(paths), strict=True))
+    # One camera has images of one size. If no panorama can be read, each says why below.
+    grid, faces = _grid(settings, max(map(_rows, paths)) or 512)
+    with replaced_folder(output) as folder:
+        project = ColmapProject(folder, grid, faces, suffix, settings.interpolation)
+
+        def work(name: str, path: Path, progress: Callable[[float], object]) -> Path:
+            image = read_panorama(path, settings.interpolation)
+            file = names[name].removesuffix(path.suffix) + path.suffix
+            project.add(name, file, image, masks.read(names[name], path), progress)
+            return output
+
+        done = _each(dict(zip(names, paths, strict=True)), work)
+        if not done:
+            _exit_if_some_failed(len(paths), len(paths))
+        project.write_rig()
+    _tell(done[:1])
+    _exit_if_some_failed(len(paths) - len(done), len(paths))
+
+
+def _rows(path: Path) -> int:
+    """Rows of the whole panorama; 0 if the file cannot be read."""
+    with suppress(DataError):
+        return panorama_area(path, read_image_size(path)).full_shape[0]
+    return 0
+
+
+def _poses(settings: Settings, model: Path) -> None:
+    """Write the poses of panoramas in a model of COLMAP."""
+    output = settings.output or Path()
+    _refuse_existing(settings, [output])
+    rig = read_rig((settings.cameras or model.parent.parent) / RIG_FILE)
+    poses = panorama_poses(model, rig)
+    write_poses(output, poses)
+    said = f"Written: {output}, poses of {len(poses)} of {counted(len(rig.panoramas), 'panoramas')}"
+    Console(highlight=False).print(said, soft_wrap=True, markup=False)
 
 
 def _rotation(settings: Settings) -> NDArray[np.float64] | None:
@@ -144,7 +249,7 @@ def _rotation(settings: Settings) -> NDArray[np.float64] | None:
     )
 
 
-def _back(settings: Settings) -> tuple[_Work, dict[Path, Path]]:
+def _back(settings: Settings) -> tuple[_Work[Path], dict[Path, Path]]:
     """Function that renders the results in a folder, and the folder of every panorama."""
     back, output = settings.back or Path(), settings.output or Path()
     if not back.is_dir():

@@ -1,4 +1,4 @@
-"""COLMAP databases of panoramas, their keypoints and matches.
+"""COLMAP databases of panoramas, their keypoints and matches; poses that COLMAP found.
 
 In COLMAP the centre of the first pixel is (½, ½), a keypoint's scale is that of the Gaussian, half
 of OpenCV's size, and its angle runs from right to down. Panoramas have the camera model
@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from tangent_train.errors import DataError
+from tangent_train.geometry import FLIP_Y, PanoramaPose
 from tangent_train.keypoints.two_view import colmap, rigid_matrix
 
 if TYPE_CHECKING:
@@ -20,8 +22,9 @@ if TYPE_CHECKING:
 
     from tangent_train.keypoints.spherical import SphericalKeypoints
     from tangent_train.keypoints.two_view import TwoView
+    from tangent_train.rendering import RigFile
 
-__all__ = ["add_pair"]
+__all__ = ["add_pair", "panorama_poses"]
 
 _SIFT = 128
 
@@ -119,3 +122,37 @@ def _geometry(pairs: NDArray[np.uint32], found: TwoView) -> Any:
     if found.translation is not None:
         geometry.E = pycolmap.essential_matrix_from_pose(geometry.cam2_from_cam1)
     return geometry
+
+
+def panorama_poses(model: Path, rig: RigFile) -> dict[str, PanoramaPose]:
+    """Poses of panoramas by those of their tangent images.
+
+    Args:
+        model: A sparse model of COLMAP, binary or text.
+        rig: Of the project that it was made of.
+
+    Returns:
+        By file of the panorama; those that are in the model, in its world and units.
+
+    Raises:
+        DataError: The model cannot be read, or no panorama is in it.
+        SettingError: pycolmap is missing.
+    """
+    pycolmap = colmap()
+    try:
+        images = pycolmap.Reconstruction(model).images.values()
+    except (ValueError, RuntimeError, OSError, IndexError, KeyError) as error:
+        expected = "a folder with a sparse model of COLMAP, such as sparse/0"
+        raise DataError(model, found=error, expected=expected) from error
+    poses: dict[str, PanoramaPose] = {}
+    for image in sorted((image for image in images if image.has_pose), key=lambda i: i.name):
+        folder, _, name = image.name.rpartition("/")
+        prefix = f"{folder}/"
+        if prefix in rig.world_from_camera and name in rig.panoramas:
+            camera_from_world = image.cam_from_world().rotation.matrix()
+            axes = camera_from_world.T @ rig.world_from_camera[prefix].T @ FLIP_Y
+            pose = PanoramaPose(axes, image.projection_center())
+            poses.setdefault(rig.panoramas[name], pose)
+    if not poses:
+        raise DataError(model, found="none of the panoramas", expected="a model of this project")
+    return dict(sorted(poses.items()))

@@ -8,9 +8,12 @@ from tangent_train.rendering.applying import apply
 from tangent_train.rendering.backward import Blend, tangent_to_equirect, tangent_to_labels
 from tangent_train.rendering.camera_files import (
     CameraFile,
+    RigFile,
     read_cameras,
+    read_rig,
     write_cameras,
-    write_colmap,
+    write_poses,
+    write_rig,
 )
 from tangent_train.rendering.forward import Interpolation, equirect_to_tangent
 from tangent_train.rendering.representations.equirect import EquirectRepresentation
@@ -35,14 +38,17 @@ __all__ = [
     "Interpolation",
     "PerspectiveRepresentation",
     "Representation",
+    "RigFile",
     "TangentRepresentation",
     "apply",
     "equirect_to_tangent",
     "read_cameras",
+    "read_rig",
     "rotate_equirect",
     "set_table_cache_limit",
     "tangent_to_equirect",
     "tangent_to_labels",
     "write_cameras",
-    "write_colmap",
+    "write_poses",
+    "write_rig",
 ]

@@ -1,4 +1,4 @@
-"""The cameras of tangent images as files: ``cameras.json``, and COLMAP's text format.
+"""The cameras of tangent images as files: ``cameras.json``, and COLMAP's ``rig_config.json``.
 
 Their world is an ordinary right-handed one: x forward (to the middle column of the panorama),
 y left, z up. `FLIP_Y` converts between it and the frame of `tangent_train.geometry`.
@@ -18,17 +18,32 @@ import numpy as np
 
 from tangent_train.errors import DataError
 from tangent_train.files import write_text
-from tangent_train.geometry import FLIP_Y, TangentGrid
+from tangent_train.geometry import FLIP_Y, PanoramaPose, TangentGrid
 from tangent_train.json_text import parse_json
 from tangent_train.registry import Text, check_fields
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import NDArray
 
-__all__ = ["CAMERAS_FILE", "CameraFile", "read_cameras", "write_cameras", "write_colmap"]
+__all__ = [
+    "CAMERAS_FILE",
+    "RIG_FILE",
+    "CameraFile",
+    "RigFile",
+    "read_cameras",
+    "read_rig",
+    "write_cameras",
+    "write_poses",
+    "write_rig",
+]
 
 CAMERAS_FILE = "cameras.json"
 """The name of the file in a folder of tangent images."""
+
+RIG_FILE = "rig_config.json"
+"""The name of the file in a project for COLMAP."""
 
 _FORMAT = "tangent images"
 _MOST_PIXELS = 2**20  # rows and columns of a panorama, which may be made of this size
@@ -44,6 +59,13 @@ _CONVENTIONS = {
     "icosahedron_rotation": "Rotation of the icosahedron as a whole, in the world axes; null for "
     "none.",
     "fov_deg": "Angle across the middle of an image, from edge to edge.",
+}
+_POSES = {
+    "panorama_axes": "Right-handed: x to the middle column of the panorama, y to the left of it, "
+    "z to the top row.",
+    "world_from_panorama": "Rotation matrix by rows, determinant +1: the point seen at distance r "
+    "in direction d of the panorama is location + r · world_from_panorama · d.",
+    "location": "Centre of the panorama, in the world and the units of COLMAP's model.",
 }
 _NUMBERS = re.compile(r"\[[-+.,\d\se]+\]")
 """Rows of matrices, which are easier to read on one line."""
@@ -115,8 +137,7 @@ def write_cameras(path: Path, cameras: CameraFile) -> None:
             for face, file in zip(cameras.faces, cameras.files, strict=True)
         ],
     }
-    text = json.dumps(content, indent=1, ensure_ascii=False)
-    write_text(path, _NUMBERS.sub(lambda match: " ".join(match[0].split()), text) + "\n")
+    _write_json(path, content)
 
 
 def _world_from_camera(grid: TangentGrid, face: int) -> NDArray[np.float64]:
@@ -164,29 +185,106 @@ def read_cameras(path: Path) -> CameraFile:
     return CameraFile(str(fields["source"].get("file")), shape, grid, faces, files)
 
 
-def write_colmap(folder: Path, cameras: CameraFile) -> None:
-    """Write ``cameras.txt``, ``images.txt`` and ``points3D.txt`` in COLMAP's text format.
+@dataclass(frozen=True)
+class RigFile:
+    """Content of a ``rig_config.json``: the images of a panorama as a rig of cameras, for COLMAP.
 
-    One PINHOLE camera, its centre counted from pixel corners; for every image the rotation from
-    world to camera as a unit quaternion (w, x, y, z), no translation; no points.
+    Attributes:
+        world_from_camera: ``(3, 3)`` rotation of each camera by the prefix of its images' names,
+            ``face_000/``, in the world of `write_cameras`. The first is COLMAP's reference.
+        panoramas: Files of panoramas by what follows the prefix: ``room.png``.
+    """
+
+    world_from_camera: Mapping[str, NDArray[np.float64]]
+    panoramas: Mapping[str, str]
+
+    @property
+    def images(self) -> list[str]:
+        """Names of all images, as COLMAP has them."""
+        return [prefix + name for prefix in self.world_from_camera for name in self.panoramas]
+
+
+def write_rig(
+    path: Path, grid: TangentGrid, faces: Mapping[str, int], panoramas: Mapping[str, str]
+) -> None:
+    """Write a ``rig_config.json`` for COLMAP 3.12 or later.
+
+    All cameras are PINHOLE, their centre is counted from pixel corners, and none is moved. COLMAP
+    passes over the fields of `RigFile` that are not its own.
 
     Args:
-        folder: Output folder; a sparse model for COLMAP.
-        cameras: The images; the world is that of `write_cameras`.
+        path: The file.
+        grid: The images.
+        faces: Index of the image of each camera, by prefix.
+        panoramas: See `RigFile`.
     """
-    grid = cameras.grid
     focal, center = 1 / grid.pitch, grid.dim / 2
-    write_text(
-        folder / "cameras.txt",
-        "# CAMERA_ID MODEL WIDTH HEIGHT FX FY CX CY\n"
-        f"1 PINHOLE {grid.dim} {grid.dim} {focal!r} {focal!r} {center!r} {center!r}\n",
-    )
-    lines = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", "# POINTS2D[] (none)"]
-    for number, (face, file) in enumerate(zip(cameras.faces, cameras.files, strict=True), 1):
-        w, x, y, z = _quaternion(_world_from_camera(grid, face).T)
-        lines += [f"{number} {w!r} {x!r} {y!r} {z!r} 0 0 0 1 {file}", ""]
-    write_text(folder / "images.txt", "\n".join(lines) + "\n")
-    write_text(folder / "points3D.txt", "# POINT3D_ID X Y Z R G B ERROR TRACK[]\n")
+    cameras: list[dict[str, Any]] = []
+    for prefix, face in faces.items():
+        axes = _world_from_camera(grid, face)
+        reference = cameras[0]["world_from_camera"] if cameras else axes
+        of_rig = {
+            "cam_from_rig_rotation": _quaternion(axes.T @ reference),
+            "cam_from_rig_translation": (0, 0, 0),
+        }
+        cameras.append(
+            {
+                "image_prefix": prefix,
+                **(of_rig if cameras else {"ref_sensor": True}),
+                "camera_model_name": "PINHOLE",
+                "camera_params": (focal, focal, center, center),
+                "world_from_camera": axes.tolist(),
+            }
+        )
+    _write_json(path, [{"cameras": cameras, "panoramas": panoramas}])
+
+
+def read_rig(path: Path) -> RigFile:
+    """Read what `write_rig` wrote.
+
+    Raises:
+        DataError: It is missing, or is another.
+    """
+    try:
+        (rig,) = parse_json(path.read_bytes())
+        axes = {
+            str(camera["image_prefix"]): np.array(camera["world_from_camera"], np.float64)
+            for camera in rig["cameras"]
+        }
+        return RigFile(
+            {prefix: matrix.reshape(3, 3) for prefix, matrix in axes.items()},
+            {name: str(file) for name, file in rig["panoramas"].items()},
+        )
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
+        raise DataError(
+            path,
+            found=f"{type(error).__name__}: {error}",
+            expected="the rig that tangent-render wrote with colmap=true",
+        ) from error
+
+
+def write_poses(path: Path, poses: Mapping[str, PanoramaPose]) -> None:
+    """Write poses of panoramas in a right-handed world as JSON; ``conventions`` defines its fields.
+
+    Args:
+        path: The file.
+        poses: By file of the panorama.
+    """
+    panoramas = [
+        {
+            "file": file,
+            "location": pose.location_m.tolist(),
+            "world_from_panorama": (pose.world_from_panorama @ FLIP_Y).tolist(),
+        }
+        for file, pose in poses.items()
+    ]
+    content = {"format": "panorama poses", "conventions": _POSES, "panoramas": panoramas}
+    _write_json(path, content)
+
+
+def _write_json(path: Path, content: Any) -> None:
+    text = json.dumps(content, indent=1, ensure_ascii=False)
+    write_text(path, _NUMBERS.sub(lambda match: " ".join(match[0].split()), text) + "\n")
 
 
 def _quaternion(rotation: NDArray[np.float64]) -> tuple[float, ...]:

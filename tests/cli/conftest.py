@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from tangent_train.errors import DataError, SettingError
+from tests.cli.rendering import Refused, render_with
 from tests.cli.tiny_runs import SETTINGS, Run, run_command, run_in
 
 
@@ -15,6 +18,19 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
     """Runs a command in this process, in an empty folder."""
     monkeypatch.chdir(tmp_path)
     return partial(run_command, monkeypatch)
+
+
+@pytest.fixture
+def refused(capsys: pytest.CaptureFixture[str]) -> Refused:
+    """See `Refused`."""
+
+    def render(**settings: Any) -> str:
+        capsys.readouterr()
+        with pytest.raises((SystemExit, DataError, SettingError)) as ended:
+            render_with(**settings)
+        return capsys.readouterr().out + str(ended.value)
+
+    return render
 
 
 @pytest.fixture(scope="session")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,61 +11,28 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from omegaconf import OmegaConf
 
 from datamodules.images import tangent_folders
 from datamodules.images.pixel_files import read_pixels, write_pixels
-from tangent_train.cli.compose import config_folder
-from tangent_train.cli.render import render
-from tangent_train.errors import DataError, SettingError
 from tangent_train.geometry import TangentGrid, equirect_directions
 from tangent_train.rendering import equirect_to_tangent, read_cameras, tangent_to_equirect
+from tests.cli.rendering import Refused, render_with, smooth
 from tests.cli.tiny_runs import Run
 from tests.datamodules.data_files import contents
 
-HEIGHT = 64
-Refused = Callable[..., str]
 _read = partial(read_pixels, indices=True)
-
-
-def _render(**settings: Any) -> None:
-    config = OmegaConf.load(config_folder() / "render.yaml")
-    texts = {
-        key: str(value) if isinstance(value, Path) else value for key, value in settings.items()
-    }
-    assert not texts.keys() - set(config)
-    plain: Any = OmegaConf.to_container(OmegaConf.merge(config, texts), resolve=True)
-    render(plain)
-
-
-@pytest.fixture
-def refused(capsys: pytest.CaptureFixture[str]) -> Refused:
-    """Messages of a rendering that is refused, or of which some panoramas fail."""
-
-    def run(**settings: Any) -> str:
-        capsys.readouterr()
-        with pytest.raises((SystemExit, DataError, SettingError)) as ended:
-            _render(**settings)
-        return capsys.readouterr().out + str(ended.value)
-
-    return run
-
-
-def _smooth(height: int = HEIGHT) -> NDArray[np.uint8]:
-    """``(H, 2H, 3)`` RGB, smooth on the sphere; every direction has its own colour."""
-    return np.rint((equirect_directions((height, 2 * height)) + 1) * 127.5).astype(np.uint8)
 
 
 @pytest.fixture
 def room(tmp_path: Path) -> Path:
     path = tmp_path / "in" / "room.png"
-    write_pixels(path, _smooth())
+    write_pixels(path, smooth())
     return path
 
 
 @pytest.fixture
 def rendered(room: Path, tmp_path: Path) -> Path:
-    _render(input=room, output=tmp_path / "tan", base_level=0)
+    render_with(input=room, output=tmp_path / "tan", base_level=0)
     return tmp_path / "tan" / "room"
 
 
@@ -88,17 +54,17 @@ def _results(folder: Path, array: NDArray[Any], suffix: str = ".npy") -> Path:
 def test_colours_come_back(
     tmp_path: Path, base_level: int, blend: Any, dtype: Any, suffix: str
 ) -> None:
-    image = _smooth().astype(dtype) * dtype(257 if dtype is np.uint16 else 1)
+    image = smooth().astype(dtype) * dtype(257 if dtype is np.uint16 else 1)
     path, output = tmp_path / f"room{suffix}", tmp_path / f"back{suffix}"
     write_pixels(path, image)
-    _render(input=path, output=tmp_path / "tan", base_level=base_level, format=suffix[1:])
+    render_with(input=path, output=tmp_path / "tan", base_level=base_level, format=suffix[1:])
     cameras = read_cameras(tmp_path / "tan" / "room" / "cameras.json")
     grid = TangentGrid(base_level, 5)
     assert (cameras.grid, cameras.shape, cameras.source) == (grid, (64, 128), path.name)
     expected = equirect_to_tangent(image, grid)
     for file, tangent in zip(cameras.files, expected, strict=True):
         np.testing.assert_array_equal(_read(tmp_path / "tan" / "room" / file), tangent)
-    _render(back=tmp_path / "tan" / "room", output=output, blend=blend)
+    render_with(back=tmp_path / "tan" / "room", output=output, blend=blend)
     again = _read(output)
     assert np.abs(again / np.iinfo(dtype).max - image / np.iinfo(dtype).max).max() <= 4 / 255
     np.testing.assert_array_equal(again, tangent_to_equirect(expected, grid, (64, 128), blend))
@@ -107,11 +73,9 @@ def test_colours_come_back(
 def test_the_command_line_takes_any_path(
     tmp_path: Path, run: Run, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write_pixels(tmp_path / "my (rooms)" / "a=b,c.png", _smooth(32))
-    settings = ("output=out [1]", "base_level=0", "colmap=true")
-    run("render", "input=my (rooms)/a=b,c.png", *settings)
+    write_pixels(tmp_path / "my (rooms)" / "a=b,c.png", smooth(32))
+    run("render", "input=my (rooms)/a=b,c.png", "output=out [1]", "base_level=0")
     run("render", "back=out [1]/a=b,c", "output=back, again.png", "height=20")
-    assert (tmp_path / "out [1]" / "a=b,c" / "sparse" / "images.txt").is_file()
     assert _read(tmp_path / "back, again.png").shape == (20, 40, 3)
     assert "Written: back, again.png" in capsys.readouterr().out
     assert not list(tmp_path.glob("outputs")), "Hydra leaves nothing behind"
@@ -119,32 +83,34 @@ def test_the_command_line_takes_any_path(
 
 def test_a_folder_of_panoramas_and_back(tmp_path: Path, refused: Refused) -> None:
     for name in ("a.png", "deeper/b.jpg", "deeper/c.v2.tif"):
-        write_pixels(tmp_path / "in" / name, _smooth(32))
+        write_pixels(tmp_path / "in" / name, smooth(32))
     # Into the folder itself: the second run does not take the images for panoramas.
     for overwrite in (False, True):
-        _render(input=tmp_path / "in", output=tmp_path / "in", base_level=0, overwrite=overwrite)
+        render_with(
+            input=tmp_path / "in", output=tmp_path / "in", base_level=0, overwrite=overwrite
+        )
     names = ["a", "deeper/b", "deeper/c.v2"]
     assert len(list((tmp_path / "in" / "a").iterdir())) == 21
-    _render(back=tmp_path / "in", output=tmp_path / "back")
+    render_with(back=tmp_path / "in", output=tmp_path / "back")
     back = tmp_path / "back"
     written = {path.relative_to(back).as_posix() for path in back.rglob("*.png")}
     assert written == {f"{name}.png" for name in names}
     for name in names:
         again = _read(tmp_path / "back" / f"{name}.png")
-        assert np.abs(again.astype(int) - _smooth(32)).max() <= 12
+        assert np.abs(again.astype(int) - smooth(32)).max() <= 12
     said = refused(back=tmp_path / "in", output=tmp_path / "back")
     assert "a.png, which exists" in said
     assert "3 of 3 panoramas could not be rendered" in said
 
 
 def test_levels_follow_the_rows_and_large_panoramas_are_averaged(tmp_path: Path) -> None:
-    write_pixels(tmp_path / "a.png", _smooth(90))
-    _render(input=tmp_path / "a.png", output=tmp_path / "tan", base_level=0)
+    write_pixels(tmp_path / "a.png", smooth(90))
+    render_with(input=tmp_path / "a.png", output=tmp_path / "tan", base_level=0)
     assert read_cameras(tmp_path / "tan" / "a" / "cameras.json").grid.level == 5
     # A checkerboard of single pixels: averaged it is grey, sampled it would be black and white.
     board = np.where(np.indices((128, 256)).sum(axis=0) % 2, 255, 0)
     write_pixels(tmp_path / "board.png", board[..., None].repeat(3, axis=2).astype(np.uint8))
-    _render(input=tmp_path / "board.png", output=tmp_path / "tan", base_level=0, level=5)
+    render_with(input=tmp_path / "board.png", output=tmp_path / "tan", base_level=0, level=5)
     assert set(np.unique(_read(tmp_path / "tan" / "board" / "face_004.png"))) <= {127, 128}
     assert read_cameras(tmp_path / "tan" / "board" / "cameras.json").shape == (128, 256)
 
@@ -154,10 +120,10 @@ def test_labels_are_never_mixed(tmp_path: Path, refused: Refused) -> None:
     labels = labels.repeat(8, axis=0).repeat(8, axis=1)
     write_pixels(tmp_path / "labels.png", labels)
     settings = {"interpolation": "nearest", "base_level": 1}
-    _render(input=tmp_path / "labels.png", output=tmp_path / "tan", **settings)
+    render_with(input=tmp_path / "labels.png", output=tmp_path / "tan", **settings)
     results = tmp_path / "tan" / "labels"
     assert "would change the labels" in refused(back=results, output=tmp_path / "back.jpg")
-    _render(back=results, output=tmp_path / "back.png")
+    render_with(back=results, output=tmp_path / "back.png")
     grid = TangentGrid(1, 5)
     images = equirect_to_tangent(labels, grid, interpolation="nearest")
     expected = tangent_to_equirect(images, grid, labels.shape, interpolation="nearest")
@@ -173,7 +139,7 @@ def test_labels_from_arrays(
 ) -> None:
     folder = _results(tmp_path / "results", np.full((32, 32), value, stored))
     for suffix in (".png", ".npy"):
-        _render(back=folder, cameras=rendered, output=tmp_path / f"back{suffix}")
+        render_with(back=folder, cameras=rendered, output=tmp_path / f"back{suffix}")
     image = _read(tmp_path / "back.png")
     assert image.dtype == written
     assert (image == value).all()
@@ -202,12 +168,12 @@ def test_z_depth_of_floats_becomes_distance(rendered: Path, tmp_path: Path, dim:
     depth = _z_depth(dim, 2.5).astype(np.float32)
     depth[: dim // 2] = 0
     folder, output = _results(tmp_path / "depth", depth, ".tif"), tmp_path / "back.tif"
-    _render(back=folder, cameras=rendered / "cameras.json", output=output, z_depth=True)
+    render_with(back=folder, cameras=rendered / "cameras.json", output=output, z_depth=True)
     distance = _read(output)
     measured = distance > 0
     assert 0.3 < measured.mean() < 0.7, "missing depth stays missing, and spreads nowhere"
     np.testing.assert_allclose(distance[measured], 2.5, rtol=1e-6)
-    _render(back=folder, cameras=rendered, output=tmp_path / "plain.tif")
+    render_with(back=folder, cameras=rendered, output=tmp_path / "plain.tif")
     plain = _read(tmp_path / "plain.tif")
     assert plain[measured].min() < 2.1
     assert set(np.unique(plain)) <= set(np.unique(depth))
@@ -218,7 +184,7 @@ def test_z_depth_of_16_bits(rendered: Path, tmp_path: Path, refused: Refused) ->
     depth[:10], depth[10:12] = 0, 65535
     folder = _results(tmp_path / "depth", depth, ".png")
     settings = {"back": folder, "cameras": rendered, "z_depth": True}
-    _render(output=tmp_path / "back.png", **settings)
+    render_with(output=tmp_path / "back.png", **settings)
     distance = _read(tmp_path / "back.png")
     assert distance.dtype == np.uint16
     valid = (distance != 0) & (distance != 65535)
@@ -245,7 +211,7 @@ def test_features_of_another_resolution(
         features = np.concatenate([world, world[..., :2]], axis=-1).astype(np.float32)
         np.save(tmp_path / "features" / f"{Path(image['file']).stem}.npy", features)
     settings = {"back": tmp_path / "features", "cameras": rendered / "cameras.json"}
-    _render(output=tmp_path / "back.npy", blend=blend, height=20, **settings)
+    render_with(output=tmp_path / "back.npy", blend=blend, height=20, **settings)
     panorama = np.load(tmp_path / "back.npy")
     assert (panorama.shape, panorama.dtype) == ((20, 40, 5), np.float32)
     np.testing.assert_array_equal(panorama[..., :2], panorama[..., 3:])
@@ -258,12 +224,12 @@ def test_features_of_another_resolution(
 
 def test_rotated_icosahedra_come_back(room: Path, tmp_path: Path) -> None:
     for output in ("tan", "again"):
-        _render(input=room, output=tmp_path / output, base_level=0, rotation="so3", seed=4)
+        render_with(input=room, output=tmp_path / output, base_level=0, rotation="so3", seed=4)
     cameras = read_cameras(tmp_path / "tan" / "room" / "cameras.json")
     assert cameras.grid.rotation is not None
     assert read_cameras(tmp_path / "again" / "room" / "cameras.json") == cameras
-    _render(back=tmp_path / "tan" / "room", output=tmp_path / "back.png")
-    assert np.abs(_read(tmp_path / "back.png").astype(int) - _smooth()).max() <= 5
+    render_with(back=tmp_path / "tan" / "room", output=tmp_path / "back.png")
+    assert np.abs(_read(tmp_path / "back.png").astype(int) - smooth()).max() <= 5
 
 
 @pytest.mark.parametrize(
@@ -278,7 +244,7 @@ def test_rotated_icosahedra_come_back(room: Path, tmp_path: Path) -> None:
 def test_yaw_pitch_roll(
     room: Path, tmp_path: Path, rotation: list[float], forward: Any, right: Any
 ) -> None:
-    _render(input=room, output=tmp_path / "tan", base_level=0, faces=[3], rotation=rotation)
+    render_with(input=room, output=tmp_path / "tan", base_level=0, faces=[3], rotation=rotation)
     turn = read_cameras(tmp_path / "tan" / "room" / "cameras.json").grid.rotation
     assert turn is not None
     np.testing.assert_allclose(turn @ (1, 0, 0), forward, atol=1e-12)
@@ -286,22 +252,24 @@ def test_yaw_pitch_roll(
 
 
 def test_some_faces_with_a_margin(room: Path, tmp_path: Path, refused: Refused) -> None:
-    _render(input=room, output=tmp_path / "tan", base_level=0, faces=[5, 0], dim=40, format="npy")
+    render_with(
+        input=room, output=tmp_path / "tan", base_level=0, faces=[5, 0], dim=40, format="npy"
+    )
     folder = tmp_path / "tan" / "room"
     names = sorted(path.name for path in folder.iterdir())
     assert names == ["cameras.json", "face_000.npy", "face_005.npy"]
-    expected = equirect_to_tangent(_smooth(), TangentGrid(0, 5, 40), [5])
+    expected = equirect_to_tangent(smooth(), TangentGrid(0, 5, 40), [5])
     np.testing.assert_array_equal(np.load(folder / "face_005.npy"), expected[0])
     assert "cameras of 2 of the 20 images" in refused(back=folder, output=tmp_path / "back.png")
 
 
 def test_a_figure_alone_or_beside_the_images(room: Path, tmp_path: Path, refused: Refused) -> None:
     figure = tmp_path / "figure.png"
-    _render(input=room, figure=figure, base_level=0)
+    render_with(input=room, figure=figure, base_level=0)
     assert _read(figure).shape[1] == 1600
     said = refused(input=room, figure=figure, output=tmp_path / "tan")
     assert "figure.png, which exists" in said
-    write_pixels(room.with_name("second.png"), _smooth(32))
+    write_pixels(room.with_name("second.png"), smooth(32))
     assert "figure: found 2 panoramas" in refused(input=room.parent, figure=tmp_path / "b.png")
 
 
@@ -311,7 +279,7 @@ def test_a_figure_alone_or_beside_the_images(room: Path, tmp_path: Path, refused
 def test_earlier_images_are_kept_unless_told(room: Path, tmp_path: Path, refused: Refused) -> None:
     folder = tmp_path / "tan" / "room"
     folder.mkdir(parents=True)  # an empty folder is no earlier result
-    _render(input=room, output=tmp_path / "tan", base_level=1, colmap=True)
+    render_with(input=room, output=tmp_path / "tan", base_level=1)
     said = refused(input=room, output=tmp_path / "tan")
     assert re.search(r"tan/room, which exists.*overwrite=true", said)
     again = {"input": room, "output": tmp_path / "tan", "overwrite": True, "format": "jpg"}
@@ -320,7 +288,7 @@ def test_earlier_images_are_kept_unless_told(room: Path, tmp_path: Path, refused
     assert "notes.txt, which is no tangent image" in refused(base_level=0, **again)
     assert contents(folder) == before
     (folder / "notes.txt").unlink()
-    _render(base_level=0, **again)
+    render_with(base_level=0, **again)
     names = sorted(path.name for path in folder.iterdir())
     assert names == ["cameras.json", *(f"face_{face:03}.jpg" for face in range(20))]
     assert not list(tmp_path.rglob(".partial*"))
@@ -339,13 +307,13 @@ def test_an_interrupted_run_leaves_the_earlier_images(
 
     monkeypatch.setattr(tangent_folders, "write_pixels", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        _render(input=room, output=rendered.parent, base_level=0, overwrite=True)
+        render_with(input=room, output=rendered.parent, base_level=0, overwrite=True)
     assert contents(tmp_path) == before
 
 
 def test_a_broken_panorama_does_not_stop_the_others(tmp_path: Path, refused: Refused) -> None:
     for name in ("a.png", "c.png"):
-        write_pixels(tmp_path / "in" / name, _smooth(32))
+        write_pixels(tmp_path / "in" / name, smooth(32))
     (tmp_path / "in" / "b.png").write_bytes(b"broken")
     write_pixels(tmp_path / "in" / "photo.jpg", np.zeros((30, 40, 3), np.uint8))
     said = refused(input=tmp_path / "in", output=tmp_path / "tan", base_level=0)
@@ -365,7 +333,7 @@ def test_a_broken_panorama_does_not_stop_the_others(tmp_path: Path, refused: Ref
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({}, "input=<panoramas>, or back="),
+        ({}, "found none of them; expected input=<panoramas>, back="),
         ({"input": "in"}, "output: found none"),
         ({"input": "in", "output": "tan", "faces": [80]}, "80"),
         ({"input": "in", "output": "tan", "format": "gif"}, r"\.gif.*expected .*\.png"),
@@ -373,7 +341,8 @@ def test_a_broken_panorama_does_not_stop_the_others(tmp_path: Path, refused: Ref
             {"input": "in", "output": "tan", "interpolation": "nearest", "format": "jpg"},
             "format: found jpg; .* others change pixels",
         ),
-        ({"input": "in", "back": "tan", "output": "a.png"}, "input and back: found both"),
+        ({"input": "in", "back": "tan", "output": "a.png"}, "found input and back; expected"),
+        ({"input": "in", "output": "tan", "mask": "in/room.png"}, "none without colmap=true"),
         ({"back": "nowhere", "output": "a.png"}, "no such folder"),
         ({"back": "in", "output": "a.png"}, r"no cameras\.json"),
     ],

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from tangent_train.errors import DataError
 from tangent_train.geometry import TangentGrid, random_rotation
@@ -17,8 +16,8 @@ from tangent_train.rendering import (
     CameraFile,
     equirect_to_tangent,
     read_cameras,
+    read_rig,
     write_cameras,
-    write_colmap,
 )
 
 ROTATION = random_rotation(np.random.default_rng(3))
@@ -65,32 +64,6 @@ def test_what_is_written_is_read(grid: TangentGrid, tmp_path: Path) -> None:
     assert again.grid.dim == grid.dim
 
 
-def _lines(path: Path) -> list[str]:
-    return [line for line in path.read_text().splitlines() if not line.startswith("#")]
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_colmap_has_the_same_cameras(seed: int, tmp_path: Path) -> None:
-    """Counted from pixel corners, two lines an image, quaternions from world to camera."""
-    grid = TangentGrid(0, 3, rotation=random_rotation(np.random.default_rng(seed)))
-    write_colmap(tmp_path, _cameras(grid))
-    write_cameras(tmp_path / "cameras.json", _cameras(grid))
-    content = json.loads((tmp_path / "cameras.json").read_text())
-    (fx, _, cx), (_, fy, cy), _ = content["camera"]["matrix"]
-    (camera,) = _lines(tmp_path / "cameras.txt")
-    assert camera.split()[:4] == ["1", "PINHOLE", str(grid.dim), str(grid.dim)]
-    np.testing.assert_allclose(np.array(camera.split()[4:], float), (fx, fy, cx + 0.5, cy + 0.5))
-    lines = _lines(tmp_path / "images.txt")
-    assert set(lines[1::2]) == {""}
-    assert _lines(tmp_path / "points3D.txt") == []
-    for number, (line, image) in enumerate(zip(lines[::2], content["images"], strict=True), 1):
-        index, w, *vector = line.split()[:5]
-        assert (index, line.split()[5:]) == (str(number), ["0", "0", "0", "1", image["file"]])
-        rotation = Rotation.from_quat([*map(float, vector), float(w)]).as_matrix()
-        np.testing.assert_allclose(rotation.T, image["world_from_camera"], atol=1e-12)
-        assert float(w) >= 0
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -121,3 +94,20 @@ def test_files_that_are_no_json(content: bytes | None, tmp_path: Path) -> None:
         (tmp_path / "cameras.json").write_bytes(content)
     with pytest.raises(DataError, match=r"cameras\.json.*tangent-render"):
         read_cameras(tmp_path / "cameras.json")
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "[]",
+        "{}",
+        '[{"cameras": 1, "panoramas": {}}]',
+        '[{"cameras": [{"image_prefix": "a/", "ref_sensor": true}], "panoramas": {}}]',
+        '[{"cameras": [], "panoramas": ["a.png"]}]',
+        '[{"cameras": [{"image_prefix": "a/", "world_from_camera": [1, 2]}], "panoramas": {}}]',
+    ],
+)
+def test_rigs_of_others(content: str, tmp_path: Path) -> None:
+    (tmp_path / "rig_config.json").write_text(content)
+    with pytest.raises(DataError, match=r"rig_config\.json.*tangent-render"):
+        read_rig(tmp_path / "rig_config.json")

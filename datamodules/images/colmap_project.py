@@ -1,0 +1,118 @@
+"""A project for COLMAP: images, masks and the rig of a set of panoramas.
+
+COLMAP takes images of one name in the folders of several cameras as taken at the same time, and one
+camera for each folder (``--ImageReader.single_camera_per_folder``), so these have no subfolders.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from datamodules.images.image_files import short_names
+from datamodules.images.pixel_files import write_pixels
+from datamodules.images.tangent_folders import face_name, in_threads, shrink_to_level
+from tangent_train.errors import DataError
+from tangent_train.rendering import equirect_to_tangent
+from tangent_train.rendering.camera_files import RIG_FILE, write_rig
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from tangent_train.geometry import TangentGrid
+    from tangent_train.rendering import Interpolation
+
+__all__ = ["ColmapProject", "flat_names"]
+
+
+def flat_names(paths: Sequence[Path]) -> list[str]:
+    """Names of `short_names` without folders.
+
+    Raises:
+        DataError: Two are the same.
+
+    >>> from pathlib import Path
+    >>> flat_names([Path("a/x/1.jpg"), Path("a/1.jpg")])
+    ['x__1', '1']
+    """
+    names = [name.replace("/", "__") for name in short_names(paths)]
+    places: dict[str, Path] = {}
+    for name, path in zip(names, paths, strict=True):
+        if places.setdefault(name.casefold(), path) != path:
+            raise DataError(
+                path,
+                found=f"{places[name.casefold()]}, which is called {name} too",
+                expected="panoramas whose paths differ with __ for /",
+                remedy="Rename one of them.",
+            )
+    return names
+
+
+class ColmapProject:
+    """A project in the making.
+
+    A pixel of a panorama counts in the image that owns it and nowhere else: features in overlapping
+    images would be found several times.
+
+    Args:
+        folder: A new one.
+        grid: The images of every panorama.
+        faces: Indices of those that are rendered.
+        suffix: Of their files.
+        interpolation: As of `equirect_to_tangent`.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        grid: TangentGrid,
+        faces: Sequence[int],
+        suffix: str,
+        interpolation: Interpolation,
+    ) -> None:
+        self._folder, self._grid, self._suffix = folder, grid, suffix
+        self._interpolation: Interpolation = interpolation
+        self._faces = {f"{face_name(grid, face)}/": face for face in faces}
+        self._owned = [grid.owners(grid.directions([face])[0]) == face for face in faces]
+        self._panoramas: dict[str, str] = {}
+
+    def add(
+        self,
+        name: str,
+        file: str,
+        image: NDArray[Any],
+        counts: NDArray[np.uint8],
+        progress: Callable[[float], object],
+    ) -> None:
+        """Render a panorama.
+
+        Args:
+            name: Of its images; one of `flat_names`.
+            file: Of the panorama, as the rig names it.
+            image: ``(H, W)`` or ``(H, W, C)``.
+            counts: ``(H', W')``, 0 where pixels are ignored.
+            progress: See `in_threads`.
+
+        Raises:
+            SettingError: The files cannot hold its pixels.
+        """
+        if self._interpolation == "bilinear":
+            image = shrink_to_level(image, self._grid.level)
+
+        def render(prefix: str, face: int, owned: NDArray[np.bool_]) -> None:
+            path = f"{prefix}{name}{self._suffix}"
+            (pixels,) = equirect_to_tangent(image, self._grid, [face], self._interpolation)
+            write_pixels(self._folder / "images" / path, pixels)
+            (mask,) = equirect_to_tangent(counts, self._grid, [face], "nearest")
+            write_pixels(self._folder / "masks" / f"{path}.png", mask * owned)
+
+        in_threads(render, progress, list(self._faces), list(self._faces.values()), self._owned)
+        self._panoramas[name + self._suffix] = file
+
+    def write_rig(self) -> None:
+        """Write the ``rig_config.json`` of the panoramas that were added."""
+        write_rig(self._folder / RIG_FILE, self._grid, self._faces, self._panoramas)

@@ -1,0 +1,287 @@
+"""Projects for COLMAP, read by COLMAP: rigs, cameras, masks, and the poses that it finds."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+
+from datamodules.images.pixel_files import read_pixels, write_pixels
+from tangent_train.geometry import FLIP_Y, PanoramaPose, TangentGrid, random_rotation
+from tangent_train.keypoints.colmap import panorama_poses
+from tangent_train.rendering import equirect_to_tangent, read_rig
+from tests.cli.rendering import Refused, render_with, smooth
+from tests.datamodules.data_files import contents
+from tests.geometry.directions import angle_deg, random_directions
+
+pycolmap = pytest.importorskip("pycolmap")
+pycolmap.logging.minloglevel = 2
+NAMES = ("hall/room.png", "kitchen/room.png")
+FRAMES = {"hall__room.png": NAMES[0], "kitchen__room.png": NAMES[1]}
+
+
+@pytest.fixture
+def panoramas(tmp_path: Path) -> Path:
+    for name in NAMES:
+        write_pixels(tmp_path / "in" / name, smooth())
+    return tmp_path / "in"
+
+
+@pytest.fixture
+def project(panoramas: Path, tmp_path: Path) -> Path:
+    settings = {"base_level": 0, "rotation": [30, 10, 5]}
+    render_with(input=panoramas, output=tmp_path / "project", colmap=True, **settings)
+    return tmp_path / "project"
+
+
+def _database(project: Path) -> Any:
+    """COLMAP's database of the images, one camera a folder, with the rig."""
+    path = project.parent / "database.db"
+    pycolmap.Database.open(path).close()
+    pycolmap.import_images(path, project / "images", pycolmap.CameraMode.PER_FOLDER)
+    database = pycolmap.Database.open(path)
+    rig = pycolmap.read_rig_config(project / "rig_config.json")
+    pycolmap.apply_rig_config(rig, database)
+    return database
+
+
+def _grid(project: Path) -> TangentGrid:
+    """The images by the matrix of the first camera: the icosahedron is turned as a whole."""
+    first = next(iter(read_rig(project / "rig_config.json").world_from_camera.values()))
+    return TangentGrid(0, 5, rotation=FLIP_Y @ first @ TangentGrid(0, 5).world_from_camera[0].T)
+
+
+# Rigs and cameras.
+
+
+def test_directions_are_where_colmap_projects_them(project: Path) -> None:
+    """Two frames of one rig; 500 directions in all views of both panoramas."""
+    grid = _grid(project)
+    directions = random_directions(500)
+    with _database(project) as database:
+        (rig,) = database.read_all_rigs()
+        assert (rig.num_sensors(), database.num_frames(), database.num_images()) == (20, 2, 40)
+        frames: dict[str, list[int]] = {}
+        for frame in database.read_all_frames():
+            images = [database.read_image(data.id) for data in frame.data_ids]
+            (name,) = {image.name.partition("/")[2] for image in images}
+            frames[name] = sorted(int(image.name[5:8]) for image in images)
+            for image in images:
+                face = int(image.name[5:8])
+                camera = database.read_camera(image.camera_id)
+                assert (camera.model.name, camera.width, camera.height) == ("PINHOLE", 32, 32)
+                assert camera.has_prior_focal_length
+                sensor = camera.sensor_id
+                from_rig = (
+                    pycolmap.Rigid3d() if rig.is_ref_sensor(sensor) else rig.sensor_from_rig(sensor)
+                )
+                assert (from_rig.translation == 0).all()
+                # The rig's axes are those of the first camera.
+                rays = directions @ grid.world_from_camera[0] @ from_rig.rotation.matrix().T
+                seen = rays[:, 2] > 0.1
+                found = camera.img_from_cam(rays[seen])
+                expected = grid.project(directions[seen], np.full(seen.sum(), face))
+                np.testing.assert_allclose(found - 0.5, expected, atol=1e-9)
+                # The pixel itself shows that direction.
+                columns, rows = np.floor(found).astype(int).T
+                inside = (np.floor(found) >= 0).all(axis=1) & (np.floor(found) < 32).all(axis=1)
+                shown = read_pixels(project / "images" / image.name, indices=False)
+                colors = shown[rows[inside], columns[inside]] / 127.5 - 1
+                away = angle_deg(colors, directions[seen][inside])
+                assert len(away) > 20
+                assert away.max() < 5  # a pixel's diagonal and the rounding of colours
+                assert away.mean() < 2
+        assert frames == {name: list(range(20)) for name in FRAMES}
+
+
+def test_the_rig_knows_its_panoramas(project: Path) -> None:
+    assert read_rig(project / "rig_config.json").panoramas == FRAMES
+    names = {path.relative_to(project).parts[0] for path in project.rglob("*")}
+    assert names == {"images", "masks", "rig_config.json"}
+
+
+def test_sizes_differ_and_one_is_broken(panoramas: Path, tmp_path: Path, refused: Refused) -> None:
+    write_pixels(panoramas / "large.png", smooth(128))
+    (panoramas / "broken.png").write_bytes(b"broken")
+    settings = {"input": panoramas, "colmap": True, "base_level": 0, "faces": [7, 2]}
+    said = refused(output=tmp_path / "tan", **settings)
+    assert "in/broken.png: found no image" in said
+    assert "1 of 4 panoramas could not be rendered" in said
+    files = {
+        path.relative_to(tmp_path / "tan").as_posix() for path in tmp_path.glob("tan/images/*/*")
+    }
+    assert files == {
+        f"images/face_{face:03}/{name}" for face in (2, 7) for name in (*FRAMES, "large.png")
+    }
+    for file in files:
+        assert read_pixels(tmp_path / "tan" / file, indices=False).shape == (64, 64, 3)
+    with _database(tmp_path / "tan") as database:
+        assert (database.num_frames(), database.num_rigs()) == (3, 1)
+
+
+# Masks.
+
+
+def test_every_pixel_counts_once_and_where_the_mask_is_white(
+    panoramas: Path, tmp_path: Path
+) -> None:
+    mask = np.random.default_rng(0).integers(0, 2, (16, 32), np.uint8).repeat(4, 0).repeat(4, 1)
+    write_pixels(tmp_path / "mask.png", mask * 200)
+    settings = {"input": panoramas, "base_level": 0, "colmap": True, "format": "jpg"}
+    render_with(output=tmp_path / "one", mask=tmp_path / "mask.png", **settings)
+    grid = TangentGrid(0, 5)
+    expected = equirect_to_tangent(mask, grid, interpolation="nearest")
+    owners = (grid.directions() @ grid.centers_xyz.T).argmax(axis=-1)
+    for name in FRAMES:
+        for face in range(20):
+            image = f"face_{face:03}/{Path(name).stem}.jpg"
+            written = read_pixels(tmp_path / "one" / "masks" / f"{image}.png", indices=True)
+            counts = (expected[face] > 0) & (owners[face] == face)
+            np.testing.assert_array_equal(written, counts * 255)
+
+
+def test_masks_by_name_and_classes_to_ignore(
+    panoramas: Path, tmp_path: Path, refused: Refused
+) -> None:
+    labels = np.zeros((32, 64), np.uint8)
+    labels[:, :20], labels[:, 20:50] = 1, 3
+    (tmp_path / "labelled").mkdir()
+    (tmp_path / "labelled" / "classes.json").write_text('{"wall": 1, "sky": 2, "person": 3}')
+    for name, stored in zip(NAMES, (labels, labels[:, ::-1]), strict=True):
+        write_pixels(tmp_path / "labelled" / "labels" / name, stored)
+        write_pixels(tmp_path / "masks" / name, (stored != 3).astype(np.uint8))
+    settings = {"input": panoramas, "base_level": 0, "colmap": True}
+    render_with(output=tmp_path / "by_name", mask=tmp_path / "masks", **settings)
+    settings["mask"] = tmp_path / "labelled"
+    render_with(output=tmp_path / "by_class", mask_classes=["person", "sky"], **settings)
+    by_name, by_class = (contents(tmp_path / name) for name in ("by_name", "by_class"))
+    assert by_name == by_class
+    first, second = (by_name[f"masks/face_004/{name}.png"] for name in FRAMES)
+    assert first != second
+    said = refused(output=tmp_path / "no", mask_classes=["tripod"], **settings)
+    assert "mask_classes: found tripod; expected of wall, sky, person" in said
+    (tmp_path / "labelled" / "labels" / NAMES[1]).unlink()
+    said = refused(output=tmp_path / "some", mask_classes=["person"], **settings)
+    assert "labels/kitchen/room.png: found no such file; expected the mask" in said
+    assert list(read_rig(tmp_path / "some" / "rig_config.json").panoramas.values()) == [NAMES[0]]
+
+
+def test_what_a_partial_panorama_does_not_show_is_ignored(tmp_path: Path) -> None:
+    tags = {"FullPanoWidth": 128, "FullPanoHeight": 64, "CroppedAreaLeft": 0, "CroppedAreaTop": 16}
+    tags |= {"CroppedAreaImageWidth": 128, "CroppedAreaImageHeight": 32}
+    attributes = " ".join(f'GPano:{name}Pixels="{value}"' for name, value in tags.items())
+    xmp = f'<x xmlns:GPano="http://ns.google.com/photos/1.0/panorama/" {attributes}/>'
+    Image.fromarray(smooth()[16:48]).save(tmp_path / "part.jpg", xmp=xmp.encode())
+    render_with(input=tmp_path / "part.jpg", output=tmp_path / "out", base_level=0, colmap=True)
+    grid = TangentGrid(0, 5)
+    for face, directions in enumerate(grid.directions()):
+        path = tmp_path / "out" / "masks" / f"face_{face:03}" / "part.png.png"
+        counts = read_pixels(path, indices=True) > 0
+        latitude_deg = np.degrees(np.arcsin(directions[counts][:, 2]))
+        assert np.abs(latitude_deg).max(initial=0) < 46.5
+
+
+# Poses.
+
+
+def _model(project: Path, poses: dict[str, PanoramaPose]) -> Any:
+    """What COLMAP's mapper would make of the project, with given poses."""
+    axes = read_rig(project / "rig_config.json").world_from_camera["face_000/"]
+    model = pycolmap.Reconstruction()
+    with _database(project) as database:
+        for camera in database.read_all_cameras():
+            model.add_camera(camera)
+        (rig,) = database.read_all_rigs()
+        model.add_rig(rig)
+        for frame in database.read_all_frames():
+            images = [database.read_image(data.id) for data in frame.data_ids]
+            pose = poses[FRAMES[images[0].name.partition("/")[2]]]
+            rotation = (pose.world_from_panorama @ FLIP_Y @ axes).T
+            shift = -rotation @ pose.location_m
+            frame.rig_from_world = pycolmap.Rigid3d(np.column_stack([rotation, shift]))
+            model.add_frame(frame)
+            for image in images:
+                model.add_image(image)
+            model.register_frame(frame.frame_id)
+    return model
+
+
+@pytest.mark.parametrize("binary", [True, False])
+def test_poses_come_back(
+    binary: bool, project: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rng = np.random.default_rng(5)
+    poses = {
+        name: PanoramaPose(random_rotation(rng) @ FLIP_Y, rng.normal(size=3)) for name in NAMES
+    }
+    model = _model(project, poses)
+    (project / "sparse" / "0").mkdir(parents=True)
+    (model.write_binary if binary else model.write_text)(project / "sparse" / "0")
+    render_with(poses=project / "sparse" / "0", output=tmp_path / "poses.json")
+    assert "poses of 2 of 2 panoramas" in capsys.readouterr().out
+    content = json.loads((tmp_path / "poses.json").read_text())
+    assert [entry["file"] for entry in content["panoramas"]] == list(NAMES)
+    found = panorama_poses(project / "sparse" / "0", read_rig(project / "rig_config.json"))
+    for entry in content["panoramas"]:
+        pose = poses[entry["file"]]
+        np.testing.assert_allclose(entry["location"], pose.location_m, atol=1e-9)
+        # A point left of the panorama's middle: y is to the left there.
+        point = pose.points_m((0.6, -0.8, 0), 2)
+        matrix: NDArray[np.float64] = np.array(entry["world_from_panorama"])
+        assert np.linalg.det(matrix) == pytest.approx(1)
+        np.testing.assert_allclose(entry["location"] + 2 * matrix @ (0.6, 0.8, 0), point, atol=1e-9)
+        seen, distance = found[entry["file"]].seen(point)
+        np.testing.assert_allclose(seen * distance, (1.2, -1.6, 0), atol=1e-9)
+
+
+def test_models_of_something_else(project: Path, tmp_path: Path, refused: Refused) -> None:
+    settings = {"output": tmp_path / "poses.json", "cameras": project}
+    assert "expected a folder with a sparse model" in refused(poses=project, **settings)
+    (tmp_path / "empty").mkdir()
+    pycolmap.Reconstruction().write(tmp_path / "empty")
+    assert "found none of the panoramas" in refused(poses=tmp_path / "empty", **settings)
+    settings["cameras"] = tmp_path
+    assert "rig_config.json: found FileNotFound" in refused(poses=tmp_path / "empty", **settings)
+    assert not (tmp_path / "poses.json").exists()
+
+
+# What exists, and what is refused.
+
+
+def test_earlier_projects_are_kept_unless_told(
+    project: Path, panoramas: Path, refused: Refused
+) -> None:
+    settings = {"input": panoramas, "output": project, "colmap": True, "base_level": 0}
+    before = contents(project)
+    assert "project, which exists" in refused(**settings)
+    (project / "database.db").write_text("mine")
+    assert "project/database.db, which is no tangent image" in refused(overwrite=True, **settings)
+    (project / "database.db").unlink()
+    assert contents(project) == before
+    render_with(overwrite=True, faces=[3], **settings)
+    assert [path.name for path in (project / "images").iterdir()] == ["face_003"]
+    # Its images are no panoramas.
+    render_with(input=project.parent, output=project.parent / "tan", base_level=0)
+    names = sorted(
+        path.relative_to(project.parent / "tan").as_posix()
+        for path in (project.parent / "tan").rglob("cameras.json")
+    )
+    assert names == ["hall/room/cameras.json", "kitchen/room/cameras.json"]
+
+
+def test_settings_that_make_no_project(panoramas: Path, tmp_path: Path, refused: Refused) -> None:
+    settings = {"input": panoramas, "output": tmp_path / "out", "colmap": True}
+    assert "format: found npy" in refused(format="npy", **settings)
+    write_pixels(tmp_path / "mask.jpg", smooth(16))
+    said = refused(mask=tmp_path / "mask.jpg", **settings)
+    assert "mask.jpg: found JPEG or WebP, which blur masks" in said
+    assert "2 of 2 panoramas could not be rendered" in said
+    write_pixels(panoramas / "hall__room.png", smooth(16))
+    assert "room.png, which is called hall__room too" in refused(**settings)
+    assert not (tmp_path / "out").exists()
+    assert not list(tmp_path.glob(".partial*"))
