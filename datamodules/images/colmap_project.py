@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from datamodules.images.image_files import short_names
 from datamodules.images.pixel_files import write_pixels
 from datamodules.images.tangent_folders import face_name, in_threads, shrink_to_level
@@ -21,6 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
+    import numpy as np
     from numpy.typing import NDArray
 
     from tangent_train.geometry import TangentGrid
@@ -55,9 +54,6 @@ def flat_names(paths: Sequence[Path]) -> list[str]:
 class ColmapProject:
     """A project in the making.
 
-    A pixel of a panorama counts in the image that owns it and nowhere else: features in overlapping
-    images would be found several times.
-
     Args:
         folder: A new one.
         grid: The images of every panorama.
@@ -77,7 +73,6 @@ class ColmapProject:
         self._folder, self._grid, self._suffix = folder, grid, suffix
         self._interpolation: Interpolation = interpolation
         self._faces = {f"{face_name(grid, face)}/": face for face in faces}
-        self._owned = [grid.owners(grid.directions([face])[0]) == face for face in faces]
         self._panoramas: dict[str, str] = {}
 
     def add(
@@ -103,14 +98,14 @@ class ColmapProject:
         if self._interpolation == "bilinear":
             image = shrink_to_level(image, self._grid.level)
 
-        def render(prefix: str, face: int, owned: NDArray[np.bool_]) -> None:
+        def render(prefix: str, face: int) -> None:
             path = f"{prefix}{name}{self._suffix}"
             (pixels,) = equirect_to_tangent(image, self._grid, [face], self._interpolation)
             write_pixels(self._folder / "images" / path, pixels)
             (mask,) = equirect_to_tangent(counts, self._grid, [face], "nearest")
-            write_pixels(self._folder / "masks" / f"{path}.png", mask * owned)
+            write_pixels(self._folder / "masks" / f"{path}.png", mask)
 
-        in_threads(render, progress, list(self._faces), list(self._faces.values()), self._owned)
+        in_threads(render, progress, list(self._faces), list(self._faces.values()))
         self._panoramas[name + self._suffix] = file
 
     def write_rig(self) -> None:

@@ -18,7 +18,7 @@ import numpy as np
 
 from tangent_train.errors import DataError
 from tangent_train.files import write_text
-from tangent_train.geometry import FLIP_Y, PanoramaPose, TangentGrid
+from tangent_train.geometry import FLIP_Y, PanoramaPose, TangentGrid, checked_rotation
 from tangent_train.json_text import parse_json
 from tangent_train.registry import Text, check_fields
 
@@ -247,14 +247,12 @@ def read_rig(path: Path) -> RigFile:
     """
     try:
         (rig,) = parse_json(path.read_bytes())
-        axes = {
-            str(camera["image_prefix"]): np.array(camera["world_from_camera"], np.float64)
-            for camera in rig["cameras"]
-        }
-        return RigFile(
-            {prefix: matrix.reshape(3, 3) for prefix, matrix in axes.items()},
-            {name: str(file) for name, file in rig["panoramas"].items()},
-        )
+        with np.errstate(over="ignore", invalid="ignore"):  # huge numbers are no rotation
+            axes = {
+                str(camera["image_prefix"]): checked_rotation(camera["world_from_camera"])
+                for camera in rig["cameras"]
+            }
+        return RigFile(axes, {name: str(file) for name, file in rig["panoramas"].items()})
     except (OSError, ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
         raise DataError(
             path,

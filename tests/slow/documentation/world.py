@@ -21,6 +21,8 @@ import pytest
 from PIL import ExifTags, Image
 from transformers import SegformerConfig, SegformerForSemanticSegmentation, SegformerImageProcessor
 
+from tangent_train.geometry import TangentGrid
+from tangent_train.rendering import write_rig
 from tests.conftest import fabricate
 from tests.datamodules.folder.folder_format import write_data_set
 from tests.datamodules.folder.photo_format import write_photos
@@ -46,6 +48,7 @@ def build_world(folder: Path) -> Path:
     write_data_set(folder / "my_rooms", height=ROWS, depth=True)
     write_photos(folder / "my_photos")
     _write_pictures(folder)
+    _write_colmap_model(folder / "project")
     _write_segformer(folder / SEGFORMER)
     demo = f"runs/demo/{TIME}"
     for line in (
@@ -88,12 +91,27 @@ def _write_pictures(folder: Path) -> None:
             cv2.imwrite(str(path), image.astype(np.uint8 if image is panorama else np.uint16))
     cv2.imwrite(str(folder / "room.png"), panorama)
     cv2.imwrite(str(folder / "labels.png"), panorama[..., 0] // 32)
+    for name in ("tripod", "labels/labels/hall", "labels/labels/kitchen"):
+        path = folder / f"{name}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(path), panorama[..., 0] // 64)
+    (folder / "labels" / "classes.json").write_text('["wall", "person", "sky", "floor"]')
     cv2.imwrite(str(folder / "strip.jpg"), cv2.resize(panorama, (288, 64)))
     exif = Image.Exif()
     exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = 24
     for name in ("photo.jpg", "photos/garden.jpg"):
         (folder / name).parent.mkdir(exist_ok=True)
         Image.fromarray(panorama[:, : 3 * ROWS // 2]).save(folder / name, exif=exif)
+
+
+def _write_colmap_model(project: Path) -> None:
+    """A project, and a model in which one of its images has a pose."""
+    model = project / "sparse" / "0"
+    model.mkdir(parents=True)
+    write_rig(project / "rig_config.json", TangentGrid(0, 5), {"face_000/": 0}, {"a.png": "a.jpg"})
+    (model / "cameras.txt").write_text("1 PINHOLE 32 32 30 30 16 16\n")
+    (model / "images.txt").write_text("1 1 0 0 0 0 0 0 1 face_000/a.png\n\n")
+    (model / "points3D.txt").write_text("")
 
 
 def _write_segformer(folder: Path) -> None:

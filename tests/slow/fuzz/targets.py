@@ -29,7 +29,13 @@ from datamodules.stanford2d3ds.reader import read_camera_matrix
 from datamodules.zind.homes import list_panoramas
 from tangent_train.errors import DataError
 from tangent_train.geometry import TangentGrid, rotation_about
-from tangent_train.rendering.camera_files import CameraFile, read_cameras, write_cameras
+from tangent_train.rendering.camera_files import (
+    CameraFile,
+    read_cameras,
+    read_rig,
+    write_cameras,
+    write_rig,
+)
 from tests.datamodules.zind.zind_format import SQUARE, Camera, write_home
 
 if TYPE_CHECKING:
@@ -131,6 +137,20 @@ def _read_camera_list(path: Path) -> None:
     cameras = read_cameras(path)
     assert len(cameras.faces) == len(cameras.files)
     assert cameras.grid.directions(cameras.faces[:1]).shape[1:] == (cameras.grid.dim,) * 2 + (3,)
+
+
+def _rig_seeds() -> list[bytes]:
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "rig_config.json"
+        write_rig(path, TangentGrid(0, 4), {"face_003/": 3, "face_007/": 7}, {"a.png": "a.jpg"})
+        return [path.read_bytes()]
+
+
+def _read_rig(path: Path) -> None:
+    rig = read_rig(path)
+    for matrix in rig.world_from_camera.values():
+        np.testing.assert_allclose(matrix @ matrix.T, np.eye(3), atol=1e-5)
+    assert len(rig.images) == len(rig.world_from_camera) * len(rig.panoramas)
 
 
 def _photo_camera_seeds() -> list[bytes]:
@@ -265,6 +285,7 @@ TARGETS: dict[str, tuple[Callable[[], list[bytes]], Callable[[Path], None]]] = {
     "label_table": (_table_seeds, _read_table),
     "classes": (_class_seeds, _read_class_list),
     "cameras": (_camera_seeds, _read_camera_list),
+    "rig": (_rig_seeds, _read_rig),
     "photo_cameras": (_photo_camera_seeds, _read_photo_cameras),
     "pose": (_pose_seeds, _read_pose),
     "off": (_off_seeds, _read_mesh),
