@@ -44,6 +44,8 @@ from tangent_train.rendering.camera_files import (
 )
 from tangent_train.rendering.figure import tangent_figure
 
+_Item = TypeVar("_Item")
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
@@ -52,8 +54,6 @@ if TYPE_CHECKING:
     _Work = Callable[[_Item, Path, Callable[[float], object]], Path]
 
 __all__ = ["render"]
-
-_Item = TypeVar("_Item")
 
 
 @dataclass(frozen=True)

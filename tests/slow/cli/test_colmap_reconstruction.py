@@ -61,7 +61,7 @@ def _reconstruct(project: Path) -> None:
     )
     with pycolmap.Database.open(database) as opened:
         pycolmap.apply_rig_config(pycolmap.read_rig_config(project / "rig_config.json"), opened)
-    matching = {"num_threads": 1, "skip_image_pairs_in_same_frame": True}
+    matching: dict[str, Any] = {"num_threads": 1, "skip_image_pairs_in_same_frame": True}
     pycolmap.match_exhaustive(
         database,
         matching_options=_options(pycolmap.FeatureMatchingOptions, **matching),
@@ -69,7 +69,7 @@ def _reconstruct(project: Path) -> None:
     )
     (project / "sparse").mkdir()
     refined = ("focal_length", "extra_params", "sensor_from_rig")
-    mapping = {f"ba_refine_{name}": False for name in refined}
+    mapping: dict[str, Any] = {f"ba_refine_{name}": False for name in refined}
     mapping |= {"num_threads": 1, "random_seed": 0, "min_model_size": 3}
     options = _options(pycolmap.IncrementalPipelineOptions, **mapping)
     pycolmap.incremental_mapping(database, project / "images", project / "sparse", options)
