@@ -45,7 +45,7 @@ def report_png(title: str, rows: Sequence[Row]) -> bytes:
     width = max(10.0, 0.12 * len(names) * len(rows))
     figure = _figure(width, 3.6 * panels + 0.2 * len(rows))
     means, classes, *latitude = figure.subplots(panels, 1)
-    means.set_title(f"{title} ({_ERROR_BARS})", loc="left")
+    means.set_title(f"{title}\n{_ERROR_BARS}", loc="left")
     _bars(
         means, rows, list(scores.means.values()), [[r.score(n) for n in scores.means] for r in rows]
     )
@@ -71,7 +71,7 @@ def grid_png(title: str, grid: Mapping[str, Mapping[str, Row]], score: str) -> b
     conditions = list(dict.fromkeys(c for found in grid.values() for c in found))
     figure = _figure(max(10.0, 0.2 * len(conditions) * len(grid)), 4.2 + 0.12 * len(grid))
     axes = figure.subplots()
-    axes.set_title(f"{title} ({_ERROR_BARS})", loc="left")
+    axes.set_title(f"{title}\n{_ERROR_BARS}", loc="left")
     nothing = Row("", ())
     scores = [[found.get(c, nothing).score(score) for c in conditions] for found in grid.values()]
     _bars(axes, [Row(view, ()) for view in grid], conditions, scores)
