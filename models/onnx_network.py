@@ -108,12 +108,14 @@ class OnnxNetwork(nn.Module):
         array = array.detach().to("cpu", _TYPES[self._input.type])
         size = self._batch or max(1, len(array))
         parts = [self._run(part, images) for part in torch.split(array, size)]
-        return torch.cat(parts).to(images.device)
+        return (parts[0] if len(parts) == 1 else torch.cat(parts)).to(images.device)
 
     def _run(self, part: Tensor, images: Tensor) -> Tensor:
         """Scores or labels of some images, of the size of the images."""
         missing = 0 if self._batch is None else self._batch - len(part)
-        whole = torch.cat([part, part[-1:].expand(missing, -1, -1, -1)]).contiguous().numpy()
+        if missing:
+            part = torch.cat([part, part[-1:].expand(missing, -1, -1, -1)])
+        whole = part.contiguous().numpy()
         try:
             (returned,) = self._session.run(None, {self._input.name: whole})
         except Exception as error:
@@ -124,7 +126,8 @@ class OnnxNetwork(nn.Module):
                 remedy=f"onnxruntime says: {str(error).partition(chr(10))[0]}",
             ) from error
         size = (images.shape[2], images.shape[3])
-        scores = _channels_first(torch.from_numpy(returned)[: len(part)], size, self._channels_last)
+        count = len(whole) - missing
+        scores = _channels_first(torch.from_numpy(returned)[:count], size, self._channels_last)
         if scores is None:
             raise SettingError(
                 f"output of {self.path.name}",

@@ -11,6 +11,7 @@ import math
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 
 from tangent_train.rendering import kernels
 from tangent_train.rendering.accumulate import NO_OWNERS, add_to_panorama, zero_sums
@@ -56,6 +57,7 @@ class ScoreMosaic:
         self._labels = np.zeros(shape, np.uint8 if num_classes < 256 else np.uint16)
         averaged = averaged or blend == "feather"
         self._total = zero_sums(shape if averaged else (0, 0), num_classes)
+        self._softmax = torch.empty(0)  # kept: fresh memory costs a quarter of the time
         self._owned: tuple[object, NDArray[np.integer]] = None, NO_OWNERS
 
     def add(self, scores: Tensor, grid: PinholeGrid, faces: NDArray[np.int64]) -> None:
@@ -125,10 +127,12 @@ class ScoreMosaic:
 
     def _prepared(self, scores: Tensor) -> NDArray[np.float32]:
         """``(n, K, h, w)`` on the CPU; feathered are probabilities, as in evaluation."""
-        scores = scores.detach().float()
+        scores = scores.detach().float().contiguous()
         if self.blend == "feather":
-            scores = scores.softmax(dim=1)
-        return scores.contiguous().cpu().numpy()
+            if self._softmax.shape != scores.shape:
+                self._softmax = torch.empty_like(scores)
+            scores = torch.softmax(scores, dim=1, out=self._softmax)
+        return scores.cpu().numpy()
 
     def _owners(
         self, images: object, build: Callable[[], NDArray[np.integer]]
