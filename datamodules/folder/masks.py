@@ -31,12 +31,15 @@ class Masks:
 
     Raises:
         DataError: ``classes.json`` is missing or cannot be used.
-        SettingError: It does not name one of the classes.
+        SettingError: It does not name one of the classes, or classes are given without a folder.
     """
 
     def __init__(self, path: Path | None, classes: tuple[str, ...] | None) -> None:
         self._path, self._classes = path, None
-        if classes and path is not None:
+        if classes:
+            if path is None:
+                expected = "mask=<a folder with labels/ and classes.json> too"
+                raise SettingError("mask_classes", found=", ".join(classes), expected=expected)
             self._classes = read_classes(path / "classes.json")
             self._path = path / "labels"
             names = self._classes.names

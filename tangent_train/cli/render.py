@@ -102,19 +102,20 @@ def render(config: Mapping[str, Any]) -> None:
             found=" and ".join(modes) or "none of them",
             expected="input=<panoramas>, back=<results for tangent images>, or poses=<COLMAP's>",
         )
-    if settings.output is None and (modes != ["input"] or not settings.figure or settings.colmap):
+    if settings.output is None and (modes != ["input"] or not settings.figure):
         raise SettingError("output", found="none", expected="a folder, or with back= a file")
-    if settings.mask is not None and not settings.colmap:
-        raise SettingError("mask", found=settings.mask, expected="none without colmap=true")
+    colmap = settings.colmap and settings.input is not None
+    for name in ("figure",) if colmap else ("mask", "mask_classes"):
+        if getattr(settings, name) is not None:
+            expected = f"none with{'' if colmap else 'out'} colmap=true"
+            raise SettingError(name, found=getattr(settings, name), expected=expected)
     if settings.poses is not None:
         _poses(settings, settings.poses)
-    elif settings.colmap:
+    elif colmap:
         _colmap(settings)
     else:
         work, jobs = _forward(settings) if settings.input is not None else _back(settings)
-        done = _each(jobs, work)
-        _tell(done)
-        _exit_if_some_failed(len(jobs) - len(done), len(jobs))
+        _end(_each(jobs, work), len(jobs))
 
 
 def _each(jobs: Mapping[_Item, Path], work: _Work[_Item]) -> list[Path]:
@@ -122,15 +123,15 @@ def _each(jobs: Mapping[_Item, Path], work: _Work[_Item]) -> list[Path]:
     return [result for _, result, _ in each("Rendering", jobs, work) if result is not None]
 
 
-def _tell(written: Sequence[Path]) -> None:
-    if written:
+def _end(done: Sequence[Path], count: int) -> None:
+    """Say what was written, and exit with 1 if not all panoramas were."""
+    if done:
+        written = list(dict.fromkeys(done))
         listed = f"{written[0]}" + (f" and {len(written) - 1} more" if written[1:] else "")
         Console(highlight=False).print(f"Written: {listed}", soft_wrap=True, markup=False)
-
-
-def _exit_if_some_failed(failed: int, count: int) -> None:
-    if failed:
-        sys.exit(f"tangent-render: {failed} of {count} panoramas could not be rendered, see above")
+    if len(done) < count:
+        failed = f"{count - len(done)} of {count} panoramas"
+        sys.exit(f"tangent-render: {failed} could not be rendered, see above")
 
 
 def _forward(settings: Settings) -> tuple[_Work[Path], dict[Path, Path]]:
@@ -162,10 +163,9 @@ def _forward(settings: Settings) -> tuple[_Work[Path], dict[Path, Path]]:
 
 def _panoramas(settings: Settings) -> list[Path]:
     """The panoramas of `input`, without tangent images that are among them."""
-    found = image_paths(settings.input or "")
     paths = [
         path
-        for path in found
+        for path in image_paths(settings.input or "")
         if not (path.parent / CAMERAS_FILE).exists()
         and not any((folder / RIG_FILE).exists() for folder in path.absolute().parents[2:3])
     ]
@@ -210,10 +210,9 @@ def _colmap(settings: Settings) -> None:
 
         done = _each(dict(zip(names, paths, strict=True)), work)
         if not done:
-            _exit_if_some_failed(len(paths), len(paths))
+            _end(done, len(paths))
         project.write_rig()
-    _tell(done[:1])
-    _exit_if_some_failed(len(paths) - len(done), len(paths))
+    _end(done, len(paths))
 
 
 def _rows(path: Path) -> int:
