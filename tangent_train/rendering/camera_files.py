@@ -219,10 +219,10 @@ def write_rig(
         panoramas: See `RigFile`.
     """
     focal, center = 1 / grid.pitch, grid.dim / 2
+    reference = _world_from_camera(grid, next(iter(faces.values())))
     cameras: list[dict[str, Any]] = []
     for prefix, face in faces.items():
         axes = _world_from_camera(grid, face)
-        reference = cameras[0]["world_from_camera"] if cameras else axes
         of_rig = {
             "cam_from_rig_rotation": _quaternion(axes.T @ reference),
             "cam_from_rig_translation": (0, 0, 0),

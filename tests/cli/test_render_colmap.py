@@ -173,7 +173,11 @@ def test_what_a_partial_panorama_does_not_show_is_ignored(tmp_path: Path) -> Non
     attributes = " ".join(f'GPano:{name}Pixels="{value}"' for name, value in tags.items())
     xmp = f'<x xmlns:GPano="http://ns.google.com/photos/1.0/panorama/" {attributes}/>'
     Image.fromarray(smooth()[16:48]).save(tmp_path / "part.jpg", xmp=xmp.encode())
-    render_with(input=tmp_path / "part.jpg", output=tmp_path / "out", base_level=0, colmap=True)
+    write_pixels(tmp_path / "white.png", np.full((32, 128), 255, np.uint8))
+    settings = {"input": tmp_path / "part.jpg", "base_level": 0, "colmap": True}
+    render_with(output=tmp_path / "out", **settings)
+    render_with(output=tmp_path / "masked", mask=tmp_path / "white.png", **settings)
+    assert contents(tmp_path / "masked") == contents(tmp_path / "out")
     grid = TangentGrid(0, 5)
     for face, directions in enumerate(grid.directions()):
         path = tmp_path / "out" / "masks" / f"face_{face:03}" / "part.png.png"
