@@ -226,7 +226,7 @@ def _poses(settings: Settings, model: Path) -> None:
     """Write the poses of panoramas in a model of COLMAP."""
     output = settings.output or Path()
     _refuse_existing(settings, [output])
-    rig = read_rig((settings.cameras or model.absolute().parents[1]) / RIG_FILE)
+    rig = read_rig((settings.cameras or model.absolute().parent.parent) / RIG_FILE)
     poses = panorama_poses(model, rig)
     write_poses(output, poses)
     said = f"Written: {output}, poses of {len(poses)} of {counted(len(rig.panoramas), 'panoramas')}"

@@ -214,7 +214,11 @@ def _model(project: Path, poses: dict[str, PanoramaPose]) -> Any:
 
 @pytest.mark.parametrize("binary", [True, False])
 def test_poses_come_back(
-    binary: bool, project: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    binary: bool,
+    project: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     rng = np.random.default_rng(5)
     poses = {
@@ -223,7 +227,8 @@ def test_poses_come_back(
     model = _model(project, poses)
     (project / "sparse" / "0").mkdir(parents=True)
     (model.write_binary if binary else model.write_text)(project / "sparse" / "0")
-    render_with(poses=project / "sparse" / "0", output=tmp_path / "poses.json")
+    monkeypatch.chdir(project / "sparse")  # the project is two folders up of the model
+    render_with(poses="0", output=tmp_path / "poses.json")
     assert "poses of 2 of 2 panoramas" in capsys.readouterr().out
     content = json.loads((tmp_path / "poses.json").read_text())
     assert [entry["file"] for entry in content["panoramas"]] == list(NAMES)
