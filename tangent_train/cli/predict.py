@@ -24,6 +24,7 @@ from tangent_train.inference.predictor import Predictor
 from tangent_train.inference.views import PanoramaViews, PhotoViews
 from tangent_train.results.predictions import (
     Entry,
+    Kind,
     PredictionFolder,
     class_shares,
 )
@@ -69,7 +70,7 @@ class Settings:
     rotations: int
     upright: Literal["pose", "auto"] | None
     max_tilt_deg: float
-    probabilities: bool
+    write: tuple[Kind, ...]
     report: int
     overwrite: bool
     resume: bool
@@ -92,7 +93,7 @@ def predict(config: Mapping[str, Any]) -> None:
     decisive = {name: config[name] for name in _DECISIVE}
     images = _find_images(settings)
     trained = _network(settings)
-    folder = PredictionFolder(settings.output, trained.class_names, settings.probabilities)
+    folder = PredictionFolder(settings.output, trained.class_names, settings.write)
     depth = _depth_folder(settings, trained)
     label = _Labeller(settings, trained, _predictor(settings, trained), depth, folder)
     earlier = folder.earlier(decisive) if settings.resume else {}
@@ -147,7 +148,8 @@ class _Labeller:
     def __call__(self, name: str, path: Path, progress: Callable[[float], object]) -> Entry:
         """Label one image and return its entry of the summary."""
         image, area = self._read(name.removesuffix(path.suffix), path)
-        scores = self.predictor.predict(image, progress, probabilities=self.settings.probabilities)
+        probabilities = "probabilities" in self.settings.write
+        scores = self.predictor.predict(image, progress, probabilities=probabilities)
         rgb, labels = image.rgb, self.trained.labels(scores.labels())
         if area is not None:
             rgb, labels = area.cut(rgb), area.cut(labels)

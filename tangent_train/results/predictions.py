@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from tangent_train.inference.views import InputImage
     from tangent_train.rendering.mosaic import ScoreMosaic
 
-__all__ = ["Entry", "PredictionFolder", "class_shares"]
+__all__ = ["Entry", "Kind", "PredictionFolder", "class_shares"]
 
 _ROWS_AT_ONCE = 64
 _SUMMARY = "summary.json"
@@ -36,6 +36,9 @@ _RESULTS = (
     "labels", "color", "overlay", "probabilities",
     "classes.json", _SUMMARY, "summary.csv", "report.html",
 )  # fmt: skip
+
+Kind = Literal["labels", "color", "overlay", "probabilities"]
+"""What is written of an image, each into a folder of its own."""
 
 Entry = dict[str, Any]
 """Entry of an image: file, name, rows, columns and ``classes``, or file, name and error."""
@@ -92,18 +95,17 @@ class PredictionFolder:
     Attributes:
         path: The folder.
         class_names: K + 1 names, the unknown class first.
-        probabilities: Whether they are written too.
+        kinds: What is written of every image.
     """
 
     path: Path
     class_names: Sequence[str]
-    probabilities: bool = False
+    kinds: Sequence[Kind]
 
     def files(self, name: str) -> dict[str, Path]:
         """The files of one image, by kind."""
-        kinds = {"labels": ".png", "color": ".png", "overlay": ".png"}
-        kinds |= {"probabilities": ".npy"} if self.probabilities else {}
-        return {kind: self.path / kind / f"{name}{suffix}" for kind, suffix in kinds.items()}
+        suffixes = {kind: ".npy" if kind == "probabilities" else ".png" for kind in self.kinds}
+        return {kind: self.path / kind / f"{name}{suffix}" for kind, suffix in suffixes.items()}
 
     def check(self) -> None:
         """Refuse a folder with earlier results.
@@ -153,7 +155,7 @@ class PredictionFolder:
         scores: ScoreMosaic,
         area: PanoramaArea | None = None,
     ) -> None:
-        """Write labels, coloured labels and overlay of one image, and probabilities if wanted.
+        """Write what is wanted of one image.
 
         Args:
             name: From `short_names`.
@@ -163,10 +165,13 @@ class PredictionFolder:
             area: Part of the sphere that the image covers.
         """
         files = self.files(name)
-        write_pixels(files["labels"], labels)
-        write_pixels(files["color"], colorize(labels, len(self.class_names)))
-        write_pixels(files["overlay"], overlay_picture(rgb, labels, self.class_names))
-        if not self.probabilities:
+        if "labels" in files:
+            write_pixels(files["labels"], labels)
+        if "color" in files:
+            write_pixels(files["color"], colorize(labels, len(self.class_names)))
+        if "overlay" in files:
+            write_pixels(files["overlay"], overlay_picture(rgb, labels, self.class_names))
+        if "probabilities" not in files:
             return
         everywhere = np.arange(labels.shape[0]), np.arange(labels.shape[1])
         rows, columns = everywhere if area is None else area.places()

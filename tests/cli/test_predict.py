@@ -140,7 +140,7 @@ def test_a_part_of_a_panorama_is_labelled_as_that_part(
     """Away from its borders it gets the labels and probabilities of the whole panorama."""
     whole = _write(tmp_path / "whole" / "a.png", sphere(64))
     part = _write(tmp_path / "part" / "a.png", sphere(64)[rows][:, columns])
-    common = {"blend": "nearest", "probabilities": "true"}
+    common = {"blend": "nearest", "write": "[labels,probabilities]"}
     predict(**common, input=whole, output=tmp_path / "w")
     predict(**common, input=part, output=tmp_path / "p", crop=crop)
     inner = slice(8, -8)
@@ -151,6 +151,7 @@ def test_a_part_of_a_panorama_is_labelled_as_that_part(
         expected, found = read(tmp_path / "w")[rows][:, columns], read(tmp_path / "p")
         assert found.shape == expected.shape
         assert (found == expected)[inner, inner].mean() > 0.98
+    assert not (tmp_path / "p" / "color").exists(), "written only if wanted"
 
 
 @pytest.mark.parametrize("representation", [TANGENT, PERSPECTIVE])

@@ -40,7 +40,8 @@ def predicted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Predicted:
     def run(rgb: NDArray[np.uint8], *typed: str) -> tuple[NDArray[Any], NDArray[Any]]:
         monkeypatch.chdir(tmp_path)
         cv2.imwrite("room.png", rgb[..., ::-1])
-        given = ["checkpoint=net.ckpt", "input=room.png", "output=out", "probabilities=true"]
+        given = ["checkpoint=net.ckpt", "input=room.png", "output=out"]
+        given += ["write=[labels,probabilities]"]
         run_command(monkeypatch, "predict", *given, "report=0", *typed)
         labels: Any = cv2.imread("out/labels/room.png", cv2.IMREAD_UNCHANGED)
         return labels, np.load("out/probabilities/room.npy")

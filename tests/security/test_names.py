@@ -24,7 +24,7 @@ _PARTS = st.text(st.characters(exclude_characters="/\0", codec="utf-8"), min_siz
 @example([["..x"], ["...", "x"]])
 def test_predictions_stay_in_their_folder(names: list[list[str]]) -> None:
     paths = [Path("images", *parts) for parts in names]
-    folder = PredictionFolder(Path("/output"), ("unknown", "wall"), probabilities=True)
+    folder = PredictionFolder(Path("/output"), ("unknown", "wall"), ("labels", "probabilities"))
     for name in short_names(paths):
         for file in folder.files(name).values():
             assert file.is_relative_to("/output")
