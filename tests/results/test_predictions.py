@@ -73,7 +73,7 @@ def test_the_summary(tmp_path: Path) -> None:
         {"file": "a, b.jpg", "name": "a", "rows": 2, "columns": 4, "classes": {"up": 1, "down": 3}},
         {"file": "=x.jpg", "name": "x", "error": "=x.jpg: found nothing; expected an image."},
     ]
-    PredictionFolder(tmp_path, NAMES).write_summary({"level": 6}, entries)
+    PredictionFolder(tmp_path, NAMES, ["labels"]).write_summary({"level": 6}, entries)
     content = json.loads((tmp_path / "summary.json").read_text())
     assert content == {"level": 6, "images": entries}
     assert json.loads((tmp_path / "classes.json").read_text()) == {"up": 1, "down": 2}
