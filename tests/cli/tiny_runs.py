@@ -53,5 +53,5 @@ def run_in(folder: Path, command: str, *arguments: str) -> None:
 def results(folder: Path) -> dict[str, Any]:
     """The ``results.json`` of a run, without the place of its network."""
     content: dict[str, Any] = json.loads((folder / "results.json").read_text())
-    del content["checkpoint"]
+    content.pop("checkpoint", None)
     return content
