@@ -26,7 +26,7 @@ demo: install
 		echo "Going on with the interrupted demo …"; \
 		$(BIN)/tangent-train resume=$(DEMO); \
 	else \
-		echo "Rendering rooms, training and evaluating (4 to 7 minutes on two cores) …"; \
+		echo "Rendering rooms, training and evaluating (14 minutes of CPU time) …"; \
 		$(BIN)/tangent-train experiment=rooms/demo hydra.run.dir=$(DEMO); \
 	fi
 
