@@ -123,16 +123,15 @@ def note_ignored(root: Path, problems: Problems) -> None:
         root: Folder with ``images/`` and ``labels/``, there or not.
         problems: They are added.
     """
-    files = {part: list(walk_files(root / part)) for part in ("images", "labels")}
-    names = {part: [_name(root / part, p) for p in paths] for part, paths in files.items()}
-    with_image = set(names["images"])
-    images = [path for path in files["images"] if path.suffix.lower() in IMAGE_SUFFIXES]
+    files = list(walk_files(root / "images"))
+    names = {_name(root / "images", path) for path in files}
+    images = [path for path in files if path.suffix.lower() in IMAGE_SUFFIXES]
     noted = [
         (path, "labels of no image", "Name it as its image, or remove it.")
-        for path, name in zip(files["labels"], names["labels"], strict=True)
-        if name not in with_image
+        for path in walk_files(root / "labels")
+        if _name(root / "labels", path) not in names
     ]
-    others = sorted(set(files["images"]) - set(images))
+    others = set(files) - set(images)
     noted += [(path, "no image", "Convert it; of a video, extract frames.") for path in others]
     grey = [path for path in images if is_grey(path)]
     if len(grey) < len(images):

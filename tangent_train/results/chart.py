@@ -62,18 +62,17 @@ def grid_png(title: str, grid: Mapping[str, Mapping[str, Row]], score: str) -> b
 
     Args:
         title: Of the chart.
-        grid: Rows by view and condition.
+        grid: Rows by view, every one with all conditions.
         score: Over all classes.
 
     Returns:
         A PNG file.
     """
-    conditions = list(dict.fromkeys(c for found in grid.values() for c in found))
+    conditions = list(next(iter(grid.values())))
     figure = _figure(max(10.0, 0.2 * len(conditions) * len(grid)), 4.2 + 0.12 * len(grid))
     axes = figure.subplots()
     axes.set_title(f"{title}\n{_ERROR_BARS}", loc="left")
-    nothing = Row("", ())
-    scores = [[found.get(c, nothing).score(score) for c in conditions] for found in grid.values()]
+    scores = [[row.score(score) for row in found.values()] for found in grid.values()]
     _bars(axes, [Row(view, ()) for view in grid], conditions, scores)
     return _png(figure, axes)
 

@@ -52,13 +52,19 @@ class Report:
 
     @property
     def grid(self) -> dict[str, dict[str, Row]]:
-        """Rows by view and condition; empty with a single condition."""
+        """Rows by view, every one with all conditions; empty with a single condition."""
         grid: dict[str, dict[str, Row]] = defaultdict(dict)
         for row in self.rows:
             if row.label in self.cells:
                 view, condition = self.cells[row.label]
                 grid[view][condition] = row
-        return grid if any(len(found) > 1 for found in grid.values()) else {}
+        conditions = dict.fromkeys(c for found in grid.values() for c in found)
+        if len(conditions) < 2:
+            return {}
+        nothing = Row("", ())
+        return {
+            view: {c: found.get(c, nothing) for c in conditions} for view, found in grid.items()
+        }
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -85,13 +91,13 @@ class Report:
         return tables
 
     def _views(self) -> Iterator[Table]:
-        if not self.grid:
+        grid = self.grid
+        if not grid:
             return
-        conditions = list(dict.fromkeys(c for found in self.grid.values() for c in found))
-        nothing = Row("", ())
+        conditions = next(iter(grid.values()))
         rows = [
-            (view, *(_cell(found.get(c, nothing).score(_OF_CELLS), 0) for c in conditions))
-            for view, found in self.grid.items()
+            (view, *(_cell(row.score(_OF_CELLS), 0) for row in found.values()))
+            for view, found in grid.items()
         ]
         note = f"{_LEGEND} {_LEGEND_OF_INTERVALS}"
         yield Table(f"{self._title_of_cells} %", ("", *conditions), rows, note)
