@@ -38,9 +38,7 @@ MEASURED = {
 }
 """Modules of the rows; each has a function of the same name."""
 
-ON_A_GPU = {
-    name: f"benchmarks.gpu.{name}" for name in ("correct", "step", "predict", "fed", "science")
-}
+ON_A_GPU = {name: f"benchmarks.gpu.{name}" for name in ("correct", "step", "predict", "fed")}
 """Likewise, of ``gpu``."""
 
 BASELINE = Path(__file__).with_name("baseline.json")
@@ -106,7 +104,7 @@ def run(modules: Mapping[str, str], output: Path, *, quick: bool) -> Path:
         "versions": {library: version(library) for library in libraries},
     }
     if {*modules} <= {*ON_A_GPU}:
-        gpu = import_module("benchmarks.gpu.attempts")
+        gpu = import_module("benchmarks.gpu.device")
         content |= {"quick": gpu.QUICK, "failures": gpu.FAILURES, **gpu.device_facts()}
     output.mkdir(parents=True, exist_ok=True)
     path = output / "results.json"

@@ -7,12 +7,10 @@ from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
-from torch.nn import functional
 
-from benchmarks.gpu.attempts import DEVICE, QUICK, Attempts, part, peak_mib, way
+from benchmarks.gpu.device import DEVICE, QUICK, peak_mib, tried, way
 from benchmarks.labels import NUM_CLASSES, random_scores
 from benchmarks.measuring import Goal, Row, Table, measure
 from models import UNet
@@ -23,8 +21,6 @@ from tangent_train.rendering import (
     tangent_to_equirect,
     tangent_to_labels,
 )
-from tangent_train.rendering.tables import image_table
-from tangent_train.rendering.taps import image_taps
 from tangent_train.tasks import SegmentationTask
 
 __all__ = ["correct"]
@@ -33,14 +29,13 @@ _LEAST = 1e-12
 """Written for 0, of which there is no multiple."""
 
 
-@part(100)
-def correct(attempts: Attempts) -> Iterator[Table]:
+def correct(_quick: bool) -> Iterator[Table]:
     """Errors in float32 and bf16, then the renderers at level 10."""
     torch.backends.cudnn.allow_tf32 = torch.backends.cuda.matmul.allow_tf32 = False
     exact = _numbers(torch.device("cpu"), torch.float64, nullcontext())
     half: Any = partial(torch.autocast, DEVICE.type, torch.bfloat16)
     for name, context, bound in (("float32", nullcontext, 1e-4), ("bf16", half, None)):
-        found = attempts.tried(name, partial(_numbers, DEVICE, torch.float32, context()))
+        found = tried(name, partial(_numbers, DEVICE, torch.float32, context()))
         if found is None:
             continue
         rows = [
@@ -50,7 +45,7 @@ def correct(attempts: Attempts) -> Iterator[Table]:
         table = Table(f"correct: {name}, norm of the difference over the norm", rows, "")
         table.goals = [Goal(row.name, row.median, bound) for row in rows if bound]
         yield table
-    yield from _renderers(attempts)
+    yield from _renderers()
 
 
 def _numbers(
@@ -90,35 +85,25 @@ def _numbers(
     return {name: tensor.detach().double().cpu() for name, tensor in found.items()}
 
 
-def _renderers(attempts: Attempts) -> Iterator[Table]:
-    """Of float32 scores beside reading them once, and two other ways to the same labels."""
-    level = 6 if attempts.quick else 10
+def _renderers() -> Iterator[Table]:
+    """Of float32 scores, beside reading them once."""
+    level = 6 if QUICK else 10
     grid, shape = TangentGrid(1, level), equirect_shape(level)
-    scores = random_scores(grid).to(DEVICE)
+    scores, panorama = random_scores(grid).to(DEVICE), torch.randn(3, *shape, device=DEVICE)
     calls: dict[str, Callable[[], Any]] = {
         "tangent_to_labels": partial(tangent_to_labels, scores, grid, shape),
         "tangent_to_equirect": partial(tangent_to_equirect, scores, grid, shape),
-        "equirect_to_tangent, RGB": partial(
-            equirect_to_tangent, torch.randn(3, *shape, device=DEVICE), grid
-        ),
+        "equirect_to_tangent, RGB": partial(equirect_to_tangent, panorama, grid),
         "tangent_to_labels, feather": partial(tangent_to_labels, scores, grid, shape, "feather"),
     }
-    ours = len(calls)
-    calls |= _others(scores, grid, shape)
-    expected = calls["tangent_to_labels"]()
     rows = measure([way("reading the scores once", scores.sum)], 5)
     memory = [Row("the scores", [scores.nbytes / 2**20])]
-    for number, (name, call) in enumerate(calls.items()):
-        if (
-            number >= ours
-            and attempts.tried(f"agreement of {name}", _agree(call, expected)) is None
-        ):
-            continue
-        timed = way(name, call, ours=number < ours, rounds=3 if "feather" in name else 5)
-        rows += attempts.tried(f"time of {name}", partial(measure, [timed], 5)) or []
-        added = attempts.tried(f"memory of {name}", partial(peak_mib, call))
+    for name, call in calls.items():
+        timed = way(name, call, ours=True, rounds=3 if "feather" in name else 5)
+        rows += tried(f"time of {name}", partial(measure, [timed], 5)) or []
+        added = tried(f"memory of {name}", partial(peak_mib, call))
         if added is not None:
-            memory.append(Row(name, [memory[0].median + added], number < ours))
+            memory.append(Row(name, [memory[0].median + added], ours=True))
     table = Table(f"correct: time of rendering, level {level}, {NUM_CLASSES} classes", rows)
     both = ("tangent_to_labels", "tangent_to_equirect")
     table.goals = [Goal(f"{n}, of reading the scores", table.ratio(n), 2) for n in both]
@@ -126,43 +111,3 @@ def _renderers(attempts: Attempts) -> Iterator[Table]:
     table = Table("correct: memory with the scores", memory, "MiB")
     table.goals = [Goal(f"{name}, of the scores'", table.ratio(name), 1.3) for name in both]
     yield table
-
-
-def _agree(call: Callable[[], Tensor], expected: Tensor) -> Callable[[], float]:
-    def agreement() -> float:
-        share = (call().view(-1) == expected.view(-1)).double().mean().item()
-        if share < 0.999:
-            raise RuntimeError(f"other labels: {share:.2%} agree")
-        return share
-
-    return agreement
-
-
-def _others(
-    scores: Tensor, grid: TangentGrid, shape: tuple[int, int]
-) -> dict[str, Callable[[], Any]]:
-    """Labels without a kernel per class and tap: worth building in where they are much faster."""
-    table = image_table(grid, shape, np.dtype(np.float32), "nearest", slice(0, shape[0]))
-    position = [torch.from_numpy(line.reshape(1, -1)).to(DEVICE) for line in table]
-    step, classes, size = 2**20, scores.shape[1], grid.dim**2
-    parts = [
-        [line[:, k : k + step] for line in position] for k in range(0, position[0].numel(), step)
-    ]
-    pixels = scores.movedim(1, -1).reshape(-1, classes)  # as a channels-last network gives them
-    flat, offsets = scores.reshape(-1), torch.arange(classes, device=DEVICE)[:, None] * size
-
-    def bag(face: Tensor, u: Tensor, v: Tensor, weight: Tensor) -> Tensor:
-        source, of_taps = (taps.T for taps in image_taps(face, u, v, grid.dim, weight, size))
-        means = functional.embedding_bag(source, pixels, per_sample_weights=of_taps, mode="sum")
-        return means.argmax(1)
-
-    @torch.compile(dynamic=False, backend="eager" if QUICK else "inductor")
-    def fused(face: Tensor, u: Tensor, v: Tensor, weight: Tensor) -> Tensor:
-        source, of_taps = image_taps(face, u, v, grid.dim, weight, classes * size)
-        terms = [flat[index + offsets] * of for index, of in zip(source, of_taps, strict=True)]
-        return (terms[0] + terms[1] + terms[2] + terms[3]).argmax(0)
-
-    return {
-        "labels by embedding_bag, channels last": lambda: torch.cat([bag(*p) for p in parts]),
-        "labels by torch.compile": lambda: torch.cat([fused(*p) for p in parts]),
-    }

@@ -15,7 +15,7 @@ from lightning.pytorch.callbacks import Callback
 from torch import Tensor
 from torch.profiler import ProfilerActivity, profile
 
-from benchmarks.gpu.attempts import DEVICE, QUICK, Attempts, part
+from benchmarks.gpu.device import DEVICE, QUICK, tried
 from benchmarks.measuring import Goal, Row, Table
 from benchmarks.training import built, quiet
 from datamodules.core.inputs import normalize
@@ -31,8 +31,7 @@ _Figures = tuple[float, float]
 """Seconds of a step, and the percentage of the time in which the device worked."""
 
 
-@part(150)
-def fed(attempts: Attempts) -> Iterator[Table]:
+def fed(_quick: bool) -> Iterator[Table]:
     """The paper's best row at level 10, in bf16: FCN-ResNet101 on 16 RGB-D images a step."""
     settings = ["experiment=paper/semseg_s10_b1_rgbd", "network.weights=null"]
     settings += ["task.images_per_chunk=null", "task.channels_last=true", "data.in_memory=false"]
@@ -42,7 +41,7 @@ def fed(attempts: Attempts) -> Iterator[Table]:
     with tempfile.TemporaryDirectory() as root:
         store = f"data.store={root}/store"
         made = partial(built, [*settings, store], f"{root}/rooms", 2 ** (level + 1), rooms)
-        both = attempts.tried("rooms and store", made)
+        both = tried("rooms and store", made)
         if both is None:
             return
         data, task = both
@@ -54,15 +53,15 @@ def fed(attempts: Attempts) -> Iterator[Table]:
         steps = _WARM + _TIMED + _PROFILED
         batch = _on_device(batch)
         alone = partial(_fit, task, train_dataloaders=_Batches(lambda _: batch, steps))
-        figures["the step alone"] = attempts.tried("the step alone", alone)
+        figures["the step alone"] = tried("the step alone", alone)
         cores = len(os.sched_getaffinity(0))
         for workers in (0,) if QUICK else [n for n in (2, 4, 8, 12, 15) if n < cores]:
             data.num_workers = workers
             name = f"{workers} workers"
-            figures[name] = attempts.tried(name, partial(_fit, task, datamodule=data), 15)
+            figures[name] = tried(name, partial(_fit, task, datamodule=data))
         name = "rendered on the GPU, whole panoramas in pinned memory"
-        figures[name] = attempts.tried(
-            name, lambda: _fit(task, train_dataloaders=_Batches(_Rendered(data), steps)), 15
+        figures[name] = tried(
+            name, lambda: _fit(task, train_dataloaders=_Batches(_Rendered(data), steps))
         )
     found = {name: each for name, each in figures.items() if each is not None}
     yield Table("fed: a training step", [Row(n, [s], True) for n, (s, _) in found.items()])

@@ -16,13 +16,14 @@ import numpy as np
 import torch
 from torch import nn
 
-from benchmarks.gpu.attempts import DEVICE, QUICK, Attempts, part, run_command, segformer, way
+from benchmarks.gpu.device import DEVICE, QUICK, segformer, tried, way
 from benchmarks.labels import NUM_CLASSES
 from benchmarks.measuring import Goal, Row, Table, measure
 from datamodules.core.inputs import RGB_NORMALIZATION
 from models import FCNResNet
 from tangent_train.checkpoints.scores import Scores
 from tangent_train.checkpoints.trained import TrainedNetwork
+from tangent_train.cli.processes import command_line, run_process
 from tangent_train.geometry import TangentGrid, equirect_shape
 from tangent_train.inference.predictor import Predictor, view_scores
 from tangent_train.inference.views import InputImage, PanoramaViews
@@ -33,18 +34,16 @@ __all__ = ["predict"]
 _NAMES = ("unknown", *map(str, range(NUM_CLASSES)))
 
 
-@part(150)
-def predict(attempts: Attempts) -> Iterator[Table]:
+def predict(quick: bool) -> Iterator[Table]:
     """2048×1024 and 4096×2048, in bf16, then 200 frames by ``tangent-predict``."""
-    quick = attempts.quick
     networks: dict[str, Callable[[], nn.Module]] = {
-        "SegFormer-B0": lambda: segformer(NUM_CLASSES, quick=quick),
+        "SegFormer-B0": lambda: segformer(NUM_CLASSES),
         "FCN-ResNet101": lambda: FCNResNet(3, NUM_CLASSES, depth=50 if quick else 101),
     }
     for level in (7,) if quick else (9, 10):
         for name, make in list(networks.items())[: 1 if quick else 2]:
             height, width = equirect_shape(level)
-            rows = attempts.tried(f"{name}, {width}×{height}", partial(_rows, make(), level), 30)
+            rows = tried(f"{name}, {width}×{height}", partial(_rows, make(), level))
             if rows is None:
                 continue
             table = Table(f"predict: {name}, bf16, {width}×{height}", rows)
@@ -52,7 +51,7 @@ def predict(attempts: Attempts) -> Iterator[Table]:
                 outside = 100 * (1 - 1 / table.ratio(row.name))
                 table.goals.append(Goal(f"outside the network, percent, {row.name}", outside, 10))
             yield table
-    frames = attempts.tried("a folder of frames", partial(_folder, 2 if quick else 200), 90)
+    frames = tried("a folder of frames", partial(_folder, 2 if quick else 200))
     if frames is not None:
         yield Table("predict: tangent-predict, of each frame", frames)
 
@@ -111,7 +110,7 @@ def _folder(count: int) -> list[Row]:
     level = 7 if QUICK else 9
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        network: Any = segformer(NUM_CLASSES, quick=QUICK)
+        network: Any = segformer(NUM_CLASSES)
         network.network.save_pretrained(folder / "net")
         size = dict.fromkeys(("height", "width"), TangentGrid(1, level).dim)
         SegformerImageProcessor(size=size).save_pretrained(folder / "net")
@@ -126,11 +125,17 @@ def _folder(count: int) -> list[Row]:
             shutil.copy(frames / "0.jpg", frames / f"{number}.jpg")
         given = ["network=huggingface", f"model={folder / 'net'}", f"classes={classes}"]
         given += [f"level={level}", "base_level=1", "normalization=imagenet"]
-        run_command("import", [*given, f"output={checkpoint}"], folder)
+        _command("import", [*given, f"output={checkpoint}"], folder)
         given = [f"checkpoint={checkpoint}", f"input={frames}", f"device={DEVICE.type}"]
         rows = []
         for blend in ("feather", "nearest"):
             start = time.perf_counter()
-            run_command("predict", [*given, f"blend={blend}", f"output={folder / blend}"], folder)
+            _command("predict", [*given, f"blend={blend}", f"output={folder / blend}"], folder)
             rows.append(Row(blend, [(time.perf_counter() - start) / count], True))
         return rows
+
+
+def _command(name: str, arguments: list[str], folder: Path) -> None:
+    status = run_process(command_line(name, arguments, folder))
+    if status:
+        raise RuntimeError(f"tangent-{name} ended with status {status}")

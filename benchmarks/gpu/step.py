@@ -11,7 +11,7 @@ import torch
 from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
-from benchmarks.gpu.attempts import DEVICE, QUICK, Attempts, part, segformer, way
+from benchmarks.gpu.device import DEVICE, QUICK, segformer, tried, way
 from benchmarks.labels import NUM_CLASSES
 from benchmarks.measuring import Goal, Row, Table, measure
 from models import FCNResNet, UNet
@@ -31,36 +31,33 @@ class _Mode(NamedTuple):
     tf32: bool = True
     half: bool = False
     compile: dict[str, Any] | None = None
-    takes_s: float = 10
 
 
 _MODES = (
     _Mode("float32, TF32 off", tf32=False),
     _Mode("float32, TF32"),
     _Mode("bf16, channels last", half=True),
-    _Mode("the same, compiled", half=True, compile={}, takes_s=60),
-    _Mode("the same, CUDA graphs", half=True, compile={"mode": "reduce-overhead"}, takes_s=60),
+    _Mode("the same, compiled", half=True, compile={}),
+    _Mode("the same, CUDA graphs", half=True, compile={"mode": "reduce-overhead"}),
 )
 
 
-@part(220)
-def step(attempts: Attempts) -> Iterator[Table]:
+def step(quick: bool) -> Iterator[Table]:
     """FCN-ResNet101 (paper, level 10), SegFormer-B0, and the UNet of ``rooms/standard``."""
-    quick = attempts.quick
     side, count = (32, 2) if quick else (512, 16)
     widths = (4, 8, 8) if quick else (16, 32, 64, 128, 256, 256)
     fcn = FCNResNet(4, NUM_CLASSES, depth=50 if quick else 101, frozen_statistics=True)
     cases: tuple[tuple[str, nn.Module, tuple[int, ...]], ...] = (
         ("UNet", UNet(4, NUM_CLASSES, widths), (2, 4, 32, 32) if quick else (40, 4, 96, 96)),
         ("FCN-ResNet101", fcn, (count, 4, side, side)),
-        ("SegFormer-B0", segformer(NUM_CLASSES, quick=quick), (count, 3, side, side)),
+        ("SegFormer-B0", segformer(NUM_CLASSES), (count, 3, side, side)),
     )
     for name, network, size in cases:
         rows: list[Row] = []
         for mode in _MODES:
             timed = partial(_timed, network, size, mode)
-            rows += attempts.tried(f"{name}, {mode.name}", timed, mode.takes_s) or []
-        flops = attempts.tried(f"{name}: operations", partial(_flops, network, size))
+            rows += tried(f"{name}, {mode.name}", timed) or []
+        flops = tried(f"{name}: operations", partial(_flops, network, size))
         if not rows or flops is None:
             continue
         table = Table(f"step: {name}, {size[0]} images of {size[-1]}²", rows)
