@@ -7,7 +7,6 @@ import lightning
 import pytest
 import torch
 from lightning.pytorch.callbacks import Callback
-from lightning.pytorch.utilities.exceptions import SIGTERMException
 from torch import Tensor, nn
 from torch.nn import functional
 from torch.utils.data import DataLoader
@@ -100,32 +99,6 @@ class Reference(Callback):
         self.epochs.append(dict(self.average))
 
 
-class Ending(Callback):
-    """Ends training after a step, as SIGTERM does."""
-
-    def __init__(self, last: LastCheckpoint, step: int) -> None:
-        self.last, self.step = last, step
-
-    def on_train_batch_end(self, trainer: Any, *_: Any) -> None:
-        self.last._told_to_end = trainer.global_step == self.step
-
-
-def _trainer(
-    folder: Path, *callbacks: Callback, decay: float | None = DECAY, end: int = -1, **settings: Any
-) -> lightning.Trainer:
-    last = LastCheckpoint(folder)
-    averaging = [] if decay is None else [averaged_weights(decay, torch.device("cpu"))]
-    contents = CheckpointContents({"config": {}})
-    checkpoints = [BestCheckpoint(folder), last, Ending(last, end), contents]
-    return quiet_trainer(
-        max_epochs=3,
-        enable_checkpointing=True,
-        plugins=[AtomicCheckpointIO()],
-        callbacks=[*averaging, *checkpoints, *callbacks],
-        **settings,
-    )
-
-
 def _read(path: Path) -> dict[str, Any]:
     content: dict[str, Any] = torch.load(path, weights_only=True)
     return content
@@ -141,8 +114,16 @@ def test_checkpoints_hold_the_average_and_the_weights_to_go_on_with(
     tmp_path: Path, accumulated: int
 ) -> None:
     reference, learner = Reference(), Learner()
-    trainer = _trainer(tmp_path, reference, accumulate_grad_batches=accumulated)
-    trainer.fit(learner)
+    average = averaged_weights(DECAY, torch.device("cpu"))
+    contents = CheckpointContents({"config": {}})
+    checkpoints = [BestCheckpoint(tmp_path), LastCheckpoint(tmp_path), contents]
+    quiet_trainer(
+        max_epochs=3,
+        enable_checkpointing=True,
+        plugins=[AtomicCheckpointIO()],
+        callbacks=[average, *checkpoints, reference],
+        accumulate_grad_batches=accumulated,
+    ).fit(learner)
     assert reference.steps == 3 * STEPS // accumulated
     best, last = _read(tmp_path / "best.ckpt"), _read(tmp_path / "last.ckpt")
     _assert_close(best["state_dict"], reference.epochs[0])
@@ -152,29 +133,3 @@ def test_checkpoints_hold_the_average_and_the_weights_to_go_on_with(
     _assert_close(learner.state_dict(), reference.average)
     apart = [(value - reference.trained[n]).abs().max() for n, value in reference.average.items()]
     assert max(apart) > 0.01, "the average is another network"
-
-
-def test_what_is_validated_is_the_average(tmp_path: Path) -> None:
-    trainer = _trainer(tmp_path)
-    trainer.fit(Learner())
-    evaluated = Learner()
-    evaluated.load_state_dict(_read(tmp_path / "best.ckpt")["state_dict"])
-    (figures,) = _trainer(tmp_path, decay=None).validate(evaluated, verbose=False)
-    assert figures["val/miou"] == pytest.approx(float(trainer.checkpoint_callback.best_model_score))  # type: ignore[union-attr]
-
-
-@pytest.mark.parametrize("step", [1, STEPS + 2])
-def test_a_run_cut_short_goes_on_as_if_nothing_had_happened(tmp_path: Path, step: int) -> None:
-    _trainer(tmp_path / "whole").fit(Learner())
-    with pytest.raises(SIGTERMException):
-        _trainer(tmp_path / "parts", end=step).fit(Learner())
-    last = tmp_path / "parts" / "last.ckpt"
-    assert _read(last)["global_step"] == step
-    torch.manual_seed(77)
-    _trainer(tmp_path / "parts").fit(Learner(), ckpt_path=last, weights_only=True)
-    found, expected = _read(last), _read(tmp_path / "whole" / "last.ckpt")
-    names = ("state_dict", "current_model_state", "averaging_state", "optimizer_states")
-    for part in (*names, "global_step"):
-        torch.testing.assert_close(found[part], expected[part], rtol=0, atol=0)
-    best, whole = (_read(tmp_path / name / "best.ckpt") for name in ("parts", "whole"))
-    torch.testing.assert_close(best["state_dict"], whole["state_dict"], rtol=0, atol=0)

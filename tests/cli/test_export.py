@@ -65,6 +65,10 @@ def test_a_file_is_overwritten_only_when_told(checkpoint: Path, tmp_path: Path, 
         (["checkpoint={}"], "output: found none"),
         (["checkpoint={}", "output=x.pt"], r"output: found x\.pt; .* \.onnx or \.safetensors\.$"),
         (["checkpoint={}", "output=x.onnx", "image_size=32"], "image_size: found 32; expected"),
+        (
+            ["checkpoint={}", "output=x.safetensors", "image_size=[16,16]", "opset=18"],
+            "image_size and opset:",
+        ),
         (["checkpoint={}", "output=x.onnx", "image_size=[15,16]"], "output: .* multiples of 2"),
     ],
 )

@@ -146,15 +146,6 @@ def test_labels_from_arrays(
     assert np.load(tmp_path / "back.npy").dtype == stored
 
 
-def test_negative_labels_fit_into_no_image(
-    rendered: Path, tmp_path: Path, refused: Refused
-) -> None:
-    folder = _results(tmp_path / "results", np.full((32, 32), -1))
-    said = refused(back=folder, cameras=rendered, output=tmp_path / "back.png")
-    assert ".png files: found int8" in said
-    assert not (tmp_path / "back.png").exists()
-
-
 def _z_depth(dim: int, radius: float) -> NDArray[np.float64]:
     """``(d, d)`` depth along the axis of a sphere around the camera, by similar triangles."""
     grid = TangentGrid(0, 5)
@@ -220,16 +211,6 @@ def test_features_of_another_resolution(
     found = panorama[..., :3] / np.linalg.norm(panorama[..., :3], axis=-1, keepdims=True)
     away = np.degrees(np.arccos((found * expected).sum(-1).clip(-1, 1)))
     assert away.max() < (0.1 if blend == "nearest" else 3)
-
-
-def test_rotated_icosahedra_come_back(room: Path, tmp_path: Path) -> None:
-    for output in ("tan", "again"):
-        render_with(input=room, output=tmp_path / output, base_level=0, rotation="so3", seed=4)
-    cameras = read_cameras(tmp_path / "tan" / "room" / "cameras.json")
-    assert cameras.grid.rotation is not None
-    assert read_cameras(tmp_path / "again" / "room" / "cameras.json") == cameras
-    render_with(back=tmp_path / "tan" / "room", output=tmp_path / "back.png")
-    assert np.abs(_read(tmp_path / "back.png").astype(int) - smooth()).max() <= 5
 
 
 @pytest.mark.parametrize(

@@ -196,22 +196,6 @@ def test_nan_is_refused(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    ("name", "settings", "message"),
-    [
-        ("net.pt", {}, r"output: found net\.pt; expected a name ending in \.onnx or"),
-        ("net.safetensors", {"opset": 18}, "image_size and opset: .*expected null"),
-        ("net.onnx", {"image_size": (32, 30)}, r"output: .*cannot be written .*multiples of 4"),
-    ],
-)
-def test_settings_that_do_not_fit(
-    name: str, settings: dict[str, Any], message: str, trained: TrainedNetwork, tmp_path: Path
-) -> None:
-    with pytest.raises(SettingError, match=f"^{message}"):
-        export_network(trained, tmp_path / name, **settings)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_packages_for_onnx_are_named(
     trained: TrainedNetwork, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -220,18 +204,6 @@ def test_packages_for_onnx_are_named(
     message = r"found no package onnxscript; .* pip install 'tangent-train\[export\]'"
     with pytest.raises(SettingError, match=message):
         export_network(trained, tmp_path / "net.onnx")
-
-
-def test_an_interrupted_export_leaves_nothing(
-    trained: TrainedNetwork, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def interrupted(*_: Any) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(export_module, "load_trained", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        export_network(trained, tmp_path / "net.safetensors")
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_other_files_are_refused(files: dict[str, Path], tmp_path: Path) -> None:

@@ -226,15 +226,6 @@ def test_impossible_settings_are_refused(tmp_path: Path, network: Network) -> No
             tt.load(tmp_path / "net.ckpt", **settings)
 
 
-def test_auto_is_a_device_of_this_machine(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, network: Network
-) -> None:
-    labels = network.labels(sphere(16))
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    found = tt.load(str(tmp_path / "net.ckpt"), device="auto").labels(sphere(16))
-    np.testing.assert_array_equal(found, labels)
-
-
 def test_a_name_of_trusted_code_is_one_name(tmp_path: Path) -> None:
     content = torch.load(write_checkpoint(tmp_path / "net.ckpt"), weights_only=True)
     content["config"]["network"] = {

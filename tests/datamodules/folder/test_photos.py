@@ -14,7 +14,6 @@ from tangent_train.rendering import EquirectRepresentation, PerspectiveRepresent
 from tests.datamodules.data_files import names_of, write_png
 from tests.datamodules.folder.folder_format import (
     CLASS_OF_STORED,
-    NAMES,
     save,
     write_classes,
     write_data_set,
@@ -88,14 +87,6 @@ def test_z_depth_becomes_distance(two: Path) -> None:
         assert photo.depth[row, column] == pytest.approx(expected, abs=0.51)
 
 
-def test_all_sizes_give_crops_of_one_size(tmp_path: Path) -> None:
-    module = _photos(write_photos(tmp_path), photos_per_step=5)
-    batch = next(iter(module.train_dataloader()))
-    assert batch.images[0].shape == (5, 1, 8, 8, 3)
-    assert module.class_names == ("unknown", *NAMES)
-    assert len(list(module.test_dataloader())) == len(module.source("test")) == 2
-
-
 def test_scenes_are_held_out_as_those_of_panoramas(tmp_path: Path) -> None:
     photos = FolderPhotos(write_photos(tmp_path / "photos", scenes=7), CROPS)
     write_data_set(tmp_path / "panoramas", scenes=7)
@@ -134,12 +125,6 @@ def test_the_nearest_camera_counts(tmp_path: Path) -> None:
         own = {n: {"fx": f, "fy": f + 1, "cx": 9, "cy": 8} for n, f in cameras.items()}
         write_cameras(tmp_path, own | {everything: same})
         assert focal_lengths(fov=60) == [80, 90, 100, 110]
-
-
-def test_fields_of_view_have_their_centre_in_the_middle_of_the_photo(two: Path) -> None:
-    matrix = _only(two, "hall/a", fov=90).camera_matrix
-    expected = np.array([[32, 0, 31.5], [0, 32, 23.5], [0, 0, 1]])
-    np.testing.assert_allclose(matrix, expected, atol=1e-12)
 
 
 def test_a_camera_is_that_of_the_photo_as_displayed(tmp_path: Path) -> None:
@@ -256,14 +241,6 @@ def test_files_of_cameras_that_cannot_be_read(two: Path, content: str, message: 
         _photos(two).setup()
 
 
-def test_broken_cameras_leave_their_photos_out(two: Path) -> None:
-    write_photo(two, "hall/c.png", 2)
-    (two / "test.txt").write_text("hall/b")
-    write_cameras(two, {"hall/a": 7})
-    module = _photos(two, fov=70, skip_broken=True)
-    assert sorted(names_of(module, "train") + names_of(module, "test")) == ["hall/b", "hall/c"]
-
-
 @pytest.mark.parametrize("fov", [0, 180, -60, float("nan")])
 def test_impossible_fields_of_view(two: Path, fov: float) -> None:
     with pytest.raises(SettingError, match=rf"data\.fov: found {fov}; expected degrees"):
@@ -281,8 +258,3 @@ def test_labels_of_another_size(tmp_path: Path) -> None:
     assert "one size" in resized
     assert "40×60 pixels; expected 60×40" in turned
     assert "EXIF" in as_displayed
-
-
-def test_a_photo_that_sees_less_than_a_crop(two: Path) -> None:
-    with pytest.raises(DataError, match=r"(?s)a\.png: found 20° × 20° for .* 15° × .*of a crop"):
-        _photos(two, fov=15).setup()

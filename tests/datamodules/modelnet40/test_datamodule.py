@@ -86,23 +86,6 @@ def test_validation_is_drawn_from_every_class_alike(make_module: MakeModule) -> 
     assert make_module(validation_fraction=0).val_dataloader() == []
 
 
-def test_validation_does_not_depend_on_what_can_be_used(tmp_path: Path) -> None:
-    root = write_tree(tmp_path)
-
-    def validation() -> set[str]:
-        module = ModelNet40(
-            root, TangentRepresentation(0, LEVEL), validation_fraction=0.34, skip_broken=True
-        )
-        module.prepare_data()
-        source = module.source("val")
-        return {source.name(index) for index in range(len(source))}
-
-    before = validation()
-    chosen = sorted(before)[0]
-    (root / f"{chosen}.off").write_text("broken")
-    assert validation() == before - {chosen}
-
-
 def test_classes_before_there_are_files(tmp_path: Path) -> None:
     module = ModelNet40(tmp_path / "ModelNet40", TangentRepresentation(0, LEVEL))
     assert module.class_names == MODELNET40

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +8,6 @@ import pytest
 
 from datamodules.stanford2d3ds.label_table import CLASSES, LabelTable
 from tangent_train.errors import DataError
-
-REAL_DATA = os.environ.get("TANGENT_REAL_DATA")
 
 
 def _colors(indices: list[int]) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
@@ -51,15 +48,3 @@ def test_no_class_table(tmp_path: Path, content: str | None, found: str) -> None
     with pytest.raises(DataError, match=found) as error:
         LabelTable.from_json(path)
     assert str(path) in str(error.value)
-
-
-@pytest.mark.real_data
-@pytest.mark.skipif(REAL_DATA is None, reason="TANGENT_REAL_DATA is not set")
-def test_agrees_with_an_independent_decode_of_the_real_table() -> None:
-    folder = Path(str(REAL_DATA)) / "stanford2d3ds"
-    # One class per entry, then that of everything past the end, which it calls 14, <INV>.
-    *classes, invalid = map(int, (folder / "independent_label_maps.txt").read_text().split())
-    table = LabelTable.from_json(folder / "semantic_labels.json")
-    assert invalid == 14
-    assert len(classes) == 9816
-    assert table.decode(_colors(list(range(9816)))).ravel().tolist() == classes

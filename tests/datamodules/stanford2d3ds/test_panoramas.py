@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,8 +17,6 @@ from tests.datamodules.data_files import names_of, read_png
 
 if TYPE_CHECKING:
     from tests.conftest import FabricateStanford
-
-REAL_DATA = os.environ.get("TANGENT_REAL_DATA")
 
 
 @pytest.fixture
@@ -53,18 +50,6 @@ def test_names_come_apart_and_together() -> None:
 def test_other_names(name: str) -> None:
     with pytest.raises(DataError, match="unknown file name"):
         FileName.parse(name)
-
-
-@pytest.mark.real_data
-@pytest.mark.skipif(REAL_DATA is None, reason="TANGENT_REAL_DATA is not set")
-def test_all_real_names_come_apart() -> None:
-    lines = (Path(str(REAL_DATA)) / "stanford2d3ds" / "pano_fold1_test_paths.txt").read_text()
-    paths = [Path(path) for line in lines.splitlines() for path in line.split()]
-    assert len(paths) == 4 * 373
-    for path in paths:
-        name = FileName.parse(path.name)
-        assert str(name) == path.name
-        assert name.frame == "equirectangular"
 
 
 # --- splits ------------------------------------------------------------------------------------

@@ -83,24 +83,6 @@ def test_perspective_depth_is_along_the_optical_axis() -> None:
     np.testing.assert_allclose(depth[8:24, 8:24], 3.5, atol=1e-4)
 
 
-def test_light_follows_the_inverse_square_and_the_cosines() -> None:
-    ray = np.array([2.5, 2.0, 0.0]) - HERE
-
-    def light(lamp_x: float, side: float) -> NDArray[np.float32]:
-        """On the floor below (2.5, 2), of a lamp 2.9 m up that shines down (−1) or up."""
-        room = lit_room(shade=False)
-        lamp = room.lights[0]
-        center, normal = np.array([lamp_x, 2.0, 2.9]), np.array([0, 0, side])
-        room.lights[0] = lamp._replace(center=center, normal=normal)
-        scene = RayScene(room)
-        hits = scene.cast(HERE, (ray / np.linalg.norm(ray))[None].astype(np.float32))
-        return scene.radiance(hits, (0.0, 0.0), np.array([0, 0, 1], np.float32))
-
-    bounced = light(2.5, 1)
-    above, aside = light(2.5, -1) - bounced, light(3.5, -1) - bounced
-    np.testing.assert_allclose(aside / above, (2.9**2 / (2.9**2 + 1)) ** 2, rtol=2e-3)
-
-
 def test_shadows_and_bounced_light_on_the_ceiling() -> None:
     view = PanoramaView(Pose.looking(HERE, 0.0), 128)
     bright, shaded = (take(lit_room(shade=shade), view) for shade in (False, True))

@@ -12,9 +12,7 @@ from datamodules.synthshapes.generate import (
     generate_shapes,
     make_shape,
 )
-from datamodules.synthshapes.parts import Parts
 from tangent_train.errors import SettingError
-from tangent_train.geometry import rotation_about
 from tests.datamodules.data_files import contents
 
 if TYPE_CHECKING:
@@ -61,24 +59,3 @@ def test_chairs_have_backs_at_the_rear() -> None:
         vertices = clean_mesh(make_shape(0, "chair", number)).vertices
         behind += vertices[vertices[:, 2] > vertices[:, 2].max() * 0.7, 0].mean() < 0
     assert behind >= 17
-
-
-def test_parts_are_where_they_should_be() -> None:
-    def extent(add: str, *arguments: Any) -> Any:
-        parts = Parts(np.random.default_rng(0))
-        getattr(parts, add)(*arguments)
-        return parts.mesh().bounds
-
-    upright = rotation_about((1, 0, 0), np.pi / 2)
-    rotated = rotation_about((0, 0, 1), np.pi / 2)
-    for expected, add, *arguments in (
-        ([[-2, -1, -3], [2, 1, 3]], "box", (0, 0, 0), (2, 4, 6), rotated),
-        ([[0, -1, -1], [5, 1, 1]], "rod", (0, 0, 0), (5, 0, 0), 1),
-        ([[-1, -1, -3], [1, 1, 2]], "rod", (0, 0, 2), (0, 0, -3), 1),
-        ([[0.9, 0.9, 0], [1.1, 1.1, 4]], "leg", (1, 1, 4), (1, 1, 0), 0.2, True),
-        ([[-1, -2, 0], [3, 2, 5]], "revolved", [(0, 0), (2, 0), (1, 5)], (1, 0, 0)),
-        ([[-2.5, -0.5, -1.5], [2.5, 0.5, 3.5]], "ring", (0, 0, 1), 2, 0.5, upright),
-        ([[-1, -2, -3], [1, 2, 3]], "ellipsoid", (0, 0, 0), (1, 2, 3)),
-        ([[0, 0, -0.1], [3, 2, 0.1]], "panel", [(0, 0, 0), (3, 0, 0), (3, 2, 0), (0, 2, 0)], 0.2),
-    ):
-        np.testing.assert_allclose(extent(add, *arguments), expected, atol=0.05)

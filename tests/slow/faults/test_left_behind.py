@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from tangent_train.files import write_text
-from tests.running import ROOT, run_python
+from tests.running import ROOT
 
 MAKER = """
 import sys
@@ -65,26 +65,3 @@ def test_files_are_on_the_disk_before_they_replace_others(
     write_text(tmp_path / "a", "four")
     assert done == ["fsync", "replace", "fsync"], "the file, then the names in its folder"
     assert sizes[0] == 4
-
-
-ELSEWHERE = """
-import os, sys
-sys.modules["fcntl"] = None
-del os.posix_fallocate
-import numpy as np
-from pathlib import Path
-from tangent_train.cli import transfer_stages
-from tangent_train.files import reserve, write_text
-write_text(Path("a.txt"), "x")
-array = np.lib.format.open_memmap("a.npy", "w+", np.float32, (100_000,))
-array[:3] = 1, 2, 3
-array.flush()
-with open("a.npy", "r+b") as file:
-    reserve(file, os.path.getsize("a.npy"))
-assert np.load("a.npy")[:4].tolist() == [1, 2, 3, 0]
-"""
-
-
-def test_no_module_of_one_system_is_needed(tmp_path: Path) -> None:
-    done = run_python(tmp_path, "-c", ELSEWHERE)
-    assert done.returncode == 0, done.stderr

@@ -91,14 +91,10 @@ class OpenReport:
         assert box is not None
         return box["x"], box["y"], box["width"], box["height"]
 
-    def middle(self) -> tuple[float, float]:
-        """The middle of the picture on the page."""
-        x, y, width, height = self.box()
-        return x + width / 2, y + height / 2
-
     def drag(self, dx: float, dy: float) -> None:
         """Drag the picture with the mouse, from its middle."""
-        x, y = self.middle()
+        left, top, width, height = self.box()
+        x, y = left + width / 2, top + height / 2
         self.page.mouse.move(x, y)
         self.page.mouse.down()
         self.page.mouse.move(x + dx, y + dy)
@@ -120,11 +116,6 @@ class OpenReport:
         """The canvas in whole pixels of the window."""
         x, y, width, height = self.box()
         return {"x": round(x), "y": round(y), "width": int(width), "height": int(height)}
-
-    def center(self) -> NDArray[np.int64]:
-        """The colour in the middle of the canvas."""
-        pixels = self.pixels()
-        return pixels[pixels.shape[0] // 2, pixels.shape[1] // 2]
 
 
 @contextmanager
