@@ -93,9 +93,9 @@ class TrainedNetwork:
         return len(channel_names(self.inputs))
 
     def labels(self, best: NDArray[np.unsignedinteger]) -> NDArray[np.unsignedinteger]:
-        """Labels 1 … K of the best scores 0 … K - 1, and 0 where nothing won."""
+        """Labels 1 … K of the best scores 0 … K - 1, and 0 where nothing won, or was certain."""
         labels = best + best.dtype.type(1)
-        labels[labels == len(self.class_names)] = 0
+        labels[labels >= len(self.class_names)] = 0
         return labels
 
 

@@ -41,7 +41,7 @@ __all__ = ["predict"]
 
 _DECISIVE = (
     "checkpoint", "class_map", "unmapped", "depth_scale", "projection", "crop", "fov", "level",
-    "levels", "base_level", "blend", "rotations", "upright", "max_tilt_deg",
+    "levels", "base_level", "blend", "rotations", "upright", "max_tilt_deg", "min_confidence",
 )  # fmt: skip
 """Settings that labels depend on: those of resumed predictions must be the same."""
 
@@ -70,6 +70,7 @@ class Settings:
     rotations: int
     upright: Literal["pose", "auto"] | None
     max_tilt_deg: float
+    min_confidence: float
     write: tuple[Kind, ...]
     report: int
     overwrite: bool
@@ -207,7 +208,8 @@ def _predictor(settings: Settings, trained: TrainedNetwork) -> Predictor:
     else:
         upright = settings.upright is not None
         views = PanoramaViews(trained, levels, *how, settings.rotations, upright=upright)
-    return Predictor(trained, views, settings.device, settings.images_per_forward)
+    of_forward = settings.device, settings.images_per_forward
+    return Predictor(trained, views, *of_forward, settings.min_confidence)
 
 
 def _depth_folder(settings: Settings, trained: TrainedNetwork) -> DepthFolder | None:

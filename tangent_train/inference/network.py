@@ -43,6 +43,7 @@ def load(
     blend: Blend = "feather",
     rotations: int = 1,
     images_per_forward: int | None = None,
+    min_confidence: float = 0.0,
     trust: str | Sequence[str] = (),
 ) -> Network:
     """A trained network from a file, for panoramas and photos in memory.
@@ -63,6 +64,7 @@ def load(
         rotations: Number of icosahedra, rotated about the vertical, to average over.
         images_per_forward: Images per call of the network, which bounds memory; None for 2^20
             pixels' worth.
+        min_confidence: Pixels whose best class has a lower probability get the label 0.
         trust: Full names of classes of other packages that the file may name.
 
     Raises:
@@ -74,12 +76,11 @@ def load(
     if class_map is not None:
         trained = map_classes(trained, load_class_map(str(class_map)), unmapped).trained
     views = PanoramaViews(trained, levels or (level,), base_level, blend, rotations)
+    how = device, images_per_forward, min_confidence
     return Network(
         trained,
-        Predictor(trained, views, device, images_per_forward),
-        lambda: Predictor(
-            trained, PhotoViews(trained, level, base_level, blend), device, images_per_forward
-        ),
+        Predictor(trained, views, *how),
+        lambda: Predictor(trained, PhotoViews(trained, level, base_level, blend), *how),
     )
 
 

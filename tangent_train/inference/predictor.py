@@ -76,9 +76,10 @@ class Predictor:
         images_per_forward: Views per call of the network, which bounds memory; None for 2^20
             pixels' worth. A network with cross-image attention takes all views of a panorama
             at once, and their scores are held.
+        min_confidence: Pixels whose best class has a lower probability, from 0 to 1, are unknown.
 
     Raises:
-        SettingError: There is no such device.
+        SettingError: There is no such device, or that is no probability.
     """
 
     def __init__(
@@ -87,7 +88,10 @@ class Predictor:
         view_sets: ViewSets,
         device: str = "cpu",
         images_per_forward: int | None = None,
+        min_confidence: float = 0.0,
     ) -> None:
+        if not 0 <= min_confidence <= 1:
+            raise SettingError("min_confidence", found=min_confidence, expected="0 to 1")
         if device == "auto":
             device = "cuda" if torch.cuda.is_available() else "cpu"
         try:
@@ -104,6 +108,7 @@ class Predictor:
         if self._sees_rays:
             self._network = partial(network, images_per_chunk=self._per_forward)
         self._trained, self._view_sets = trained, view_sets
+        self._min_confidence = min_confidence
 
     def predict(
         self,
@@ -130,6 +135,7 @@ class Predictor:
             self._trained.network.num_scores,
             self._view_sets.blend,
             averaged=probabilities or len(sets) > 1,
+            min_confidence=self._min_confidence,
         )
         for views in sets:
 

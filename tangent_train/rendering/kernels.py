@@ -541,11 +541,17 @@ def add_images(
 
 
 @njit_exact
-def best_classes(start: int, stop: int, total: Array, labels: Array) -> None:
-    """Best class of the ``(H, W, K + 1)`` totals of `add_images`, rows ``start:stop``."""
+def best_classes(start: int, stop: int, total: Array, min_confidence: float, labels: Array) -> None:
+    """Best class of the ``(H, W, K + 1)`` totals of `add_images`, rows ``start:stop``.
+
+    K where its probability is below `min_confidence`.
+    """
+    count = total.shape[2] - 1
     for i in range(start, stop):
         for j in range(labels.shape[1]):
-            labels[i, j] = _best_class(total[i, j], total.shape[2] - 1)
+            best = _best_class(total[i, j], count)
+            unsure = total[i, j, best] < min_confidence * total[i, j, count]
+            labels[i, j] = count if unsure else best
 
 
 @njit_exact

@@ -44,18 +44,27 @@ class ScoreMosaic:
         averaged: Whether to keep sums of probabilities: always with ``feather``; with ``nearest``
             for more than one grid, or when the probabilities are wanted. They take 4·(K + 1) bytes
             a pixel, beyond 2 GiB in a temporary file (of the folder TMPDIR).
+        min_confidence: Probability from which the best class is certain, see `labels`; above 0,
+            sums are kept.
 
     Raises:
         SettingError: The temporary file for the sums does not fit on the disk.
     """
 
     def __init__(
-        self, shape: tuple[int, int], num_classes: int, blend: Blend, *, averaged: bool = False
+        self,
+        shape: tuple[int, int],
+        num_classes: int,
+        blend: Blend,
+        *,
+        averaged: bool = False,
+        min_confidence: float = 0.0,
     ) -> None:
         self.shape = shape
         self.blend = blend
         self._labels = np.zeros(shape, np.uint8 if num_classes < 256 else np.uint16)
-        averaged = averaged or blend == "feather"
+        averaged = averaged or blend == "feather" or min_confidence > 0
+        self._min_confidence = min_confidence
         self._total = zero_sums(shape if averaged else (0, 0), num_classes)
         self._softmax = torch.empty(0)  # kept: fresh memory costs a quarter of the time
         self._owned: tuple[object, NDArray[np.integer]] = None, NO_OWNERS
@@ -114,9 +123,10 @@ class ScoreMosaic:
         over_rows(kernels.add_images, height, width, *arguments)
 
     def labels(self) -> NDArray[np.unsignedinteger]:
-        """``(H, W)`` place of the best class of every pixel; of equal ones the first."""
+        """``(H, W)`` places of the best classes, of equal ones the first; K where unsure."""
         if len(self._total):
-            over_rows(kernels.best_classes, *self.shape, self._total, self._labels)
+            least = self._min_confidence
+            over_rows(kernels.best_classes, *self.shape, self._total, least, self._labels)
         return self._labels
 
     def probabilities(self, rows: slice | NDArray[np.intp]) -> NDArray[np.float32]:

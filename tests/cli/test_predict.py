@@ -200,6 +200,7 @@ def test_depth_is_that_of_the_image_in_its_folder(tmp_path: Path, predict: Predi
         ({"input": "nowhere"}, "nowhere"),
         ({"blend": "mean"}, "blend: found mean; expected feather or nearest"),
         ({"device": "abacus"}, "device"),
+        ({"min_confidence": 70}, "min_confidence: found 70.0; expected 0 to 1"),
         ({"class_map": "night"}, "class_map: found night; expected ade20k_to_stanford2d3ds"),
         ({"class_map": "voc_to_stanford2d3ds", "unmapped": "0"}, "unmapped: found 0; expected unk"),
     ],

@@ -197,6 +197,20 @@ def test_probabilities_of_several_rotations_are_averaged(monkeypatch: pytest.Mon
     np.testing.assert_allclose(probabilities, np.mean(alone, axis=0), atol=1e-5)
 
 
+def test_unsure_is_unknown_of_networks_that_know_nothing_too() -> None:
+    groups = [[0], [1], [2]]  # of which the last means nothing
+    network = Scores(color_network(), 2, groups)
+    names = ("unknown", "dark", "green")
+    trained = trained_network(TANGENT, network=network, class_names=names, groups=groups)
+    predictor = Predictor(trained, PanoramaViews(trained), min_confidence=0.6)
+    scores = predictor.predict(InputImage(sphere(32)))
+    probabilities = scores.probabilities(slice(None))
+    best = probabilities.argmax(axis=-1)
+    known = (best < 2) & (probabilities.max(axis=-1) >= 0.6)
+    assert all(((best == k) & known).any() != (k == 2) for k in range(3))
+    np.testing.assert_array_equal(trained.labels(scores.labels()), np.where(known, best + 1, 0))
+
+
 def test_level_and_base_level_choose_the_views() -> None:
     def views(representation: dict[str, Any], **settings: Any) -> tuple[int, int]:
         (found,) = PanoramaViews(trained_network(representation), **settings)(
