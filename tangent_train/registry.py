@@ -71,8 +71,8 @@ def registered(made: _Registered) -> _Registered:
     """Let settings in files name a class or function.
 
     They may give its arguments by name, as the annotations say: numbers, words (`Literal` or
-    ``str``), sequences and mappings of these, and other registered objects. An argument that may be
-    a `Path` or `Any` is not taken from files.
+    ``str``), sequences and mappings of these, and other registered objects. A `Path` is not taken
+    from files, nor is an argument that may be `Any`.
     """
     _registered.add(made)
     return made
@@ -349,8 +349,10 @@ def _kinds_of_fields(made: Any) -> dict[str, Any]:
 
 def _kind(hint: Any) -> Any:
     members = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
-    if any(m in (Any, Path, object) or Any in get_args(m) for m in members):
+    if any(m in (Any, object) or Any in get_args(m) for m in members):
         return NoneType
+    if Path in members:  # text would be one
+        members = tuple(m for m in members if m not in (Path, str)) or (NoneType,)
     plain = [member for member in members if _is_plain(member)]
     return Union[tuple(plain)] if set(plain) - {NoneType} else _Object  # noqa: UP007 - of a list
 

@@ -58,6 +58,9 @@ OF_THIS_MACHINE = (
 )
 """Paths, processes, sockets, and what is looked at: never taken from a file."""
 
+_OR_PATHS = ("data.mask",)
+"""Settings whose text is a path: numbers are taken from a file."""
+
 
 def may_differ(name: str, purpose: Purpose) -> bool:
     """Whether a setting may differ between two runs.
@@ -71,9 +74,16 @@ def may_differ(name: str, purpose: Purpose) -> bool:
     return purpose in _MAY_DIFFER.get(name, ())
 
 
-def from_file(name: str) -> bool:
-    """Whether the settings in a file may give a setting, ``section.setting``."""
-    return not any(f"{name}.".startswith(f"{own}.") for own in OF_THIS_MACHINE)
+def from_file(name: str, value: Any = None) -> bool:
+    """Whether the settings in a file may give a setting.
+
+    Args:
+        name: As ``section.setting``.
+        value: Its value: a mask may be a latitude, or a path of this machine.
+    """
+    return not (
+        _are_paths(name, value) or any(f"{name}.".startswith(f"{own}.") for own in OF_THIS_MACHINE)
+    )
 
 
 def flat_settings(config: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -102,5 +112,11 @@ def differing_settings(
     return [
         (name, new.get(name), old.get(name))
         for name in sorted(new.keys() | old.keys())
-        if new.get(name) != old.get(name) and not may_differ(name, purpose)
+        if new.get(name) != old.get(name)
+        and not may_differ(name, purpose)
+        and not (purpose == "resume" and _are_paths(name, new.get(name), old.get(name)))
     ]
+
+
+def _are_paths(name: str, *values: Any) -> bool:
+    return name in _OR_PATHS and all(isinstance(value, str) for value in values)

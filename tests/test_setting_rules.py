@@ -37,6 +37,14 @@ def test_differences_are_found_in_nested_and_missing_settings() -> None:
     ]  # fmt: skip
 
 
+def test_a_mask_may_lie_elsewhere_when_a_run_is_resumed() -> None:
+    path, other, latitude = ({"data": {"mask": mask}} for mask in ("a.png", "/b.png", -60))
+    assert differing_settings(other, path, "resume") == []
+    assert differing_settings(other, path, "report") == [("data.mask", "/b.png", "a.png")]
+    assert differing_settings(path, latitude, "resume") == [("data.mask", "a.png", -60)]
+    assert [from_file("data.mask", mask) for mask in (-60, None, "a.png")] == [True, True, False]
+
+
 def test_files_do_not_decide_about_this_machine() -> None:
     own = ("data.root", "data.store", "task.compile.options", "trainer.devices", "trainer.plugins")
     assert not any(map(from_file, own))

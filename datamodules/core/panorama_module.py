@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 from datamodules.core.found import Found, Split
@@ -11,6 +12,7 @@ from datamodules.core.image_module import ImageDataModule
 from datamodules.core.panoramas import Panorama, Turn
 from datamodules.core.pipeline import (
     EstimatedUp,
+    MaskedPanoramas,
     PosedUp,
     RotatedPanoramas,
     SplitItems,
@@ -18,8 +20,10 @@ from datamodules.core.pipeline import (
     in_threads,
 )
 from datamodules.core.problems import Problems
-from datamodules.core.reading import ImageFiles, PanoramaReading, check_headers
+from datamodules.core.reading import ImageFiles, ImageReader, PanoramaReading, check_headers
 from datamodules.core.store import Store
+from datamodules.images.gpano import whole_area
+from datamodules.images.masks import Mask, Masks
 from tangent_train.errors import SettingError
 
 __all__ = ["PanoramaDataModule", "Split", "Upright"]
@@ -36,6 +40,8 @@ class PanoramaDataModule(ImageDataModule):
 
     Args:
         panoramas_per_step: Panoramas per training step and process. Evaluation takes one at a time.
+        mask: What does not count in training and evaluation, in the panorama's own frame, before
+            it is rotated: labels are unknown there, pixels stay. See `Masks`.
         test_rotation: Rotate the test panoramas: tilt in degrees, or `so3`, see `RotatedPanoramas`.
         upright: Align tilted panoramas with gravity. `pose`: as their files say (GPano) and, of
             test panoramas, as they were rotated. `auto`: as their files say, else as estimated from
@@ -46,12 +52,14 @@ class PanoramaDataModule(ImageDataModule):
         erp_height: Rows of the panoramas read.
 
     Raises:
+        DataError: The mask cannot be used.
         SettingError: A setting is invalid.
     """
 
     noun: ClassVar[str] = "panoramas"
 
     panoramas_per_step: int = 4
+    mask: Mask = None
     test_rotation: Turn = None
     upright: Upright = None
     max_tilt_deg: float = 60.0
@@ -65,6 +73,9 @@ class PanoramaDataModule(ImageDataModule):
         )
         self.erp_height: int = self.representation.erp_height
         self._check_rotations()
+        self._masks = Masks(self.mask, "data.mask")
+        if not self._masks.of_each:
+            self._masks.read("", whole_area(Path(), (self.erp_height, 2 * self.erp_height)))
 
     def find(self, problems: Problems) -> Found[ImageFiles]:
         """See `SplitDataModule`."""
@@ -73,14 +84,23 @@ class PanoramaDataModule(ImageDataModule):
         read = PanoramaReading(reader, len(self.class_names), shape)
         store = Store.of(self.store, f"{height}x{width}", reader.settings)
         found = Found(self.noun, splits, read, store)
-        check = partial(check_headers, reader=reader, problems=problems, erp_height=height)
+        check = partial(self._check, reader=reader, problems=problems)
         for _ in in_threads(check, found.of()):
             pass
         return found
 
+    def _check(self, files: ImageFiles, reader: ImageReader, problems: Problems) -> None:
+        """Make sure that the files are whole, and that there is a mask."""
+        check_headers(files, reader, problems, self.erp_height)
+        if self._masks.of_each:
+            with problems.noted(files.name):
+                self._masks.check(files.name)
+
     def pipeline(self, found: Found[ImageFiles], split: Split) -> SplitItems[ImageFiles, Panorama]:
-        """From files or store, then rotated, then aligned with gravity."""
+        """From files or store, then masked, then rotated, then aligned with gravity."""
         transforms: list[Transform[Panorama, Any]] = []
+        if self.mask is not None:
+            transforms.append(MaskedPanoramas(self._masks))
         if self.upright is not None:
             transforms.append(PosedUp())
         if split == "test" and self.test_rotation is not None:

@@ -1,4 +1,4 @@
-"""Panoramas in memory, whatever data set they come from: sizes and masks.
+"""Panoramas in memory, whatever data set they come from: sizes and unknown pixels.
 
 Everything about one panorama (RGB, depth, labels) is brought to the size a run reads with **one**
 pixel grid: the outer edges of source and target agree, so target row i covers source rows
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 
 __all__ = [
     "STEPS_PER_M",
-    "Mask",
     "Panorama",
     "Turn",
+    "Unknown",
     "mask_black",
     "meters_to_steps",
     "resize_area",
@@ -36,7 +36,7 @@ __all__ = [
 
 _Pixel = TypeVar("_Pixel", bound=np.generic)
 
-Mask = Literal["labels", "any_black", "all_black"]
+Unknown = Literal["labels", "any_black", "all_black"]
 """Pixels that count as unknown besides unlabelled ones; see `mask_black`."""
 
 Turn = float | Literal["so3"] | None
@@ -122,7 +122,9 @@ def resize_depth(depth: NDArray[np.uint16], shape: tuple[int, int]) -> NDArray[n
     return small
 
 
-def mask_black(labels: NDArray[np.uint8], rgb: NDArray[np.uint8], mask: Mask) -> NDArray[np.uint8]:
+def mask_black(
+    labels: NDArray[np.uint8], rgb: NDArray[np.uint8], unknown: Unknown
+) -> NDArray[np.uint8]:
     """Make black pixels unknown.
 
     The released code of the paper does `any_black`, in training and in evaluation alike, on the
@@ -131,16 +133,16 @@ def mask_black(labels: NDArray[np.uint8], rgb: NDArray[np.uint8], mask: Mask) ->
     Args:
         labels: ``(H, W)``.
         rgb: ``(H, W, 3)`` at the same pixels.
-        mask: `labels` changes nothing; `any_black` makes pixels unknown where any channel is 0,
+        unknown: `labels` changes nothing; `any_black` makes pixels unknown where any channel is 0,
             `all_black` where all are.
 
     Returns:
         ``(H, W)`` labels.
     """
-    if mask == "labels":
+    if unknown == "labels":
         return labels
     black = rgb == 0
-    return np.where(black.any(-1) if mask == "any_black" else black.all(-1), np.uint8(0), labels)
+    return np.where(black.any(-1) if unknown == "any_black" else black.all(-1), np.uint8(0), labels)
 
 
 def steps_to_meters(steps: NDArray[np.uint16]) -> NDArray[np.float32]:

@@ -1,4 +1,4 @@
-"""The images of a split: read from files or a store, rotated, then aligned with gravity."""
+"""The images of a split: read from files or a store, masked, rotated, then aligned with gravity."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 from datamodules.core.order import sample_rng
 from datamodules.core.panoramas import Panorama
 from datamodules.core.problems import Problems
-from datamodules.images.gpano import up_of
+from datamodules.images.gpano import up_of, whole_area
 from tangent_train.geometry import random_rotation, rotation_about
 from tangent_train.rendering import rotate_equirect
 from tangent_train.rendering.upright.gravity import estimate_up
@@ -24,10 +24,12 @@ if TYPE_CHECKING:
 
     from datamodules.core.reading import ImageFiles
     from datamodules.core.store import Store
+    from datamodules.images.masks import Masks
 
 __all__ = [
     "EstimatedUp",
     "Item",
+    "MaskedPanoramas",
     "PosedUp",
     "Reading",
     "RotatedPanoramas",
@@ -158,6 +160,24 @@ class SplitItems(Generic[_Item, _Image]):
         kind: Any = self._kind
         image: _Image = kind(**{**dict.fromkeys(kind._fields), **read})
         return image
+
+
+class MaskedPanoramas:
+    """Panoramas with labels that are unknown where they do not count.
+
+    Args:
+        masks: Where they count.
+    """
+
+    def __init__(self, masks: Masks) -> None:
+        self._masks = masks
+
+    def __call__(self, panorama: Panorama, index: int, files: ImageFiles) -> Panorama:
+        """One masked panorama; its colours and depth stay."""
+        del index
+        labels = panorama.labels
+        counts = self._masks.read(files.name, whole_area(files.rgb, labels.shape))
+        return panorama._replace(labels=labels & counts)
 
 
 class PosedUp:

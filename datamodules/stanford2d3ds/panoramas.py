@@ -25,7 +25,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from datamodules.core.panorama_module import PanoramaDataModule
-from datamodules.core.panoramas import Mask
+from datamodules.core.panoramas import Unknown
 from datamodules.stanford2d3ds.reader import StanfordReader
 from datamodules.stanford2d3ds.splits import StanfordAreas
 from tangent_train.errors import SettingError
@@ -40,7 +40,7 @@ class Stanford2D3DS(StanfordAreas, PanoramaDataModule):
     """Stanford2D3DS, 13 classes, in the three folds of its authors.
 
     Args:
-        mask: Pixels that count as unknown, see `mask_black`.
+        unknown: Pixels that count as unknown, see `mask_black`.
 
     Raises:
         SettingError: A setting is invalid.
@@ -48,16 +48,16 @@ class Stanford2D3DS(StanfordAreas, PanoramaDataModule):
 
     group = "pano"
 
-    mask: Mask = "labels"
+    unknown: Unknown = "labels"
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.mask not in ("labels", "any_black", "all_black"):
+        if self.unknown not in ("labels", "any_black", "all_black"):
             raise SettingError(
-                "data.mask", found=repr(self.mask), expected="labels, any_black or all_black"
+                "data.unknown", found=repr(self.unknown), expected="labels, any_black or all_black"
             )
 
     @property
     def reader(self) -> StanfordReader:
-        """With the class table and the mask."""
-        return StanfordReader.of(self.root, self.label_table, self.mask)
+        """With the class table and what is unknown."""
+        return StanfordReader.of(self.root, self.label_table, self.unknown)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from datamodules.core.panoramas import Mask, mask_black, resize_nearest
+from datamodules.core.panoramas import Unknown, mask_black, resize_nearest
 from datamodules.core.reading import ImageReader
 from datamodules.images.png import check_png, read_color_png, read_depth_png
 from datamodules.stanford2d3ds.files import MISSING_DEPTH
@@ -37,20 +37,22 @@ class StanfordReader(ImageReader):
 
     Attributes:
         table: The classes of the instances.
-        mask: Pixels that count as unknown, see `mask_black`.
+        unknown: Pixels that count as unknown, see `mask_black`.
     """
 
     table: LabelTable
-    mask: Mask = "labels"
+    unknown: Unknown = "labels"
 
     @classmethod
-    def of(cls, root: Path, label_table: Path | None, mask: Mask = "labels") -> StanfordReader:
+    def of(
+        cls, root: Path, label_table: Path | None, unknown: Unknown = "labels"
+    ) -> StanfordReader:
         """The reader of a data set.
 
         Args:
             root: Its folder.
             label_table: The class table, if not at the place of the release.
-            mask: See `mask_black`.
+            unknown: See `mask_black`.
 
         Raises:
             DataError: There is no class table.
@@ -66,13 +68,13 @@ class StanfordReader(ImageReader):
                 expected=f"it there or at {places[-1]}",
                 remedy="Copy it from the release (assets), or name it in data.label_table.",
             )
-        return cls(LabelTable.from_json(table), mask)
+        return cls(LabelTable.from_json(table), unknown)
 
     @property
     def settings(self) -> dict[str, str]:
-        """The mask and the class table in short."""
+        """Unknown pixels and the class table in short."""
         classes = hashlib.sha256(self.table.class_ids.tobytes()).hexdigest()
-        return {"mask": self.mask, "class table": classes}
+        return {"unknown": self.unknown, "class table": classes}
 
     def size(self, part: str, path: Path) -> tuple[int, int]:
         """See `ImageReader`, as all others."""
@@ -88,9 +90,9 @@ class StanfordReader(ImageReader):
         colors = read_color_png(files.labels)
         shape = shape or (colors.shape[0], colors.shape[1])
         labels = self.table.decode(resize_nearest(colors, shape), files.labels)
-        if self.mask == "labels":
+        if self.unknown == "labels":
             return labels
-        return mask_black(labels, resize_nearest(self.rgb(files), shape), self.mask)
+        return mask_black(labels, resize_nearest(self.rgb(files), shape), self.unknown)
 
     def depth(self, files: ImageFiles) -> NDArray[np.uint16]:
         """Depth in steps of 1/512 m, as in the files."""

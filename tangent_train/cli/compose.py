@@ -17,7 +17,7 @@ __all__ = ["compose_option", "config_folder", "quote_path", "quoted"]
 
 _PATHS = (
     *("back", "cameras", "checkpoint", "class_map", "classes", "depth", "figure", "file"),
-    *("init_from", "input", "left", "model", "output", "resume", "right", "weights"),
+    *("init_from", "input", "left", "mask", "model", "output", "resume", "right", "weights"),
 )
 """Settings that name files or folders."""
 

@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 import numpy as np
 from rich.console import Console
 
-from datamodules.folder.masks import Masks
+from datamodules.folder.masks import class_masks
 from datamodules.images.colmap_project import ColmapProject, flat_names
 from datamodules.images.image_files import image_paths, short_names
+from datamodules.images.masks import Mask, Masks
 from datamodules.images.pixel_files import (
     LOSSY_SUFFIXES,
     PIXEL_SUFFIXES,
@@ -72,7 +73,7 @@ class Settings:
     format: str
     interpolation: Literal["bilinear", "nearest"]
     colmap: bool
-    mask: Path | None
+    mask: Mask
     mask_classes: tuple[str, ...] | None
     figure: Path | None
     back: Path | None
@@ -195,7 +196,7 @@ def _colmap(settings: Settings) -> None:
     if suffix == ".npy":
         raise SettingError("format", found="npy", expected="png, jpg, webp or tif for COLMAP")
     _refuse_existing(settings, [output])
-    masks = Masks(settings.mask, settings.mask_classes)
+    masks = _masks(settings)
     names = dict(zip(flat_names(paths), short_names(paths), strict=True))
     # One camera has images of one size. If no panorama can be read, each says why below.
     grid, faces = _grid(settings, max(map(_rows, paths)) or 512)
@@ -205,7 +206,8 @@ def _colmap(settings: Settings) -> None:
         def work(name: str, path: Path, progress: Callable[[float], object]) -> Path:
             image = read_panorama(path, settings.interpolation)
             file = names[name].removesuffix(path.suffix) + path.suffix
-            project.add(name, file, image, masks.read(names[name], path), progress)
+            counts = masks.read(names[name], panorama_area(path, read_image_size(path)))
+            project.add(name, file, image, counts, progress)
             return output
 
         done = _each(dict(zip(names, paths, strict=True)), work)
@@ -213,6 +215,18 @@ def _colmap(settings: Settings) -> None:
             _end(done, len(paths))
         project.write_rig()
     _end(done, len(paths))
+
+
+def _masks(settings: Settings) -> Masks:
+    if not settings.mask_classes:
+        return Masks(settings.mask)
+    if not isinstance(settings.mask, Path):
+        raise SettingError(
+            "mask_classes",
+            found=", ".join(settings.mask_classes),
+            expected="mask=<a folder with labels/ and classes.json> too",
+        )
+    return class_masks(settings.mask, settings.mask_classes)
 
 
 def _rows(path: Path) -> int:

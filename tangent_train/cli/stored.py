@@ -17,7 +17,7 @@ from tangent_train.cli.compose import config_folder, quoted
 from tangent_train.cli.settings import Trust, typed
 from tangent_train.errors import DataError, SettingError
 from tangent_train.registry import SettingsFile, Text, check_fields
-from tangent_train.setting_rules import OF_THIS_MACHINE, from_file
+from tangent_train.setting_rules import OF_THIS_MACHINE, flat_settings, from_file
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -100,22 +100,25 @@ class StoredRun:
         if "data" in own:
             settings["data"] |= self._of_the_network(settings["data"], own)
         trust = typed(Trust, said).trust
-        return settings, SettingsFile(self.path, trust, own.union(OF_THIS_MACHINE))
+        local = {n for n, value in flat_settings(self.config) if not from_file(n, value)}
+        return settings, SettingsFile(self.path, trust, own.union(local, OF_THIS_MACHINE))
 
     def _section(self, name: str, here: Mapping[str, Any], own: set[str]) -> dict[str, Any]:
         """A section of the file, with machine-specific settings from the user's own config."""
         theirs = self.config[name]
-        section = {n: v for n, v in theirs.items() if from_file(f"{name}.{n}")}
+        names = {*theirs, *here}
+        local = {n for n in names if not from_file(f"{name}.{n}", theirs.get(n))}
+        section = {n: v for n, v in theirs.items() if n not in local}
         if here.get("_target_") == theirs.get("_target_"):
-            section |= {n: v for n, v in here.items() if not from_file(f"{name}.{n}")}
-        root = theirs.get("root")
-        if name == "data" and "data.root" not in own and section.get("root") != root:
-            raise SettingError(
-                "data.root",
-                found="no folder, as checkpoints do not say where data lie",
-                expected="that of the data set on this machine",
-                remedy=f"The run had data.root={root!r}: add that if it is right here.",
-            )
+            section |= {n: v for n, v in here.items() if n in local}
+        for n in sorted(local & {"root", "mask"} if name == "data" else ()):
+            if f"data.{n}" not in own and section.get(n) != theirs.get(n):
+                raise SettingError(
+                    f"data.{n}",
+                    found="none, as checkpoints do not say where files are",
+                    expected="that of the run on this machine",
+                    remedy=f"The run had data.{n}={theirs.get(n)!r}: add that if it is right here.",
+                )
         return section
 
     def _of_the_network(self, data: Mapping[str, Any], own: set[str]) -> dict[str, Any]:

@@ -148,6 +148,5 @@ def _check_resumed(settings: Settings, before: Mapping[str, Any]) -> None:
 def _typed_local() -> list[str]:
     """Typed machine-specific settings, which no file holds: a resumed run needs them again."""
     typed = [said.lstrip("+") for said in HydraConfig.get().overrides.task]
-    names = [said.partition("=")[0] for said in typed]
-    pairs = zip(names, typed, strict=True)
-    return [said for name, said in pairs if name == "trust" or not from_file(name)]
+    parts = [(*said.partition("=")[::2], said) for said in typed]
+    return [said for name, value, said in parts if name == "trust" or not from_file(name, value)]

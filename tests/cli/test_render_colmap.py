@@ -163,7 +163,7 @@ def test_masks_by_name_and_classes_to_ignore(
     assert "mask_classes: found tripod; expected of wall, sky, person" in said
     (tmp_path / "labelled" / "labels" / NAMES[1]).unlink()
     said = refused(output=tmp_path / "some", mask_classes=["person"], **settings)
-    assert "labels/kitchen/room.png: found no such file; expected the mask" in said
+    assert "labels/kitchen/room.png: found no such file; expected a mask" in said
     assert list(read_rig(tmp_path / "some" / "rig_config.json").panoramas.values()) == [NAMES[0]]
 
 
@@ -288,7 +288,6 @@ def test_settings_that_make_no_project(panoramas: Path, tmp_path: Path, refused:
     write_pixels(tmp_path / "mask.jpg", smooth(16))
     said = refused(mask=tmp_path / "mask.jpg", **settings)
     assert "mask.jpg: found JPEG or WebP, which blur masks" in said
-    assert "2 of 2 panoramas could not be rendered" in said
     write_pixels(panoramas / "hall__room.png", smooth(16))
     assert "room.png, which is called hall__room too" in refused(**settings)
     assert not (tmp_path / "out").exists()

@@ -87,6 +87,28 @@ def test_what_concerns_this_machine_is_its_own(content: dict[str, Any], forbidde
     assert settled(own, root=None)[0]["data"]["root"] == "data/rooms_demo", "as one's own config"
 
 
+def test_a_mask_is_a_latitude_in_a_file_and_a_path_of_ones_own(
+    content: dict[str, Any], tmp_path: Path
+) -> None:
+    def masked(mask: Any, *said: str) -> tuple[Any, SettingsFile]:
+        data = content["config"]["data"] | {"mask": mask}
+        settings, source = settled(with_config(content, tmp_path, data=data), *said)
+        return settings["data"]["mask"], source
+
+    assert masked(-60)[0] == -60
+    assert masked(-60, "data.mask=null")[0] is None
+    mask, source = masked(-60, "data.mask=pole.png")
+    assert (mask, source.owns("data.mask")) == ("pole.png", False)
+    with pytest.raises(SettingError, match=r"data\.mask: found none.*had data\.mask='pole\.png'"):
+        masked("pole.png")
+    mask, source = masked("/theirs/pole.png", "data.mask=pole.png")
+    assert (mask, source.owns("data.mask")) == ("pole.png", False)
+    settings, source = settled(with_config(content, tmp_path))
+    settings["data"] |= {"mask": "pole.png"}
+    with pytest.raises(DataError, match=r"data\.mask='pole\.png'; expected .*float"):
+        build(settings, source)
+
+
 def test_names_of_options_are_no_paths(
     content: dict[str, Any], forbidden: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -36,7 +36,7 @@ CROPS: Any = PerspectiveRepresentation(level=5)
         (Stanford2D3DS, {"max_tilt_deg": 0}, "max_tilt_deg"),
         (Stanford2D3DS, {"test_rotation": 200}, "test_rotation"),
         (Stanford2D3DS, {"fold": 4}, "fold"),
-        (Stanford2D3DS, {"mask": "black"}, "mask"),
+        (Stanford2D3DS, {"unknown": "black"}, "unknown"),
         (Stanford2D3DS, {"validation_fraction": 1.0}, "validation_fraction"),
         (Stanford2D3DS, {"areas": ("1", "7")}, "areas"),
         (Stanford2D3DS, {"areas": ("5a", "5b")}, "areas"),

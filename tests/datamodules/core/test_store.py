@@ -151,7 +151,7 @@ def _samples(module: Any) -> list[torch.Tensor]:
 
 @pytest.mark.parametrize(
     "settings",
-    [{"inputs": ["rgb"]}, {"mask": "any_black", "num_workers": 1}, {"in_memory": True},
+    [{"inputs": ["rgb"]}, {"unknown": "any_black", "num_workers": 1}, {"in_memory": True},
      {"test_rotation": 30}],
     ids=str,
 )  # fmt: skip
@@ -188,9 +188,9 @@ def test_what_is_there_is_kept_and_what_is_not_is_made(
     damaged.write_bytes(damaged.read_bytes()[:-9])
     make_module().prepare_data()
     assert _made(store, before) == {damaged}
-    make_module(mask="any_black").prepare_data()
+    make_module(unknown="any_black").prepare_data()
     Stanford2D3DS(root, EquirectRepresentation(level=2), store=store).prepare_data()
-    assert len(_times(store)) == 3 * PANORAMAS, "masks and sizes lie beside each other"
+    assert len(_times(store)) == 3 * PANORAMAS, "choices and sizes lie beside each other"
     table = root / "semantic_labels.json"
     table.write_text(table.read_text().replace("sofa", "clutter"))
     changed, plain = make_module(), make_module(store=None)

@@ -117,10 +117,10 @@ def test_reads_what_was_written(stanford_root: Path, erp_height: int) -> None:
 
 def test_masks_are_applied_on_reading(stanford_root: Path, erp: Any) -> None:
     unknown = {}
-    for mask in ("labels", "any_black", "all_black"):
-        module = Stanford2D3DS(stanford_root, erp, mask=mask)
+    for preset in ("labels", "any_black", "all_black"):
+        module = Stanford2D3DS(stanford_root, erp, unknown=preset)
         source = module.source("train")
-        unknown[mask] = source.read(0).labels == 0
+        unknown[preset] = source.read(0).labels == 0
         np.testing.assert_array_equal(source.labels(0), source.read(0).labels)
     # The fabricated black region has no labels; one more patch has no blue.
     np.testing.assert_array_equal(unknown["labels"], unknown["all_black"])

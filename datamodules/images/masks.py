@@ -1,0 +1,126 @@
+"""Masks of panoramas: where their pixels do not count."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from datamodules.core.panoramas import resize_nearest
+from datamodules.images.gpano import PanoramaArea, whole_area
+from datamodules.images.pixel_files import LOSSY_SUFFIXES, read_image_size, read_pixels
+from tangent_train.errors import DataError, SettingError
+
+__all__ = ["Mask", "Masks"]
+
+Mask = float | Path | None
+"""What of panoramas does not count: what is below a latitude, −90 to 0 degrees; the black pixels of
+a file, for all panoramas, or of the PNG files of a folder, which has one for each; or nothing."""
+
+Counts = Callable[[Path], NDArray[np.bool_]]
+"""Reads a mask: where it counts, ``(H, W)``."""
+
+
+def _not_black(path: Path) -> NDArray[np.bool_]:
+    pixels = read_pixels(path, indices=False)
+    return np.asarray((pixels != 0).reshape(*pixels.shape[:2], -1).any(axis=-1))
+
+
+class Masks:
+    """Where panoramas count, in the frame in which they are stored.
+
+    Args:
+        mask: See `Mask`; text is a path.
+        setting: Its name, for messages.
+        counts: Reads a file.
+
+    Attributes:
+        of_each: Whether every panorama has a mask of its own.
+
+    Raises:
+        DataError: There is no such file, or it cannot be read.
+        SettingError: There is no such latitude.
+    """
+
+    def __init__(
+        self, mask: Mask | str, setting: str = "mask", counts: Counts = _not_black
+    ) -> None:
+        self._lowest_deg, self._path, self._of_all = -90.0, Path(), None
+        self._counts, self.of_each = counts, False
+        self._kept: tuple[PanoramaArea, NDArray[np.uint8]] | None = None
+        if isinstance(mask, str | Path):
+            self._path = Path(mask)
+            self.of_each = self._path.is_dir()
+            self._of_all = None if self.of_each else self._read(self._path)
+        elif isinstance(mask, int | float) and not isinstance(mask, bool) and -90 < mask <= 0:
+            self._lowest_deg = float(mask)
+        elif mask is not None:
+            expected = "a latitude above −90, at most 0 degrees; a file or folder; or null"
+            raise SettingError(setting, found=mask, expected=expected)
+
+    def check(self, name: str) -> None:
+        """Check the header of the mask of one panorama.
+
+        Args:
+            name: See `read`.
+
+        Raises:
+            DataError: It is missing, or not twice as wide as high.
+        """
+        path = self._checked(self._path / f"{name}.png")
+        _whole(path, read_image_size(path))
+
+    def read(self, name: str, area: PanoramaArea) -> NDArray[np.uint8]:
+        """Where a panorama counts: 255, elsewhere and where it shows nothing 0.
+
+        Args:
+            name: Its path in the folder of panoramas, without ending.
+            area: The part of the sphere that it shows. A mask of its size is of that part; others
+                are of the whole sphere and sampled without interpolation.
+
+        Returns:
+            ``(H, W)`` of the whole sphere, not to be written to.
+
+        Raises:
+            DataError: There is no mask, or it cannot be used.
+        """
+        kept = self._kept
+        if kept is not None and kept[0] == area:
+            return kept[1]
+        path, own = self._path, self._of_all
+        if self.of_each:
+            path = self._path / f"{name}.png"
+            own = self._read(path)
+        counts = area.place(np.full(area.image_shape, 255, np.uint8))
+        rows = area.full_shape[0]
+        counts[90 - (np.arange(rows) + 0.5) * 180 / rows < self._lowest_deg] = 0
+        if own is not None:
+            place = area if own.shape == area.image_shape else _whole(path, own.shape)
+            counts[~resize_nearest(place.place(own), area.full_shape)] = 0
+        if not self.of_each:
+            self._kept = area, counts
+        return counts
+
+    def _read(self, path: Path) -> NDArray[np.bool_]:
+        return self._counts(self._checked(path))
+
+    def _checked(self, path: Path) -> Path:
+        there = path.is_file()
+        if not there or path.suffix.lower() in LOSSY_SUFFIXES:
+            raise DataError(
+                path,
+                found="JPEG or WebP, which blur masks" if there else "no such file",
+                expected="a mask as PNG, black where nothing counts; in a folder, one of the name "
+                "of each panorama",
+            )
+        return path
+
+
+def _whole(path: Path, size: tuple[int, ...]) -> PanoramaArea:
+    try:
+        return whole_area(path, (size[0], size[1]))
+    except DataError as error:
+        expected = "the size of the panorama, or the whole sphere, twice as wide as high"
+        raise DataError(path, found=error.found, expected=expected) from error

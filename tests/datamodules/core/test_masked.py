@@ -1,0 +1,159 @@
+"""`data.mask`: what does not count in training and evaluation."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch import nn
+
+import datamodules
+from datamodules import FolderPanoramas, SynthRooms
+from datamodules.core.panorama_module import PanoramaDataModule
+from datamodules.core.pipeline import RotatedPanoramas
+from datamodules.images.pixel_files import write_pixels
+from tangent_train.cli.compose import config_folder
+from tangent_train.errors import DataError
+from tangent_train.geometry import equirect_directions
+from tangent_train.rendering import EquirectRepresentation, TangentRepresentation
+from tangent_train.tasks import SegmentationTask
+from tests.datamodules.conftest import TINY_ROOMS
+from tests.datamodules.data_files import names_of
+from tests.datamodules.folder.folder_format import CLASS_OF_STORED, write_data_set
+from tests.tasks.shapes import quiet_trainer
+
+SHAPE = (32, 64)
+ERP: Any = EquirectRepresentation(level=4)
+BELOW = 90 - (np.arange(32) + 0.5) * 180 / 32 < -30
+"""Rows."""
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Six scenes of two panoramas; not to be changed."""
+    return write_data_set(tmp_path_factory.mktemp("folder") / "data")
+
+
+def stored_labels(root: Path, name: str) -> Any:
+    """Decoded by another program."""
+    stored = np.array(Image.open(root / "labels" / f"{name}.png"))
+    return np.vectorize(CLASS_OF_STORED.get)(stored)
+
+
+def test_every_panorama_data_set_has_the_setting() -> None:
+    for path in (config_folder() / "data").glob("*.yaml"):
+        text = path.read_text()
+        name = text.partition("_target_: datamodules.")[2].partition("\n")[0]
+        kind = getattr(datamodules, name)
+        of_panoramas = isinstance(kind, type) and issubclass(kind, PanoramaDataModule)
+        inherited = "  - stanford2d3ds\n" in text
+        assert ("\nmask: null" in text or inherited) == of_panoramas, path
+
+
+@pytest.mark.parametrize("settings", [{}, {"in_memory": True}, {"store": "store"}], ids=str)
+def test_labels_are_unknown_there_and_pixels_stay(
+    root: Path, settings: dict[str, Any], tmp_path: Path
+) -> None:
+    settings = {n: tmp_path if n == "store" else v for n, v in settings.items()}
+    plain = FolderPanoramas(root, ERP, **settings)
+    masked = FolderPanoramas(root, ERP, mask=-30, **settings)
+    masked.prepare_data()
+    prepared = sorted(tmp_path.rglob("*.npy"))
+    plain.prepare_data()
+    assert sorted(tmp_path.rglob("*.npy")) == prepared, "one store for both"
+    for split in ("train", "val", "test"):
+        for index, name in enumerate(names_of(masked, split)):
+            expected = stored_labels(root, name)
+            read, before = masked.source(split).read(index), plain.source(split).read(index)
+            np.testing.assert_array_equal(before.labels, expected)
+            expected[BELOW] = 0
+            np.testing.assert_array_equal(read.labels, expected)
+            np.testing.assert_array_equal(masked.source(split).labels(index), expected)
+            np.testing.assert_array_equal(read.rgb, before.rgb)
+
+
+def test_views_of_training_are_masked(root: Path) -> None:
+    grid: Any = TangentRepresentation(base_level=0, level=4)
+    masked, plain = (FolderPanoramas(root, grid, mask=mask) for mask in (-30, None))
+    counts = np.where(BELOW, 0, 255).astype(np.uint8)[:, None].repeat(64, 1)
+    shown = grid.whole().render(counts, "nearest")
+    assert 0 < (shown == 0).mean() < 0.5
+    for index in range(2):
+        labels, before = (m.training_samples()[0, index].labels.numpy() for m in (masked, plain))
+        np.testing.assert_array_equal(labels, np.where(shown, before, 0))
+
+
+def test_the_mask_rotates_with_the_panorama(root: Path, tmp_path: Path) -> None:
+    """At the seam and the poles too: the mask has patches there."""
+    patches = np.full((64, 128), 255, np.uint8)
+    patches[:8, :40], patches[20:40, 120:], patches[20:40, :9], patches[50:, 30:90] = 0, 0, 0, 0
+    write_pixels(tmp_path / "mask.png", patches)
+    settings: Any = {"test_rotation": "so3", "seed": 3}
+    masked = FolderPanoramas(root, ERP, mask=tmp_path / "mask.png", **settings)
+    for index, name in enumerate(names_of(masked, "test")):
+        expected = np.where(patches[1::2, 1::2], stored_labels(root, name), 0)
+        # The output direction d shows the input at Rᵀd.
+        rotation = RotatedPanoramas("so3", 3).rotation(index)
+        x, y, z = np.moveaxis(equirect_directions(SHAPE) @ rotation, -1, 0)
+        rows = (0.5 - np.arcsin(np.clip(z, -1, 1)) / np.pi) * 32
+        columns = (np.arctan2(y, x) / np.pi + 1) * 32
+        expected = expected[rows.astype(int).clip(0, 31), columns.astype(int) % 64]
+        clear = np.minimum(abs(rows - rows.round()), abs(columns - columns.round())) > 1e-6
+        found = masked.source("test").read(index).labels
+        np.testing.assert_array_equal(found[clear], expected[clear])
+        assert clear.mean() > 0.99
+
+
+def test_metrics_are_those_of_the_pixels_that_count(root: Path) -> None:
+    network = nn.Conv2d(3, 3, 1)
+    nn.init.eye_(network.weight[..., 0, 0])
+    module = FolderPanoramas(root, ERP, mask=-30)
+    optimizer = partial(torch.optim.SGD, lr=0.1)
+    task = SegmentationTask(network, ERP, module.class_names, optimizer)
+    quiet_trainer().test(task, datamodule=module, verbose=False)
+    normalization: Any = module.normalization
+    weight = network.weight.detach().numpy()[..., 0, 0].astype(np.float64)
+    bias = network.bias.detach().numpy()  # type: ignore[union-attr]
+    expected = np.zeros((4, 4), np.int64)
+    for name in names_of(module, "test"):
+        (path,) = (root / "images").glob(f"{name}.*")
+        rgb = np.array(Image.open(path).convert("RGB")) / 255
+        scores = (rgb - normalization.mean) / normalization.std @ weight.T + bias
+        truth = stored_labels(root, name)
+        counted = (truth > 0) & ~BELOW[:, None]
+        np.add.at(expected, (truth[counted], 1 + scores.argmax(-1)[counted]), 1)
+    np.testing.assert_array_equal(task.matrices.pixels, expected)
+    assert (expected[1:].sum(axis=0)[1:] > 0).sum() > 1
+
+
+def test_the_pole_of_generated_rooms(tiny_rooms: Path) -> None:
+    erp: Any = EquirectRepresentation(level=3)
+    module = SynthRooms(tiny_rooms, erp, rooms=TINY_ROOMS, inputs=["rgb"], mask=-45)
+    labels = module.source("test").read(0).labels
+    assert labels[1:12].any(axis=1).all()
+    assert not labels[12:].any()
+
+
+def test_missing_masks_are_listed_before_training(root: Path, tmp_path: Path) -> None:
+    names = [path.relative_to(root / "labels") for path in (root / "labels").rglob("*.png")]
+    for name in names:
+        write_pixels(tmp_path / name, np.ones((16, 32), np.uint8))
+    FolderPanoramas(root, ERP, mask=tmp_path).setup()
+    (tmp_path / names[0]).unlink()
+    (tmp_path / names[1]).unlink()
+    module = FolderPanoramas(root, ERP, mask=tmp_path)
+    problems, _ = module.check()
+    assert problems.items == {name.with_suffix("").as_posix() for name in names[:2]}
+    with pytest.raises(DataError, match=r"2 problems(.|\n)*found no such file; expected a mask"):
+        module.setup()
+
+
+def test_masks_that_fit_no_panorama_are_refused_at_once(root: Path, tmp_path: Path) -> None:
+    write_pixels(tmp_path / "mask.png", np.ones((20, 20), np.uint8))
+    with pytest.raises(DataError, match=r"mask\.png: found 20×20 pixels; .*twice as wide"):
+        FolderPanoramas(root, ERP, mask=tmp_path / "mask.png")
