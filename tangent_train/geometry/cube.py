@@ -104,6 +104,10 @@ class CubeGrid(PinholeGrid):
         """
         return type(self)(self.dim, rotation, self.margin)
 
+    def widened(self, margin: int) -> Self:
+        """The same faces with more pixels on every side, at the same pitch."""
+        return type(self)(self.dim + 2 * margin, self.rotation, self.margin + margin)
+
     def _resting_axes(self) -> NDArray[np.float64]:
         return _AXES
 

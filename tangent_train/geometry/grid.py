@@ -185,6 +185,10 @@ class TangentGrid(PinholeGrid):
         """
         return type(self)(self.base_level, self.level, self.dim, rotation)
 
+    def widened(self, margin: int) -> Self:
+        """The same images with more pixels on every side, at the same pitch."""
+        return type(self)(self.base_level, self.level, self.dim + 2 * margin, self.rotation)
+
     def _resting_axes(self) -> NDArray[np.float64]:
         return _face_table(self.base_level).world_from_camera
 

@@ -12,7 +12,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from tangent_train.errors import SettingError
-from tangent_train.geometry import TangentGrid, equirect_to_lonlat, lonlat_to_xyz
+from tangent_train.geometry import equirect_to_lonlat, lonlat_to_xyz
 from tangent_train.keypoints.spherical import (
     SphericalKeypoints,
     equirect_jacobian,
@@ -22,6 +22,8 @@ from tangent_train.rendering import equirect_to_tangent
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+    from tangent_train.geometry import CubeGrid, PinholeGrid, TangentGrid
 
 __all__ = ["Detections", "Detector", "detect_on_equirect", "detect_on_tangent_images"]
 
@@ -157,9 +159,9 @@ def detect_on_equirect(image: NDArray[np.uint8], detector: Detector) -> Spherica
 
 
 def detect_on_tangent_images(
-    image: NDArray[np.uint8], grid: TangentGrid, detector: Detector, margin: int = 32
+    image: NDArray[np.uint8], grid: TangentGrid | CubeGrid, detector: Detector, margin: int = 32
 ) -> SphericalKeypoints:
-    """Detect keypoints on the tangent images of a panorama.
+    """Detect keypoints on the tangent images of a panorama, or on the faces of a cube.
 
     Images overlap, and duplicates would spoil the ratio test: a keypoint is kept by the image that
     owns its direction, and only once where two images find it on their common border. Where each
@@ -167,7 +169,7 @@ def detect_on_tangent_images(
 
     Args:
         image: ``(H, W)`` grey or ``(H, W, 3)`` RGB, uint8.
-        grid: The tangent images.
+        grid: The images.
         detector: The detector.
         margin: Pixels added on every side of the images, at the same pitch: detectors find nothing
             near borders, and large keypoints need space.
@@ -176,7 +178,7 @@ def detect_on_tangent_images(
         Keypoints in the order of the faces they were detected in.
     """
     gray = _gray(image)
-    wide = TangentGrid(grid.base_level, grid.level, grid.dim + 2 * margin, grid.rotation)
+    wide = grid.widened(margin)
 
     def search(face: int) -> SphericalKeypoints:
         found = detector.detect(equirect_to_tangent(gray, wide, [face])[0])
@@ -196,7 +198,7 @@ def detect_on_tangent_images(
 
 
 def gnomonic_jacobian(
-    directions_xyz: NDArray[np.float64], grid: TangentGrid, face: int
+    directions_xyz: NDArray[np.float64], grid: PinholeGrid, face: int
 ) -> NDArray[np.float64]:
     """Jacobian of directions by pixel in a tangent image, ``∂d/∂(column, row)``.
 

@@ -53,8 +53,8 @@ def test_two_panoramas(
     names = ["keypoints.md", "matches", "pairs.csv", "results.json"]
     assert sorted(path.name for path in output.iterdir()) == names
     rows = list(csv.DictReader((output / "pairs.csv").read_text().splitlines()))
-    assert [row["representation"] for row in rows] == ["ERP", "ERP ×0.71", "L0"] * 2
-    assert [row["condition"] for row in rows] == ["as_given"] * 3 + ["rotated"] * 3
+    assert [row["representation"] for row in rows] == ["ERP", "ERP ×0.71", "cube", "L0"] * 2
+    assert [row["condition"] for row in rows] == ["as_given"] * 4 + ["rotated"] * 4
     for row, kept in zip(rows, results(output)["rows"], strict=True):
         assert float(row["pmr"]) == kept["pmr"]
         assert int(row["putative"]) == kept["putative"] > 0

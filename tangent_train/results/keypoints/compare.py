@@ -13,6 +13,7 @@ import numpy as np
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry import (
+    CubeGrid,
     PanoramaPose,
     TangentGrid,
     equirect_shape,
@@ -43,6 +44,8 @@ if TYPE_CHECKING:
 
 __all__ = [
     "AS_GIVEN",
+    "AUC_DEG",
+    "CUBE",
     "ROTATED",
     "SHRUNK",
     "Comparer",
@@ -61,6 +64,12 @@ AS_GIVEN, ROTATED = "as_given", "rotated"
 
 SHRUNK = "ERP ×0.71"
 """The panorama with pixels as large as those of tangent images, see `shrunk_rows`."""
+
+CUBE = "cube"
+"""The six faces of a cube, 90° over as many pixels as on the panorama's equator."""
+
+AUC_DEG = (5, 10, 20)
+"""Largest errors of the pose up to which the area under the curve of the recall is given."""
 
 
 class MatchedPair(NamedTuple):
@@ -99,7 +108,7 @@ class Ways:
         mutual: See `match`.
         max_error_deg: See `estimate_two_view`, at most 20.
         seed: Of random samples and of the random rotations.
-        controls: Whether to compare the downsampled panorama and the rotated one too.
+        controls: Whether to compare the downsampled panorama, a cube and the rotated one too.
 
     Raises:
         SettingError: A number is out of range.
@@ -124,8 +133,9 @@ class Ways:
 
     @property
     def representations(self) -> list[str]:
-        """``ERP``, the shrunk one with controls, and ``L0``, ``L1`` … for the base levels."""
-        return ["ERP", *[SHRUNK] * self.controls, *(f"L{b}" for b in self.base_level)]
+        """``ERP``, the shrunk one and the cube with controls, ``L0``, ``L1`` … of base levels."""
+        controls = [SHRUNK, CUBE] if self.controls else []
+        return ["ERP", *controls, *(f"L{b}" for b in self.base_level)]
 
 
 @dataclass
@@ -144,8 +154,9 @@ class Comparer:
         Returns:
             Among its figures are n_L and n_R as ``visible_left`` and ``visible_right`` (all
             keypoints where depth and pose are unknown), PMR, MS and P as shares of 1, and, where
-            depth and pose are known, the errors of the estimated motion and how many of the
-            ``judged`` matches are ``correct``. None stands for what is undefined.
+            depth and pose are known, the errors of the estimated motion, what the pair adds to
+            the area under the curve of its recall, and how many of the ``judged`` matches are
+            ``correct``. None stands for what is undefined.
 
         Raises:
             SettingError: The panoramas are too small for the level or for a base level.
@@ -200,7 +211,9 @@ class Comparer:
         level: int,
         condition: str,
     ) -> dict[str, MatchedPair]:
+        grids: dict[str, TangentGrid | CubeGrid]
         grids = {f"L{b}": TangentGrid(b, level) for b in self.ways.base_level}
+        grids[CUBE] = CubeGrid(2**level)
         found: dict[str, MatchedPair] = {}
         for name in self.ways.representations:
             both = []
@@ -224,7 +237,7 @@ class Comparer:
         return found
 
     def _detect(
-        self, rgb: NDArray[np.uint8], level: int, name: str, grid: TangentGrid | None
+        self, rgb: NDArray[np.uint8], level: int, name: str, grid: TangentGrid | CubeGrid | None
     ) -> SphericalKeypoints:
         if grid is not None:
             return detect_on_tangent_images(
@@ -261,7 +274,10 @@ class Comparer:
         }
 
 
-_TRUTH = ("rotation_error_deg", "translation_error_deg", "judged", "correct", "correct_share")
+_TRUTH = (
+    *("rotation_error_deg", "translation_error_deg", *(f"pose_auc_{d}" for d in AUC_DEG)),
+    *("judged", "correct", "correct_share"),
+)
 
 
 def _truth(
@@ -281,7 +297,12 @@ def _truth(
     rotated = PanoramaPose(right.pose.world_from_panorama @ rotation.T, right.pose.location_m)
     errors = found.geometry.pose_error_deg(left.pose, rotated)
     known, correct = int(judged.known.sum()), int(judged.correct.sum())
-    figures = (*map(_defined, errors), known, correct, correct / known if known else None)
+    # Of a pair the area under the step from 0 to 1 at its error; without an estimate it stays 0.
+    worst = max(errors) if all(map(math.isfinite, errors)) else math.inf
+    moved = not np.array_equal(left.pose.location_m, right.pose.location_m)
+    areas = (max(0.0, 1 - worst / limit) if moved else None for limit in AUC_DEG)
+    shares = known, correct, correct / known if known else None
+    figures = (*map(_defined, errors), *areas, *shares)
     counts = int(visible[0].sum()), int(visible[1].sum())
     return counts, dict(zip(_TRUTH, figures, strict=True))
 

@@ -14,7 +14,13 @@ import numpy as np
 
 from tangent_train.csv_text import csv_text
 from tangent_train.files import write_text
-from tangent_train.results.keypoints.compare import AS_GIVEN, ROTATED, Comparison, Row
+from tangent_train.results.keypoints.compare import (
+    AS_GIVEN,
+    AUC_DEG,
+    ROTATED,
+    Comparison,
+    Row,
+)
 from tangent_train.results.tables import Table, percent
 
 if TYPE_CHECKING:
@@ -32,6 +38,7 @@ _METRICS = {
     "overlap of the fields of view %": "fov_overlap",
     "rotation error °, median": "rotation_error_deg",
     "translation error °, median": "translation_error_deg",
+    **{f"pose AUC {degrees}° %": f"pose_auc_{degrees}" for degrees in AUC_DEG},
 }
 """Columns of the rows by what tables call them."""
 

@@ -9,6 +9,7 @@ from datamodules.core.panorama_pairs import PanoramaPair
 from tangent_train.errors import SettingError
 from tangent_train.results.keypoints.compare import (
     AS_GIVEN,
+    CUBE,
     ROTATED,
     SHRUNK,
     Comparer,
@@ -33,7 +34,9 @@ def comparison(pair: PanoramaPair) -> Comparison:
 
 def test_every_way_in_every_condition(comparison: Comparison) -> None:
     assert [(row["condition"], row["representation"]) for row in comparison.rows] == [
-        (condition, name) for condition in (AS_GIVEN, ROTATED) for name in ("ERP", SHRUNK, "L1")
+        (condition, name)
+        for condition in (AS_GIVEN, ROTATED)
+        for name in ("ERP", SHRUNK, CUBE, "L1")
     ]
     for row in comparison.rows:
         assert (row["pair"], row["left"], row["right"]) == ("ball", "ball_l", "ball_r")
@@ -58,6 +61,11 @@ def test_figures_are_those_of_the_counts_and_of_the_truth(comparison: Comparison
         assert (row["geometry"], row["judged"]) == ("general", p)
         assert row["rotation_error_deg"] < 1
         assert row["translation_error_deg"] < 5
+        # Of one pair the recall is 0 up to its error and 1 from there on.
+        worst = max(row["rotation_error_deg"], row["translation_error_deg"])
+        recall = np.linspace(0, 10, 10_001) >= worst
+        assert row["pose_auc_10"] == pytest.approx(recall.mean(), abs=1e-3)
+        assert row["pose_auc_5"] < row["pose_auc_10"] < row["pose_auc_20"] < 1
         # Inliers by the estimate and by the truth are nearly the same matches.
         assert row["correct_share"] == row["correct"] / row["judged"]
         assert abs(row["correct_share"] - row["p"]) < 0.1
@@ -83,6 +91,7 @@ def test_without_depth_all_keypoints_count_and_blank_panoramas_have_no_scores(
             assert row["visible_left"] == row["keypoints_left"]
             assert (row["judged"], row["rotation_error_deg"]) == (None, None)
             assert (row["putative"], row["geometry"]) == (0, "none")
+            assert row["pose_auc_20"] is None
             assert row["pmr"] is row["ms"] is row["p"] is None
 
 

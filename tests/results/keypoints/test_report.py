@@ -22,7 +22,8 @@ ALL = ("ERP", SHRUNK, "L0", "L1", "L2")
 
 def row(pair: str = "a", representation: str = "ERP", **figures: Any) -> Row:
     unknown = ("split", "fov_overlap", "rotation_error_deg", "translation_error_deg")
-    base = dict.fromkeys((*unknown, "correct_share"))
+    areas = (f"pose_auc_{degrees}" for degrees in (5, 10, 20))
+    base = dict.fromkeys((*unknown, *areas, "correct_share"))
     scores = {"pmr": 0.2, "ms": 0.1, "p": 0.5, "inliers": 20, "visible_by": "depth"}
     counts = {"keypoints_left": 100, "keypoints_right": 120, "condition": AS_GIVEN}
     return {
@@ -85,7 +86,7 @@ def test_other_data_have_nothing_of_the_papers() -> None:
     rows = [
         row("a|b", fov_overlap=0.5, rotation_error_deg=1.0, correct_share=0.5),
         row("a|b", condition=ROTATED, fov_overlap=0.5, pmr=0.4),
-        row("c", fov_overlap=0.6, rotation_error_deg=2.0, pmr=None, inliers=12345),
+        row("c", fov_overlap=0.6, rotation_error_deg=2.0, pmr=None, inliers=12345, pose_auc_5=0.6),
         row("c", condition=ROTATED, fov_overlap=0.6),
     ]
     text = KeypointReport(rows, ("ERP",), {"seed": 0}, {}).markdown()
@@ -98,6 +99,7 @@ def test_other_data_have_nothing_of_the_papers() -> None:
     assert ["", "keypoints, left", "100"] in table
     assert ["", "inliers", "12,345"] in table
     assert ["", "rotation error °, median", "2"] in table
+    assert ["", "pose AUC 5° %", "60.0"] in table
     assert ["easy (1)", "PMR %", "–"] in table
     assert tables(text)["Right panorama randomly rotated"][1][2] == "40.0"
     bare = [row("a", visible_by="all keypoints")]
