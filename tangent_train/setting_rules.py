@@ -34,7 +34,8 @@ _RULES = (
     # What the runs of a group are the mean over.
     ("report", "data.fold data.seed seed"),
     # Of the evaluation: it comes after the training that is resumed.
-    ("resume", "data.test_rotation representation.average_rotations task.absent_class"),
+    ("resume", "data.test_rotation task.absent_class"),
+    ("resume", "representation.average_rotations representation.further_levels"),
     # Of the training: an evaluation does not depend on it.
     ("evaluation", "optimizer scheduler"),
     ("resume evaluation", "task.images_per_chunk trainer.devices trainer.num_nodes"),

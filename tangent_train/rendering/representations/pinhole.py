@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from itertools import chain
 from typing import Self, TypeVar
 
@@ -139,6 +139,8 @@ class TangentRepresentation(PinholeRepresentation):
             (`feather`).
         erp_height: Rows of the panorama, default `equirect_shape(level)`.
         average_rotations: Rotations of the icosahedron that evaluation averages over, see `turns`.
+        further_levels: Levels that evaluation averages over besides `level`, with images of as many
+            pixels: those of a lower level show more.
 
     Raises:
         SettingError: An impossible combination.
@@ -158,6 +160,7 @@ class TangentRepresentation(PinholeRepresentation):
         blend: Blend = "nearest",
         erp_height: int | None = None,
         average_rotations: int = 1,
+        further_levels: Sequence[int] = (),
     ) -> None:
         if crop_multiple is not None:
             if dim is not None:
@@ -176,21 +179,24 @@ class TangentRepresentation(PinholeRepresentation):
             )
         super().__init__(grid, level, rotation, mirror, erp_height, blend, faces_per_panorama)
         self._turns = turns(average_rotations, "representation.average_rotations")
+        further = [TangentGrid(base_level, other, grid.dim) for other in further_levels]
+        self._grids = [grid, *further]
 
     def whole(self) -> Views:
-        """All images, of every rotation that is averaged over."""
-        views = [PinholeViews(spun(self.grid, turn)) for turn in self._turns]
+        """All images, of every level and rotation that is averaged over."""
+        grids = [grid.with_rotation(self.grid.rotation) for grid in self._grids]
+        views = [PinholeViews(spun(grid, turn)) for grid in grids for turn in self._turns]
         return views[0] if len(views) == 1 else ManyViews(tuple(views))
 
     def to_averaged_labels(
         self, scores: Iterable[Tensor], shape: tuple[int, int], rotations: NDArray[np.float64]
     ) -> Tensor:
-        """The class with the highest mean probability over several rotations, as in prediction.
+        """The class with the highest mean probability of all of `whole`, as in prediction.
 
         Args:
-            scores: Of all images, one rotation after the other.
+            scores: Of all images of `whole`, those of one level and rotation after the other.
             shape: ``(H, W)`` of the panorama.
-            rotations: The rotations, see `Views.rotations`.
+            rotations: Of each of them, see `Views.rotations`.
 
         Returns:
             Class indices, on the CPU.
@@ -198,9 +204,10 @@ class TangentRepresentation(PinholeRepresentation):
         parts = iter(scores)
         first = next(parts)
         mosaic = ScoreMosaic(shape, first.shape[1], self.blend, averaged=True)
-        for of_turn, rotation in zip(chain([first], parts), rotations, strict=True):
-            grid = self.grid.with_rotation(unless_identity(rotation))
-            mosaic.add(of_turn, grid, np.arange(grid.num_images))
+        grids = [grid for grid in self._grids for _ in self._turns]
+        for one, grid, rotation in zip(chain([first], parts), grids, rotations, strict=True):
+            turned = grid.with_rotation(unless_identity(rotation))
+            mosaic.add(one, turned, np.arange(grid.num_images))
         return torch.from_numpy(mosaic.labels().astype(np.int64))
 
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from tangent_train.rendering import (
     EquirectRepresentation,
     Representation,
     TangentRepresentation,
+    equirect_to_tangent,
     rotate_equirect,
     tangent_to_equirect,
     tangent_to_labels,
@@ -217,29 +219,41 @@ def test_impossible_crops_are_refused(crop_deg: float) -> None:
         EquirectRepresentation(5, crop_deg)
 
 
-@pytest.mark.parametrize(("blend", "least"), [("nearest", 0.999), ("feather", 0.95)])
-def test_averaged_rotations_have_the_highest_mean_probability(blend: Blend, least: float) -> None:
-    """Against the probabilities of every rotation, rendered on their own in double precision.
+@pytest.mark.parametrize(
+    ("averaged", "levels", "blend", "least"),
+    [
+        ({"average_rotations": 3}, [4, 4, 4], "nearest", 0.999),
+        ({"average_rotations": 3}, [4, 4, 4], "feather", 0.95),
+        ({"further_levels": [3, 2]}, [4, 3, 2], "nearest", 0.999),
+    ],
+)
+def test_averages_have_the_highest_mean_probability(
+    averaged: dict[str, Any], levels: list[int], blend: Blend, least: float
+) -> None:
+    """Against the probabilities of every part, rendered on its own in double precision.
 
-    Feathered ones are added up with the weights of all rotations, there with those of each: almost
-    the same.
+    Feathered ones are added up with the weights of all parts, there with those of each: almost the
+    same.
     """
-    representation = TangentRepresentation(0, 4, blend=blend, average_rotations=3).turned(TILT)
+    representation = TangentRepresentation(0, 4, blend=blend, **averaged).turned(TILT)
     views = representation.whole()
     rotations, shape = views.rotations(), (32, 64)
     assert rotations.shape == (3, 3, 3)
     np.testing.assert_allclose(rotations[:, :, 2], np.tile(TILT[:, 2], (3, 1)), atol=1e-12)
-    assert views.render(np.zeros((*shape, 3), np.uint8), "bilinear").shape == (60, 16, 16, 3)
+    image = equirect_directions(shape).astype(np.float32)
+    rendered = views.render(image, "bilinear")
+    grids = [TangentGrid(0, s, 16, R) for s, R in zip(levels, rotations, strict=True)]
+    for own, grid in zip(np.split(rendered, 3), grids, strict=True):
+        np.testing.assert_array_equal(own, equirect_to_tangent(image, grid))
     waves = torch.from_numpy(views.rays()).double() @ torch.tensor([3.0, 2.0, 1.0]).double()
     scores = torch.randn(60, 5, 16, 16, generator=torch.Generator().manual_seed(0))
     scores += 4 * torch.sin(waves[:, 2, None, None, None] + torch.arange(5)[:, None, None]).float()
     mean = torch.zeros(5, *shape, dtype=torch.float64)
-    for of_turn, rotation in zip(torch.split(scores, 20), rotations, strict=True):
-        grid = TangentGrid(0, 4, rotation=rotation)
+    for own_scores, grid in zip(torch.split(scores.double(), 20), grids, strict=True):
         if blend == "nearest":
-            mean += tangent_to_equirect(of_turn.double(), grid, shape).softmax(dim=0)
+            mean += tangent_to_equirect(own_scores, grid, shape).softmax(dim=0)
         else:
-            mean += tangent_to_equirect(of_turn.double().softmax(dim=1), grid, shape, blend)
+            mean += tangent_to_equirect(own_scores.softmax(dim=1), grid, shape, blend)
     labels = representation.to_averaged_labels(iter(torch.split(scores, 20)), shape, rotations)
     assert labels.dtype == torch.int64
     assert (labels == mean.argmax(dim=0)).double().mean() > least
