@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Generic, Literal, TypeVar
 
@@ -173,6 +173,33 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
             found.read_all(("test",) if stage == TrainerFn.TESTING else SPLITS, problems)
             problems.refuse(self.root, _GO_ON)
 
+    def prepare_part(self, part: Callable[[Sequence[_Item]], Sequence[_Item]]) -> int:
+        """Complete a part of the store, as on one of several machines.
+
+        Args:
+            part: Of all items, which are listed the same way on every machine.
+
+        Returns:
+            The number of its items that are in the store.
+
+        Raises:
+            DataError: Something in it is broken.
+            SettingError: There is no store.
+        """
+        self.make_files()
+        problems = Problems()
+        found = self._checked(problems)
+        if found.store is None:
+            expected = "a folder: files of the store are all that can be prepared in parts"
+            raise SettingError("data.store", found="none, with shard=", expected=expected)
+        if not self.skip_broken:
+            problems.refuse(self.root, _GO_ON)
+        items = part(found.of())
+        replace(found, splits={"train": items, "val": [], "test": []}).read_all(SPLITS, problems)
+        if not self.skip_broken:
+            problems.refuse(self.root, _GO_ON)
+        return len(problems.without(items))
+
     def found(self) -> Found[_Item]:
         """Items found by `setup`."""
         if self._found is None:
@@ -220,14 +247,19 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
             raise DataError(self.root, found=f"no {self.noun}", expected=expected)
         return found
 
-    def _usable(self, *, sample: bool = False) -> Found[_Item]:
-        """Usable items; refuse the data set if one is broken, unless broken ones are left out."""
-        problems = Problems()
+    def _checked(self, problems: Problems) -> Found[_Item]:
+        """Items with files that look whole, or broken ones; refuse a data set that has none."""
         found: Any = None
         with problems.noted():
             found = self._listed(problems)
         if problems.fatal:
             problems.refuse(self.root)
+        return found
+
+    def _usable(self, *, sample: bool = False) -> Found[_Item]:
+        """Usable items; refuse the data set if one is broken, unless broken ones are left out."""
+        problems = Problems()
+        found = self._checked(problems)
         if not self.skip_broken:
             if sample and self.store is None:
                 found.read_some(self.seed, problems)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from rich.console import Console
 
 from tangent_train.cli.build import Settings
+from tangent_train.cli.shard import Shard
 from tangent_train.registry import make
 
 __all__ = ["prepare"]
@@ -16,10 +17,15 @@ def prepare(settings: Settings) -> None:
     Args:
         settings: The composed ``prepare.yaml``.
     """
+    shard = Shard.of(settings["shard"])
     representation = make(settings["representation"], "representation")
     data = make(settings["data"], "data", representation=representation)
-    data.prepare_data()
-    data.setup()
-    counts = ", ".join(f"{len(data.found().splits[s])} {s}" for s in ("train", "val", "test"))
-    console = Console(soft_wrap=True, highlight=False)
-    console.print(f"{data.root} is ready. {data.noun.capitalize()}: {counts}.")
+    if shard is not None:
+        count = data.prepare_part(shard.part)
+        told = f"Shard {shard}: {count} {data.noun} are in {data.store}."
+    else:
+        data.prepare_data()
+        data.setup()
+        counts = ", ".join(f"{len(data.found().splits[s])} {s}" for s in ("train", "val", "test"))
+        told = f"{data.root} is ready. {data.noun.capitalize()}: {counts}."
+    Console(soft_wrap=True, highlight=False).print(told, markup=False)
