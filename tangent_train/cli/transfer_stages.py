@@ -276,7 +276,7 @@ def run_stage(stage: Stage, state: State) -> int:
         if weights is None:
             raise DataError(
                 stage.weights,
-                found="no checkpoints/best.ckpt or last.ckpt",
+                found="no checkpoints/best.ckpt",
                 expected=f"the network that {stage.name} starts from",
                 remedy="Delete the stages of this seed to run it all again.",
             )
@@ -309,8 +309,7 @@ def stage_command(stage: Stage) -> list[str]:
 
 def _checkpoint_in(weights: Path) -> Path | None:
     """The checkpoint: a file itself, or the one that a run has tested; None if missing."""
-    folder = weights / "checkpoints"
-    places = (weights, folder / "best.ckpt", folder / "last.ckpt")
+    places = (weights, weights / "checkpoints" / "best.ckpt")
     return next((path for path in places if path.is_file()), None)
 
 

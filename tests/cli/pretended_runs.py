@@ -63,7 +63,9 @@ class PretendedRuns:
         write_settings(folder / "config.yaml", settings)
         if command == "train":
             (folder / "checkpoints").mkdir(exist_ok=True)
-            (folder / "checkpoints" / "last.ckpt").write_text(f"{config.name} {config.seed}")
+            for name in ("best", "last"):
+                path = folder / "checkpoints" / f"{name}.ckpt"
+                path.write_text(f"{config.name} {config.seed}")
         if folder.name == self.failing:
             return 7
         hits = 100 if folder.name == "S-FT-1" else 50

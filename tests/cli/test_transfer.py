@@ -42,7 +42,7 @@ def test_all_stages_run_in_order_and_the_tables_are_written(
     run_transfer()
     trained = ("P", "P-FT-1", "S-FT-1")
     assert runs.started == [("train" if s in trained else "evaluate", s) for s in STAGES]
-    weights = str(Path(OF_SEED_0 / "P" / "checkpoints" / "last.ckpt").absolute())
+    weights = str(Path(OF_SEED_0 / "P" / "checkpoints" / "best.ckpt").absolute())
     first, *others = runs.configs
     assert first.init_from is None
     for (command, _), config in zip(runs.started[1:], others, strict=True):
@@ -123,13 +123,13 @@ def test_stages_of_a_network_that_was_trained_again_are_refused(runs: PretendedR
     with pytest.raises(REFUSED, match=r"S/stage\.json: found .*delete the folder"):
         run_transfer(*SHORT)
     record.write_text(before)
-    network = OF_SEED_0 / "P" / "checkpoints" / "last.ckpt"
+    network = OF_SEED_0 / "P" / "checkpoints" / "best.ckpt"
     network.write_text("another network, longer")
     with pytest.raises(REFUSED, match=r"seed_0/S: found stage S of another network, or"):
         run_transfer(*SHORT)
     network.unlink()  # to save space: what was found stays found
     run_transfer(*SHORT)
-    with pytest.raises(REFUSED, match=r"seed_0/P: found no checkpoints/best\.ckpt or last"):
+    with pytest.raises(REFUSED, match=r"seed_0/P: found no checkpoints/best\.ckpt; "):
         run_transfer("compare=[erp]", "fine_tuning.epochs=[]")
 
 
