@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
@@ -8,9 +8,6 @@ from datamodules.synthrooms.generate import generate_rooms
 from datamodules.synthrooms.settings import RoomSettings
 from datamodules.synthshapes.generate import ShapeSettings, generate_shapes
 from tangent_train.rendering import EquirectRepresentation
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 TINY_ROOMS = RoomSettings(
     seed=3,

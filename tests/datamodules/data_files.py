@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import cv2
+from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from datamodules.core.found import Split
-    from datamodules.core.split_module import SplitDataModule
+from datamodules.core.found import Split
+from datamodules.core.split_module import SplitDataModule
 
 __all__ = ["contents", "names_of", "read_png", "write_png"]
 

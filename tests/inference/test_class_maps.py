@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 import torch
 from torch import nn
+from torchvision.datasets import Cityscapes
+from torchvision.models.segmentation import DeepLabV3_ResNet50_Weights
 
 from datamodules.stanford2d3ds.label_table import CLASSES as STANFORD
 from datamodules.synthia.reader import CLASSES as SYNTHIA
@@ -21,9 +23,14 @@ from tangent_train.checkpoints.trained import TrainedNetwork
 from tangent_train.errors import DataError, SettingError
 from tangent_train.inference import class_maps
 from tangent_train.inference.class_maps import ClassMap, Unmapped, load_class_map, map_classes
-from tests.inference.published_classes import PUBLISHED
 from tests.inference.trained import TANGENT, trained_network
 
+# ADE20K: objectInfo150.txt of the MIT Scene Parsing Benchmark; COCO-Stuff: labels.txt.
+PUBLISHED: dict[str, list[str]] = {
+    **json.loads(Path(__file__).with_name("published_classes.json").read_text()),
+    "Cityscapes": [c.name for c in Cityscapes.classes if not c.ignore_in_eval],
+    "Pascal VOC": DeepLabV3_ResNet50_Weights.DEFAULT.meta["categories"],
+}
 SHIPPED = {
     "ade20k_to_stanford2d3ds": ("ADE20K", 150, STANFORD),
     "ade20k_to_zind_layout": ("ADE20K", 150, ZIND),

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 
 import tangent_train as tt
 from tangent_train.errors import DataError, SettingError
+from tangent_train.inference.network import Network
 from tests.cli.tiny_runs import run_command
 from tests.inference.trained import (
     CLASS_NAMES,
@@ -22,15 +26,7 @@ from tests.inference.trained import (
     write_checkpoint,
 )
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from tangent_train.inference.network import Network
-
-    Predicted = Callable[..., tuple[NDArray[Any], NDArray[Any]]]
+Predicted = Callable[..., tuple[NDArray[Any], NDArray[Any]]]
 
 
 @pytest.fixture

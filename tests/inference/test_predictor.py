@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 
 from datamodules import Stanford2D3DS
 from datamodules.core.inputs import normalize
 from datamodules.core.photos import distance_from_z_depth
 from datamodules.core.samples import render_inputs
 from tangent_train.checkpoints.scores import Scores
+from tangent_train.checkpoints.trained import TrainedNetwork
 from tangent_train.errors import SettingError
 from tangent_train.geometry import (
     TangentGrid,
@@ -37,13 +40,6 @@ from tests.inference.trained import (
     trained_network,
 )
 from tests.models.sphere_networks import awake, small_context
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from tangent_train.checkpoints.trained import TrainedNetwork
 
 SGD = functools.partial(torch.optim.SGD, lr=1.0)
 

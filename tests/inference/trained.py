@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import nn
 
 from datamodules.core.inputs import RGB_NORMALIZATION, RGBD_NORMALIZATION
@@ -13,11 +15,6 @@ from tangent_train.checkpoints.scores import Scores
 from tangent_train.checkpoints.trained import TrainedNetwork
 from tangent_train.geometry import equirect_directions
 from tangent_train.registry import make
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
 
 CLASS_NAMES = ("unknown", "dark", "green", "bright")
 

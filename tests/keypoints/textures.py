@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
 from tangent_train.geometry import equirect_directions
+from tangent_train.keypoints.spherical import SphericalKeypoints
 from tests.geometry.directions import angle_deg
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
-
-    from tangent_train.keypoints.spherical import SphericalKeypoints
 
 
 def texture(

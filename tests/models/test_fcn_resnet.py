@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 from urllib.error import URLError
 
 import pytest
@@ -13,9 +14,6 @@ from torchvision.models.segmentation import fcn_resnet50
 
 from models import FCNResNet
 from tangent_train.errors import DataError, SettingError
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 LAST = ("classifier.4.weight", "classifier.4.bias")
 State = dict[str, Tensor]

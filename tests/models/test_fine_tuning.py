@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterable
+from pathlib import Path
 
 import pytest
 import torch
@@ -12,10 +13,6 @@ from torch import Tensor, nn
 from models import AuxiliaryHead, SphereAttention, SphereContext, UNet, initialize
 from tangent_train.errors import DataError
 from tests.models.sphere_networks import ATTENTION, STAGE, awake, small_unet
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-    from pathlib import Path
 
 
 def _network(channels: int = 3, classes: int = 5) -> nn.Module:

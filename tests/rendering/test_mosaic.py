@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -11,6 +10,7 @@ import torch
 
 from tangent_train.geometry import (
     CubeGrid,
+    PinholeGrid,
     TangentGrid,
     camera_matrix_from_fov,
     equirect_directions,
@@ -18,6 +18,7 @@ from tangent_train.geometry import (
     rotation_about,
 )
 from tangent_train.rendering import (
+    Blend,
     PerspectiveRepresentation,
     accumulate,
     tangent_to_equirect,
@@ -25,10 +26,6 @@ from tangent_train.rendering import (
 )
 from tangent_train.rendering.mosaic import ScoreMosaic
 from tangent_train.rendering.representations.perspective import PhotoCrops
-
-if TYPE_CHECKING:
-    from tangent_train.geometry import PinholeGrid
-    from tangent_train.rendering import Blend
 
 GRIDS = [
     (TangentGrid(0, 5), (64, 128)),

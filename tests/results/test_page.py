@@ -5,7 +5,8 @@ from __future__ import annotations
 import io
 import json
 from html.parser import HTMLParser
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,9 +14,6 @@ from rich.console import Console
 
 from tangent_train.results.html import encode_image, write_report
 from tangent_train.results.tables import Table
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 NASTY = """</script><script>throw 1</script><!-- <b>&amp; "it's" {{images}} <!--images-->"""
 NAMES = ("unknown", "wall", "floor", NASTY)

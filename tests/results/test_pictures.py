@@ -1,15 +1,11 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from datamodules.images.palette import class_colors
 from tangent_train.results.pictures import colorize, prediction_panel
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 NAMES = ("unknown", "wall", "floor", "sofa")
 

@@ -1,17 +1,13 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from tangent_train.results.html import EncodedImage, encode_image
 from tangent_train.results.html.images import BUDGET_BYTES
 from tests.decoded import decoded
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 CLASSES = 14
 NAMES = tuple(f"class {k}" for k in range(CLASSES))

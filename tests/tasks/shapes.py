@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import lightning
 import torch
@@ -12,9 +13,6 @@ from torch.utils.data import DataLoader
 
 from tangent_train.rendering import TangentRepresentation
 from tangent_train.tasks import ClassificationTask
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 NAMES = ("bottle", "chair", "mug")
 TANGENT = TangentRepresentation(base_level=0, level=4)

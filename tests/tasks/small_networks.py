@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import nn
@@ -15,10 +15,8 @@ from tangent_train.checkpoints.scores import Scores
 from tangent_train.checkpoints.trained import TrainedNetwork, completed_settings
 from tangent_train.cli.build import build
 from tangent_train.registry import SettingsFile, make
+from tangent_train.tasks import SegmentationTask
 from tests.running import composed_settings
-
-if TYPE_CHECKING:
-    from tangent_train.tasks import SegmentationTask
 
 NAMES = ("unknown", "beam", "board", "sofa", "wall")
 UNET = {"_target_": "models.UNet", "in_channels": 4, "num_classes": 4, "widths": [4, 8, 8]}

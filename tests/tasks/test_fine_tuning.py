@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import lightning
 import pytest
@@ -14,9 +14,6 @@ from torch.optim.lr_scheduler import CosineAnnealingLR, CyclicLR, OneCycleLR, St
 
 from tangent_train.errors import SettingError
 from tests.tasks.shapes import Shapes, quiet_trainer, shape_task
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 pytestmark = pytest.mark.filterwarnings("ignore:Found .* in eval mode")
 FRESH = frozenset({"head.weight", "head.bias"})
@@ -140,24 +137,3 @@ def test_frozen_and_loaded_parts_together() -> None:
 def test_impossible_factors_are_refused(factor: Any) -> None:
     with pytest.raises(SettingError, match=r"optimizer\.backbone_lr_factor: .*task\.frozen"):
         shape_task(backbone_lr_factor=factor)
-
-
-def test_a_resumed_training_has_the_same_groups(tmp_path: Path) -> None:
-    def made(epochs: int) -> tuple[Any, Any]:
-        settings: Any = {"optimizer": partial(Adam, lr=0.01), "frozen": ["encoder.0"]}
-        scheduler = partial(StepLR, step_size=1, gamma=0.5)
-        task = shape_task(WithStatistics(), scheduler=scheduler, backbone_lr_factor=0.1, **settings)
-        return task, quiet_trainer(max_epochs=epochs, limit_val_batches=0)
-
-    whole, trainer = made(2)
-    whole.fresh = FRESH
-    trainer.fit(whole, datamodule=Shapes())
-    half, trainer = made(1)
-    half.fresh = FRESH
-    trainer.fit(half, datamodule=Shapes())
-    trainer.save_checkpoint(tmp_path / "half.ckpt")
-    resumed, trainer = made(2)
-    path = str(tmp_path / "half.ckpt")
-    trainer.fit(resumed, datamodule=Shapes(), ckpt_path=path, weights_only=True)
-    assert resumed.fresh == FRESH
-    torch.testing.assert_close(resumed.state_dict(), whole.state_dict(), rtol=0, atol=0)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import shutil
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import pytest
 
@@ -15,9 +16,6 @@ from tangent_train.errors import DataError
 from tangent_train.rendering import TangentRepresentation
 from tests.datamodules.conftest import TINY_ROOMS, TINY_SHAPES
 from tests.datamodules.data_files import contents, names_of
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 class _Generated(NamedTuple):

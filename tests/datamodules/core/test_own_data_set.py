@@ -4,25 +4,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
+from datamodules.core.found import Split
 from datamodules.core.panorama_module import PanoramaDataModule
+from datamodules.core.problems import Problems
 from datamodules.core.reading import ImageFiles, ImageReader
 from datamodules.images.png import check_png, read_color_png, read_png
 from tangent_train.errors import DataError, SettingError
 from tangent_train.rendering import EquirectRepresentation
 from tests.datamodules.data_files import read_png as read_as_stored
 from tests.datamodules.data_files import write_png
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from datamodules.core.found import Split
-    from datamodules.core.problems import Problems
 
 
 class ToyReader(ImageReader):

@@ -1,9 +1,10 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from datamodules.core.panoramas import (
     mask_black,
@@ -11,10 +12,6 @@ from datamodules.core.panoramas import (
     resize_depth,
     resize_nearest,
 )
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
 
 # --- sizes -------------------------------------------------------------------------------------
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from datamodules.core.panoramas import Panorama
 from datamodules.core.pipeline import (
@@ -19,9 +20,6 @@ from datamodules.core.reading import ImageFiles
 from tangent_train.errors import DataError
 from tangent_train.geometry import equirect_directions
 from tangent_train.rendering.upright.gravity import Gravity
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 FILES = [ImageFiles(name, Path(name), Path("labels")) for name in ("0", "1")]
 UP = np.array([0.6, 0.0, 0.8])

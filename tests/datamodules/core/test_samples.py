@@ -1,11 +1,12 @@
 from __future__ import annotations
 
 import colorsys
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 
 from datamodules.core.inputs import (
     RGB_NORMALIZATION,
@@ -20,11 +21,7 @@ from datamodules.images.colors import jitter_colors
 from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_directions
 from tangent_train.rendering import EquirectRepresentation, TangentRepresentation
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from tangent_train.rendering.representations.views import Representation
+from tangent_train.rendering.representations.views import Representation
 
 DEPTH: tuple[Input, ...] = ("rgb", "depth")
 IDENTITY = Normalization((0, 0, 0, 0), (1 / 255, 1 / 255, 1 / 255, 1))

@@ -2,7 +2,9 @@ from __future__ import annotations
 
 import hashlib
 import multiprocessing
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -11,17 +13,11 @@ import torch
 from lightning import LightningModule, Trainer
 
 from datamodules.core.found import Split
-from datamodules.core.samples import EvaluationSample
+from datamodules.core.samples import EvaluationSample, TrainingSample
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 from tangent_train.rendering import TangentRepresentation
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from datamodules.core.samples import TrainingSample
-
-    MakeModule = Callable[..., Stanford2D3DS]
+MakeModule = Callable[..., Stanford2D3DS]
 
 
 SPLITS: tuple[Split, ...] = ("train", "val", "test")

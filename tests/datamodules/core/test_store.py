@@ -3,27 +3,24 @@ from __future__ import annotations
 import json
 import os
 from collections import namedtuple
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
 from datamodules import Stanford2D3DS, Stanford2D3DSPerspective
+from datamodules.core.found import Split
 from datamodules.core.store import Store
 from tangent_train.cli.shard import Shard
 from tangent_train.errors import DataError, SettingError
 from tangent_train.rendering import EquirectRepresentation, PerspectiveRepresentation
+from tests.conftest import FabricateStanford
 from tests.datamodules.data_files import contents
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from datamodules.core.found import Split
-    from tests.conftest import FabricateStanford
-
-    MakeModule = Callable[..., Stanford2D3DS]
+MakeModule = Callable[..., Stanford2D3DS]
 
 SPLITS: tuple[Split, ...] = ("train", "val", "test")
 PANORAMAS = 8

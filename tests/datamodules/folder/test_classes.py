@@ -1,16 +1,13 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from datamodules.folder.classes import read_classes
 from tangent_train.errors import DataError
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 def _write_json(path: Path, text: str) -> Path:

@@ -1,12 +1,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from PIL import Image
 
+from datamodules.core.found import Split
 from datamodules.core.inputs import RGBD_NORMALIZATION, Normalization
 from datamodules.folder.panoramas import FolderPanoramas
 from tangent_train.errors import DataError
@@ -18,12 +20,6 @@ from tests.datamodules.folder.folder_format import (
     write_classes,
     write_panorama,
 )
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from datamodules.core.found import Split
-
 
 # Pixels
 

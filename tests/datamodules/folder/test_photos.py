@@ -2,11 +2,12 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
 
+from datamodules.core.photos import Photo
 from datamodules.folder.panoramas import FolderPanoramas
 from datamodules.folder.photos import FolderPhotos
 from tangent_train.errors import DataError, SettingError
@@ -24,9 +25,6 @@ from tests.datamodules.folder.photo_format import (
     write_photo,
     write_photos,
 )
-
-if TYPE_CHECKING:
-    from datamodules.core.photos import Photo
 
 CROPS = PerspectiveRepresentation(level=4, fov_deg=20, dim=8)
 K: list[list[float]] = [[70, 0, 30.5], [0, 72, 20], [0, 0, 1]]

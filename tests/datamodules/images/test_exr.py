@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import struct
 import sys
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenEXR
@@ -12,9 +13,6 @@ import pytest
 
 from datamodules.images.exr import read_exr, read_exr_size
 from tangent_train.errors import DataError
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 _SIZE = b"dataWindow\0box2i\0"  # then the length of what follows, 16
 _DEPTH = np.fromfunction(lambda row, column: (row // 8 + column % 12) / 4 + 0.5, (40, 96)).astype(

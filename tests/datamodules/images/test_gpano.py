@@ -1,21 +1,18 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from PIL import Image, PngImagePlugin
 
 from datamodules.images.gpano import PanoramaArea, area_of, area_of_crop, up_of, whole_area
 from tangent_train.errors import DataError, SettingError
 from tangent_train.geometry import equirect_to_lonlat
 from tangent_train.rendering.upright.gravity import up_from_pose
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
-    from numpy.typing import NDArray
 
 _TAGS = {
     "ProjectionType": "equirectangular",

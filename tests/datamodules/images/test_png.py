@@ -1,6 +1,7 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,9 +17,6 @@ from datamodules.images.png import (
 )
 from tangent_train.errors import DataError, SettingError
 from tests.datamodules.data_files import write_png
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 READERS = [read_png_header, read_color_png, read_depth_png]
 

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Literal
 
 from datamodules.synthshapes.generate import make_shape
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
 
 COUNTS = {"chair": (6, 2), "cup": (4, 3), "night_stand": (5, 1)}
 """Shapes of every class for training and for the test."""

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,11 +25,7 @@ from tangent_train.rendering import (
 )
 from tests.datamodules.modelnet40.shapes_format import COUNTS, write_tree
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    MakeModule = Callable[..., ModelNet40]
+MakeModule = Callable[..., ModelNet40]
 
 SPLITS: tuple[Split, ...] = ("train", "val", "test")
 LEVEL = 3

@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import math
 import re
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from trimesh import Trimesh, creation, util
 
 from datamodules.modelnet40.meshes import RADIUS, clean_mesh, mesh_spheres, read_off
 from datamodules.synthshapes.generate import make_shape
 from tangent_train.errors import DataError
 from tangent_train.geometry import equirect_directions, random_rotation
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
 
 SHAPE = (64, 128)
 RAYS = equirect_directions(SHAPE)

@@ -1,15 +1,13 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from pathlib import Path
+from typing import Literal
 
 import pytest
 
 from datamodules.modelnet40.shape_files import find_shapes
 from tangent_train.errors import DataError
 from tests.datamodules.modelnet40.shapes_format import COUNTS, write_tree
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 PARTS = ("train", "test")
 

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,10 +13,8 @@ from datamodules.stanford2d3ds.label_table import CLASSES
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 from tangent_train.errors import DataError
 from tangent_train.rendering import EquirectRepresentation
+from tests.conftest import FabricateStanford
 from tests.datamodules.data_files import names_of, read_png
-
-if TYPE_CHECKING:
-    from tests.conftest import FabricateStanford
 
 
 @pytest.fixture

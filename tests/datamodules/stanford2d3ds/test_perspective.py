@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,12 +12,8 @@ from datamodules.core.photos import distance_from_z_depth
 from tangent_train.errors import DataError
 from tangent_train.geometry import camera_matrix_from_fov
 from tangent_train.rendering import PerspectiveRepresentation, TangentRepresentation
+from tests.conftest import FabricateStanford
 from tests.datamodules.data_files import names_of, read_png
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from tests.conftest import FabricateStanford
 
 CROPS = PerspectiveRepresentation(level=5, evaluation="grid", crops_per_photo=2)
 

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tests.datamodules.data_files import write_png
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
-    from numpy.typing import NDArray
 
 SIZE = (38, 64)  # the real 760×1280 by 20
 FOCAL, CENTER_X, CENTER_Y = 532.740352 / 20, 32.0, 19.0

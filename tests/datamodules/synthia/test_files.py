@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from datamodules.core.reading import ImageFiles
 from datamodules.synthia.files import read_camera
@@ -21,10 +22,6 @@ from datamodules.synthia.splits import choose_frames, divide
 from tangent_train.errors import DataError
 from tests.datamodules.data_files import write_png
 from tests.datamodules.synthia import synthia_format as synthia
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
 
 # --- cameras -------------------------------------------------------------------------------------
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,9 +12,6 @@ from tangent_train.errors import DataError
 from tangent_train.rendering import EquirectRepresentation
 from tests.datamodules.data_files import names_of, read_png, write_png
 from tests.datamodules.synthia import synthia_format as synthia
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 FRAMES = {"01": 5, "02": 3, "04": 2, "05": 2, "06": 4}
 

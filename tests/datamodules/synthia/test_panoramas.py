@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from datamodules.core.problems import Problems
 from datamodules.synthia.files import VIEWS
@@ -15,11 +17,6 @@ from tangent_train.geometry import equirect_directions
 from tests.datamodules.data_files import contents, read_png
 from tests.datamodules.synthia import synthia_format as synthia
 from tests.datamodules.synthia.synthia_format import HEIGHT, SIZE
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
 
 DIRECTIONS = equirect_directions((HEIGHT, 2 * HEIGHT))
 PARTS = {"rgb": "RGB", "labels": "GT/LABELS_Correct", "depth": "Depth"}

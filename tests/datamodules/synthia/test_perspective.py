@@ -1,7 +1,8 @@
 from __future__ import annotations
 
 import shutil
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,9 +13,6 @@ from tangent_train.errors import DataError
 from tangent_train.rendering import PerspectiveRepresentation
 from tests.datamodules.data_files import names_of
 from tests.datamodules.synthia import synthia_format as synthia
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 CROPS = PerspectiveRepresentation(level=5)
 

@@ -26,12 +26,6 @@ def test_walls_go_around_the_floor_once_with_the_room_on_their_left(
         assert not plan.contains(Rectangle.around(outside, (0, 0), (0, 0)))
 
 
-def test_the_missing_corner_is_outside() -> None:
-    assert not L_SHAPE.contains(Rectangle(3.9, 3.4, 4.1, 3.6))
-    assert L_SHAPE.contains(Rectangle(3.7, 3.3, 3.9, 3.6))
-    assert not L_SHAPE.contains(Rectangle(3.7, 3.3, 3.9, 3.6), margin=0.2)
-
-
 @pytest.mark.parametrize("notch", [None, (2.0, 1.5)])
 def test_what_stands_on_the_floor_keeps_apart_and_inside(
     notch: tuple[float, float] | None,
@@ -50,12 +44,3 @@ def test_what_stands_on_the_floor_keeps_apart_and_inside(
     for k, area in enumerate(areas):
         assert plan.contains(area)
         assert not any(area.meets(other) for other in areas[:k])
-
-
-def test_a_wall_holds_something_low_below_something_high_but_no_two_of_a_kind() -> None:
-    wall = FloorPlan((4.0, 3.0, 2.5)).walls[0]
-    wall.taken.append((1.0, 2.0, "low"))
-    assert wall.is_free(1.0, 2.0, "high")
-    assert not wall.is_free(1.9, 2.5, "low")
-    assert not wall.is_free(1.9, 2.5, "full")
-    assert wall.is_free(2.2, 2.5, "full")

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,9 +15,6 @@ from datamodules.synthshapes.generate import (
 )
 from tangent_train.errors import SettingError
 from tests.datamodules.data_files import contents
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 def test_another_seed_or_more_shapes(tiny_shapes: Path, tmp_path: Path) -> None:

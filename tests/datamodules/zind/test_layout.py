@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from datamodules.zind.layout import CLASSES, DOOR, OPENING, WINDOW, Fixture, Layout
 from tangent_train.geometry import equirect_directions
@@ -18,9 +19,6 @@ from tests.datamodules.zind.zind_format import (
     Room,
     brute_force_labels,
 )
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 LABELS = {"doors": DOOR, "windows": WINDOW, "openings": OPENING}
 SPLIT_WALL = Room(

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,9 +22,6 @@ from tests.datamodules.zind.zind_format import (
     write_home,
     write_homes,
 )
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 def test_panoramas_inside_one_room_are_paired(tmp_path: Path) -> None:

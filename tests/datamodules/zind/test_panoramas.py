@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,9 +17,6 @@ from tangent_train.errors import DataError, SettingError
 from tangent_train.rendering import EquirectRepresentation
 from tests.datamodules.data_files import names_of
 from tests.datamodules.zind.zind_format import brute_force_labels, write_homes
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 ERP = EquirectRepresentation(level=4)
 ROOM = "000/floor_01/complete_room_01/partial_room_01"

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from datamodules.core.panorama_pairs import PairedPanorama, PanoramaPair
 from tangent_train.geometry import FLIP_Y, PanoramaPose, equirect_directions, random_rotation
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 RADIUS_M = 3.0
 SHAPE = (192, 384)

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 
+from tangent_train.checkpoints.trained import load_trained
 from tangent_train.cli.build import build
 from tangent_train.cli.compose import config_folder
+from tangent_train.inference.export import SUFFIXES, export_network
 from tests.running import composed_settings
+from tests.tasks.odd_networks import assert_same, scores_of, some_images
+from tests.tasks.small_networks import save_checkpoint
 
 NETWORKS = {path.stem for path in (config_folder() / "network").glob("*.yaml")}
 OF_SHAPES = {"multi_view_resnet18", "shape_classifier", "shape_classifier_16"}
@@ -20,31 +25,40 @@ def _composed(*overrides: str) -> dict[str, Any]:
     return composed_settings("train", "level=5", "representation.erp_height=32", *overrides)
 
 
-@pytest.mark.parametrize("network", sorted(NETWORKS - OF_SHAPES))
-def test_every_network_takes_the_data_s_channels_and_classes(network: str) -> None:
-    shallow = [DEPTH[network]] if network in DEPTH else []
-    for inputs, channels in (("[rgb]", 3), ("[rgb,depth]", 4)):
-        _, task = build(_composed(f"network={network}", f"data.inputs={inputs}", *shallow))
-        scores = task(torch.randn(2, channels, 32, 32))
-        assert scores.shape == (2, 13, 32, 32)
-    outputs = task.outputs(torch.randn(2, channels, 32, 32)).values()
+SHAPES = ("data=modelnet40", "data.root=nowhere", "task=classification")
+
+
+@pytest.mark.parametrize("network", sorted(NETWORKS))
+def test_every_network_takes_its_data_s_channels_and_classes(network: str) -> None:
+    settings = [f"network={network}", *([DEPTH[network]] if network in DEPTH else [])]
+    shapes = network in OF_SHAPES
+    cases = {6: SHAPES} if shapes else {3: ("data.inputs=[rgb]",), 4: ("data.inputs=[rgb,depth]",)}
+    for channels, of_data in cases.items():
+        _, task = build(_composed(*of_data, *settings))
+        assert len(task.class_names) == (40 if shapes else 14)
+        images = torch.randn(2, *([3] if shapes else []), channels, 32, 32)
+        assert task(images).shape == ((2, 40) if shapes else (2, 13, 32, 32))
+    outputs = [task(images)] if shapes else task.outputs(images).values()
     sum(output.square().mean() for output in outputs).backward()
     unused = [n for n, p in task.named_parameters() if p.grad is None and ".mixer." not in n]
     assert not unused, "parameters without gradient"
 
 
-SHAPES = ("data=modelnet40", "data.root=nowhere", "task=classification")
-
-
-@pytest.mark.parametrize("network", sorted(OF_SHAPES))
-def test_every_network_of_shapes_takes_their_channels_and_classes(network: str) -> None:
-    data, task = build(_composed(*SHAPES, f"network={network}"))
-    assert len(data.class_names) == 40
-    scores = task(torch.randn(2, 3, 6, 32, 32))
-    assert scores.shape == (2, 40)
-    scores.square().mean().backward()
-    unused = [n for n, p in task.named_parameters() if p.grad is None and ".mixer." not in n]
-    assert not unused, "parameters without gradient"
+@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("network", sorted(NETWORKS - OF_SHAPES))
+def test_every_network_can_be_exported_for_images_of_any_size(
+    network: str, suffix: str, tmp_path: Path
+) -> None:
+    shallow = [DEPTH[network]] if network in DEPTH else []
+    level = ["level=5", "representation.erp_height=32"]
+    save_checkpoint(tmp_path / "net.ckpt", f"network={network}", *level, *shallow)
+    trained = load_trained(tmp_path / "net.ckpt")
+    path = tmp_path / f"net{suffix}"
+    assert export_network(trained, path).trained.fixed_size is None
+    again, step = load_trained(path), trained.size_multiple
+    for count, size in ((1, (64, 96)), (5, (32 + step, 64))):
+        images = some_images(trained, count, size)
+        assert_same(again.network(images).detach(), scores_of(trained, images))
 
 
 class Recorder(torch.nn.Conv2d):

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -11,9 +12,6 @@ from datamodules.synthrooms.settings import RoomSettings
 from datamodules.synthshapes import generate as shapes
 from datamodules.synthshapes.generate import ShapeSettings, generate_shapes
 from tests.datamodules.data_files import contents
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 ROOMS = RoomSettings(
     rooms={"1": 2, "5b": 1}, height=16, views_per_camera=1, view_size=8, supersample=1

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import re
 import shlex
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from omegaconf import OmegaConf
 
 from tests.running import composed
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 TIME = "2026-01-31_12-00-00"
 STAND_INS = {

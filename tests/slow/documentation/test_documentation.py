@@ -9,15 +9,12 @@ from __future__ import annotations
 import re
 import shutil
 import tomllib
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
 from tests.slow.documentation.commands import Block, blocks, words_of
 from tests.slow.documentation.world import ROOT, build_world, run
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 BLOCKS = [
     block

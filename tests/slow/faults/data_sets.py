@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,18 +19,13 @@ from datamodules import (
     SynthiaPerspective,
 )
 from datamodules.core.found import SPLITS
+from datamodules.core.split_module import SplitDataModule
 from tangent_train.rendering import EquirectRepresentation, PerspectiveRepresentation
+from tests.conftest import FabricateStanford
 from tests.datamodules.folder.folder_format import write_data_set
 from tests.datamodules.folder.photo_format import write_photos
 from tests.datamodules.modelnet40.shapes_format import write_tree
 from tests.datamodules.synthia.synthia_format import write_panoramas, write_views
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from datamodules.core.split_module import SplitDataModule
-    from tests.conftest import FabricateStanford
 
 NAME = "Küche 1 [b] 部屋 ∕ a,b=c"
 ERP = EquirectRepresentation(level=3)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
+import lightning
 import torch
 from torch import Tensor, nn
 
@@ -13,12 +16,6 @@ from tangent_train.callbacks.checkpoints import AtomicCheckpointIO, LastCheckpoi
 from tangent_train.rendering import TangentRepresentation
 from tangent_train.tasks import SegmentationTask
 from tests.tasks.shapes import quiet_trainer
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    import lightning
 
 
 class Faulty(nn.Module):

@@ -7,21 +7,16 @@ import io
 import os
 import re
 import shutil
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
 
-from tests.datamodules.folder.folder_format import write_classes
+from tests.conftest import FabricateStanford
 from tests.slow.faults import data_sets as sets
 from tests.slow.faults.data_sets import colors, module, partner, write
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from tests.conftest import FabricateStanford
 
 
 def _found(kind: str, root: Path, **settings: Any) -> dict[str, str]:
@@ -129,21 +124,6 @@ def test_an_empty_folder_a_missing_area_and_a_damaged_file_at_once(
         str(first.relative_to(root)): f"{first.stat().st_size} bytes, truncated",
         str(colors("stanford", root)[-1].relative_to(root)): "a broken image",
     }
-
-
-def test_values_past_the_list_of_classes(root: Path, fabricate_stanford: FabricateStanford) -> None:
-    """In a list every value has a place; values or colours by name leave others unknown."""
-    write("folder", root, fabricate_stanford)
-    assert not _found("folder", root), "4 and 0 have no name"
-    write_classes(root, [None, "wall", "floor", "floor 2"])
-    labels = sorted((root / "labels").rglob("*.png"))
-    expected = {
-        str(path.relative_to(root)) for path in labels if (np.asarray(Image.open(path)) == 4).any()
-    }
-    found = _found("folder", root)
-    assert set(found) == expected, "255 is unknown"
-    assert all("value 4 in " in text and "write null" in text for text in found.values())
-    assert len(expected) > 1
 
 
 # --- what may not be opened, and links ----------------------------------------------------------

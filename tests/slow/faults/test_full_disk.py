@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import re
 import resource
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import lightning
 import numpy as np
@@ -22,9 +23,6 @@ from tangent_train.callbacks.checkpoints import AtomicCheckpointIO
 from tangent_train.cli.machine import machine_faults
 from tangent_train.files import NoRoomError, atomic_path, reserve, write_text
 from tests.slow.faults.small_runs import Faulty, run_trainer, small_data, small_task
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 LIMIT = 1 << 16
 LARGE = 100_000

@@ -14,18 +14,16 @@ import random
 import signal
 import sys
 import time
+from collections.abc import Callable
+from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import pytest
 import torch
 
 from tests.dropping import TRUST, write_dropout
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from multiprocessing.process import BaseProcess
 
 _PATIENCE_S = 300.0
 _RUNS = 4

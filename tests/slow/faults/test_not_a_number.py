@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -13,10 +14,6 @@ from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 from tangent_train.errors import SettingError
 from tests.running import run_python
 from tests.slow.faults.small_runs import Faulty, run_trainer, small_data, small_task
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
 
 pytestmark = pytest.mark.filterwarnings("ignore:You defined a `validation_step`:UserWarning")
 

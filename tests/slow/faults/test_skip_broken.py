@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,14 +15,12 @@ from datamodules.core import found as found_module
 from datamodules.core.found import Found
 from datamodules.core.problems import Problems
 from datamodules.core.reading import ImageFiles
+from datamodules.core.split_module import SplitDataModule
 from tangent_train.errors import DataError
 from tests.cli.tiny_runs import run_command
+from tests.conftest import FabricateStanford
 from tests.slow.faults import data_sets as sets
 from tests.slow.faults.data_sets import colors, module, names, partner, write
-
-if TYPE_CHECKING:
-    from datamodules.core.split_module import SplitDataModule
-    from tests.conftest import FabricateStanford
 
 
 def _as_in_training(data: SplitDataModule[Any]) -> SplitDataModule[Any]:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import multiprocessing
 import zlib
 from concurrent.futures import ProcessPoolExecutor
+from multiprocessing.context import ForkServerContext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 import torch
@@ -15,9 +16,6 @@ from datamodules.core.made_folders import claim_folder
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 from datamodules.synthrooms.settings import RoomSettings
 from tangent_train.rendering import TangentRepresentation
-
-if TYPE_CHECKING:
-    from multiprocessing.context import ForkServerContext
 
 PROCESSES = 3
 PANORAMAS = 14

@@ -5,21 +5,18 @@ from __future__ import annotations
 import gc
 import os
 import signal
+from collections.abc import Callable, Iterator
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import pytest
 from torch.utils.data import get_worker_info
 
+from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 from tangent_train.cli.machine import machine_faults
 from tangent_train.errors import DataError, SettingError
 from tests.slow.faults.small_runs import Faulty, run_trainer, small_data, small_task
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from pathlib import Path
-
-    from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:You defined a `validation_step`:UserWarning"),

@@ -6,10 +6,8 @@ import json
 import re
 import struct
 import zlib
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from random import Random
+from random import Random
+from typing import Any
 
 __all__ = ["mutate", "png_chunk", "sealed_png"]
 

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from contextlib import suppress
 from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
 import OpenEXR
+from numpy.typing import NDArray
 from PIL import Image
 
 from datamodules.core.problems import Problems
@@ -37,11 +39,6 @@ from tangent_train.rendering.camera_files import (
     write_rig,
 )
 from tests.datamodules.zind.zind_format import SQUARE, Camera, write_home
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from numpy.typing import NDArray
 
 __all__ = ["TARGETS"]
 

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
+from playwright.sync_api import Browser
 
 from tangent_train.results.html import encode_image, write_report
 from tangent_train.results.tables import Table
 from tests.slow.results.browser import OpenReport, chromium, opened
 from tests.slow.results.scene import NAMES, panorama, panorama_rgb, photo
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from playwright.sync_api import Browser
 
 
 # Not for the whole session: while it runs, no other test could start an event loop.

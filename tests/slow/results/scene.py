@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from datamodules.images.palette import class_colors
 from tangent_train.results.html import EncodedImage, encode_image
+from tests.slow.results.browser import OpenReport
 from tests.slow.results.reference import classes_of, colors_of, erp_directions, rays
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from tests.slow.results.browser import OpenReport
 
 HEIGHT, WIDTH = 251, 503  # odd, no powers of two
 PHOTO = (120, 200)

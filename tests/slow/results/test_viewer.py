@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
+from playwright.sync_api import Browser
 
 from tangent_train.results.html import encode_image, write_report
 from tests.slow.results.browser import OpenReport, opened
@@ -32,12 +35,6 @@ from tests.slow.results.scene import (
     step_rad,
     view_of,
 )
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-    from playwright.sync_api import Browser
 
 
 def test_the_first_picture_is_the_overlay_ahead(report: OpenReport) -> None:
