@@ -44,3 +44,12 @@ def test_what_stands_on_the_floor_keeps_apart_and_inside(
     for k, area in enumerate(areas):
         assert plan.contains(area)
         assert not any(area.meets(other) for other in areas[:k])
+
+
+def test_a_wall_holds_something_low_below_something_high_but_no_two_of_a_kind() -> None:
+    wall = FloorPlan((4.0, 3.0, 2.5)).walls[0]
+    wall.taken.append((1.0, 2.0, "low"))
+    assert wall.is_free(1.0, 2.0, "high")
+    assert not wall.is_free(1.9, 2.5, "low")
+    assert not wall.is_free(1.9, 2.5, "full")
+    assert wall.is_free(2.2, 2.5, "full")
