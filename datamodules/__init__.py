@@ -10,41 +10,23 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from datamodules.core.panorama_pairs import ImagePairs
-    from datamodules.folder.panoramas import FolderPanoramas
-    from datamodules.folder.photos import FolderPhotos
-    from datamodules.modelnet40.datamodule import ModelNet40
-    from datamodules.stanford2d3ds.pairs import StanfordPairs
-    from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
-    from datamodules.stanford2d3ds.perspective import Stanford2D3DSPerspective
-    from datamodules.synthia.omnisynthia import OmniSynthia
-    from datamodules.synthia.perspective import SynthiaPerspective
-    from datamodules.synthrooms.datamodule import (
-        SynthRooms,
-        SynthRoomsPairs,
-        SynthRoomsPerspective,
+    from datamodules.core.panorama_pairs import ImagePairs as ImagePairs
+    from datamodules.folder.panoramas import FolderPanoramas as FolderPanoramas
+    from datamodules.folder.photos import FolderPhotos as FolderPhotos
+    from datamodules.modelnet40.datamodule import ModelNet40 as ModelNet40
+    from datamodules.stanford2d3ds.pairs import StanfordPairs as StanfordPairs
+    from datamodules.stanford2d3ds.panoramas import Stanford2D3DS as Stanford2D3DS
+    from datamodules.stanford2d3ds.perspective import (
+        Stanford2D3DSPerspective as Stanford2D3DSPerspective,
     )
-    from datamodules.synthshapes.datamodule import SynthShapes
-    from datamodules.zind.pairs import ZindPairs
-    from datamodules.zind.panoramas import Zind
-
-__all__ = [
-    "FolderPanoramas",
-    "FolderPhotos",
-    "ImagePairs",
-    "ModelNet40",
-    "OmniSynthia",
-    "Stanford2D3DS",
-    "Stanford2D3DSPerspective",
-    "StanfordPairs",
-    "SynthRooms",
-    "SynthRoomsPairs",
-    "SynthRoomsPerspective",
-    "SynthShapes",
-    "SynthiaPerspective",
-    "Zind",
-    "ZindPairs",
-]
+    from datamodules.synthia.omnisynthia import OmniSynthia as OmniSynthia
+    from datamodules.synthia.perspective import SynthiaPerspective as SynthiaPerspective
+    from datamodules.synthrooms.datamodule import SynthRooms as SynthRooms
+    from datamodules.synthrooms.datamodule import SynthRoomsPairs as SynthRoomsPairs
+    from datamodules.synthrooms.datamodule import SynthRoomsPerspective as SynthRoomsPerspective
+    from datamodules.synthshapes.datamodule import SynthShapes as SynthShapes
+    from datamodules.zind.pairs import ZindPairs as ZindPairs
+    from datamodules.zind.panoramas import Zind as Zind
 
 _MODULES = {
     "FolderPanoramas": "datamodules.folder.panoramas",
@@ -63,6 +45,8 @@ _MODULES = {
     "Zind": "datamodules.zind.panoramas",
     "ZindPairs": "datamodules.zind.pairs",
 }
+
+__all__ = list(_MODULES)
 
 
 def __getattr__(name: str) -> Any:

@@ -7,31 +7,17 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from models.auxiliary_head import AuxiliaryHead
-    from models.fcn_resnet import FCNResNet
-    from models.fine_tuning import initialize
-    from models.hexunet import HexUNet
-    from models.huggingface import HuggingFaceNetwork
-    from models.multi_view import MultiView
-    from models.shape_classifier import ShapeClassifier
-    from models.sphere_attention import SphereAttention
-    from models.sphere_context import SphereContext
-    from models.stem import widen_stem
-    from models.unet import UNet
-
-__all__ = [
-    "AuxiliaryHead",
-    "FCNResNet",
-    "HexUNet",
-    "HuggingFaceNetwork",
-    "MultiView",
-    "ShapeClassifier",
-    "SphereAttention",
-    "SphereContext",
-    "UNet",
-    "initialize",
-    "widen_stem",
-]
+    from models.auxiliary_head import AuxiliaryHead as AuxiliaryHead
+    from models.fcn_resnet import FCNResNet as FCNResNet
+    from models.fine_tuning import initialize as initialize
+    from models.hexunet import HexUNet as HexUNet
+    from models.huggingface import HuggingFaceNetwork as HuggingFaceNetwork
+    from models.multi_view import MultiView as MultiView
+    from models.shape_classifier import ShapeClassifier as ShapeClassifier
+    from models.sphere_attention import SphereAttention as SphereAttention
+    from models.sphere_context import SphereContext as SphereContext
+    from models.stem import widen_stem as widen_stem
+    from models.unet import UNet as UNet
 
 _FILES = {
     "AuxiliaryHead": "auxiliary_head",
@@ -46,6 +32,8 @@ _FILES = {
     "initialize": "fine_tuning",
     "widen_stem": "stem",
 }
+
+__all__ = list(_FILES)
 
 
 def __getattr__(name: str) -> Any:

@@ -7,14 +7,12 @@ import os
 import re
 import shutil
 import tempfile
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, Any
 
 from tangent_train.errors import DataError, SettingError
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 __all__ = [
     "NoRoomError",

@@ -7,15 +7,12 @@ the index, from the sampler to the workers: persistent workers need not be told 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
 
 import numpy as np
 from torch.utils.data import Sampler
 
 from tangent_train.errors import SettingError
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 __all__ = ["EpochSampler", "Seed", "sample_rng"]
 

@@ -6,17 +6,14 @@ import hashlib
 import json
 import re
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tangent_train.errors import DataError, counted
 from tangent_train.json_text import parse_json
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
 
 __all__ = ["UNKNOWN_NAME", "FolderClasses", "read_classes"]
 

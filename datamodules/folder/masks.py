@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from datamodules.folder.classes import read_classes
 from datamodules.folder.reader import read_codes
 from datamodules.images.masks import Masks
 from tangent_train.errors import SettingError
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from numpy.typing import NDArray
 
 __all__ = ["class_masks"]
 

@@ -7,24 +7,21 @@ would cut to 8 bits.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.lib.format import open_memmap
+from numpy.typing import DTypeLike, NDArray
 from PIL import ExifTags, Image, ImageOps
 
 from datamodules.images.exr import read_exr, read_exr_size
 from datamodules.images.png import MOST_PIXELS, check_pixels, decode, read_png_header
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import atomic_path, reserve, write_bytes
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from numpy.typing import DTypeLike, NDArray
 
 __all__ = [
     "LOSSY_SUFFIXES",

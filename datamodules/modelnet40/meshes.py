@@ -20,22 +20,18 @@ from __future__ import annotations
 
 import re
 from io import StringIO
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
+from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 from trimesh import Trimesh
 from trimesh.exchange.off import load_off
 
 from tangent_train.errors import DataError
 from tangent_train.geometry import equirect_directions
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
 
 __all__ = ["CHANNELS", "RADIUS", "clean_mesh", "mesh_spheres", "read_off"]
 

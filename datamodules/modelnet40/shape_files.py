@@ -14,12 +14,10 @@ The class is the folder, or the name of the file without its number. Other files
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from pathlib import Path
+from typing import Literal, NamedTuple
 
 from tangent_train.errors import DataError
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 __all__ = ["MODELNET40", "ShapeFile", "find_shapes"]
 

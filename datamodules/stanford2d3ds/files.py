@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import os
 import re
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from pathlib import Path
+from typing import Literal, NamedTuple
 
 from datamodules.core.problems import Problems
 from datamodules.core.reading import ImageFiles
 from tangent_train.errors import DataError
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
 
 __all__ = [
     "AREAS",

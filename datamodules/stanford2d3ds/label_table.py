@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tangent_train.errors import DataError, counted
 from tangent_train.json_text import parse_json
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 __all__ = ["CLASSES", "UNKNOWN", "LabelTable"]
 

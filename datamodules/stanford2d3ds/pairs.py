@@ -11,10 +11,11 @@ hard with the overlap, 0.86, that six easy ones have: the split is by figures be
 from __future__ import annotations
 
 import csv
+from collections.abc import Iterable, Sequence
 from functools import cached_property
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -35,9 +36,6 @@ from datamodules.stanford2d3ds.files import (
 )
 from datamodules.stanford2d3ds.poses import read_panorama_pose
 from tangent_train.errors import DataError, SettingError
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
 
 __all__ = ["StanfordPairs", "published_pairs"]
 

@@ -15,19 +15,16 @@ pose, which ``tangent-keypoints`` shows beside the paper's.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from datamodules.synthrooms.camera import CAMERA_FROM_SPHERE, euler_rotation
 from tangent_train.errors import DataError
 from tangent_train.geometry import PanoramaPose
 from tangent_train.json_text import parse_json
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
 
 __all__ = ["read_panorama_pose"]
 

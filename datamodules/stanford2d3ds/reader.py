@@ -4,25 +4,19 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from datamodules.core.panoramas import Unknown, mask_black, resize_nearest
-from datamodules.core.reading import ImageReader
+from datamodules.core.reading import ImageFiles, ImageReader
 from datamodules.images.png import check_png, read_color_png, read_depth_png
 from datamodules.stanford2d3ds.files import MISSING_DEPTH
 from datamodules.stanford2d3ds.label_table import LabelTable
 from tangent_train.errors import DataError
 from tangent_train.geometry import is_camera_matrix
 from tangent_train.json_text import parse_json
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from datamodules.core.reading import ImageFiles
 
 __all__ = ["StanfordReader", "read_camera_matrix"]
 

@@ -3,24 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from datamodules.core.inputs import RGBD_NORMALIZATION, Normalization
 from datamodules.core.panoramas import STEPS_PER_M, resize_nearest
-from datamodules.core.reading import ImageReader
+from datamodules.core.reading import ImageFiles, ImageReader
 from datamodules.images.png import check_png, read_color_png, read_png
 from datamodules.synthia.files import read_camera
 from tangent_train.errors import DataError
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from datamodules.core.reading import ImageFiles
 
 __all__ = [
     "CLASSES",

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 from datamodules.stanford2d3ds.pairs import StanfordPairs
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
@@ -14,9 +15,6 @@ from datamodules.synthrooms.generate import generate_rooms
 from datamodules.synthrooms.settings import RoomSettings
 from tangent_train.errors import SettingError
 from tangent_train.registry import registered
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 __all__ = ["SynthRooms", "SynthRoomsPairs", "SynthRoomsPerspective"]
 

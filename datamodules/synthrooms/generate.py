@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 
@@ -28,9 +28,6 @@ from datamodules.synthrooms.writer import (
     pose_record,
 )
 from tangent_train.files import write_bytes, write_text
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 __all__ = ["MANIFEST", "RoomPlan", "generate_rooms", "make_room", "plan_rooms"]
 

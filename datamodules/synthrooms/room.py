@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partialmethod
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from trimesh import creation
 
 from datamodules.synthrooms.layout import FloorPlan, Frame
 from datamodules.synthrooms.materials import Material, Palette
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
 
 __all__ = ["UNKNOWN", "Item", "Light", "Part", "Room"]
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,9 +11,6 @@ from datamodules.synthrooms import clutter, furniture, structure
 from datamodules.synthrooms.layout import FloorPlan
 from datamodules.synthrooms.materials import Palette
 from datamodules.synthrooms.room import Room
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 __all__ = ["ROOM_TYPES", "draw_room_type", "furnish", "shell"]
 

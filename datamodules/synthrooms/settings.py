@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import Any, Literal, get_args
 
 from datamodules.stanford2d3ds.files import AREAS
 from tangent_train.errors import SettingError
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
 __all__ = ["RoomSettings", "ViewKind"]
 

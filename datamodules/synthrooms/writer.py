@@ -9,23 +9,17 @@ from __future__ import annotations
 
 import math
 import uuid
+from collections.abc import Sequence
 from pathlib import PurePosixPath
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from datamodules.synthrooms.camera import PanoramaView, Pose, euler_angles
-from datamodules.synthrooms.render import MISSING
+from datamodules.synthrooms.camera import PanoramaView, PerspectiveView, Pose, euler_angles
+from datamodules.synthrooms.render import MISSING, Picture
 from datamodules.synthrooms.room import UNKNOWN
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from datamodules.synthrooms.camera import PerspectiveView
-    from datamodules.synthrooms.render import Picture
 
 __all__ = [
     "INSTANCES",

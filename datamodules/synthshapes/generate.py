@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import zlib
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
+from trimesh import Trimesh
 from trimesh.exchange.off import export_off
 
 from datamodules.core.made_folders import claim_folder
@@ -17,12 +19,6 @@ from datamodules.synthshapes.parts import Parts
 from tangent_train.errors import SettingError
 from tangent_train.files import write_text
 from tangent_train.geometry import rotation_about
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from trimesh import Trimesh
 
 __all__ = ["CLASSES", "MANIFEST", "ShapeSettings", "generate_shapes", "make_shape", "plan_shapes"]
 

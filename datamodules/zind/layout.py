@@ -11,17 +11,14 @@ the camera in the origin.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tangent_train.geometry import equirect_latitudes, equirect_to_lonlat
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
 
 __all__ = ["CLASSES", "DOOR", "OPENING", "WINDOW", "Fixture", "Layout"]
 

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import Any, Literal
 
 import yaml  # type: ignore[import-untyped]
 
 from tangent_train.errors import DataError
 from tangent_train.files import load_plain, write_text
 from tangent_train.registry import Text, check_fields, check_plain
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping
-    from pathlib import Path
 
 __all__ = [
     "GROUPS",

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from hydra import compose
 from hydra.core.override_parser.types import Quote, QuotedString
 from omegaconf import OmegaConf
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 __all__ = ["compose_option", "config_folder", "quote_path", "quoted"]
 

@@ -5,14 +5,15 @@ from __future__ import annotations
 import os
 import re
 import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rich.console import Console
 from rich.progress import track
 
-from datamodules.core.panorama_pairs import ImagePairs, PanoramaPairs
+from datamodules.core.panorama_pairs import ImagePairs, PanoramaPair, PanoramaPairs
 from datamodules.images.pixel_files import read_image_size
 from tangent_train.cli.settings import typed
 from tangent_train.errors import DataError, SettingError
@@ -23,11 +24,6 @@ from tangent_train.keypoints.two_view import colmap
 from tangent_train.registry import make, maker_of
 from tangent_train.results.keypoints.compare import AS_GIVEN, Comparer, Comparison, Row, Ways
 from tangent_train.results.keypoints.report import KeypointReport, matches_png
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from datamodules.core.panorama_pairs import PanoramaPair
 
 __all__ = ["earlier_results", "file_name", "keypoints"]
 

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 from tangent_train.errors import SettingError
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 __all__ = ["Shard"]
 

@@ -8,9 +8,10 @@ for what is typed and what concerns this machine, and never reach Hydra.
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from tangent_train.checkpoints.content import INPUTS, NORMALIZATION, read_checkpoint
 from tangent_train.cli.compose import config_folder, quoted
@@ -18,9 +19,6 @@ from tangent_train.cli.settings import Trust, typed
 from tangent_train.errors import DataError, SettingError
 from tangent_train.registry import SettingsFile, Text, check_fields
 from tangent_train.setting_rules import OF_THIS_MACHINE, flat_settings, from_file
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
 
 __all__ = ["GROUPS", "StoredNetwork", "StoredRun", "run_settings", "stored_run"]
 

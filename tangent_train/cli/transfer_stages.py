@@ -19,12 +19,13 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from filelock import FileLock, Timeout
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 from tangent_train.checkpoints.content import read_settings
 from tangent_train.cli.processes import command_line, run_process
@@ -33,11 +34,6 @@ from tangent_train.errors import DataError, SettingError
 from tangent_train.files import write_text
 from tangent_train.json_text import parse_json
 from tangent_train.setting_rules import differing_settings
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-
-    from omegaconf import DictConfig
 
 __all__ = ["STUDY", "Stage", "State", "plan", "run_stage", "stage_command", "stage_state"]
 

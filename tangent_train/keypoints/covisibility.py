@@ -4,22 +4,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tangent_train.geometry import (
+    PanoramaPose,
     equirect_to_lonlat,
     lonlat_to_equirect,
     lonlat_to_xyz,
     xyz_to_lonlat,
 )
 from tangent_train.keypoints.spherical import angles_between
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from tangent_train.geometry import PanoramaPose
 
 __all__ = ["DepthView", "MatchTruth", "correct_matches", "fov_overlap", "visible_from"]
 

@@ -8,14 +8,12 @@ infinity, to ``t``, the left centre. Without translation the arc is the point ``
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tangent_train.keypoints.spherical import angles_between
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 __all__ = ["Motion", "is_by_chance", "motion_errors", "prefers_rotation"]
 

@@ -9,23 +9,20 @@ from __future__ import annotations
 import json
 import math
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from tangent_train.errors import DataError
 from tangent_train.files import write_text
 from tangent_train.geometry import FLIP_Y, PanoramaPose, TangentGrid, checked_rotation
 from tangent_train.json_text import parse_json
 from tangent_train.registry import Text, check_fields
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from numpy.typing import NDArray
 
 __all__ = [
     "CAMERAS_FILE",

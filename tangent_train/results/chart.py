@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from tangent_train.results.record import SCORES
 from tangent_train.results.rows import Row, Statistic
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 __all__ = ["grid_png", "report_png"]
 

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from tangent_train.geometry import equirect_solid_angles
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 __all__ = ["BUDGET_BYTES", "MOST_PIXELS", "EncodedImage", "encode_image"]
 

@@ -8,16 +8,13 @@ import re
 from base64 import b64encode
 from collections.abc import Sequence
 from importlib.resources import files
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any, TextIO
 
 from datamodules.images.palette import class_colors
 from tangent_train.files import atomic_path
 from tangent_train.results.html.images import EncodedImage
 from tangent_train.results.tables import Table
-
-if TYPE_CHECKING:
-    from pathlib import Path
-    from typing import TextIO
 
 __all__ = ["write_report"]
 
