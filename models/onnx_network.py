@@ -21,7 +21,7 @@ _LABEL_MAP = 3
 """Dimensions of label maps."""
 
 _ERRORS_ONLY = 3
-"""Of onnxruntime's log levels: its warnings are about speed."""
+"""The log level of onnxruntime: its warnings are about speed."""
 
 
 class OnnxNetwork(nn.Module):
@@ -142,7 +142,7 @@ class OnnxNetwork(nn.Module):
 
 
 def _channels_first(returned: Tensor, size: tuple[int, int], last: bool) -> Tensor | None:
-    """What a network returns, as ``(B, K, h, w)``; labels with K = 1; None for anything else.
+    """The output of a network as ``(B, K, h, w)``; labels with K = 1; None for anything else.
 
     The axis of the classes is the one without which rows and columns have one stride.
 

@@ -21,7 +21,7 @@ _PREFIX = "network."
 """Begins the names of the network's tensors in a checkpoint of this package."""
 
 _COUNTER = "num_batches_tracked"
-"""Of batch normalization; older files lack it, and nothing here uses it."""
+"""A buffer of batch normalization that older files lack and nothing here uses."""
 
 
 def read_tensors(path: Path) -> dict[str, Tensor]:

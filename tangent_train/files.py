@@ -150,7 +150,7 @@ def _refused(path: Path) -> OSError:
 
 
 def load_plain(path: Path, expected: str, *, mmap: bool = False) -> Any:
-    """What `torch.save` wrote, if it is tensors and plain values: nothing else is unpickled.
+    """Load a file of `torch.save` that holds tensors and plain values; nothing else is unpickled.
 
     Args:
         path: The file.

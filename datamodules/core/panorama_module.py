@@ -97,7 +97,7 @@ class PanoramaDataModule(ImageDataModule):
                 self._masks.check(files.name)
 
     def pipeline(self, found: Found[ImageFiles], split: Split) -> SplitItems[ImageFiles, Panorama]:
-        """From files or store, then masked, then rotated, then aligned with gravity."""
+        """Panoramas from files or store: masked, rotated, then aligned with gravity."""
         transforms: list[Transform[Panorama, Any]] = []
         if self.mask is not None:
             transforms.append(MaskedPanoramas(self._masks))

@@ -63,7 +63,7 @@ class PhotoDataModule(ImageDataModule):
         return found
 
     def pipeline(self, found: Found[ImageFiles], split: Split) -> SplitItems[ImageFiles, Photo]:
-        """From files or store."""
+        """Photos from files or store."""
         return SplitItems(found.splits[split], found.read, Photo, found.store)
 
     def _check(self, files: ImageFiles, reader: ImageReader, problems: Problems) -> None:

@@ -40,7 +40,7 @@ class _PhotoReader(FolderReader):
         return {**super().settings, "cameras": self.cameras.fingerprint}
 
     def camera(self, files: ImageFiles) -> NDArray[np.float64]:
-        """By ``cameras.json``, the field of view or the EXIF data."""
+        """The camera matrix, by ``cameras.json``, the field of view or the EXIF data."""
         return self.cameras.matrix(files)
 
 

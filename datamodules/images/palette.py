@@ -20,7 +20,7 @@ _SEEN = np.array(
         [[0.3673, 0.8606, -0.2280], [0.2801, 0.6725, 0.0474], [-0.0118, 0.0429, 0.9689]],
     ]
 )
-"""What eyes make of linear RGB."""
+"""Linear RGB as seen with full colour vision, and without red or green cones."""
 
 
 @lru_cache

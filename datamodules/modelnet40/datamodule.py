@@ -106,7 +106,7 @@ class ModelNet40(SplitDataModule[ShapeFile]):
         return Found(self.noun, splits, SphereReading(shape), Store(folder), _in_processes)
 
     def pipeline(self, found: Found[ShapeFile], split: Split) -> SplitItems[ShapeFile, Spheres]:
-        """From the store."""
+        """The spheres in the store."""
         return SplitItems(found.splits[split], found.read, Spheres, found.store)
 
     def evaluation_samples(self, split: Split) -> ShapeViews:
@@ -119,7 +119,7 @@ class ModelNet40(SplitDataModule[ShapeFile]):
         return views
 
     def evaluation_size(self) -> int:
-        """As many shapes as in training."""
+        """Shapes per evaluation batch: as many as in training."""
         return self.per_step
 
     def _choose_for_validation(self, meshes: Sequence[ShapeFile]) -> set[str]:

@@ -36,7 +36,7 @@ from tangent_train.geometry import equirect_directions
 __all__ = ["CHANNELS", "RADIUS", "clean_mesh", "mesh_spheres", "read_off"]
 
 CHANNELS = 6
-"""Of the mesh and of its convex hull, three each."""
+"""Three channels of the mesh, then three of its convex hull."""
 
 RADIUS = 0.99
 """Distance of the farthest vertex from the origin."""

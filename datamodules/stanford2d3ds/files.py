@@ -106,7 +106,7 @@ class PictureFiles(NamedTuple):
 
     @property
     def image(self) -> ImageFiles:
-        """As a panorama or photo to be read."""
+        """The files of this panorama or photo."""
         if self.name.frame == "equirectangular":
             return ImageFiles(self.short_name, self.rgb, self.semantic, self.depth)
         name = f"{self.short_name}/{self.name.frame}"

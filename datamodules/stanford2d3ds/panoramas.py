@@ -59,5 +59,5 @@ class Stanford2D3DS(StanfordAreas, PanoramaDataModule):
 
     @property
     def reader(self) -> StanfordReader:
-        """With the class table and what is unknown."""
+        """The reader, with the class table and the choice of unknown pixels."""
         return StanfordReader.of(self.root, self.label_table, self.unknown)

@@ -95,7 +95,7 @@ class StanfordReader(ImageReader):
         return steps
 
     def camera(self, files: ImageFiles) -> NDArray[np.float64]:
-        """From the pose file."""
+        """The camera matrix in the pose file."""
         return read_camera_matrix(files.parts["camera"])
 
 

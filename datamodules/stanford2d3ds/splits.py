@@ -64,7 +64,7 @@ class StanfordAreas(ImageDataModule):
 
     @property
     def reader(self) -> StanfordReader:
-        """With the class table."""
+        """The reader, with the class table of the data set."""
         return StanfordReader.of(self.root, self.label_table)
 
     def find_images(

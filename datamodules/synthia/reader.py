@@ -56,7 +56,7 @@ NORMALIZATIONS = (
         std=(0.2601, 0.2680, 0.2931, RGBD_NORMALIZATION.std[3]),
     ),
 )
-"""Of RGB as in the released code of the paper. None is published for SYNTHIA's depth; this is
+"""RGB as in the released code of the paper. None is published for SYNTHIA's depth; this is
 that of Stanford2D3DS, clipped alike."""
 
 Formats = dict[str, tuple[int, tuple[str, ...]]]
@@ -118,7 +118,7 @@ class SynthiaReader(ImageReader):
         return depth_steps(read_first_channel(files.parts["depth"]))
 
     def camera(self, files: ImageFiles) -> NDArray[np.float64]:
-        """Of a view: that of its sequence."""
+        """The camera matrix of the sequence that the view is from."""
         return read_camera(files.rgb.parents[3], self.size("rgb", files.rgb))
 
 

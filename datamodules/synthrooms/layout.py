@@ -127,7 +127,7 @@ class FloorPlan:
 
     @property
     def floor_area(self) -> float:
-        """In square metres."""
+        """Area of the floor in square metres."""
         return sum((r.x1 - r.x0) * (r.y1 - r.y0) for r in self.floors)
 
     def contains(self, area: Rectangle, margin: float = 0.0) -> bool:

@@ -96,7 +96,7 @@ class CheckpointContents(Callback):
 
 
 def _random_state() -> dict[str, Any]:
-    """Of this process; the data draws from its own generators, see `sample_rng`."""
+    """The random state of this process; data has generators of its own, see `sample_rng`."""
     cuda = [torch.cuda.get_rng_state()] if torch.cuda.is_available() else []
     return {"cpu": torch.get_rng_state(), "cuda": cuda}
 

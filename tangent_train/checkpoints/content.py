@@ -28,7 +28,7 @@ NORMALIZATION = dict[str, list[float]]
 """Its ``mean`` and ``std``."""
 
 GROUPS = list[list[int]] | None
-"""Of every class the scores of a photo network, see `Groups`."""
+"""The scores of a photo network that make each class, see `Groups`."""
 
 _FIELDS = {
     "config": dict,

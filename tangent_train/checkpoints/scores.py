@@ -17,7 +17,7 @@ _CERTAIN = 20.0
 """Score of a pixel's class where the network gives nothing but labels."""
 
 Groups = Sequence[Sequence[int]]
-"""Of every class the scores whose probabilities add up to its own."""
+"""For every class, the scores whose probabilities add up to that of the class."""
 
 
 class Scores(nn.Module):

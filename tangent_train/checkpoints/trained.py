@@ -101,7 +101,7 @@ class TrainedNetwork:
 
 @dataclass(frozen=True)
 class Start:
-    """What a file says of the network that training starts from.
+    """The description of the network that training starts from.
 
     Attributes:
         class_names: Names of its labels.
@@ -193,7 +193,7 @@ def load_trained(path: Path, trust: Collection[str] = ()) -> TrainedNetwork:
 
 
 def start_in(path: Path) -> Start | None:
-    """What a checkpoint or safetensors file of this package says of its network; None of others."""
+    """The description of the network in a file of this package; None for other files."""
     try:
         if path.suffix.lower() == ".safetensors":
             with _safetensors(path) as file:

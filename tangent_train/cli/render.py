@@ -248,7 +248,7 @@ def _poses(settings: Settings, model: Path) -> None:
 
 
 def _rotation(settings: Settings) -> NDArray[np.float64] | None:
-    """In the frame of directions: x forward, y to the right, z up."""
+    """The rotation in the frame of directions: x forward, y to the right, z up."""
     if settings.rotation is None:
         return None
     if settings.rotation == "so3":

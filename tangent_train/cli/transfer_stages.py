@@ -319,7 +319,7 @@ def _weights_in(record: Path) -> Any:
 
 
 def _digest(weights: Path, config: Mapping[str, Any]) -> str:
-    """Of the network's file, and of that of its class map, if it has one."""
+    """A hash of the network's file and, if there is one, of its class map's."""
     given = str(config.get("class_map") or "")
     own_map = [Path(given).expanduser()] if given.lower().endswith(".json") else []
     hashed = hashlib.blake2b()

@@ -1,4 +1,4 @@
-"""What a transfer evaluates its network on: views of the panoramas, in several conditions.
+"""Views of the panoramas, in several conditions, on which a transfer evaluates its network.
 
 Both are lists of the user's own settings with names: ``compare`` of the representation,
 ``conditions`` of the data. Every view is evaluated in every condition, always on the same

@@ -66,7 +66,7 @@ class PanoramaPose:
         return way / np.where(distance > 0, distance, 1.0)[..., None], distance
 
     def relative_to(self, other: PanoramaPose) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """From another panorama's coordinates to this one's: ``x_this = R x_other + t``.
+        """Rotation and shift from another panorama to this one: ``x_this = R x_other + t``.
 
         Args:
             other: Pose in the same world.

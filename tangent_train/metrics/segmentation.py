@@ -84,7 +84,7 @@ def segmentation_scores(
 
 
 def _class_sums(confusion: Any) -> tuple[Any, Any, Any]:
-    """Of each class what is labelled, what is predicted, and hits; of an array or a tensor."""
+    """Labelled pixels, predicted pixels and hits of each class, of an array or a tensor."""
     known = confusion[1:]
     return known.sum(1), known[:, 1:].sum(0), known[:, 1:].diagonal()
 

@@ -166,7 +166,7 @@ def _check_alike(results: NDArray[Any], channels: tuple[int, ...], kind: str) ->
 
 
 def _as_array(returned: Any, images: Tensor | NDArray[Any]) -> NDArray[Any]:
-    """What the function returned for some images, as ``(n, d, d[, K])`` on the CPU."""
+    """The result of the function for some images, as ``(n, d, d[, K])`` on the CPU."""
     kind = Tensor if isinstance(images, Tensor) else np.ndarray
     count, side = len(images), images.shape[-1] if kind is Tensor else images.shape[1]
     found = f"a {type(returned).__name__}"

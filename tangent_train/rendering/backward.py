@@ -1,4 +1,4 @@
-"""From tangent images back to the panorama."""
+"""Rendering tangent images back to the panorama."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From panoramas to tangent images."""
+"""Rendering panoramas to tangent images."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ def freeze(network: nn.Module, names: Iterable[str]) -> list[nn.Module]:
 
 
 def _near(name: str, modules: Mapping[str, nn.Module]) -> list[str]:
-    """What there is where a name is wrong: the parts of the last module in it that exists."""
+    """Names to suggest for a wrong one: the parts of its last module that exists."""
     while name not in modules:
         name = name.rpartition(".")[0]
     return _parts(modules[name], f"{name}." if name else "") or [name]

@@ -33,7 +33,7 @@ Crops = Literal["grid", "center"]
 _PAPER_FOV_DEG = 45.0
 
 _NEGLIGIBLE = 1e-6
-"""Of a crop's side: it need not be covered by another one."""
+"""Share of a crop's side that may stay uncovered."""
 
 
 @dataclass(frozen=True)
@@ -149,13 +149,13 @@ class PhotoSampler:
         return self._crops(shifts, mirrored=wanted.mirror and bool(rng.random() < 0.5))
 
     def whole(self) -> PhotoCrops:
-        """As few crops as cover the photo, evenly spread; or the one in the middle."""
+        """The fewest crops that cover the photo, evenly spread; or the one in the middle."""
         if self.representation.evaluation == "center":
             return self._crops(np.clip(np.zeros((1, 2)), *self._shifts()))
         return self.cover()
 
     def cover(self, overlap: float = 0.0) -> PhotoCrops:
-        """As few crops as cover the photo, evenly spread.
+        """The fewest crops that cover the photo, evenly spread.
 
         Args:
             overlap: The least share of its side by which a crop overlaps the next, 0 to below 1.

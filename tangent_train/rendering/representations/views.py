@@ -37,7 +37,7 @@ RotationAugmentation = Literal["none", "yaw", "so3"]
 Image = NDArray[Any]
 
 NO_RAYS: NDArray[np.float32] = np.empty((0, 3, 3), np.float32)
-"""Of views that are no pinhole images of a sphere."""
+"""The rays of views that are not pinhole images of a sphere."""
 
 NOT_ROTATED: NDArray[np.float64] = np.eye(3)[None]
 """Rotations of views that are not rotated."""
