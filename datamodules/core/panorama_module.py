@@ -7,12 +7,16 @@ from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
+from rich.progress import track
+from torch.utils.data import DataLoader
+
 from datamodules.core.found import Found, Split
 from datamodules.core.image_module import ImageDataModule
 from datamodules.core.panoramas import Panorama, Turn
 from datamodules.core.pipeline import (
     EstimatedUp,
     MaskedPanoramas,
+    PanoramaJudge,
     PosedUp,
     RotatedPanoramas,
     SplitItems,
@@ -45,11 +49,13 @@ class PanoramaDataModule(ImageDataModule):
         test_rotation: Rotate the test panoramas: tilt in degrees, or `so3`, see `RotatedPanoramas`.
         upright: Align tilted panoramas with gravity. `pose`: as their files say (GPano) and, of
             test panoramas, as they were rotated. `auto`: as their files say, else as estimated from
-            the image.
+            the image, see `judge`.
         max_tilt_deg: Of `auto`: some degrees more than they are tilted, see `estimate_up`.
 
     Attributes:
         erp_height: Rows of the panoramas read.
+        judge: Of `auto`, for the test split: helps to estimate, see `estimate_up`. To be set before
+            that split is read.
 
     Raises:
         DataError: The mask cannot be used.
@@ -72,6 +78,7 @@ class PanoramaDataModule(ImageDataModule):
             "Choose representation=tangent, or photos, as data=synthrooms_perspective.",
         )
         self.erp_height: int = self.representation.erp_height
+        self.judge: PanoramaJudge | None = None
         self._check_rotations()
         self._masks = Masks(self.mask, "data.mask")
         if not self._masks.of_each:
@@ -107,8 +114,17 @@ class PanoramaDataModule(ImageDataModule):
             known = self.upright == "pose"
             transforms.append(RotatedPanoramas(self.test_rotation, self.seed, known=known))
         if self.upright == "auto":
-            transforms.append(EstimatedUp(self.max_tilt_deg))
+            judge = self.judge if split == "test" else None
+            transforms.append(EstimatedUp(self.max_tilt_deg, judge))
         return SplitItems(found.splits[split], found.read, Panorama, found.store, transforms)
+
+    def test_dataloader(self) -> DataLoader[Any]:
+        """Batches for the test; what is to be judged is estimated first, in this process."""
+        source = self.source("test")
+        if self.judge is not None:
+            for index in track(range(len(source)), "Estimating up", transient=True):
+                source.read(index)
+        return super().test_dataloader()
 
     def _check_rotations(self) -> None:
         rotation = self.test_rotation

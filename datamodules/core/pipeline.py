@@ -6,6 +6,7 @@ import math
 import os
 from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, Literal, Protocol, TypeVar
 
@@ -30,6 +31,7 @@ __all__ = [
     "EstimatedUp",
     "Item",
     "MaskedPanoramas",
+    "PanoramaJudge",
     "PosedUp",
     "Reading",
     "RotatedPanoramas",
@@ -61,6 +63,9 @@ _Image = TypeVar("_Image")
 
 Reading = Callable[[_Item], _Image]
 """Reads an image from its files, a named tuple of arrays; may have a method `labels`."""
+
+PanoramaJudge = Callable[[Panorama, "NDArray[np.float64]"], "NDArray[np.float64]"]
+"""Log-likelihoods ``(n,)`` that directions ``(n, 3)`` of a panorama are up."""
 
 Transform = Callable[[_Image, int, _Item], _Image]
 """Changes an image, given its place in the split and its files."""
@@ -200,10 +205,13 @@ class EstimatedUp:
 
     Args:
         max_tilt_deg: Maximum tilt, see `estimate_up`.
+        judge: Log-likelihoods that directions of a panorama are up, see `estimate_up`; it stays in
+            its process.
     """
 
-    def __init__(self, max_tilt_deg: float) -> None:
+    def __init__(self, max_tilt_deg: float, judge: PanoramaJudge | None = None) -> None:
         self._max_tilt_deg = max_tilt_deg
+        self._judge = judge
         self._ups: dict[int, NDArray[np.float64] | None] = {}
 
     def __call__(self, panorama: Panorama, index: int, files: ImageFiles) -> Panorama:
@@ -212,8 +220,12 @@ class EstimatedUp:
         if panorama.up is not None:
             return panorama
         if index not in self._ups:
-            self._ups[index] = estimate_up(panorama.rgb, self._max_tilt_deg).found
+            judge = None if self._judge is None else partial(self._judge, panorama)
+            self._ups[index] = estimate_up(panorama.rgb, self._max_tilt_deg, judge).found
         return panorama._replace(up=self._ups[index])
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_judge": None}
 
 
 class RotatedPanoramas:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import lightning
+import torch
 from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch.accelerators import CPUAccelerator
 from lightning.pytorch.callbacks import Callback
@@ -20,11 +21,14 @@ from tangent_train.callbacks.checkpoints import AtomicCheckpointIO, CheckpointCo
 from tangent_train.callbacks.progress import ProgressBar
 from tangent_train.callbacks.results import evaluated, pictures, write_evaluation
 from tangent_train.checkpoints.content import read_checkpoint, write_settings
+from tangent_train.checkpoints.image_sizes import size_multiple_of
+from tangent_train.checkpoints.scores import Scores
 from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
 from tangent_train.cli.build import Settings, build, build_trained, check_fits, shown
 from tangent_train.cli.machine import machine_faults
 from tangent_train.cli.stored import GROUPS, run_settings
 from tangent_train.errors import SettingError
+from tangent_train.inference.judge import NetworkJudge
 from tangent_train.registry import SettingsFile, make
 from tangent_train.results.evaluation import headline, result_tables
 from tangent_train.results.record import Record
@@ -148,12 +152,23 @@ class Run:
             content = read_checkpoint(checkpoint)
             check_fits(self.data, content, checkpoint)
             self._load(content["state_dict"], checkpoint)
+        if getattr(self.data, "upright", None) == "auto":
+            self.data.judge = self._judge(trainer.strategy.root_device)
         trainer.test(self.task, datamodule=self.data, verbose=False)
         record = evaluated(self.task, self.data.noun)
         total = len(self.data.source("test"))
         if record.images != total:
             raise RuntimeError(f"{record.images} of {total} test {self.data.noun} were counted")
         self._report(record, checkpoint)
+
+    def _judge(self, device: torch.device) -> NetworkJudge:
+        """The network as what says which way is up in the test panoramas."""
+        if self.trained is not None:
+            return NetworkJudge.of(self.trained, device)
+        data, network = self.data, Scores(self.task.network, self.data.num_classes).eval()
+        multiple = size_multiple_of(network, data.in_channels) or 1
+        known = data.inputs, data.normalization, self.settings["level"]
+        return NetworkJudge(network, *known, multiple, device=device)
 
     def _load(self, tensors: Mapping[str, Any], checkpoint: Path) -> None:
         try:

@@ -20,6 +20,7 @@ from tangent_train.cli.settings import typed
 from tangent_train.errors import SettingError, counted
 from tangent_train.inference.class_maps import Unmapped, load_class_map, map_classes
 from tangent_train.inference.images import DepthFolder, read_panorama, read_photo
+from tangent_train.inference.judge import NetworkJudge
 from tangent_train.inference.predictor import Predictor
 from tangent_train.inference.views import PanoramaViews, PhotoViews
 from tangent_train.results.predictions import (
@@ -93,10 +94,12 @@ def predict(config: Mapping[str, Any]) -> None:
     settings = typed(Settings, config)
     decisive = {name: config[name] for name in _DECISIVE}
     images = _find_images(settings)
-    trained = _network(settings)
+    original, trained = _networks(settings)
     folder = PredictionFolder(settings.output, trained.class_names, settings.write)
     depth = _depth_folder(settings, trained)
-    label = _Labeller(settings, trained, _predictor(settings, trained), depth, folder)
+    predictor = _predictor(settings, trained)
+    judge = NetworkJudge.of(original, predictor.device)
+    label = _Labeller(settings, trained, predictor, judge, depth, folder)
     earlier = folder.earlier(decisive) if settings.resume else {}
     if not (settings.overwrite or earlier):
         folder.check()
@@ -134,6 +137,7 @@ class _Labeller:
         settings: Of the command.
         trained: The network.
         predictor: Labels images with it.
+        judge: Tells with it which way is up.
         depth: Depth images, for networks that take depth.
         folder: Output folder.
         shown: Images for the report: the first ones done.
@@ -142,6 +146,7 @@ class _Labeller:
     settings: Settings
     trained: TrainedNetwork
     predictor: Predictor
+    judge: NetworkJudge
     depth: DepthFolder | None
     folder: PredictionFolder
     shown: list[EncodedImage] = field(default_factory=list)
@@ -167,7 +172,8 @@ class _Labeller:
         given = self.settings
         if given.projection == "perspective":
             return read_photo(path, name, self.depth, given.fov), None
-        return read_panorama(path, name, self.depth, given.crop, given.upright, given.max_tilt_deg)
+        how = given.crop, given.upright, given.max_tilt_deg
+        return read_panorama(path, name, self.depth, *how, self.judge)
 
 
 def _save(folder: PredictionFolder, settings: Mapping[str, Any], entries: list[Entry]) -> None:
@@ -175,15 +181,15 @@ def _save(folder: PredictionFolder, settings: Mapping[str, Any], entries: list[E
         folder.write_summary(settings, entries)
 
 
-def _network(settings: Settings) -> TrainedNetwork:
-    """The network, with the classes of the class map."""
+def _networks(settings: Settings) -> tuple[TrainedNetwork, TrainedNetwork]:
+    """The network with its own classes, and with those of the class map."""
     if settings.class_map is None:
-        return load_trained(settings.checkpoint, settings.trust)
+        return (load_trained(settings.checkpoint, settings.trust),) * 2
     class_map = load_class_map(settings.class_map)
     trained = load_trained(settings.checkpoint, settings.trust)
     mapped = map_classes(trained, class_map, settings.unmapped)
     _say(f"Class map {class_map.name}: {mapped}.")
-    return mapped.trained
+    return trained, mapped.trained
 
 
 def _find_images(settings: Settings) -> dict[str, Path]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from datamodules.core.panorama_module import Upright
+    from tangent_train.inference.judge import NetworkJudge
 
 __all__ = ["DepthFolder", "read_panorama", "read_photo"]
 
@@ -71,6 +73,7 @@ def read_panorama(
     crop: Sequence[float] | None = None,
     upright: Upright = None,
     max_tilt_deg: float = 60.0,
+    judge: NetworkJudge | None = None,
 ) -> tuple[InputImage, PanoramaArea]:
     """Read a panorama of the whole sphere or a part of it.
 
@@ -82,6 +85,7 @@ def read_panorama(
         upright: Source of its zenith: ``pose`` by its GPano tags, ``auto`` by these or else as
             estimated; None for z.
         max_tilt_deg: Of estimates, see `estimate_up`.
+        judge: Helps to estimate.
 
     Returns:
         The whole sphere, black outside the file's area, and that area.
@@ -94,11 +98,12 @@ def read_panorama(
     size = (rgb.shape[0], rgb.shape[1])
     area = area_of(path, size) if crop is None else area_of_crop(size, crop)
     whole = area.place(rgb)
-    up = None if upright is None else up_of(path)
-    if up is None and upright == "auto":
-        up = estimate_up(whole, max_tilt_deg).found
     placed_depth = None if depth is None else area.place(depth.read(name, size))
-    return InputImage(whole, placed_depth, up), area
+    image = InputImage(whole, placed_depth, None if upright is None else up_of(path))
+    if image.up is None and upright == "auto":
+        by_network = None if judge is None else partial(judge, image)
+        image = replace(image, up=estimate_up(whole, max_tilt_deg, by_network).found)
+    return image, area
 
 
 def read_photo(

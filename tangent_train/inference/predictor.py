@@ -78,6 +78,9 @@ class Predictor:
             at once, and their scores are held.
         min_confidence: Pixels whose best class has a lower probability, from 0 to 1, are unknown.
 
+    Attributes:
+        device: Where the network is.
+
     Raises:
         SettingError: There is no such device, or that is no probability.
     """
@@ -95,8 +98,8 @@ class Predictor:
         if device == "auto":
             device = "cuda" if torch.cuda.is_available() else "cpu"
         try:
-            self._device = torch.device(device)
-            network = trained.network.to(self._device).to(memory_format=_FORMAT)
+            self.device = torch.device(device)
+            network = trained.network.to(self.device).to(memory_format=_FORMAT)
         except (RuntimeError, AssertionError) as error:  # AssertionError: torch without CUDA
             raise SettingError(
                 "device", found=f"{device} ({error})", expected="cpu, or a device of this machine"
@@ -142,7 +145,7 @@ class Predictor:
             def images(part: slice, views: Any = views) -> Tensor:
                 return self._images(views.image, views.views(part))
 
-            rays = torch.from_numpy(views.rays).to(self._device)
+            rays = torch.from_numpy(views.rays).to(self.device)
             of_sphere = rays if self._sees_rays and len(rays) else None
             for part, scores in view_scores(
                 self._network, images, views.count, self._per_forward, of_sphere
@@ -153,6 +156,6 @@ class Predictor:
 
     def _images(self, image: InputImage, views: Any) -> Tensor:
         trained = self._trained
-        rendered = [part.to(self._device) for part in render_inputs(image, views, trained.inputs)]
+        rendered = [part.to(self.device) for part in render_inputs(image, views, trained.inputs)]
         images = normalize(rendered, trained.normalization, trained.inputs)
         return images.contiguous(memory_format=_FORMAT)

@@ -40,6 +40,7 @@ __all__ = [
     "ViewSets",
     "check_size",
     "panorama_settings",
+    "resized",
 ]
 
 _TANGENT = "tangent_train.rendering.TangentRepresentation"
@@ -163,7 +164,7 @@ class PanoramaViews:
             grid = grid.with_rotation(upright_rotation(image.up))
         rows = seen.erp_height
         if image.rgb.shape[0] > rows:
-            image = _resized(image, (rows, 2 * rows))
+            image = resized(image, (rows, 2 * rows))
         return [_grid_set(image, spun(grid, turn)) for turn in self._turns]
 
 
@@ -314,11 +315,11 @@ def _equirect_set(image: InputImage, seen: EquirectRepresentation) -> ViewSet:
     def add(mosaic: ScoreMosaic, scores: Tensor, _: slice) -> None:
         mosaic.add_crops(*as_crop(scores, (height, width)), np.array([0]))
 
-    return ViewSet(_resized(image, seen.image_size), 1, lambda _: seen.whole(), add)
+    return ViewSet(resized(image, seen.image_size), 1, lambda _: seen.whole(), add)
 
 
-def _resized(image: InputImage, shape: tuple[int, int]) -> InputImage:
-    """As training resizes panoramas; depth is never averaged."""
+def resized(image: InputImage, shape: tuple[int, int]) -> InputImage:
+    """An image of another size, as training resizes panoramas; depth is never averaged."""
     depth = None if image.depth is None else resize_depth(image.depth, shape)
     if image.rgb.shape[0] >= shape[0]:
         return replace(image, rgb=resize_area(image.rgb, shape), depth=depth)

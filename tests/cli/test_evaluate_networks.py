@@ -9,9 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from datamodules.stanford2d3ds.label_table import CLASSES
 from tangent_train.checkpoints.content import read_settings
+from tangent_train.rendering.upright.gravity import Gravity
 from tests.cli.tiny_runs import SMALL_ROOMS, Run, results
 from tests.inference.trained import write_checkpoint
 
@@ -115,6 +117,35 @@ def test_the_file_gives_what_is_not_typed(
     assert section["_target_"].endswith(f".{kind}")
     assert {name: section.get(name) for name in expected} == expected
     assert results(tmp_path / "out")["images"] == 2
+
+
+def test_the_network_judges_which_way_is_up(
+    network: str,
+    rooms: str,
+    run_folder: Path,
+    tmp_path: Path,
+    run: Run,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Asked in this process, once for every test panorama, before workers read them."""
+    asked: list[Any] = []
+
+    def estimate(rgb: NDArray[np.uint8], max_tilt_deg: float, judge: Any) -> Gravity:
+        likely = judge(np.eye(3))
+        assert likely.shape == (3,)
+        assert np.isfinite(likely).all()
+        asked.append(max_tilt_deg)
+        return Gravity(np.array([0.0, 0, -1]), 1.0, np.eye(3))
+
+    monkeypatch.setattr("datamodules.core.pipeline.estimate_up", estimate)
+    given = ["data.upright=auto", "data.max_tilt_deg=180", "data.num_workers=1", rooms]
+    mapped = _written(tmp_path / "map.json", MAP)
+    run("evaluate", network, *ROOMS, *given, mapped, "hydra.run.dir=imported")
+    assert asked == [180, 180]
+    best = f"checkpoint={run_folder / 'checkpoints' / 'best.ckpt'}"
+    run("evaluate", best, *given, "trainer.accelerator=cpu", "hydra.run.dir=own")
+    assert len(asked) == 4
+    assert (_confusion(tmp_path / "own") != _confusion(run_folder)).any(), "seen upside down"
 
 
 def test_a_class_map_of_a_run(rooms: str, run_folder: Path, tmp_path: Path, run: Run) -> None:

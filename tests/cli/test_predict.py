@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,9 +13,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from tangent_train.geometry import rotation_about
 from tangent_train.inference.images import read_panorama
+from tangent_train.inference.judge import NetworkJudge
+from tangent_train.inference.views import InputImage
 from tests.cli.tiny_runs import Run
 from tests.inference.trained import PERSPECTIVE, TANGENT, sphere, write_checkpoint
+from tests.rendering.drawn_room import draw_room
 
 Predict = Callable[..., dict[str, Any]]
 
@@ -170,6 +175,24 @@ def test_photos(
     assert "Give fov=" in " ".join(capsys.readouterr().out.split())
     predict(**settings, fov=70)
     assert _labels(tmp_path / "out" / "labels" / "a.png").shape == (30, 50)
+
+
+def test_the_network_judges_which_way_is_up(
+    tmp_path: Path, predict: Predict, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    even = np.full(6, 1 / 6)
+    monkeypatch.setattr("tangent_train.rendering.upright.gravity.up_probabilities", lambda *_: even)
+    turn = rotation_about((1, 0, 0), math.radians(100))
+    room = draw_room((128, 256), turn)
+    _write(tmp_path / "in" / "a.png", room)
+
+    def judge(self: NetworkJudge, image: InputImage, ups: NDArray[np.float64]) -> Any:
+        np.testing.assert_array_equal(image.rgb, room)
+        return 30 * ups @ turn[:, 2]
+
+    monkeypatch.setattr(NetworkJudge, "__call__", judge)
+    found = predict(upright="auto", max_tilt_deg=180, write="[labels]", report=0)["a"]
+    assert found["tilt_deg"] == pytest.approx(100, abs=0.5)
 
 
 def test_depth_is_that_of_the_image_in_its_folder(tmp_path: Path, predict: Predict) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -14,12 +15,17 @@ from tangent_train.rendering.upright.cues import up_probabilities
 from tangent_train.rendering.upright.line_segments import LineSegments, find_line_segments
 from tangent_train.rendering.upright.manhattan import ManhattanFrame, find_manhattan_frames
 
-__all__ = ["Gravity", "estimate_up", "up_from_pose", "upright_rotation"]
+__all__ = ["Gravity", "Judge", "estimate_up", "up_from_pose", "upright_rotation"]
+
+Judge = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+"""Maps directions ``(n, 3)`` to log-likelihoods ``(n,)`` of being up, up to a constant."""
 
 _UP = np.array([0.0, 0.0, 1.0])
 _EVEN_CHANCE = 3.1  # significance of frames of which half are right
 _STEEPNESS = 3.0
 _ACCEPTED = 0.5
+_HOPELESS = 1 / 400
+"""Directions less likely than the best by that factor are not judged: judging takes time."""
 _LEAST_ROWS = 64
 """With fewer, noise looks like a room."""
 _DISTINCT = np.cos(np.radians(6))
@@ -45,14 +51,17 @@ class Gravity(NamedTuple):
         return self.up if self.confidence else None
 
 
-def estimate_up(rgb: NDArray[np.uint8], max_tilt_deg: float = 60.0) -> Gravity:
+def estimate_up(
+    rgb: NDArray[np.uint8], max_tilt_deg: float = 60.0, judge: Judge | None = None
+) -> Gravity:
     """Estimate the direction of up from the straight edges of rooms and buildings.
 
     Most of them follow three directions at right angles, one of which is the vertical: the frame
     that most edges follow (Coughlan and Yuille, "Manhattan World", ICCV 1999) gives its axes, to a
     fraction of a degree. Where only one of them is within `max_tilt_deg` of the panorama's own
     vertical, it is up. Of several, one is chosen by the appearance of rooms (see
-    `up_probabilities`): one in six randomly rotated SynthRooms gets a wrong axis.
+    `up_probabilities`), with which one in six randomly rotated SynthRooms gets a wrong axis, and by
+    `judge`, if there is one.
 
     Estimates with a probability below one half are rejected: nature, noise and pictures without
     edges leave the panorama as it is.
@@ -63,6 +72,9 @@ def estimate_up(rgb: NDArray[np.uint8], max_tilt_deg: float = 60.0) -> Gravity:
         max_tilt_deg: Maximum angle of up from ``(0, 0, 1)``, above 0; 180 is any orientation.
             Choose it slightly above the camera's tilt: beyond it, another axis of the room may be
             taken for up.
+        judge: What else is known of directions, such as what a network sees by them
+            (`tangent_train.inference.judge`). Asked once at most, for those of the best frame that
+            are not hopeless.
 
     Raises:
         SettingError: The panorama or the tilt cannot be used.
@@ -77,14 +89,18 @@ def estimate_up(rgb: NDArray[np.uint8], max_tilt_deg: float = 60.0) -> Gravity:
     segments = find_line_segments(rgb)
     frames = find_manhattan_frames(segments)
     lowest = math.cos(math.radians(max_tilt_deg)) - 1e-9
-    directions, chances = _candidates(rgb, segments, frames, lowest)
+    directions, chances = _candidates(rgb, segments, frames, lowest, judge)
     if not len(chances) or chances[0] < _ACCEPTED:
         return Gravity(_UP.copy(), 0.0, directions)
     return Gravity(directions[0].copy(), float(chances[0]), directions)
 
 
 def _candidates(
-    rgb: NDArray[np.uint8], segments: LineSegments, frames: list[ManhattanFrame], lowest: float
+    rgb: NDArray[np.uint8],
+    segments: LineSegments,
+    frames: list[ManhattanFrame],
+    lowest: float,
+    judge: Judge | None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Directions of up in reach ``(n, 3)`` and their probabilities ``(n,)``, best first."""
     # A logit model of all frames and of none of them; frames with the same vertical add up.
@@ -99,6 +115,11 @@ def _candidates(
         shares = np.ones(1)
         if inside.sum() > 1:
             shares = up_probabilities(rgb, segments, frame.axes_xyz)[inside]
+            open_ones = shares > _HOPELESS * shares.max()
+            if judge is not None and frame is frames[0] and open_ones.sum() > 1:
+                likely = judge(axes[inside][open_ones])
+                shares[open_ones] *= np.exp(likely - likely.max())
+                shares[~open_ones] = 0
         for axis, share in zip(axes[inside], odd * shares / shares.sum(), strict=True):
             known = np.flatnonzero(directions @ axis > _DISTINCT)
             if len(known):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from pathlib import Path
 from typing import Any, Literal
 
@@ -89,7 +90,8 @@ def test_only_what_nothing_says_is_estimated_and_only_once(
 ) -> None:
     asked: list[float] = []
 
-    def estimate(rgb: NDArray[np.uint8], max_tilt_deg: float) -> Gravity:
+    def estimate(rgb: NDArray[np.uint8], max_tilt_deg: float, judge: Any) -> Gravity:
+        assert judge is None
         asked.append(max_tilt_deg)
         return Gravity(UP if confidence else np.array([0.0, 0, 1]), confidence, UP[None])
 
@@ -101,6 +103,26 @@ def test_only_what_nothing_says_is_estimated_and_only_once(
             upright(_heights(), 0, FILES[0]).up, UP if confidence else None
         )
     assert asked == [50]
+
+
+def test_a_judge_sees_the_panorama_and_stays_in_its_process(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def judge(panorama: Panorama, ups: NDArray[np.float64]) -> NDArray[np.float64]:
+        np.testing.assert_array_equal(panorama.rgb, _heights().rgb)
+        return -ups[:, 0]
+
+    def estimate(rgb: NDArray[np.uint8], max_tilt_deg: float, judge: Any) -> Gravity:
+        up = np.array([-1.0, 0, 0])
+        assert judge is None or judge(np.eye(3)).argmax() != 0
+        return Gravity(up if judge is not None else UP, 1.0, UP[None])
+
+    monkeypatch.setattr("datamodules.core.pipeline.estimate_up", estimate)
+    upright = EstimatedUp(180, judge)
+    judged = upright(_heights(), 0, FILES[0]).up
+    sent = pickle.loads(pickle.dumps(upright))  # as to a worker
+    np.testing.assert_array_equal(sent(_heights(), 0, FILES[0]).up, judged)
+    np.testing.assert_array_equal(sent(_heights(), 1, FILES[1]).up, UP)
 
 
 def test_what_is_remembered_is_read_once_and_what_is_broken_is_listed() -> None:

@@ -58,6 +58,45 @@ def test_rooms_held_at_any_angle(seed: int) -> None:
         assert min(angle_deg(axis, one) for one in gravity.candidates) < 0.5
 
 
+def test_a_judge_chooses_among_the_axes_of_the_best_frame(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    even = np.full(6, 1 / 6)
+    monkeypatch.setattr("tangent_train.rendering.upright.gravity.up_probabilities", lambda *_: even)
+    turn = random_rotation(np.random.default_rng(0))
+    room = draw_room((128, 256), turn)
+    asked: list[NDArray[np.float64]] = []
+
+    def judge(ups: NDArray[np.float64]) -> NDArray[np.float64]:
+        asked.append(ups)
+        return 30 * ups @ wanted
+
+    wanted = turn[:, 2]
+    estimate_up(room, 180, judge)
+    (axes,) = asked
+    assert len(axes) == 6
+    for one in axes:
+        assert min(angle_deg(axis, one) for axis in (*turn.T, *-turn.T)) < 0.5
+    assert (axes @ axes.T - np.eye(6) < 0.01).all()
+    for wanted in axes:
+        gravity = estimate_up(room, 180, judge)
+        np.testing.assert_array_equal(gravity.up, wanted)
+        assert gravity.confidence > 0.9
+
+
+def test_what_is_hopeless_or_the_only_one_is_not_judged(monkeypatch: pytest.MonkeyPatch) -> None:
+    def judge(ups: NDArray[np.float64]) -> NDArray[np.float64]:
+        raise AssertionError(ups)
+
+    turn = _tilted(3, 200, 180)
+    assert angle_deg(estimate_up(draw_room((128, 256), turn), 60, judge).up, turn[:, 2]) < 0.5
+    estimate_up(_without_structure()["black"], 180, judge)
+    certain = np.array([0.001, 0.001, 0.996, 0.001, 0.001, 0])
+    place = "tangent_train.rendering.upright.gravity.up_probabilities"
+    monkeypatch.setattr(place, lambda *_: certain)
+    assert estimate_up(draw_room((128, 256), turn), 180, judge).confidence > 0.9
+
+
 def test_upside_down() -> None:
     turn = rotation_about((1, 0, 0), math.pi)
     room = draw_room((128, 256), turn)

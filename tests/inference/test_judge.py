@@ -1,0 +1,77 @@
+"""Which way is up by a network that is sure of its images only where they are upright."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from datamodules.core.inputs import Normalization
+from datamodules.core.panoramas import Panorama
+from tangent_train.geometry import equirect_directions, random_rotation
+from tangent_train.inference.judge import NetworkJudge
+from tangent_train.inference.views import InputImage
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+PLAIN = Normalization((0.5, 0.5, 0.5), (0.5, 0.5, 0.5))
+AXES = np.concatenate([np.eye(3), -np.eye(3)])
+
+
+class Sky(nn.Module):
+    """Sure of bright pixels in the upper half of an image and of dark ones in the lower half."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.sizes: set[tuple[int, ...]] = set()
+
+    def forward(self, images: Tensor) -> Tensor:
+        self.sizes.add(tuple(images.shape[-2:]))
+        upper = torch.arange(images.shape[2]) < images.shape[2] / 2
+        fits = (images[:, 0] > 0) == upper[:, None]
+        return torch.stack([30.0 * fits, 0.0 * fits], dim=1)
+
+
+def _judge(**settings: Any) -> NetworkJudge:
+    return NetworkJudge(Sky(), ("rgb",), PLAIN, level=5, **settings)
+
+
+def _bright_above(up: NDArray[np.float64], height: int = 64) -> NDArray[np.uint8]:
+    bright = equirect_directions((height, 2 * height)) @ up > 0
+    return np.repeat(np.where(bright, 220, 30).astype(np.uint8)[..., None], 3, axis=-1)
+
+
+@pytest.mark.parametrize("height", [64, 200])
+def test_the_network_is_surest_of_what_is_upright(height: int) -> None:
+    ups = AXES @ random_rotation(np.random.default_rng(height)).T
+    judge = _judge()
+    for true in range(6):
+        likely = judge(InputImage(_bright_above(ups[true], height)), ups)
+        assert likely.argmax() == true
+        # Upside down nothing fits, and both classes are equally likely everywhere.
+        assert likely.argmin() == (true + 3) % 6
+        np.testing.assert_allclose(likely.min(), 6 * np.log(2), atol=0.2)
+        # Lying on a side, two views see the border upright (half of each fits), two one colour.
+        others = np.delete(likely, [true, (true + 3) % 6])
+        np.testing.assert_allclose(others, 6 * np.log(4), atol=0.2)
+
+
+def test_a_panorama_of_a_data_set_is_judged_alike() -> None:
+    rgb = _bright_above(AXES[1])
+    panorama = Panorama(rgb, None, rgb[..., 0])
+    np.testing.assert_array_equal(_judge()(panorama, AXES), _judge()(InputImage(rgb), AXES))
+
+
+@pytest.mark.parametrize(
+    ("settings", "side"),
+    [({}, 29), ({"size_multiple": 16}, 32), ({"fixed_size": (64, 64)}, 64)],
+)
+def test_images_are_of_a_size_that_the_network_takes(settings: dict[str, Any], side: int) -> None:
+    judge: Any = _judge(**settings)
+    likely = judge(InputImage(_bright_above(AXES[2])), AXES)
+    assert likely.argmax() == 2
+    assert judge.network.sizes == {(side, side)}
