@@ -11,11 +11,12 @@ from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
 
-from datamodules.core.pipeline import Item, in_threads
+from datamodules.core.pipeline import Item
 from datamodules.core.problems import Problems
 from datamodules.core.progress import show_progress
 from datamodules.core.store import Store
 from tangent_train.errors import DataError, SettingError
+from tangent_train.threads import in_threads
 
 __all__ = ["SAMPLED", "SPLITS", "Found", "Split"]
 

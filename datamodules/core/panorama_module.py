@@ -21,7 +21,6 @@ from datamodules.core.pipeline import (
     RotatedPanoramas,
     SplitItems,
     Transform,
-    in_threads,
 )
 from datamodules.core.problems import Problems
 from datamodules.core.reading import ImageFiles, ImageReader, PanoramaReading, check_headers
@@ -29,6 +28,7 @@ from datamodules.core.store import Store
 from datamodules.images.gpano import whole_area
 from datamodules.images.masks import Mask, Masks
 from tangent_train.errors import SettingError
+from tangent_train.threads import in_threads
 
 __all__ = ["PanoramaDataModule", "Split", "Upright"]
 

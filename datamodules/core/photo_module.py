@@ -9,12 +9,13 @@ from typing import Any, ClassVar
 from datamodules.core.found import Found, Split
 from datamodules.core.image_module import ImageDataModule
 from datamodules.core.photos import Photo
-from datamodules.core.pipeline import SplitItems, in_threads
+from datamodules.core.pipeline import SplitItems
 from datamodules.core.problems import Problems
 from datamodules.core.reading import ImageFiles, ImageReader, PhotoReading, check_headers
 from datamodules.core.store import Store
 from tangent_train.errors import DataError, SettingError
 from tangent_train.geometry import shift_range
+from tangent_train.threads import in_threads
 
 __all__ = ["PhotoDataModule", "Split"]
 

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-import os
-from collections.abc import Callable, Generator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, Literal, Protocol, TypeVar
@@ -19,6 +17,7 @@ from datamodules.images.gpano import up_of, whole_area
 from tangent_train.geometry import random_rotation, rotation_about
 from tangent_train.rendering import rotate_equirect
 from tangent_train.rendering.upright.gravity import estimate_up
+from tangent_train.threads import in_threads
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -37,11 +36,7 @@ __all__ = [
     "RotatedPanoramas",
     "SplitItems",
     "Transform",
-    "in_threads",
 ]
-
-_Result = TypeVar("_Result")
-_Work = TypeVar("_Work")
 
 
 class Item(Protocol):
@@ -268,15 +263,3 @@ class RotatedPanoramas:
             rotate_equirect(labels, rotation, "nearest"),
             up if self._known else None,
         )
-
-
-def in_threads(work: Callable[[_Work], _Result], items: Sequence[_Work]) -> Generator[_Result]:
-    """Results of some work on each item, in order, on all cores.
-
-    OpenCV and zlib free the GIL.
-    """
-    workers = os.cpu_count() or 1
-    with ThreadPoolExecutor(workers) as pool:
-        # A few at a time: the reader is never far ahead of who consumes them.
-        for start in range(0, len(items), 4 * workers):
-            yield from pool.map(work, items[start : start + 4 * workers])

@@ -21,9 +21,10 @@ from datamodules.core.found import SPLITS, Found, Split
 from datamodules.core.inputs import Normalization
 from datamodules.core.loading import at_least, make_loader, this_process
 from datamodules.core.order import EpochSampler
-from datamodules.core.pipeline import Item, SplitItems, in_threads
+from datamodules.core.pipeline import Item, SplitItems
 from datamodules.core.problems import Problems
 from tangent_train.errors import DataError, SettingError
+from tangent_train.threads import in_threads
 
 __all__ = ["SPLITS", "Found", "Kind", "Split", "SplitDataModule"]
 

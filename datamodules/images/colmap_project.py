@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from datamodules.images.image_files import short_names
 from datamodules.images.pixel_files import write_pixels
-from datamodules.images.tangent_folders import face_name, in_threads, shrink_to_level
+from datamodules.images.tangent_folders import face_name, shrink_to_level, write_each
 from tangent_train.errors import DataError
 from tangent_train.rendering import equirect_to_tangent
 from tangent_train.rendering.camera_files import RIG_FILE, write_rig
@@ -90,7 +90,7 @@ class ColmapProject:
             file: Of the panorama, as the rig names it.
             image: ``(H, W)`` or ``(H, W, C)``.
             counts: ``(H', W')``, 0 where pixels are ignored.
-            progress: See `in_threads`.
+            progress: See `write_each`.
 
         Raises:
             SettingError: The files cannot hold its pixels.
@@ -105,7 +105,7 @@ class ColmapProject:
             (mask,) = equirect_to_tangent(counts, self._grid, [face], "nearest")
             write_pixels(self._folder / "masks" / f"{path}.png", mask)
 
-        in_threads(render, progress, list(self._faces), list(self._faces.values()))
+        write_each(render, self._faces, progress)
         self._panoramas[name + self._suffix] = file
 
     def write_rig(self) -> None:

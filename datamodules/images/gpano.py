@@ -82,7 +82,12 @@ class PanoramaArea:
         return whole
 
     def cut(self, whole: NDArray[_Pixel]) -> NDArray[_Pixel]:
-        """The image's part ``(h, w[, C])`` of a panorama ``(H, W[, C])``; inverse of `place`."""
+        """The image's part ``(h, w[, C])`` of a panorama ``(H, W[, C])``; inverse of `place`.
+
+        Of a whole panorama it is the panorama itself.
+        """
+        if self.is_whole and self.image_shape == self.full_shape:
+            return whole
         rows, columns = self.places()
         return whole[rows[:, None], columns]
 

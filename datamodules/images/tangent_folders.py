@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import tempfile
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,9 +25,10 @@ from tangent_train.rendering.camera_files import (
     read_rig,
     write_cameras,
 )
+from tangent_train.threads import in_threads
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Mapping
 
     from numpy.typing import NDArray
 
@@ -38,11 +37,11 @@ if TYPE_CHECKING:
 
 __all__ = [
     "face_name",
-    "in_threads",
     "panorama_area",
     "read_panorama",
     "replaced_folder",
     "shrink_to_level",
+    "write_each",
     "write_tangent_folder",
 ]
 
@@ -128,12 +127,12 @@ def write_tangent_folder(
             folder holds other files.
     """
 
-    def render(face: int, file: str) -> None:
+    def render(file: str, face: int) -> None:
         (pixels,) = equirect_to_tangent(image, cameras.grid, [face], interpolation)
         write_pixels(unfinished / file, pixels)
 
     with replaced_folder(folder) as unfinished:
-        in_threads(render, progress, cameras.faces, cameras.files)
+        write_each(render, dict(zip(cameras.files, cameras.faces, strict=True)), progress)
         write_cameras(unfinished / CAMERAS_FILE, cameras)
 
 
@@ -158,20 +157,19 @@ def replaced_folder(folder: Path) -> Iterator[Path]:
         shutil.rmtree(unfinished, ignore_errors=True)
 
 
-def in_threads(work: Callable[..., None], progress: Callable[[float], object], *of: Any) -> None:
-    """Call a function in threads with the elements of sequences, as `map` does.
+def write_each(
+    write: Callable[[str, int], None], faces: Mapping[str, int], progress: Callable[[float], object]
+) -> None:
+    """Write the images of some faces in threads.
 
     Args:
-        work: The function.
-        progress: Called with the share of the calls done since its last call.
-        of: Sequences, all of one length.
+        write: Takes the name of an image and its face.
+        faces: Faces by name.
+        progress: Called with the share of the images written since its last call.
     """
-    pool = ThreadPoolExecutor(os.cpu_count() or 1)
-    try:
-        for _ in pool.map(work, *of):
-            progress(1 / len(of[0]))
-    finally:
-        pool.shutdown(cancel_futures=True)
+    with closing(in_threads(lambda face: write(*face), faces.items())) as written:
+        for _ in written:
+            progress(1 / len(faces))
 
 
 def _remove_earlier(folder: Path) -> None:

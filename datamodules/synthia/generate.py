@@ -18,7 +18,6 @@ import numpy as np
 from datamodules.core.loading import at_least
 from datamodules.core.made_folders import claim_folder
 from datamodules.core.photos import distance_from_z_depth
-from datamodules.core.pipeline import in_threads
 from datamodules.core.problems import Problems
 from datamodules.core.progress import show_progress
 from datamodules.core.reading import check_headers
@@ -49,6 +48,7 @@ from tangent_train.geometry import (
     lonlat_to_xyz,
     rotation_about,
 )
+from tangent_train.threads import in_threads
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

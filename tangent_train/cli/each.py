@@ -2,47 +2,93 @@
 
 from __future__ import annotations
 
+import os
 import time
-from typing import TYPE_CHECKING, TypeVar
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 from datamodules.core.progress import progress_bar
 from tangent_train.errors import DataError, SettingError
+from tangent_train.threads import in_threads
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Generator, Iterable, Iterator
     from pathlib import Path
 
-__all__ = ["each"]
+__all__ = ["Job", "each"]
 
-_Result = TypeVar("_Result")
-_Item = TypeVar("_Item")
+_THREADS = min(4, os.cpu_count() or 1)
+"""Images that are read ahead, and that are written meanwhile, at most: all are in memory."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """Work on one item.
+
+    Attributes:
+        item: Name of the item.
+        path: The file that it is from.
+        value: What the next step takes; in the end, the result.
+        error: Why there is none.
+    """
+
+    item: Any
+    path: Path
+    value: Any = None
+    error: str = ""
+
+    def then(self, step: Callable[[Job], Any]) -> Job:
+        """The job after its next step, which is left out after an error."""
+        if self.error:
+            return self
+        try:
+            return replace(self, value=step(self))
+        except (DataError, SettingError, MemoryError) as error:
+            message = str(error) if str(self.path) in str(error) else f"{self.path}: {error}"
+            return replace(self, value=None, error=message)
 
 
 def each(
     description: str,
-    items: Mapping[_Item, Path],
-    work: Callable[[_Item, Path, Callable[[float], object]], _Result],
-) -> Iterator[tuple[_Item, _Result | None, str]]:
+    jobs: Iterable[Job],
+    count: int,
+    work: Callable[[Job, Callable[[float], object]], Any],
+    before: Callable[[Job], Any] | None = None,
+    after: Callable[[Job], Any] | None = None,
+) -> Generator[Job]:
     """Do some work for every item, with its rate and the time left on a bar.
 
     Args:
         description: Of the work.
-        items: Files by item.
-        work: Takes an item, its file, and a function to call with the share of the work done
-            since the last call.
+        jobs: The items.
+        count: How many there are.
+        work: Done here, one by one. Takes a job, and a function to call with the share of the work
+            done since the last call.
+        before: Done in other threads for the next items.
+        after: Done in other threads for the last items.
 
     Yields:
-        The item with its result and no error, or with None and the error, which has been printed.
+        Finished jobs in order; errors have been printed.
     """
     begun = time.monotonic()
     with progress_bar() as bar:
-        task = bar.add_task(description, total=len(items), rate="")
-        for number, (item, path) in enumerate(items.items(), start=1):
-            try:
-                yield item, work(item, path, lambda share: bar.advance(task, share)), ""
-            except (DataError, SettingError, MemoryError) as error:
-                message = str(error) if str(path) in str(error) else f"{path}: {error}"
-                bar.console.print(message, style="red", markup=False, soft_wrap=True)
-                yield item, None, message
-            rate = f"{number / (time.monotonic() - begun):.2f}/s"
-            bar.update(task, completed=number, rate=rate)
+        task = bar.add_task(description, total=count, rate="")
+        progress = partial(bar.advance, task)
+
+        def worked() -> Iterator[Job]:
+            for number, job in enumerate(_stage(before, jobs), start=1):
+                yield job.then(lambda job: work(job, progress))
+                rate = f"{number / (time.monotonic() - begun):.2f}/s"
+                bar.update(task, completed=number, rate=rate)
+
+        for job in _stage(after, worked()):
+            if job.error:
+                bar.console.print(job.error, style="red", markup=False, soft_wrap=True)
+            yield job
+
+
+def _stage(step: Callable[[Job], Any] | None, jobs: Iterable[Job]) -> Iterable[Job]:
+    if step is None:
+        return jobs
+    return in_threads(lambda job: job.then(step), jobs, _THREADS, _THREADS)

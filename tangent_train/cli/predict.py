@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 import sys
 import time
-from dataclasses import dataclass, field
+from contextlib import closing
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from rich.console import Console
@@ -15,11 +17,11 @@ from rich.table import Table
 
 from datamodules.images.image_files import image_paths, short_names
 from tangent_train.checkpoints.trained import load_trained
-from tangent_train.cli.each import each
+from tangent_train.cli.each import Job, each
 from tangent_train.cli.settings import typed
 from tangent_train.errors import SettingError, counted
 from tangent_train.inference.class_maps import Unmapped, load_class_map, map_classes
-from tangent_train.inference.images import DepthFolder, read_panorama, read_photo
+from tangent_train.inference.images import DepthFolder, read_panorama, read_photo, with_up
 from tangent_train.inference.judge import NetworkJudge
 from tangent_train.inference.predictor import Predictor
 from tangent_train.inference.views import PanoramaViews, PhotoViews
@@ -32,6 +34,8 @@ from tangent_train.results.predictions import (
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
+
+    from numpy.typing import NDArray
 
     from datamodules.images.gpano import PanoramaArea
     from tangent_train.checkpoints.trained import TrainedNetwork
@@ -99,28 +103,33 @@ def predict(config: Mapping[str, Any]) -> None:
     depth = _depth_folder(settings, trained)
     predictor = _predictor(settings, trained)
     judge = NetworkJudge.of(original, predictor.device)
-    label = _Labeller(settings, trained, predictor, judge, depth, folder)
     earlier = folder.earlier(decisive) if settings.resume else {}
     if not (settings.overwrite or earlier):
         folder.check()
     entries = [entry for name, entry in earlier.items() if name in images]
     missing = {name: path for name, path in images.items() if name not in earlier}
     _say(f"{counted(len(images), 'images')}, {len(entries)} done already.")
+    label = _Labeller(settings, trained, predictor, judge, depth, folder, len(missing))
+    jobs = (Job(name, path, partial(label.read, name, path)) for name, path in missing.items())
+    steps = label, lambda job: job.value(), label.write
+    shown: list[EncodedImage] = []
     saved = -math.inf
     try:
-        for name, entry, error in each("Predicting", missing, label):
-            file = {"file": str(missing[name]), "name": name}
-            entries.append(file | (entry or {"error": error}))
-            if time.monotonic() - saved > _SAVED_EVERY_S:
-                _save(folder, decisive, entries)
-                saved = time.monotonic()
+        with closing(each("Predicting", jobs, len(missing), *steps)) as done:
+            for job in done:
+                entry, pictures = ({"error": job.error}, []) if job.error else job.value
+                entries.append({"file": str(job.path), "name": job.item, **entry})
+                shown += pictures
+                if time.monotonic() - saved > _SAVED_EVERY_S:
+                    _save(folder, decisive, entries)
+                    saved = time.monotonic()
     except KeyboardInterrupt:
         _say(f"{len(entries)} of {len(images)} images are done. resume=true continues.")
         raise
     finally:
         _save(folder, decisive, entries)
-    if label.shown:
-        folder.write_page(entries, label.shown)
+    if shown:
+        folder.write_page(entries, shown)
     failed = sum("error" in entry for entry in entries)
     if failed < len(entries):
         _say(folder.mean_shares(entries).terminal())
@@ -129,51 +138,78 @@ def predict(config: Mapping[str, Any]) -> None:
         sys.exit(f"tangent-predict: {failed} of {len(entries)} images could not be used, see above")
 
 
-@dataclass(frozen=True)
-class _Labeller:
-    """Predicts the labels of one image and writes them.
+class _Labelled(NamedTuple):
+    """An image with its labels; `area` is their part of a panorama, None of photos."""
 
-    Attributes:
+    image: InputImage
+    labels: NDArray[np.unsignedinteger]
+    area: PanoramaArea | None
+    shown: bool
+
+
+class _Labeller:
+    """Reads images, predicts their labels and writes these.
+
+    Args:
         settings: Of the command.
         trained: The network.
         predictor: Labels images with it.
         judge: Tells with it which way is up.
         depth: Depth images, for networks that take depth.
         folder: Output folder.
-        shown: Images for the report: the first ones done.
+        count: Number of images; those of the report are spread over them.
     """
 
-    settings: Settings
-    trained: TrainedNetwork
-    predictor: Predictor
-    judge: NetworkJudge
-    depth: DepthFolder | None
-    folder: PredictionFolder
-    shown: list[EncodedImage] = field(default_factory=list)
+    def __init__(
+        self,
+        settings: Settings,
+        trained: TrainedNetwork,
+        predictor: Predictor,
+        judge: NetworkJudge,
+        depth: DepthFolder | None,
+        folder: PredictionFolder,
+        count: int,
+    ) -> None:
+        self._settings, self._trained, self._predictor = settings, trained, predictor
+        self._judge, self._depth, self._folder, self._count = judge, depth, folder, count
+        self._number = self._shown = 0
 
-    def __call__(self, name: str, path: Path, progress: Callable[[float], object]) -> Entry:
-        """Label one image and return its entry of the summary."""
-        image, area = self._read(name.removesuffix(path.suffix), path)
-        probabilities = "probabilities" in self.settings.write
-        scores = self.predictor.predict(image, progress, probabilities=probabilities)
-        rgb, labels = image.rgb, self.trained.labels(scores.labels())
-        if area is not None:
-            rgb, labels = area.cut(rgb), area.cut(labels)
-        self.folder.write(name, rgb, labels, scores, area)
-        if len(self.shown) < self.settings.report:
-            self.shown.append(self.folder.viewer_image(name, rgb, labels, area))
+    def read(self, name: str, path: Path) -> tuple[InputImage, PanoramaArea | None]:
+        """Read one image; a panorama with its area."""
+        given, stem = self._settings, name.removesuffix(path.suffix)
+        if given.projection == "perspective":
+            return read_photo(path, stem, self._depth, given.fov), None
+        return read_panorama(path, stem, self._depth, given.crop, given.upright)
+
+    def __call__(self, job: Job, progress: Callable[[float], object]) -> _Labelled:
+        """Predict the labels of one image that was read."""
+        image, area = job.value
+        if self._settings.upright == "auto" and area is not None:
+            image = with_up(image, self._settings.max_tilt_deg, self._judge)
+        probabilities = "probabilities" in self._settings.write
+        scores = self._predictor.predict(image, progress, probabilities=probabilities)
+        self._folder.write_probabilities(job.item, scores, area)  # here: scores are large
+        labels = self._trained.labels(scores.labels())
+        shown = self._number * self._settings.report >= self._shown * self._count
+        shown = shown and self._shown < self._settings.report
+        self._number, self._shown = self._number + 1, self._shown + shown
+        return _Labelled(image, labels if area is None else area.cut(labels), area, shown)
+
+    def write(self, job: Job) -> tuple[Entry, list[EncodedImage]]:
+        """Write the labels of one image.
+
+        Returns:
+            Its entry of the summary, and pictures for the report.
+        """
+        image, labels, area, shown = job.value
+        self._folder.write(job.item, image, labels, area)
         rows, columns = labels.shape
         entry: Entry = {"rows": rows, "columns": columns}
         if image.up is not None:
             entry["tilt_deg"] = round(math.degrees(math.acos(np.clip(image.up[2], -1, 1))), 2)
-        return entry | {"classes": class_shares(labels, self.folder.class_names, image, area)}
-
-    def _read(self, name: str, path: Path) -> tuple[InputImage, PanoramaArea | None]:
-        given = self.settings
-        if given.projection == "perspective":
-            return read_photo(path, name, self.depth, given.fov), None
-        how = given.crop, given.upright, given.max_tilt_deg
-        return read_panorama(path, name, self.depth, *how, self.judge)
+        entry["classes"] = class_shares(labels, self._folder.class_names, image, area)
+        of_report = (job.item, image, labels, area)
+        return entry, [self._folder.viewer_image(*of_report)] if shown else []
 
 
 def _save(folder: PredictionFolder, settings: Mapping[str, Any], entries: list[Entry]) -> None:

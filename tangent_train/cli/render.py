@@ -30,7 +30,7 @@ from datamodules.images.tangent_folders import (
     write_tangent_folder,
 )
 from datamodules.images.tangent_results import Kind, TangentResults, result_files
-from tangent_train.cli.each import each
+from tangent_train.cli.each import Job, each
 from tangent_train.cli.settings import typed
 from tangent_train.errors import DataError, SettingError, counted
 from tangent_train.geometry import TangentGrid, nearest_level, random_rotation, rotation_about
@@ -121,7 +121,13 @@ def render(config: Mapping[str, Any]) -> None:
 
 def _each(jobs: Mapping[_Item, Path], work: _Work[_Item]) -> list[Path]:
     """Results of the panoramas that could be rendered."""
-    return [result for _, result, _ in each("Rendering", jobs, work) if result is not None]
+    done = each(
+        "Rendering",
+        [Job(item, path) for item, path in jobs.items()],
+        len(jobs),
+        lambda job, progress: work(job.item, job.path, progress),
+    )
+    return [job.value for job in done if not job.error]
 
 
 def _end(done: Sequence[Path], count: int) -> None:

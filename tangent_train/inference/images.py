@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from datamodules.core.panorama_module import Upright
     from tangent_train.inference.judge import NetworkJudge
 
-__all__ = ["DepthFolder", "read_panorama", "read_photo"]
+__all__ = ["DepthFolder", "read_panorama", "read_photo", "with_up"]
 
 _ASPECT_TOLERANCE = 0.01
 
@@ -72,8 +72,6 @@ def read_panorama(
     depth: DepthFolder | None = None,
     crop: Sequence[float] | None = None,
     upright: Upright = None,
-    max_tilt_deg: float = 60.0,
-    judge: NetworkJudge | None = None,
 ) -> tuple[InputImage, PanoramaArea]:
     """Read a panorama of the whole sphere or a part of it.
 
@@ -82,10 +80,8 @@ def read_panorama(
         name: Its path below the folder of all images, without suffix.
         depth: Its depth file, for networks with depth.
         crop: Its part of the sphere, see `area_of_crop`; None for that of its GPano tags.
-        upright: Source of its zenith: ``pose`` by its GPano tags, ``auto`` by these or else as
-            estimated; None for z.
-        max_tilt_deg: Of estimates, see `estimate_up`.
-        judge: Helps to estimate.
+        upright: Source of its zenith: ``pose`` by its GPano tags, ``auto`` likewise, see
+            `with_up`; None for z.
 
     Returns:
         The whole sphere, black outside the file's area, and that area.
@@ -99,11 +95,21 @@ def read_panorama(
     area = area_of(path, size) if crop is None else area_of_crop(size, crop)
     whole = area.place(rgb)
     placed_depth = None if depth is None else area.place(depth.read(name, size))
-    image = InputImage(whole, placed_depth, None if upright is None else up_of(path))
-    if image.up is None and upright == "auto":
-        by_network = None if judge is None else partial(judge, image)
-        image = replace(image, up=estimate_up(whole, max_tilt_deg, by_network).found)
-    return image, area
+    return InputImage(whole, placed_depth, None if upright is None else up_of(path)), area
+
+
+def with_up(image: InputImage, max_tilt_deg: float, judge: NetworkJudge) -> InputImage:
+    """A panorama with its zenith: its own, or else as estimated.
+
+    Args:
+        image: A panorama.
+        max_tilt_deg: Of estimates, see `estimate_up`.
+        judge: Helps to estimate.
+    """
+    if image.up is not None:
+        return image
+    estimate = estimate_up(image.rgb, max_tilt_deg, partial(judge, image))
+    return replace(image, up=estimate.found)
 
 
 def read_photo(

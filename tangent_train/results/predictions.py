@@ -150,19 +150,17 @@ class PredictionFolder:
     def write(
         self,
         name: str,
-        rgb: NDArray[np.uint8],
+        image: InputImage,
         labels: NDArray[np.unsignedinteger],
-        scores: ScoreMosaic,
         area: PanoramaArea | None = None,
     ) -> None:
-        """Write what is wanted of one image.
+        """Write labels and pictures of one image, those that are wanted.
 
         Args:
             name: From `short_names`.
-            rgb: ``(h, w, 3)`` the image.
-            labels: ``(h, w)`` its labels.
-            scores: Those of the photo, or of the whole sphere.
-            area: Part of the sphere that the image covers.
+            image: The photo, or the whole sphere.
+            labels: ``(h, w)`` of the image, or of its area.
+            area: Part of the sphere that the labels are of.
         """
         files = self.files(name)
         if "labels" in files:
@@ -170,13 +168,26 @@ class PredictionFolder:
         if "color" in files:
             write_pixels(files["color"], colorize(labels, len(self.class_names)))
         if "overlay" in files:
+            rgb = image.rgb if area is None else area.cut(image.rgb)
             write_pixels(files["overlay"], overlay_picture(rgb, labels, self.class_names))
-        if "probabilities" not in files:
+
+    def write_probabilities(
+        self, name: str, scores: ScoreMosaic, area: PanoramaArea | None = None
+    ) -> None:
+        """Write the probabilities of one image, if they are wanted.
+
+        Args:
+            name: From `short_names`.
+            scores: Those of the photo, or of the whole sphere.
+            area: Part of the sphere that they are written of.
+        """
+        file = self.files(name).get("probabilities")
+        if file is None:
             return
-        everywhere = np.arange(labels.shape[0]), np.arange(labels.shape[1])
+        everywhere = np.arange(scores.shape[0]), np.arange(scores.shape[1])
         rows, columns = everywhere if area is None else area.places()
-        shape = (*labels.shape, len(self.class_names) - 1)
-        with array_file(files["probabilities"], shape, np.float16) as array:
+        shape = (len(rows), len(columns), len(self.class_names) - 1)
+        with array_file(file, shape, np.float16) as array:
             for start in range(0, len(rows), _ROWS_AT_ONCE):
                 part = slice(start, start + _ROWS_AT_ONCE)
                 array[part] = scores.probabilities(rows[part])[:, columns, : shape[-1]]
@@ -211,15 +222,14 @@ class PredictionFolder:
     def viewer_image(
         self,
         name: str,
-        rgb: NDArray[np.uint8],
+        image: InputImage,
         labels: NDArray[np.unsignedinteger],
         area: PanoramaArea | None,
     ) -> EncodedImage:
         """An image for `write_page`, of 0.1 to a few megabytes; see `write`."""
-        if area is not None:
-            rgb, labels = area.place(rgb), area.place(labels)
+        placed = labels if area is None else area.place(labels)
         count, sphere = len(self.class_names), area is not None
-        return encode_image(name, rgb, count, prediction=labels, sphere=sphere)
+        return encode_image(name, image.rgb, count, prediction=placed, sphere=sphere)
 
     def write_page(self, entries: Sequence[Entry], shown: Sequence[EncodedImage]) -> None:
         """Write ``report.html``.
