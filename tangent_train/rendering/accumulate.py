@@ -59,10 +59,12 @@ def add_to_panorama(
         shape: ``(H, W)`` of the panorama.
         rows: Rows of it, without a step.
         owner: ``(rows, W)`` from `owners`; none to feather.
-        total: ``(rows, W, K + 1)`` weighted sums, and the sum of the weights, changed.
+        total: ``(rows, W, K)`` weighted sums, changed; for the sum of the weights, add a channel
+            of ones.
         labels: ``(rows, W)`` best classes, written where there is no `total`; feathered ones need
             all images at once.
-        softmax: Whether scores become probabilities after they are interpolated.
+        softmax: Whether scores become probabilities: those of owners after they are interpolated,
+            feathered ones before.
     """
     step = max(64, _SPANS // max(1, len(faces)))
     for start in range(rows.start, rows.stop, step):
@@ -74,7 +76,7 @@ def add_to_panorama(
 
 
 def zero_sums(shape: tuple[int, int], channels: int) -> NDArray[np.float32]:
-    """``(H, W, K + 1)`` sums and their weights, 0; beyond 2 GiB in a temporary file without a name.
+    """``(H, W, K)`` sums, 0; beyond 2 GiB in a temporary file without a name.
 
     Args:
         shape: ``(H, W)``.
@@ -83,7 +85,7 @@ def zero_sums(shape: tuple[int, int], channels: int) -> NDArray[np.float32]:
     Raises:
         SettingError: They do not fit on the disk (of the folder TMPDIR).
     """
-    whole = (*shape, channels + 1)
+    whole = (*shape, channels)
     nbytes = math.prod(whole) * 4
     if nbytes <= _IN_MEMORY_BYTES:
         return np.zeros(whole, np.float32)

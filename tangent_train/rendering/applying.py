@@ -109,16 +109,16 @@ class _Means:
     ) -> None:
         self._grid, self._shape, self._channels = grid, shape, first.shape[3:]
         self._owner = NO_OWNERS if blend == "feather" else owners(grid, shape)
-        self._sums = zero_sums(shape, math.prod(self._channels))
+        self._sums = zero_sums(shape, math.prod(self._channels) + 1)
 
     def add(self, results: NDArray[Any], faces: NDArray[np.int64]) -> None:
         """Add those of some images."""
         _check_alike(results, self._channels, "f")
-        stack = np.moveaxis(results.reshape(*results.shape[:3], -1), -1, 1)
-        # Writeable: of others numba would compile the kernel anew.
-        stack = np.require(stack, np.float32, ["C", "W"])
-        rows = slice(0, self._shape[0])
-        add_to_panorama(stack, self._grid, faces, self._shape, rows, self._owner, self._sums)
+        count, rows, columns = results.shape[:3]
+        stack = np.ones((count, self._sums.shape[2], rows, columns), np.float32)  # and weights
+        stack[:, :-1] = np.moveaxis(results.reshape(count, rows, columns, -1), -1, 1)
+        whole = slice(0, self._shape[0])
+        add_to_panorama(stack, self._grid, faces, self._shape, whole, self._owner, self._sums)
 
     def panorama(self) -> NDArray[np.float32]:
         """``(H, W[, K])``, in the memory of the sums: row by row, what is written was read."""

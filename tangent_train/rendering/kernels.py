@@ -1,7 +1,7 @@
 """Compiled loops: positions on the sphere, owners of pixels, and adding images to a canvas.
 
 A *canvas* is what images are put together on: a panorama, or a photo made of crops. Its pixel
-(i, j) looks along the ray ``(rows[i, 0] columns[j, 0], rows[i, 0] columns[j, 1], rows[i, 1])``;
+(i, j) looks along the ray ``(rows[i, 0] columns[0, j], rows[i, 0] columns[1, j], rows[i, 1])``;
 `sphere_rays` and `plane_rays` give these factors. An image sees the ray at its pixel (u, v) where
 ``(u, v, 1)`` is proportional to its ``(3, 3)`` matrix times the ray, if the third number is
 positive.
@@ -32,15 +32,17 @@ __all__ = [
 FEATHER_POWER = 4
 """Exponent p of the feather weights ((1 − a²)(1 − b²))^p at offsets a, b in half image sides."""
 
-_LANES = 16
-"""Sums of a pixel are padded to a multiple of this, which compiles to vector code."""
-
 _TILE = 64
 """Rows and columns at the equator of what is added to at once: its sums stay in the cache."""
 
+_ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
+_LN_2, _LOG2_E = np.float32(math.log(2)), np.float32(1 / math.log(2))
+_C3, _C4, _C5, _C6 = np.float32(1 / 6), np.float32(1 / 24), np.float32(1 / 120), np.float32(1 / 720)
+_FLUSHED = np.float32(-40)
+
 Array = NDArray[Any]
 Rays = tuple[Array, Array]
-"""``(W, 2)`` factors of the columns and ``(H, 2)`` factors of the rows, float64."""
+"""``(2, W)`` factors of the columns and ``(H, 2)`` factors of the rows, float64."""
 Tile = tuple[int, int, int, int]
 """First row and the one after the last, first column and the one after the last."""
 
@@ -53,7 +55,7 @@ class Sight(NamedTuple):
         matrices: ``(n, 3, 3)`` from rays to homogeneous pixels.
         spans: ``(n, H, 2)`` in every row the first column that may see something of an image, and
             how many may, across the seam. Not read where there are owners.
-        columns: ``(W, 2)`` factors of the rays.
+        columns: ``(2, W)`` factors of the rays.
         rows: ``(H, 2)`` factors of the rays.
         owner: ``(H, W)``: an image has weight 1 where it is the owner, else 0. Empty for feather
             weights: 1 in the middle of an image, 0 at the outer edges of its outermost pixels.
@@ -88,13 +90,13 @@ def sphere_rays(shape: tuple[int, int]) -> Rays:
     height, width = shape
     lon = (np.arange(width) + 0.5) / width * 2 * np.pi - np.pi
     lat = np.pi / 2 - (np.arange(height) + 0.5) / height * np.pi
-    return np.stack([np.cos(lon), np.sin(lon)], -1), np.stack([np.cos(lat), np.sin(lat)], -1)
+    return np.stack([np.cos(lon), np.sin(lon)]), np.stack([np.cos(lat), np.sin(lat)], -1)
 
 
 def plane_rays(shape: tuple[int, int]) -> Rays:
     """``(j, 1, i)`` of the pixels of an image: its homogeneous pixels in another order."""
     height, width = shape
-    columns = np.stack([np.arange(width, dtype=np.float64), np.ones(width)], -1)
+    columns = np.stack([np.arange(width, dtype=np.float64), np.ones(width)])
     return columns, np.stack([np.ones(height), np.arange(height, dtype=np.float64)], -1)
 
 
@@ -109,7 +111,7 @@ def equirect_map(
         start: First row.
         stop: One past the last row.
         matrices: ``(n, 3, 3)`` from each canvas's rays to directions of any length.
-        columns: ``(w, 2)`` factors of the rays.
+        columns: ``(2, w)`` factors of the rays.
         rows: ``(h, 2)`` factors of the rays.
         height: Rows H of the ERP.
         width: Columns W of the ERP.
@@ -120,8 +122,8 @@ def equirect_map(
         m = matrices[row // len(rows)]
         i = row % len(rows)
         c = rows[i, 1]
-        for j in range(len(columns)):
-            a, b = rows[i, 0] * columns[j, 0], rows[i, 0] * columns[j, 1]
+        for j in range(columns.shape[1]):
+            a, b = rows[i, 0] * columns[0, j], rows[i, 0] * columns[1, j]
             x = m[0, 0] * a + m[0, 1] * b + m[0, 2] * c
             y = m[1, 0] * a + m[1, 1] * b + m[1, 2] * c
             z = m[2, 0] * a + m[2, 1] * b + m[2, 2] * c
@@ -152,8 +154,8 @@ def owners(
     own = 0
     for i in range(start, stop):
         z = rows[i, 1]
-        for j in range(len(columns)):
-            x, y = rows[i, 0] * columns[j, 0], rows[i, 0] * columns[j, 1]
+        for j in range(columns.shape[1]):
+            x, y = rows[i, 0] * columns[0, j], rows[i, 0] * columns[1, j]
             best = centers[own, 0] * x + centers[own, 1] * y + centers[own, 2] * z
             while best < inner:
                 nearer = own
@@ -169,8 +171,8 @@ def owners(
 
 @njit_fast
 def _project(
-    side: tuple[int, int], m: Array, row: Array, columns: Array, feather: bool,
-    start: int, stop: int, at: int, u: Array, v: Array, weight: Array,
+    side: tuple[int, int], m: Array, row: Array, columns: Array, start: int, stop: int,
+    u: Array, v: Array, weight: Array,
 ) -> None:  # fmt: skip
     """Project neighbors in a row of the canvas into an image.
 
@@ -178,29 +180,33 @@ def _project(
         side: Rows and columns of the image.
         m: ``(3, 3)`` from rays to homogeneous pixels.
         row: ``(2,)`` factors of the row.
-        columns: ``(W, 2)`` factors of the columns.
-        feather: Whether weights fall to 0 at the image's borders, instead of being 1.
+        columns: ``(2, W)`` factors of the columns.
         start: First column.
         stop: One past the last column.
-        at: Where the first one is written.
-        u: Columns in the image, written.
-        v: Rows in the image, written.
-        weight: Weights, written.
+        u: ``(n,)`` columns in the image, written.
+        v: ``(n,)`` rows in the image, written.
+        weight: ``(n,)`` feather weights, written.
     """
     ux, uy, uz = row[0] * m[0, 0], row[0] * m[0, 1], row[1] * m[0, 2]
     vx, vy, vz = row[0] * m[1, 0], row[0] * m[1, 1], row[1] * m[1, 2]
     wx, wy, wz = row[0] * m[2, 0], row[0] * m[2, 1], row[1] * m[2, 2]
-    ahead = np.uint64(at - start)  # unsigned indices spare numba's test for negative ones
-    for j in range(np.uint64(start), np.uint64(stop)):
-        x, y, p = columns[j, 0], columns[j, 1], ahead + j
-        depth = wx * x + wy * y + wz
-        u[p] = (ux * x + uy * y + uz) / depth
-        v[p] = (vx * x + vy * y + vz) / depth
-        weight[p] = 1.0
-        if feather:
-            across, down = (2 * u[p] + 1) / side[1] - 1, (2 * v[p] + 1) / side[0] - 1
-            seen = depth > 0 and abs(across) < 1 and abs(down) < 1
-            weight[p] = ((1 - across**2) * (1 - down**2)) ** FEATHER_POWER if seen else 0.0
+    xs, ys = columns[0, start:stop], columns[1, start:stop]
+    per_column, per_row = 2 / side[1], 2 / side[0]
+    for p in range(len(xs)):
+        x, y = xs[p], ys[p]
+        near = 1 / (wx * x + wy * y + wz)
+        across, down = (ux * x + uy * y + uz) * near, (vx * x + vy * y + vz) * near
+        u[p], v[p] = across, down
+        a, b = (across + 0.5) * per_column - 1, (down + 0.5) * per_row - 1
+        inside = max(1 - a * a, 0.0) * max(1 - b * b, 0.0)
+        weight[p] = inside**FEATHER_POWER if near > 0 else 0.0
+
+
+@njit_fast
+def _room(pixels: int) -> _Seen:
+    """Room for a list; one array each, as numba takes the parts of a common one for strided."""
+    u, v, weight = np.empty(pixels), np.empty(pixels), np.empty(pixels)
+    return _Seen(np.empty(pixels, np.int64), u, v, weight)
 
 
 @njit_fast
@@ -241,11 +247,12 @@ def _list_owned(
             while stop < right and owner[stop] == image:
                 stop += 1
             _project(
-                side, sight.matrices[m], sight.rows[i], sight.columns, False,
-                start, stop, count, u, v, weight,
+                side, sight.matrices[m], sight.rows[i], sight.columns, start, stop,
+                u[count:], v[count:], weight[count:],
             )  # fmt: skip
-            for p in range(np.uint64(stop - start)):
-                pixel[np.uint64(count) + p] = at + start + p
+            pixels, weights = pixel[count:], weight[count:]
+            for p in range(stop - start):
+                pixels[p], weights[p] = at + start + p, 1.0
             count += stop - start
     return count
 
@@ -261,13 +268,13 @@ def _list_seen(
     for i in range(top, bottom):
         begin, span = sight.spans[m, i, 0], sight.spans[m, i, 1]
         at = i * step[0] + step[1]
-        for back in range(0, len(columns) + 1, len(columns)):
+        for back in range(0, columns.shape[1] + 1, columns.shape[1]):
             start, stop = max(left, begin - back), min(right, begin + span - back)
             if start >= stop:
                 continue
             _project(
-                side, sight.matrices[m], sight.rows[i], columns, True,
-                start, stop, count, u, v, weight,
+                side, sight.matrices[m], sight.rows[i], columns, start, stop,
+                u[count:], v[count:], weight[count:],
             )  # fmt: skip
             first = count
             for p in range(first, first + stop - start):
@@ -320,145 +327,136 @@ def _split(places: Array, count: int, whole: Array, share: Array) -> tuple[int, 
 
 
 @njit_fast
-def _find_corners(
-    row: Array, upper: int, column: Array, first: int, width: int, lanes: int, corner: Array
-) -> None:
-    """Where the first of four pixels starts in a patch of `width` columns."""
-    for p in range(np.uint64(len(row))):
-        corner[p] = ((row[p] - upper) * width + column[p] - first) * lanes
+def _exp(x: np.float32) -> np.float32:
+    """Exponential of a number up to 0, relative error 3e-7; 0 below −40 and of NaN.
+
+    2^n e^r with r between ± ln(2) / 2, where a Taylor polynomial is enough. Unlike `math.exp` it
+    compiles to vector code, and gives no denormal numbers, with which arithmetic is slow.
+    """
+    n = np.int32(x * _LOG2_E - _HALF)
+    r = x - np.float32(n) * _LN_2
+    power = ((((_C6 * r + _C5) * r + _C4) * r + _C3) * r + _HALF) * r * r + r + _ONE
+    scale = np.int32((n + np.int32(127)) << np.int32(23)).view(np.float32)
+    return power * scale if x > _FLUSHED else _ZERO
+
+
+@njit_fast
+def _softmax_lines(lines: Array, highest: Array, factor: Array) -> None:
+    """Softmax of ``(K, n)`` scores over the first axis, in place, but for a factor.
+
+    Args:
+        lines: The scores, changed; NaN gets a probability of 0.
+        highest: Room for n numbers.
+        factor: ``(n,)`` factors that make the sums 1, written.
+    """
+    highest[:], factor[:] = -np.inf, 0
+    count = np.uint64(lines.shape[1])
+    for k in range(len(lines)):
+        line = lines[k]
+        for x in range(count):
+            highest[x] = line[x] if line[x] > highest[x] else highest[x]
+    for k in range(len(lines)):
+        line = lines[k]
+        for x in range(count):
+            line[x] = _exp(line[x] - highest[x])
+            factor[x] += line[x]
+    for x in range(count):
+        factor[x] = _ONE / factor[x] if factor[x] > 0 else _ZERO
 
 
 @njit_fast
 def _copy_patch(
-    scores: Array, left: int, top: int, height: int, width: int, lanes: int, patch: Array
+    scores: Array, left: int, top: int, width: int, height: int, softmax: bool, patch: Array
 ) -> None:
-    """Copy a part of ``(K, h, w)`` scores so that those of a pixel lie together, and a 1."""
-    step, one = np.uint64(lanes), np.uint64(1)
-    columns = np.uint64(left), np.uint64(left + width)
+    """Copy a part of ``(K, h, w)`` scores so that those of a pixel lie together."""
     num_classes = scores.shape[0]
-    by_four = num_classes - num_classes % 4
+    lines = np.empty((num_classes, width), np.float32)
+    highest, factor = np.ones(width, np.float32), np.ones(width, np.float32)
     for y in range(height):
-        lines, start = scores[:, top + y], y * width * lanes
-        for k in range(0, by_four, 4):  # four stores side by side become one
-            a, b, c, d = lines[k], lines[k + 1], lines[k + 2], lines[k + 3]
-            at = np.uint64(start + k)
-            for x in range(columns[0], columns[1]):
-                patch[at], patch[at + one] = a[x], b[x]
-                patch[at + one + one], patch[at + one + one + one] = c[x], d[x]
-                at += step
-        for k in range(by_four, num_classes):
-            line, at = lines[k], np.uint64(start + k)
-            for x in range(columns[0], columns[1]):
-                patch[at] = line[x]
-                at += step
-        at = np.uint64(start + num_classes)
-        for _ in range(width):
-            patch[at] = 1
-            at += step
-
-
-@njit_fast
-def _four_pixels(
-    p: int, corner: Array, below: np.uint64, lanes: np.uint64,
-    right_share: Array, below_share: Array, weight: np.float32,
-) -> tuple[Any, ...]:  # fmt: skip
-    """Where the scores of the four pixels around a position start in a patch, and their weights.
-
-    Unsigned indices spare numba's test for negative ones.
-
-    Args:
-        p: The position.
-        corner: ``(n,)`` where the first of four pixels starts.
-        below: From there to the pixel below.
-        lanes: From there to the pixel to the right.
-        right_share: ``(n,)`` of the pixels to the right.
-        below_share: ``(n,)`` of the pixels below.
-        weight: Sum of the weights.
-    """
-    a = corner[p]
-    c = a + below
-    lower = weight * below_share[p]
-    upper = weight - lower
-    right, lower_right = right_share[p] * upper, right_share[p] * lower
-    return a, a + lanes, c, c + lanes, upper - right, right, lower - lower_right, lower_right
+        for k in range(num_classes):
+            line, there = lines[k], scores[k, top + y]
+            for x in range(np.uint64(width)):
+                line[x] = there[np.uint64(left) + x]
+        if softmax:
+            _softmax_lines(lines, highest, factor)
+        pixels = patch[y * width * num_classes :]
+        for x in range(np.uint64(width)):
+            at = x * np.uint64(num_classes)
+            for k in range(np.uint64(num_classes)):
+                pixels[at + k] = lines[k, x] * factor[x]
 
 
 @njit_fast
 def _add_patch(
-    patch: Array, corner: Array, below: np.uint64, lanes: np.uint64,
+    patch: Array, num_classes: np.uint64, width: int, origin: int, column: Array, row: Array,
     right_share: Array, below_share: Array, weight: Array, pixel: Array, sums: Array,
 ) -> None:  # fmt: skip
-    """Add weighted bilinear samples of a patch to the sums of a tile."""
-    for p in range(np.uint64(len(corner))):
-        a, b, c, d, wa, wb, wc, wd = _four_pixels(
-            p, corner, below, lanes, right_share, below_share, np.float32(weight[p])
-        )
-        to = np.uint64(pixel[p]) * lanes
-        for k in range(lanes):
+    """Add weighted bilinear samples of a patch to sums.
+
+    Unsigned indices spare numba's test for negative ones.
+
+    Args:
+        patch: Scores of an image's pixels, row by row.
+        num_classes: K, scores of a pixel.
+        width: Columns of the patch.
+        origin: Place in the patch of pixel (0, 0) of the image.
+        column: ``(n,)`` columns in the image.
+        row: ``(n,)`` rows in the image.
+        right_share: ``(n,)`` of the pixels to the right.
+        below_share: ``(n,)`` of the pixels below.
+        weight: ``(n,)``.
+        pixel: ``(n,)`` where the sums are.
+        sums: K for every pixel, changed.
+    """
+    for p in range(np.uint64(len(column))):
+        a = np.uint64(row[p] * width + column[p] + origin) * num_classes
+        b, c = a + num_classes, a + np.uint64(width) * num_classes
+        d, to = c + num_classes, np.uint64(pixel[p]) * num_classes
+        whole = np.float32(weight[p])
+        lower = whole * below_share[p]
+        upper = whole - lower
+        wb, wd = right_share[p] * upper, right_share[p] * lower
+        wa, wc = upper - wb, lower - wd
+        for k in range(num_classes):
             sums[to + k] += (
                 wa * patch[a + k] + wb * patch[b + k] + wc * patch[c + k] + wd * patch[d + k]
             )
 
 
 @njit_fast
-def _label_patch(
-    patch: Array, corner: Array, below: np.uint64, lanes: np.uint64,
-    right_share: Array, below_share: Array, num_classes: np.uint64, pixel: Array, labels: Array,
-) -> None:  # fmt: skip
-    """Write the best class of bilinear samples of a patch; see `_best_class`."""
-    for p in range(np.uint64(len(corner))):
-        a, b, c, d, wa, wb, wc, wd = _four_pixels(
-            p, corner, below, lanes, right_share, below_share, np.float32(1)
-        )
-        label: Any = np.uint64(0)  # as k: with int64 both would become floats
-        best = np.float32(-np.inf)
-        for k in range(num_classes):
-            score = wa * patch[a + k] + wb * patch[b + k] + wc * patch[c + k] + wd * patch[d + k]
-            better = score > best
-            best, label = (score, k) if better else (best, label)
-        labels[pixel[p]] = label
-
-
-@njit_fast
-def _best_class(sums: Array, num_classes: int) -> int:
+def _best_class(sums: Array) -> int:
     """Of the largest sum: the first of equal ones, and NaN never wins."""
     best, label = np.float32(-np.inf), 0
-    for k in range(num_classes):
+    for k in range(len(sums)):
         better = sums[k] > best
         best, label = (sums[k], k) if better else (best, label)
     return label
 
 
 @njit_fast
-def _softmax(sums: Array, num_classes: int) -> None:
-    """Of the first K numbers, in place."""
-    highest = sums[_best_class(sums, num_classes)]
-    whole = np.float32(0)
-    for k in range(num_classes):
-        sums[k] = math.exp(sums[k] - highest)
-        whole += sums[k]
-    for k in range(num_classes):
-        sums[k] /= whole
-
-
-@njit_fast
 def _finish(
-    tile: Tile, num_classes: int, softmax: bool, sums: Array, total: Array, labels: Array
+    tile: Tile, covered: Array, sight: Sight, sums: Array, total: Array, labels: Array
 ) -> None:
-    """Add the sums of a tile's covered pixels to the totals, or write their labels."""
+    """Add the probabilities of a tile's pixels to the totals, or write their labels."""
     top, bottom, left, right = tile
+    p = 0
     for i in range(top, bottom):
         for j in range(left, right):
-            p = (i - top) * (right - left) + j - left
-            if not sums[p, num_classes] > 0:
+            of_pixel = sums[p]
+            p += 1
+            if len(sight.owner) > 0 and not covered[sight.owner[i, j]]:
                 continue
             if len(total) == 0:
-                labels[i, j] = _best_class(sums[p], num_classes)
+                labels[i, j] = _best_class(of_pixel)
                 continue
-            if softmax:
-                _softmax(sums[p], num_classes)
-            for k in range(num_classes + 1):
-                total[i, j, k] += sums[p, k]
+            highest = of_pixel[_best_class(of_pixel)]
+            whole = np.float32(0)
+            for k in range(len(of_pixel)):
+                of_pixel[k] = _exp(of_pixel[k] - highest)
+                whole += of_pixel[k]
+            factor = _ONE / whole if whole > 0 else _ZERO
+            for k in range(len(of_pixel)):
+                total[i, j, k] += of_pixel[k] * factor
 
 
 @njit_fast
@@ -475,43 +473,41 @@ def add_images(
     """Add images to rows ``start:stop`` of a canvas: weighted scores, or at once the best class.
 
     Works tile by tile. The part of an image that a tile sees is copied so that the scores of a
-    pixel lie together, and those of all classes are interpolated at once. Labels of owners are
-    complete with one image: their scores are compared as they are interpolated.
+    pixel lie together, and those of all classes are interpolated at once.
 
     Args:
         start: First row.
         stop: One past the last row.
         scores: ``(n, K, h, w)`` float32, h and w at least 2.
         sight: Geometry of these images and the canvas.
-        softmax: Whether scores become probabilities after they are interpolated; not feathered.
-        total: ``(H, W, K + 1)`` weighted sums, and the sum of the weights, changed. Empty where
-            only labels are wanted, for which all images of a pixel have to come at once.
+        softmax: Whether scores become probabilities: those of owners after they are interpolated,
+            feathered ones before.
+        total: ``(H, W, K)`` weighted sums, changed. Empty where only labels are wanted, for which
+            all images of a pixel have to come at once.
         labels: ``(H, W)`` best classes, written where `total` is empty.
     """
-    num_classes = scores.shape[1]
-    side = scores.shape[2], scores.shape[3]
-    at_once = len(sight.owner) > 0 and len(total) == 0
-    lanes = (num_classes // _LANES + 1) * _LANES
-    owns = np.empty(_count(sight), np.bool_)
-    u, v, weight = np.empty((3, _TILE**2))
-    seen = _Seen(np.empty(_TILE**2, np.int64), u, v, weight)
-    column, row = np.empty((2, _TILE**2), np.int32)
-    right, below = np.empty((2, _TILE**2), np.float32)
-    corner = np.empty(_TILE**2, np.uint64)
-    sums = np.empty((_TILE**2, lanes), np.float32)
+    num_classes, side = scores.shape[1], (scores.shape[2], scores.shape[3])
+    owned = len(sight.owner) > 0
+    at_once = len(total) > 0 and not (owned and softmax)
+    owns, covered = np.empty(_count(sight), np.bool_), np.zeros(_count(sight), np.bool_)
+    for image in sight.images:
+        covered[image] = True
+    seen = _room(_TILE**2)
+    column, row = np.empty(_TILE**2, np.int32), np.empty(_TILE**2, np.int32)
+    right, below = np.empty(_TILE**2, np.float32), np.empty(_TILE**2, np.float32)
+    sums = total.reshape(-1) if at_once else np.empty(_TILE**2 * num_classes, np.float32)
     patch = np.empty(0, np.float32)
     bottom = start
     while bottom < stop:
         top = bottom
         height, across = _tile_size(abs(sight.rows[top, 0]))
         bottom = min(stop, top + height)
-        for left in range(0, len(sight.columns), across):
-            tile = top, bottom, left, min(len(sight.columns), left + across)
-            step = tile[3] - left, -top * (tile[3] - left) - left
-            if at_once:
-                step = len(sight.columns), 0
-            else:
+        for left in range(0, sight.columns.shape[1], across):
+            tile = top, bottom, left, min(sight.columns.shape[1], left + across)
+            step = sight.columns.shape[1], 0
+            if not at_once:
                 sums[:] = 0
+                step = tile[3] - left, -top * (tile[3] - left) - left
             _mark_owners(tile, sight.owner, owns)
             for m in range(len(scores)):
                 if not owns[sight.images[m]]:
@@ -519,39 +515,34 @@ def add_images(
                 n = _list_pixels(tile, m, side, sight, step, seen)
                 if n == 0:
                     continue
-                first, last = _split(u[:n], side[1], column, right)
-                upper, lower = _split(v[:n], side[0], row, below)
+                first, last = _split(seen.u[:n], side[1], column, right)
+                upper, lower = _split(seen.v[:n], side[0], row, below)
                 wide, high = last - first + 2, lower - upper + 2
-                if len(patch) < high * wide * lanes:
-                    patch = np.empty(high * wide * lanes, np.float32)
-                _copy_patch(scores[m], first, upper, high, wide, lanes, patch)
-                _find_corners(row[:n], upper, column, first, wide, lanes, corner)
-                if at_once:
-                    _label_patch(
-                        patch, corner[:n], np.uint64(wide * lanes), np.uint64(lanes),
-                        right, below, np.uint64(num_classes), seen.pixel, labels.reshape(-1),
-                    )  # fmt: skip
-                else:
-                    _add_patch(
-                        patch, corner[:n], np.uint64(wide * lanes), np.uint64(lanes),
-                        right, below, weight, seen.pixel, sums.reshape(-1),
-                    )  # fmt: skip
+                if len(patch) < high * wide * num_classes:
+                    patch = np.empty(high * wide * num_classes, np.float32)
+                _copy_patch(scores[m], first, upper, wide, high, softmax and not owned, patch)
+                _add_patch(
+                    patch, np.uint64(num_classes), wide, -upper * wide - first,
+                    column[:n], row, right, below, seen.weight, seen.pixel, sums,
+                )  # fmt: skip
             if not at_once:
-                _finish(tile, num_classes, softmax, sums, total, labels)
+                _finish(tile, covered, sight, sums.reshape(-1, num_classes), total, labels)
 
 
-@njit_exact
+@njit_fast
 def best_classes(start: int, stop: int, total: Array, min_confidence: float, labels: Array) -> None:
-    """Best class of the ``(H, W, K + 1)`` totals of `add_images`, rows ``start:stop``.
+    """Best class of the ``(H, W, K)`` totals of `add_images`, rows ``start:stop``.
 
     K where its probability is below `min_confidence`.
     """
-    count = total.shape[2] - 1
     for i in range(start, stop):
         for j in range(labels.shape[1]):
-            best = _best_class(total[i, j], count)
-            unsure = total[i, j, best] < min_confidence * total[i, j, count]
-            labels[i, j] = count if unsure else best
+            of_pixel = total[i, j]
+            best, whole = _best_class(of_pixel), _ZERO
+            for k in range(len(of_pixel)):
+                whole += of_pixel[k]
+            unsure = of_pixel[best] < min_confidence * whole
+            labels[i, j] = len(of_pixel) if unsure else best
 
 
 @njit_exact
@@ -572,10 +563,9 @@ def seen_table(
         v: ``(R, H, W)`` rows in the images, written.
         weight: ``(R, H, W)`` weights, written.
     """
-    width = len(sight.columns)
+    width = sight.columns.shape[1]
     owns = np.empty(_count(sight), np.bool_)
-    line_u, line_v, line_w = np.empty((3, width))
-    seen = _Seen(np.empty(width + 1, np.int32), line_u, line_v, line_w)
+    seen = _room(width)
     for i in range(start, stop):
         tile = i, i + 1, 0, width
         _mark_owners(tile, sight.owner, owns)
@@ -587,5 +577,5 @@ def seen_table(
                 rank = count[i, j]
                 count[i, j] += 1
                 if rank < len(face):
-                    face[rank, i, j], weight[rank, i, j] = m, line_w[p]
-                    u[rank, i, j], v[rank, i, j] = line_u[p], line_v[p]
+                    face[rank, i, j], weight[rank, i, j] = m, seen.weight[p]
+                    u[rank, i, j], v[rank, i, j] = seen.u[p], seen.v[p]

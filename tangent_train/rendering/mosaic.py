@@ -11,7 +11,6 @@ import math
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 
 from tangent_train.rendering import kernels
 from tangent_train.rendering.accumulate import NO_OWNERS, add_to_panorama, zero_sums
@@ -42,8 +41,8 @@ class ScoreMosaic:
             `tangent_to_labels`. ``feather``: the weighted average of the probabilities of all
             images that see it.
         averaged: Whether to keep sums of probabilities: always with ``feather``; with ``nearest``
-            for more than one grid, or when the probabilities are wanted. They take 4·(K + 1) bytes
-            a pixel, beyond 2 GiB in a temporary file (of the folder TMPDIR).
+            for more than one grid, or when the probabilities are wanted. They take 4 K bytes a
+            pixel, beyond 2 GiB in a temporary file (of the folder TMPDIR).
         min_confidence: Probability from which the best class is certain, see `labels`; above 0,
             sums are kept.
 
@@ -66,7 +65,6 @@ class ScoreMosaic:
         averaged = averaged or blend == "feather" or min_confidence > 0
         self._min_confidence = min_confidence
         self._total = zero_sums(shape if averaged else (0, 0), num_classes)
-        self._softmax = torch.empty(0)  # kept: fresh memory costs a quarter of the time
         self._owned: tuple[object, NDArray[np.integer]] = None, NO_OWNERS
 
     def add(self, scores: Tensor, grid: PinholeGrid, faces: NDArray[np.int64]) -> None:
@@ -82,7 +80,7 @@ class ScoreMosaic:
         """
         check_blend(self.blend, grid)
         add_to_panorama(
-            self._prepared(scores),
+            _on_cpu(scores),
             grid,
             faces,
             self.shape,
@@ -90,7 +88,7 @@ class ScoreMosaic:
             self._owners(grid, lambda: owners(grid, self.shape)),
             self._total,
             self._labels,
-            softmax=self.blend == "nearest",
+            softmax=True,
         )
 
     def add_crops(self, scores: Tensor, crops: PhotoCrops, which: NDArray[np.int64]) -> None:
@@ -102,7 +100,7 @@ class ScoreMosaic:
             which: ``(n,)`` which of them these are.
         """
         height, width = self.shape
-        prepared = self._prepared(scores)
+        prepared = _on_cpu(scores)
         views, spans = np.zeros((len(which), 3, 3)), np.zeros((len(which), height, 2), np.int32)
         for number, box in enumerate(crops.boxes[which]):
             left, top, right, bottom = box
@@ -118,8 +116,7 @@ class ScoreMosaic:
         rays = kernels.plane_rays(self.shape)
         owner = self._owners(crops, lambda: crops.owners(self.shape))
         sight = kernels.Sight(which, views, spans, *rays, owner)
-        softmax = self.blend == "nearest"
-        arguments = (prepared, sight, softmax, self._total, self._labels)
+        arguments = (prepared, sight, True, self._total, self._labels)
         over_rows(kernels.add_images, height, width, *arguments)
 
     def labels(self) -> NDArray[np.unsignedinteger]:
@@ -132,17 +129,7 @@ class ScoreMosaic:
     def probabilities(self, rows: slice | NDArray[np.intp]) -> NDArray[np.float32]:
         """``(h, W, K)`` probabilities of some rows, which add up to 1; only where averaged."""
         total: NDArray[np.float32] = self._total[rows]
-        weight: NDArray[np.float32] = np.maximum(total[..., -1:], np.float32(1e-37))
-        return total[..., :-1] / weight
-
-    def _prepared(self, scores: Tensor) -> NDArray[np.float32]:
-        """``(n, K, h, w)`` on the CPU; feathered are probabilities, as in evaluation."""
-        scores = scores.detach().float().contiguous()
-        if self.blend == "feather":
-            if self._softmax.shape != scores.shape:
-                self._softmax = torch.empty_like(scores)
-            scores = torch.softmax(scores, dim=1, out=self._softmax)
-        return scores.cpu().numpy()
+        return total / np.maximum(total.sum(axis=-1, keepdims=True), np.float32(1e-37))
 
     def _owners(
         self, images: object, build: Callable[[], NDArray[np.integer]]
@@ -153,3 +140,8 @@ class ScoreMosaic:
         if self._owned[0] is not images:
             self._owned = images, build()
         return self._owned[1]
+
+
+def _on_cpu(scores: Tensor) -> NDArray[np.float32]:
+    result: NDArray[np.float32] = scores.detach().float().contiguous().cpu().numpy()
+    return result

@@ -133,7 +133,7 @@ def equirect_map(
         Positions ``(n h, w)``.
     """
     columns, rows = rays
-    u, v = np.empty((2, len(matrices) * len(rows), len(columns)), dtype)
+    u, v = np.empty((2, len(matrices) * len(rows), columns.shape[1]), dtype)
     over_rows(kernels.equirect_map, *u.shape, np.ascontiguousarray(matrices), *rays, *shape, u, v)
     return EquirectMap(u, v, np.flatnonzero((v < 0) | (v > shape[0] - 1)))
 
