@@ -17,7 +17,6 @@ from models.pretrained import read_tensors
 from tangent_train.checkpoints.content import read_checkpoint
 from tangent_train.checkpoints.trained import load_trained
 from tangent_train.errors import DataError
-from tests.cli.tiny_runs import run_command
 from tests.inference.trained import write_checkpoint
 
 
@@ -60,47 +59,6 @@ NAMES = ("x.ckpt", "x.pt", "x.pth", "x.onnx", "x.safetensors", "x.npy")
 @pytest.fixture
 def created(tmp_path: Path) -> Path:
     return tmp_path / "created"
-
-
-COMMANDS = {
-    "evaluate": ["checkpoint={file}"],
-    "predict": ["checkpoint={file}", "input=image.png", "output=labels"],
-    "export": ["checkpoint={file}", "output=net.onnx"],
-    "resume": ["resume=run"],
-    "init_from": ["init_from={file}", "level=5"],
-    "weights": ["network=fcn_resnet", "network.weights={file}", "level=4"],
-    "transfer": ["experiment=rooms/transfer", "checkpoint={file}"],
-    "keypoints": ["left={file}", "right={file}", "output=found"],
-    "render": ["input={file}", "output=tangent"],
-    "report": ["run"],
-}
-
-
-@pytest.mark.parametrize("what", COMMANDS)
-def test_no_command_unpickles(
-    what: str,
-    created: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    file = Path("x.npy") if what == "render" else Path("x.ckpt")
-    if what == "resume":
-        file = Path("run/checkpoints/last.ckpt")
-    if what == "report":
-        file = Path("run/results.json")
-    file.parent.mkdir(parents=True, exist_ok=True)
-    _archive(tmp_path / file, created)
-    (tmp_path / "image.png").touch()
-    command = {"resume": "train", "init_from": "train", "weights": "train"}.get(what, what)
-    with pytest.raises(SystemExit) as refused:
-        run_command(monkeypatch, command, *(text.format(file=file) for text in COMMANDS[what]))
-    assert not created.exists()
-    message = str(refused.value) + capsys.readouterr().out  # which names one file of several
-    assert file.name in message
-    assert "found" in message
-    assert "expected" in message
 
 
 def _read_store(path: Path) -> None:
