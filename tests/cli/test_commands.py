@@ -108,20 +108,29 @@ def test_an_evaluation_repeats_the_figures_exactly(
 
 
 @pytest.mark.parametrize(
-    ("override", "message"),
+    ("command", "override", "message"),
     [
-        ("optimizer.lr=1", r"optimizer\.lr: found 1 for a run that began with 0\.003"),
-        ("seed=3", r"seed: found 3 for a run that began with 0"),
-        ("network.widths=[4,9]", r"network\.widths: found \[4, 9\]"),
-        ("data=folder", r"found data=folder beside it"),
-        ("trainer.max_epochs=3", r"trainer\.max_epochs, .*: found 12 training steps"),
+        ("train", "optimizer.lr=1", r"optimizer\.lr: found 1 for a run that began with 0\.003"),
+        ("train", "seed=3", r"seed: found 3 for a run that began with 0"),
+        ("train", "network.widths=[4,9]", r"network\.widths: found \[4, 9\]"),
+        ("train", "data=folder", r"found data=folder beside it"),
+        ("train", "trainer.max_epochs=3", r"trainer\.max_epochs, .*: found 12 training steps"),
+        (
+            "evaluate",
+            "data.inputs=[rgb]",
+            "network: found .*|found inputs .* which the network was",
+        ),
+        ("evaluate", "data=omnisynthia", r"found class names .*'sky'.*; expected .*'beam'"),
+        ("evaluate", "network.widths=[4,9]", "network: found other tensors than in"),
     ],
 )
-def test_a_run_is_not_resumed_as_another(
-    run_folder: Path, rooms: str, override: str, message: str, run: Run
+def test_a_run_is_neither_resumed_nor_evaluated_as_another(
+    run_folder: Path, rooms: str, command: str, override: str, message: str, run: Run
 ) -> None:
+    checkpoint = f"checkpoint={run_folder / 'checkpoints' / 'best.ckpt'}"
+    begun = {"train": f"resume={run_folder}", "evaluate": checkpoint}
     with pytest.raises(SystemExit, match=message):
-        run("train", f"resume={run_folder}", rooms, override)
+        run(command, begun[command], rooms, override)
 
 
 def test_settings_of_an_evaluation(run_folder: Path, rooms: str, run: Run) -> None:
@@ -142,22 +151,6 @@ def test_settings_of_an_evaluation(run_folder: Path, rooms: str, run: Run) -> No
     assert config["data"]["panoramas_per_step"] == 4, "the option's own, not the run's"
     assert "base_level" not in config["representation"]
     assert config["representation"]["level"] == 4
-
-
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        ("data.inputs=[rgb]", "network: found .*|found inputs .* which the network was trained"),
-        ("data=omnisynthia", r"found class names .*'sky'.*; expected .*'beam'"),
-        ("network.widths=[4,9]", "network: found other tensors than in"),
-    ],
-)
-def test_what_a_checkpoint_cannot_do_is_refused(
-    run_folder: Path, rooms: str, override: str, message: str, run: Run
-) -> None:
-    checkpoint = run_folder / "checkpoints" / "best.ckpt"
-    with pytest.raises(SystemExit, match=message):
-        run("evaluate", f"checkpoint={checkpoint}", rooms, override)
 
 
 def test_a_run_starts_from_the_network_of_another(

@@ -342,38 +342,23 @@ def test_settings_that_cannot_work(
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("changes", "settings", "message"),
     [
-        ({"face_003.png": None}, r"found no face_003; expected one file for each"),
-        ({"face_003.npy": (32, 32, 3)}, r"face_003\.npy and face_003\.png; .*folder of their own"),
+        ({"face_003.png": None}, {}, r"found no face_003; expected one file for each"),
+        ({"face_003.npy": (32, 32, 3)}, {}, r"face_003\.npy and face_003\.png; .*folder of their"),
         (
             {"face_003.png": (16, 16, 3)},
+            {},
             r"face_003\.png: found 16×16×3 of uint8; expected squares, all alike: 32×32",
         ),
-        ({"face_000.png": (32, 30, 3)}, "found 32×30×3 of uint8; expected squares"),
+        ({"face_000.png": (32, 30, 3)}, {}, "found 32×30×3 of uint8; expected squares"),
+        ({}, {"kind": "labels"}, "expected labels.*Say what they are with kind=.*one channel"),
+        ({}, {"z_depth": True}, "z_depth: found true for color"),
+        ({}, {"output": "folder"}, r"expected a name ending in \.png"),
     ],
 )
 def test_results_that_cannot_be_used(
-    changes: dict[str, Any], message: str, rendered: Path, tmp_path: Path, refused: Refused
-) -> None:
-    for name, shape in changes.items():
-        if shape is None:
-            (rendered / name).unlink()
-        else:
-            write_pixels(rendered / name, np.zeros(shape, np.uint8))
-    assert re.search(message, refused(back=rendered, output=tmp_path / "back.png"))
-    assert not (tmp_path / "back.png").exists()
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"kind": "labels"}, "expected labels.*Say what they are with kind=.*one channel"),
-        ({"z_depth": True}, "z_depth: found true for color"),
-        ({"output": "folder"}, r"expected a name ending in \.png"),
-    ],
-)
-def test_settings_that_do_not_fit_the_results(
+    changes: dict[str, Any],
     settings: dict[str, Any],
     message: str,
     rendered: Path,
@@ -382,5 +367,10 @@ def test_settings_that_do_not_fit_the_results(
     refused: Refused,
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    for name, shape in changes.items():
+        if shape is None:
+            (rendered / name).unlink()
+        else:
+            write_pixels(rendered / name, np.zeros(shape, np.uint8))
     assert re.search(message, refused(**{"back": rendered, "output": "back.png"} | settings))
     assert not list(tmp_path.glob("back*"))
