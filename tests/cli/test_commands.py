@@ -118,7 +118,7 @@ def test_an_evaluation_repeats_the_figures_exactly(
         (
             "evaluate",
             "data.inputs=[rgb]",
-            "network: found .*|found inputs .* which the network was",
+            "network: found .*|found inputs .* which the",
         ),
         ("evaluate", "data=omnisynthia", r"found class names .*'sky'.*; expected .*'beam'"),
         ("evaluate", "network.widths=[4,9]", "network: found other tensors than in"),

@@ -167,15 +167,27 @@ def test_grey_palette_and_transparency(tmp_path: Path) -> None:
         np.testing.assert_array_equal(read_rgb(tmp_path / f"{name}.png"), pixels, err_msg=name)
 
 
-@pytest.mark.parametrize("orientation", range(1, 9))
-def test_jpeg_gives_the_upright_pixels_of_another_decoder(tmp_path: Path, orientation: int) -> None:
+def _save_oriented(path: Path, orientation: int) -> None:
     exif = Image.Exif()
     exif[ExifTags.Base.Orientation] = orientation
-    Image.fromarray(_smooth(24, 41)).save(tmp_path / "image.jpg", exif=exif)
+    Image.fromarray(_smooth(24, 41)).save(path, exif=exif, lossless=True)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_jpeg_gives_the_upright_pixels_of_another_decoder(tmp_path: Path, orientation: int) -> None:
+    _save_oriented(tmp_path / "image.jpg", orientation)
     expected = cv2.imread(str(tmp_path / "image.jpg"))
     assert expected is not None
     np.testing.assert_array_equal(read_rgb(tmp_path / "image.jpg"), expected[..., ::-1])
     assert read_image_size(tmp_path / "image.jpg") == expected.shape[:2]
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif", ".webp"])
+def test_lossless_formats_give_the_upright_pixels_written(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"image{suffix}"
+    _save_oriented(path, 6)
+    np.testing.assert_array_equal(read_rgb(path), np.rot90(_smooth(24, 41), -1))
+    assert read_image_size(path) == (41, 24)
 
 
 def test_broken_exif_data_do_not_matter(tmp_path: Path) -> None:
