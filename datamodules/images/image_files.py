@@ -32,17 +32,20 @@ DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".npy", ".exr")
 """Suffixes of depth maps."""
 
 
-def image_paths(pattern: str | Path, noted: Noted | None = None) -> list[Path]:
+def image_paths(
+    pattern: str | Path, noted: Noted | None = None, suffixes: Sequence[str] = IMAGE_SUFFIXES
+) -> list[Path]:
     """The images that a setting names.
 
     Args:
         pattern: A file; a folder, searched recursively; or a glob pattern, with ``**`` for folders
             of any depth. ``~`` is the home folder.
         noted: Reports folders that cannot be opened, see `Problems.noted`.
+        suffixes: Of images, in lower case.
 
     Returns:
-        Sorted paths. Of folders and patterns only files with one of `IMAGE_SUFFIXES`, in lower or
-        upper case, that are not hidden.
+        Sorted paths. Of folders and patterns only files with one of the suffixes, in lower or upper
+        case, that are not hidden.
 
     Raises:
         DataError: There are none.
@@ -56,7 +59,7 @@ def image_paths(pattern: str | Path, noted: Noted | None = None) -> list[Path]:
         found = list(walk_files(path, noted))
     else:
         found = [Path(name) for name in glob.glob(str(path), recursive=True)]  # noqa: PTH207
-    images = sorted({file for file in found if file.suffix.lower() in IMAGE_SUFFIXES})
+    images = sorted({file for file in found if file.suffix.lower() in suffixes})
     # Links that lead nowhere stay: whoever reads them says so.
     images = [file for file in images if not file.is_dir() and not file.name.startswith(".")]
     if not images:
@@ -64,7 +67,7 @@ def image_paths(pattern: str | Path, noted: Noted | None = None) -> list[Path]:
             pattern,
             found=f"{len(found)} files, none of them an image" if found else "nothing",
             expected=f"an image, a folder of images or a pattern such as 'holiday/*.jpg' "
-            f"({', '.join(IMAGE_SUFFIXES)})",
+            f"({', '.join(suffixes)})",
         )
     return images
 

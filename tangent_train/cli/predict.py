@@ -15,9 +15,10 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from datamodules.images.image_files import image_paths, short_names
+from datamodules.images.gpano import area_of_crop, whole_area
 from tangent_train.checkpoints.trained import load_trained
 from tangent_train.cli.each import Job, each
+from tangent_train.cli.predict_inputs import Inputs, is_video
 from tangent_train.cli.settings import typed
 from tangent_train.errors import SettingError, counted
 from tangent_train.inference.class_maps import Unmapped, load_class_map, map_classes
@@ -97,7 +98,7 @@ def predict(config: Mapping[str, Any]) -> None:
     """
     settings = typed(Settings, config)
     decisive = {name: config[name] for name in _DECISIVE}
-    images = _find_images(settings)
+    inputs = _inputs(settings)
     original, trained = _networks(settings)
     folder = PredictionFolder(settings.output, trained.class_names, settings.write)
     depth = _depth_folder(settings, trained)
@@ -106,28 +107,35 @@ def predict(config: Mapping[str, Any]) -> None:
     earlier = folder.earlier(decisive) if settings.resume else {}
     if not (settings.overwrite or earlier):
         folder.check()
-    entries = [entry for name, entry in earlier.items() if name in images]
-    missing = {name: path for name, path in images.items() if name not in earlier}
-    _say(f"{counted(len(images), 'images')}, {len(entries)} done already.")
-    label = _Labeller(settings, trained, predictor, judge, depth, folder, len(missing))
-    jobs = (Job(name, path, partial(label.read, name, path)) for name, path in missing.items())
-    steps = label, lambda job: job.value(), label.write
+    entries = [entry for entry in earlier.values() if inputs.has(entry)]
+    count = inputs.count()
+    _say(f"{counted(count, 'images')}, {len(entries)} done already.")
+    missing = count - len(entries)
+    label = _Labeller(settings, trained, predictor, judge, depth, folder, missing)
+    steps = label, label.read, label.write
+    labelled = set()
     shown: list[EncodedImage] = []
     saved = -math.inf
     try:
-        with closing(each("Predicting", jobs, len(missing), *steps)) as done:
+        with closing(each("Predicting", inputs.missing(earlier), missing, *steps)) as done:
             for job in done:
                 entry, pictures = ({"error": job.error}, []) if job.error else job.value
                 entries.append({"file": str(job.path), "name": job.item, **entry})
                 shown += pictures
+                labelled.add(job.path)
                 if time.monotonic() - saved > _SAVED_EVERY_S:
                     _save(folder, decisive, entries)
                     saved = time.monotonic()
     except KeyboardInterrupt:
-        _say(f"{len(entries)} of {len(images)} images are done. resume=true continues.")
+        _say(f"{len(entries)} of {count} images are done. resume=true continues.")
         raise
     finally:
         _save(folder, decisive, entries)
+    videos = _videos(inputs, entries)
+    for job in each("Making videos", videos, len(videos), partial(_write_videos, folder, labelled)):
+        if job.error:
+            entries.append({"file": str(job.path), "name": job.item, "error": job.error})
+            _save(folder, decisive, entries)
     if shown:
         folder.write_page(entries, shown)
     failed = sum("error" in entry for entry in entries)
@@ -174,12 +182,13 @@ class _Labeller:
         self._judge, self._depth, self._folder, self._count = judge, depth, folder, count
         self._number = self._shown = 0
 
-    def read(self, name: str, path: Path) -> tuple[InputImage, PanoramaArea | None]:
+    def read(self, job: Job) -> tuple[InputImage, PanoramaArea | None]:
         """Read one image; a panorama with its area."""
-        given, stem = self._settings, name.removesuffix(path.suffix)
+        given, path, frame = self._settings, job.path, job.value
+        stem = job.item.removesuffix(path.suffix)
         if given.projection == "perspective":
-            return read_photo(path, stem, self._depth, given.fov), None
-        return read_panorama(path, stem, self._depth, given.crop, given.upright)
+            return read_photo(path, stem, self._depth, given.fov, frame), None
+        return read_panorama(path, stem, self._depth, given.crop, given.upright, frame)
 
     def __call__(self, job: Job, progress: Callable[[float], object]) -> _Labelled:
         """Predict the labels of one image that was read."""
@@ -202,14 +211,29 @@ class _Labeller:
             Its entry of the summary, and pictures for the report.
         """
         image, labels, area, shown = job.value
-        self._folder.write(job.item, image, labels, area)
+        folder = self._folder.of_frames if is_video(job.path) else self._folder
+        folder.write(job.item, image, labels, area)
         rows, columns = labels.shape
         entry: Entry = {"rows": rows, "columns": columns}
+        if is_video(job.path):
+            entry["frame"] = int(job.item.rpartition("/")[2])
         if image.up is not None:
             entry["tilt_deg"] = round(math.degrees(math.acos(np.clip(image.up[2], -1, 1))), 2)
         entry["classes"] = class_shares(labels, self._folder.class_names, image, area)
         of_report = (job.item, image, labels, area)
         return entry, [self._folder.viewer_image(*of_report)] if shown else []
+
+
+def _videos(inputs: Inputs, entries: list[Entry]) -> list[Job]:
+    """The videos of which every frame was labelled."""
+    failed = {entry["file"] for entry in entries if "error" in entry}
+    return [job for job in inputs.videos.values() if str(job.path) not in failed]
+
+
+def _write_videos(
+    folder: PredictionFolder, labelled: set[Path], job: Job, _: Callable[[float], object]
+) -> None:
+    folder.write_videos(job.item, job.path, again=job.path in labelled)
 
 
 def _save(folder: PredictionFolder, settings: Mapping[str, Any], entries: list[Entry]) -> None:
@@ -228,17 +252,26 @@ def _networks(settings: Settings) -> tuple[TrainedNetwork, TrainedNetwork]:
     return trained, mapped.trained
 
 
-def _find_images(settings: Settings) -> dict[str, Path]:
-    """The images by name, without results of this command in its output folder."""
-    results = [(settings.output / kind).resolve() for kind in ("labels", "color", "overlay")]
-    paths = [
-        path
-        for path in image_paths(settings.input)
-        if not any(path.resolve().is_relative_to(folder) for folder in results)
-    ]
-    if not paths:
-        raise SettingError("input", found=f"only results in {settings.output}", expected="images")
-    return dict(zip(short_names(paths), paths, strict=True))
+def _inputs(settings: Settings) -> Inputs:
+    """The images and videos."""
+
+    def check_size(path: Path, size: tuple[int, int]) -> None:
+        if settings.projection == "perspective":
+            return
+        if settings.crop is None:
+            whole_area(path, size)
+        else:
+            area_of_crop(size, settings.crop)
+
+    inputs = Inputs.find(settings.input, settings.output, check_size)
+    pictures = {"color", "overlay"}.intersection(settings.write)
+    if inputs.videos and pictures and "labels" not in settings.write:
+        raise SettingError(
+            "write",
+            found=f"{' and '.join(sorted(pictures))} of a video without labels",
+            expected="labels too: pictures of a video are made of the labels of all its frames",
+        )
+    return inputs
 
 
 def _predictor(settings: Settings, trained: TrainedNetwork) -> Predictor:

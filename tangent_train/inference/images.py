@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from datamodules.core.panoramas import meters_to_steps, resize_nearest
-from datamodules.images.gpano import PanoramaArea, area_of, area_of_crop, up_of
+from datamodules.images.gpano import PanoramaArea, area_of, area_of_crop, up_of, whole_area
 from datamodules.images.image_files import find_depth
 from datamodules.images.pixel_files import photo_fov_deg, read_depth_m, read_rgb
 from tangent_train.errors import DataError
@@ -18,7 +18,7 @@ from tangent_train.inference.views import InputImage
 from tangent_train.rendering.upright.gravity import estimate_up
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -72,6 +72,7 @@ def read_panorama(
     depth: DepthFolder | None = None,
     crop: Sequence[float] | None = None,
     upright: Upright = None,
+    frame: Callable[[], NDArray[np.uint8]] | None = None,
 ) -> tuple[InputImage, PanoramaArea]:
     """Read a panorama of the whole sphere or a part of it.
 
@@ -82,6 +83,7 @@ def read_panorama(
         crop: Its part of the sphere, see `area_of_crop`; None for that of its GPano tags.
         upright: Source of its zenith: ``pose`` by its GPano tags, ``auto`` likewise, see
             `with_up`; None for z.
+        frame: Gives the frame, if the file is a video; videos have no GPano tags.
 
     Returns:
         The whole sphere, black outside the file's area, and that area.
@@ -90,12 +92,16 @@ def read_panorama(
         DataError: A file cannot be used.
         SettingError: The crop does not fit the image.
     """
-    rgb = read_rgb(path)
+    rgb = read_rgb(path) if frame is None else frame()
     size = (rgb.shape[0], rgb.shape[1])
-    area = area_of(path, size) if crop is None else area_of_crop(size, crop)
+    if crop is not None:
+        area = area_of_crop(size, crop)
+    else:
+        area = area_of(path, size) if frame is None else whole_area(path, size)
     whole = area.place(rgb)
     placed_depth = None if depth is None else area.place(depth.read(name, size))
-    return InputImage(whole, placed_depth, None if upright is None else up_of(path)), area
+    up = None if upright is None or frame is not None else up_of(path)
+    return InputImage(whole, placed_depth, up), area
 
 
 def with_up(image: InputImage, max_tilt_deg: float, judge: NetworkJudge) -> InputImage:
@@ -113,7 +119,11 @@ def with_up(image: InputImage, max_tilt_deg: float, judge: NetworkJudge) -> Inpu
 
 
 def read_photo(
-    path: Path, name: str, depth: DepthFolder | None = None, fov_deg: float | None = None
+    path: Path,
+    name: str,
+    depth: DepthFolder | None = None,
+    fov_deg: float | None = None,
+    frame: Callable[[], NDArray[np.uint8]] | None = None,
 ) -> InputImage:
     """Read a photo.
 
@@ -122,13 +132,15 @@ def read_photo(
         name: Its path below the folder of all images, without suffix.
         depth: File of its z-depth, for networks with depth.
         fov_deg: Its horizontal field of view; None for what its EXIF data say.
+        frame: Gives the frame, if the file is a video; videos have no EXIF data.
 
     Raises:
         DataError: A file cannot be used, or the field of view is unknown.
     """
-    rgb = read_rgb(path)
+    rgb = read_rgb(path) if frame is None else frame()
     size = (rgb.shape[0], rgb.shape[1])
-    fov_deg = photo_fov_deg(path) if fov_deg is None else fov_deg
+    if fov_deg is None and frame is None:
+        fov_deg = photo_fov_deg(path)
     if fov_deg is None:
         raise DataError(
             path,

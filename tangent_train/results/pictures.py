@@ -14,6 +14,7 @@ from tangent_train.metrics.segmentation import UNKNOWN
 
 __all__ = [
     "colorize",
+    "mixed_picture",
     "overlay_picture",
     "prediction_panel",
     "shown_arrays",
@@ -107,21 +108,29 @@ def overlay_picture(
 ) -> _Image:
     """A picture overlaid with its labels, above a legend of its classes.
 
-    Args:
-        rgb: ``(H, W, 3)``.
-        labels: ``(H, W)`` class indices; unknown pixels (0) show the picture.
-        class_names: K + 1 names.
-        opacity: Of the labels, 0 to 1.
-
     Returns:
         RGB image of the same width, a little higher; the legend grows with the width.
     """
-    colors = colorize(labels, len(class_names))
-    mixed = cv2.addWeighted(rgb, 1 - opacity, colors, opacity, 0)
-    mixed[labels == UNKNOWN] = rgb[labels == UNKNOWN]
+    mixed = mixed_picture(rgb, labels, len(class_names), opacity)
     scale = max(1, round(rgb.shape[1] / _LEGEND_WIDTH))
     seen = np.setdiff1d(np.unique(labels), [UNKNOWN])
     return np.concatenate([mixed, _legend(rgb.shape[1], seen, class_names, scale)])
+
+
+def mixed_picture(
+    rgb: _Image, labels: NDArray[np.integer], num_classes: int, opacity: float = 0.5
+) -> _Image:
+    """A picture overlaid with its labels, of the same size.
+
+    Args:
+        rgb: ``(H, W, 3)``.
+        labels: ``(H, W)`` class indices; unknown pixels (0) show the picture.
+        num_classes: K + 1.
+        opacity: Of the labels, 0 to 1.
+    """
+    mixed = cv2.addWeighted(rgb, 1 - opacity, colorize(labels, num_classes), opacity, 0)
+    mixed[labels == UNKNOWN] = rgb[labels == UNKNOWN]
+    return mixed
 
 
 def _legend(

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from datamodules.images.pixel_files import array_file, write_pixels
+from datamodules.images.pixel_files import array_file, read_pixels, write_pixels
+from datamodules.images.videos import write_video
 from tangent_train.csv_text import csv_text
 from tangent_train.errors import SettingError
 from tangent_train.files import write_text
 from tangent_train.geometry import equirect_solid_angles
 from tangent_train.json_text import parse_json
 from tangent_train.results.html import EncodedImage, encode_image, write_report
-from tangent_train.results.pictures import colorize, overlay_picture
+from tangent_train.results.pictures import colorize, mixed_picture, overlay_picture
 from tangent_train.results.tables import Table, percent
 
 if TYPE_CHECKING:
@@ -28,7 +30,7 @@ if TYPE_CHECKING:
     from tangent_train.inference.views import InputImage
     from tangent_train.rendering.mosaic import ScoreMosaic
 
-__all__ = ["Entry", "Kind", "PredictionFolder", "class_shares"]
+__all__ = ["Entry", "Kind", "PredictionFolder", "class_shares", "frame_name"]
 
 _ROWS_AT_ONCE = 64
 _SUMMARY = "summary.json"
@@ -40,8 +42,15 @@ _RESULTS = (
 Kind = Literal["labels", "color", "overlay", "probabilities"]
 """What is written of an image, each into a folder of its own."""
 
+_PICTURES: tuple[Kind, ...] = ("color", "overlay")
+
 Entry = dict[str, Any]
 """Entry of an image: file, name, rows, columns and ``classes``, or file, name and error."""
+
+
+def frame_name(video: str, number: int) -> str:
+    """Name of a frame of a video, ``walk/000012``; numbers begin with 0."""
+    return f"{video}/{number:06d}"
 
 
 def class_shares(
@@ -144,8 +153,16 @@ class PredictionFolder:
                 expected="the same",
                 remedy="Give another folder, or overwrite=true.",
             )
-        complete = {n for n in entries if all(f.is_file() for f in self.files(n).values())}
-        return {name: entry for name, entry in entries.items() if name in complete}
+        return {name: entry for name, entry in entries.items() if self._is_complete(name, entry)}
+
+    def _is_complete(self, name: str, entry: Entry) -> bool:
+        folder = self.of_frames if "frame" in entry else self
+        return all(file.is_file() for file in folder.files(name).values())
+
+    @property
+    def of_frames(self) -> PredictionFolder:
+        """The same for frames of a video, whose pictures are videos."""
+        return replace(self, kinds=[kind for kind in self.kinds if kind not in _PICTURES])
 
     def write(
         self,
@@ -170,6 +187,29 @@ class PredictionFolder:
         if "overlay" in files:
             rgb = image.rgb if area is None else area.cut(image.rgb)
             write_pixels(files["overlay"], overlay_picture(rgb, labels, self.class_names))
+
+    def write_videos(self, name: str, path: Path, *, again: bool) -> None:
+        """Write the pictures that are wanted of a video, from the labels of all its frames.
+
+        Args:
+            name: Of the video.
+            path: Its file.
+            again: Whether to replace existing ones.
+
+        Raises:
+            DataError: The video, or the labels of a frame, cannot be read.
+        """
+        for kind in _PICTURES:
+            file = self.path / kind / f"{name}.mp4"
+            if kind in self.kinds and (again or not file.exists()):
+                write_video(file, path, partial(self._painted, name, kind))
+
+    def _painted(
+        self, name: str, kind: Kind, number: int, rgb: NDArray[np.uint8]
+    ) -> NDArray[np.uint8]:
+        labels = read_pixels(self.of_frames.files(frame_name(name, number))["labels"], indices=True)
+        count = len(self.class_names)
+        return colorize(labels, count) if kind == "color" else mixed_picture(rgb, labels, count)
 
     def write_probabilities(
         self, name: str, scores: ScoreMosaic, area: PanoramaArea | None = None

@@ -1,0 +1,114 @@
+"""What ``tangent-predict`` labels: images, and the frames of videos."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from datamodules.images.image_files import IMAGE_SUFFIXES, image_paths, short_names
+from datamodules.images.videos import VIDEO_SUFFIXES, read_frames, read_video_size
+from tangent_train.cli.each import Job
+from tangent_train.errors import DataError, SettingError
+from tangent_train.results.predictions import frame_name
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Container, Iterator
+    from pathlib import Path
+
+    from tangent_train.results.predictions import Entry
+
+__all__ = ["Inputs", "is_video"]
+
+
+def is_video(path: Path) -> bool:
+    """Whether a file is a video, by its suffix."""
+    return path.suffix.lower() in VIDEO_SUFFIXES
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Images and videos by name.
+
+    Attributes:
+        files: All files, sorted.
+        videos: Jobs of the videos among them: the number of frames, or an error.
+    """
+
+    files: dict[str, Path]
+    videos: dict[str, Job]
+
+    @classmethod
+    def find(
+        cls, pattern: str, output: Path, check_size: Callable[[Path, tuple[int, int]], object]
+    ) -> Inputs:
+        """The files that a setting names, without results of this command.
+
+        Args:
+            pattern: See `image_paths`.
+            output: Where results are.
+            check_size: Refuses videos by their rows and columns.
+
+        Raises:
+            DataError: There are none.
+            SettingError: There are only results.
+        """
+        results = [(output / kind).resolve() for kind in ("labels", "color", "overlay")]
+        paths = [
+            path
+            for path in image_paths(pattern, suffixes=(*IMAGE_SUFFIXES, *VIDEO_SUFFIXES))
+            if not any(path.resolve().is_relative_to(folder) for folder in results)
+        ]
+        if not paths:
+            raise SettingError("input", found=f"only results in {output}", expected="images")
+
+        def frames(job: Job) -> int:
+            count, rows, columns = read_video_size(job.path)
+            check_size(job.path, (rows, columns))
+            return count
+
+        names = short_names(paths)
+        folders = {parent.casefold() for name in names for parent in _parents(name)}
+        files = {
+            # A folder of images may have the name of a video, whose frames get a folder too.
+            name + path.suffix if is_video(path) and name.casefold() in folders else name: path
+            for name, path in zip(names, paths, strict=True)
+        }
+        videos = {name: Job(name, path) for name, path in files.items() if is_video(path)}
+        return cls(files, {name: job.then(frames) for name, job in videos.items()})
+
+    def count(self) -> int:
+        """Number of images and frames; a video that cannot be read counts as one."""
+        frames = sum(1 if job.error else job.value for job in self.videos.values())
+        return len(self.files) - len(self.videos) + frames
+
+    def has(self, entry: Entry) -> bool:
+        """Whether an entry of an earlier summary is of one of these."""
+        name: str = entry["name"]
+        return (name.rpartition("/")[0] if "frame" in entry else name) in self.files
+
+    def missing(self, done: Container[str]) -> Iterator[Job]:
+        """Images, and frames with what gives their pixels, that are not done yet."""
+        for name, path in self.files.items():
+            if name in self.videos:
+                yield from self._frames(self.videos[name], done)
+            elif name not in done:
+                yield Job(name, path)
+
+    def _frames(self, video: Job, done: Container[str]) -> Iterator[Job]:
+        if video.error:
+            yield video
+            return
+        if all(frame_name(video.item, number) in done for number in range(video.value)):
+            return
+        number = -1
+        try:
+            for number, frame in enumerate(read_frames(video.path)):
+                if (name := frame_name(video.item, number)) not in done:
+                    yield Job(name, video.path, frame)
+        except DataError as error:
+            yield Job(frame_name(video.item, number + 1), video.path, error=str(error))
+
+
+def _parents(name: str) -> list[str]:
+    parts = name.split("/")
+    return ["/".join(parts[:end]) for end in range(1, len(parts))]

@@ -1,0 +1,154 @@
+"""`tangent-predict` on videos: labels of their frames, and videos of these."""
+
+from __future__ import annotations
+
+import json
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from datamodules.images.palette import class_colors
+from datamodules.images.videos import read_frames
+from tests.cli.tiny_runs import Run
+from tests.inference.trained import CLASS_NAMES, sphere, write_checkpoint
+
+av: Any = pytest.importorskip("av")
+
+TIMES = [0, 1, 2, 4, 5, 9, 10]
+"""Of the frames, in sixteenths of a second: the rate varies."""
+
+
+def _write_video(path: Path, shape: tuple[int, int] = (32, 64)) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with av.open(str(path), "w") as output:
+        stream = output.add_stream("mpeg4", rate=16)
+        stream.height, stream.width = shape
+        stream.codec_context.time_base = Fraction(1, 16)
+        for number, time in enumerate(TIMES):
+            rgb = np.roll(sphere(shape[0]), 5 * number, axis=1)[:, : shape[1]]
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(rgb), format="rgb24")
+            frame.pts, frame.time_base = time, Fraction(1, 16)
+            output.mux(stream.encode(frame))
+        output.mux(stream.encode(None))
+    return path
+
+
+def _decoded(path: Path) -> tuple[NDArray[np.uint8], list[float]]:
+    with av.open(str(path)) as container:
+        frames = list(container.decode(video=0))
+    return np.stack([frame.to_ndarray(format="rgb24") for frame in frames]), [
+        frame.time for frame in frames
+    ]
+
+
+def _predict(run: Run, tmp_path: Path, **settings: Any) -> None:
+    checkpoint = tmp_path / "model.ckpt"
+    if not checkpoint.exists():
+        write_checkpoint(checkpoint)
+    given = {"checkpoint": checkpoint, "input": "in", "output": "out", "report": 0, **settings}
+    run("predict", *(f"{name}={value}" for name, value in given.items()))
+
+
+def _labels(folder: Path) -> dict[str, NDArray[np.uint8]]:
+    paths = sorted(folder.rglob("*.png"))
+    found = {path.stem: cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in paths}
+    return {name: labels for name, labels in found.items() if labels is not None}
+
+
+def _entries(folder: Path) -> dict[str, Any]:
+    images = json.loads((folder / "summary.json").read_text())["images"]
+    return {entry["name"]: entry for entry in images}
+
+
+def test_frames_get_the_labels_of_images_and_pictures_are_a_video(tmp_path: Path, run: Run) -> None:
+    """Beside a folder of images that has the video's name."""
+    video = _write_video(tmp_path / "in" / "walk.mp4")
+    frames, times = _decoded(video)
+    (tmp_path / "in" / "walk").mkdir()
+    for number, rgb in enumerate(frames):
+        cv2.imwrite(str(tmp_path / "in" / "walk" / f"{number:06d}.png"), rgb[..., ::-1])
+    _predict(run, tmp_path)
+    of_images = _labels(tmp_path / "out" / "labels" / "walk")
+    of_frames = _labels(tmp_path / "out" / "labels" / "walk.mp4")
+    assert sorted(of_frames) == [f"{number:06d}" for number in range(len(TIMES))]
+    for name, labels in of_frames.items():
+        np.testing.assert_array_equal(labels, of_images[name])
+    palette = class_colors(len(CLASS_NAMES)).astype(float)
+    colors = palette[np.stack(list(of_frames.values()))]
+    for kind, expected in (("color", colors), ("overlay", (colors + frames) / 2)):
+        made, made_times = _decoded(tmp_path / "out" / kind / "walk.mp4.mp4")
+        assert made.shape == frames.shape
+        assert made_times == pytest.approx(times)
+        assert np.abs(made - expected).mean() < 8  # compressed, with colours at half resolution
+    entries = _entries(tmp_path / "out")
+    assert len(entries) == 2 * len(TIMES)
+    assert entries["walk.mp4/000003"]["classes"] == entries["walk/000003"]["classes"]
+
+
+def test_an_interrupted_video_is_resumed(
+    tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    video = _write_video(tmp_path / "in" / "walk.mp4")
+
+    def interrupted(path: Path) -> Any:
+        for number, frame in enumerate(read_frames(path)):
+            if number == 4:
+                raise KeyboardInterrupt
+            yield frame
+
+    monkeypatch.setattr("tangent_train.cli.predict_inputs.read_frames", interrupted)
+    with pytest.raises(SystemExit) as stopped:
+        _predict(run, tmp_path, input=video)
+    assert stopped.value.code == 130
+    assert len(_entries(tmp_path / "out")) == 4
+    assert not (tmp_path / "out" / "overlay").exists()
+    monkeypatch.setattr("tangent_train.cli.predict_inputs.read_frames", read_frames)
+    before = (tmp_path / "out" / "labels" / "walk" / "000003.png").stat().st_mtime_ns
+    _predict(run, tmp_path, input=video, resume="true")
+    assert (tmp_path / "out" / "labels" / "walk" / "000003.png").stat().st_mtime_ns == before
+    assert [entry["frame"] for entry in _entries(tmp_path / "out").values()] == list(range(7))
+    assert len(_decoded(tmp_path / "out" / "overlay" / "walk.mp4")[0]) == len(TIMES)
+    _predict(run, tmp_path, input=video, resume="true")
+    _predict(run, tmp_path, input=video, output="again")
+    first, second = (_labels(tmp_path / name / "labels") for name in ("out", "again"))
+    assert first.keys() == second.keys()
+    assert all((first[name] == second[name]).all() for name in first)
+
+
+def test_videos_that_cannot_be_used(
+    tmp_path: Path, run: Run, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each is named once, and the others are labelled."""
+    folder = tmp_path / "in"
+    good = _write_video(folder / "good.mp4")
+    _write_video(folder / "narrow.mp4", (32, 48))
+    (folder / "broken.mp4").write_bytes(b"nothing" * 100)
+    (folder / "cut.mp4").write_bytes(good.read_bytes()[:900])
+    with av.open(str(folder / "sound.mp4"), "w") as output:
+        stream = output.add_stream("aac", rate=44100)
+        sound = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), "fltp", "mono")
+        sound.sample_rate = 44100
+        output.mux(stream.encode(sound))
+        output.mux(stream.encode(None))
+    with pytest.raises(SystemExit, match="4 of 11 images could not be used"):
+        _predict(run, tmp_path, write="[labels]")
+    said = " ".join(capsys.readouterr().out.split())
+    for name, message in (
+        ("broken", "cannot be decoded"),
+        ("cut", "found no frames"),
+        ("narrow", "expected a whole panorama"),
+        ("sound", "no video stream"),
+    ):
+        assert said.count(f"{name}.mp4: found") == 1
+        assert message in _entries(tmp_path / "out")[name]["error"]
+    with pytest.raises(SystemExit, match="write: found color of a video without labels"):
+        _predict(run, tmp_path, write="[color]", output="other")
+    monkeypatch.setitem(__import__("sys").modules, "av", None)
+    with pytest.raises(SystemExit, match="1 of 1 images"):
+        _predict(run, tmp_path, input=good, output="other")
+    assert "pip install 'tangent-train[video]'" in " ".join(capsys.readouterr().out.split())
