@@ -1,20 +1,13 @@
-"""From one's own photos to one's own panoramas with one command."""
+"""From one's own photos to one's own panoramas: what is said before the first stage."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from tests.cli.tiny_runs import results, run_command
-from tests.datamodules.folder.folder_format import (
-    NAMES,
-    pixels_of_classes,
-    write_classes,
-    write_data_set,
-)
+from tests.cli.tiny_runs import run_command
+from tests.datamodules.folder.folder_format import write_classes, write_data_set
 from tests.datamodules.folder.photo_format import write_photo, write_photos
 
 _SETTINGS = (
@@ -43,27 +36,6 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     write_data_set(tmp_path / "my_rooms", scenes=5)
     write_photos(tmp_path / "my_photos", scenes=5)
     return tmp_path
-
-
-def test_from_photos_to_panoramas(
-    here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for root in ("my_rooms", "my_photos"):
-        (here / root / "test.txt").write_text("scene_3/view.0\nscene_3/view.1\n")
-    normalization = "data.normalization={mean:[0.1,0.2,0.3],std:[0.5,0.5,0.5]}"
-    run_command(monkeypatch, "transfer", *_SETTINGS, normalization)
-    assert "Note:" not in capsys.readouterr().out, "the same scene is held out of both"
-    rows = json.loads((here / "runs/transfer/transfer/transfer.json").read_text())["rows"]
-    data = {row["row"]: row["data"] for row in rows}
-    photos, panoramas = "FolderPhotos", "FolderPanoramas"
-    assert data == {"P": photos, "S": panoramas, "P-FT-1": photos, "S-FT-1": panoramas}
-    expected = pixels_of_classes(here / "my_rooms", ["scene_3/view.0", "scene_3/view.1"])
-    for name in data:
-        found = results(_SEED_0 / name)
-        assert found["images"] == 2
-        assert [row["class"] for row in found["classes"]] == list(NAMES)
-        if name[0] == "S":
-            assert np.array(found["confusion"]).sum(axis=1).tolist() == expected
 
 
 def test_other_classes_are_refused_with_both_files(
