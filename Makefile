@@ -1,13 +1,14 @@
 # make demo   sets up, makes furnished rooms, trains on them and shows the results
 # make test   sets up and runs the tests, 3 to 5 minutes on two cores
 # make test-all  with the slow ones and the coverage, about 35 minutes; what CI runs
+# make real ZIND=zind/sample_tour NETWORK=net.onnx  the tables of docs/real_panoramas.md, in hours
 # make bench  measures speed and memory, under 10 minutes; make bench-compare looks for regressions
 PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 DEMO := runs/make_demo
 
-.PHONY: install demo test test-all lint bench bench-compare
+.PHONY: install demo test test-all lint real bench bench-compare
 
 install: $(READY)
 
@@ -41,6 +42,14 @@ lint: install
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+# NETWORK was written by tangent-import; repeated, both commands go on where they were interrupted.
+real: install
+	$(BIN)/tangent-transfer experiment=zero_shot name=real/$(basename $(notdir $(NETWORK))) checkpoint=$(NETWORK) \
+		data=zind data.root=$(ZIND) data.test_fraction=1 data.doors=ignore \
+		class_map=ade20k_to_zind_layout unmapped=never
+	$(BIN)/tangent-keypoints data=zind_pairs data.root=$(ZIND) data.max_distance_m=3 \
+		output=runs/real/keypoints
 
 bench: install
 	$(BIN)/python -m benchmarks
