@@ -90,13 +90,6 @@ class StanfordAreas(ImageDataModule):
         rooms: set[tuple[str, str, int]] = set()
         if self.validation_fraction:
             rooms = draw_groups((p.room for p in training), self.validation_fraction, self.seed)
-            if training and not rooms:
-                raise DataError(
-                    root,
-                    found="one training room",
-                    expected="two or more, to keep some for validation",
-                    remedy="Set data.validation_fraction=0, or use more rooms.",
-                )
         return self.reader, {
             "train": [picture.image for picture in training if picture.room not in rooms],
             "val": [picture.image for picture in training if picture.room in rooms],

@@ -13,7 +13,7 @@ from datamodules.core.image_module import ImageDataModule
 from datamodules.core.inputs import Input
 from datamodules.core.reading import ImageFiles
 from datamodules.synthia.reader import CLASSES, NORMALIZATIONS, Formats, SynthiaReader
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import SettingError
 
 if TYPE_CHECKING:
     from datamodules.core.found import Split
@@ -140,10 +140,7 @@ def divide(
         frames: Of every sequence, in order: the images of each frame.
         test: Sequences for the test; all others are for training.
         validation_fraction: Share of each training sequence for validation: at least one frame,
-            never all; 0 for no validation.
-
-    Raises:
-        DataError: A training sequence has a single frame, and validation needs one.
+            never all, so none of a single one; 0 for no validation.
     """
     splits: dict[Split, list[ImageFiles]] = {"train": [], "val": [], "test": []}
     for sequence, found in frames.items():
@@ -151,13 +148,6 @@ def divide(
         if sequence in test:
             splits["test"] += chain.from_iterable(found)
             continue
-        if validation_fraction and count == 1:
-            raise DataError(
-                f"SYNTHIA sequence {sequence}",
-                found="one frame",
-                expected="two or more, to keep some for validation",
-                remedy="Set data.validation_fraction=0, or use more frames.",
-            )
         held = min(max(1, round(validation_fraction * count)), count - 1)
         last = count - held if validation_fraction else count
         splits["train"] += chain.from_iterable(found[:last])

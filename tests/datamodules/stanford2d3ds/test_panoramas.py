@@ -72,11 +72,12 @@ def test_folds_are_disjoint_and_rooms_stay_whole(
     assert not rooms["train"] & rooms["val"]
 
 
-def test_one_training_room(fabricate_stanford: FabricateStanford, tmp_path: Path, erp: Any) -> None:
+@pytest.mark.parametrize("fraction", [0, 0.1])
+def test_of_one_training_room_nothing_is_held_out(
+    fraction: float, fabricate_stanford: FabricateStanford, tmp_path: Path, erp: Any
+) -> None:
     root = fabricate_stanford(tmp_path, {"1": ("office_1",) * 3, "5a": ("office_1",)})
-    with pytest.raises(DataError, match="one training room"):
-        Stanford2D3DS(root, erp, areas=("1", "5a")).setup()
-    module = Stanford2D3DS(root, erp, areas=("1", "5a"), validation_fraction=0)
+    module = Stanford2D3DS(root, erp, areas=("1", "5a"), validation_fraction=fraction)
     assert [len(names_of(module, split)) for split in ("train", "val", "test")] == [3, 0, 1]
 
 
