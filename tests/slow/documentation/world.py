@@ -15,6 +15,7 @@ import traceback
 from pathlib import Path
 from typing import Any, NoReturn
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -96,6 +97,11 @@ def _write_pictures(folder: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(path), panorama[..., 0] // 64)
     (folder / "labels" / "classes.json").write_text('["wall", "person", "sky", "floor"]')
+    with av.open(str(folder / "walk.mp4"), "w") as output:
+        stream: Any = output.add_stream("mpeg4", rate=5)
+        stream.height, stream.width = panorama.shape[:2]
+        output.mux(stream.encode(av.VideoFrame.from_ndarray(panorama, format="bgr24")))
+        output.mux(stream.encode(None))
     cv2.imwrite(str(folder / "strip.jpg"), cv2.resize(panorama, (288, 64)))
     exif = Image.Exif()
     exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = 24
