@@ -7,7 +7,6 @@ import sys
 import time
 from contextlib import closing
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -16,10 +15,14 @@ from rich.console import Console
 from rich.table import Table
 
 from datamodules.images.gpano import area_of_crop, whole_area
+from datamodules.images.masks import Mask, Masks
+from datamodules.images.pixel_files import read_pixels
 from tangent_train.checkpoints.trained import load_trained
 from tangent_train.cli.each import Job, each
 from tangent_train.cli.predict_inputs import Inputs, is_video
+from tangent_train.cli.predict_shards import PredictionShard
 from tangent_train.cli.settings import typed
+from tangent_train.cli.shard import Shard
 from tangent_train.errors import SettingError, counted
 from tangent_train.inference.class_maps import Unmapped, load_class_map, map_classes
 from tangent_train.inference.images import DepthFolder, read_panorama, read_photo, with_up
@@ -34,7 +37,7 @@ from tangent_train.results.predictions import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -47,7 +50,8 @@ __all__ = ["predict"]
 
 _DECISIVE = (
     "checkpoint", "class_map", "unmapped", "depth_scale", "projection", "crop", "fov", "level",
-    "levels", "base_level", "blend", "rotations", "upright", "max_tilt_deg", "min_confidence",
+    "levels", "base_level", "blend", "rotations", "upright", "max_tilt_deg", "mask",
+    "min_confidence",
 )  # fmt: skip
 """Settings that labels depend on: those of resumed predictions must be the same."""
 
@@ -76,11 +80,13 @@ class Settings:
     rotations: int
     upright: Literal["pose", "auto"] | None
     max_tilt_deg: float
+    mask: Mask
     min_confidence: float
     write: tuple[Kind, ...]
     report: int
     overwrite: bool
     resume: bool
+    shard: str | int | None
     images_per_forward: int | None
     device: str
     trust: tuple[str, ...]
@@ -98,52 +104,92 @@ def predict(config: Mapping[str, Any]) -> None:
     """
     settings = typed(Settings, config)
     decisive = {name: config[name] for name in _DECISIVE}
-    inputs = _inputs(settings)
+    inputs, shard = _inputs(settings), Shard.of(settings.shard)
     original, trained = _networks(settings)
     folder = PredictionFolder(settings.output, trained.class_names, settings.write)
-    depth = _depth_folder(settings, trained)
-    predictor = _predictor(settings, trained)
-    judge = NetworkJudge.of(original, predictor.device)
-    earlier = folder.earlier(decisive) if settings.resume else {}
-    if not (settings.overwrite or earlier):
+    label = _Labeller(settings, original, trained, folder, inputs.spread(settings.report))
+    if shard is None:
+        done = _label(settings, decisive, inputs, label, folder)
+        _finish(settings, inputs, label, folder, done)
+    else:
+        together = {**decisive, "write": list(settings.write)}
+        part = PredictionShard(shard, settings.output / "shards", list(inputs.files), together)
+        done = _label(settings, decisive, inputs.part(shard), label, folder, part)
+        part.save(done, done=True)
+        count, entries = part.together()
+        _say(f"Shard {shard} is done, as are {count - 1} others.")
+        if count == shard.count:
+            folder.write_summary(decisive, entries)
+            _finish(settings, inputs, label, folder, entries)
+    if failed := sum("error" in entry for entry in done):
+        sys.exit(f"tangent-predict: {failed} of {len(done)} images could not be used, see above")
+
+
+def _label(
+    settings: Settings,
+    decisive: Mapping[str, Any],
+    inputs: Inputs,
+    label: _Labeller,
+    folder: PredictionFolder,
+    part: PredictionShard | None = None,
+) -> list[Entry]:
+    """Label images, those of a shard or all; returns their entries, with those done before."""
+    summary = None if part is None else part.path
+    earlier = folder.earlier(decisive, summary) if settings.resume else {}
+    if not (settings.overwrite or earlier or (part is not None and part.folder.exists())):
         folder.check()
     entries = [entry for entry in earlier.values() if inputs.has(entry)]
+    if part is not None:
+        part.begin(entries, resume=settings.resume, overwrite=settings.overwrite)
+
+    def save() -> None:
+        if part is not None:
+            part.save(entries)
+        elif any("classes" in e for e in entries):  # else nothing is in the way of another try
+            folder.write_summary(decisive, entries)
+
     count = inputs.count()
     _say(f"{counted(count, 'images')}, {len(entries)} done already.")
     missing = count - len(entries)
-    label = _Labeller(settings, trained, predictor, judge, depth, folder, missing)
     steps = label, label.read, label.write
     labelled = set()
-    shown: list[EncodedImage] = []
     saved = -math.inf
     try:
         with closing(each("Predicting", inputs.missing(earlier), missing, *steps)) as done:
             for job in done:
-                entry, pictures = ({"error": job.error}, []) if job.error else job.value
+                entry = {"error": job.error} if job.error else job.value
                 entries.append({"file": str(job.path), "name": job.item, **entry})
-                shown += pictures
                 labelled.add(job.path)
                 if time.monotonic() - saved > _SAVED_EVERY_S:
-                    _save(folder, decisive, entries)
+                    save()
                     saved = time.monotonic()
     except KeyboardInterrupt:
         _say(f"{len(entries)} of {count} images are done. resume=true continues.")
         raise
     finally:
-        _save(folder, decisive, entries)
-    videos = _videos(inputs, entries)
-    for job in each("Making videos", videos, len(videos), partial(_write_videos, folder, labelled)):
-        if job.error:
-            entries.append({"file": str(job.path), "name": job.item, "error": job.error})
-            _save(folder, decisive, entries)
-    if shown:
-        folder.write_page(entries, shown)
-    failed = sum("error" in entry for entry in entries)
-    if failed < len(entries):
-        _say(folder.mean_shares(entries).terminal())
-        _say(f"Results are in {settings.output}.")
-    if failed:
-        sys.exit(f"tangent-predict: {failed} of {len(entries)} images could not be used, see above")
+        save()
+    if unmade := _make_videos(inputs, folder, entries, labelled):
+        entries += unmade
+        save()
+    return entries
+
+
+def _finish(
+    settings: Settings,
+    inputs: Inputs,
+    label: _Labeller,
+    folder: PredictionFolder,
+    entries: Sequence[Entry],
+) -> None:
+    """Write the report, and print the shares of the classes."""
+    used = {entry["name"] for entry in entries if "classes" in entry}
+    if not used:
+        return
+    pictures = label.pictures({name: path for name, path in inputs.files.items() if name in used})
+    if pictures:
+        folder.write_page(entries, pictures)
+    _say(folder.mean_shares(entries).terminal())
+    _say(f"Results are in {settings.output}.")
 
 
 class _Labelled(NamedTuple):
@@ -152,7 +198,6 @@ class _Labelled(NamedTuple):
     image: InputImage
     labels: NDArray[np.unsignedinteger]
     area: PanoramaArea | None
-    shown: bool
 
 
 class _Labeller:
@@ -160,27 +205,26 @@ class _Labeller:
 
     Args:
         settings: Of the command.
+        original: The network with its own classes, which tells which way is up.
         trained: The network.
-        predictor: Labels images with it.
-        judge: Tells with it which way is up.
-        depth: Depth images, for networks that take depth.
         folder: Output folder.
-        count: Number of images; those of the report are spread over them.
+        shown: Names of the images of the report.
     """
 
     def __init__(
         self,
         settings: Settings,
+        original: TrainedNetwork,
         trained: TrainedNetwork,
-        predictor: Predictor,
-        judge: NetworkJudge,
-        depth: DepthFolder | None,
         folder: PredictionFolder,
-        count: int,
+        shown: Sequence[str],
     ) -> None:
-        self._settings, self._trained, self._predictor = settings, trained, predictor
-        self._judge, self._depth, self._folder, self._count = judge, depth, folder, count
-        self._number = self._shown = 0
+        self._settings, self._trained, self._folder = settings, trained, folder
+        self._predictor = _predictor(settings, trained)
+        self._judge = NetworkJudge.of(original, self._predictor.device)
+        self._depth = _depth_folder(settings, trained)
+        self._masks = _masks(settings)
+        self._shown: dict[str, EncodedImage | None] = dict.fromkeys(shown)
 
     def read(self, job: Job) -> tuple[InputImage, PanoramaArea | None]:
         """Read one image; a panorama with its area."""
@@ -199,18 +243,14 @@ class _Labeller:
         scores = self._predictor.predict(image, progress, probabilities=probabilities)
         self._folder.write_probabilities(job.item, scores, area)  # here: scores are large
         labels = self._trained.labels(scores.labels())
-        shown = self._number * self._settings.report >= self._shown * self._count
-        shown = shown and self._shown < self._settings.report
-        self._number, self._shown = self._number + 1, self._shown + shown
-        return _Labelled(image, labels if area is None else area.cut(labels), area, shown)
+        return _Labelled(image, labels if area is None else area.cut(labels), area)
 
-    def write(self, job: Job) -> tuple[Entry, list[EncodedImage]]:
-        """Write the labels of one image.
-
-        Returns:
-            Its entry of the summary, and pictures for the report.
-        """
-        image, labels, area, shown = job.value
+    def write(self, job: Job) -> Entry:
+        """Write the labels of one image, and return its entry of the summary."""
+        image, labels, area = job.value
+        if area is not None:
+            counts = area.cut(self._masks.read(job.item, area))
+            labels = np.where(counts, labels, labels.dtype.type(0))
         folder = self._folder.of_frames if is_video(job.path) else self._folder
         folder.write(job.item, image, labels, area)
         rows, columns = labels.shape
@@ -220,25 +260,37 @@ class _Labeller:
         if image.up is not None:
             entry["tilt_deg"] = round(math.degrees(math.acos(np.clip(image.up[2], -1, 1))), 2)
         entry["classes"] = class_shares(labels, self._folder.class_names, image, area)
-        of_report = (job.item, image, labels, area)
-        return entry, [self._folder.viewer_image(*of_report)] if shown else []
+        if job.item in self._shown:
+            self._shown[job.item] = self._folder.viewer_image(job.item, image, labels, area)
+        return entry
+
+    def pictures(self, images: Mapping[str, Path]) -> list[EncodedImage]:
+        """Pictures for the report; images labelled earlier or elsewhere are read again.
+
+        Args:
+            images: That have been labelled.
+        """
+        for name in self._shown.keys() & images.keys():
+            labels = self._folder.files(name).get("labels")
+            if self._shown[name] is None and labels is not None:
+                image, area = self.read(Job(name, images[name]))
+                read = read_pixels(labels, indices=True)
+                self._shown[name] = self._folder.viewer_image(name, image, read, area)
+        return [picture for picture in self._shown.values() if picture is not None]
 
 
-def _videos(inputs: Inputs, entries: list[Entry]) -> list[Job]:
-    """The videos of which every frame was labelled."""
+def _make_videos(
+    inputs: Inputs, folder: PredictionFolder, entries: Sequence[Entry], labelled: set[Path]
+) -> list[Entry]:
+    """Make pictures of the videos of which every frame was labelled; returns the errors."""
     failed = {entry["file"] for entry in entries if "error" in entry}
-    return [job for job in inputs.videos.values() if str(job.path) not in failed]
+    videos = [job for job in inputs.videos.values() if str(job.path) not in failed]
 
+    def write(job: Job, _: Callable[[float], object]) -> None:
+        folder.write_videos(job.item, job.path, again=job.path in labelled)
 
-def _write_videos(
-    folder: PredictionFolder, labelled: set[Path], job: Job, _: Callable[[float], object]
-) -> None:
-    folder.write_videos(job.item, job.path, again=job.path in labelled)
-
-
-def _save(folder: PredictionFolder, settings: Mapping[str, Any], entries: list[Entry]) -> None:
-    if any("classes" in entry for entry in entries):  # else nothing is in the way of another try
-        folder.write_summary(settings, entries)
+    done = each("Making videos", videos, len(videos), write)
+    return [{"file": str(j.path), "name": j.item, "error": j.error} for j in done if j.error]
 
 
 def _networks(settings: Settings) -> tuple[TrainedNetwork, TrainedNetwork]:
@@ -285,6 +337,12 @@ def _predictor(settings: Settings, trained: TrainedNetwork) -> Predictor:
         views = PanoramaViews(trained, levels, *how, settings.rotations, upright=upright)
     of_forward = settings.device, settings.images_per_forward
     return Predictor(trained, views, *of_forward, settings.min_confidence)
+
+
+def _masks(settings: Settings) -> Masks:
+    if settings.mask is not None and settings.projection == "perspective":
+        raise SettingError("mask", found=settings.mask, expected="null for photos")
+    return Masks(settings.mask)
 
 
 def _depth_folder(settings: Settings, trained: TrainedNetwork) -> DepthFolder | None:

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Container, Iterator
     from pathlib import Path
 
+    from tangent_train.cli.shard import Shard
     from tangent_train.results.predictions import Entry
 
 __all__ = ["Inputs", "is_video"]
@@ -75,6 +76,27 @@ class Inputs:
         }
         videos = {name: Job(name, path) for name, path in files.items() if is_video(path)}
         return cls(files, {name: job.then(frames) for name, job in videos.items()})
+
+    def part(self, shard: Shard) -> Inputs:
+        """Those of a shard; a video is not divided."""
+        names = shard.part(list(self.files))
+        files = {name: self.files[name] for name in names}
+        return Inputs(files, {name: job for name, job in self.videos.items() if name in files})
+
+    def spread(self, count: int) -> list[str]:
+        """Names of some images and frames, spread over all."""
+        total = self.count()
+        count = min(count, total)
+        chosen = {-(-number * total // count) for number in range(count)}
+        return [name for number, name in enumerate(self._names()) if number in chosen]
+
+    def _names(self) -> Iterator[str]:
+        for name in self.files:
+            video = self.videos.get(name)
+            if video is None or video.error:
+                yield name
+            else:
+                yield from (frame_name(name, number) for number in range(video.value))
 
     def count(self) -> int:
         """Number of images and frames; a video that cannot be read counts as one."""

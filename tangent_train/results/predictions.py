@@ -36,7 +36,7 @@ _ROWS_AT_ONCE = 64
 _SUMMARY = "summary.json"
 _RESULTS = (
     "labels", "color", "overlay", "probabilities",
-    "classes.json", _SUMMARY, "summary.csv", "report.html",
+    "classes.json", _SUMMARY, "summary.csv", "report.html", "shards",
 )  # fmt: skip
 
 Kind = Literal["labels", "color", "overlay", "probabilities"]
@@ -131,17 +131,18 @@ class PredictionFolder:
                 remedy="Give another folder, resume=true to keep them, or overwrite=true.",
             )
 
-    def earlier(self, settings: Mapping[str, Any]) -> dict[str, Entry]:
+    def earlier(self, settings: Mapping[str, Any], summary: Path | None = None) -> dict[str, Entry]:
         """The entries of the images whose files are there, by name.
 
         Args:
             settings: Settings that earlier predictions must share.
+            summary: Where they are; by default in ``summary.json``.
 
         Raises:
             SettingError: They have other settings.
         """
         try:
-            content = parse_json((self.path / _SUMMARY).read_bytes())
+            content = parse_json((summary or self.path / _SUMMARY).read_bytes())
             entries = {entry["name"]: entry for entry in content["images"] if "classes" in entry}
             changed = [f"{n}={v}" for n, v in settings.items() if v != content[n]]
         except (OSError, ValueError, KeyError, TypeError):

@@ -1,0 +1,125 @@
+"""Shards of predictions: what each has done, in a file of its own, and all of them together."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NoReturn
+
+from tangent_train.errors import SettingError
+from tangent_train.files import write_text
+from tangent_train.json_text import parse_json
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+    from tangent_train.cli.shard import Shard
+    from tangent_train.results.predictions import Entry
+
+__all__ = ["PredictionShard"]
+
+
+@dataclass(frozen=True)
+class PredictionShard:
+    """One of the shards of predictions, which know of each other by their files alone.
+
+    Attributes:
+        shard: Which one.
+        folder: Of the files of all, ``3-of-16.json``.
+        names: Of the images and videos of all, in order.
+        settings: Settings that all must share.
+    """
+
+    shard: Shard
+    folder: Path
+    names: Sequence[str]
+    settings: Mapping[str, Any]
+
+    @property
+    def path(self) -> Path:
+        """Its file, which is there from its start."""
+        return self._path(self.shard.number)
+
+    def begin(self, entries: Sequence[Entry], *, resume: bool, overwrite: bool) -> None:
+        """Say that it has begun.
+
+        Args:
+            entries: Of images done before.
+            resume: Whether it may have begun before.
+            overwrite: Whether it may replace what is there.
+
+        Raises:
+            SettingError: It has begun before, or others in the folder do not belong to it.
+        """
+        known = self.path.exists()
+        if known and not (resume or overwrite):
+            raise SettingError(
+                "shard",
+                found=f"{self.shard}, which has {self.path}",
+                expected="one that has not begun",
+                remedy="resume=true continues it, overwrite=true does it again.",
+            )
+        # First: of two that begin at once and do not belong together, one sees the other.
+        self.save(entries)
+        for path in self.folder.glob("[!.]*.json"):
+            if not (content := _read(path)):
+                continue  # taken back meanwhile
+            unlike = [name for name, value in self._common.items() if content.get(name) != value]
+            if unlike and not overwrite:
+                if not known:
+                    self.path.unlink()
+                self._refuse(path, unlike[0], content.get(unlike[0]))
+            elif "shards" in unlike:  # the others are replaced one by one
+                path.unlink(missing_ok=True)
+
+    def save(self, entries: Sequence[Entry], *, done: bool = False) -> None:
+        """Write its file.
+
+        Args:
+            entries: Of the images done so far.
+            done: Whether there are no others.
+        """
+        content = {**self._common, "done": done, "images": list(entries)}
+        write_text(self.path, json.dumps(content, indent=1) + "\n")
+
+    def together(self) -> tuple[int, list[Entry]]:
+        """How many shards are done, and all their entries in the order of `names`."""
+        read = [_read(self._path(number)) for number in range(1, self.shard.count + 1)]
+        done = [c for c in read if c.get("done") and self._common.items() <= c.items()]
+        entries = [entry for content in done for entry in content["images"]]
+        place = {name: number for number, name in enumerate(self.names)}
+
+        def order(entry: Entry) -> int:
+            name: str = entry["name"]
+            return place[name if name in place else name.rpartition("/")[0]]
+
+        return len(done), sorted(entries, key=order)
+
+    @property
+    def _common(self) -> dict[str, Any]:
+        names = hashlib.sha256("\n".join(self.names).encode(errors="surrogateescape")).hexdigest()
+        return {"shards": self.shard.count, "names": names, **self.settings}
+
+    def _path(self, number: int) -> Path:
+        return self.folder / f"{number}-of-{self.shard.count}.json"
+
+    def _refuse(self, path: Path, name: str, value: object) -> NoReturn:
+        own = {"names": "images of other names"}.get(name, f"{name}={self._common[name]}")
+        others = "" if name == "names" else f" ({value})"
+        raise SettingError(
+            "shard",
+            found=f"{own} than those of {path}{others}",
+            expected="the same images and settings for all shards of a folder",
+            remedy="Give another output, or overwrite=true.",
+        )
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """Content of the file of a shard; nothing if it is not there, or no such file."""
+    try:
+        content = parse_json(path.read_bytes())
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}

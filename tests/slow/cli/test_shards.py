@@ -1,0 +1,84 @@
+"""Shards of predictions in processes of their own, at once, one of them killed."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from datamodules.images.pixel_files import write_pixels
+from tangent_train.cli.processes import command_line
+from tests.cli.tiny_runs import run_command
+from tests.datamodules.data_files import contents
+from tests.inference.trained import sphere, write_checkpoint
+
+ROOT = Path(__file__).parents[3]
+COUNT = 30
+
+
+@pytest.fixture
+def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Of the predictions of thirty panoramas; they are in ``whole``."""
+    monkeypatch.chdir(tmp_path)
+    for number in range(COUNT):
+        write_pixels(tmp_path / "in" / f"{number:02}.png", np.roll(sphere(128), number, 1))
+    checkpoint = write_checkpoint(tmp_path / "model.ckpt")
+    settings = [f"checkpoint={checkpoint}", "input=in", "report=5"]
+    run_command(monkeypatch, "predict", *settings, "output=whole")
+    return settings
+
+
+def _started(*arguments: str) -> subprocess.Popen[bytes]:
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    line = command_line("predict", arguments, Path())
+    return subprocess.Popen(line, env=environment)
+
+
+def _results(folder: str) -> dict[str, bytes]:
+    return {name: b for name, b in contents(Path(folder)).items() if not name.startswith("shards/")}
+
+
+def _images(shard: str) -> list[Any]:
+    content = json.loads(Path("out", "shards", shard).read_text())
+    return [entry["name"] for entry in content["images"]]
+
+
+def test_one_of_them_is_killed_and_resumed(settings: list[str]) -> None:
+    settings = [*settings, "output=out"]
+    killed, other = (_started(*settings, f"shard={n}/3") for n in (1, 2))
+    while not Path("out/shards/1-of-3.json").exists() or not _images("1-of-3.json"):
+        assert killed.poll() is None
+        time.sleep(0.01)
+    killed.send_signal(signal.SIGKILL)
+    assert killed.wait() == -signal.SIGKILL
+    before = _images("1-of-3.json")
+    assert 0 < len(before) < COUNT // 3
+    kept = Path("out", "labels", f"{before[0]}.png")
+    time_ns = kept.stat().st_mtime_ns
+    again = [_started(*settings, f"shard={n}/3", "resume=true") for n in (1, 3)]
+    assert [process.wait(300) for process in (other, *again)] == [0, 0, 0]
+    assert kept.stat().st_mtime_ns == time_ns
+    done = [_images(f"{n}-of-3.json") for n in (1, 2, 3)]
+    assert [sorted(names) for names in done] == [
+        [f"{number:02}" for number in range(first, COUNT, 3)] for first in range(3)
+    ]
+    for path in Path("out").rglob(".partial*"):  # of the killed one
+        path.unlink()
+    assert _results("out") == _results("whole")
+
+
+def test_they_run_through_the_launchers_of_sweeps(
+    settings: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hydra._internal.utils.is_under_debugger", lambda: False)
+    shards = ("-m", "launcher=local", "shard=1/2,2/2", "hydra.sweep.dir=jobs")
+    run_command(monkeypatch, "predict", *shards, *settings, "output=out")
+    assert _results("out") == _results("whole")
+    assert len(list(Path("jobs", ".submitit").glob("[0-9]*"))) == 2
