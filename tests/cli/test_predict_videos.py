@@ -152,3 +152,24 @@ def test_videos_that_cannot_be_used(
     with pytest.raises(SystemExit, match="1 of 1 images"):
         _predict(run, tmp_path, input=good, output="other")
     assert "pip install 'tangent-train[video]'" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_shard_has_whole_videos(tmp_path: Path, run: Run) -> None:
+    for name in ("a", "c"):
+        _write_video(tmp_path / "in" / f"{name}.mp4")
+    cv2.imwrite(str(tmp_path / "in" / "b.png"), sphere(32))
+    (tmp_path / "in" / "d.mp4").write_bytes(b"broken")
+    settings = {"blend": "nearest", "write": "[labels,color]", "mask": -45}
+    for output, shard in (("whole", "null"), ("out", "2/2"), ("out", "1/2")):
+        try:
+            _predict(run, tmp_path, **settings, output=output, shard=shard)
+        except SystemExit as ended:
+            assert "1 of " in str(ended.code)  # noqa: PT017 - the shard of the broken one
+    out, whole = tmp_path / "out", tmp_path / "whole"
+    for name in ("summary.json", "summary.csv", "labels/b.png", "labels/c/000006.png"):
+        assert (out / name).read_bytes() == (whole / name).read_bytes()
+    for name in ("color/a.mp4", "color/c.mp4"):
+        np.testing.assert_array_equal(_decoded(out / name)[0], _decoded(whole / name)[0])
+    assert not _labels(out / "labels" / "a")["000003"][24:].any()
+    of_shard = json.loads((out / "shards" / "1-of-2.json").read_text())["images"]
+    assert {entry["name"].partition("/")[0] for entry in of_shard} == {"a", "c"}
