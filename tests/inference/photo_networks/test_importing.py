@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import onnx
+import onnxruntime
 import pytest
 import torch
 from onnx import TensorProto, helper, numpy_helper
@@ -61,6 +62,16 @@ def _run(command: str, monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None
 OF_ONNX = ("network=onnx", "file=net.onnx", "classes=classes.json", "normalization=unit")
 
 
+def test_an_onnx_file_gives_the_scores_of_its_runtime(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _run("import", monkeypatch, *OF_ONNX, "output=ours.onnx")
+    photos = np.random.default_rng(0).integers(0, 256, (2, 3, 32, 32)).astype(np.float32) / 255
+    (expected,) = onnxruntime.InferenceSession("net.onnx").run(None, {"image": photos})
+    found = load_trained(here / "ours.onnx").network(torch.from_numpy(photos))
+    np.testing.assert_array_equal(found.numpy(), expected)
+
+
 @pytest.mark.parametrize("wins", [True, False])
 def test_an_onnx_file_labels_panoramas(
     wins: bool, here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -106,11 +117,17 @@ def test_a_network_of_a_config_and_its_export_compute_the_same(
         torch.testing.assert_close(again.network(images), expected)
 
 
+@pytest.mark.parametrize(
+    "name",
+    [
+        "lraspp_mobilenet_v3_large",
+        pytest.param("deeplabv3_mobilenet_v3_large", marks=pytest.mark.slow),
+    ],
+)
 def test_torchvision_gives_the_scores_of_its_own_transform(
-    here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    name: str, here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     torch.manual_seed(0)
-    name = "lraspp_mobilenet_v3_large"
     network = torchvision_models.get_model(name, weights=None, weights_backbone=None).eval()
     torch.save(network.state_dict(), here / "state.pt")
     (here / "classes.json").unlink()
