@@ -73,8 +73,11 @@ class NetworkJudge:
             ups_xyz: ``(n, 3)`` directions in its frame.
 
         Returns:
-            ``(n,)``.
+            ``(n,)``; all 0 of a network that gets the elevation of its pixels, which is told where
+            up is and believes it.
         """
+        if "elevation" in self.inputs:
+            return np.zeros(len(ups_xyz))
         rows = min(image.rgb.shape[0], 2 ** (self.level + 1))
         seen = resized(InputImage(image.rgb, image.depth), (rows, 2 * rows))
         self.network.eval()

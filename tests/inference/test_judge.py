@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from datamodules.core.inputs import Normalization
+from datamodules.core.inputs import Input, Normalization
 from datamodules.core.panoramas import Panorama
 from tangent_train.geometry import equirect_directions, random_rotation
 from tangent_train.inference.judge import NetworkJudge
@@ -36,8 +36,8 @@ class Sky(nn.Module):
         return torch.stack([30.0 * fits, 0.0 * fits], dim=1)
 
 
-def _judge(**settings: Any) -> NetworkJudge:
-    return NetworkJudge(Sky(), ("rgb",), PLAIN, level=5, **settings)
+def _judge(inputs: tuple[Input, ...] = ("rgb",), **settings: Any) -> NetworkJudge:
+    return NetworkJudge(Sky(), inputs, PLAIN, level=5, **settings)
 
 
 def _bright_above(up: NDArray[np.float64], height: int = 64) -> NDArray[np.uint8]:
@@ -64,6 +64,11 @@ def test_a_panorama_of_a_data_set_is_judged_alike() -> None:
     rgb = _bright_above(AXES[1])
     panorama = Panorama(rgb, None, rgb[..., 0])
     np.testing.assert_array_equal(_judge()(panorama, AXES), _judge()(InputImage(rgb), AXES))
+
+
+def test_who_is_told_where_up_is_does_not_judge() -> None:
+    judge = _judge(("rgb", "elevation"))
+    np.testing.assert_array_equal(judge(InputImage(_bright_above(AXES[1])), AXES), np.zeros(6))
 
 
 @pytest.mark.parametrize(
