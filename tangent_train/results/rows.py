@@ -197,7 +197,9 @@ def group_runs(records: Sequence[Record]) -> list[Row]:
 
 
 def _identity(record: Record) -> dict[str, Any]:
-    return {
+    # A network that no settings describe is the file's.
+    network = {"checkpoint": record.checkpoint} if "network" in record.settings else {}
+    return network | {
         # Each fold is fine-tuned from a checkpoint of its own.
         name: value is not None if name == "init_from" else value
         for name, value in record.settings.items()

@@ -102,6 +102,18 @@ def test_other_settings_make_other_groups_named_by_what_differs() -> None:
     ]
 
 
+def test_networks_from_elsewhere_make_other_groups() -> None:
+    records = [
+        replace(made_record([0.1, 0.2, 0.3], network=None, seed=seed), checkpoint=file)
+        for file in ("one.onnx", "two.onnx")
+        for seed in (0, 1)
+    ]
+    assert [(row.label, len(row.records)) for row in group_runs(records)] == [
+        ("mine (checkpoint=one.onnx)", 2),
+        ("mine (checkpoint=two.onnx)", 2),
+    ]
+
+
 def test_groups_that_differ_in_much_have_labels_of_their_own() -> None:
     values = [(0, 0), (1, 1), (0, 9)]
     records = [made_record([0.1, 0.2, 0.3], a=v, b=v, c=v, d=last) for v, last in values]
