@@ -7,7 +7,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-from rich.progress import track
 from torch.utils.data import DataLoader
 
 from datamodules.core.found import Found, Split
@@ -23,6 +22,7 @@ from datamodules.core.pipeline import (
     Transform,
 )
 from datamodules.core.problems import Problems
+from datamodules.core.progress import show_progress
 from datamodules.core.reading import ImageFiles, ImageReader, PanoramaReading, check_headers
 from datamodules.core.store import Store
 from datamodules.images.gpano import whole_area
@@ -122,8 +122,8 @@ class PanoramaDataModule(ImageDataModule):
         """Batches for the test; what is to be judged is estimated first, in this process."""
         source = self.source("test")
         if self.judge is not None:
-            for index in track(range(len(source)), "Estimating up", transient=True):
-                source.read(index)
+            read = (source.read(index) for index in range(len(source)))
+            show_progress(read, "Estimating up", self.noun, len(source))
         return super().test_dataloader()
 
     def _check_rotations(self) -> None:
