@@ -13,7 +13,7 @@ DEMO := runs/make_demo
 install: $(READY)
 
 $(READY): pyproject.toml constraints.txt
-	@echo "Setting up .venv (about 6 GB, some minutes; only when the dependencies change) …"
+	@echo "Setting up .venv (about 7 GB, some minutes; only when the dependencies change) …"
 	@$(PYTHON) -c 'import sys; sys.exit(None if (3, 11) <= sys.version_info < (3, 14) else "Python 3.11 to 3.13 is needed: make PYTHON=python3.12 …")'
 	$(PYTHON) -m venv .venv
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'

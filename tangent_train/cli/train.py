@@ -33,9 +33,6 @@ from tangent_train.setting_rules import differing_settings, from_file
 
 __all__ = ["best_on_validation", "train"]
 
-# lightning 2.6 asks torch's tree library in a way torch ≥ 2.13 deprecates: nothing to do about it.
-warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)`", FutureWarning)
-
 
 def train(settings: Settings, source: SettingsFile | None = None) -> float | None:
     """Train, then evaluate the best epoch of the validation split (else the last) on the test fold.

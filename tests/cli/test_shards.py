@@ -80,7 +80,7 @@ def test_an_interrupted_shard_resumes(predict: Predict, monkeypatch: pytest.Monk
     monkeypatch.setattr("tangent_train.cli.predict.read_panorama", read_panorama)
     before = {path: path.stat().st_mtime_ns for path in Path("out").rglob("*.png")}
     assert {path.stem for path in before} == {"a", "c"}
-    assert "as are 0 others" in predict("out", 1, 2, resume="true")
+    assert "1 of 2 in all" in predict("out", 1, 2, resume="true")
     assert "shard: found 2/2, which has out/shards/2-of-2.json" in predict("out", 2, 2)
     assert "3 images, 2 done already" in predict("out", 2, 2, resume="true")
     assert {path: path.stat().st_mtime_ns for path in before} == before
