@@ -170,7 +170,7 @@ def test_a_shard_has_whole_videos(tmp_path: Path, run: Run) -> None:
         assert (out / name).read_bytes() == (whole / name).read_bytes()
     for name in ("color/a.mp4", "color/c.mp4"):
         found, expected = (_decoded(folder / name)[0].astype(int) for folder in (out, whole))
-        assert np.abs(found - expected).mean() < 2  # an encoder is not exact to the last bit
+        assert np.abs(found - expected).mean() < 2  # encoding does not repeat itself exactly
     assert not _labels(out / "labels" / "a")["000003"][24:].any()
     of_shard = json.loads((out / "shards" / "1-of-2.json").read_text())["images"]
     assert {entry["name"].partition("/")[0] for entry in of_shard} == {"a", "c"}
