@@ -109,25 +109,29 @@ class _Means:
     ) -> None:
         self._grid, self._shape, self._channels = grid, shape, first.shape[3:]
         self._owner = NO_OWNERS if blend == "feather" else owners(grid, shape)
-        self._sums = zero_sums(shape, math.prod(self._channels) + 1)
+        self._sums = zero_sums(shape, math.prod(self._channels))
+        self._weights = zero_sums(shape, 1) if blend == "feather" else None
 
     def add(self, results: NDArray[Any], faces: NDArray[np.int64]) -> None:
         """Add those of some images."""
         _check_alike(results, self._channels, "f")
-        count, rows, columns = results.shape[:3]
-        stack = np.ones((count, self._sums.shape[2], rows, columns), np.float32)  # and weights
-        stack[:, :-1] = np.moveaxis(results.reshape(count, rows, columns, -1), -1, 1)
+        flat = results.reshape(*results.shape[:3], -1)
+        self._add_to(self._sums, np.moveaxis(flat, -1, 1).astype(np.float32), faces)
+        if self._weights is not None:
+            self._add_to(self._weights, np.ones_like(flat[:, None, ..., 0], np.float32), faces)
+
+    def _add_to(
+        self, total: NDArray[np.float32], images: NDArray[np.float32], faces: NDArray[np.int64]
+    ) -> None:
         whole = slice(0, self._shape[0])
-        add_to_panorama(stack, self._grid, faces, self._shape, whole, self._owner, self._sums)
+        add_to_panorama(images, self._grid, faces, self._shape, whole, self._owner, total)
 
     def panorama(self) -> NDArray[np.float32]:
-        """``(H, W[, K])``, in the memory of the sums: row by row, what is written was read."""
-        flat, size = self._sums.reshape(-1), self._shape[1] * math.prod(self._channels)
-        for number, row in enumerate(self._sums):
-            weights = np.maximum(row[:, -1:], np.float32(1e-37))
-            flat[number * size : (number + 1) * size] = (row[:, :-1] / weights).ravel()
-        whole = np.asarray(flat[: self._shape[0] * size])
-        return whole.reshape(*self._shape, *self._channels)
+        """``(H, W[, K])``, in the memory of the sums."""
+        if self._weights is not None:
+            for row, weights in zip(self._sums, self._weights, strict=True):
+                row /= weights
+        return np.asarray(self._sums).reshape(*self._shape, *self._channels)
 
 
 class _Copies:

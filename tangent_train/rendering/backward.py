@@ -162,15 +162,15 @@ def _feathered(
     images: NDArray[np.float32], grid: PinholeGrid, shape: tuple[int, int]
 ) -> NDArray[np.float32]:
     """``(H, W, C)`` average of ``(N, C, d, d)`` images; a compiled kernel, in bands of rows."""
-    channels = images.shape[1]
-    weighed = np.concatenate([images, np.ones_like(images[:, :1])], axis=1)
-    panorama = np.empty((*shape, channels), np.float32)
+    panorama = np.zeros((*shape, images.shape[1]), np.float32)
+    faces, ones = np.arange(len(images)), np.ones_like(images[:, :1])
     step = max(1, _BAND // shape[1])
     for start in range(0, shape[0], step):
         rows = slice(start, min(shape[0], start + step))
-        total = np.zeros((rows.stop - start, shape[1], channels + 1), np.float32)
-        add_to_panorama(weighed, grid, np.arange(len(images)), shape, rows, total=total)
-        panorama[rows] = total[..., :-1] / total[..., -1:]
+        weights = np.zeros((rows.stop - start, shape[1], 1), np.float32)
+        add_to_panorama(images, grid, faces, shape, rows, total=panorama[rows])
+        add_to_panorama(ones, grid, faces, shape, rows, total=weights)
+        panorama[rows] /= weights
     return panorama
 
 

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from tangent_train.rendering.compiled import njit_exact, njit_fast
 
 __all__ = [
-    "FEATHER_POWER",
     "Sight",
     "add_images",
     "best_classes",
@@ -28,9 +27,6 @@ __all__ = [
     "seen_table",
     "sphere_rays",
 ]
-
-FEATHER_POWER = 4
-"""Exponent p of the feather weights ((1 − a²)(1 − b²))^p at offsets a, b in half image sides."""
 
 _TILE = 64
 """Rows and columns at the equator of what is added to at once: its sums stay in the cache."""
@@ -58,7 +54,7 @@ class Sight(NamedTuple):
         columns: ``(2, W)`` factors of the rays.
         rows: ``(H, 2)`` factors of the rays.
         owner: ``(H, W)``: an image has weight 1 where it is the owner, else 0. Empty for feather
-            weights: 1 in the middle of an image, 0 at the outer edges of its outermost pixels.
+            weights √((1 − a²)(1 − b²)) at offsets a, b in half image sides.
     """
 
     images: Array
@@ -199,7 +195,7 @@ def _project(
         u[p], v[p] = across, down
         a, b = (across + 0.5) * per_column - 1, (down + 0.5) * per_row - 1
         inside = max(1 - a * a, 0.0) * max(1 - b * b, 0.0)
-        weight[p] = inside**FEATHER_POWER if near > 0 else 0.0
+        weight[p] = math.sqrt(inside) if near > 0 else 0.0
 
 
 @njit_fast

@@ -195,7 +195,7 @@ class ReferenceGrid:
             row, column = self.positions(shape, np.full(shape, face))
             a, b = ((line - (self.dim - 1) / 2) / (self.dim / 2) for line in (column, row))
             seen = (nearness[..., face] > 0) & (np.abs(a) < 1) & (np.abs(b) < 1)
-            weight = np.where(seen, ((1 - a**2) * (1 - b**2)) ** 4, 0)[..., None]
+            weight = np.sqrt(np.where(seen, (1 - a**2) * (1 - b**2), 0))[..., None]
             total += weight * sample_images(images, np.full(shape, face), row, column)
             weights += weight
         return total / weights

@@ -80,11 +80,11 @@ def test_feathered_probabilities_are_those_of_all_images_at_once(
 @pytest.mark.parametrize("blend", ["nearest", "feather"])
 def test_pixels_without_a_probable_class_are_unsure(blend: Blend) -> None:
     grid, shape = GRIDS[1]
-    result = _added(ScoreMosaic(shape, 7, blend, min_confidence=0.6), _scores(grid), grid)
+    result = _added(ScoreMosaic(shape, 7, blend, min_confidence=0.4), _scores(grid), grid)
     probabilities = result.probabilities(slice(None))
     best = probabilities.max(axis=-1)
-    decided = abs(best - 0.6) > 1e-6
-    expected = np.where(best < 0.6, 7, probabilities.argmax(axis=-1))
+    decided = abs(best - 0.4) > 1e-6
+    expected = np.where(best < 0.4, 7, probabilities.argmax(axis=-1))
     assert set(np.unique(expected)) == set(range(8))
     np.testing.assert_array_equal(result.labels()[decided], expected[decided])
 
