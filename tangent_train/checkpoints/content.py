@@ -33,6 +33,7 @@ GROUPS = list[list[int]] | None
 _FIELDS = {
     "config": dict,
     "class_names": list[Text],
+    "epoch": int | None,  # of runs: the last that has begun, from 0
     "groups": GROUPS,
     "inputs": INPUTS | None,  # None of shapes, whose six channels are all there is
     "kind": Literal["segmentation", "classification"],
@@ -48,7 +49,8 @@ def read_checkpoint(path: Path, needed: Collection[str] = tuple(_FIELDS)) -> dic
     Args:
         path: The file; tensors are memory-mapped.
         needed: Which of its fields: ``config`` (the resolved settings of the run, plain values),
-            ``class_names``, ``groups``, ``inputs``, ``kind``, ``normalization``, ``state_dict``.
+            ``class_names``, ``epoch``, ``groups``, ``inputs``, ``kind``, ``normalization``,
+            ``state_dict``.
 
     Raises:
         DataError: The file is missing, no checkpoint, or of another program.

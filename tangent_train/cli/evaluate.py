@@ -65,8 +65,13 @@ def evaluate(
     if trained is None and (mapped or run_settings(checkpoint) is None):
         trained = load_trained(checkpoint, settings.get("trust", ()))
     run = Run.begin(settings, source, trained)
-    with machine_faults(run.folder, run.data):
-        run.test(run.trainer([]), checkpoint)
+    try:
+        with machine_faults(run.folder, run.data):
+            run.test(run.trainer([]), checkpoint)
+    except (KeyboardInterrupt, SystemExit):
+        told = "Nothing is kept of an interrupted evaluation; the same command begins it anew."
+        Console(stderr=True, soft_wrap=True, highlight=False).print(told)
+        raise
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from io import StringIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from tangent_train.errors import DataError, SettingError
 
@@ -49,12 +49,13 @@ def _main(command: str) -> None:
 
     from tangent_train.cli.compose import config_folder, quote_path
     from tangent_train.cli.help import annotate
+    from tangent_train.cli.processes import ended_by_sigterm
     from tangent_train.cli.stored import stored_run
 
     typed = sys.argv[1:]
     arguments = typed[1:] if __name__ == "__main__" else typed
     visible_gpus = os.environ.get("CUDA_VISIBLE_DEVICES")
-    with _refusals(command):
+    with _refusals(command), ended_by_sigterm():
         stored = stored_run(command, arguments)
 
         def job(config: DictConfig) -> float | None:
@@ -155,11 +156,23 @@ def _refusals(command: str) -> Iterator[None]:
         sys.exit(128 + signal.SIGPIPE)
     except (DataError, SettingError) as error:
         sys.exit(f"tangent-{command}: {error}")
-    except KeyboardInterrupt:
-        sys.exit(130)  # as a shell says it; runs have said how to go on
+    except KeyboardInterrupt as error:
+        _end(command, error)
     except SystemExit as error:
         # Lightning ends an interrupted run with 1.
-        sys.exit(130 if isinstance(error.__context__, KeyboardInterrupt) else error.code)
+        if error.code == 1 and isinstance(error.__context__, KeyboardInterrupt):
+            _end(command, error.__context__)
+        raise
+
+
+def _end(command: str, interrupt: KeyboardInterrupt) -> NoReturn:
+    """Exit as a shell says it; commands have said how to go on."""
+    from tangent_train.cli.processes import SigtermError
+
+    if not isinstance(interrupt, SigtermError):
+        sys.exit(128 + signal.SIGINT)
+    sys.stderr.write(f"tangent-{command}: ended by SIGTERM\n")
+    sys.exit(128 + signal.SIGTERM)
 
 
 if __name__ == "__main__":

@@ -13,9 +13,13 @@ from typing import NoReturn
 
 from tangent_train.cli.compose import quoted
 
-__all__ = ["command_line", "ended_by_sigterm", "run_process"]
+__all__ = ["SigtermError", "command_line", "ended_by_sigterm", "run_process"]
 
 _PATIENCE_S = 30.0  # for a last checkpoint
+
+
+class SigtermError(KeyboardInterrupt):
+    """SIGTERM, by which everything ends as by Ctrl-C."""
 
 
 def command_line(command: str, arguments: Sequence[str], folder: Path) -> list[str]:
@@ -48,7 +52,7 @@ def run_process(line: Sequence[str], changes: Mapping[str, str | None] | None = 
         try:
             return process.wait()
         except BaseException as error:
-            if not isinstance(error, KeyboardInterrupt):  # a terminal's Ctrl-C has told it
+            if type(error) is not KeyboardInterrupt:  # a terminal's Ctrl-C has told it
                 process.terminate()
             try:
                 with suppress(subprocess.TimeoutExpired):
@@ -64,7 +68,7 @@ def ended_by_sigterm() -> Iterator[None]:
     """Let SIGTERM unwind this process like Ctrl-C instead of ending it at once."""
 
     def leave(number: int, frame: object) -> NoReturn:
-        sys.exit(128 + number)
+        raise SigtermError
 
     before = signal.signal(signal.SIGTERM, leave)
     try:

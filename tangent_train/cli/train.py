@@ -47,7 +47,7 @@ def train(settings: Settings, source: SettingsFile | None = None) -> float | Non
     resumed = start = None
     if settings["resume"] is not None:
         resumed = Path(settings["resume"]) / "checkpoints" / "last.ckpt"
-        _check_resumed(settings, read_checkpoint(resumed, ("config",))["config"])
+        _check_resumed(settings, **read_checkpoint(resumed, ("config", "epoch")))
     elif settings["init_from"] is not None:
         start = Path(settings["init_from"])
         settings, source = begin_from(start, settings)
@@ -127,18 +127,25 @@ def _fit(run: Run, trainer: lightning.Trainer, resumed: Path | None, last: LastC
                 found=f"what cannot be resumed ({type(error).__name__}: {error})",
                 expected="the last checkpoint of this run",
             ) from error
-        except MisconfigurationException as error:  # as fewer epochs than a resumed run has done
+        except MisconfigurationException as error:
             raise SettingError("trainer", found=error, expected="valid settings") from error
 
 
-def _check_resumed(settings: Settings, before: Mapping[str, Any]) -> None:
-    """Refuse to resume a run as another one."""
-    for name, now, then in differing_settings(settings, before, "resume"):
+def _check_resumed(settings: Settings, config: Mapping[str, Any], epoch: int | None) -> None:
+    """Refuse to resume a run as another one, or for fewer epochs than it has."""
+    for name, now, then in differing_settings(settings, config, "resume"):
         raise SettingError(
             name,
             found=f"{now!r} for a run that began with {then!r}",
             expected="the same as before",
             remedy="Start a new run for it.",
+        )
+    begun, epochs = (epoch or 0) + 1, settings["trainer"].get("max_epochs")
+    if epochs is not None and -1 < epochs < begun:
+        raise SettingError(
+            "trainer.max_epochs",
+            found=f"{epochs} for a run that is in its epoch {begun}",
+            expected=f"{begun} or more",
         )
 
 

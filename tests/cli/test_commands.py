@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 import shutil
 import signal
@@ -94,6 +95,29 @@ def test_ctrl_c_ends_a_run_as_a_shell_says_it(
     assert ended.value.code == 128 + signal.SIGINT
 
 
+def test_sigterm_ends_an_evaluation_with_a_line(
+    run_folder: Path,
+    rooms: str,
+    run: Run,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def terminated(*_: object) -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(SegmentationTask, "test_step", terminated)
+    checkpoint = run_folder / "checkpoints" / "best.ckpt"
+    before = signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)
+    with pytest.raises(SystemExit) as ended:
+        run("evaluate", f"checkpoint={checkpoint}", rooms, "hydra.run.dir=cut")
+    signal.signal(signal.SIGINT, before[1])
+    assert signal.getsignal(signal.SIGTERM) == before[0]
+    assert ended.value.code == 128 + signal.SIGTERM
+    told = capsys.readouterr().err.splitlines()
+    assert "the same command" in told[-2]
+    assert told[-1] == "tangent-evaluate: ended by SIGTERM"
+
+
 def test_an_evaluation_repeats_the_figures_exactly(
     run_folder: Path, rooms: str, tmp_path: Path, run: Run
 ) -> None:
@@ -114,6 +138,7 @@ def test_an_evaluation_repeats_the_figures_exactly(
         ("train", "seed=3", r"seed: found 3 for a run that began with 0"),
         ("train", "network.widths=[4,9]", r"network\.widths: found \[4, 9\]"),
         ("train", "data=folder", r"found data=folder beside it"),
+        ("train", "trainer.max_epochs=1", r"max_epochs: found 1 for a run that is in its epoch 2"),
         ("train", "trainer.max_epochs=3", r"trainer\.max_epochs, .*: found 12 training steps"),
         (
             "evaluate",

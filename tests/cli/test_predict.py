@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,8 @@ import pytest
 from numpy.typing import NDArray
 
 from tangent_train.geometry import rotation_about
-from tangent_train.inference.images import read_panorama
 from tangent_train.inference.judge import NetworkJudge
+from tangent_train.inference.predictor import Predictor
 from tangent_train.inference.views import InputImage
 from tests.cli.tiny_runs import Run
 from tests.inference.trained import PERSPECTIVE, TANGENT, sphere, write_checkpoint
@@ -101,7 +102,13 @@ def test_earlier_results_stay_and_are_not_labelled_again(tmp_path: Path, predict
         predict(**settings, input=tmp_path / "in" / "color", overwrite="true")
 
 
+@pytest.mark.parametrize(
+    ("number", "told"),
+    [(signal.SIGINT, ""), (signal.SIGTERM, "tangent-predict: ended by SIGTERM\n")],
+)
 def test_an_interruption_keeps_what_is_done(
+    number: signal.Signals,
+    told: str,
     tmp_path: Path,
     predict: Predict,
     monkeypatch: pytest.MonkeyPatch,
@@ -110,20 +117,27 @@ def test_an_interruption_keeps_what_is_done(
     for name in ("a", "b", "c"):
         _write(tmp_path / "in" / f"{name}.png", sphere(16))
 
-    def interrupted(path: Path, *args: Any) -> Any:
-        if path.name == "b.png":
-            raise KeyboardInterrupt
-        return read_panorama(path, *args)
+    whole, names = Predictor.predict, iter("abc")
 
-    monkeypatch.setattr("tangent_train.cli.predict.read_panorama", interrupted)
+    def interrupted(*args: Any, **settings: Any) -> Any:
+        if next(names) == "b":
+            signal.raise_signal(number)
+        return whole(*args, **settings)
+
+    # A shell starts what runs in the background deaf to it.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    monkeypatch.setattr(Predictor, "predict", interrupted)
     with pytest.raises(SystemExit) as stopped:
         predict()
-    assert stopped.value.code == 130
+    signal.signal(signal.SIGINT, before)
+    assert stopped.value.code == 128 + number
     assert _entries(tmp_path / "out").keys() == {"a"}
     first = tmp_path / "out" / "labels" / "a.png"
     assert list(first.parent.iterdir()) == [first]
-    assert "1 of 3 images are done. resume=true" in capsys.readouterr().out
-    monkeypatch.setattr("tangent_train.cli.predict.read_panorama", read_panorama)
+    printed = capsys.readouterr()
+    assert "1 of 3 images are done. resume=true" in printed.out
+    assert printed.err == told
+    monkeypatch.setattr(Predictor, "predict", whole)
     written = first.stat().st_mtime_ns
     with pytest.raises(SystemExit, match="resume: found blend=nearest, another setting"):
         predict(resume="true", blend="nearest")
