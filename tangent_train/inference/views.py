@@ -15,7 +15,7 @@ from datamodules.core.samples import world_rays
 from tangent_train.errors import SettingError
 from tangent_train.registry import make
 from tangent_train.rendering import EquirectRepresentation, PerspectiveRepresentation
-from tangent_train.rendering.representations.equirect import as_crop
+from tangent_train.rendering.representations.equirect import EquirectViews, as_crop, column_shifts
 from tangent_train.rendering.representations.perspective import PhotoCrops
 from tangent_train.rendering.representations.pinhole import PinholeRepresentation, spun, turns
 from tangent_train.rendering.representations.views import NO_RAYS, PinholeViews
@@ -116,7 +116,8 @@ class PanoramaViews:
         levels: Levels s to average over, the angular resolution; None as trained.
         base_level: Base level b of tangent images; None as trained.
         blend: Blending of overlapping views.
-        rotations: Number of icosahedra, rotated about the vertical, to average over.
+        rotations: Number of rotations about the vertical to average over: of the icosahedron or of
+            equirectangular images.
         upright: Whether some panoramas will have their own `InputImage.up`.
 
     Raises:
@@ -134,16 +135,17 @@ class PanoramaViews:
         upright: bool = False,
     ) -> None:
         self._seen = [_panorama_representation(trained, level, base_level) for level in levels]
+        self._rotations = rotations
         self._turns = turns(rotations, "rotations")
         self.image_size = max(seen.image_size for seen in self._seen)
         self.blend: Blend = blend
         for seen in self._seen:
             if isinstance(seen, EquirectRepresentation):
-                if rotations > 1 or upright or len(levels) > 1:
+                if upright or len(levels) > 1:
                     raise SettingError(
-                        "rotations, upright and levels",
-                        found=f"{rotations}, {upright}, {len(levels)} levels",
-                        expected="1, null and one for a network that takes equirectangular images",
+                        "upright and levels",
+                        found=f"{upright}, {len(levels)} levels",
+                        expected="null and one for a network that takes equirectangular images",
                         remedy="Give base_level= to use tangent images.",
                     )
                 self.blend = "nearest"
@@ -158,7 +160,9 @@ class PanoramaViews:
         self, image: InputImage, seen: PinholeRepresentation | EquirectRepresentation
     ) -> list[ViewSet]:
         if isinstance(seen, EquirectRepresentation):
-            return [_equirect_set(image, seen)]
+            whole = resized(image, seen.image_size)
+            shifts = column_shifts(seen.image_size[1], self._rotations)
+            return [_equirect_set(whole, shift, image.rgb.shape[:2]) for shift in shifts]
         grid = seen.grid
         if image.up is not None:
             grid = grid.with_rotation(upright_rotation(image.up))
@@ -308,14 +312,15 @@ def _grid_set(image: InputImage, grid: PinholeGrid) -> ViewSet:
     return ViewSet(image, grid.num_images, views, add, rays)
 
 
-def _equirect_set(image: InputImage, seen: EquirectRepresentation) -> ViewSet:
-    """The panorama itself."""
-    height, width = image.rgb.shape[:2]
+def _equirect_set(image: InputImage, shift: int, shape: tuple[int, int]) -> ViewSet:
+    """The panorama itself, rotated by some of its columns; `shape` is that of the result."""
+    depth = None if image.depth is None else np.roll(image.depth, -shift, axis=1)
+    turned = replace(image, rgb=np.roll(image.rgb, -shift, axis=1), depth=depth)
 
     def add(mosaic: ScoreMosaic, scores: Tensor, _: slice) -> None:
-        mosaic.add_crops(*as_crop(scores, (height, width)), np.array([0]))
+        mosaic.add_crops(*as_crop(scores.roll(shift, -1), shape), np.array([0]))
 
-    return ViewSet(resized(image, seen.image_size), 1, lambda _: seen.whole(), add)
+    return ViewSet(turned, 1, lambda _: EquirectViews(), add)
 
 
 def resized(image: InputImage, shape: tuple[int, int]) -> InputImage:

@@ -15,6 +15,7 @@ from tangent_train.geometry import PinholeGrid
 __all__ = [
     "check_blend",
     "check_choice",
+    "check_count",
     "check_images",
     "check_interpolation",
     "check_panorama",
@@ -55,6 +56,12 @@ def check_choice(name: str, value: str, allowed: tuple[str, ...]) -> None:
     """Raise SettingError unless a word is one of those allowed."""
     if value not in allowed:
         raise SettingError(name, found=repr(value), expected=" or ".join(map(repr, allowed)))
+
+
+def check_count(name: str, value: int) -> None:
+    """Raise SettingError unless a number counts at least one."""
+    if not isinstance(value, int) or value < 1:
+        raise SettingError(name, found=value, expected="a whole number from 1")
 
 
 def check_shape(shape: Sequence[int]) -> tuple[int, int]:

@@ -90,6 +90,28 @@ def test_labels_are_those_of_an_evaluation(
     np.testing.assert_array_equal(labels + 1, expected)
 
 
+def test_equirectangular_images_are_averaged_over_rotations() -> None:
+    """As in an evaluation, and as the network's own probabilities, shifted back, add up."""
+    trained, rgb = trained_network(ERP), _blocks(32, 64)
+    labels = _labels(trained, InputImage(rgb), rotations=3)
+    total = torch.zeros(3, 32, 64)
+    for shift in (0, 21, 43):
+        turned = torch.from_numpy(np.roll(rgb, -shift, axis=1).copy())[None]
+        images = normalize([turned], trained.normalization, trained.inputs)
+        with torch.no_grad():
+            total += trained.network(images)[0].softmax(dim=0).roll(shift, -1)
+    np.testing.assert_array_equal(labels, total.argmax(dim=0).numpy())
+    assert (labels != _labels(trained, InputImage(rgb))).any(), "at the seam"
+    made = make(ERP | {"average_rotations": 3}, "representation")
+    whole = made.whole()
+    rendered = render_inputs(InputImage(rgb), whole, trained.inputs)
+    images = normalize(rendered, trained.normalization, trained.inputs)
+    task = SegmentationTask(trained.network, made, trained.class_names, SGD)
+    where = torch.tensor(whole.rays()), torch.tensor(whole.rotations())
+    evaluated = task.predict_labels(images, (32, 64), *where).numpy() - 1
+    np.testing.assert_array_equal(evaluated, labels)
+
+
 @pytest.mark.parametrize("per_forward", [7, 1000])
 def test_cross_image_attention_is_that_of_an_evaluation(per_forward: int) -> None:
     torch.manual_seed(0)
@@ -309,8 +331,8 @@ def test_impossible_settings_are_refused() -> None:
     trained = trained_network(TANGENT)
     with pytest.raises(SettingError, match="rotations: found 0"):
         PanoramaViews(trained, rotations=0)
-    for settings in ({"rotations": 2}, {"upright": True}, {"levels": (4, 5)}):
-        with pytest.raises(SettingError, match=r"rotations, upright and levels: .*base_level="):
+    for settings in ({"upright": True}, {"levels": (4, 5)}):
+        with pytest.raises(SettingError, match=r"upright and levels: .*base_level="):
             PanoramaViews(trained_network(ERP), **settings)
     strided = trained_network(TANGENT, size_multiple=16)
     with pytest.raises(SettingError, match="multiples of 16"):

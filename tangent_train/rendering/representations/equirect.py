@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import copy
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any, Self
 
 import cv2
@@ -13,9 +16,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tangent_train.errors import SettingError
-from tangent_train.geometry import equirect_shape, random_rotation
+from tangent_train.geometry import equirect_shape, random_rotation, rotation_about
 from tangent_train.registry import registered
-from tangent_train.rendering.checks import check_choice
+from tangent_train.rendering.checks import check_choice, check_count
 from tangent_train.rendering.forward import Interpolation
 from tangent_train.rendering.mosaic import ScoreMosaic
 from tangent_train.rendering.representations.perspective import PhotoCrops
@@ -23,12 +26,13 @@ from tangent_train.rendering.representations.pinhole import unless_identity
 from tangent_train.rendering.representations.views import (
     NO_RAYS,
     NOT_ROTATED,
+    ManyViews,
     RotationAugmentation,
     Views,
 )
 from tangent_train.rendering.rotate import rotate_equirect
 
-__all__ = ["EquirectRepresentation", "EquirectViews", "as_crop"]
+__all__ = ["EquirectRepresentation", "EquirectViews", "as_crop", "column_shifts"]
 
 Image = NDArray[Any]
 
@@ -102,6 +106,16 @@ def as_crop(scores: Tensor, shape: tuple[int, int]) -> tuple[Tensor, PhotoCrops]
     return framed, PhotoCrops(box, (rows + 2, columns + 2))
 
 
+def column_shifts(columns: int, count: int) -> list[int]:
+    """Columns by which evenly spaced rotations about the vertical shift an equirectangular image.
+
+    Args:
+        columns: Of the image.
+        count: Number of rotations, 1 or more; none is the first.
+    """
+    return [round(columns * k / count) for k in range(count)]
+
+
 @registered
 class EquirectRepresentation:
     """The baseline without tangent images: the equirectangular image, or random crops of it.
@@ -117,9 +131,11 @@ class EquirectRepresentation:
         erp_height: Rows of the panorama, default `equirect_shape(level)`.
         rows: Rows of the image that the network sees, default those of the panorama. Its scores are
             interpolated on the panorama.
+        average_rotations: Rotations about the vertical that evaluation averages over: each has its
+            seam elsewhere.
 
     Raises:
-        SettingError: The crop is no part of the panorama, or there are no rows.
+        SettingError: The crop is no part of the panorama, or there are no rows or rotations.
     """
 
     def __init__(
@@ -130,18 +146,21 @@ class EquirectRepresentation:
         mirror: bool = False,
         erp_height: int | None = None,
         rows: int | None = None,
+        average_rotations: int = 1,
     ) -> None:
         if crop_deg is not None and not 0 < crop_deg <= 360:
             raise SettingError("representation.crop_deg", found=crop_deg, expected="0 to 360")
         if rows is not None and rows < 1:
             raise SettingError("representation.rows", found=rows, expected="1 or more, or null")
         check_choice("representation.rotation", rotation, ("none", "yaw", "so3"))
+        check_count("representation.average_rotations", average_rotations)
         self.erp_height = equirect_shape(level)[0] if erp_height is None else erp_height
         self.crop_deg = crop_deg
         self.rotation = rotation
         self.mirror = mirror
         self._rows = rows
         self._turn: NDArray[np.float64] | None = None
+        self._shifts = column_shifts(self.image_size[1], average_rotations)
 
     def turned(self, rotation: NDArray[np.float64]) -> Self:
         """The same, looking in rotated directions R·d, instead of a rotation before."""
@@ -169,22 +188,49 @@ class EquirectRepresentation:
         return EquirectViews(rotation, columns, mirrored, self._rows)
 
     def whole(self) -> Views:
-        """The whole panorama."""
-        return EquirectViews(self._turn, rows=self._rows)
+        """The whole panorama, in every rotation that is averaged over."""
+        columns, own = self.image_size[1], np.eye(3) if self._turn is None else self._turn
+        turns = (rotation_about((0, 0, 1), 2 * math.pi * n / columns) for n in self._shifts)
+        views = [EquirectViews(unless_identity(own @ turn), rows=self._rows) for turn in turns]
+        return views[0] if len(views) == 1 else ManyViews(tuple(views))
 
     def to_labels(
         self, scores: Tensor, shape: tuple[int, int], rotation: NDArray[np.float64] | None = None
     ) -> Tensor:
         """The best class of every pixel; the scores are already those of the rotated panorama."""
         if self._rows is None:
-            labels = scores[0].argmax(dim=0)
-        else:
-            mosaic = ScoreMosaic(shape, scores.shape[1], "nearest")
-            mosaic.add_crops(*as_crop(scores, shape), np.array([0]))
-            labels = torch.from_numpy(mosaic.labels().astype(np.int64)).to(scores.device)
-        turn = unless_identity(rotation)
-        if turn is None:
-            return labels
-        small = labels.to(torch.int32).cpu().numpy().astype(np.uint16)
-        back = rotate_equirect(small, turn, "nearest").astype(np.int64)
-        return torch.from_numpy(back).to(labels.device)
+            return _turned_back(scores[0].argmax(dim=0), rotation)
+        mosaic = ScoreMosaic(shape, scores.shape[1], "nearest")
+        mosaic.add_crops(*as_crop(scores, shape), np.array([0]))
+        labels = torch.from_numpy(mosaic.labels().astype(np.int64))
+        return _turned_back(labels.to(scores.device), rotation)
+
+    def to_averaged_labels(
+        self, scores: Iterable[Tensor], shape: tuple[int, int], rotations: NDArray[np.float64]
+    ) -> Tensor:
+        """The class with the highest mean probability over all rotations.
+
+        Args:
+            scores: ``(1, K, h, w)`` of each of the views of `whole`.
+            shape: ``(H, W)`` of the panorama.
+            rotations: Of each of them, see `Views.rotations`.
+
+        Returns:
+            Class indices, on the CPU.
+        """
+        parts = iter(scores)
+        first = next(parts)
+        mosaic = ScoreMosaic(shape, first.shape[1], "nearest", averaged=True)
+        for one, shift in zip(chain([first], parts), self._shifts, strict=True):
+            mosaic.add_crops(*as_crop(one.roll(shift, -1), shape), np.array([0]))
+        return _turned_back(torch.from_numpy(mosaic.labels().astype(np.int64)), rotations[0])
+
+
+def _turned_back(labels: Tensor, rotation: NDArray[np.float64] | None) -> Tensor:
+    """Labels of a rotated panorama as those of the panorama."""
+    turn = unless_identity(rotation)
+    if turn is None:
+        return labels
+    small = labels.to(torch.int32).cpu().numpy().astype(np.uint16)
+    back = rotate_equirect(small, turn, "nearest").astype(np.int64)
+    return torch.from_numpy(back).to(labels.device)

@@ -24,7 +24,7 @@ from tangent_train.geometry import (
 )
 from tangent_train.registry import registered
 from tangent_train.rendering.backward import Blend, tangent_to_labels
-from tangent_train.rendering.checks import check_blend, check_choice
+from tangent_train.rendering.checks import check_blend, check_choice, check_count
 from tangent_train.rendering.mosaic import ScoreMosaic
 from tangent_train.rendering.representations.views import (
     ManyViews,
@@ -262,8 +262,7 @@ def turns(count: int, setting: str) -> list[NDArray[np.float64]]:
     Raises:
         SettingError: Fewer.
     """
-    if not isinstance(count, int) or count < 1:
-        raise SettingError(setting, found=count, expected="a whole number from 1")
+    check_count(setting, count)
     step = math.radians(_SYMMETRY_DEG / count)
     return [rotation_about((0, 0, 1), step * k) for k in range(count)]
 

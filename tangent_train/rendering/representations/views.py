@@ -150,7 +150,7 @@ class ManyViews:
         parts: The views.
     """
 
-    parts: tuple[PinholeViews, ...]
+    parts: tuple[Views, ...]
 
     def render(self, image: Image, interpolation: Interpolation) -> Image:
         """Render a panorama ``(H, W[, C])`` to images ``(n, d, d[, C])``, dtype kept."""

@@ -219,6 +219,11 @@ def test_impossible_crops_are_refused(crop_deg: float) -> None:
         EquirectRepresentation(5, crop_deg)
 
 
+def test_equirectangular_images_have_at_least_one_rotation() -> None:
+    with pytest.raises(SettingError, match="average_rotations: found 0; expected a whole number"):
+        EquirectRepresentation(5, average_rotations=0)
+
+
 @pytest.mark.parametrize(
     ("averaged", "levels", "blend", "least"),
     [
@@ -257,6 +262,42 @@ def test_averages_have_the_highest_mean_probability(
     labels = representation.to_averaged_labels(iter(torch.split(scores, 20)), shape, rotations)
     assert labels.dtype == torch.int64
     assert (labels == mean.argmax(dim=0)).double().mean() > least
+
+
+@pytest.mark.parametrize("rows", [None, 40])
+def test_equirectangular_averages_have_the_highest_mean_probability(rows: int | None) -> None:
+    """In a tilted frame: probabilities of every rotation, shifted back, then rotated back."""
+    representation = EquirectRepresentation(4, rows=rows, average_rotations=3).turned(TILT)
+    views, shape = representation.whole(), (32, 64)
+    rotations, columns = views.rotations(), representation.image_size[1]
+    assert rotations.shape == (3, 3, 3)
+    np.testing.assert_allclose(rotations[:, :, 2], np.tile(TILT[:, 2], (3, 1)), atol=1e-12)
+    image = equirect_directions(shape).astype(np.float32)
+    upright = EquirectRepresentation(4, rows=rows).turned(TILT).whole().render(image, "bilinear")
+    shifts = [0, round(columns / 3), round(columns * 2 / 3)]
+    rendered = views.render(image, "bilinear")
+    for own, shift in zip(rendered, shifts, strict=True):
+        np.testing.assert_allclose(np.roll(own, shift, axis=1), upright[0], atol=0.02)
+    generator = torch.Generator().manual_seed(0)
+    scores = torch.randn(3, 5, *representation.image_size, generator=generator)
+    for place, shift in enumerate(shifts):
+        waves = torch.from_numpy(upright[0] @ [3.0, 2.0, 1.0]).float()
+        scores[place] += 4 * torch.sin(waves + torch.arange(5)[:, None, None]).roll(-shift, -1)
+    mean = torch.zeros(5, *shape, dtype=torch.float64)
+    for one, shift in zip(scores.double(), shifts, strict=True):
+        back = one.roll(shift, -1)[None]
+        if rows is not None:  # 40 to 32: with 5 more around the sphere on every side, 4 of them
+            half = back.roll(columns // 2, -1)
+            back = torch.cat([half[..., :5, :].flip(-2), back, half[..., -5:, :].flip(-2)], dim=-2)
+            back = torch.cat([back[..., -5:], back, back[..., :5]], dim=-1)
+            back = torch.nn.functional.interpolate(back, (40, 72), mode="bilinear")[..., 4:-4, 4:-4]
+        mean += back[0].softmax(dim=0)
+    best = rotate_equirect(mean.argmax(dim=0).numpy().astype(np.uint8), TILT, "nearest")
+    labels = representation.to_averaged_labels(iter(scores.split(1)), shape, rotations)
+    assert labels.dtype == torch.int64
+    assert (labels.numpy() == best).mean() > 0.999
+    first = representation.to_labels(scores[:1], shape, rotations[0])
+    assert (first.numpy() == best).mean() < 0.95, "averaging does something"
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
