@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable
+from datetime import timedelta
 from typing import Any
 
 from rich import get_console
@@ -42,21 +43,42 @@ class PlainLines:
 
 
 class _Progress(Progress):
-    """A bar, or lines."""
+    """A bar, or lines, of one task."""
 
     def __init__(self, *columns: Any, **settings: Any) -> None:
         self._lines = PlainLines()
+        self._begun = time.monotonic()
         super().__init__(*columns, **settings)
 
     def update(self, task_id: TaskID, **changes: Any) -> None:
         super().update(task_id, **changes)
         task = self.tasks[task_id]
-        told = f"{task.description}: {task.completed:g} of {task.total:g}"
-        self._lines.tell(f"{told}, {task.fields['rate']}")
+        told, total = f"{task.description}: {task.completed:g} of {task.total:g}", task.total or 0
+        done = task.completed - task.fields["before"]
+        if done <= 0:
+            self._lines.tell(told, at_once=True)
+            return
+        each_s = (time.monotonic() - self._begun) / done
+        rate = _rate(each_s, task.fields["unit"])
+        super().update(task_id, rate=rate)
+        # rich's own estimate is of the last 30 seconds, in which nothing may have been finished.
+        left = timedelta(seconds=round(each_s * (total - task.completed)))
+        self._lines.tell(f"{told}, {rate}, {left} left")
+
+
+def _rate(each_s: float, unit: str) -> str:
+    """How many pieces are done in a second, a minute or an hour.
+
+    >>> _rate(0.5, " rooms"), _rate(45, ""), _rate(5000, "")
+    ('2.0 rooms/s', '1.3/min', '0.7/h')
+    """
+    scales = {"s": 1, "min": 60, "h": 3600}
+    name = next((name for name, seconds in scales.items() if seconds >= each_s), "h")
+    return f"{scales[name] / max(each_s, 1e-9):.1f}{unit}/{name}"
 
 
 def progress_bar() -> Progress:
-    """A bar for tasks with a field `rate`."""
+    """A bar for a task with `unit`, `before` (pieces that were done before) and an empty `rate`."""
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -86,8 +108,8 @@ def show_progress(
     if before == total:
         return
     with progress_bar() as bar:
-        task = bar.add_task(description, total=total, rate="")
-        bar.advance(task, before)
+        own = {"unit": f" {unit}", "before": before, "rate": ""}
+        task = bar.add_task(description, total=total, completed=before, **own)
+        bar.update(task)
         for _ in done:
-            speed = bar.tasks[task].speed
-            bar.update(task, advance=1, rate=f"{speed:.1f} {unit}/s" if speed else "")
+            bar.update(task, advance=1)

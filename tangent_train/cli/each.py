@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import time
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -71,16 +70,14 @@ def each(
     Yields:
         Finished jobs in order; errors have been printed.
     """
-    begun = time.monotonic()
     with progress_bar() as bar:
-        task = bar.add_task(description, total=count, rate="")
+        task = bar.add_task(description, total=count, unit="", before=0, rate="")
         progress = partial(bar.advance, task)
 
         def worked() -> Iterator[Job]:
             for number, job in enumerate(_stage(before, jobs), start=1):
                 yield job.then(lambda job: work(job, progress))
-                rate = f"{number / (time.monotonic() - begun):.2f}/s"
-                bar.update(task, completed=number, rate=rate)
+                bar.update(task, completed=number)
 
         for job in _stage(after, worked()):
             if job.error:

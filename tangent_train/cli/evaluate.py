@@ -199,7 +199,7 @@ class Run:
         for note in self.notes:
             console.print(note, markup=False)
         console.print(headline(record), markup=False)
-        console.print(result_tables(record)[0].terminal())
+        result_tables(record)[0].print()
         told = f"Results, pictures and logs: {self.folder}; report.html opens in a browser."
         console.print(told, markup=False)
 

@@ -81,7 +81,7 @@ def keypoints(config: Mapping[str, Any]) -> None:
         done[name] = comparison.rows
         report().write(output)
     for table in report().means():
-        console.print(table.terminal())
+        table.print()
     console.print(f"Results are in {output}." if done else "There are no results.", markup=False)
     if given.export:
         root = _root(pairs.files)

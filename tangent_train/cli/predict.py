@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
 
 from datamodules.images.gpano import area_of_crop, whole_area
 from datamodules.images.masks import Mask, Masks
@@ -149,7 +148,7 @@ def _label(
             folder.write_summary(decisive, entries)
 
     count = inputs.count()
-    _say(f"{counted(count, 'images')}, {len(entries)} done already.")
+    _say(f"{counted(count, inputs.noun)}, {len(entries)} done already.")
     missing = count - len(entries)
     steps = label, label.read, label.write
     labelled = set()
@@ -164,7 +163,7 @@ def _label(
                     save()
                     saved = time.monotonic()
     except KeyboardInterrupt:
-        _say(f"{len(entries)} of {count} images are done. resume=true continues.")
+        _say(f"{len(entries)} of {count} {inputs.noun} are done. resume=true continues.")
         raise
     finally:
         save()
@@ -188,7 +187,7 @@ def _finish(
     pictures = label.pictures({name: path for name, path in inputs.files.items() if name in used})
     if pictures:
         folder.write_page(entries, pictures)
-    _say(folder.mean_shares(entries).terminal())
+    folder.mean_shares(entries).print()
     _say(f"Results are in {settings.output}.")
 
 
@@ -357,5 +356,5 @@ def _depth_folder(settings: Settings, trained: TrainedNetwork) -> DepthFolder | 
     return None if folder is None else DepthFolder(folder, settings.depth_scale)
 
 
-def _say(content: str | Table) -> None:
+def _say(content: str) -> None:
     Console(soft_wrap=True, highlight=False).print(content, markup=False)

@@ -103,6 +103,13 @@ class Inputs:
         frames = sum(1 if job.error else job.value for job in self.videos.values())
         return len(self.files) - len(self.videos) + frames
 
+    @property
+    def noun(self) -> str:
+        """What is labelled, in the plural."""
+        if not self.videos:
+            return "images"
+        return "frames" if len(self.videos) == len(self.files) else "images and frames"
+
     def has(self, entry: Entry) -> bool:
         """Whether an entry of an earlier summary is of one of these."""
         name: str = entry["name"]

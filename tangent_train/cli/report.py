@@ -30,7 +30,7 @@ def report(arguments: Sequence[str]) -> None:
     found = runs_report(records, notes)
     found.write(options.output, "report")
     console = Console(highlight=False)
-    console.print(found.tables()[0].terminal())
+    found.tables()[0].print()
     for line in (*(f"- {note}" for note in found.all_notes()), f"Files: {options.output}/report.*"):
         console.print(line, soft_wrap=True, markup=False)
 

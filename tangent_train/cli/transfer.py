@@ -233,7 +233,7 @@ def _report(
         cells = {s.name: (s.view or "S", s.condition) for s in stages if s.condition}
         name, report = "transfer", transfer_report(found, cells)
     report.write(folder, name)
-    Console(highlight=False).print(report.tables()[0].terminal())
+    report.tables()[0].print()
     for note in report.all_notes():
         _say(f"- {note}")
     _say(f"Tables and a chart: {folder / name}.md, .csv, .json, .png")

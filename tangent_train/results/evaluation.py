@@ -185,6 +185,8 @@ def largest_loss(record: Record) -> str:
 def result_tables(record: Record) -> list[Table]:
     """The scores per class, with their means, and per latitude band.
 
+    Classes that neither the labels nor the predictions have are left out, if their scores are.
+
     Args:
         record: Of an evaluation.
     """
@@ -195,7 +197,13 @@ def result_tables(record: Record) -> list[Table]:
         if name != "class" and (record.latitude_bands or not name.endswith("_solid_angle"))
     ]
     headings = {**_HEADINGS, **{name: f"{text} %" for name, text in scores.per_class.items()}}
-    rows = [[e["class"], *(_cell(e[name]) for name in columns)] for e in record.classes]
+    counts = np.asarray(record.confusion, np.float64)[-len(record.classes) :]
+    predicted = counts.sum(axis=0)[-len(record.classes) :]
+    rows = [
+        [e["class"], *(_cell(e[name]) for name in columns)]
+        for e, count in zip(record.classes, predicted, strict=True)
+        if count or e["accuracy"] is not None
+    ]
     names = (mean_of.get(column) for column in columns)
     means = (percent(record.means[n], record.intervals.get(n)) if n else "" for n in names)
     rows.append(["mean", *means])

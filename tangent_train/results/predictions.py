@@ -253,11 +253,12 @@ class PredictionFolder:
         write_text(self.path / "summary.csv", csv_text([*columns, *names, "error"], rows))
 
     def mean_shares(self, entries: Sequence[Entry]) -> Table:
-        """Mean over the images of `class_shares`, the largest first."""
+        """Mean over the images of `class_shares`, the largest first, of classes that occur."""
         shares = [entry["classes"] for entry in entries if "classes" in entry]
         count = max(1, len(shares))
         mean = {name: sum(of[name] for of in shares) / count for name in self.class_names[1:]}
-        rows = [[n, percent(mean[n])] for n in sorted(mean, key=mean.__getitem__, reverse=True)]
+        seen = sorted(filter(mean.get, mean), key=mean.__getitem__, reverse=True)
+        rows = [[name, percent(mean[name])] for name in seen]
         return Table("Mean over the images", ["class", "solid angle, %"], rows)
 
     def viewer_image(

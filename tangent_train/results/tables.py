@@ -7,9 +7,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from rich import table as rich_table
+from rich.console import Console
 from rich.markup import escape
 
 __all__ = ["Table", "markdown_line", "percent"]
+
+_WIDEST = 10_000
+"""Characters: no table is wider."""
 
 
 @dataclass(frozen=True)
@@ -45,14 +49,17 @@ class Table:
         lines += ["", self.note] if self.note else []
         return "\n".join(lines) + "\n"
 
-    def terminal(self) -> rich_table.Table:
-        """The table for the terminal."""
+    def print(self) -> None:
+        """Print the table: as wide as the terminal, elsewhere as wide as it is."""
+        console = Console(highlight=False)
+        if not console.is_terminal:
+            console.width = _WIDEST
         table = rich_table.Table(title=escape(self.title), caption=escape(self.note) or None)
         for k, name in enumerate(self.header):
             table.add_column(escape(name), justify="left" if k in self.text_columns else "right")
         for row in self.rows:
             table.add_row(*map(escape, row))
-        return table
+        console.print(table)
 
     def html(self) -> str:
         """The table as an HTML section."""

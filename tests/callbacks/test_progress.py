@@ -57,9 +57,14 @@ def test_a_line_whenever_a_minute_has_passed(
 
     monkeypatch.setattr(time, "monotonic", half_a_minute_later)
     progress.show_progress(iter(range(4)), "Rendering rooms", "rooms", 5, before=1)
-    lines = capsys.readouterr().out.splitlines()
+    first, *lines = capsys.readouterr().out.splitlines()
+    assert first == "Rendering rooms: 1 of 5"
     assert 1 <= len(lines) <= 4
-    assert lines[-1].startswith("Rendering rooms: ")
+    count, rate, left = lines[0].removeprefix("Rendering rooms: ").split(", ")
+    pieces, minutes = int(count[0]) - 1, float(rate.removesuffix(" rooms/min"))
+    hours, of_hour, _ = left.split(":")
+    assert 0.1 <= minutes <= 2
+    assert 60 * int(hours) + int(of_hour) == pytest.approx((4 - pieces) / minutes, rel=0.2)
     trainer = _trainer()
     trainer.test(_Model(), verbose=False)
     assert "Test: 2 of 2 steps" in capsys.readouterr().out

@@ -91,7 +91,10 @@ def test_frames_get_the_labels_of_images_and_pictures_are_a_video(tmp_path: Path
 
 
 def test_an_interrupted_video_is_resumed(
-    tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    run: Run,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     video = _write_video(tmp_path / "in" / "walk.mp4")
 
@@ -105,6 +108,7 @@ def test_an_interrupted_video_is_resumed(
     with pytest.raises(SystemExit) as stopped:
         _predict(run, tmp_path, input=video)
     assert stopped.value.code == 130
+    assert "4 of 7 frames are done. resume=true" in capsys.readouterr().out
     assert len(_entries(tmp_path / "out")) == 4
     assert not (tmp_path / "out" / "overlay").exists()
     monkeypatch.setattr("tangent_train.cli.predict_inputs.read_frames", read_frames)

@@ -74,6 +74,19 @@ def test_csv_and_markdown_hold_the_same_scores(tmp_path: Path) -> None:
     assert "| 0° … 30° | 35.2 | 46.7 |" in text
 
 
+def test_classes_of_no_pixel_are_left_out_of_the_table() -> None:
+    """Neither labelled nor predicted, and without a score that counts in the mean."""
+    predicted = _matrices({(1, 1): 90, (1, 3): 10, (2, 2): 50})
+    shown = {
+        "skip": _record(),
+        "zero": _record("zero"),
+        "predicted": segmentation_record(predicted, NAMES, "skip"),
+    }
+    names = {name: [row[0] for row in result_tables(r)[0].rows] for name, r in shown.items()}
+    whole = ["wall", "floor", "=sofa", "mean"]
+    assert names == {"skip": ["wall", "floor", "mean"], "zero": whole, "predicted": whole}
+
+
 def test_photos_have_neither_solid_angles_nor_latitudes() -> None:
     none = np.zeros((4, 4))
     of_images = np.zeros((2, 2, 3, 3))
@@ -145,7 +158,7 @@ def test_shapes_are_counted_per_class_and_over_all(tmp_path: Path) -> None:
     write_results(record, tmp_path)
     text = (tmp_path / "results.md").read_text()
     assert "| mug | 4 | 25.0 | bottle | 75.0 |" in text
-    assert "| plant | 0 | – | – | – |" in text
+    assert "| plant" not in text, "no shape, and none taken for one"
     assert "| mean |  | 75.0 |  |  |" in text
 
 

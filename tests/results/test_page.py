@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 from html.parser import HTMLParser
 from pathlib import Path
@@ -10,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 from tangent_train.results.html import encode_image, write_report
 from tangent_train.results.tables import Table
@@ -105,10 +103,15 @@ def test_tables_align_columns_and_shade_heat_maps() -> None:
     assert '<td class="strong" style="--share:0.900">90</td>' in heat
 
 
-def test_tables_for_the_terminal_and_markdown_take_any_text() -> None:
+def test_printed_tables_and_markdown_take_any_text(capsys: pytest.CaptureFixture[str]) -> None:
     table = Table("[t]", ("", "[red]"), [("a|b", "[/]")], "[note]")
-    console = Console(width=80, record=True, file=io.StringIO())
-    console.print(table.terminal())
-    shown = console.export_text()
+    table.print()
+    shown = capsys.readouterr().out
     assert all(text in shown for text in ("[t]", "[red]", "[/]", "[note]"))
     assert r"| a\|b | [/] |" in table.markdown()
+
+
+def test_tables_are_printed_in_full_width_to_a_file(capsys: pytest.CaptureFixture[str]) -> None:
+    cells = ["x" * 60, "word " * 20 + "end"]
+    Table("t", ("a", "b"), [cells]).print()
+    assert any(all(cell in line for cell in cells) for line in capsys.readouterr().out.splitlines())

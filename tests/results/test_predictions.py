@@ -68,6 +68,15 @@ def test_pixels_of_photos_count_by_their_solid_angle() -> None:
     assert class_shares(labels, NAMES, image)["down"] == pytest.approx(part, rel=1e-3)
 
 
+def test_the_table_has_the_classes_that_occur() -> None:
+    folder = PredictionFolder(Path(), ("unknown", "sky", "wall", "car"), [])
+    entries: list[Entry] = [
+        {"classes": {"sky": 0.25, "wall": 0.75, "car": 0.0}},
+        {"error": "broken"},
+    ]
+    assert folder.mean_shares(entries).rows == [["wall", "75.0"], ["sky", "25.0"]]
+
+
 def test_the_summary(tmp_path: Path) -> None:
     entries: list[Entry] = [
         {"file": "a, b.jpg", "name": "a", "rows": 2, "columns": 4, "classes": {"up": 1, "down": 3}},
