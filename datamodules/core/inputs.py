@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Any, Literal, Self, get_args
 
 import torch
 from torch import Tensor
@@ -72,26 +72,32 @@ class Normalization:
             )
 
     @classmethod
-    def of(
-        cls, given: Normalization | Mapping[str, Sequence[float]], channels: int
-    ) -> Normalization:
-        """The same, made of its `mean` and `std` if need be.
+    def of(cls, given: Any, channels: int, setting: str = "normalization") -> Self:
+        """The one that a setting names or describes.
 
         Args:
-            given: It, or a mapping.
+            given: ``imagenet``, ``unit`` (0 to 1) or ``symmetric`` (-1 to 1) of RGB, a mapping with
+                ``mean`` and ``std``, or the normalization itself.
             channels: Required number of channels.
+            setting: For the message.
 
         Raises:
-            SettingError: It has others.
+            SettingError: It is something else, or has other channels.
         """
-        if isinstance(given, Mapping):
-            if set(given) != {"mean", "std"}:
-                expected = "mean and std"
-                raise SettingError("data.normalization", found=dict(given), expected=expected)
+        if isinstance(given, str):
+            given = _NAMED.get(given, given)
+        if isinstance(given, Mapping) and set(given) == {"mean", "std"}:
             given = cls(given["mean"], given["std"])
+        if not isinstance(given, cls):
+            raise SettingError(
+                setting,
+                found="none" if given is None else given,
+                expected=f"{', '.join(_NAMED)}, or {{mean: […], std: […]}} of 0 to 1",
+                remedy="Take what the network was trained with; labels are poor with another one.",
+            )
         if given.channels != channels:
             raise SettingError(
-                "data.normalization",
+                setting,
                 found=f"{given.channels} channels",
                 expected=f"{channels}, as the inputs have",
             )
@@ -102,6 +108,13 @@ class Normalization:
         """3, 4 with depth, or 6 of shapes."""
         return len(self.mean)
 
+
+_NAMED = {
+    "imagenet": Normalization((0.485, 0.456, 0.406), (0.229, 0.224, 0.225)),
+    "unit": Normalization((0, 0, 0), (1, 1, 1)),
+    "symmetric": Normalization((0.5, 0.5, 0.5), (0.5, 0.5, 0.5)),
+}
+"""Of RGB from 0 to 1: torchvision's, none, and to -1 … 1."""
 
 RGB_NORMALIZATION = Normalization(
     mean=(0.5490, 0.5306, 0.4779),

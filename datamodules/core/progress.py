@@ -108,7 +108,7 @@ def show_progress(
     if before == total:
         return
     with progress_bar() as bar:
-        own = {"unit": f" {unit}", "before": before, "rate": ""}
+        own: dict[str, Any] = {"unit": f" {unit}", "before": before, "rate": ""}
         task = bar.add_task(description, total=total, completed=before, **own)
         bar.update(task)
         for _ in done:

@@ -92,7 +92,7 @@ class ImageSamples:
 
     Args:
         inputs: Inputs of the network, `rgb` and optionally others, see `Input`.
-        normalization: Of RGB and depth, or its `mean` and `std`.
+        normalization: Of RGB and depth, see `Normalization.of`.
         color_jitter: Strength of the colour augmentation, 0 (none) to 1, see `jitter_colors`.
 
     Attributes:
@@ -107,11 +107,13 @@ class ImageSamples:
     def __init__(
         self,
         inputs: Sequence[Input],
-        normalization: Normalization | Mapping[str, Sequence[float]],
+        normalization: Normalization | str | Mapping[str, Sequence[float]],
         color_jitter: float,
     ) -> None:
         self.inputs = _checked_inputs(inputs)
-        self.normalization = Normalization.of(normalization, 3 + ("depth" in inputs))
+        self.normalization = Normalization.of(
+            normalization, 3 + ("depth" in inputs), "data.normalization"
+        )
         self.in_channels = len(channel_names(self.inputs))
         if not isinstance(color_jitter, int | float) or not 0 <= color_jitter <= 1:
             raise SettingError("data.color_jitter", found=color_jitter, expected="0 to 1")

@@ -52,7 +52,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
         representation: Representation of the images.
         validation_fraction: Share of the training data that is held out for validation; 0 for no
             validation.
-        normalization: Of the input channels, or its `mean` and `std`; by default that of the data.
+        normalization: See `Normalization.of`; by default that of the data.
         num_workers: Worker processes of a loader; the samples are the same for any number.
         seed: Seed of order, views and augmentation, 0 or more.
         stream: Another number draws another order and other views from the same seed, so that
@@ -80,7 +80,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
     root: Path = field(kw_only=False)
     representation: Any = field(kw_only=False)
     validation_fraction: float = 0.1
-    normalization: Normalization | Mapping[str, Sequence[float]] | None = None
+    normalization: Normalization | str | Mapping[str, Sequence[float]] | None = None
     num_workers: int = 0
     seed: int = 0
     stream: int = 0

@@ -103,16 +103,16 @@ class ShapeSamples:
 
     Args:
         class_names: Of the shapes, in the order of their labels.
-        normalization: Of the six channels, or its `mean` and `std`.
+        normalization: Of the six channels, see `Normalization.of`.
     """
 
     def __init__(
         self,
         class_names: Sequence[str],
-        normalization: Normalization | Mapping[str, Sequence[float]],
+        normalization: Normalization | str | Mapping[str, Sequence[float]],
     ) -> None:
         self._labels = {name: label for label, name in enumerate(class_names)}
-        self.normalization = Normalization.of(normalization, CHANNELS)
+        self.normalization = Normalization.of(normalization, CHANNELS, "data.normalization")
         self.in_channels = CHANNELS
 
     def training(self, source: _Shapes, representation: Any, seed: Seed) -> ShapeViews:

@@ -129,8 +129,8 @@ class _Means:
     def panorama(self) -> NDArray[np.float32]:
         """``(H, W[, K])``, in the memory of the sums."""
         if self._weights is not None:
-            for row, weights in zip(self._sums, self._weights, strict=True):
-                row /= weights
+            for sums, weights in zip(self._sums, self._weights, strict=True):
+                np.divide(sums, weights, out=sums)
         return np.asarray(self._sums).reshape(*self._shape, *self._channels)
 
 

@@ -7,10 +7,10 @@ from typing import Any
 
 import torch
 
+from datamodules.core.inputs import Normalization
 from tangent_train.inference.photo_networks import (
     PhotoNetwork,
     import_network,
-    normalization_of,
 )
 from tangent_train.registry import make
 from tests.tasks.small_networks import with_statistics
@@ -25,7 +25,7 @@ def write_imported(path: Path, settings: dict[str, Any] = UNET, classes: int = 2
     torch.manual_seed(3)
     network = with_statistics(make(settings, "network"))
     names = [f"thing {number}" for number in range(classes)]
-    normalization = normalization_of("imagenet")
+    normalization = Normalization.of("imagenet", 3)
     photo = PhotoNetwork(network, settings, names, normalization, (64, 64))
     import_network(photo, path, level=6)
     return path

@@ -11,14 +11,13 @@ from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
-from datamodules.core.inputs import RGBD_NORMALIZATION
+from datamodules.core.inputs import RGBD_NORMALIZATION, Normalization
 from tangent_train.checkpoints.content import read_settings
 from tangent_train.checkpoints.trained import load_trained
 from tangent_train.cli.build import build
 from tangent_train.cli.fine_tuning import begin_from
 from tangent_train.errors import DataError, SettingError
 from tangent_train.inference.export import export_network
-from tangent_train.inference.photo_networks import normalization_of
 from tests.cli.imported import UNET, write_imported
 from tests.cli.tiny_runs import SETTINGS, Run, results
 from tests.running import composed, composed_settings
@@ -175,7 +174,7 @@ def test_fine_tuning_leaves_a_run_of_its_own(
     assert choices["experiment"] == "rooms/demo"
     trained = load_trained(checkpoint)
     assert trained.class_names == tuple(content["class_names"])
-    assert trained.normalization == normalization_of("imagenet")
+    assert trained.normalization == Normalization.of("imagenet", 3)
     run("evaluate", f"checkpoint={checkpoint}", rooms, "hydra.run.dir=again")
     assert results(tmp_path / "again") == results(tmp_path / "tuned")
     assert read_settings(tmp_path / "again" / "config.yaml")["choices"] == choices

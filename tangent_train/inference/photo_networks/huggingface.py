@@ -15,7 +15,6 @@ from tangent_train.errors import DataError, SettingError
 from tangent_train.inference.photo_networks.network import (
     PhotoNetwork,
     class_names_in,
-    normalization_of,
 )
 from tangent_train.inference.photo_networks.saved import json_in, saved_folder, tensors_in
 from tangent_train.registry import SettingsFile, make
@@ -37,7 +36,7 @@ def load(*, model: str | None, classes: Path | None, normalization: Any, **_: An
     Args:
         model: Its name on the hub, or a folder written by ``save_pretrained``.
         classes: JSON file of the class names; None for those of its config.
-        normalization: See `normalization_of`; None for that of its image processor.
+        normalization: See `Normalization.of`; None for that of its image processor.
 
     Raises:
         DataError: A file is missing, cannot be fetched or used.
@@ -59,7 +58,7 @@ def load(*, model: str | None, classes: Path | None, normalization: Any, **_: An
     tensors, remarks = tensors_in(folder)
     _load_tensors(network, tensors, folder)
     settings["config"] = architecture(network.network.config.to_dict())
-    given = None if normalization is None else normalization_of(normalization)
+    given = None if normalization is None else Normalization.of(normalization, 3)
     return PhotoNetwork(
         network=network,
         settings=settings,

@@ -13,17 +13,10 @@ from datamodules.core.inputs import Normalization
 from tangent_train.errors import DataError, SettingError
 from tangent_train.json_text import parse_json
 
-__all__ = ["USUAL_SIZE", "PhotoNetwork", "class_names_in", "normalization_of"]
+__all__ = ["USUAL_SIZE", "PhotoNetwork", "class_names_in"]
 
 USUAL_SIZE = (512, 512)
 """Rows and columns of the photos, where nothing says what they were."""
-
-_NORMALIZATIONS = {
-    "imagenet": Normalization((0.485, 0.456, 0.406), (0.229, 0.224, 0.225)),
-    "unit": Normalization((0, 0, 0), (1, 1, 1)),
-    "symmetric": Normalization((0.5, 0.5, 0.5), (0.5, 0.5, 0.5)),
-}
-"""Of images from 0 to 1: torchvision's, none, and to -1 … 1."""
 
 
 @dataclass(frozen=True)
@@ -46,28 +39,6 @@ class PhotoNetwork:
     normalization: Normalization
     image_size: tuple[int, int]
     remarks: Sequence[str] = ()
-
-
-def normalization_of(given: Any) -> Normalization:
-    """The normalization that a setting names.
-
-    Args:
-        given: ``imagenet``, ``unit`` (0 to 1), ``symmetric`` (-1 to 1), or a mapping with ``mean``
-            and ``std`` of images from 0 to 1.
-
-    Raises:
-        SettingError: It is something else.
-    """
-    if isinstance(given, Mapping):
-        return Normalization.of(given, 3)
-    if given not in _NORMALIZATIONS:
-        raise SettingError(
-            "normalization",
-            found="none" if given is None else given,
-            expected=f"{', '.join(_NORMALIZATIONS)}, or {{mean: […], std: […]}} of 0 to 1",
-            remedy="Take what the network was trained with; labels are poor with another one.",
-        )
-    return _NORMALIZATIONS[given]
 
 
 def class_names_in(path: Path | None) -> tuple[str, ...]:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from datamodules.core.inputs import Normalization
 from models.pretrained import load_tensors, read_tensors
 from tangent_train.checkpoints.trained import completed_settings
 from tangent_train.errors import SettingError
@@ -13,7 +14,6 @@ from tangent_train.inference.photo_networks.network import (
     USUAL_SIZE,
     PhotoNetwork,
     class_names_in,
-    normalization_of,
 )
 from tangent_train.registry import make
 
@@ -29,7 +29,7 @@ def load(
         settings: Its section.
         weights: File of its state dict.
         classes: JSON file of the class names.
-        normalization: See `normalization_of`.
+        normalization: See `Normalization.of`.
 
     Raises:
         DataError: A file cannot be used.
@@ -41,4 +41,4 @@ def load(
     whole = completed_settings(settings, 3, len(names), restored=True)
     network = make(whole, "network")
     load_tensors(network, read_tensors(Path(weights).expanduser()), weights)
-    return PhotoNetwork(network, whole, names, normalization_of(normalization), USUAL_SIZE)
+    return PhotoNetwork(network, whole, names, Normalization.of(normalization, 3), USUAL_SIZE)

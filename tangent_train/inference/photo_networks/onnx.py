@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from datamodules.core.inputs import Normalization
 from models.onnx_network import OnnxNetwork
 from tangent_train.errors import SettingError
 from tangent_train.inference.photo_networks.network import (
     USUAL_SIZE,
     PhotoNetwork,
     class_names_in,
-    normalization_of,
 )
 
 __all__ = ["load"]
@@ -23,7 +23,7 @@ def load(*, file: Path | None, classes: Path | None, normalization: Any, **_: An
     Args:
         file: The file.
         classes: JSON file of the class names.
-        normalization: See `normalization_of`.
+        normalization: See `Normalization.of`.
 
     Raises:
         DataError: A file cannot be used.
@@ -36,6 +36,6 @@ def load(*, file: Path | None, classes: Path | None, normalization: Any, **_: An
         network=network,
         settings=None,
         score_names=class_names_in(classes),
-        normalization=normalization_of(normalization),
+        normalization=Normalization.of(normalization, 3),
         image_size=network.image_size or USUAL_SIZE,
     )

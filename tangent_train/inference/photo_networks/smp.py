@@ -12,7 +12,6 @@ from tangent_train.inference.photo_networks.network import (
     USUAL_SIZE,
     PhotoNetwork,
     class_names_in,
-    normalization_of,
 )
 from tangent_train.inference.photo_networks.saved import json_in, saved_folder, tensors_in
 from tangent_train.registry import SettingsFile, make
@@ -29,7 +28,7 @@ def load(*, model: str | None, classes: Path | None, normalization: Any, **_: An
     Args:
         model: A folder, or its name on the hub.
         classes: JSON file of the class names.
-        normalization: See `normalization_of`; None for that of the encoder's own weights.
+        normalization: See `Normalization.of`; None for that of the encoder's own weights.
 
     Raises:
         DataError: A file is missing, cannot be fetched or used.
@@ -51,7 +50,7 @@ def load(*, model: str | None, classes: Path | None, normalization: Any, **_: An
             found="a network with one score, of one class or not",
             expected="a score for every class, at least two",
         )
-    given = None if normalization is None else normalization_of(normalization)
+    given = None if normalization is None else Normalization.of(normalization, 3)
     tensors, remarks = tensors_in(folder)
     load_tensors(network, tensors, folder)
     return PhotoNetwork(

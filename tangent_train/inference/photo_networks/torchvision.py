@@ -15,7 +15,6 @@ from tangent_train.errors import SettingError
 from tangent_train.inference.photo_networks.network import (
     PhotoNetwork,
     class_names_in,
-    normalization_of,
 )
 
 __all__ = ["load"]
@@ -33,7 +32,7 @@ def load(
         weights: Published weights by name, or a file of a state dict, to which the classes and
             normalization of the default weights belong.
         classes: JSON file of the class names; None for those of the weights.
-        normalization: See `normalization_of`; None for that of the weights.
+        normalization: See `Normalization.of`; None for that of the weights.
 
     Raises:
         DataError: The weights cannot be fetched or read, or do not fit.
@@ -68,6 +67,6 @@ def load(
         network=network,
         settings=settings,
         score_names=names,
-        normalization=own if normalization is None else normalization_of(normalization),
+        normalization=own if normalization is None else Normalization.of(normalization, 3),
         image_size=(preset.resize_size[0], preset.resize_size[0]),
     )

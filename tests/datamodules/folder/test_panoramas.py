@@ -11,7 +11,7 @@ from PIL import Image
 from datamodules.core.found import Split
 from datamodules.core.inputs import RGBD_NORMALIZATION, Normalization
 from datamodules.folder.panoramas import FolderPanoramas
-from tangent_train.errors import DataError
+from tangent_train.errors import DataError, SettingError
 from tests.datamodules.data_files import read_png, write_png
 from tests.datamodules.folder.folder_format import (
     CLASS_OF_STORED,
@@ -133,6 +133,10 @@ def test_normalization_is_by_the_inputs_or_ones_own(root: Path, erp: Any) -> Non
     assert both.samples.normalization == RGBD_NORMALIZATION
     own = FolderPanoramas(root, erp, normalization={"mean": [0, 0.5, 1], "std": [1, 1, 2]})
     assert own.samples.normalization == Normalization((0, 0.5, 1), (1, 1, 2))
+    named = FolderPanoramas(root, erp, normalization="symmetric")
+    assert named.samples.normalization == Normalization((0.5, 0.5, 0.5), (0.5, 0.5, 0.5))
+    with pytest.raises(SettingError, match="normalization: found image; expected imagenet, unit"):
+        FolderPanoramas(root, erp, normalization="image")
 
 
 # What is wrong with files

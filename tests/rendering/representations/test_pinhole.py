@@ -293,7 +293,7 @@ def test_equirectangular_averages_have_the_highest_mean_probability(rows: int | 
             back = torch.nn.functional.interpolate(back, (40, 72), mode="bilinear")[..., 4:-4, 4:-4]
         mean += back[0].softmax(dim=0)
     best = rotate_equirect(mean.argmax(dim=0).numpy().astype(np.uint8), TILT, "nearest")
-    labels = representation.to_averaged_labels(iter(scores.split(1)), shape, rotations)
+    labels = representation.to_averaged_labels(iter(scores[:, None]), shape, rotations)
     assert labels.dtype == torch.int64
     assert (labels.numpy() == best).mean() > 0.999
     first = representation.to_labels(scores[:1], shape, rotations[0])
