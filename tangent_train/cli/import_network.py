@@ -57,6 +57,9 @@ def import_network(config: Mapping[str, Any]) -> None:
 
     settings = typed(Settings, config)
     output = settings.output
+    suffix = ".onnx" if settings.network == "onnx" else ".ckpt"
+    if output.suffix.lower() != suffix:
+        raise SettingError("output", found=output.name, expected=f"a name ending in {suffix}")
     check_new(output, overwrite=settings.overwrite)
     console = Console(soft_wrap=True, highlight=False)
     with console.status(f"Writing {output.name} …"):
@@ -71,7 +74,8 @@ def import_network(config: Mapping[str, Any]) -> None:
             nothing_wins=settings.nothing_wins,
         )
     console.print(_understood(output, imported, settings), markup=False)
-    for remark in network.remarks:
+    indoors = _indoors(imported.view.level, network.image_size, settings)
+    for remark in (*indoors, *network.remarks):
         console.print(remark, markup=False)
 
 
@@ -101,6 +105,20 @@ def _load(settings: Settings, normalization: Any) -> PhotoNetwork:
     config: Any = compose("import", [f"+network@section={name}", search])
     section: Any = OmegaConf.to_container(config.section)
     return of_config.load(section, settings.weights, settings.classes, normalization)
+
+
+def _indoors(level: int, image_size: tuple[int, int], settings: Settings) -> list[str]:
+    """Levels below the one derived, unless one was given."""
+    from tangent_train.inference.photo_networks.importing import view_of
+
+    if settings.level is not None:
+        return []
+    view = view_of(image_size, settings.fov, level - 1, settings.base_level)
+    levels = f"levels=[{view.level - 1},{view.level}] base_level={view.base_level}"
+    return [
+        f"indoors, try {levels} in tangent-predict: images that show more of a room, the best "
+        "of those tried on real ones (docs/photo_networks.md)"
+    ]
 
 
 def _understood(path: Path, imported: Imported, settings: Settings) -> str:

@@ -86,20 +86,17 @@ def import_network(
         SettingError: A setting is impossible, or the names do not fit the scores.
         NoRoomError: The disk is full.
     """
-    onnx = isinstance(network.network, OnnxNetwork)
-    suffix = ".onnx" if onnx else ".ckpt"
-    if path.suffix.lower() != suffix:
-        raise SettingError("output", found=path.name, expected=f"a name ending in {suffix}")
     view = view_of(network.image_size, fov_deg, level, base_level)
     _try(network)
     names, groups = _groups(network.score_names, nothing, nothing_wins)
     with atomic_path(path) as temporary:
-        if onnx:
+        if isinstance(network.network, OnnxNetwork):
             _write_onnx(network, temporary, names, groups, view)
         else:
             _write_checkpoint(network, temporary, names, groups, view)
         trained = load_trained(temporary)
-        _use(trained, view, network.image_size)
+        if network.image_size != (view.dim, view.dim):  # else it was tried
+            _use(trained, view, network.image_size)
     source = None if trained.source is None else replace(trained.source, path=path)
     return Imported(replace(trained, source=source), tuple(nothing), view)
 
@@ -237,6 +234,6 @@ def _write_onnx(
         groups=groups,
     )
     graph = onnx.load(inner.path)
-    entry = graph.metadata_props.add()
-    entry.key, entry.value = METADATA_KEY, metadata_json(described)
+    entries = inner.metadata | {METADATA_KEY: metadata_json(described)}
+    onnx.helper.set_model_props(graph, entries)  # in place of what was there
     onnx.save(graph, path)

@@ -17,6 +17,7 @@ from onnx import TensorProto, helper, numpy_helper
 from torchvision import models as torchvision_models
 
 from models import UNet
+from models.onnx_network import OnnxNetwork
 from tangent_train.checkpoints.trained import load_trained
 from tangent_train.cli import main
 from tangent_train.errors import SettingError
@@ -72,6 +73,31 @@ def test_an_onnx_file_gives_the_scores_of_its_runtime(
     np.testing.assert_array_equal(found.numpy(), expected)
 
 
+def test_an_imported_file_is_imported_again(
+    here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its description is replaced, and the network runs once."""
+    given = onnx.load("net.onnx")
+    helper.set_model_props(given, {"author": "somebody"})
+    onnx.save(given, "net.onnx")
+    _run("import", monkeypatch, *OF_ONNX, "level=7", "output=ours.onnx")
+    ran: list[Any] = []
+    forward = OnnxNetwork.forward
+
+    def noted(self: OnnxNetwork, images: Any) -> Any:
+        ran.append(images.shape)
+        return forward(self, images)
+
+    monkeypatch.setattr(OnnxNetwork, "forward", noted)
+    again = ("file=ours.onnx", "level=6", "base_level=1", "output=again.onnx")
+    _run("import", monkeypatch, *OF_ONNX, *again)
+    assert "indoors" not in capsys.readouterr().out.partition("again.onnx")[2]
+    assert ran == [(1, 3, 32, 32)]
+    assert load_trained(here / "again.onnx").level == 6
+    properties = [entry.key for entry in onnx.load("again.onnx").metadata_props]
+    assert sorted(properties) == ["author", "tangent_train"]
+
+
 @pytest.mark.parametrize("wins", [True, False])
 def test_an_onnx_file_labels_panoramas(
     wins: bool, here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -82,6 +108,7 @@ def test_an_onnx_file_labels_panoramas(
     said = capsys.readouterr().out
     assert "3 classes: dark, green, bright\n" in said
     assert f"background: mean nothing, {'are written as unknown' if wins else 'never win'}" in said
+    assert "indoors, try levels=[3,4] base_level=0 in tangent-predict" in said
     trained = load_trained(here / "ours.onnx")
     assert trained.class_names == ("unknown", "dark", "green", "bright")
     assert (trained.fixed_size, trained.level) == ((32, 32), 5)
@@ -178,15 +205,28 @@ def test_impossible_views_are_refused() -> None:
         (("nothing=[sky]",), "nothing: found sky; expected of background, dark"),
         (("nothing=[background,dark,green,bright]",), "nothing: found all classes"),
         (("output=net.onnx",), "which exists; expected a new file"),
+        (("output=ours.ckpt", "file=absent.onnx"), r"output: found ours\.ckpt; expected .*\.onnx"),
         (("file=null",), "file: found none; expected an ONNX file"),
-        (("network=timm", "model=vit"), "found timm, which has no networks for segmentation"),
-        (("network=torchvision", "model=resnet50"), "model: found resnet50; expected deeplabv3"),
         (
-            ("network=torchvision", "model=lraspp_mobilenet_v3_large", "weights=VOC"),
+            ("network=timm", "model=vit", "output=net.ckpt"),
+            "found timm, which has no networks for segmentation",
+        ),
+        (
+            ("network=torchvision", "model=resnet50", "output=net.ckpt"),
+            "model: found resnet50; expected deeplabv3",
+        ),
+        (
+            (
+                *("network=torchvision", "model=lraspp_mobilenet_v3_large", "weights=VOC"),
+                "output=net.ckpt",
+            ),
             "weights: found VOC; expected COCO_WITH_VOC_LABELS_V1, DEFAULT, or a file",
         ),
-        (("network=unet_small",), "weights: found none; expected a file with the network's"),
-        (("network=unet_smal",), "unet_smal"),
+        (
+            ("network=unet_small", "output=net.ckpt"),
+            "weights: found none; expected a file with the network's",
+        ),
+        (("network=unet_smal", "output=net.ckpt"), "unet_smal"),
     ],
 )
 def test_what_does_not_fit_is_one_clear_message(
