@@ -108,6 +108,12 @@ def overlay_picture(
 ) -> _Image:
     """A picture overlaid with its labels, above a legend of its classes.
 
+    Args:
+        rgb: ``(H, W, 3)``.
+        labels: ``(H, W)`` class indices; unknown pixels (0) show the picture.
+        class_names: K + 1 names, the unknown class first.
+        opacity: Of the labels, 0 to 1.
+
     Returns:
         RGB image of the same width, a little higher; the legend grows with the width.
     """
@@ -120,7 +126,10 @@ def overlay_picture(
 def mixed_picture(
     rgb: _Image, labels: NDArray[np.integer], num_classes: int, opacity: float = 0.5
 ) -> _Image:
-    """A picture overlaid with its labels, of the same size.
+    """The lightness of a picture overlaid with its labels, of the same size.
+
+    Without the picture's colours, which would change those of the classes; these are pure where a
+    class begins.
 
     Args:
         rgb: ``(H, W, 3)``.
@@ -128,7 +137,12 @@ def mixed_picture(
         num_classes: K + 1.
         opacity: Of the labels, 0 to 1.
     """
-    mixed = cv2.addWeighted(rgb, 1 - opacity, colorize(labels, num_classes), opacity, 0)
+    light = cv2.cvtColor(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB)
+    colors = colorize(labels, num_classes)
+    mixed = cv2.addWeighted(light, 1 - opacity, colors, opacity, 0)
+    for axis in (0, 1):
+        begins = np.diff(labels, axis=axis, prepend=labels.take([0], axis)) != 0
+        mixed[begins] = colors[begins]
     mixed[labels == UNKNOWN] = rgb[labels == UNKNOWN]
     return mixed
 

@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from datamodules.images.palette import class_colors
-from tangent_train.results.pictures import colorize, prediction_panel
+from tangent_train.results.pictures import colorize, mixed_picture, prediction_panel
 
 NAMES = ("unknown", "wall", "floor", "sofa")
 
@@ -33,6 +33,24 @@ def test_colours_are_distinct_for_colour_blind_readers_too() -> None:
         distances = np.linalg.norm(lab[:, None] - lab, axis=-1) + 999 * np.eye(len(lab))
         assert distances.min() > least
     assert len(np.unique(class_colors(256), axis=0)) == 256
+
+
+def test_an_overlay_keeps_the_hues_of_the_classes() -> None:
+    rgb = np.random.default_rng(0).integers(0, 256, (6, 8, 3), np.uint8)
+    labels = np.ones((6, 8), np.uint8)
+    labels[2:, 3:] = 2
+    labels[5] = 0
+    mixed = mixed_picture(rgb, labels, 3).astype(float)
+    colors = class_colors(3)[labels].astype(float)
+    light = 2 * mixed - colors  # grey, but for rounding
+    inside = labels > 0
+    inside[2, 3:] = inside[2:5, 3] = False
+    assert np.ptp(light[inside], axis=-1).max() <= 2
+    weights = [0.299, 0.587, 0.114]  # luma of ITU-R BT.601
+    np.testing.assert_allclose(light[inside].mean(axis=-1), rgb[inside] @ weights, atol=2)
+    np.testing.assert_array_equal(mixed[2, 3:], colors[2, 3:], "where a class begins")
+    np.testing.assert_array_equal(mixed[2:5, 3], colors[2:5, 3])
+    np.testing.assert_array_equal(mixed[5], rgb[5], "unknown")
 
 
 @pytest.mark.parametrize(("rows", "scale"), [(100, 2), (256, 1), (300, 1)])
