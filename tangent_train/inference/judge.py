@@ -8,10 +8,14 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 import torch
 
-from datamodules.core.inputs import normalize
-from datamodules.core.samples import render_inputs, world_rays
+from datamodules.core.samples import world_rays
 from tangent_train.geometry import CubeGrid, TangentGrid
-from tangent_train.inference.predictor import sees_rays, view_scores
+from tangent_train.inference.predictor import (
+    sees_rays,
+    view_images,
+    view_scores,
+    views_per_forward,
+)
 from tangent_train.inference.views import InputImage, resized
 from tangent_train.rendering.representations.views import PinholeViews
 from tangent_train.rendering.upright.gravity import upright_rotation
@@ -30,7 +34,6 @@ __all__ = ["NetworkJudge"]
 _AROUND = np.arange(4)  # faces of a cube: all but up and down
 _WEIGHT = 6.0  # fitted to one network on the real panoramas of one home, checked with another
 _LEAST_DOUBT = 1e-4
-_PIXELS_PER_FORWARD = 2**20
 
 
 @dataclass(frozen=True)
@@ -93,11 +96,10 @@ class NetworkJudge:
         rays = torch.from_numpy(world_rays(faces, image.up)).to(self.device)
 
         def images(part: slice) -> Tensor:
-            rendered = render_inputs(image, PinholeViews(grid, _AROUND[part]), self.inputs)
-            on_device = [one.to(self.device) for one in rendered]
-            return normalize(on_device, self.normalization, self.inputs)
+            views = PinholeViews(grid, _AROUND[part])
+            return view_images(image, views, self.inputs, self.normalization, self.device)
 
-        per_forward = max(1, _PIXELS_PER_FORWARD // grid.dim**2)
+        per_forward = views_per_forward((grid.dim, grid.dim))
         of_sphere = rays if sees_rays(self.network) else None
         found = [
             ((1 - scores.softmax(dim=1).amax(dim=1)) * weights).sum(dim=(1, 2)) / weights.sum()

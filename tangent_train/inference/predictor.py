@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -15,14 +16,15 @@ from tangent_train.errors import SettingError
 from tangent_train.rendering.mosaic import ScoreMosaic
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Sequence
 
     from torch import Tensor, nn
 
+    from datamodules.core.inputs import Input, Normalization
     from tangent_train.checkpoints.trained import TrainedNetwork
     from tangent_train.inference.views import InputImage, ViewSets
 
-__all__ = ["Predictor", "sees_rays", "view_scores"]
+__all__ = ["Predictor", "sees_rays", "view_images", "view_scores", "views_per_forward"]
 
 _PIXELS_PER_FORWARD = 2**20
 
@@ -31,6 +33,31 @@ def sees_rays(network: nn.Module) -> bool:
     """Whether a network takes viewing rays, as for cross-image attention."""
     inner = network.network if isinstance(network, Scores) else network
     return "rays" in inspect.signature(inner.forward).parameters
+
+
+def views_per_forward(image_size: tuple[int, int]) -> int:
+    """Views of that many rows and columns per call of a network, which bounds memory."""
+    return max(1, _PIXELS_PER_FORWARD // math.prod(image_size))
+
+
+def view_images(
+    image: InputImage,
+    views: Any,
+    inputs: Sequence[Input],
+    normalization: Normalization,
+    device: torch.device | str,
+) -> Tensor:
+    """Some views of an image as a network takes them: ``(n, C, h, w)``, normalized.
+
+    Args:
+        image: A panorama or photo.
+        views: Renders the views.
+        inputs: Of the network.
+        normalization: Of RGB and depth.
+        device: Where the network is.
+    """
+    rendered = [part.to(device) for part in render_inputs(image, views, inputs)]
+    return normalize(rendered, normalization, inputs)
 
 
 @torch.no_grad()
@@ -104,8 +131,7 @@ class Predictor:
         # Halves the time of a UNet on a CPU; an ONNX file takes what it was made for.
         in_torch = any(True for _ in network.parameters())
         self._format = torch.channels_last if in_torch else torch.contiguous_format
-        rows, columns = view_sets.image_size
-        self._per_forward = images_per_forward or max(1, _PIXELS_PER_FORWARD // (rows * columns))
+        self._per_forward = images_per_forward or views_per_forward(view_sets.image_size)
         self._network: Any = network
         self._sees_rays = sees_rays(trained.network)
         if self._sees_rays:
@@ -155,7 +181,6 @@ class Predictor:
         return mosaic
 
     def _images(self, image: InputImage, views: Any) -> Tensor:
-        trained = self._trained
-        rendered = [part.to(self.device) for part in render_inputs(image, views, trained.inputs)]
-        images = normalize(rendered, trained.normalization, trained.inputs)
+        known = self._trained.inputs, self._trained.normalization
+        images = view_images(image, views, *known, self.device)
         return images.contiguous(memory_format=self._format)
