@@ -7,6 +7,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 DEMO := runs/make_demo
+AGAIN := status=$$?; echo "tangent-train ended with an error, see above; make demo goes on where it stopped."; exit $$status
 
 .PHONY: install demo test test-all lint real bench bench-compare
 
@@ -25,10 +26,10 @@ demo: install
 		echo; echo "The demo has run; its pictures are in $(DEMO)/panels. Delete $(DEMO) to run it again."; \
 	elif [ -f $(DEMO)/checkpoints/last.ckpt ]; then \
 		echo "Going on with the interrupted demo …"; \
-		$(BIN)/tangent-train resume=$(DEMO); \
+		$(BIN)/tangent-train resume=$(DEMO) || { $(AGAIN); }; \
 	else \
 		echo "Rendering rooms, training and evaluating (14 minutes of CPU time) …"; \
-		$(BIN)/tangent-train experiment=rooms/demo hydra.run.dir=$(DEMO); \
+		$(BIN)/tangent-train experiment=rooms/demo hydra.run.dir=$(DEMO) || { $(AGAIN); }; \
 	fi
 
 test: install

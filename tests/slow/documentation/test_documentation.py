@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import shutil
+import subprocess
 import tomllib
 from pathlib import Path
 
@@ -45,6 +46,8 @@ def test_documented_commands_run(block: Block, template: Path, tmp_path: Path) -
             exported |= variables
         elif words[0] in ("make", "pip"):
             _check_exists(words)
+        elif words[0] == "cp":
+            subprocess.run(words, check=True, cwd=world)
         else:
             run(words, exported | variables, world)
 
