@@ -72,7 +72,3 @@ def test_the_crops_of_photos_lie_side_by_side(tmp_path: Path) -> None:
     means = decoded(image.jpeg)[..., 0].reshape(height, count, width).mean(axis=(0, 2))
     np.testing.assert_allclose(means, [0, 60, 120], atol=12)
     assert decoded(image.truth).shape == (height, count * width)
-
-
-def test_no_panels_no_images(tmp_path: Path) -> None:
-    assert _tested(tmp_path, 0, *SHAPE).images == []

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -130,18 +129,3 @@ def test_shapes_have_accuracies_and_no_unknown_class(tmp_path: Path) -> None:
     assert _steps(events, f"val_accuracy/{task.class_names[0]}") == [2, 5]
     mean = np.mean([events.Scalars(f"val_accuracy/{n}")[-1].value for n in task.class_names])
     assert mean == pytest.approx(events.Scalars("val/class_accuracy")[-1].value, rel=1e-6)
-
-
-def test_nothing_is_drawn_by_other_processes_or_without_tensorboard(tmp_path: Path) -> None:
-    logger = TensorBoardLogger(tmp_path, name="", version="tensorboard")
-    for rank_0, loggers in ((False, [logger]), (True, [])):
-        trainer: Any = SimpleNamespace(
-            sanity_checking=False,
-            is_global_zero=rank_0,
-            loggers=loggers,
-            num_val_batches=[3],
-        )
-        unused: Any = object()  # without attributes
-        ValidationPictures(3).on_validation_batch_end(trainer, unused, None, unused, 0)
-        ClassScores().on_validation_end(trainer, unused)
-    assert not list(tmp_path.rglob("events*"))

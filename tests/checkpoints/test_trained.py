@@ -12,14 +12,12 @@ from torch import Tensor, nn
 
 from tangent_train.checkpoints.content import read_checkpoint
 from tangent_train.checkpoints.image_sizes import size_multiple_of
-from tangent_train.checkpoints.scores import Scores
 from tangent_train.checkpoints.trained import completed_settings, load_trained
 from tangent_train.errors import DataError
-from tests.tasks.odd_networks import Looking, OneSize, own
+from tests.tasks.odd_networks import Looking, OneSize
 from tests.tasks.small_networks import save_checkpoint
 
 SMALL_UNET = ["network=unet", "network.widths=[4,8,8]"]
-PRETRAINED = ("weights", "weights_backbone", "encoder_weights", "pretrained")
 
 
 @pytest.mark.parametrize(
@@ -70,41 +68,6 @@ def test_a_network_computes_what_its_task_does(
     assert trained.representation["_target_"].startswith("tangent_train.rendering.")
 
 
-def test_tensors_of_the_file_are_used_and_no_others_fetched(tmp_path: Path) -> None:
-    path = tmp_path / "best.ckpt"
-    save_checkpoint(path, *SMALL_UNET)
-    content = torch.load(path, weights_only=True)
-    settings = content["config"]["network"]
-    settings["_target_"] = f"{__name__}.Remembering"
-    settings |= dict.fromkeys(PRETRAINED, "published")
-    del settings["widths"]
-    content["state_dict"] = {
-        "network.weight": torch.ones(13, 4, 1, 1),
-        "class_weights": torch.ones(2),
-    }
-    torch.save(content, path)
-    trained = load_trained(path, trust=[f"{__name__}.Remembering"])
-    assert isinstance(trained.network, Scores)
-    network = trained.network.network
-    assert isinstance(network, Remembering)
-    assert network.settings == dict.fromkeys(PRETRAINED)
-    assert torch.equal(network.weight.detach(), torch.ones(13, 4, 1, 1))
-    assert trained.settings == {
-        "_target_": f"{__name__}.Remembering",
-        "in_channels": 4,
-        "num_classes": 13,
-        **dict.fromkeys(PRETRAINED),
-    }
-
-
-class Remembering(nn.Conv2d):
-    """A network that remembers its settings."""
-
-    def __init__(self, in_channels: int, num_classes: int, **settings: Any) -> None:
-        super().__init__(in_channels, num_classes, 1, bias=False)
-        self.settings = settings
-
-
 class Coarse(nn.Conv2d):
     """A network whose scores are smaller than its images unless those are multiples of 6."""
 
@@ -128,26 +91,6 @@ class Coarse(nn.Conv2d):
 )
 def test_sizes_that_a_network_takes_are_found(network: nn.Module, multiple: int | None) -> None:
     assert size_multiple_of(network.eval(), 3) == multiple
-
-
-def test_a_network_of_one_size_is_said_to_be_one(tmp_path: Path) -> None:
-    path = tmp_path / "best.ckpt"
-    save_checkpoint(
-        path,
-        "data=synthrooms_perspective",
-        "representation=perspective",
-        "representation.dim=[24,40]",
-        "data.inputs=[rgb]",
-        "network=hexunet",
-        "representation.dim=[32,48]",
-    )
-    content = torch.load(path, weights_only=True)
-    content["config"]["network"] = own("OneSize") | {"channels": 3, "classes": 13}
-    content["config"]["representation"]["dim"] = [24, 40]
-    content["state_dict"] = {f"network.{n}": t for n, t in OneSize(3, 13).state_dict().items()}
-    torch.save(content, path)
-    trained = load_trained(path, trust=own("OneSize").values())
-    assert (trained.image_size, trained.fixed_size) == ((24, 40), (24, 40))
 
 
 def test_nulls_of_networks_inside_networks_are_completed() -> None:

@@ -178,24 +178,6 @@ def test_settings_of_an_evaluation(run_folder: Path, rooms: str, run: Run) -> No
     assert config["representation"]["level"] == 4
 
 
-def test_a_run_starts_from_the_network_of_another(
-    run_folder: Path,
-    rooms: str,
-    tmp_path: Path,
-    run: Run,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    checkpoint = run_folder / "checkpoints" / "best.ckpt"
-    begun = ["data.inputs=[rgb]", "trainer.max_epochs=1", "hydra.run.dir=begun"]
-    run("train", *SETTINGS, rooms, *begun, f"init_from={checkpoint}")
-    assert "left out: depth" in capsys.readouterr().out
-    assert results(tmp_path / "begun")["images"] == 2
-    foreign = tmp_path / "foreign.pt"
-    torch.save({"x": torch.zeros(1)}, foreign)
-    with pytest.raises(SystemExit, match=r"foreign\.pt: found no tensor that fits, but x"):
-        run("train", *SETTINGS, rooms, f"init_from={foreign}")
-
-
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [

@@ -44,20 +44,6 @@ def test_the_suffix_says_the_format(
     assert kept == [path]  # and no folder of Hydra's
 
 
-def test_a_file_is_overwritten_only_when_told(checkpoint: Path, tmp_path: Path, run: Run) -> None:
-    output = tmp_path / "model.safetensors"
-    output.write_text("mine")
-    typed = [f"checkpoint={checkpoint}", f"output={output}"]
-    with pytest.raises(SystemExit, match=r"^tangent-export: output: .*set overwrite=true\."):
-        run("export", *typed)
-    assert output.read_text() == "mine"
-    run("export", *typed, "overwrite=true")
-    assert load_trained(output).level == 4
-    (tmp_path / "folder.onnx").mkdir()
-    with pytest.raises(SystemExit, match=r"folder\.onnx, which exists; expected a new file\.$"):
-        run("export", typed[0], f"output={tmp_path}/folder.onnx", "overwrite=true")
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

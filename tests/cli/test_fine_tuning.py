@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
@@ -109,12 +108,6 @@ def test_a_network_that_holds_the_file_s_is_kept(
     assert source is None
 
 
-def test_one_s_own_normalization_is_kept(imported: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    typed = "+data.normalization={mean: [0.5, 0.5, 0.5], std: [1, 1, 1]}"
-    settings, _ = _begun(monkeypatch, imported, typed, "data.inputs=[rgb]")
-    assert settings["data"]["normalization"]["mean"] == [0.5] * 3
-
-
 def test_files_that_do_not_describe_their_network_change_nothing(
     imported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -144,14 +137,6 @@ def test_classes_of_files_are_called_only_where_they_are_known(
         build(*begun)
     begun = _begun(monkeypatch, tmp_path / "odd.ckpt", "trust=[torch.nn.Flatten]")
     with pytest.raises(SettingError, match=r"of Flatten: found none; .*data\.inputs=\[rgb\]"):
-        build(*begun)
-
-
-def test_errors_of_one_s_own_settings_do_not_blame_the_file(
-    imported: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    begun = _begun(monkeypatch, imported, "+task.oddity=1")
-    with pytest.raises(TypeError, match="oddity"):
         build(*begun)
 
 
@@ -200,16 +185,3 @@ def test_class_names_are_compared_with_the_scores(
         found = rf"{number}\.ckpt: found {len(scores)} scores in head\.weight .*"
         with pytest.raises(SystemExit, match=f"{found} expected {len(changed) - 1}, one for each"):
             run("train", *SETTINGS, rooms, f"init_from={path}")
-
-
-def test_complete_configs_stay_as_they_are(
-    imported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Such as a stage of a transfer."""
-    complete = "defaults: [_self_]\ninit_from: null\nnetwork: {_target_: models.UNet}\n"
-    (tmp_path / "stage.yaml").write_text(complete)
-    with initialize_config_dir(str(tmp_path), version_base="1.3"):
-        config = compose("stage", return_hydra_config=True)
-    monkeypatch.setattr(HydraConfig, "get", lambda: config.hydra)
-    settings = {"network": {"_target_": "models.UNet"}, "data": {"inputs": ["rgb"]}}
-    assert begin_from(imported, settings) == (settings, None)

@@ -131,21 +131,6 @@ def test_labels_are_never_mixed(tmp_path: Path, refused: Refused) -> None:
     assert set(np.unique(expected)) == {3, 90, 200}
 
 
-@pytest.mark.parametrize(
-    ("value", "stored", "written"), [(300, np.int64, np.uint16), (1, np.bool_, np.uint8)]
-)
-def test_labels_from_arrays(
-    rendered: Path, tmp_path: Path, value: int, stored: Any, written: Any
-) -> None:
-    folder = _results(tmp_path / "results", np.full((32, 32), value, stored))
-    for suffix in (".png", ".npy"):
-        render_with(back=folder, cameras=rendered, output=tmp_path / f"back{suffix}")
-    image = _read(tmp_path / "back.png")
-    assert image.dtype == written
-    assert (image == value).all()
-    assert np.load(tmp_path / "back.npy").dtype == stored
-
-
 def _z_depth(dim: int, radius: float) -> NDArray[np.float64]:
     """``(d, d)`` depth along the axis of a sphere around the camera, by similar triangles."""
     grid = TangentGrid(0, 5)

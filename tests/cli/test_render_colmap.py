@@ -99,12 +99,6 @@ def test_directions_are_where_colmap_projects_them(project: Path) -> None:
         assert frames == {name: list(range(20)) for name in FRAMES}
 
 
-def test_the_rig_knows_its_panoramas(project: Path) -> None:
-    assert read_rig(project / "rig_config.json").panoramas == FRAMES
-    names = {path.relative_to(project).parts[0] for path in project.rglob("*")}
-    assert names == {"images", "masks", "rig_config.json"}
-
-
 def test_sizes_differ_and_one_is_broken(panoramas: Path, tmp_path: Path, refused: Refused) -> None:
     write_pixels(panoramas / "large.png", smooth(128))
     (panoramas / "broken.png").write_bytes(b"broken")

@@ -114,16 +114,6 @@ def test_shards_that_do_not_belong_together_are_refused(predict: Predict) -> Non
     assert "expected a folder without earlier results" in predict("whole", 1, 2)
 
 
-def test_overwriting_with_other_shards(predict: Predict) -> None:
-    for number in (1, 2, 3):
-        predict("out", number, 3)
-    predict("whole", rotations=2)
-    for number in (1, 2):
-        predict("out", number, 2, rotations=2, overwrite="true")
-    assert results("out") == results("whole")
-    assert {path.name for path in Path("out/shards").iterdir()} == {"1-of-2.json", "2-of-2.json"}
-
-
 def test_masked_pixels_are_unknown_and_have_no_share(predict: Predict) -> None:
     """Of whole panoramas and of a part; with a file for all and one for each."""
     for output, mask in {"half": -30, "file": "mask.png", "folder": "masks"}.items():

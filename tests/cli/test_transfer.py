@@ -199,31 +199,6 @@ def test_a_given_network_is_not_trained(runs: PretendedRuns, tmp_path: Path) -> 
         run_transfer(*arguments, "folds=[1,2]")
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["data.fold=2", "folds=[1]"], r"data\.fold=2: found folds=\[1\] beside it"),
-        (["compare=erp"], "compare: found erp; expected a list"),
-    ],
-)
-def test_what_cannot_work_is_refused(
-    runs: PretendedRuns, arguments: list[str], message: str
-) -> None:
-    with pytest.raises(REFUSED, match=message):
-        run_transfer(*arguments)
-    assert not runs.started
-
-
-def test_a_killed_stage_ends_the_command(
-    monkeypatch: pytest.MonkeyPatch, runs: PretendedRuns, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(transfer_stages, "run_process", lambda *_: -9)
-    with pytest.raises(SystemExit) as stopped:
-        run_transfer()
-    assert stopped.value.code == 137, "as a shell says it"
-    assert "Finished stages are kept; the same command continues" in capsys.readouterr().err
-
-
 def test_the_level_of_the_photos() -> None:
     """f' = 128 / (2 tan 22.5°) = 154.5 pixels; at level 8, b = 1, p = 1.10715 / 128."""
     photos = {"_target_": "tangent_train.rendering.PerspectiveRepresentation", "level": 8}

@@ -84,12 +84,6 @@ def test_fine_tuning_takes_a_tenth_of_the_rate(rooms: DictConfig) -> None:
         _stages(rooms, optimizer__lr=None)
 
 
-def test_fine_tuning_with_an_optimizer_of_its_own(rooms: DictConfig) -> None:
-    own = {"_target_": "torch.optim.SGD", "_partial_": True, "lr": "${optimizer.lr}"}
-    tuned = _stages(rooms, fine_tuning__optimizer=own)["P-FT-1"].config
-    assert tuned["optimizer"] == {**own, "lr": 3e-3}, "AdamW's settings are not SGD's"
-
-
 def _seen(stages: dict[str, Stage], name: str, *settings: str) -> list[Any]:
     section = stages[name].config["representation"]
     return [section["_target_"].rpartition(".")[2][:4], *(section.get(n) for n in settings)]
@@ -112,21 +106,6 @@ def test_all_views_see_the_same_panoramas(rooms: DictConfig) -> None:
     assert rows == {200}
     coarse = _stages(rooms, compare=views, representation__dim=60)
     assert _seen(coarse, "S-wide", "dim", "erp_height") == ["Tang", 30, 256], "those of level 7"
-
-
-def test_views_of_a_network_that_takes_images_of_one_size(rooms: DictConfig) -> None:
-    own = {"_target_": "tangent_train.rendering.TangentRepresentation"}
-    trained = trained_network(own | {"base_level": 1, "level": 7, "dim": 64}, fixed_size=(64, 64))
-    views: Any = [
-        {"name": "same", "blend": "feather"},
-        {"name": "wide", "level": 5},
-        {"name": "large", "base_level": 0},
-    ]
-    given = {"checkpoint": "/net.onnx", "representation": trained.representation}
-    stages = _stages(rooms, trained, compare=views, **given, fine_tuning__epochs=[])
-    assert _seen(stages, "S-same", "level", "base_level", "dim") == ["Tang", 7, 1, 64]
-    assert _seen(stages, "S-wide", "level", "base_level", "dim") == ["Tang", 5, 0, 64]
-    assert _seen(stages, "S-large", "level", "base_level", "dim") == ["Tang", 7, 0, 128]
 
 
 def test_every_view_is_evaluated_in_every_condition(rooms: DictConfig) -> None:

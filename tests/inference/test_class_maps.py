@@ -171,16 +171,6 @@ def test_a_map_of_a_map() -> None:
     assert twice.network(torch.randn(1, 4, 12, 20)).shape == (1, 2, 12, 20)
 
 
-def test_own_maps(tmp_path: Path) -> None:
-    path = _written(tmp_path / "My Map.JSON", {"classes": {"Möbel": ["chair"], "none": []}})
-    found = load_class_map(path)
-    assert (found.source, dict(found.classes)) == (None, {"Möbel": ["chair"], "none": []})
-    with pytest.raises(SettingError, match="found no class of the map in a network of cat, dog"):
-        map_classes(_trained(["cat", "dog"]), found)
-    with pytest.raises(SettingError, match="found no class of ADE20K in a network of cat"):
-        map_classes(_trained(["cat"]), load_class_map("ade20k_to_zind_layout"))
-
-
 @pytest.mark.parametrize(
     ("content", "message"),
     [
@@ -208,8 +198,3 @@ def test_unusable_files(content: Any, message: str, tmp_path: Path) -> None:
     with pytest.raises(DataError, match=message) as caught:
         load_class_map(str(path))
     assert caught.value.subject == path
-
-
-def test_a_name_of_no_map_is_refused() -> None:
-    with pytest.raises(SettingError, match="found ade20k; expected ade20k_to_stanford2d3ds, "):
-        load_class_map("ade20k")

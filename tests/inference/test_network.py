@@ -17,7 +17,6 @@ from tangent_train.errors import DataError, SettingError
 from tangent_train.inference.network import Network
 from tests.cli.tiny_runs import run_command
 from tests.inference.trained import (
-    CLASS_NAMES,
     CUBE,
     ERP,
     PERSPECTIVE,
@@ -169,17 +168,6 @@ def test_classes_of_another_data_set(tmp_path: Path, predicted: Predicted, unmap
     np.testing.assert_allclose(scores, probabilities, atol=1e-3)
     assert (scores.sum(axis=-1).min() < 0.9) == (unmapped == "unknown")
     assert (labels == 0).any() == (unmapped == "unknown")
-
-
-def test_names_and_colors_of_the_labels(network: Network) -> None:
-    assert network.class_names == CLASS_NAMES
-    assert network.palette.dtype == np.uint8
-    assert network.palette.shape == (4, 3)
-    assert network.palette[0].tolist() == [0, 0, 0]
-    assert len(np.unique(network.palette, axis=0)) == 4
-    picture = network.palette[network.labels(sphere(16))]
-    assert (picture.shape, picture.dtype) == ((16, 32, 3), np.uint8)
-    assert repr(network) == "<Network of 3 classes, sees rgb>"
 
 
 _RGB = np.zeros((16, 32, 3), np.uint8)

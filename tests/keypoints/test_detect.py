@@ -10,7 +10,6 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from tangent_train.errors import SettingError
 from tangent_train.geometry import (
     TangentGrid,
     icosphere,
@@ -98,11 +97,6 @@ def test_arrays_fit_together(name: str) -> None:
         assert [v.shape for v in found] == [(n, 2), (n,), (n,), (n,), (n, width)]
         assert found.descriptors.dtype == kind
         assert (n > 10) == (number == 0)
-
-
-def test_unknown_detectors_are_refused() -> None:
-    with pytest.raises(SettingError, match="detector: found 'surf'; expected sift or orb"):
-        Detector("surf")
 
 
 # The panorama.

@@ -50,15 +50,6 @@ def test_trained_layers_stay_and_the_first_and_last_are_fitted(name: str) -> Non
     assert network(torch.randn(2, 3, 6, 64, 64)).shape == (2, 7)
 
 
-def test_a_network_that_fits_is_left_alone() -> None:
-    inner = nn.Sequential(
-        nn.Conv2d(6, 4, 3), nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(4, 7)
-    )
-    before = dict(inner.named_parameters())
-    after = dict(MultiView(inner, 6, 7).network.named_parameters())
-    assert all(after[name] is parameter for name, parameter in before.items())
-
-
 def test_further_channels_change_nothing_at_first_and_are_learned() -> None:
     torch.manual_seed(0)
     network = _torchvision("mobilenet_v3_small").eval()

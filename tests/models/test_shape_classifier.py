@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from models import ShapeClassifier
-from tangent_train.errors import SettingError
 from tests.tasks.small_networks import with_statistics
 
 
@@ -32,18 +31,3 @@ def test_scores_are_of_the_mean_over_views_and_positions() -> None:
         expected = network.head.weight @ features.mean(dim=(0, 2, 3)) + network.head.bias
         scores = network(torch.stack([other, shape.flip(0)]))
     torch.testing.assert_close(scores[1], expected, rtol=1e-4, atol=1e-5)
-
-
-def test_dropout_is_of_training_only() -> None:
-    torch.manual_seed(0)
-    images = torch.randn(2, 3, 6, 16, 16)
-    network = ShapeClassifier(6, 4, 2)
-    assert not torch.equal(network(images), network(images))
-    none = ShapeClassifier(6, 4, 2, dropout=0.0)
-    assert torch.equal(none(images), none(images))
-
-
-def test_images_that_do_not_fit_are_refused() -> None:
-    message = r"image size for the ShapeClassifier: found 24×32; expected .* multiples of 16"
-    with pytest.raises(SettingError, match=message):
-        ShapeClassifier(6, 4, 2)(torch.zeros(1, 2, 6, 24, 32))

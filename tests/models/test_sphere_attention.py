@@ -14,7 +14,6 @@ from torch.nn import functional
 from models import SphereAttention
 from models.sphere_attention import angular_attention
 from models.sphere_context import token_directions
-from tangent_train.errors import SettingError
 from tangent_train.geometry import random_rotation
 from tests.models.sphere_networks import awake, sphere_rays
 
@@ -138,9 +137,3 @@ def test_half_precision_does_not_blur_directions() -> None:
         share = angular_attention(queries, queries, values, close, torch.tensor([1000.0]))
     expected_share = 1 / (1 + math.exp(1000 * (math.cos(0.04) - 1)))
     assert float(share[0, 0, 0, 0]) == pytest.approx(expected_share, abs=1e-4)
-
-
-@pytest.mark.parametrize("settings", [{"heads": 0}, {"heads": 3, "width": 8}, {"width": 0}])
-def test_impossible_sizes_are_refused(settings: dict[str, int]) -> None:
-    with pytest.raises(SettingError, match="heads and width of SphereAttention: found"):
-        SphereAttention(12, **settings)

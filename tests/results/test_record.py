@@ -85,19 +85,3 @@ def test_scores_must_be_shares(place: str, value: object, tmp_path: Path) -> Non
     path.write_text(json.dumps(results))
     with pytest.raises(DataError, match=r"results\.json: found ValueError: "):
         load_record(path.parent)
-
-
-def test_results_without_intervals_are_read(tmp_path: Path) -> None:
-    folder = write_run(tmp_path / "a", made_record(SCORES))
-    assert "intervals" not in json.loads((folder / "results.json").read_text())
-    assert load_record(folder).intervals == {}
-
-
-@pytest.mark.parametrize("content", [None, "[1, 2]", "a: &b 1\nc: *b", "a: [", "level: high"])
-def test_broken_settings_are_named(content: str | None, tmp_path: Path) -> None:
-    path = write_run(tmp_path / "a", made_record(SCORES)) / "config.yaml"
-    path.unlink()
-    if content is not None:
-        path.write_text(content)
-    with pytest.raises(DataError, match=r"config\.yaml: found .*expected the settings"):
-        load_record(path.parent)

@@ -193,20 +193,6 @@ def test_the_papers_transfer_is_the_mean_of_its_printed_folds(
         assert classes == pytest.approx(miou / 100, abs=1e-3)
 
 
-def test_omnisynthia_stands_beside_by_level() -> None:
-    settings: dict[str, Any] = {
-        "data___target_": "datamodules.OmniSynthia",
-        "data__fold": None,
-        "level": 7,
-    }
-    record = made_record([0.5] * 13, [f"class {k}" for k in range(13)], **settings)
-    report = transfer_report({"P": [record], "S": [record]})
-    cells = _cells(report)
-    assert cells["S (paper)"]["mIoU %"] == "44.9"
-    assert cells["Zhang et al., native (paper)"]["mAcc %"] == "57.1"
-    assert len(cells) == 2 + 4
-
-
 def test_a_transfer_compares_panoramas_with_photos_of_as_much_fine_tuning() -> None:
     photos = without_solid_angle(made_record([0.4, 0.8, 0.6]))
     sphere = made_record([0.3, 0.8, 0.4], bands=(0.1, 0.2))

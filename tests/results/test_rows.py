@@ -46,17 +46,6 @@ def test_a_class_absent_from_a_fold_is_left_out_there(three_folds: list[Record])
     assert row.of_fold(3).score("iou", "sofa") == Statistic(None, None, None, 0)
 
 
-def test_only_a_single_run_has_an_interval_over_its_images() -> None:
-    intervals = {"miou": (0.25, 0.75)}
-    runs = [replace(made_record([0.5] * 3, data__fold=f), intervals=intervals) for f in (1, 2)]
-    (row,) = group_runs(runs)
-    assert row.score("miou").interval is None
-    single = row.of_fold(2)
-    assert single.score("miou").interval == (0.25, 0.75)
-    assert single.score("macc").interval is None
-    assert single.score("miou", "wall").interval is None
-
-
 @pytest.fixture
 def transfer() -> Row:
     """Panoramas compared with photos, two folds of two seeds."""

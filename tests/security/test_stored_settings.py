@@ -12,11 +12,10 @@ import yaml  # type: ignore[import-untyped]
 from rich.console import Console
 from torch import nn
 
-from datamodules.core.inputs import Input
 from models import initialize
 from tangent_train import registry
 from tangent_train.callbacks.checkpoints import AtomicCheckpointIO, BestCheckpoint
-from tangent_train.checkpoints.content import INPUTS, read_settings
+from tangent_train.checkpoints.content import read_settings
 from tangent_train.checkpoints.trained import completed_settings, load_trained, start_in
 from tangent_train.cli.build import build
 from tangent_train.cli.compose import config_folder
@@ -275,10 +274,6 @@ def test_networks_of_libraries_need_no_trust_and_fetch_nothing(
     with watched(tmp_path / "forbidden") as happened, torch.device("meta"):
         make(settings, "network", SettingsFile(tmp_path))
     assert not happened
-
-
-def test_what_networks_are_shown_is_said_alike_in_both_places() -> None:
-    assert list[Input] == INPUTS
 
 
 def test_words_are_no_paths_and_no_addresses(tmp_path: Path) -> None:

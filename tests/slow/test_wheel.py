@@ -77,21 +77,6 @@ def test_the_commands_answer_from_another_folder(scripts: Path, tmp_path: Path) 
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.usefixtures("clean")
-def test_the_installed_modules_are_those_of_the_wheel(scripts: Path, tmp_path: Path) -> None:
-    code = (
-        "import datamodules, models, tangent_train;"
-        "print(*(m.__file__ for m in (datamodules, models, tangent_train)))"
-    )
-    python = scripts / "python"
-    done = subprocess.run(
-        [python, "-c", code], check=False, cwd=tmp_path, capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
-    for file in done.stdout.split():
-        assert Path(file).is_relative_to(scripts.parent.resolve()), file
-
-
 def test_packages_of_the_same_names_on_the_path_hide_nothing(
     scripts: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

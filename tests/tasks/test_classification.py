@@ -92,7 +92,3 @@ def test_scores_that_do_not_fit_are_refused(network: nn.Module, found: str) -> N
     message = rf"scores of the network: found {found}; expected \(2, 3\)"
     with pytest.raises(SettingError, match=message):
         task(torch.zeros(2, 5, 3, 16, 16))
-
-
-def test_the_example_has_all_views_of_one_shape() -> None:
-    assert shape_task().example(6).shape == (1, 20, 6, 16, 16)

@@ -74,12 +74,6 @@ def test_what_cannot_be_frozen_is_refused(names: list[str], message: str) -> Non
         shape_task(WithStatistics(), frozen=names)
 
 
-def test_names_are_told_inside_what_holds_the_whole_network() -> None:
-    wrapped = nn.ModuleDict({"model": WithStatistics()})
-    with pytest.raises(SettingError, match=r"such as model\.encoder, model\.neck, model\.head"):
-        shape_task(wrapped, frozen=["backbone"])
-
-
 def test_what_was_loaded_takes_smaller_steps() -> None:
     moved = {}
     for factor in (1, 0.25):

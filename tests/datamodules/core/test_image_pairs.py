@@ -26,14 +26,6 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / "in"
 
 
-def test_two_files(folder: Path) -> None:
-    pairs = ImagePairs(left=str(folder / "b.png"), right=str(folder / "a.png"))
-    assert pairs.names == ["b – a"]
-    left = pairs.read(0).left
-    assert left.rgb[0, 0].tolist() == [255, 0, 10]
-    assert left[2:] == (folder / "b.png", None, None)
-
-
 def test_the_pairs_of_a_folder(folder: Path) -> None:
     assert ImagePairs(input=str(folder)).names == ["a – b", "b – c/d", "c/d – e"]
     every = ImagePairs(input=str(folder / "*.png"), pairing="all")

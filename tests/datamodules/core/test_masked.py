@@ -13,16 +13,15 @@ from PIL import Image
 from torch import nn
 
 import datamodules
-from datamodules import FolderPanoramas, SynthRooms
+from datamodules import FolderPanoramas
 from datamodules.core.panorama_module import PanoramaDataModule
 from datamodules.core.pipeline import RotatedPanoramas
 from datamodules.images.pixel_files import write_pixels
 from tangent_train.cli.compose import config_folder
 from tangent_train.errors import DataError
 from tangent_train.geometry import equirect_directions
-from tangent_train.rendering import EquirectRepresentation, TangentRepresentation
+from tangent_train.rendering import EquirectRepresentation
 from tangent_train.tasks import SegmentationTask
-from tests.datamodules.conftest import TINY_ROOMS
 from tests.datamodules.data_files import names_of
 from tests.datamodules.folder.folder_format import CLASS_OF_STORED, write_data_set
 from tests.tasks.shapes import quiet_trainer
@@ -77,17 +76,6 @@ def test_labels_are_unknown_there_and_pixels_stay(
             np.testing.assert_array_equal(read.rgb, before.rgb)
 
 
-def test_views_of_training_are_masked(root: Path) -> None:
-    grid: Any = TangentRepresentation(base_level=0, level=4)
-    masked, plain = (FolderPanoramas(root, grid, mask=mask) for mask in (-30, None))
-    counts = np.where(BELOW, 0, 255).astype(np.uint8)[:, None].repeat(64, 1)
-    shown = grid.whole().render(counts, "nearest")
-    assert 0 < (shown == 0).mean() < 0.5
-    for index in range(2):
-        labels, before = (m.training_samples()[0, index].labels.numpy() for m in (masked, plain))
-        np.testing.assert_array_equal(labels, np.where(shown, before, 0))
-
-
 def test_the_mask_rotates_with_the_panorama(root: Path, tmp_path: Path) -> None:
     """At the seam and the poles too: the mask has patches there."""
     patches = np.full((64, 128), 255, np.uint8)
@@ -131,14 +119,6 @@ def test_metrics_are_those_of_the_pixels_that_count(root: Path) -> None:
     assert (expected[1:].sum(axis=0)[1:] > 0).sum() > 1
 
 
-def test_the_pole_of_generated_rooms(tiny_rooms: Path) -> None:
-    erp: Any = EquirectRepresentation(level=3)
-    module = SynthRooms(tiny_rooms, erp, rooms=TINY_ROOMS, inputs=["rgb"], mask=-45)
-    labels = module.source("test").read(0).labels
-    assert labels[1:12].any(axis=1).all()
-    assert not labels[12:].any()
-
-
 def test_missing_masks_are_listed_before_training(root: Path, tmp_path: Path) -> None:
     names = [path.relative_to(root / "labels") for path in (root / "labels").rglob("*.png")]
     for name in names:
@@ -151,9 +131,3 @@ def test_missing_masks_are_listed_before_training(root: Path, tmp_path: Path) ->
     assert problems.items == {name.with_suffix("").as_posix() for name in names[:2]}
     with pytest.raises(DataError, match=r"2 problems(.|\n)*found no such file; expected a mask"):
         module.setup()
-
-
-def test_masks_that_fit_no_panorama_are_refused_at_once(root: Path, tmp_path: Path) -> None:
-    write_pixels(tmp_path / "mask.png", np.ones((20, 20), np.uint8))
-    with pytest.raises(DataError, match=r"mask\.png: found 20×20 pixels; .*twice as wide"):
-        FolderPanoramas(root, ERP, mask=tmp_path / "mask.png")

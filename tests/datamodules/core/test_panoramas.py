@@ -40,12 +40,6 @@ def test_a_ramp_keeps_its_place_at_an_uneven_ratio() -> None:
     np.testing.assert_allclose(resize_nearest(ramp, (32, 64))[0], expected, atol=1)
 
 
-def test_rgb_is_averaged() -> None:
-    stripes = np.zeros((8, 16, 3), np.uint8)
-    stripes[:, ::2] = 200
-    assert np.unique(resize_area(stripes, (4, 8))).tolist() == [100]
-
-
 def _nearest_valid(depth: NDArray[np.uint16], shape: tuple[int, int]) -> NDArray[np.uint16]:
     """Slow and independent: look at every source pixel of every footprint."""
     out = resize_nearest(depth, shape).copy()

@@ -64,19 +64,6 @@ def test_normalize_against_the_formula(depth: bool) -> None:
         np.testing.assert_allclose(images[:, :, channel], (value - mean) / std, atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("mean", "std"),
-    [
-        ((0, 0, 0), (1, 1, 0)),
-        ((0, 0, 0), (1, 1, 1, 1)),
-        ((0, 0, float("nan")), (1, 1, 1)),
-    ],
-)
-def test_impossible_normalization(mean: Any, std: Any) -> None:
-    with pytest.raises(SettingError, match="normalization"):
-        Normalization(mean, std)
-
-
 # --- other inputs -------------------------------------------------------------------------------
 
 
@@ -175,20 +162,6 @@ def test_evaluation_sample(erp: Representation) -> None:
     assert sample.index == 2
     np.testing.assert_array_equal(sample.target.numpy(), _positions(2).labels)
     torch.testing.assert_close(images[0, 0], sample.target.float())
-
-
-def test_samples_share_no_memory_with_panoramas(
-    erp: Representation, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    panorama = _positions(0)
-    monkeypatch.setattr(_Positions, "read", lambda *_: panorama)
-    whole = EquirectRepresentation(level=3)
-    for dataset in (
-        TrainingImages(POSITIONS, whole, 0, DEPTH),
-        EvaluationImages(POSITIONS, whole, DEPTH),
-    ):
-        for tensor in (*(sample := dataset[0, 0]).images, sample[1]):
-            assert not any(np.shares_memory(tensor.numpy(), part) for part in panorama)
 
 
 # --- colours -----------------------------------------------------------------------------------

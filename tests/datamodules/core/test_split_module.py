@@ -88,16 +88,6 @@ def test_workers_start_after_opencv_has_used_threads(make_module: MakeModule) ->
     assert not stuck
 
 
-def test_in_memory_reads_no_file_twice(
-    make_module: MakeModule, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    module = make_module(in_memory=True)
-    list(module.train_dataloader())
-    monkeypatch.setattr("datamodules.stanford2d3ds.reader.read_color_png", None)
-    assert len(list(module.train_dataloader())) > 0
-    assert module.class_weights("log").shape == (13,)
-
-
 def test_rotated_panoramas_are_seen_upright_where_up_is_known(make_module: MakeModule) -> None:
     rotated, known = make_module(test_rotation=30), make_module(test_rotation=30, upright="pose")
     panorama, aware = rotated.source("test").read(0), known.source("test").read(0)
@@ -111,14 +101,6 @@ def test_rotated_panoramas_are_seen_upright_where_up_is_known(make_module: MakeM
     np.testing.assert_allclose(rotation @ [0, 0, 1], aware.up, atol=1e-12)
     for split in ("train", "val"):
         assert known.source(split).read(0).up is None
-
-
-def test_only_test_panoramas_are_rotated(make_module: MakeModule) -> None:
-    plain, rotated = make_module(), make_module(test_rotation=30)
-    for split in SPLITS:
-        before, after = plain.source(split).read(0), rotated.source(split).read(0)
-        assert np.array_equal(before.rgb, after.rgb) is (split != "test")
-    assert rotated.sample_name("test", 1) == plain.sample_name("test", 1)
 
 
 def test_processes_share_the_panoramas(

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 import torch
 
-from datamodules import Stanford2D3DS, Stanford2D3DSPerspective
+from datamodules import Stanford2D3DS
 from datamodules.core.found import Split
 from datamodules.core.store import Store
 from tangent_train.cli.shard import Shard
 from tangent_train.errors import DataError, SettingError
-from tangent_train.rendering import EquirectRepresentation, PerspectiveRepresentation
+from tangent_train.rendering import EquirectRepresentation
 from tests.conftest import FabricateStanford
 from tests.datamodules.data_files import contents
 
@@ -164,17 +164,6 @@ def test_samples_and_class_weights_are_those_without_a_store(
     assert torch.equal(prepared.class_weights("log"), plain.class_weights("log"))
 
 
-def test_photos_have_a_store_as_well(root: Path, store: Path) -> None:
-    crops = PerspectiveRepresentation(level=5)
-    prepared, plain = (
-        Stanford2D3DSPerspective(root, crops, store=where) for where in (store, None)
-    )
-    prepared.prepare_data()
-    samples = zip(_samples(prepared), _samples(plain), strict=True)
-    assert all(torch.equal(a, b) for a, b in samples)
-    assert len(_times(store)) == PANORAMAS
-
-
 def test_parts_make_the_whole_store_and_each_makes_only_what_is_missing_of_it(
     make_module: MakeModule, store: Path, tmp_path: Path
 ) -> None:
@@ -191,20 +180,6 @@ def test_parts_make_the_whole_store_and_each_makes_only_what_is_missing_of_it(
     assert made[-1] == set(lost)
     with pytest.raises(SettingError, match=r"data\.store: found none, with shard="):
         make_module(store=None).prepare_part(parts[0])
-
-
-def test_a_broken_file_is_a_problem_of_its_part(make_module: MakeModule, store: Path) -> None:
-    module = make_module()
-    broken = module.found().of()[4]
-    damaged = bytearray(broken.rgb.read_bytes())
-    damaged[len(damaged) // 2] ^= 255
-    broken.rgb.write_bytes(damaged)
-    first, second = (Shard(number, 2).part for number in (1, 2))
-    assert make_module().prepare_part(second) == PANORAMAS // 2
-    with pytest.raises(DataError, match=broken.rgb.name):
-        make_module().prepare_part(first)
-    assert len(_times(store)) == PANORAMAS - 1
-    assert make_module(skip_broken=True).prepare_part(first) == PANORAMAS // 2 - 1
 
 
 def test_what_is_there_is_kept_and_what_is_not_is_made(

@@ -12,7 +12,7 @@ from datamodules.core.found import Split
 from datamodules.core.inputs import RGBD_NORMALIZATION, Normalization
 from datamodules.folder.panoramas import FolderPanoramas
 from tangent_train.errors import DataError, SettingError
-from tests.datamodules.data_files import read_png, write_png
+from tests.datamodules.data_files import read_png
 from tests.datamodules.folder.folder_format import (
     CLASS_OF_STORED,
     NAMES,
@@ -77,15 +77,6 @@ def _one_panorama(root: Path, stored: Image.Image, classes: Any, **settings: Any
 
 def _test_labels(root: Path, erp: Any) -> NDArray[np.uint8]:
     return FolderPanoramas(root, erp).source("test").read(0).labels
-
-
-def test_16_bit_values(tmp_path: Path, erp: Any) -> None:
-    values = np.array([0, 1, 255, 256, 1000, 65535], np.uint16)
-    stored = np.resize(values, (16, 32))
-    _one_panorama(tmp_path, Image.new("L", (32, 16)), {"high": 65535, "mid": [256, 1000], "x": 0})
-    write_png(tmp_path / "labels" / "0.png", stored)
-    expected = np.array([3, 0, 0, 2, 2, 1], np.uint8)
-    np.testing.assert_array_equal(_test_labels(tmp_path, erp), np.resize(expected, (16, 32)))
 
 
 @pytest.mark.parametrize(("colors", "transparent"), [(4, False), (16, True), (256, True)])

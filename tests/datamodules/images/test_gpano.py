@@ -131,21 +131,6 @@ def test_tags_that_cannot_be_are_refused(
         area_of(path, size)
 
 
-def test_tags_of_a_whole_panorama(tmp_path: Path) -> None:
-    whole = {
-        "CroppedAreaImageWidthPixels": "360",
-        "CroppedAreaImageHeightPixels": "180",
-        "CroppedAreaLeftPixels": "0",
-        "CroppedAreaTopPixels": "0",
-    }
-    path = _save(tmp_path / "image.jpg", _attributes(_TAGS | whole))
-    for size in [(180, 360), (90, 180), (77, 155)]:
-        area = area_of(path, size)
-        assert area == whole_area(path, size)
-        assert area is not None
-        assert area.is_whole
-
-
 # Placing and cutting
 
 
@@ -243,11 +228,6 @@ def test_edges_are_where_the_crop_says(seed: int) -> None:
 def test_impossible_crops(crop: tuple[float, ...], message: str) -> None:
     with pytest.raises(SettingError, match=f"crop: found .*{message}|{message}"):
         area_of_crop((100, 100), crop)
-
-
-def test_a_crop_of_a_panorama_too_large_for_memory() -> None:
-    with pytest.raises(DataError, match="at most 32768"):
-        area_of_crop((100, 100), (0, 0.1, 0, 0.1))
 
 
 # Pose

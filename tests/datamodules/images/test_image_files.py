@@ -52,14 +52,6 @@ def test_patterns(tmp_path: Path) -> None:
     assert names("**/a?.*") == ["a1.jpg", "a2.png", "s/a3.JPG", "s/t/a4.jpg"]
 
 
-def test_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("HOME", str(tmp_path))
-    monkeypatch.chdir(tmp_path)
-    _touch(tmp_path / "pictures" / "a.jpg", tmp_path / "~b.jpg")
-    assert image_paths("~/pictures/*.jpg") == [tmp_path / "pictures" / "a.jpg"]
-    assert image_paths("~b.jpg") == [Path("~b.jpg")]
-
-
 @pytest.mark.parametrize(
     ("pattern", "found"),
     [

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 from pathlib import Path
 from typing import Any
@@ -90,43 +89,6 @@ def test_files_that_cannot_hold_the_pixels(
     check_writable(".npy", dtype, channels)
 
 
-def test_sides_that_a_format_cannot_have(tmp_path: Path) -> None:
-    with pytest.raises(SettingError, match=r"a\.webp"):
-        write_pixels(tmp_path / "a.webp", np.zeros((2, 20000, 3), np.uint8))
-    assert not list(tmp_path.iterdir())
-
-
-def _npz() -> bytes:
-    file = io.BytesIO()
-    np.savez(file, a=np.ones(3))
-    return file.getvalue()
-
-
-def _npy(array: Any) -> bytes:
-    file = io.BytesIO()
-    np.save(file, array, allow_pickle=True)
-    return file.getvalue()
-
-
-@pytest.mark.parametrize(
-    ("name", "content"),
-    [
-        ("a.npy", b""),
-        ("a.npy", _npz()),
-        ("a.npy", _npy(np.array([{}]))),
-        ("a.npy", _npy(np.ones(4))),
-        ("a.npy", _npy(np.array([["a"]]))),
-        ("a.png", b"\x89PNG\r\n\x1a\n" + b"\0" * 16 + b"\x10\x02"),
-        ("a.tif", b"II*\0\0\0\0\0"),
-        ("a.jpg", b"no image"),
-    ],
-)
-def test_broken_files(name: str, content: bytes, tmp_path: Path) -> None:
-    (tmp_path / name).write_bytes(content)
-    with pytest.raises(DataError, match=name):
-        read_pixels(tmp_path / name, indices=True)
-
-
 # Colours
 
 
@@ -188,33 +150,6 @@ def test_lossless_formats_give_the_upright_pixels_written(tmp_path: Path, suffix
     _save_oriented(path, 6)
     np.testing.assert_array_equal(read_rgb(path), np.rot90(_smooth(24, 41), -1))
     assert read_image_size(path) == (41, 24)
-
-
-def test_broken_exif_data_do_not_matter(tmp_path: Path) -> None:
-    path = tmp_path / "image.png"
-    Image.fromarray(_noise((4, 8, 3))).save(path, exif=b"Exif\0\0II*\0\xff\xff\xff\xff")
-    np.testing.assert_array_equal(read_rgb(path), _noise((4, 8, 3)))
-    assert photo_fov_deg(path) is None
-
-
-def _encoded(image_format: str) -> bytes:
-    buffer = io.BytesIO()
-    compression = {"compression": "tiff_lzw"} if image_format == "TIFF" else {}
-    Image.fromarray(_noise((64, 128, 3))).save(buffer, image_format, **compression)
-    return buffer.getvalue()
-
-
-@pytest.mark.parametrize("image_format", ["JPEG", "PNG", "TIFF", "WEBP"])
-@pytest.mark.parametrize("kept", [0, 20, 0.5, 0.97])
-# What is said about the file is an error here; a decoder may have warned before.
-@pytest.mark.filterwarnings("ignore:Truncated File Read:UserWarning")
-@pytest.mark.filterwarnings("ignore:Corrupt EXIF data:UserWarning")
-def test_cut_files_are_explained(tmp_path: Path, image_format: str, kept: float) -> None:
-    content = _encoded(image_format)
-    path = tmp_path / "image.jpg"
-    path.write_bytes(content[: int(kept * len(content)) if isinstance(kept, float) else kept])
-    with pytest.raises(DataError, match=r"image\.jpg: found .*again\."):
-        read_rgb(path)
 
 
 @pytest.mark.parametrize("read", [read_rgb, read_image_size, photo_fov_deg])

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from trimesh import Trimesh, creation, util
+from trimesh import Trimesh, creation
 
 from datamodules.modelnet40.meshes import RADIUS, clean_mesh, mesh_spheres, read_off
 from datamodules.synthshapes.generate import make_shape
@@ -140,29 +140,6 @@ def test_open_and_overlapping_meshes_against_a_slow_reference(label: str) -> Non
 
 
 # --- conventions -------------------------------------------------------------------------------
-
-
-def test_where_nothing_is_hit() -> None:
-    plates = util.concatenate(_box((0, 0, 1), (1, 1, 0.1)), _box((0, 0, -1), (1, 1, 0.1)))
-    spheres = mesh_spheres(clean_mesh(plates), SHAPE)
-    assert spheres[32, :, :3].tolist() == [[1, 0, 0]] * 128
-    assert (spheres[..., 4] > 0).all()  # the hull is closed
-    assert spheres[0, 0, 0] < 0.2
-
-
-def test_a_surface_that_is_only_behind_the_middle() -> None:
-    mesh = _mesh(
-        [[-1, -1, -1], [-1, 1, -1], [-1, 0, 1.0], [2, 0, 0], [2, 0.1, 0], [2, 0, 0.1]],
-        [[0, 1, 2], [3, 4, 5]],
-    )
-    cleaned = clean_mesh(mesh)
-    distance = mesh_spheres(cleaned, SHAPE)[..., 0]
-    # From above the small triangle the large one is seen, beyond the middle.
-    x = cleaned.vertices[0, 0]
-    row, column = 28, 64
-    expected = 1 - x / RAYS[row, column, 0]
-    assert expected > 1
-    assert distance[row, column] == pytest.approx(expected, abs=1e-6)
 
 
 @pytest.mark.parametrize("shape", [(33, 65), (1, 1)])

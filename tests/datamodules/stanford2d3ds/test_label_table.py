@@ -30,21 +30,3 @@ def test_what_is_past_the_end_of_the_table_is_missing_or_a_mistake() -> None:
     assert table.decode(_colors([0x0D0D0D, 9815])).tolist() == [[0, 6]]
     with pytest.raises(DataError, match="found instance 9816 in 2 pixels; expected 0 to 9815"):
         table.decode(_colors([0x0D0D0D, 9815, 9816, 0xFFFFFF]))
-
-
-@pytest.mark.parametrize(
-    ("content", "found"),
-    [
-        ("{not json", "Expecting"),
-        ('{"beam": 1}', "dict"),
-        ('["beam_1_office_1_1", "sky_1_office_1_1"]', "'sky'"),
-        (None, "No such file"),
-    ],
-)
-def test_no_class_table(tmp_path: Path, content: str | None, found: str) -> None:
-    path = tmp_path / "labels.json"
-    if content is not None:
-        path.write_text(content)
-    with pytest.raises(DataError, match=found) as error:
-        LabelTable.from_json(path)
-    assert str(path) in str(error.value)

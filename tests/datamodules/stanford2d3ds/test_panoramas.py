@@ -148,10 +148,3 @@ def test_wrong_layout(broken_root: Path, erp: Any) -> None:
     (broken_root / "area_5b" / "data").mkdir(parents=True)
     with pytest.raises(DataError, match=r"area_5b/pano/rgb: found no panoramas"):
         Stanford2D3DS(broken_root, erp).setup()
-
-
-def test_a_strange_name_is_found_before_training(broken_root: Path, erp: Any) -> None:
-    path = next((broken_root / "area_5b" / "pano" / "rgb").iterdir())  # only for the test
-    path.rename(path.with_name("a.png"))
-    with pytest.raises(DataError, match="unknown file name"):
-        Stanford2D3DS(broken_root, erp).setup("fit")

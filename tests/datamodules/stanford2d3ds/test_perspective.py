@@ -107,23 +107,6 @@ def test_a_photo_that_sees_less_than_a_crop_is_named(broken_root: Path) -> None:
         module.setup()
 
 
-POSES = {
-    "no JSON": ("{", "JSONDecodeError"),
-    "no matrix": ("{}", "KeyError: 'camera_k_matrix'"),
-    "skew": ('{"camera_k_matrix": [[9, 1, 4], [0, 9, 4], [0, 0, 1]]}', "9.0, 1.0"),
-    "no focal length": ('{"camera_k_matrix": [[0, 0, 4], [0, 9, 4], [0, 0, 1]]}', "0.0"),
-}
-
-
-@pytest.mark.parametrize("damage", POSES)
-def test_broken_poses_are_found_before_training(broken_root: Path, damage: str) -> None:
-    content, found = POSES[damage]
-    path = next((broken_root / "area_5b" / "data" / "pose").iterdir())
-    path.write_text(content)
-    with pytest.raises(DataError, match=rf"pose\.json: found .*{found}.*camera_k_matrix"):
-        Stanford2D3DSPerspective(broken_root, CROPS).setup()
-
-
 def test_no_photos(stanford_root: Path) -> None:
     with pytest.raises(DataError, match=r"area_1/data/rgb: found no photos"):
         Stanford2D3DSPerspective(stanford_root, CROPS).setup()

@@ -16,7 +16,6 @@ from datamodules.synthia.reader import (
     VIEW_FORMATS,
     SynthiaReader,
     depth_steps,
-    read_first_channel,
 )
 from datamodules.synthia.splits import choose_frames, divide
 from tangent_train.errors import DataError
@@ -93,19 +92,6 @@ def test_there_are_no_other_labels(tmp_path: Path, value: int) -> None:
     image = np.full((2, 2), value, np.uint16 if value > 255 else np.uint8)
     with pytest.raises(DataError, match=rf"labels\.png: found labels {value}; expected 0 to 15"):
         _labels(tmp_path, image)
-
-
-@pytest.mark.parametrize("channels", [1, 3, 4])
-def test_depth_in_any_number_of_channels(tmp_path: Path, channels: int) -> None:
-    depth = np.array([[0, 1, 255, 256, 40000, 65535]], np.uint16)
-    # The others may hold anything: grey of these would be something else.
-    image = depth if channels == 1 else np.stack([depth * 0, depth // 2, depth], axis=-1)
-    if channels == 4:
-        image = np.dstack([image, np.full(depth.shape, 7, np.uint16)])
-    write_png(tmp_path / "depth.png", image)
-    read = read_first_channel(tmp_path / "depth.png")
-    assert read.dtype == np.uint16
-    np.testing.assert_array_equal(read, depth)
 
 
 def test_steps_of_depth() -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from datamodules.core.problems import Problems
 from datamodules.synthia.files import VIEWS
-from datamodules.synthia.generate import MANIFEST, ViewStitcher, make_panoramas
+from datamodules.synthia.generate import MANIFEST, make_panoramas
 from tangent_train.errors import DataError
 from tangent_train.geometry import equirect_directions
 from tests.datamodules.data_files import contents, read_png
@@ -113,25 +113,6 @@ def test_depth_is_the_distance_from_the_centre(made: Path, seen: Seen) -> None:
         expected = seen.nearest(distance, 0)
         assert np.abs(depth - expected)[seen.certain].max() <= 0.5
         np.testing.assert_array_equal((depth == 0)[seen.certain], (expected == 0)[seen.certain])
-
-
-def _camera() -> NDArray[np.float64]:
-    x, y = synthia.CENTER_X - 0.5, synthia.CENTER_Y - 0.5
-    return np.array([[synthia.FOCAL, 0, x], [0, synthia.FOCAL, y], [0, 0, 1]])
-
-
-@pytest.mark.parametrize("height", [HEIGHT, 63])
-def test_views_never_mix(height: int) -> None:
-    stitcher = ViewStitcher(_camera(), SIZE, height)
-    grey = [10, 60, 110, 160]
-    rgb = stitcher.rgb([np.full((*SIZE, 3), value, np.uint8) for value in grey])
-    assert np.unique(rgb).tolist() == [0, *grey]
-    labels = stitcher.labels([np.full(SIZE, value, np.uint8) for value in (3, 12, 9, 15)])
-    assert np.unique(labels).tolist() == [3, 9, 12, 15, 255]
-    depth = stitcher.depth([np.full(SIZE, 65535, np.uint16)] * 4)
-    assert np.unique(depth).tolist() == [0, 65535]
-    for image, elsewhere in ((rgb[..., 0], 0), (labels, 255), (depth, 0)):
-        np.testing.assert_array_equal(image == elsewhere, labels == 255)
 
 
 # --- files ---------------------------------------------------------------------------------------

@@ -76,13 +76,6 @@ def test_distances_in_an_empty_box_are_those_of_its_planes() -> None:
     np.testing.assert_allclose(depth[seen], wall_distance(rays)[seen], atol=1e-4)
 
 
-def test_perspective_depth_is_along_the_optical_axis() -> None:
-    view = PerspectiveView(Pose.looking(HERE, heading=0.0), 32, math.radians(60))
-    depth = take(empty_room(), view).depth_m
-    # The camera faces the wall x = 5 m: all of it is 3.5 m ahead.
-    np.testing.assert_allclose(depth[8:24, 8:24], 3.5, atol=1e-4)
-
-
 def test_shadows_and_bounced_light_on_the_ceiling() -> None:
     view = PanoramaView(Pose.looking(HERE, 0.0), 128)
     bright, shaded = (take(lit_room(shade=shade), view) for shade in (False, True))

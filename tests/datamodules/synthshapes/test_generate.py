@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +12,6 @@ from datamodules.synthshapes.generate import (
     generate_shapes,
     make_shape,
 )
-from tangent_train.errors import SettingError
 from tests.datamodules.data_files import contents
 
 
@@ -25,14 +23,6 @@ def test_another_seed_or_more_shapes(tiny_shapes: Path, tmp_path: Path) -> None:
     generate_shapes(tmp_path / "other", ShapeSettings(4, 2, 1), workers=0)
     other = contents(tmp_path / "other")
     assert not any(other[name] == own[name] for name in own)
-
-
-@pytest.mark.parametrize(
-    ("name", "value"), [("seed", -1), ("train", 0), ("test", 0), ("train", 1.5), ("test", True)]
-)
-def test_impossible_settings(name: str, value: Any) -> None:
-    with pytest.raises(SettingError, match=rf"data\.shapes\.{name}: found {value}"):
-        ShapeSettings(**{name: value})
 
 
 # --- shapes -----------------------------------------------------------------------------------

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -79,19 +78,3 @@ def test_distant_pairs_and_floors_of_unknown_size_are_left_out(tmp_path: Path) -
     file.write_text(json.dumps(content))
     with pytest.raises(DataError, match=r"found no two panoramas .*scale_meters_per_coordinate"):
         _ = ZindPairs(root).names
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [("scale", 0), ("scale", None), ("translation", [1.0]), ("rotation", math.nan)],
-)
-def test_broken_poses_are_named(tmp_path: Path, name: str, value: Any) -> None:
-    file = write_homes(tmp_path) / "000" / "zind_data.json"
-    content = json.loads(file.read_text())
-    rooms = content["merger"]["floor_01"]
-    rooms["complete_room_01"]["partial_room_01"]["pano_2"]["floor_plan_transformation"][name] = (
-        value
-    )
-    file.write_text(json.dumps(content))
-    with pytest.raises(DataError, match=r"zind_data\.json: .* in merger.*pano_2"):
-        _ = ZindPairs(tmp_path).names

@@ -195,36 +195,6 @@ def test_a_broken_record_is_named_with_its_place(root: Path, name: str) -> None:
     assert len(names_of(data, "test")) == 5
 
 
-@pytest.mark.parametrize(
-    ("content", "expected"),
-    [
-        ("{", "found .*; expected zind_data.json as released"),
-        ("[]", "list instead of a mapping inside"),
-        ('{"merger": {}}', "no scale_meters_per_coordinate inside"),
-        ('{"merger": [], "scale_meters_per_coordinate": {}}', r"merger=\[\] inside"),
-        (
-            '{"merger": {"floor_01": {"complete_room_01": 3}}, "scale_meters_per_coordinate": {}}',
-            r"found int in merger\.floor_01\.complete_room_01; expected a mapping",
-        ),
-        (
-            '{"merger": {"../floor": {}}, "scale_meters_per_coordinate": {}}',
-            r"found \['\.\./floor'\] in merger; expected .* letters",
-        ),
-        (
-            '{"merger": {"f": {"c": {"p": {"i": {}}}}}, "scale_meters_per_coordinate": {"f": "1"}}',
-            "f='1' in scale_meters_per_coordinate",
-        ),
-    ],
-)
-def test_a_broken_home_is_named(root: Path, content: str, expected: str) -> None:
-    write_homes(root, ["001", "002"])
-    (root / "001" / "zind_data.json").write_text(content)
-    with pytest.raises(DataError, match=rf"001/zind_data\.json: .*{expected}"):
-        _zind(root).setup()
-    data = _zind(root, test_fraction=1, skip_broken=True)
-    assert len(names_of(data, "test")) == 12
-
-
 def test_a_missing_or_small_picture_is_named(root: Path) -> None:
     path = root / "000" / _record(root, 1, "pano_2")["image_path"]
     Image.new("RGB", (64, 64)).save(path)
@@ -240,18 +210,6 @@ def test_a_folder_without_homes_is_refused(root: Path) -> None:
     for wrong, found in ((root / "000", r"no \*/zind_data\.json"), (root / "no", "no such folder")):
         with pytest.raises(DataError, match=rf"{wrong.name}: found {found}; .*github\.com/zillow"):
             _zind(wrong).setup()
-
-
-def test_too_few_rooms_are_refused(root: Path) -> None:
-    file = root / "000" / "zind_data.json"
-    content = json.loads(file.read_text())
-    rooms = content["merger"]["floor_01"]
-    for name in ("complete_room_03", "complete_room_04"):
-        del rooms[name]
-    file.write_text(json.dumps(content))
-    with pytest.raises(DataError, match=r"found 2 rooms or homes .*data\.test_fraction=1"):
-        _zind(root).setup()
-    assert len(names_of(_zind(root, validation_fraction=0), "test")) == 2
 
 
 @pytest.mark.parametrize(

@@ -69,18 +69,6 @@ def upernet() -> Made:
     return transformers.UperNetForSemanticSegmentation(config), processor
 
 
-def beit() -> Made:
-    config = transformers.BeitConfig(
-        out_indices=[1, 2, 3, 4],
-        pool_scales=[1, 2],
-        use_relative_position_bias=True,
-        **_TRANSFORMER,
-        **_LABELS,
-    )
-    processor = transformers.BeitImageProcessor(size=_SIZE, do_center_crop=False)
-    return transformers.BeitForSemanticSegmentation(config), processor
-
-
 def mobilevit() -> Made:
     config = transformers.MobileViTConfig(
         hidden_sizes=[16, 16, 16],

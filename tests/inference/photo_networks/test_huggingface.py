@@ -13,7 +13,6 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from models import HuggingFaceNetwork
-from models.huggingface import architecture
 from tangent_train.checkpoints.trained import load_trained
 from tangent_train.errors import DataError, SettingError
 from tangent_train.inference.photo_networks import huggingface, import_network
@@ -67,19 +66,6 @@ def test_float16_weights_are_stored_as_float32(folder: Path) -> None:
     assert {t.dtype for t in tensors.values() if t.is_floating_point()} == {torch.float32}
 
 
-def test_another_number_of_classes_for_training(folder: Path) -> None:
-    settings = dict(networks.imported(folder).settings or {})
-    network = HuggingFaceNetwork(settings["config"], num_classes=3)
-    assert network(torch.zeros(2, 3, 33, 40)).shape == (2, 3, 33, 40)
-
-
-def test_a_network_reads_whole_patches_only() -> None:
-    made = networks.beit()[0]
-    network = HuggingFaceNetwork(architecture(made.config.to_dict()), 6)
-    with pytest.raises(SettingError, match="found 64×70; expected multiples of 16 pixels"):
-        network(torch.zeros(1, 3, 64, 70))
-
-
 @pytest.mark.parametrize(
     ("file", "changes", "message"),
     [
@@ -129,13 +115,6 @@ def test_files_that_are_missing(folder: Path, tmp_path: Path) -> None:
     (folder / "config.json").unlink()
     with pytest.raises(DataError, match=r"config\.json: found no such file"):
         networks.imported(folder)
-
-
-def test_names_of_another_number_of_scores(folder: Path, tmp_path: Path) -> None:
-    classes = tmp_path / "classes.json"
-    classes.write_text('["wall", "floor"]')
-    with pytest.raises(SettingError, match="found 2, for 6 scores"):
-        networks.imported(folder, classes=classes)
 
 
 def test_a_model_that_cannot_be_fetched(monkeypatch: pytest.MonkeyPatch) -> None:

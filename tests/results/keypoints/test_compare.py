@@ -15,7 +15,6 @@ from tangent_train.results.keypoints.compare import (
     Comparer,
     Comparison,
     Ways,
-    shrunk_rows,
 )
 from tests.results.keypoints.ball_room import ball_pair
 
@@ -100,9 +99,3 @@ def test_levels_that_do_not_fit_are_refused(pair: PanoramaPair) -> None:
         Comparer(Ways((6,))).compare(pair)
     with pytest.raises(SettingError, match=r"level: found 8; expected at most 7, .* 192 rows"):
         Comparer(Ways((0,), level=8)).compare(pair)
-
-
-@pytest.mark.parametrize(("level", "rows"), [(10, 1453), (5, 45)])
-def test_the_shrunk_panorama_has_the_pixels_of_tangent_images(level: int, rows: int) -> None:
-    # R_v(−1) = 2 R_v(0) = 2.2142974 radians across 2^s pixels (DESIGN, section 3).
-    assert shrunk_rows(level) == rows == round(np.pi / (2.2142974 / 2**level))

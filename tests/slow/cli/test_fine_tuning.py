@@ -7,10 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from transformers import SegformerConfig
 
-from models.huggingface import architecture
-from tangent_train.checkpoints.trained import load_trained
 from tests.cli.imported import write_imported
 from tests.cli.test_commands import CUT_SHORT
 from tests.cli.tiny_runs import SETTINGS, results, run_command, run_in
@@ -66,26 +63,3 @@ def test_it_is_resumed_exactly_without_the_imported_file(
     assert len(frozen) > 10
     for name in frozen:
         assert torch.equal(before["state_dict"][name], expected["state_dict"][name]), name
-
-
-def test_a_network_of_transformers_learns_other_classes_from_depth_too(
-    rooms: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    sizes: Any = {"hidden_sizes": [8, 8, 16, 16], "depths": [1] * 4, "decoder_hidden_size": 16}
-    heads: Any = {"num_attention_heads": [1] * 4, "sr_ratios": [2, 1, 1, 1]}
-    config = architecture(SegformerConfig(**sizes, **heads).to_dict())
-    section = {"_target_": "models.HuggingFaceNetwork", "config": config, "num_classes": 21}
-    monkeypatch.chdir(tmp_path)
-    write_imported(Path("net.ckpt"), section)
-    typed = ["network.segformer.stages.1", "optimizer.backbone_lr_factor=0.1"]
-    tuned = [f"task.frozen=[{typed[0]}]", typed[1], "trainer.max_epochs=1", "hydra.run.dir=run"]
-    run_command(monkeypatch, "train", *TYPED, rooms, *tuned, "init_from=net.ckpt")
-    said = capsys.readouterr().out
-    assert "patch_embeddings.proj.weight: starts at zero: depth" in said
-    assert "network.decode_head.classifier.weight: (21, 16, 1, 1) in the file" in said
-    Path("net.ckpt").unlink()
-    content = _last(Path("run"))
-    assert len(content["fresh"]) == 2
-    assert all("decode_head.classifier" in name for name in content["fresh"])
-    trained = load_trained(Path("run") / "checkpoints" / "best.ckpt")
-    assert trained.network(torch.zeros(1, 4, 64, 64)).shape == (1, 13, 64, 64)

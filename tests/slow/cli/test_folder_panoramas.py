@@ -60,22 +60,6 @@ def test_results_and_checkpoint_are_of_the_own_classes(root: Path, own_run: Path
     assert content["normalization"] == {"mean": [0.1, 0.2, 0.3, 2], "std": [0.5, 0.5, 0.5, 1.5]}
 
 
-def test_the_checkpoint_is_evaluated_again_and_on_other_files(
-    root: Path, own_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    checkpoint = f"checkpoint={own_run / 'checkpoints' / 'best.ckpt'}"
-    run_command(monkeypatch, "evaluate", checkpoint, f"data.root='{root}'", "hydra.run.dir=again")
-    assert results(tmp_path / "again") == results(own_run)
-    # Another folder of the same classes, with all panoramas for test but one of each other split.
-    own = write_data_set(tmp_path / "more", scenes=4, each=1, height=_ROWS, depth=True)
-    (own / "train.txt").write_text("scene_0/view.0\n")
-    (own / "val.txt").write_text("scene_1/view.0\n")
-    run_command(monkeypatch, "evaluate", checkpoint, f"data.root={own}", "hydra.run.dir=more")
-    expected = pixels_of_classes(own, ["scene_2/view.0", "scene_3/view.0"])
-    assert np.array(results(tmp_path / "more")["confusion"]).sum(axis=1).tolist() == expected
-
-
 def test_two_panoramas_train_and_the_last_epoch_is_tested(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

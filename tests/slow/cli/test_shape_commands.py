@@ -56,24 +56,3 @@ def test_evaluating_repeats_the_numbers_and_rotates_the_shapes(
     text = (Path("both") / "report.json").read_text()
     assert "z / SO3" in text
     assert "z / z" in text
-
-
-@pytest.mark.parametrize(
-    ("command", "arguments", "message"),
-    [
-        ("predict", ["input=data", "output=labels"], "found a network for classification; .*"),
-        ("export", ["output=x.onnx"], "found a network for classification; expected one for seg"),
-    ],
-)
-def test_what_a_classifier_cannot_do_is_refused(
-    command: str,
-    arguments: list[str],
-    message: str,
-    shapes_run: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.chdir(shapes_run.parent)
-    checkpoint = f"checkpoint={shapes_run / 'checkpoints' / 'best.ckpt'}"
-    Path("data/x.png").write_bytes(b"never read")
-    with pytest.raises(SystemExit, match=rf"^tangent-{command}: .*{message}"):
-        run_command(monkeypatch, command, checkpoint, *arguments)

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from submitit.core.utils import FailedJobError
 
 from tests.cli.tiny_runs import SETTINGS, run_command
 
@@ -116,21 +115,3 @@ def test_a_search_without_a_validation_split_is_refused(
     with pytest.raises(SystemExit, match=message):
         run_command(monkeypatch, "train", "-m", "sweep=optuna", *without)
     assert not list(tmp_path.rglob("checkpoints"))
-
-
-def test_slurm_gets_the_resources_of_the_config(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    for name, script in {"srun": "exit 0", "sbatch": f'cp "$1" {tmp_path}/job; exit 1'}.items():
-        (tmp_path / "bin").mkdir(exist_ok=True)
-        (tmp_path / "bin" / name).write_text(f"#!/bin/sh\n{script}\n")
-        (tmp_path / "bin" / name).chmod(0o755)
-    monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}:{os.environ['PATH']}")
-    asked = ("hydra.launcher.partition=gpu", "hydra.launcher.gpus_per_node=4")
-    with pytest.raises((SystemExit, FailedJobError)):
-        run_command(monkeypatch, "train", "-m", "launcher=slurm", "seed=1,2", "name=try", *asked)
-    job = (tmp_path / "job").read_text()
-    for option in ("job-name=try", "partition=gpu", "gpus-per-node=4", "ntasks-per-node=4",
-                   "cpus-per-task=8", "mem=32GB", "time=1440", "array=0-1%2"):  # fmt: skip
-        assert f"#SBATCH --{option}\n" in job, job

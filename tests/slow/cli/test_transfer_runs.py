@@ -48,16 +48,3 @@ def test_real_runs_from_photos_to_panoramas(
     assert (HERE / "transfer.csv").read_text() == before, "the same figures again"
     left = {path.name for path in tmp_path.iterdir() if path.name[0] != "."}  # those are coverage's
     assert left == {"data", "my", "runs"}
-
-
-def test_stages_that_differ_in_inputs_are_refused_before_the_first(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    dims = (*SETTINGS, "level=6", "representation.base_level=2", "compare=[]")
-    alike = (
-        r"stage S: data\.inputs: found \('rgb', 'depth'\); expected \('rgb',\), as in the stages"
-    )
-    with pytest.raises(SystemExit, match=alike):
-        run_command(monkeypatch, "transfer", *dims, "photos.data.inputs=[rgb]")
-    assert not (tmp_path / "data").exists()

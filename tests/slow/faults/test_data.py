@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import errno
-import io
-import os
 import re
-import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,15 +12,6 @@ import pytest
 from tests.conftest import FabricateStanford
 from tests.slow.faults import data_sets as sets
 from tests.slow.faults.data_sets import colors, module, partner, write
-
-
-def _found(kind: str, root: Path, **settings: Any) -> dict[str, str]:
-    """Finding by file, relative to the root."""
-    problems, _ = module(kind, root, **settings).check()
-    return {
-        os.path.relpath(problem.file, root): f"{problem.finding} | {problem.remedy}"
-        for problem in problems.listed()
-    }
 
 
 @pytest.fixture
@@ -106,46 +92,4 @@ def test_a_damaged_file_is_found(
 # --- folders, names, copies ---------------------------------------------------------------------
 
 
-def test_an_empty_folder_a_missing_area_and_a_damaged_file_at_once(
-    root: Path, fabricate_stanford: FabricateStanford
-) -> None:
-    write("stanford", root, fabricate_stanford)
-    for path in (root / "area_3" / "pano" / "rgb").iterdir():
-        path.unlink()
-    shutil.rmtree(root / "area_6")
-    first = colors("stanford", root)[0]
-    sets.truncate(first)
-    sets.corrupt(partner("stanford", first, "labels"))
-    sets.corrupt(colors("stanford", root)[-1])
-    found = _found("stanford", root)
-    assert {name: text.partition(";")[0] for name, text in found.items()} == {
-        ".": "no area_6",
-        "area_3/pano/rgb": "no panoramas",
-        str(first.relative_to(root)): f"{first.stat().st_size} bytes, truncated",
-        str(colors("stanford", root)[-1].relative_to(root)): "a broken image",
-    }
-
-
 # --- what may not be opened, and links ----------------------------------------------------------
-
-
-@pytest.mark.parametrize("kind", ["folder", "shapes"])
-def test_files_that_may_not_be_read(
-    kind: str, root: Path, fabricate_stanford: FabricateStanford, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Root may read all files, so the refusal is simulated."""
-    write(kind, root, fabricate_stanford)
-    closed = colors(kind, root)[1]
-    opened = io.open
-
-    def refuse(file: Any, *arguments: Any, **settings: Any) -> Any:
-        if os.fspath(file) == str(closed):
-            raise PermissionError(errno.EACCES, "Permission denied", str(closed))
-        return opened(file, *arguments, **settings)
-
-    monkeypatch.setattr(io, "open", refuse)
-    monkeypatch.setattr("builtins.open", refuse)
-    monkeypatch.setattr(os, "cpu_count", lambda: 1)  # no other processes, which could open it
-    found = _found(kind, root)
-    assert list(found) == [str(closed.relative_to(root))]
-    assert "Permission denied" in "".join(found.values())

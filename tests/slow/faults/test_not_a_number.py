@@ -8,7 +8,6 @@ from typing import Any
 import pytest
 import torch
 from lightning.pytorch.plugins import MixedPrecision
-from torch import Tensor
 
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 from tangent_train.errors import SettingError
@@ -80,38 +79,9 @@ def test_nan_weights_never_replace_a_good_checkpoint(stanford_root: Path, tmp_pa
         )
 
 
-def test_a_statistic_of_batch_normalization_counts_as_a_weight(
-    stanford_root: Path, tmp_path: Path
-) -> None:
-    normalization: Any = torch.nn.BatchNorm2d(13)
-    normalization.running_var[3] = torch.nan
-    network = torch.nn.Sequential(Faulty(), normalization)
-    network.register_buffer("mask", torch.full((2,), -torch.inf))  # is one a network may have
-    with pytest.raises(SettingError, match=r"in network\.1\.running_var; expected finite"):
-        run_trainer(tmp_path, max_epochs=1).fit(
-            small_task(network), datamodule=small_data(stanford_root)
-        )
-
-
 def _half(scaler: torch.amp.GradScaler) -> dict[str, Any]:
     """Real half precision with a scaled loss, which works on a CPU as on a GPU."""
     return {"plugins": [MixedPrecision("16-mixed", "cpu", scaler)], "max_steps": 4}
-
-
-def test_gradients_that_overflow_are_left_out_and_the_scale_shrinks(
-    stanford_root: Path, tmp_path: Path
-) -> None:
-    def overflow(scores: Any) -> Tensor:
-        scores.register_hook(lambda gradient: gradient * 1e38)
-        return scores
-
-    network, scaler = Faulty(1, overflow), torch.amp.GradScaler("cpu", init_scale=2.0**14)
-    trainer = run_trainer(tmp_path, **_half(scaler))
-    trainer.fit(small_task(network), datamodule=small_data(stanford_root))
-    before, after, later = network.weights[1:4]
-    torch.testing.assert_close(before, after, rtol=0, atol=0)
-    assert not torch.equal(after, later), "the next step is taken"
-    assert scaler.get_scale() == 2.0**13
 
 
 def test_scores_beyond_half_precision_stop_and_another_precision_is_named(

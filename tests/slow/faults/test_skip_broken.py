@@ -80,25 +80,6 @@ def test_broken_files_are_refused_or_left_out_and_counted(
             source.read(index)
 
 
-def test_a_split_that_has_nothing_left(root: Path, fabricate_stanford: FabricateStanford) -> None:
-    write("folder", root, fabricate_stanford)
-    (root / "test.txt").write_text("scene_0/view.0")
-    sets.corrupt(root / "labels" / "scene_0" / "view.0.png")
-    with pytest.raises(DataError, match=r"no panoramas for test that can be used"):
-        module("folder", root, skip_broken=True).setup()
-
-
-def test_a_missing_area_cannot_be_left_out(
-    root: Path, fabricate_stanford: FabricateStanford
-) -> None:
-    """Nobody asked for another fold."""
-    write("stanford", root, fabricate_stanford)
-    (root / "area_6").rename(root / "area_7")
-    sets.truncate(colors("stanford", root)[0])
-    with pytest.raises(DataError, match=r"found 2 problems(.|\n)*no area_6"):
-        module("stanford", root, skip_broken=True).setup()
-
-
 # --- with a store and in memory -----------------------------------------------------------------
 
 
@@ -211,26 +192,3 @@ def test_the_command_lists_problems_line_by_line(
         "Copy or extract the file again.",
     ]
     assert "2 problems; 13 panoramas" in captured.err
-
-
-def test_the_command_shows_a_table_on_a_terminal(
-    tmp_path: Path,
-    fabricate_stanford: FabricateStanford,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("FORCE_COLOR", "1")
-    monkeypatch.setenv("COLUMNS", "72")
-    root = write("folder", tmp_path / "rooms", fabricate_stanford)
-    strange = root / "images" / "scene_0" / "[red]line\nend\x1b[2J\udcff.png"
-    strange.write_bytes(b"nothing")
-    with pytest.raises(SystemExit):
-        run_command(monkeypatch, "check", "data=folder", "level=3", f"data.root='{root}'")
-    printed = capsys.readouterr().out
-    assert "\x1b[2J" not in printed, "no command to the terminal"
-    rows = [line.split("│") for line in printed.splitlines() if line.startswith("│")]
-    path = "".join(cells[1].strip() for cells in rows)
-    assert str(root) in path, "folded, not cut"
-    assert r"[red]line\nend\x1b[2J\udcff.png" in path
-    assert "problem" in printed

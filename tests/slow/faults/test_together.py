@@ -12,7 +12,6 @@ from typing import Any
 import pytest
 import torch
 
-from datamodules.core.made_folders import claim_folder
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 from datamodules.synthrooms.settings import RoomSettings
 from tangent_train.rendering import TangentRepresentation
@@ -74,27 +73,3 @@ def test_runs_that_prepare_the_same_store_at_once_see_the_same(
     before = {path: path.stat().st_mtime_ns for path in store.rglob("*.npy")}
     data.prepare_data()
     assert {path: path.stat().st_mtime_ns for path in before} == before, "all are whole"
-
-
-def test_two_runs_claim_the_same_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # The other run claims the folder and makes its first file just after this one has looked.
-    root = tmp_path / "rooms"
-    looked: list[Path] = []
-    really_exists = Path.exists
-
-    def exists(path: Path) -> bool:
-        found = really_exists(path)
-        if path.name == "manifest.json" and not looked:
-            looked.append(path)
-            _claim(root)
-            (root / "area_1").mkdir()
-        return found
-
-    monkeypatch.setattr(Path, "exists", exists)
-    _claim(root)
-    assert looked
-    _claim(root)
-
-
-def _claim(root: Path) -> None:
-    claim_folder(root, "manifest.json", "SynthRooms", 1, {"seed": 0})

@@ -16,10 +16,8 @@ import pytest
 import torch
 from lightning.pytorch.plugins import MixedPrecision
 
-from tangent_train.callbacks.checkpoints import BestCheckpoint
 from tangent_train.callbacks.panels import PredictionPanels
 from tangent_train.callbacks.results import evaluated, write_evaluation
-from tangent_train.cli.train import best_on_validation
 from tests.slow.faults.small_runs import Faulty, run_trainer, small_data, small_task
 
 WITHOUT_VALIDATION = pytest.mark.filterwarnings(
@@ -115,23 +113,3 @@ def test_panoramas_without_a_labelled_pixel(
         assert np.isnan(logged["test/miou"]) == (absent == "skip")
     for name in ("results.csv", "results.md"):
         assert "nan" not in (tmp_path / "results" / name).read_text().lower()
-
-
-def test_a_validation_split_without_a_labelled_pixel_has_no_best_figure(
-    root: Path, tmp_path: Path
-) -> None:
-    data = small_data(root, validation_fraction=0.3)
-    names = [data.sample_name("val", i) for i in range(len(data.source("val")))]
-    for name in names:
-        (path,) = root.glob(f"area_*/pano/semantic/camera_{Path(name).name}_*")
-        _without_labels(path)
-    best = BestCheckpoint(tmp_path / "checkpoints")
-    task = small_task(Faulty())
-    trainer = run_trainer(tmp_path, max_epochs=2, limit_val_batches=1.0, callbacks=[best])
-    trainer.fit(task, datamodule=data)
-    assert (tmp_path / "checkpoints" / "best.ckpt").exists()
-    figures = evaluated(task, "panoramas")
-    assert figures.means["miou"] is None
-    assert figures.images == len(names)
-    assert best_on_validation(trainer, tmp_path) is None, "a sweep is not told minus infinity"
-    assert not list(tmp_path.glob("*.json"))

@@ -15,7 +15,7 @@ from torch.utils.data import get_worker_info
 
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 from tangent_train.cli.machine import machine_faults
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import SettingError
 from tests.slow.faults.small_runs import Faulty, run_trainer, small_data, small_task
 
 pytestmark = [
@@ -74,16 +74,3 @@ def test_a_worker_that_dies_is_reported_with_what_may_help(
     message = r"data\.num_workers: found 2, and a DataLoader worker"
     with pytest.raises(SettingError, match=message), machine_faults(tmp_path, data):
         run(small_task(Faulty()), datamodule=data)
-
-
-def test_errors_of_workers_are_said_without_their_stack(
-    stanford_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refuse() -> None:
-        raise DataError("a.png", found="half of it", expected="all", remedy="Copy it\nagain.")
-
-    data = small_data(stanford_root, num_workers=1)
-    _make_fail(data, "train", refuse, monkeypatch)
-    with pytest.raises(DataError) as caught, machine_faults(tmp_path, data):
-        run_trainer(tmp_path, max_epochs=1).fit(small_task(Faulty()), datamodule=data)
-    assert str(caught.value) == "a.png: found half of it; expected all. Copy it\nagain."

@@ -13,7 +13,7 @@ from tangent_train.errors import DataError
 from tests.inference.photo_networks import huggingface_networks as networks
 
 
-@pytest.mark.parametrize("make", [networks.upernet, networks.beit, networks.mobilevit])
+@pytest.mark.parametrize("make", [networks.upernet, networks.mobilevit])
 def test_semantic_segmentation(make: Callable[[], networks.Made], tmp_path: Path) -> None:
     network, processor = networks.saved(make, tmp_path)
     scores = networks.imported_scores(networks.imported(tmp_path))

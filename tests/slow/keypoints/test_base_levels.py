@@ -24,9 +24,3 @@ def test_the_rotation_of_the_grid_counts() -> None:
     agreement = Agreement(rotated(found_on_texture(1), ROTATION), right)
     assert agreement.share > 0.85
     assert agreement.error_deg < 0.05
-
-
-def test_a_margin_finds_what_is_near_borders() -> None:
-    """ORB finds nothing within 31 pixels of a border: without a margin nothing is left."""
-    counts = [len(found_on_texture(2, margin=margin, name="orb")) for margin in (0, 32)]
-    assert counts[0] < 0.02 * counts[1]
