@@ -16,16 +16,20 @@ import json
 import os
 import platform
 import statistics
+import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import asdict
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-from benchmarks.measuring import Goal, Row, Table
+import torch
+
+from benchmarks.measuring import DEVICE, FAILURES, Table, attempted
 
 MEASURED = {
     "images": "benchmarks.images",
@@ -39,19 +43,11 @@ MEASURED = {
 """Modules of the rows; each has a function of the same name."""
 
 ON_A_GPU = {name: f"benchmarks.gpu.{name}" for name in ("correct", "step", "predict", "fed")}
-"""Likewise, of ``gpu``."""
+"""Likewise, of ``gpu``. What fails is listed, and the others go on."""
 
 BASELINE = Path(__file__).with_name("baseline.json")
 _NOISE = 1.1
 """The load of a machine may change a quotient that much."""
-
-
-class Interval(NamedTuple):
-    """Median, least and most of a quotient."""
-
-    median: float
-    low: float
-    high: float
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -67,25 +63,24 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--quick", action="store_true", help="small: the figures mean nothing")
     parser.add_argument("--output", type=Path, default=Path("runs/bench"), help="folder")
     options = parser.parse_args(arguments)
-    command, files = "", [Path(name) for name in options.names if name.endswith(".json")]
-    if options.names[:1] in (["compare"], ["baseline"], ["gpu"]):
-        command, *options.names = options.names
-    if command == "baseline":
-        write_baseline(files)
-        return
+    command, names = "", options.names
+    if names[:1] in (["compare"], ["baseline"], ["gpu"]):
+        command, *names = names
+    files = [Path(name) for name in names if name.endswith(".json")]
     if not files:
         measured = ON_A_GPU if command == "gpu" else MEASURED
-        unknown = sorted({*options.names} - {*measured})
-        if unknown:
+        if unknown := sorted({*names} - {*measured}):
             parser.error(f"unknown: {', '.join(unknown)}")
-        modules = {name: measured[name] for name in options.names or measured}
-        files = [run(modules, options.output, quick=options.quick)]
-    if command == "compare":
-        compare(files[0])
+        quick = options.quick or (command == "gpu" and DEVICE.type == "cpu")
+        files = [run({n: measured[n] for n in names or measured}, options.output, quick=quick)]
+    if command == "baseline":
+        write_baseline([read(file) for file in files])
+    elif command == "compare":
+        compare(read(files[0]))
 
 
 def run(modules: Mapping[str, str], output: Path, *, quick: bool) -> Path:
-    """Measure, print and write ``results.json``, whose path is returned, and ``results.md``.
+    """Measure, print and write ``results.json``, whose path is returned.
 
     Written after every table: what is stopped keeps what it has.
 
@@ -96,25 +91,17 @@ def run(modules: Mapping[str, str], output: Path, *, quick: bool) -> Path:
     """
     start = time.perf_counter()
     tables: list[Table] = []
-    libraries = ("torch", "numpy", "opencv-python-headless", "numba", "lightning")
-    content: dict[str, Any] = {
-        "quick": quick,
-        "cores": len(os.sched_getaffinity(0)),
-        "machine": f"{platform.processor()} {platform.platform(terse=True)}",
-        "versions": {library: version(library) for library in libraries},
-    }
-    if {*modules} <= {*ON_A_GPU}:
-        gpu = import_module("benchmarks.gpu.device")
-        content |= {"quick": gpu.QUICK, "failures": gpu.FAILURES, **gpu.device_facts()}
+    content = machine() | {"quick": quick, "failures": FAILURES}
     output.mkdir(parents=True, exist_ok=True)
     path = output / "results.json"
     for name, module in modules.items():
-        for table in getattr(import_module(module), name)(content["quick"]):
-            print(f"{table_text(table)}\n[{time.perf_counter() - start:.0f} s]", flush=True)
-            tables.append(table)
-            content["tables"] = [asdict(table) for table in tables]
-            path.write_text(json.dumps(content, indent=1, ensure_ascii=False), encoding="utf-8")
-            path.with_suffix(".md").write_text(markdown(content, tables), encoding="utf-8")
+        with attempted(name) if module in ON_A_GPU.values() else nullcontext():
+            for table in getattr(import_module(module), name)(quick):
+                print(f"{table_text(table)}\n[{time.perf_counter() - start:.0f} s]", flush=True)
+                tables.append(table)
+                content["tables"] = [asdict(table) for table in tables]
+                content["quotients"] = quotients(tables)
+                path.write_text(json.dumps(content, indent=1, ensure_ascii=False), "utf-8")
     goals = [goal for table in tables for goal in table.goals]
     met = sum(goal.met for goal in goals)
     print(f"{met} of {len(goals)} goals met, in {time.perf_counter() - start:.0f} s")
@@ -122,10 +109,19 @@ def run(modules: Mapping[str, str], output: Path, *, quick: bool) -> Path:
     return path
 
 
-def markdown(content: Mapping[str, Any], tables: Sequence[Table]) -> str:
-    """The tables, after what is known of the machine."""
-    facts = [f"- {name}: {value}" for name, value in content.items() if name != "tables"]
-    return "\n".join([*facts, *(f"```text{table_text(table)}\n```" for table in tables), ""])
+def machine() -> dict[str, Any]:
+    """What figures depend on."""
+    libraries = ("torch", "numpy", "opencv-python-headless", "numba", "lightning")
+    facts: dict[str, Any] = {
+        "cores": len(os.sched_getaffinity(0)),
+        "machine": f"{platform.processor()} {platform.platform(terse=True)}",
+        "versions": {library: version(library) for library in libraries},
+    }
+    if DEVICE.type == "cuda":
+        query = ["nvidia-smi", "--query-gpu=name,memory.total,driver_version", "--format=csv"]
+        told = subprocess.run(query, capture_output=True, text=True, check=False).stdout
+        facts |= {"device": told.splitlines(), "cuda": torch.version.cuda}
+    return facts
 
 
 def table_text(table: Table) -> str:
@@ -143,83 +139,62 @@ def table_text(table: Table) -> str:
     return "\n".join(lines)
 
 
-def read(path: Path) -> tuple[list[Table], dict[str, Any]]:
-    """The tables of a ``results.json`` of full size, and all else that is in it."""
-    content = json.loads(path.read_text(encoding="utf-8"))
-    if content["quick"]:
-        sys.exit(f"{path}: found a run with --quick; expected one of full size")
-    tables = [
-        Table(
-            table["name"],
-            [Row(**row) for row in table["rows"]],
-            table["unit"],
-            [Goal(*goal) for goal in table["goals"]],
-        )
-        for table in content.pop("tables")
-    ]
-    return tables, content
-
-
-def quotients(tables: Sequence[Table]) -> dict[str, Interval]:
-    """This project's rows over the first of their table."""
+def quotients(tables: Sequence[Table]) -> dict[str, dict[str, float]]:
+    """This project's rows over the first of their table: median, least and most."""
     found = {}
     for table in tables:
         for row in table.rows[1:]:
             if row.ours:
                 values = table.ratios(row.name)
-                interval = Interval(statistics.median(values), min(values), max(values))
-                found[f"{table.name}: {row.name}"] = interval
+                interval = {"median": table.ratio(row.name), "low": min(values)}
+                found[f"{table.name}: {row.name}"] = interval | {"high": max(values)}
     return found
 
 
-def compare(path: Path) -> None:
+def read(path: Path) -> dict[str, Any]:
+    """The content of a ``results.json`` of full size."""
+    content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    if content["quick"]:
+        sys.exit(f"{path}: found a run with --quick; expected one of full size")
+    return content
+
+
+def compare(content: Mapping[str, Any]) -> None:
     """Print how quotients changed; exit with 1 if something is slower beyond noise.
 
     That is, all its rounds are above all of the baseline's, and its median is a tenth above.
     """
     baseline = json.loads(BASELINE.read_text(encoding="utf-8"))
-    then = {name: Interval(**interval) for name, interval in baseline["quotients"].items()}
-    tables, content = read(path)
     if content["cores"] not in baseline["cores"]:
         print(f"The baseline is of {baseline['cores']} cores, this of {content['cores']}.")
-    found = verdicts(quotients(tables), then)
-    for name, verdict in found.items():
+    slower = 0
+    for name, now in content["quotients"].items():
+        then, verdict = baseline["quotients"].get(name), "same"
+        if then is None:
+            verdict = "new"
+        elif now["low"] > then["high"] and now["median"] > _NOISE * then["median"]:
+            verdict, slower = "slower", slower + 1
+        elif now["high"] < then["low"] and now["median"] * _NOISE < then["median"]:
+            verdict = "faster"
         print(f"{verdict:7} {name}")
-    slower = sum(verdict == "slower" for verdict in found.values())
     if slower:
-        sys.exit(f"{slower} of {len(found)} have become slower.")
+        sys.exit(f"{slower} of {len(content['quotients'])} have become slower.")
     print("Nothing has become slower beyond noise.")
 
 
-def verdicts(now: Mapping[str, Interval], then: Mapping[str, Interval]) -> dict[str, str]:
-    """``slower``, ``faster``, ``same`` or ``new`` by name; larger memory is slower too."""
-    found = {}
-    for name, one in now.items():
-        other = then.get(name)
-        if other is None:
-            found[name] = "new"
-        elif one.low > other.high and one.median > _NOISE * other.median:
-            found[name] = "slower"
-        elif one.high < other.low and one.median * _NOISE < other.median:
-            found[name] = "faster"
-        else:
-            found[name] = "same"
-    return found
-
-
-def write_baseline(files: Sequence[Path]) -> None:
+def write_baseline(runs: Sequence[Mapping[str, Any]]) -> None:
     """Write the median of several runs' medians, and the widest interval."""
-    runs = [read(file) for file in files]
-    found = [quotients(tables) for tables, _ in runs]
     rows = {}
-    for name in dict.fromkeys(name for one in found for name in one):
-        intervals = [one[name] for one in found if name in one]
-        median = statistics.median_low(interval.median for interval in intervals)
-        low, high = min(i.low for i in intervals), max(i.high for i in intervals)
-        rows[name] = {"median": median, "low": low, "high": high}
-    rounded = {n: {k: float(f"{v:.4g}") for k, v in row.items()} for n, row in rows.items()}
-    cores = sorted({content["cores"] for _, content in runs})
-    text = json.dumps({"cores": cores, "runs": len(runs), "quotients": rounded}, indent=1)
+    for name in dict.fromkeys(name for one in runs for name in one["quotients"]):
+        found = [one["quotients"][name] for one in runs if name in one["quotients"]]
+        row = {
+            "median": statistics.median_low(one["median"] for one in found),
+            "low": min(one["low"] for one in found),
+            "high": max(one["high"] for one in found),
+        }
+        rows[name] = {key: float(f"{value:.4g}") for key, value in row.items()}
+    cores = sorted({one["cores"] for one in runs})
+    text = json.dumps({"cores": cores, "runs": len(runs), "quotients": rows}, indent=1)
     BASELINE.write_text(text + "\n", encoding="utf-8")
 
 

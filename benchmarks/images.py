@@ -13,10 +13,16 @@ import torch
 from numpy.typing import NDArray
 
 from benchmarks.measuring import Goal, Table, Way, measure
-from tangent_train.geometry import TangentGrid, equirect_shape, lonlat_to_equirect, xyz_to_lonlat
+from tangent_train.geometry import (
+    TangentGrid,
+    equirect_directions,
+    equirect_shape,
+    lonlat_to_equirect,
+    xyz_to_lonlat,
+)
 from tangent_train.rendering import equirect_to_tangent
 
-__all__ = ["check_same_views", "images", "rivals", "striped_panorama"]
+__all__ = ["images"]
 
 BARE = "bare cv2.remap, maps ready-made"
 ALL = "equirect_to_tangent"
@@ -37,7 +43,7 @@ def images(quick: bool) -> Iterator[Table]:
 
 def _table(level: int, dtype: np.dtype[Any], rounds: int) -> Table:
     grid, shape = TangentGrid(1, level), equirect_shape(level)
-    striped = striped_panorama(shape)
+    striped = _striped_panorama(shape)
     panorama = striped if dtype.kind == "f" else np.rint(striped).astype(dtype)
     maps = [
         lonlat_to_equirect(xyz_to_lonlat(grid.directions([face])[0]), shape).astype(np.float32)
@@ -52,8 +58,8 @@ def _table(level: int, dtype: np.dtype[Any], rounds: int) -> Table:
     faces = range(0, grid.num_images, step)
     ours = equirect_to_tangent(panorama, grid, faces)
     libraries = []
-    for name, render in rivals(panorama, grid).items():
-        check_same_views(name, ours, render(faces))
+    for name, render in _rivals(panorama, grid).items():
+        _check_same_views(name, ours, render(faces))
         libraries.append(Way(name, lambda r=render: r(faces), scale=step, rounds=3))  # type: ignore[misc]
     four = [3, 20, 41, 77]
     own = [
@@ -70,21 +76,13 @@ def _table(level: int, dtype: np.dtype[Any], rounds: int) -> Table:
     return table
 
 
-def striped_panorama(shape: tuple[int, int]) -> NDArray[np.float32]:
+def _striped_panorama(shape: tuple[int, int]) -> NDArray[np.float32]:
     """Waves of 16 pixels along all axes, RGB from 28 to 228: half a pixel off is seen."""
-    height, width = shape
-    longitude = (np.arange(width) + 0.5) / width * 2 * np.pi - np.pi
-    latitude = (np.pi / 2 - (np.arange(height) + 0.5) / height * np.pi)[:, None]
-    axes = (
-        np.cos(latitude) * np.cos(longitude),
-        np.cos(latitude) * np.sin(longitude),
-        np.broadcast_to(np.sin(latitude), shape),
-    )
-    waves = [np.sin(axis * (width / 16)) for axis in axes]
-    return (128 + 100 * np.stack(waves, axis=-1)).astype(np.float32)
+    waves = np.sin(equirect_directions(shape) * (shape[1] / 16))
+    return (128 + 100 * waves).astype(np.float32)
 
 
-def rivals(panorama: NDArray[Any], grid: TangentGrid) -> dict[str, Render]:
+def _rivals(panorama: NDArray[Any], grid: TangentGrid) -> dict[str, Render]:
     """Other libraries, made to render this project's tangent images.
 
     Their conventions, in ours (centres of pixels are integers, yaw to the right, pitch up):
@@ -124,12 +122,12 @@ def rivals(panorama: NDArray[Any], grid: TangentGrid) -> dict[str, Render]:
     }
 
 
-def check_same_views(name: str, ours: NDArray[Any], theirs: Sequence[NDArray[Any]]) -> None:
+def _check_same_views(name: str, ours: NDArray[Any], theirs: Sequence[NDArray[Any]]) -> None:
     """Refuse a comparison of different views.
 
     Args:
         name: Of the library.
-        ours: ``(n, d, d, C)`` tangent images of a `striped_panorama`.
+        ours: ``(n, d, d, C)`` tangent images of a `_striped_panorama`.
         theirs: The same, up to a pixel smaller.
 
     Raises:

@@ -7,18 +7,40 @@ times do not transfer to another machine.
 
 from __future__ import annotations
 
+import gc
 import math
 import re
 import statistics
 import time
-from collections.abc import Callable, Sequence
+import traceback
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 
-__all__ = ["Goal", "Row", "Table", "Way", "added_mib", "measure", "memory_kib"]
+import torch
+
+__all__ = [
+    "DEVICE",
+    "FAILURES",
+    "Goal",
+    "Row",
+    "Table",
+    "Way",
+    "added_mib",
+    "attempted",
+    "measure",
+    "peak_mib",
+]
+
+DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+"""Of the measurements that are meant for a GPU."""
+
+FAILURES: list[str] = []
+"""What was attempted and failed, and why."""
 
 _SHORTEST_S = 0.02
 """Shorter calls are repeated until they take that long."""
@@ -77,7 +99,7 @@ class Table:
     Attributes:
         name: Short and unique: the baseline knows it by this.
         rows: Measurements.
-        unit: ``s`` or ``MiB``.
+        unit: Such as ``s`` or ``MiB``.
         goals: Its promises.
     """
 
@@ -111,6 +133,7 @@ def measure(ways: Sequence[Way], rounds: int) -> list[Row]:
         start = time.perf_counter()
         for _ in range(repeats):
             way.run()
+        _synchronize()
         return (time.perf_counter() - start) / repeats
 
     warm = [min(seconds(way, 1), seconds(way, 1)) for way in ways]
@@ -121,6 +144,12 @@ def measure(ways: Sequence[Way], rounds: int) -> list[Row]:
             if number < ways[k].rounds:
                 rows[k].values.append(seconds(ways[k], repeats[k]) * ways[k].scale)
     return rows
+
+
+def _synchronize() -> None:
+    """Wait until a GPU, if there is one, has done its work."""
+    if DEVICE.type == "cuda":
+        torch.cuda.synchronize()
 
 
 def added_mib(function: Callable[..., Callable[[], object]], *arguments: Any) -> float:
@@ -135,15 +164,35 @@ def added_mib(function: Callable[..., Callable[[], object]], *arguments: Any) ->
 
 
 def _added_mib(function: Callable[..., Callable[[], object]], arguments: tuple[Any, ...]) -> float:
-    call = function(*arguments)
-    before = memory_kib("VmRSS")
+    return peak_mib(function(*arguments), torch.device("cpu"))
+
+
+def peak_mib(call: Callable[[], object], device: torch.device = DEVICE) -> float:
+    """Memory of a device that a call adds at most, in MiB."""
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats()
+        before = torch.cuda.memory_allocated()
+        call()
+        return (torch.cuda.max_memory_allocated() - before) / 2**20
+    before = _memory_kib("VmRSS")
     call()
-    return max(1, memory_kib("VmHWM") - before) / 2**10
+    return max(1, _memory_kib("VmHWM") - before) / 2**10
 
 
-def memory_kib(name: str) -> int:
+def _memory_kib(name: str) -> int:
     """A figure of this process: ``VmRSS`` is what it holds, ``VmHWM`` what it held at most."""
-    found = re.search(rf"^{name}:\s+(\d+) kB$", Path("/proc/self/status").read_text(), re.MULTILINE)
-    if found is None:
-        raise LookupError(f"/proc/self/status has no {name}")
-    return int(found[1])
+    status = Path("/proc/self/status").read_text()
+    return int(re.findall(rf"^{name}:\s+(\d+) kB$", status, re.MULTILINE)[0])
+
+
+@contextmanager
+def attempted(name: str) -> Iterator[None]:
+    """What fails in here is listed, and what comes after it goes on."""
+    try:
+        yield
+    except Exception as error:
+        traceback.print_exc()
+        FAILURES.append(f"{name}: {type(error).__name__}: {error}")
+    finally:
+        gc.collect()
+        torch.cuda.empty_cache()

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 from benchmarks.measuring import Goal, Table, Way, measure
@@ -32,21 +33,21 @@ _SETTINGS = (
 
 def start(quick: bool) -> Iterator[Table]:
     """Until a command answers, and until its first step is done."""
+    name, imports = "tangent-train --help", "import lightning, torchvision, cv2, numba"
     with tempfile.TemporaryDirectory() as folder:
-        name = "tangent-train --help"
+        run = partial(_run, folder)
         ways = [
-            _way("import hydra", "import hydra", folder),
-            _way(name, _command("--help"), folder, ours=True),
-            _way("tangent-train, a setting misspelt", _command("levle=5"), folder, ours=True),
+            Way("import hydra", partial(run, "import hydra")),
+            Way(name, partial(run, _command("--help")), ours=True),
+            Way("tangent-train, a setting misspelt", partial(run, _command("levle=5"), 1), True),
         ]
         table = Table("start: answers", measure(ways, 2 if quick else 7))
         table.goals = [Goal(f"{name}, seconds", table.rows[1].median, 1.5)]
         yield table
         step = _FIRST_STEP + _command(*_SETTINGS, f"data.root={folder}/rooms")
-        imports = "import lightning, torchvision, cv2, numba"
         ways = [
-            _way(imports, imports, folder),
-            _way("tangent-train, until its first step is done", step, folder, ours=True),
+            Way(imports, partial(run, imports)),
+            Way("tangent-train, until its first step is done", partial(run, step), ours=True),
         ]
         yield Table("start: first step", measure(ways, 1 if quick else 3))
 
@@ -55,17 +56,9 @@ def _command(*arguments: str) -> str:
     return _COMMAND.format(["tangent-train", *arguments])
 
 
-def _way(name: str, code: str, folder: str, *, ours: bool = False) -> Way:
-    root = str(Path(__file__).resolve().parents[1])
-    environment = os.environ | {"PYTHONPATH": root}
-
-    def run() -> None:
-        subprocess.run(
-            [sys.executable, "-c", code],
-            check="misspelt" not in name,
-            capture_output=True,
-            cwd=folder,
-            env=environment,
-        )
-
-    return Way(name, run, ours)
+def _run(folder: str, code: str, status: int = 0) -> None:
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parents[1])}
+    line = [sys.executable, "-c", code]
+    done = subprocess.run(line, check=False, capture_output=True, cwd=folder, env=environment)
+    if done.returncode != status:
+        raise RuntimeError(done.stderr.decode())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import tempfile
 import time
@@ -14,70 +13,66 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from torch import nn
 
-from benchmarks.gpu.device import DEVICE, QUICK, segformer, tried, way
+from benchmarks.gpu import segformer
 from benchmarks.labels import NUM_CLASSES
-from benchmarks.measuring import Goal, Row, Table, measure
-from datamodules.core.inputs import RGB_NORMALIZATION
-from models import FCNResNet
-from tangent_train.checkpoints.scores import Scores
+from benchmarks.measuring import DEVICE, Goal, Row, Table, Way, measure
 from tangent_train.checkpoints.trained import TrainedNetwork
 from tangent_train.cli.processes import command_line, run_process
 from tangent_train.geometry import TangentGrid, equirect_shape
+from tangent_train.inference.photo_networks import PhotoNetwork, import_network, normalization_of
 from tangent_train.inference.predictor import Predictor, view_scores
 from tangent_train.inference.views import InputImage, PanoramaViews
+from tangent_train.registry import make
 from tangent_train.rendering import equirect_to_tangent, tangent_to_labels
 
 __all__ = ["predict"]
 
-_NAMES = ("unknown", *map(str, range(NUM_CLASSES)))
-
 
 def predict(quick: bool) -> Iterator[Table]:
     """2048×1024 and 4096×2048, in bf16, then 200 frames by ``tangent-predict``."""
-    networks: dict[str, Callable[[], nn.Module]] = {
-        "SegFormer-B0": lambda: segformer(NUM_CLASSES),
-        "FCN-ResNet101": lambda: FCNResNet(3, NUM_CLASSES, depth=50 if quick else 101),
+    fcn = {"_target_": "models.FCNResNet", "in_channels": 3, "depth": 50 if quick else 101}
+    networks: dict[str, dict[str, Any]] = {
+        "SegFormer-B0": {"_target_": "models.HuggingFaceNetwork", "config": segformer(quick)},
+        "FCN-ResNet101": fcn,
     }
-    for level in (7,) if quick else (9, 10):
-        for name, make in list(networks.items())[: 1 if quick else 2]:
-            height, width = equirect_shape(level)
-            rows = tried(f"{name}, {width}×{height}", partial(_rows, make(), level))
-            if rows is None:
-                continue
-            table = Table(f"predict: {name}, bf16, {width}×{height}", rows)
-            for row in rows[1:]:
-                outside = 100 * (1 - 1 / table.ratio(row.name))
-                table.goals.append(Goal(f"outside the network, percent, {row.name}", outside, 10))
-            yield table
-    frames = tried("a folder of frames", partial(_folder, 2 if quick else 200))
-    if frames is not None:
-        yield Table("predict: tangent-predict, of each frame", frames)
+    with tempfile.TemporaryDirectory() as temporary:
+        path = Path(temporary) / "net.ckpt"
+        for level in (7,) if quick else (9, 10):
+            for name, settings in list(networks.items())[: 1 if quick else 2]:
+                height, width = equirect_shape(level)
+                rows = _rows(_imported(settings, level, path), level, 1 if quick else 5)
+                table = Table(f"predict: {name}, bf16, {width}×{height}", rows)
+                for row in rows[1:]:
+                    outside = 100 * (1 - 1 / table.ratio(row.name))
+                    goal = f"outside the network, percent, {row.name}"
+                    table.goals.append(Goal(goal, outside, 10))
+                yield table
+        _imported(networks["SegFormer-B0"], 7 if quick else 9, path)
+        rows = _folder(path, 7 if quick else 9, 2 if quick else 200)
+        yield Table("predict: tangent-predict, of each frame", rows)
 
 
-def _rows(network: nn.Module, level: int) -> list[Row]:
+def _imported(settings: dict[str, Any], level: int, path: Path) -> TrainedNetwork:
+    """An untrained network for the tangent images of a level, in a checkpoint."""
+    settings |= {"num_classes": NUM_CLASSES}
+    names, side = [f"class {k}" for k in range(NUM_CLASSES)], TangentGrid(1, level).dim
+    network, normalization = make(settings, "network"), normalization_of("imagenet")
+    photo = PhotoNetwork(network, settings, names, normalization, (side, side))
+    return import_network(photo, path, level=level, base_level=1).trained
+
+
+def _rows(trained: TrainedNetwork, level: int, rounds: int) -> list[Row]:
     """The network alone, `Predictor` as it is, and everything on the device."""
-    shape = equirect_shape(level)
-    settings = {"_target_": "tangent_train.rendering.TangentRepresentation", "base_level": 1}
-    grid = TangentGrid(1, level)
-    size = (grid.dim, grid.dim)
-    trained = TrainedNetwork(
-        network=Scores(network, NUM_CLASSES).eval(),
-        class_names=_NAMES,
-        inputs=("rgb",),
-        normalization=RGB_NORMALIZATION,
-        level=level,
-        representation=settings,
-        image_size=size,
-    )
+    shape, grid = equirect_shape(level), TangentGrid(1, level)
     image = InputImage(np.random.default_rng(0).integers(0, 256, (*shape, 3), np.uint8))
     predictors = {
         blend: Predictor(trained, PanoramaViews(trained, blend=blend), DEVICE.type)
         for blend in ("feather", "nearest")
     }
     per_forward = max(1, 2**20 // grid.dim**2)
-    random = torch.randn(min(per_forward, grid.num_images), 3, *size, device=DEVICE)
+    count = min(per_forward, grid.num_images)
+    random = torch.randn(count, 3, grid.dim, grid.dim, device=DEVICE)
     random = random.contiguous(memory_format=torch.channels_last)
 
     def scores(views: Callable[[slice], torch.Tensor]) -> list[torch.Tensor]:
@@ -94,48 +89,29 @@ def _rows(network: nn.Module, level: int) -> list[Row]:
         trained.labels(predictor.predict(image).labels())
 
     ways = [
-        way("the network", lambda: scores(lambda part: random[: part.stop - part.start])),
-        way("Predictor, feather", partial(labelled, predictors["feather"]), ours=True),
-        way("Predictor, nearest", partial(labelled, predictors["nearest"]), ours=True),
-        way("rendered and labelled on the device, nearest", on_device),
+        Way("the network", lambda: scores(lambda part: random[: part.stop - part.start])),
+        Way("Predictor, feather", partial(labelled, predictors["feather"]), ours=True),
+        Way("Predictor, nearest", partial(labelled, predictors["nearest"]), ours=True),
+        Way("rendered and labelled on the device, nearest", on_device),
     ]
-    with torch.autocast(DEVICE.type, torch.bfloat16, enabled=not QUICK):
-        return measure(ways, 1 if QUICK else 5)
+    with torch.autocast(DEVICE.type, torch.bfloat16, enabled=DEVICE.type == "cuda"):
+        return measure(ways, rounds)
 
 
-def _folder(count: int) -> list[Row]:
+def _folder(checkpoint: Path, level: int, count: int) -> list[Row]:
     """All of the command, its start too; float32, as the command computes."""
-    from transformers import SegformerImageProcessor
-
-    level = 7 if QUICK else 9
-    with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary)
-        network: Any = segformer(NUM_CLASSES)
-        network.network.save_pretrained(folder / "net")
-        size = dict.fromkeys(("height", "width"), TangentGrid(1, level).dim)
-        SegformerImageProcessor(size=size).save_pretrained(folder / "net")
-        classes = folder / "classes.json"
-        classes.write_text(json.dumps(list(_NAMES[1:])), encoding="utf-8")
-        frames, checkpoint = folder / "frames", folder / "net.ckpt"
-        frames.mkdir()
-        shape = equirect_shape(level)
-        noise = np.random.default_rng(0).integers(0, 256, (16, 32, 3), np.uint8)
-        cv2.imwrite(str(frames / "0.jpg"), cv2.resize(noise, shape[::-1]))
-        for number in range(1, count):
-            shutil.copy(frames / "0.jpg", frames / f"{number}.jpg")
-        given = ["network=huggingface", f"model={folder / 'net'}", f"classes={classes}"]
-        given += [f"level={level}", "base_level=1", "normalization=imagenet"]
-        _command("import", [*given, f"output={checkpoint}"], folder)
-        given = [f"checkpoint={checkpoint}", f"input={frames}", f"device={DEVICE.type}"]
-        rows = []
-        for blend in ("feather", "nearest"):
-            start = time.perf_counter()
-            _command("predict", [*given, f"blend={blend}", f"output={folder / blend}"], folder)
-            rows.append(Row(blend, [(time.perf_counter() - start) / count], True))
-        return rows
-
-
-def _command(name: str, arguments: list[str], folder: Path) -> None:
-    status = run_process(command_line(name, arguments, folder))
-    if status:
-        raise RuntimeError(f"tangent-{name} ended with status {status}")
+    folder, frames = checkpoint.parent, checkpoint.with_name("frames")
+    frames.mkdir()
+    noise = np.random.default_rng(0).integers(0, 256, (16, 32, 3), np.uint8)
+    cv2.imwrite(str(frames / "0.jpg"), cv2.resize(noise, equirect_shape(level)[::-1]))
+    for number in range(1, count):
+        shutil.copy(frames / "0.jpg", frames / f"{number}.jpg")
+    given = [f"checkpoint={checkpoint}", f"input={frames}", f"device={DEVICE.type}"]
+    rows = []
+    for blend in ("feather", "nearest"):
+        more = [f"blend={blend}", f"output={folder / blend}"]
+        start = time.perf_counter()
+        if status := run_process(command_line("predict", [*given, *more], folder)):
+            raise RuntimeError(f"tangent-predict ended with status {status}")
+        rows.append(Row(blend, [(time.perf_counter() - start) / count], True))
+    return rows

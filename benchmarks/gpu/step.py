@@ -11,10 +11,10 @@ import torch
 from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
-from benchmarks.gpu.device import DEVICE, QUICK, segformer, tried, way
+from benchmarks.gpu import segformer
 from benchmarks.labels import NUM_CLASSES
-from benchmarks.measuring import Goal, Row, Table, measure
-from models import FCNResNet, UNet
+from benchmarks.measuring import DEVICE, Goal, Row, Table, Way, attempted, measure
+from models import FCNResNet, HuggingFaceNetwork, UNet
 from tangent_train.rendering import TangentRepresentation
 from tangent_train.tasks import SegmentationTask
 
@@ -47,19 +47,20 @@ def step(quick: bool) -> Iterator[Table]:
     side, count = (32, 2) if quick else (512, 16)
     widths = (4, 8, 8) if quick else (16, 32, 64, 128, 256, 256)
     fcn = FCNResNet(4, NUM_CLASSES, depth=50 if quick else 101, frozen_statistics=True)
-    cases: tuple[tuple[str, nn.Module, tuple[int, ...]], ...] = (
-        ("UNet", UNet(4, NUM_CLASSES, widths), (2, 4, 32, 32) if quick else (40, 4, 96, 96)),
-        ("FCN-ResNet101", fcn, (count, 4, side, side)),
-        ("SegFormer-B0", segformer(NUM_CLASSES), (count, 3, side, side)),
-    )
-    for name, network, size in cases:
+    cases: dict[str, tuple[nn.Module, tuple[int, ...]]] = {
+        "UNet": (UNet(4, NUM_CLASSES, widths), (2, 4, 32, 32) if quick else (40, 4, 96, 96)),
+        "FCN-ResNet101": (fcn, (count, 4, side, side)),
+        "SegFormer-B0": (
+            HuggingFaceNetwork(segformer(quick), NUM_CLASSES),
+            (count, 3, side, side),
+        ),
+    }
+    for name, (network, size) in cases.items():
         rows: list[Row] = []
         for mode in _MODES:
-            timed = partial(_timed, network, size, mode)
-            rows += tried(f"{name}, {mode.name}", timed) or []
-        flops = tried(f"{name}: operations", partial(_flops, network, size))
-        if not rows or flops is None:
-            continue
+            with attempted(f"{name}, {mode.name}"):
+                taken = Way(mode.name, _step(network, size, mode), ours=True)
+                rows += measure([taken], 1 if quick else 5)
         table = Table(f"step: {name}, {size[0]} images of {size[-1]}²", rows)
         if name == "FCN-ResNet101":
             best = min(rows, key=lambda row: row.median)
@@ -68,34 +69,25 @@ def step(quick: bool) -> Iterator[Table]:
                 Goal("milliseconds", 1000 * best.median, 40),
             ]
         yield table
-        share = 100 * flops / PEAK_FLOPS
+        with FlopCounterMode(display=False) as counter:
+            _step(network, size, _MODES[0])()
+        share = 100 * counter.get_total_flops() / PEAK_FLOPS
         rows = [Row(row.name, [share / s for s in row.values], True) for row in rows]
         yield Table(f"step: {name}, share of the bf16 peak of {PEAK_FLOPS:.3g}/s", rows, "%")
-
-
-def _timed(network: nn.Module, size: tuple[int, ...], mode: _Mode) -> list[Row]:
-    repeats, rounds = (1, 1) if QUICK else (5, 5)
-    return measure([way(mode.name, _step(network, size, mode), repeats, ours=True)], rounds)
-
-
-def _flops(network: nn.Module, size: tuple[int, ...]) -> int:
-    take = _step(network, size, _MODES[0])
-    with FlopCounterMode(display=False) as counter:
-        take()
-    return int(counter.get_total_flops())
 
 
 def _step(network: nn.Module, size: tuple[int, ...], mode: _Mode) -> Callable[[], object]:
     """A step of the task, without its loader."""
     torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = mode.tf32
     names = ("unknown", *map(str, range(NUM_CLASSES)))
+    on_gpu = DEVICE.type == "cuda"
     task = SegmentationTask(
         copy.deepcopy(network),
         TangentRepresentation(base_level=0, level=4),
         names,
         partial(torch.optim.Adam, lr=1e-4),
         channels_last=mode.half,
-        compile={"backend": "eager"} if QUICK and mode.compile is not None else mode.compile,
+        compile=mode.compile if on_gpu or mode.compile is None else {"backend": "eager"},
     )
     task = task.to(DEVICE).train()
     optimizer = task.optimization(lambda: 1)
@@ -104,7 +96,7 @@ def _step(network: nn.Module, size: tuple[int, ...], mode: _Mode) -> Callable[[]
 
     def take() -> None:
         optimizer.zero_grad()
-        with torch.autocast(DEVICE.type, torch.bfloat16, enabled=mode.half and not QUICK):
+        with torch.autocast(DEVICE.type, torch.bfloat16, enabled=mode.half and on_gpu):
             loss = task.loss_sum((images,), labels) / task.loss_norm(labels)
         torch.autograd.backward(loss)
         optimizer.step()

@@ -1,4 +1,4 @@
-"""The benchmarks run at toy size, compare what is the same, and find regressions."""
+"""The benchmarks run at toy size."""
 
 from __future__ import annotations
 
@@ -16,10 +16,12 @@ from benchmarks.__main__ import MEASURED, ON_A_GPU, main
 def test_every_benchmark_runs(name: str, tmp_path: Path) -> None:
     main([name, "--quick", "--output", str(tmp_path)])
     path = tmp_path / "results.json"
-    for table in json.loads(path.read_text(encoding="utf-8"))["tables"]:
+    content = json.loads(path.read_text(encoding="utf-8"))
+    for table in content["tables"]:
         assert table["name"].startswith(f"{name}: ")
         assert any(row["ours"] for row in table["rows"])
         assert all(min(row["values"]) > 0 for row in table["rows"])
+    assert content["quotients"]
     for command in ("compare", "baseline"):
         with pytest.raises(SystemExit, match="found a run with --quick"):
             main([command, str(path)])
@@ -33,5 +35,4 @@ def test_every_benchmark_of_gpus_runs(name: str, tmp_path: Path) -> None:
     content = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))
     assert content["failures"] == []
     for table in content["tables"]:
-        assert f"\n{table['name']}\n" in (tmp_path / "results.md").read_text(encoding="utf-8")
         assert all(min(row["values"]) > 0 for row in table["rows"])
