@@ -24,12 +24,6 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> 
     assert list(path.parent.iterdir()) == [path]
 
 
-def test_the_temporary_file_keeps_the_suffix(tmp_path: Path) -> None:
-    with atomic_path(tmp_path / "x.png") as temporary:
-        assert temporary.suffix == ".png"
-        assert temporary.parent == tmp_path
-
-
 @pytest.mark.parametrize("kind", [DataError, SettingError])
 def test_errors_say_everything_and_survive_another_process(kind: type[DataError]) -> None:
     error = kind("data.fold", found=4, expected="1, 2 or 3", remedy="Choose one of these.")

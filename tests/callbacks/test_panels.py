@@ -62,13 +62,3 @@ def test_the_panoramas_of_the_panels_are_kept_for_the_report(tmp_path: Path) -> 
         assert prediction[0, 0] == 2
         assert np.count_nonzero(prediction == 1) == 127
         assert image.note == f"mIoU {100 * 127 / 128:.1f}\u00a0%", "the floor is not in the truth"
-
-
-def test_the_crops_of_photos_lie_side_by_side(tmp_path: Path) -> None:
-    (image,) = _tested(tmp_path, 1, *CROPS).images
-    assert not image.sphere
-    count, height, width = CROPS
-    assert (image.width, image.height) == (count * width, height)
-    means = decoded(image.jpeg)[..., 0].reshape(height, count, width).mean(axis=(0, 2))
-    np.testing.assert_allclose(means, [0, 60, 120], atol=12)
-    assert decoded(image.truth).shape == (height, count * width)

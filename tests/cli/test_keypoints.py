@@ -109,18 +109,6 @@ def test_an_interrupted_run_goes_on(
         run(*arguments, "pairing=consecutive")
 
 
-@pytest.mark.parametrize("content", [None, "[]"])
-def test_foreign_folders_are_left_alone(
-    run: Run, panoramas: Path, tmp_path: Path, content: str | None
-) -> None:
-    (tmp_path / "out").mkdir()
-    name = "holiday.jpg" if content is None else "results.json"
-    (tmp_path / "out" / name).write_text(content or "picture")
-    with pytest.raises(SystemExit, match="with other files"):
-        run(f"input={panoramas}", "output=out")
-    assert [path.name for path in (tmp_path / "out").iterdir()] == [name]
-
-
 def test_a_broken_pair_is_named_and_the_others_are_compared(
     run: Run, tmp_path: Path, panoramas: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from datamodules.images import tangent_folders
 from datamodules.images.pixel_files import read_pixels, write_pixels
 from tangent_train.geometry import TangentGrid, equirect_directions
 from tangent_train.rendering import equirect_to_tangent, read_cameras, tangent_to_equirect
@@ -155,22 +154,6 @@ def test_z_depth_of_floats_becomes_distance(rendered: Path, tmp_path: Path, dim:
     assert set(np.unique(plain)) <= set(np.unique(depth))
 
 
-def test_z_depth_of_16_bits(rendered: Path, tmp_path: Path, refused: Refused) -> None:
-    depth = np.rint(_z_depth(32, 5000)).astype(np.uint16)
-    depth[:10], depth[10:12] = 0, 65535
-    folder = _results(tmp_path / "depth", depth, ".png")
-    settings = {"back": folder, "cameras": rendered, "z_depth": True}
-    render_with(output=tmp_path / "back.png", **settings)
-    distance = _read(tmp_path / "back.png")
-    assert distance.dtype == np.uint16
-    valid = (distance != 0) & (distance != 65535)
-    assert np.abs(distance[valid].astype(int) - 5000).max() <= 1
-    assert (distance == 0).any()
-    write_pixels(folder / "face_003.png", np.full((32, 32), 60000, np.uint16))
-    assert "at most 65535, which uint16" in refused(output=tmp_path / "again.png", **settings)
-    assert not (tmp_path / "again.png").exists()
-
-
 @pytest.mark.parametrize(("dim", "blend"), [(32, "nearest"), (16, "feather")])
 def test_features_of_another_resolution(
     rendered: Path, tmp_path: Path, dim: int, blend: str, monkeypatch: pytest.MonkeyPatch
@@ -217,18 +200,6 @@ def test_yaw_pitch_roll(
     np.testing.assert_allclose(turn @ (0, 1, 0), right, atol=1e-12)
 
 
-def test_some_faces_with_a_margin(room: Path, tmp_path: Path, refused: Refused) -> None:
-    render_with(
-        input=room, output=tmp_path / "tan", base_level=0, faces=[5, 0], dim=40, format="npy"
-    )
-    folder = tmp_path / "tan" / "room"
-    names = sorted(path.name for path in folder.iterdir())
-    assert names == ["cameras.json", "face_000.npy", "face_005.npy"]
-    expected = equirect_to_tangent(smooth(), TangentGrid(0, 5, 40), [5])
-    np.testing.assert_array_equal(np.load(folder / "face_005.npy"), expected[0])
-    assert "cameras of 2 of the 20 images" in refused(back=folder, output=tmp_path / "back.png")
-
-
 def test_a_figure_alone_or_beside_the_images(room: Path, tmp_path: Path, refused: Refused) -> None:
     figure = tmp_path / "figure.png"
     render_with(input=room, figure=figure, base_level=0)
@@ -259,22 +230,6 @@ def test_earlier_images_are_kept_unless_told(room: Path, tmp_path: Path, refused
     assert names == ["cameras.json", *(f"face_{face:03}.jpg" for face in range(20))]
     assert not list(tmp_path.rglob(".partial*"))
     assert folder.stat().st_mode & 0o777 == 0o755
-
-
-def test_an_interrupted_run_leaves_the_earlier_images(
-    room: Path, rendered: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    before = contents(tmp_path)
-
-    def interrupted(path: Path, pixels: NDArray[Any]) -> None:
-        if path.stem == "face_007":
-            raise KeyboardInterrupt
-        write_pixels(path, pixels)
-
-    monkeypatch.setattr(tangent_folders, "write_pixels", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        render_with(input=room, output=rendered.parent, base_level=0, overwrite=True)
-    assert contents(tmp_path) == before
 
 
 def test_a_broken_panorama_does_not_stop_the_others(tmp_path: Path, refused: Refused) -> None:

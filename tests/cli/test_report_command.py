@@ -43,12 +43,3 @@ def test_the_files_hold_the_runs(
     (tmp_path / "report" / "report.md").unlink()
     run("report", str(runs / "1"))  # a report may be written over
     assert "mine: fold 2 and 3 missing" in (tmp_path / "report" / "report.md").read_text()
-
-
-def test_what_cannot_be_reported_is_said_and_nothing_written(
-    runs: Path, tmp_path: Path, run: Run
-) -> None:
-    (runs / "2" / "results.json").write_text("{")
-    with pytest.raises(SystemExit, match=r"^tangent-report: .*2/results\.json: found JSONDecode"):
-        run("report", str(runs))
-    assert not (tmp_path / "report").exists()

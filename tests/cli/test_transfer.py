@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from filelock import FileLock
 from omegaconf import OmegaConf
 
 from datamodules.core.inputs import RGB_NORMALIZATION
@@ -169,16 +168,6 @@ def test_a_network_that_knows_no_run_is_only_evaluated(runs: PretendedRuns, tmp_
     for typed in ("optimizer.lr=1", "network.widths=[4]", "fine_tuning.epochs=[1]"):
         with pytest.raises(REFUSED, match=f"{typed.split('=')[0]}=.*a setting of training beside"):
             run_transfer(*arguments, typed)
-
-
-def test_two_commands_never_run_the_same_stage(runs: PretendedRuns) -> None:
-    (OF_SEED_0 / "P").mkdir(parents=True)
-    with (
-        FileLock(OF_SEED_0 / "P" / ".lock"),
-        pytest.raises(REFUSED, match="another tangent-transfer that runs stage P"),
-    ):
-        run_transfer(*SHORT)
-    assert not runs.started
 
 
 def test_the_study_of_the_angular_resolution(runs: PretendedRuns) -> None:

@@ -165,13 +165,6 @@ def test_the_study_has_a_stage_for_every_level(rooms: DictConfig) -> None:
     assert {stage.weights for stage in given.values()} == {Path("/p.ckpt")}
 
 
-def test_folds_and_seeds_one_after_the_other(rooms: DictConfig) -> None:
-    config = rooms.copy()
-    config.folds, config.seeds = [1, 3], [0, 5]
-    found = [(s.fold, s.seed) for s in plan(config, FOLDER, {}) if s.name == "P"]
-    assert found == [(1, 0), (1, 5), (3, 0), (3, 5)]
-
-
 def test_data_without_folds() -> None:
     config = composed("transfer", "experiment=paper/transfer_omnisynthia_s6")
     stage = _stages(config)["P"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import logging
 from importlib.metadata import version
@@ -21,7 +20,6 @@ from models import UNet, initialize
 from models.onnx_network import OnnxNetwork
 from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
 from tangent_train.errors import DataError, SettingError
-from tangent_train.inference import export as export_module
 from tangent_train.inference.export import SUFFIXES, export_network
 from tests.tasks.odd_networks import assert_same, own, scores_of, some_images
 from tests.tasks.small_networks import NAMES, UNET, small_trained
@@ -184,26 +182,6 @@ def test_what_would_compute_something_else_is_refused(
     assert path.read_text() == "before"
     assert list(tmp_path.iterdir()) == [path]
     assert capfd.readouterr() == ("", "")
-
-
-def test_nan_is_refused(tmp_path: Path) -> None:
-    trained = small_trained()
-    assert isinstance(trained.network.network, UNet)
-    with torch.no_grad():
-        trained.network.network.head.weight[0] = torch.nan
-    with pytest.raises(SettingError, match="differ from PyTorch's by nan"):
-        export_network(trained, tmp_path / "net.safetensors")
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_packages_for_onnx_are_named(
-    trained: TrainedNetwork, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    found = importlib.util.find_spec
-    monkeypatch.setattr(export_module, "find_spec", lambda n: n != "onnxscript" and found(n))
-    message = r"found no package onnxscript; .* pip install 'tangent-train\[export\]'"
-    with pytest.raises(SettingError, match=message):
-        export_network(trained, tmp_path / "net.onnx")
 
 
 def test_other_files_are_refused(files: dict[str, Path], tmp_path: Path) -> None:

@@ -155,15 +155,6 @@ def test_networks_fit_into_each_others_wrappers(
         torch.testing.assert_close(modules[0].state_dict(), modules[1].state_dict(), rtol=0, atol=0)
 
 
-def test_part_of_a_network_can_be_given(tmp_path: Path) -> None:
-    """Such as the encoder that others publish."""
-    encoder, network = _network(), nn.ModuleDict({"encoder": _network(), "head": nn.Linear(3, 2)})
-    torch.save(encoder.state_dict(), tmp_path / "x.pt")
-    assert set(initialize(network, tmp_path / "x.pt").fresh) == {"head.weight", "head.bias"}
-    found = network["encoder"].state_dict()
-    torch.testing.assert_close(found, encoder.state_dict(), rtol=0, atol=0)
-
-
 def test_scores_of_other_classes_are_left_out_though_they_fit(tmp_path: Path) -> None:
     other, network = _network(), _network()
     torch.save(other.state_dict(), tmp_path / "x.pt")

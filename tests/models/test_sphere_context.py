@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from typing import Any
 
 import numpy as np
 import pytest
@@ -110,11 +109,3 @@ def test_copies_are_on_their_own_and_the_network_by_itself_is_as_before() -> Non
     other = copy.deepcopy(context)
     awake(context)
     torch.testing.assert_close(other(images, rays), expected)
-
-
-def test_impossible_settings_are_refused() -> None:
-    wrong: Any = {"tokens": 0}
-    with pytest.raises(SettingError, match=r"network\.tokens: found 0"):
-        small_context(**wrong)
-    with pytest.raises(SettingError, match=r"rays: found 2 spheres of 3 images; .* of 4 images"):
-        small_context()(torch.zeros(4, 3, 16, 16), sphere_rays(3, 2))

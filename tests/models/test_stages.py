@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
 import torch
 from torch import Tensor, nn
@@ -12,7 +10,7 @@ from torchvision.models.segmentation import deeplabv3_mobilenet_v3_large
 from models import AuxiliaryHead, FCNResNet, UNet
 from models.stages import stage_channels
 from tangent_train.errors import SettingError
-from tests.models.sphere_networks import STAGE, small_context, small_unet
+from tests.models.sphere_networks import STAGE, small_unet
 
 
 class _Looking(nn.Sequential):
@@ -99,9 +97,3 @@ def test_the_auxiliary_head_scores_the_stage_in_training_only() -> None:
     inputs = _seen(module.auxiliary_head)
     assert torch.equal(module.eval()(images), network.eval()(images))
     assert not inputs, "it costs nothing in evaluation"
-
-
-def test_context_inside_an_auxiliary_head_would_see_no_rays() -> None:
-    context: Any = small_context()
-    with pytest.raises(SettingError, match=r"network\.network: found SphereContext"):
-        AuxiliaryHead(context, f"network.{STAGE}", 3, 4)

@@ -84,15 +84,6 @@ def test_the_page_refers_to_nothing_outside_and_forbids_it(nasty_page: str) -> N
     assert policy.startswith("default-src 'none'; img-src data: blob:;")
 
 
-def test_without_images_there_is_no_viewer(tmp_path: Path) -> None:
-    page = _page(tmp_path / "report.html", title="Ä → 360°", notes=["one", "two"])
-    reader = _Reader(page)
-    assert not {"script", "canvas", "table", "svg"} & set(reader.tags)
-    assert "<title>Ä → 360°</title>" in page
-    assert [text for text in reader.texts if text in ("one", "two")] == ["one", "two"]
-    assert "{{" not in page
-
-
 def test_tables_align_columns_and_shade_heat_maps() -> None:
     text = Table("t", ("class", "a"), [("wall", "61.2"), ("floor", "–")]).html()
     assert '<th scope="col"><span>class' in text

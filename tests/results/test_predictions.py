@@ -45,13 +45,6 @@ def test_a_cap_has_its_solid_angle() -> None:
     assert shares == pytest.approx({"up": 2 * cap, "down": 1 - 2 * cap})
 
 
-def test_what_is_unknown_does_not_count() -> None:
-    image, labels = InputImage(np.zeros((20, 40, 3), np.uint8)), np.zeros((20, 40), int)
-    assert class_shares(labels, NAMES, image) == {"up": 0, "down": 0}
-    labels[3, 5] = 2
-    assert class_shares(labels, NAMES, image) == {"up": 0, "down": 1}
-
-
 def test_pixels_of_photos_count_by_their_solid_angle() -> None:
     """Of 90°: ∫∫ (1 + x² + y²)^(−3/2) over a rectangle, by the arctangents of its corners."""
     size = (200, 200)

@@ -14,7 +14,7 @@ import pytest
 from datamodules.modelnet40.shape_files import MODELNET40
 from datamodules.stanford2d3ds.label_table import CLASSES
 from tangent_train.results.chart import report_png
-from tangent_train.results.comparisons import levels_report, runs_report, transfer_report
+from tangent_train.results.comparisons import runs_report, transfer_report
 from tangent_train.results.paper import published
 from tangent_train.results.record import Record
 from tangent_train.results.report import Report
@@ -205,14 +205,6 @@ def test_a_transfer_compares_panoramas_with_photos_of_as_much_fine_tuning() -> N
     assert [row.partner and row.partner.label for row in report.rows] == [None, "P", "P", None]
 
 
-def test_levels_are_compared_with_that_nearest_to_the_photos_resolution() -> None:
-    levels = {7: [made_record([0.4] * 3, level=7)], 6: [made_record([0.2] * 3, level=6)]}
-    report = levels_report(levels, 7.3)
-    assert [row.label for row in report.rows] == ["level 6", "level 7"]
-    assert report.rows[0].kept("miou").mean == pytest.approx(0.5)
-    assert report.all_notes()[-1].endswith("the angular resolution of level 7.3.")
-
-
 def test_shapes_are_told_apart_by_how_they_were_rotated() -> None:
     classes = [{"class": name, "images": 3, "accuracy": 0.5} for name in MODELNET40]
     settings = {
@@ -242,13 +234,3 @@ def test_the_chart_shows_a_bar_of_the_right_height() -> None:
     low, middle, high = map(blue_rows, (0.0, 0.4, 0.8))  # two rows of axes, the legend's handle
     assert high - middle == pytest.approx(middle - low, abs=8)
     assert high - low > 200
-
-
-def test_the_chart_takes_bands_published_rows_and_nothing() -> None:
-    sphere = made_record([0.5, None, 0.1], bands=(0.5, 0.1))
-    rows = [
-        Row("S", (sphere,)),
-        Row("x (paper)", (made_record([0.5, 0.2, 0.1]),), published=True),
-    ]
-    without_bands, with_bands = (len(decoded(report_png("", r))) for r in (rows[1:], rows))
-    assert with_bands > 1.3 * without_bands, "another panel"

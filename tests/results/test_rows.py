@@ -71,13 +71,6 @@ def test_what_is_kept_is_the_ratio_of_the_means_over_what_both_have(
     assert transfer.of_fold(1).kept(name).mean == pytest.approx(0.8)
 
 
-def test_nothing_is_kept_of_nothing(transfer: Row) -> None:
-    assert transfer.partner is not None
-    assert transfer.partner.kept("miou").mean is None
-    zero = Row("P", tuple(made_record([0.0] * 3, data__fold=fold) for fold in (1, 2)))
-    assert replace(transfer, partner=zero).kept("iou", "wall").mean is None
-
-
 def test_other_settings_make_other_groups_named_by_what_differs() -> None:
     records = [
         made_record([0.1, 0.2, 0.3], optimizer__lr=rate, data__fold=fold)
@@ -100,16 +93,6 @@ def test_networks_from_elsewhere_make_other_groups() -> None:
     assert [(row.label, len(row.records)) for row in group_runs(records)] == [
         ("mine (checkpoint=one.onnx)", 2),
         ("mine (checkpoint=two.onnx)", 2),
-    ]
-
-
-def test_groups_that_differ_in_much_have_labels_of_their_own() -> None:
-    values = [(0, 0), (1, 1), (0, 9)]
-    records = [made_record([0.1, 0.2, 0.3], a=v, b=v, c=v, d=last) for v, last in values]
-    assert [row.label for row in group_runs(records)] == [
-        "mine (a=0, b=0, c=0, …)",
-        "mine (a=1, b=1, c=1, …)",
-        "mine (a=0, b=0, c=0, …) #2",
     ]
 
 

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -22,23 +21,6 @@ def _noise(height: int, budget: int = BUDGET_BYTES) -> tuple[NDArray[np.uint8], 
     return truth, encode_image(
         "noise", rgb, CLASSES, prediction=prediction, truth=truth, budget_bytes=budget
     )
-
-
-def _smooth(height: int) -> NDArray[np.uint8]:
-    v = np.linspace(0, 1, height, dtype=np.float32)[:, None]
-    lon = np.linspace(0, 2 * np.pi, 2 * height, dtype=np.float32)
-    waves = [np.cos(lon) + 0 * v, np.sin(lon) * v, 1 - 2 * v + 0 * lon]
-    return np.stack([(127.5 + 100 * wave).astype(np.uint8) for wave in waves], axis=-1)
-
-
-def test_an_ordinary_panorama_keeps_all_its_pixels() -> None:
-    rgb = _smooth(2048)
-    labels = (rgb[..., 0] // 20).astype(np.uint8)
-    image = encode_image("smooth", rgb, CLASSES, prediction=labels)
-    assert cv2.PSNR(decoded(image.jpeg), rgb) > 38
-    np.testing.assert_array_equal(decoded(image.prediction), labels)
-    assert image.truth is None
-    assert decoded(image.thumbnail).shape == (108, 216, 3)
 
 
 @pytest.mark.parametrize("budget", [150_000, 400_000])

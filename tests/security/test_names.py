@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from datamodules.images.image_files import short_names
 from datamodules.images.pixel_files import write_pixels
-from tangent_train.cli.keypoints import file_name
 from tangent_train.results.predictions import PredictionFolder
 from tests.cli.tiny_runs import run_command
 
@@ -29,15 +28,6 @@ def test_predictions_stay_in_their_folder(names: list[list[str]]) -> None:
         for file in folder.files(name).values():
             assert file.is_relative_to("/output")
             assert ".." not in file.parts
-
-
-@given(st.text())
-@example("../../x")
-@example("..")
-@example("/etc/passwd")
-def test_pictures_of_pairs_stay_in_their_folder(name: str) -> None:
-    assert Path("/output", file_name(name)).parent == Path("/output")
-    assert file_name(name).strip(".")
 
 
 def test_names_in_a_list_of_cameras_lead_nowhere(

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from tangent_train.errors import SettingError
 from tests.tasks.shapes import Gradients, Shapes, SmallNetwork, quiet_trainer, shape_task
 
 
@@ -81,14 +80,3 @@ def test_every_shape_is_counted_once_in_integers() -> None:
     (figures,) = quiet_trainer().validate(task, datamodule=data, verbose=False)
     assert set(figures) == {"val/accuracy", "val/class_accuracy"}
     assert task.matrices.sum() == 10, "counted anew"
-
-
-@pytest.mark.parametrize(
-    ("network", "found"),
-    [(SmallNetwork(classes=4), r"\(2, 4\)"), (nn.Identity(), r"\(2, 5, 3, 16, 16\)")],
-)
-def test_scores_that_do_not_fit_are_refused(network: nn.Module, found: str) -> None:
-    task = shape_task(network)
-    message = rf"scores of the network: found {found}; expected \(2, 3\)"
-    with pytest.raises(SettingError, match=message):
-        task(torch.zeros(2, 5, 3, 16, 16))

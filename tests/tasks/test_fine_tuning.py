@@ -117,16 +117,6 @@ def test_schedules_move_both_rates(scheduler: Any) -> None:
         assert rates == pytest.approx([0.1 * whole, whole])
 
 
-def test_frozen_and_loaded_parts_together() -> None:
-    for frozen, groups in ((["features"], ["new"]), (["head"], ["backbone"])):
-        task = shape_task(frozen=frozen, backbone_lr_factor=0.5)
-        task.fresh = FRESH
-        found = task.optimization(lambda: 1).param_groups
-        assert [group["name"] for group in found] == groups
-        trained = [p for p in task.network.parameters() if p.requires_grad]
-        assert [id(p) for p in found[0]["params"]] == [id(p) for p in trained]
-
-
 @pytest.mark.parametrize("factor", [0, -1, float("inf"), "small"])
 def test_impossible_factors_are_refused(factor: Any) -> None:
     with pytest.raises(SettingError, match=r"optimizer\.backbone_lr_factor: .*task\.frozen"):

@@ -91,19 +91,6 @@ def test_elevation_is_how_far_a_pixel_looks_up(
         assert elevation.dtype == np.float32
 
 
-def test_the_elevation_follows_the_measured_channels() -> None:
-    rgb = torch.full((2, 3, 3, 3), 255, dtype=torch.uint8)
-    depth = torch.tensor([[0, 1, 2048]] * 3, dtype=torch.int16).expand(2, 3, 3)
-    elevation = torch.linspace(-1, 1, 18).reshape(2, 3, 3)
-    every: tuple[Input, ...] = ("rgb", "depth", "elevation")
-    images = normalize([rgb, depth, elevation], IDENTITY, every)
-    assert images.shape == (2, 5, 3, 3)
-    assert images[0, 3, 0].tolist() == [0, 1 / 512, 4]
-    torch.testing.assert_close(images[:, 4], elevation)
-    flat = normalize([rgb, elevation], RGB_NORMALIZATION, ("rgb", "elevation"))
-    torch.testing.assert_close(flat[:, 3], elevation)
-
-
 @pytest.mark.parametrize("inputs", [(), ("depth",), ("rgb", "rgb"), ("rgb", "heat"), "rgb"])
 def test_impossible_inputs(inputs: Any) -> None:
     with pytest.raises(SettingError, match=r"data\.inputs: found .* expected a list: rgb"):
@@ -133,17 +120,6 @@ def test_training_sample(erp: Representation) -> None:
 def test_neither_depth_nor_labels_are_interpolated() -> None:
     sample = _training(TangentRepresentation(0, 3, rotation="so3"))[0, 0]
     torch.testing.assert_close(sample.images[1], sample.labels.short() * 4)
-
-
-def test_depth_is_clipped_and_missing_is_zero(
-    erp: Representation, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    steps = np.tile(np.array([0, 1, 2047, 2048, 2049, 32768, 65535, 0], np.uint16), (16, 4))
-    panorama = _positions(0)._replace(depth=steps)
-    monkeypatch.setattr(_Positions, "read", lambda *_: panorama)
-    images = EvaluationImages(POSITIONS, erp, DEPTH)[0, 0].images
-    assert images[1][0, 0, :8].tolist() == [0, 1, 2047, 2048, 2048, 2048, 2048, 0]
-    assert normalize(images, IDENTITY, DEPTH)[0, 3, 0, 3] == 4  # metres
 
 
 def test_views_are_those_of_seed_epoch_and_index(erp: Representation) -> None:

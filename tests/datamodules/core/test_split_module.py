@@ -41,19 +41,6 @@ def _digest(batch: TrainingSample[Any]) -> str:
 # --- loaders -----------------------------------------------------------------------------------
 
 
-def test_evaluation_batches_are_whole_panoramas_in_order(make_module: MakeModule) -> None:
-    module = make_module(inputs=("rgb",))
-    loaders = {"val": module.val_dataloader(), "test": module.test_dataloader()}
-    for split in SPLITS[1:]:
-        batches = list(loaders[split])
-        assert all(isinstance(batch, EvaluationSample) for batch in batches)
-        assert [int(batch.index) for batch in batches] == list(range(len(module.source(split))))
-        images = module.on_after_batch_transfer(batches[0], 0).images
-        assert images.shape == (1, 1, 3, 16, 32)
-        expected = module.source(split).read(0).labels[None]
-        np.testing.assert_array_equal(batches[0].target.numpy(), expected)
-
-
 @pytest.mark.parametrize("in_memory", [False, True])
 def test_the_same_samples_for_any_number_of_workers(
     make_module: MakeModule, in_memory: bool

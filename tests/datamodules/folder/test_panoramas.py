@@ -167,19 +167,6 @@ def test_missing_folders_and_classes(tmp_path: Path, erp: Any) -> None:
         FolderPanoramas(tmp_path, erp).setup()
 
 
-@pytest.mark.parametrize(
-    ("classes", "message"),
-    [
-        ({"sky": 77, "sea": [78, 100]}, r"found values 0, 1, 2, 3, 4, 255, .* values 77, 78, 100"),
-        ([None] * 90 + ["a"] * 1, r"expected values 90, as classes\.json says"),
-    ],
-)
-def test_class_lists_of_other_labels(own_root: Path, erp: Any, classes: Any, message: str) -> None:
-    write_classes(own_root, classes)
-    with pytest.raises(DataError, match=message):
-        FolderPanoramas(own_root, erp).setup()
-
-
 def test_the_check_names_what_a_hand_made_data_set_gets_wrong(tmp_path: Path, erp: Any) -> None:
     write_classes(tmp_path)
     for name in ("hall/a", "hall/b", "hall/c"):

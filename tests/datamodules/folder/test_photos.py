@@ -8,22 +8,19 @@ import numpy as np
 import pytest
 
 from datamodules.core.photos import Photo
-from datamodules.folder.panoramas import FolderPanoramas
 from datamodules.folder.photos import FolderPhotos
 from tangent_train.errors import DataError
-from tangent_train.rendering import EquirectRepresentation, PerspectiveRepresentation
-from tests.datamodules.data_files import names_of, write_png
+from tangent_train.rendering import PerspectiveRepresentation
+from tests.datamodules.data_files import write_png
 from tests.datamodules.folder.folder_format import (
     CLASS_OF_STORED,
     save,
     write_classes,
-    write_data_set,
 )
 from tests.datamodules.folder.photo_format import (
     displayed,
     write_cameras,
     write_photo,
-    write_photos,
 )
 
 CROPS = PerspectiveRepresentation(level=4, fov_deg=20, dim=8)
@@ -85,15 +82,6 @@ def test_z_depth_becomes_distance(two: Path) -> None:
         assert photo.depth[row, column] == pytest.approx(expected, abs=0.51)
 
 
-def test_scenes_are_held_out_as_those_of_panoramas(tmp_path: Path) -> None:
-    photos = FolderPhotos(write_photos(tmp_path / "photos", scenes=7), CROPS)
-    write_data_set(tmp_path / "panoramas", scenes=7)
-    panoramas = FolderPanoramas(tmp_path / "panoramas", EquirectRepresentation(level=3))
-    for split in ("train", "val", "test"):
-        assert names_of(photos, split) == names_of(panoramas, split)
-        assert names_of(photos, split)
-
-
 # Cameras
 
 
@@ -137,14 +125,6 @@ def test_a_camera_is_that_of_the_photo_as_displayed(tmp_path: Path) -> None:
     message = r"cameras\.json: found .* cx = 55, cy = 5 for a; .* 40 across and 60 down"
     with pytest.raises(DataError, match=message):
         _photos(tmp_path).setup()
-
-
-def test_stored_photos_have_the_camera_of_now(two: Path, tmp_path: Path) -> None:
-    for given, expected in (({".": K}, 70), ({}, 32), ({"hall": K}, 70)):
-        write_cameras(two, given)
-        module = _photos(two, fov=90, store=tmp_path / "store")
-        module.prepare_data()
-        assert module.source("test").read(0).camera_matrix[0, 0] == pytest.approx(expected)
 
 
 # What cannot be used

@@ -53,13 +53,6 @@ def test_the_channel_of_depth_is_found(tmp_path: Path, others: list[str], name: 
     np.testing.assert_array_equal(read_exr(path), _DEPTH)
 
 
-@pytest.mark.parametrize("names", [("a.Z", "b.Z"), ("G", "B")])
-def test_no_single_channel_of_depth(tmp_path: Path, names: tuple[str, str]) -> None:
-    path = _write(tmp_path / "a.exr", dict.fromkeys(names, _DEPTH))
-    with pytest.raises(DataError, match=r"a\.exr: found channels .*; expected one channel, or"):
-        read_exr(path)
-
-
 def test_several_parts_and_deep_pixels(tmp_path: Path) -> None:
     path = tmp_path / "a.exr"
     parts = [OpenEXR.Part({"name": name}, {"Z": _DEPTH}) for name in ("left", "right")]

@@ -68,13 +68,6 @@ def test_tags_of_all_formats(tmp_path: Path, suffix: str, written: Any) -> None:
     assert area_of(path, (40, 60)) == _AREA
 
 
-def test_tags_behind_the_pixels(tmp_path: Path) -> None:
-    path = tmp_path / "image.png"
-    Image.effect_noise((600, 400), 50).save(path)
-    path.write_bytes(path.read_bytes() + _attributes(_TAGS).encode())
-    assert area_of(path, (40, 60)) == _AREA
-
-
 def test_images_that_say_nothing(tmp_path: Path) -> None:
     Image.new("RGB", (60, 40)).save(tmp_path / "none.jpg")
     incomplete = {k: v for k, v in _TAGS.items() if k != "CroppedAreaTopPixels"}

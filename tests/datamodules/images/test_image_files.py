@@ -25,14 +25,6 @@ def test_a_folder_is_searched_for_images_only(tmp_path: Path) -> None:
     assert image_paths(str(tmp_path)) == found
 
 
-def test_linked_folders_are_searched_once(tmp_path: Path) -> None:
-    _touch(tmp_path / "here" / "a.png", tmp_path / "there" / "deep" / "b.png")
-    (tmp_path / "here" / "link").symlink_to(tmp_path / "there")
-    (tmp_path / "there" / "deep" / "back").symlink_to(tmp_path / "here")
-    found = [str(path.relative_to(tmp_path)) for path in image_paths(tmp_path / "here")]
-    assert found == ["here/a.png", "here/link/deep/b.png"]
-
-
 def test_names_may_have_the_characters_of_a_pattern(tmp_path: Path) -> None:
     odd, inside = tmp_path / "room [1] *.panorama", tmp_path / "[ab]" / "x.png"
     _touch(odd, inside, tmp_path / "room 1 x.jpg", tmp_path / "a" / "y.png")

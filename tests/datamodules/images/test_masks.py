@@ -31,17 +31,6 @@ def test_what_is_below_a_latitude(rows: int, lowest_deg: float) -> None:
     assert (counts[-1] == 0).all()
 
 
-def test_a_mask_of_the_size_of_the_panorama(tmp_path: Path) -> None:
-    pixels = spotted(32)
-    for name, stored in (
-        ("grey", pixels),
-        ("color", np.stack([pixels * 0, pixels], -1)[..., [0, 0, 1]]),
-    ):
-        write_pixels(tmp_path / f"{name}.png", stored)
-        counts = Masks(tmp_path / f"{name}.png").read("any", WHOLE)
-        np.testing.assert_array_equal(counts, np.where(pixels, 255, 0))
-
-
 @pytest.mark.parametrize("rows", [16, 64, 96])
 def test_a_mask_of_any_other_size_is_sampled_at_the_centres_of_pixels(
     rows: int, tmp_path: Path

@@ -53,12 +53,6 @@ def test_truncated_files_are_named(tmp_path: Path, missing: slice, read: Any) ->
         read(path)
 
 
-def test_notes_behind_the_end_are_ignored(tmp_path: Path) -> None:
-    path = _written(tmp_path, np.ones((4, 8, 3), np.uint8))
-    path.write_bytes(path.read_bytes() + b"notes")
-    assert read_color_png(path).shape == (4, 8, 3)
-
-
 def test_size_of_panoramas(tmp_path: Path) -> None:
     check_panorama_size(tmp_path, (64, 128), 64)
     with pytest.raises(DataError, match="found 64×127 pixels; expected twice as wide as high"):

@@ -92,16 +92,6 @@ def test_classes_before_there_are_files(tmp_path: Path) -> None:
             use()
 
 
-def test_spheres_elsewhere(root: Path, tmp_path: Path) -> None:
-    for level in (2, 4):  # two sizes in one store
-        module = ModelNet40(root, TangentRepresentation(0, level), store=tmp_path / "store")
-        module.prepare_data()
-        size = (2 ** (level + 1), 2 ** (level + 2))
-        assert module.source("train").read(0).spheres.shape == (*size, 6)
-        made = (tmp_path / "store").glob(f"spheres_{size[0]}x{size[1]}/cup/train/*.npy")
-        assert len(list(made)) == COUNTS["cup"][0]
-
-
 # --- samples -----------------------------------------------------------------------------------
 
 
@@ -148,17 +138,6 @@ def test_training_is_rotated_anew_every_time_and_evaluation_is_not(make_module: 
 
 
 # --- rotated test shapes ------------------------------------------------------------------------
-
-
-def test_the_same_shape_is_rotated_the_same_way(make_module: MakeModule) -> None:
-    upright = list(make_module().test_dataloader())
-    first = list(make_module(test_rotation="so3", shapes_per_step=2).test_dataloader())
-    again = list(make_module(test_rotation="so3", num_workers=1).test_dataloader())
-    other = list(make_module(test_rotation="so3", seed=1).test_dataloader())
-    images = [torch.cat([b.images for b in batches]) for batches in (first, again, upright, other)]
-    assert torch.equal(images[0], images[1])
-    for different in images[2:]:
-        assert not any(torch.equal(a, b) for a, b in zip(images[0], different, strict=True))
 
 
 @pytest.mark.parametrize("rotation", ["so3", "yaw"])

@@ -37,12 +37,6 @@ def test_both_layouts(tmp_path: Path, layout: Literal["by class", "by split"]) -
     assert found == sorted(found, key=lambda shape: (shape.part, shape.name))
 
 
-def test_no_meshes(tmp_path: Path) -> None:
-    _touch(tmp_path / "chair/train/chair_0001.obj")
-    with pytest.raises(DataError, match="no meshes"):
-        find_shapes(tmp_path)
-
-
 def test_a_class_that_is_only_tested(tmp_path: Path) -> None:
     write_tree(tmp_path, counts={"cup": (1, 1), "chair": (0, 1)})
     with pytest.raises(DataError, match="only test shapes of chair"):

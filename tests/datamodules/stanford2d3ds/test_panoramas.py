@@ -27,15 +27,6 @@ def broken_root(fabricate_stanford: FabricateStanford, tmp_path: Path) -> Path:
 # --- names -------------------------------------------------------------------------------------
 
 
-def test_names_come_apart_and_together() -> None:
-    text = f"camera_{'0f' * 16}_conferenceRoom_12_frame_equirectangular_domain_semantic_pretty.png"
-    name = FileName.parse(text)
-    assert name == ("0f" * 16, "conferenceRoom", 12, "equirectangular", "semantic_pretty", ".png")
-    assert str(name) == text
-    partner = FileName.parse(str(name._replace(domain="pose", suffix=".json")))
-    assert partner[:4] == name[:4]
-
-
 @pytest.mark.parametrize(
     "name",
     [

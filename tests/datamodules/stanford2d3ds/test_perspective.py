@@ -105,8 +105,3 @@ def test_a_photo_that_sees_less_than_a_crop_is_named(broken_root: Path) -> None:
     message = r"rgb\.png: found 70° × 70° for an image that spans 60° × 60°; expected all of a crop"
     with pytest.raises(DataError, match=message):
         module.setup()
-
-
-def test_no_photos(stanford_root: Path) -> None:
-    with pytest.raises(DataError, match=r"area_1/data/rgb: found no photos"):
-        Stanford2D3DSPerspective(stanford_root, CROPS).setup()

@@ -152,12 +152,3 @@ def test_other_settings_are_refused(views: Path) -> None:
         with pytest.raises(DataError, match=rf"{MANIFEST}: found (height={HEIGHT}|frames=500);"):
             make(views, "01", **other)
     assert {name for name in contents(views) if name not in before} == set()
-
-
-def test_a_broken_view_is_named_and_the_others_are_used(views: Path) -> None:
-    place = "RGB/Stereo_Left/Omni_L/000001.png"
-    path = synthia.sequence(views, "01") / place
-    path.write_bytes(path.read_bytes()[:-30])
-    with pytest.raises(DataError, match=f"{place}: .*truncated"):
-        make(views, "01")
-    assert [path.stem for path in views.glob("*/pano/RGB/*.png")] == ["000000"], "of whole views"

@@ -9,7 +9,6 @@ import pytest
 
 from datamodules.synthia.omnisynthia import OmniSynthia
 from datamodules.synthia.perspective import SynthiaPerspective
-from tangent_train.errors import DataError
 from tangent_train.rendering import PerspectiveRepresentation
 from tests.datamodules.data_files import names_of
 from tests.datamodules.synthia import synthia_format as synthia
@@ -65,10 +64,3 @@ def test_reads_what_was_written(root: Path) -> None:
             K = np.array([[synthia.FOCAL, 0, 31.5], [0, synthia.FOCAL, 18.5], [0, 0, 1]])
             np.testing.assert_allclose(photo.camera_matrix, K, rtol=1e-12)
             np.testing.assert_array_equal(source.labels(4 * frame + index), photo.labels)
-
-
-def test_nothing_there(tmp_path: Path, broken_root: Path) -> None:
-    with pytest.raises(DataError, match=r"nowhere: found no such folder.*synthia-dataset"):
-        two(tmp_path / "nowhere").setup()
-    with pytest.raises(DataError, match=r"02-SUMMER.*Omni_F: found no views.*synthia-dataset"):
-        two(broken_root, train_sequences=["02"]).setup()

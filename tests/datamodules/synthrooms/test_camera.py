@@ -47,11 +47,6 @@ def test_heading_and_pitch(heading: float, pitch: float, forward: list[float]) -
     np.testing.assert_allclose(ahead, [0, 0, 2], atol=1e-12)
 
 
-def test_roll_lifts_the_left_side() -> None:
-    right = Pose.looking(HERE, 0.0, roll=0.1).world_from_camera[:, 0]
-    np.testing.assert_allclose(right, [0, -math.cos(0.1), -math.sin(0.1)], atol=1e-12)
-
-
 def test_panorama_rays_are_the_sphere_mirrored_and_turned_by_the_heading() -> None:
     view = PanoramaView(Pose.looking(HERE, heading=0.7), 16)
     expected = equirect_directions((16, 32)) @ (rotation_about((0, 0, 1), 0.7) @ FLIP_Y).T

@@ -9,7 +9,7 @@ from datamodules.synthrooms.camera import PanoramaView, Pose
 from datamodules.synthrooms.raycast import RayScene
 from datamodules.synthrooms.render import MISSING, draw_camera, draw_holes, render
 from datamodules.synthrooms.room import UNKNOWN, Room
-from datamodules.synthrooms.scene import ROOM_TYPES, draw_room_type, furnish
+from datamodules.synthrooms.scene import draw_room_type, furnish
 from datamodules.synthrooms.writer import INSTANCES
 
 SEEDS = range(60)
@@ -22,14 +22,6 @@ def rooms() -> list[Room]:
         rng = np.random.default_rng(seed)
         made.append(furnish(rng, draw_room_type(rng)))
     return made
-
-
-def test_rooms_are_of_all_types_sizes_and_both_shapes(rooms: list[Room]) -> None:
-    rng = np.random.default_rng(0)
-    assert {draw_room_type(rng) for _ in range(500)} == set(ROOM_TYPES)
-    assert 0.05 < np.mean([room.plan.notch is not None for room in rooms]) < 0.6
-    areas = [room.plan.floor_area for room in rooms]
-    assert max(areas) > 2.5 * min(areas)
 
 
 def test_everything_stands_inside(rooms: list[Room]) -> None:

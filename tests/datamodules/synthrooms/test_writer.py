@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import math
-import re
 from typing import Any
 
 import cv2
@@ -26,15 +25,6 @@ ROOMS = [
     RoomPlan("1", "office", 1, 0, (), RNG),
     RoomPlan("5b", "WC", 17, 1, (CAMERA,), RNG),
 ]
-
-
-def test_labels_name_class_instance_room_and_area() -> None:
-    table = label_strings(ROOMS)
-    assert table[0] == "<UNK>_0_<UNK>_0_0"
-    assert table[1] == "beam_1_office_1_1"
-    assert table[-1] == f"window_{INSTANCES['window']}_WC_17_5"
-    assert len(set(table)) == len(table) == 1 + 2 * sum(INSTANCES.values())
-    assert all(re.fullmatch(r"[a-z]+_[1-9]\d*_(office_1_1|WC_17_5)", text) for text in table[1:])
 
 
 def test_every_item_has_its_own_label_until_the_numbers_run_out() -> None:

@@ -110,13 +110,6 @@ def test_rays_to_corners_meet_a_wall() -> None:
         np.testing.assert_allclose(distances[0, :: 16 // len(vertices)], 2, rtol=1e-8)
 
 
-def test_corners_that_repeat_change_nothing() -> None:
-    given = VIEWS["concave"][1].layout(CORNERED)
-    twice = given | {"vertices": [v for v in given["vertices"] for _ in range(2)]}
-    found, expected = (_layout(some, 0.6).labels((32, 64)) for some in (twice, given))
-    np.testing.assert_array_equal(found, expected)
-
-
 def test_fixtures_a_little_off_their_wall_are_on_it() -> None:
     shifted = Room(SQUARE.vertices, {"windows": [((-1, 1.52), (0.5, 1.49), (-0.4, 0.4))]})
     near, exact = (_layout(Camera("").layout(r), 0.6).labels((64, 128)) for r in (shifted, SQUARE))

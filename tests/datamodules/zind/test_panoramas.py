@@ -104,11 +104,6 @@ def test_the_partition_of_the_release_decides(root: Path) -> None:
         _zind(root).setup()
 
 
-def test_all_may_be_the_test_set(root: Path) -> None:
-    data = _zind(root, test_fraction=1)
-    assert [len(names_of(data, split)) for split in SPLITS] == [0, 0, 6]
-
-
 def test_the_prepared_store_holds_the_same(root: Path, tmp_path: Path) -> None:
     settings: dict[str, Any] = {"test_fraction": 1, "store": tmp_path / "store"}
     stored, plain = _zind(root, **settings), _zind(root, test_fraction=1)
@@ -193,17 +188,6 @@ def test_a_broken_record_is_named_with_its_place(root: Path, name: str) -> None:
     assert count == 5
     data = _zind(root, test_fraction=1, skip_broken=True)
     assert len(names_of(data, "test")) == 5
-
-
-def test_a_missing_or_small_picture_is_named(root: Path) -> None:
-    path = root / "000" / _record(root, 1, "pano_2")["image_path"]
-    Image.new("RGB", (64, 64)).save(path)
-    with pytest.raises(DataError, match=r"pano_2\.jpg: found 64×64 pixels; expected twice as wide"):
-        _zind(root).setup()
-    path.unlink()
-    with pytest.raises(DataError, match=r"pano_2\.jpg: found no image .*No such file"):
-        _zind(root).setup()
-    assert _zind(root).check()[0].items == {f"{ROOM}/pano_2"}
 
 
 def test_a_folder_without_homes_is_refused(root: Path) -> None:

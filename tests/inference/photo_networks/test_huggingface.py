@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -141,12 +140,6 @@ def test_a_model_of_the_hub(folder: Path, tmp_path: Path, monkeypatch: pytest.Mo
     assert tuple(network.score_names) == networks.NAMES
     (patterns,) = asked.values()
     assert not [p for p in patterns if p.endswith((".py", ".bin", "*"))]
-
-
-def test_without_transformers(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "transformers", None)
-    with pytest.raises(SettingError, match=r"pip install 'tangent-train\[huggingface\]'"):
-        networks.imported(folder)
 
 
 def test_nothing_in_a_folder_or_checkpoint_runs_or_fetches(folder: Path, tmp_path: Path) -> None:

@@ -20,7 +20,6 @@ from models import UNet
 from models.onnx_network import OnnxNetwork
 from tangent_train.checkpoints.trained import load_trained
 from tangent_train.cli import main
-from tangent_train.errors import SettingError
 from tangent_train.geometry import TangentGrid, camera_matrix_from_fov
 from tangent_train.inference.photo_networks.importing import View, view_of
 from tangent_train.inference.predictor import Predictor
@@ -188,11 +187,6 @@ def test_tangent_images_have_the_angular_resolution_of_the_photos(
     grid = TangentGrid(view.base_level, view.level, view.dim)
     focal = camera_matrix_from_fov(fov, size)[0, 0]
     assert abs(math.log2(1 / grid.pitch / focal)) < 0.6, "within half a level, and the base level's"
-
-
-def test_impossible_views_are_refused() -> None:
-    with pytest.raises(SettingError, match="fov: found 180"):
-        view_of((64, 64), 180.0)
 
 
 @pytest.mark.parametrize(

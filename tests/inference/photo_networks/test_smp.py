@@ -92,15 +92,3 @@ def test_settings_that_do_not_fit(changes: dict[str, Any], message: str, folder:
     change_json(folder / "config.json", **changes)
     with pytest.raises(DataError, match=message):
         _load(folder, "imagenet")
-
-
-def test_an_encoder_without_a_known_normalization(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def unknown(name: str, weights: str) -> None:
-        raise ValueError(f"no {weights} of {name}")
-
-    monkeypatch.setattr(encoders, "get_preprocessing_params", unknown)
-    with pytest.raises(SettingError, match=r"normalization: found none.*no imagenet of tu-mobile"):
-        _load(folder)
-    assert _load(folder, "unit").normalization.mean == (0, 0, 0)
