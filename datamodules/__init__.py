@@ -11,16 +11,16 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from datamodules.core.panorama_pairs import ImagePairs as ImagePairs
-    from datamodules.folder.panoramas import FolderPanoramas as FolderPanoramas
-    from datamodules.folder.photos import FolderPhotos as FolderPhotos
+    from datamodules.folder.labelled import FolderPanoramas as FolderPanoramas
+    from datamodules.folder.labelled import FolderPhotos as FolderPhotos
     from datamodules.modelnet40.datamodule import ModelNet40 as ModelNet40
     from datamodules.stanford2d3ds.pairs import StanfordPairs as StanfordPairs
     from datamodules.stanford2d3ds.panoramas import Stanford2D3DS as Stanford2D3DS
-    from datamodules.stanford2d3ds.perspective import (
+    from datamodules.stanford2d3ds.panoramas import (
         Stanford2D3DSPerspective as Stanford2D3DSPerspective,
     )
     from datamodules.synthia.omnisynthia import OmniSynthia as OmniSynthia
-    from datamodules.synthia.perspective import SynthiaPerspective as SynthiaPerspective
+    from datamodules.synthia.omnisynthia import SynthiaPerspective as SynthiaPerspective
     from datamodules.synthrooms.datamodule import SynthRooms as SynthRooms
     from datamodules.synthrooms.datamodule import SynthRoomsPairs as SynthRoomsPairs
     from datamodules.synthrooms.datamodule import SynthRoomsPerspective as SynthRoomsPerspective
@@ -29,19 +29,19 @@ if TYPE_CHECKING:
     from datamodules.zind.panoramas import Zind as Zind
 
 _MODULES = {
-    "FolderPanoramas": "datamodules.folder.panoramas",
-    "FolderPhotos": "datamodules.folder.photos",
+    "FolderPanoramas": "datamodules.folder.labelled",
+    "FolderPhotos": "datamodules.folder.labelled",
     "ImagePairs": "datamodules.core.panorama_pairs",
     "ModelNet40": "datamodules.modelnet40.datamodule",
     "OmniSynthia": "datamodules.synthia.omnisynthia",
     "Stanford2D3DS": "datamodules.stanford2d3ds.panoramas",
-    "Stanford2D3DSPerspective": "datamodules.stanford2d3ds.perspective",
+    "Stanford2D3DSPerspective": "datamodules.stanford2d3ds.panoramas",
     "StanfordPairs": "datamodules.stanford2d3ds.pairs",
     "SynthRooms": "datamodules.synthrooms.datamodule",
     "SynthRoomsPairs": "datamodules.synthrooms.datamodule",
     "SynthRoomsPerspective": "datamodules.synthrooms.datamodule",
     "SynthShapes": "datamodules.synthshapes.datamodule",
-    "SynthiaPerspective": "datamodules.synthia.perspective",
+    "SynthiaPerspective": "datamodules.synthia.omnisynthia",
     "Zind": "datamodules.zind.panoramas",
     "ZindPairs": "datamodules.zind.pairs",
 }

@@ -13,7 +13,7 @@ from torch.nn import functional
 from torch.nn.modules.batchnorm import _BatchNorm
 from torch.utils.checkpoint import checkpoint
 
-from models.stages import stage_channels
+from models.auxiliary_head import stage_channels
 from tangent_train.errors import SettingError
 from tangent_train.registry import registered
 

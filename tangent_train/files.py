@@ -1,13 +1,16 @@
-"""Atomic writing of files, and reading those of torch."""
+"""Files: written atomically; those of torch, JSON and CSV."""
 
 from __future__ import annotations
 
+import csv
 import errno
+import io
+import json
 import os
 import re
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
@@ -17,8 +20,10 @@ from tangent_train.errors import DataError, SettingError
 __all__ = [
     "NoRoomError",
     "atomic_path",
+    "csv_text",
     "load_plain",
     "no_room",
+    "parse_json",
     "reserve",
     "write_bytes",
     "write_text",
@@ -174,3 +179,49 @@ def load_plain(path: Path, expected: str, *, mmap: bool = False) -> Any:
             found = "a damaged file, or none of torch.save"
             remedy = ""
         raise DataError(path, found=found, expected=expected, remedy=remedy) from error
+
+
+def parse_json(text: str | bytes, **options: Any) -> Any:
+    """`json.loads`, with a `ValueError` for text that is nested too deeply.
+
+    Args:
+        text: UTF-8, UTF-16 or UTF-32 where it is bytes.
+        **options: For `json.loads`.
+
+    Raises:
+        ValueError: It is no JSON.
+    """
+    try:
+        return json.loads(text, **options)
+    except RecursionError as error:
+        raise ValueError("its brackets are nested too deeply") from error
+
+
+_FORMULA = ("=", "+", "-", "@", "\t", "\r")
+"""First characters of text that spreadsheets evaluate (OWASP, "CSV Injection")."""
+
+
+def csv_text(columns: Sequence[str], rows: Iterable[Mapping[str, Any] | Sequence[Any]]) -> str:
+    r"""A table as CSV, its header first.
+
+    Text that a spreadsheet would take for a formula is prefixed with ``'``: names of classes and
+    files are untrusted.
+
+    Args:
+        columns: Their names.
+        rows: Values in that order, or by column; None, or a missing one, is an empty cell.
+
+    >>> csv_text(["class", "iou"], [{"class": "=1+1", "iou": -0.5}])
+    "class,iou\n'=1+1,-0.5\n"
+    """
+    file = io.StringIO()
+    writer = csv.writer(file, lineterminator="\n")
+    writer.writerow(map(_cell, columns))
+    for row in rows:
+        cells = [row.get(name) for name in columns] if isinstance(row, Mapping) else row
+        writer.writerow(map(_cell, cells))
+    return file.getvalue()
+
+
+def _cell(value: Any) -> Any:
+    return f"'{value}" if isinstance(value, str) and value.startswith(_FORMULA) else value

@@ -17,10 +17,11 @@ import torch
 from benchmarks.gpu import segformer
 from benchmarks.labels import NUM_CLASSES
 from benchmarks.measuring import DEVICE, Goal, Row, Table, Way, measure
+from datamodules.core.inputs import Normalization
 from tangent_train.checkpoints.trained import TrainedNetwork
 from tangent_train.cli.processes import command_line, run_process
 from tangent_train.geometry import TangentGrid, equirect_shape
-from tangent_train.inference.photo_networks import PhotoNetwork, import_network, normalization_of
+from tangent_train.inference.photo_networks import PhotoNetwork, import_network
 from tangent_train.inference.predictor import Predictor, view_scores
 from tangent_train.inference.views import InputImage, PanoramaViews
 from tangent_train.registry import make
@@ -57,7 +58,7 @@ def _imported(settings: dict[str, Any], level: int, path: Path) -> TrainedNetwor
     """An untrained network for the tangent images of a level, in a checkpoint."""
     settings |= {"num_classes": NUM_CLASSES}
     names, side = [f"class {k}" for k in range(NUM_CLASSES)], TangentGrid(1, level).dim
-    network, normalization = make(settings, "network"), normalization_of("imagenet")
+    network, normalization = make(settings, "network"), Normalization.of("imagenet", 3)
     photo = PhotoNetwork(network, settings, names, normalization, (side, side))
     return import_network(photo, path, level=level, base_level=1).trained
 

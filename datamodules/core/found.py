@@ -18,7 +18,7 @@ from datamodules.core.store import Store
 from tangent_train.errors import DataError, SettingError
 from tangent_train.threads import in_threads
 
-__all__ = ["SAMPLED", "SPLITS", "Found", "Split"]
+__all__ = ["SAMPLED", "SPLITS", "Found", "Split", "draw_groups"]
 
 Split = Literal["train", "val", "test"]
 """A part of a data set."""
@@ -155,3 +155,28 @@ def _stored(read: Callable[[Any], object], store: Store, item: Item) -> list[Cal
 def _arrays(read: Callable[[Any], Any], item: Item) -> dict[str, Any]:
     """The arrays of a named tuple that are there."""
     return {name: array for name, array in read(item)._asdict().items() if array is not None}
+
+
+# What can be sorted: names, or tuples of them and numbers.
+_Group = TypeVar("_Group", bound="str | tuple[Any, ...]")
+
+
+def draw_groups(
+    groups: Iterable[_Group], fraction: float, seed: int | Sequence[int]
+) -> set[_Group]:
+    """Draw some of the groups, the same for the same seed, in whatever order they come.
+
+    Args:
+        groups: All there are; those that come several times count once.
+        fraction: Share of them to draw: at least one, never all, so none of a single one.
+        seed: Of the drawing.
+
+    >>> sorted(draw_groups(["hall", "attic", "kitchen", "hall"], 0.5, seed=0))
+    ['attic', 'kitchen']
+    """
+    ordered = sorted(set(groups))
+    if len(ordered) < 2:
+        return set()
+    count = min(max(1, round(fraction * len(ordered))), len(ordered) - 1)
+    order = np.random.default_rng(seed).permutation(len(ordered))
+    return {ordered[place] for place in order[:count]}

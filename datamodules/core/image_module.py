@@ -1,20 +1,47 @@
-"""Base data module of labelled images: panoramas and photos."""
+"""Base data modules of labelled images: panoramas and photos."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar, Literal
 
-from datamodules.core.found import Split
+from torch.utils.data import DataLoader
+
+from datamodules.core.found import Found, Split
 from datamodules.core.inputs import RGB_NORMALIZATION, RGBD_NORMALIZATION, Input, Normalization
+from datamodules.core.panoramas import Panorama, Photo, Turn
+from datamodules.core.pipeline import (
+    EstimatedUp,
+    MaskedPanoramas,
+    PanoramaJudge,
+    PosedUp,
+    RotatedPanoramas,
+    SplitItems,
+    Transform,
+)
 from datamodules.core.problems import Problems
-from datamodules.core.reading import ImageFiles, ImageReader
+from datamodules.core.progress import show_progress
+from datamodules.core.reading import (
+    ImageFiles,
+    ImageReader,
+    PanoramaReading,
+    PhotoReading,
+    check_headers,
+)
 from datamodules.core.samples import ImageSamples
 from datamodules.core.split_module import SplitDataModule
+from datamodules.core.store import Store
+from datamodules.images.gpano import whole_area
+from datamodules.images.masks import Mask, Masks
+from tangent_train.errors import DataError, SettingError
+from tangent_train.geometry import shift_range
+from tangent_train.threads import in_threads
 
-__all__ = ["ImageDataModule"]
+__all__ = ["ImageDataModule", "PanoramaDataModule", "PhotoDataModule", "Split", "Upright"]
 
 
 @dataclass(kw_only=True, eq=False, repr=False)
@@ -61,3 +88,182 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
         Raises:
             DataError: The data set as a whole cannot be used.
         """
+
+    @abstractmethod
+    def reading(self, reader: ImageReader) -> tuple[str, Callable[[ImageFiles], Any]]:
+        """What reads one image as it is stored, and the name of that in the store."""
+
+    @abstractmethod
+    def check_image(self, files: ImageFiles, reader: ImageReader, problems: Problems) -> None:
+        """Make sure, without decoding them, that files are whole and fit the settings."""
+
+    def find(self, problems: Problems) -> Found[ImageFiles]:
+        """See `SplitDataModule`."""
+        reader, splits = self.find_images(problems)
+        name, read = self.reading(reader)
+        found = Found(self.noun, splits, read, Store.of(self.store, name, reader.settings))
+        check = partial(self.check_image, reader=reader, problems=problems)
+        for _ in in_threads(check, found.of()):
+            pass
+        return found
+
+
+_HALF_TURN_DEG = 180
+
+Upright = Literal["pose", "auto"] | None
+"""Source of the up direction of a panorama."""
+
+
+@dataclass(kw_only=True, eq=False, repr=False)
+class PanoramaDataModule(ImageDataModule):
+    """Labelled panoramas of one data set, see `ImageDataModule`.
+
+    Args:
+        panoramas_per_step: Panoramas per training step and process. Evaluation takes one at a time.
+        mask: What does not count in training and evaluation, in the panorama's own frame, before
+            it is rotated: labels are unknown there, pixels stay. See `Masks`.
+        test_rotation: Rotate the test panoramas: tilt in degrees, or `so3`, see `RotatedPanoramas`.
+        upright: Align tilted panoramas with gravity. `pose`: as their files say (GPano) and, of
+            test panoramas, as they were rotated. `auto`: as their files say, else as estimated from
+            the image, see `judge`.
+        max_tilt_deg: Of `auto`: some degrees more than they are tilted, see `estimate_up`.
+
+    Attributes:
+        erp_height: Rows of the panoramas read.
+        judge: Of `auto`, for the test split: helps to estimate, see `estimate_up`. To be set before
+            that split is read.
+
+    Raises:
+        DataError: The mask cannot be used.
+        SettingError: A setting is invalid.
+    """
+
+    noun: ClassVar[str] = "panoramas"
+
+    panoramas_per_step: int = 4
+    mask: Mask = None
+    test_rotation: Turn = None
+    upright: Upright = None
+    max_tilt_deg: float = 60.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.need_representation(
+            "erp_height",
+            "one for panoramas",
+            "Choose representation=tangent, or photos, as data=synthrooms_perspective.",
+        )
+        self.erp_height: int = self.representation.erp_height
+        self.judge: PanoramaJudge | None = None
+        self._check_rotations()
+        self._masks = Masks(self.mask, "data.mask")
+        if not self._masks.of_each:
+            self._masks.read("", whole_area(Path(), (self.erp_height, 2 * self.erp_height)))
+
+    def reading(self, reader: ImageReader) -> tuple[str, PanoramaReading]:
+        """See `ImageDataModule`."""
+        height, width = shape = self.erp_height, 2 * self.erp_height
+        return f"{height}x{width}", PanoramaReading(reader, len(self.class_names), shape)
+
+    def check_image(self, files: ImageFiles, reader: ImageReader, problems: Problems) -> None:
+        """See `ImageDataModule`; there must be a mask, too."""
+        check_headers(files, reader, problems, self.erp_height)
+        if self._masks.of_each:
+            with problems.noted(files.name):
+                self._masks.check(files.name)
+
+    def pipeline(self, found: Found[ImageFiles], split: Split) -> SplitItems[ImageFiles, Panorama]:
+        """Panoramas from files or store: masked, rotated, then aligned with gravity."""
+        transforms: list[Transform[Panorama, Any]] = []
+        if self.mask is not None:
+            transforms.append(MaskedPanoramas(self._masks))
+        if self.upright is not None:
+            transforms.append(PosedUp())
+        if split == "test" and self.test_rotation is not None:
+            known = self.upright == "pose"
+            transforms.append(RotatedPanoramas(self.test_rotation, self.seed, known=known))
+        if self.upright == "auto":
+            judge = self.judge if split == "test" else None
+            transforms.append(EstimatedUp(self.max_tilt_deg, judge))
+        return SplitItems(found.splits[split], found.read, Panorama, found.store, transforms)
+
+    def test_dataloader(self) -> DataLoader[Any]:
+        """Batches for the test; what is to be judged is estimated first, in this process."""
+        source = self.source("test")
+        if self.judge is not None:
+            read = (source.read(index) for index in range(len(source)))
+            show_progress(read, "Estimating up", self.noun, len(source))
+        return super().test_dataloader()
+
+    def _check_rotations(self) -> None:
+        rotation = self.test_rotation
+        tilt = type(rotation) in (int, float) and 0 <= float(rotation or 0) <= _HALF_TURN_DEG
+        if rotation not in (None, "so3") and not tilt:
+            expected = "null, a tilt of 0 to 180 degrees, or so3"
+            raise SettingError("data.test_rotation", found=repr(rotation), expected=expected)
+        if self.upright not in (None, "pose", "auto"):
+            raise SettingError("data.upright", found=self.upright, expected="null, pose or auto")
+        if not 0 < self.max_tilt_deg <= _HALF_TURN_DEG:
+            raise SettingError(
+                "data.max_tilt_deg", found=self.max_tilt_deg, expected="more than 0, at most 180"
+            )
+
+
+@dataclass(kw_only=True, eq=False, repr=False)
+class PhotoDataModule(ImageDataModule):
+    """Labelled photos of one data set, see `ImageDataModule`.
+
+    The representation is the camera to which all photos are normalized.
+
+    Args:
+        photos_per_step: Photos per training step and process. Evaluation takes one at a time.
+
+    Raises:
+        SettingError: A setting is invalid.
+    """
+
+    noun: ClassVar[str] = "photos"
+
+    photos_per_step: int = 16
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.need_representation(
+            "of_camera",
+            "one for photos",
+            "Choose representation=perspective, or panoramas, as data=synthrooms.",
+        )
+        if "elevation" in self.inputs:
+            raise SettingError(
+                "data.inputs",
+                found=list(self.inputs),
+                expected="no elevation: the horizon of a photo is unknown",
+                remedy="Train on photos without it, then on panoramas with it and init_from=…: "
+                "its filters start at zero.",
+            )
+
+    def reading(self, reader: ImageReader) -> tuple[str, PhotoReading]:
+        """See `ImageDataModule`."""
+        return "photos", PhotoReading(reader, len(self.class_names))
+
+    def pipeline(self, found: Found[ImageFiles], split: Split) -> SplitItems[ImageFiles, Photo]:
+        """Photos from files or store."""
+        return SplitItems(found.splits[split], found.read, Photo, found.store)
+
+    def check_image(self, files: ImageFiles, reader: ImageReader, problems: Problems) -> None:
+        """See `ImageDataModule`; crops must fit into the photo, too."""
+        size = check_headers(files, reader, problems)
+        if size is None:
+            return
+        representation: Any = self.representation
+        with problems.noted(files.name, files.rgb):
+            camera_matrix = reader.camera(files)
+            try:
+                shift_range(camera_matrix, size, representation.fov_deg, representation.image_size)
+            except SettingError as error:
+                raise DataError(
+                    files.rgb,
+                    found=error.found,
+                    expected=f"all of a crop of {representation.fov_deg:g}°",
+                    remedy="Lower representation.fov_deg, or leave the photo out.",
+                ) from error

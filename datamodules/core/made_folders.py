@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from tangent_train.errors import DataError
-from tangent_train.files import write_text
-from tangent_train.json_text import parse_json
+from tangent_train.files import parse_json, write_text
 
 __all__ = ["claim_folder"]
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Generic, Literal, Protocol, TypeVar
 
 import numpy as np
 
-from datamodules.core.order import sample_rng
+from datamodules.core.loading import sample_rng
 from datamodules.core.panoramas import Panorama
 from datamodules.core.problems import Problems
 from datamodules.images.gpano import up_of, whole_area

@@ -7,8 +7,13 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from datamodules.core.panoramas import Panorama, resize_area, resize_depth
-from datamodules.core.photos import Photo, distance_from_z_depth
+from datamodules.core.panoramas import (
+    Panorama,
+    Photo,
+    distance_from_z_depth,
+    resize_area,
+    resize_depth,
+)
 from datamodules.images.png import check_panorama_size
 from tangent_train.errors import DataError
 

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.data import Dataset
+from torchvision.transforms.v2 import functional
 
 from datamodules.core.inputs import (
     INPUTS,
@@ -20,9 +21,8 @@ from datamodules.core.inputs import (
     channel_names,
     normalize,
 )
-from datamodules.core.order import Seed, sample_rng
+from datamodules.core.loading import Seed, sample_rng
 from datamodules.core.panoramas import STEPS_PER_M
-from datamodules.images.colors import jitter_colors
 from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_elevations
 from tangent_train.rendering.upright.gravity import upright_rotation
@@ -40,6 +40,7 @@ __all__ = [
     "Inputs",
     "TrainingImages",
     "TrainingSample",
+    "jitter_colors",
     "render_inputs",
     "world_rays",
 ]
@@ -254,3 +255,29 @@ def _upright_elevations(shape: tuple[int, int]) -> NDArray[np.float32]:
 def _tensor(array: NDArray[Any]) -> Tensor:
     # What is rendered may be the panorama itself, shared or a read-only file: that is copied.
     return torch.from_numpy(array) if array.flags.owndata else torch.tensor(array)
+
+
+_HUE_SHARE = 0.1
+
+
+def jitter_colors(rgb: Tensor, strength: float, rng: np.random.Generator) -> Tensor:
+    """Change brightness, contrast, saturation and, a little, hue of all images alike.
+
+    Args:
+        rgb: ``(n, h, w, 3)`` uint8, views of one panorama or photo.
+        strength: 0 to 1. The factors of the first three are uniform in 1 ± strength, hue is
+            rotated by up to strength / 10 of the circle either way.
+        rng: Generator of four numbers.
+
+    Returns:
+        ``(n, h, w, 3)`` uint8.
+    """
+    brightness, contrast, saturation = rng.uniform(1 - strength, 1 + strength, 3)
+    hue = rng.uniform(-1, 1) * strength * _HUE_SHARE
+    # One high image: contrast is about the mean of all, or neighbours would part at their seams.
+    image = rgb.flatten(0, 1).movedim(-1, 0)
+    image = functional.adjust_brightness(image, brightness)
+    image = functional.adjust_contrast(image, contrast)
+    image = functional.adjust_saturation(image, saturation)
+    image = functional.adjust_hue(image, hue)
+    return image.movedim(0, -1).reshape(rgb.shape)

@@ -19,8 +19,7 @@ from torch.utils.data import DataLoader, Dataset
 from datamodules.core.class_weights import ClassWeights, class_weights
 from datamodules.core.found import SPLITS, Found, Split
 from datamodules.core.inputs import Normalization
-from datamodules.core.loading import at_least, make_loader, this_process
-from datamodules.core.order import EpochSampler
+from datamodules.core.loading import EpochSampler, at_least, make_loader, this_process
 from datamodules.core.pipeline import Item, SplitItems
 from datamodules.core.problems import Problems
 from tangent_train.errors import DataError, SettingError

@@ -20,8 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tangent_train.errors import DataError
-from tangent_train.files import atomic_path
-from tangent_train.json_text import parse_json
+from tangent_train.files import atomic_path, parse_json
 
 __all__ = ["Store"]
 

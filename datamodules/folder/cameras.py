@@ -13,8 +13,8 @@ import numpy as np
 
 from datamodules.images.pixel_files import photo_fov_deg, read_image_size
 from tangent_train.errors import DataError
+from tangent_train.files import parse_json
 from tangent_train.geometry import camera_matrix_from_fov, is_camera_matrix
-from tangent_train.json_text import parse_json
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tangent_train.errors import DataError, counted
-from tangent_train.json_text import parse_json
+from tangent_train.files import parse_json
 
 __all__ = ["UNKNOWN_NAME", "FolderClasses", "read_classes"]
 

@@ -18,22 +18,26 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from datamodules.core.image_module import ImageDataModule
+from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
 from datamodules.core.inputs import Input
 from datamodules.core.loading import at_least
+from datamodules.folder.cameras import FolderCameras, read_cameras
 from datamodules.folder.classes import UNKNOWN_NAME, read_classes
 from datamodules.folder.reader import FolderReader, list_images, note_ignored, read_codes
 from datamodules.folder.splits import FolderSplits
 from tangent_train.errors import DataError, SettingError
+from tangent_train.registry import registered
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from numpy.typing import NDArray
 
     from datamodules.core.found import Split
     from datamodules.core.problems import Problems
     from datamodules.core.reading import ImageFiles
 
-__all__ = ["LabelledFolder"]
+__all__ = ["FolderPanoramas", "FolderPhotos", "LabelledFolder"]
 
 _TRIED = 4
 
@@ -134,3 +138,60 @@ class LabelledFolder(ImageDataModule):
                 expected=f"{classes.describe(classes.codes)}, as classes.json says",
                 remedy="Correct classes.json: no pixel would have a class.",
             )
+
+
+@registered
+@dataclass(kw_only=True, eq=False, repr=False)
+class FolderPanoramas(LabelledFolder, PanoramaDataModule):
+    """A user's own panoramas, with the classes of ``classes.json``.
+
+    Raises:
+        DataError: ``classes.json`` is missing or cannot be used.
+        SettingError: A setting is invalid.
+    """
+
+
+@dataclass(frozen=True)
+class _PhotoReader(FolderReader):
+    """Reads a user's own photos."""
+
+    cameras: FolderCameras
+
+    @property
+    def settings(self) -> dict[str, str]:
+        """The cameras in short too: they are stored with the photos."""
+        return {**super().settings, "cameras": self.cameras.fingerprint}
+
+    def camera(self, files: ImageFiles) -> NDArray[np.float64]:
+        """The camera matrix, by ``cameras.json``, the field of view or the EXIF data."""
+        return self.cameras.matrix(files)
+
+
+@registered
+@dataclass(kw_only=True, eq=False, repr=False)
+class FolderPhotos(LabelledFolder, PhotoDataModule):
+    """A user's own photos, with the classes of ``classes.json``.
+
+    Args:
+        fov: Horizontal field of view, in degrees, of all photos that ``cameras.json`` does not
+            name; None for that of their EXIF data.
+
+    Raises:
+        DataError: ``classes.json`` is missing or cannot be used.
+        SettingError: A setting is invalid.
+    """
+
+    fov: float | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.fov is not None and not 0 < self.fov < 180:
+            raise SettingError(
+                "data.fov", found=self.fov, expected="degrees, more than 0 and less than 180"
+            )
+
+    def make_reader(self, images: Sequence[ImageFiles], problems: Problems) -> FolderReader:
+        """See `LabelledFolder`."""
+        cameras = read_cameras(self.root / "cameras.json", self.fov)
+        cameras.check_names(images, problems)
+        return _PhotoReader(self._classes, self.depth_units_per_m, cameras)

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import glob
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from datamodules.core.panoramas import meters_to_steps, resize_nearest
 from datamodules.core.reading import ImageFiles, ImageReader
+from datamodules.folder.classes import read_classes
 from datamodules.images.image_files import IMAGE_SUFFIXES, find_depth, image_paths, walk_files
+from datamodules.images.masks import Masks
 from datamodules.images.pixel_files import (
     is_grey,
     read_depth_m,
@@ -20,17 +25,13 @@ from datamodules.images.pixel_files import (
     read_rgb,
 )
 from datamodules.images.png import PngHeader, read_png_header
-from tangent_train.errors import DataError
+from tangent_train.errors import DataError, SettingError
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
     from datamodules.core.problems import Problems
     from datamodules.folder.classes import FolderClasses
 
-__all__ = ["FolderReader", "list_images", "note_ignored", "read_codes"]
+__all__ = ["FolderReader", "class_masks", "list_images", "note_ignored", "read_codes"]
 
 # What label images may be. In grey of 1 to 4 bits the numbers may be meant, or the steps from black
 # to white that they stand for: better asked than guessed. 16 bits beside alpha are not decoded.
@@ -186,3 +187,28 @@ def read_codes(path: Path, *, in_colors: bool) -> NDArray[np.integer]:
         DataError: The file is broken.
     """
     return read_rgb(path) if in_colors else read_pixels(path, indices=True)
+
+
+def class_masks(folder: Path, ignored: Sequence[str]) -> Masks:
+    """Masks of all pixels of some classes.
+
+    Args:
+        folder: With ``labels/`` and ``classes.json``, as of ``data=folder``.
+        ignored: Names of the classes.
+
+    Raises:
+        DataError: ``classes.json`` or ``labels/`` is missing or cannot be used.
+        SettingError: It does not name one of the classes.
+    """
+    classes = read_classes(folder / "classes.json")
+    names = classes.names
+    if set(ignored) - set(names):
+        found = ", ".join(sorted(set(ignored) - set(names)))
+        raise SettingError("mask_classes", found=found, expected=f"of {', '.join(names)}")
+    values = [names.index(name) + 1 for name in ignored]
+
+    def counts(path: Path) -> NDArray[np.bool_]:
+        codes = read_codes(path, in_colors=classes.in_colors)
+        return ~np.isin(classes.decode(codes, path), values)
+
+    return Masks(folder / "labels", counts=counts)

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 
 from lightning.pytorch.utilities import rank_zero_warn
 
-from datamodules.core.found import SPLITS, Split
-from datamodules.core.group_drawing import draw_groups
+from datamodules.core.found import SPLITS, Split, draw_groups
 from tangent_train.errors import DataError, counted
 
 if TYPE_CHECKING:

@@ -11,8 +11,7 @@ from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from datamodules.core.found import Found, Split
-from datamodules.core.group_drawing import draw_groups
+from datamodules.core.found import Found, Split, draw_groups
 from datamodules.core.pipeline import SplitItems
 from datamodules.core.processes import in_processes
 from datamodules.core.split_module import Kind, SplitDataModule

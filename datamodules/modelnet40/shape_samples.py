@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from datamodules.core.inputs import Normalization, normalize_channels
-from datamodules.core.order import Seed, sample_rng
+from datamodules.core.loading import Seed, sample_rng
 from datamodules.modelnet40.meshes import CHANNELS, clean_mesh, mesh_spheres, read_off
 from tangent_train.geometry import random_rotation, rotation_about
 

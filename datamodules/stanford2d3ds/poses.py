@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from datamodules.synthrooms.camera import CAMERA_FROM_SPHERE, euler_rotation
 from tangent_train.errors import DataError
+from tangent_train.files import parse_json
 from tangent_train.geometry import PanoramaPose
-from tangent_train.json_text import parse_json
 
 __all__ = ["read_panorama_pose"]
 

@@ -15,8 +15,8 @@ from datamodules.images.png import check_png, read_color_png, read_depth_png
 from datamodules.stanford2d3ds.files import MISSING_DEPTH
 from datamodules.stanford2d3ds.label_table import LabelTable
 from tangent_train.errors import DataError
+from tangent_train.files import parse_json
 from tangent_train.geometry import is_camera_matrix
-from tangent_train.json_text import parse_json
 
 __all__ = ["StanfordReader", "read_camera_matrix"]
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
-from datamodules.core.group_drawing import draw_groups
+from datamodules.core.found import draw_groups
 from datamodules.core.image_module import ImageDataModule
 from datamodules.core.reading import ImageFiles
 from datamodules.stanford2d3ds.files import AREAS, FOLDS, GET_IT, list_pictures

@@ -17,7 +17,7 @@ import numpy as np
 
 from datamodules.core.loading import at_least
 from datamodules.core.made_folders import claim_folder
-from datamodules.core.photos import distance_from_z_depth
+from datamodules.core.panoramas import distance_from_z_depth
 from datamodules.core.problems import Problems
 from datamodules.core.progress import show_progress
 from datamodules.core.reading import check_headers

@@ -2,8 +2,8 @@
 
 Features: 2096×4192 RGB, depth and 13 semantic classes (`reader.CLASSES`). The panoramas combine
 four cameras: a band around the horizon, black and unknown above and below. Missing panoramas are
-generated from the four views of SYNTHIA's sequences 01, 02, 04, 05 and 06 SUMMER. `files`
-has the tree on disk.
+generated from the four views of SYNTHIA's sequences 01, 02, 04, 05 and 06 SUMMER, which are
+photos too. `files` has the tree on disk.
 
 Licence: SYNTHIA is free for research: http://synthia-dataset.net.
 
@@ -17,12 +17,21 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from datamodules.core.panorama_module import PanoramaDataModule
+from datamodules.core.image_module import PanoramaDataModule, PhotoDataModule
 from datamodules.core.problems import Problems
-from datamodules.synthia.files import GET_IT, list_panoramas, panorama_files, sequence_folder
+from datamodules.synthia.files import (
+    GET_IT,
+    VIEWS,
+    list_frames,
+    list_panoramas,
+    panorama_files,
+    sequence_folder,
+    view_files,
+    views_folder,
+)
 from datamodules.synthia.generate import HEIGHT, make_panoramas
-from datamodules.synthia.reader import PANORAMA_FORMATS
-from datamodules.synthia.splits import SynthiaSequences
+from datamodules.synthia.reader import PANORAMA_FORMATS, VIEW_FORMATS
+from datamodules.synthia.splits import SynthiaSequences, choose_frames
 from tangent_train.errors import DataError
 from tangent_train.registry import registered
 
@@ -30,7 +39,7 @@ if TYPE_CHECKING:
     from datamodules.core.found import Found
     from datamodules.core.reading import ImageFiles
 
-__all__ = ["OmniSynthia"]
+__all__ = ["OmniSynthia", "SynthiaPerspective"]
 
 
 @registered
@@ -92,4 +101,32 @@ class OmniSynthia(SynthiaSequences, PanoramaDataModule):
             )
         return [
             [panorama_files(self.root, sequence, frame, with_depth=with_depth)] for frame in frames
+        ]
+
+
+@registered
+@dataclass(kw_only=True, eq=False, repr=False)
+class SynthiaPerspective(SynthiaSequences, PhotoDataModule):
+    """SYNTHIA's views, 13 classes, of the frames and in the splits of OmniSYNTHIA.
+
+    Raises:
+        SettingError: A setting is invalid.
+    """
+
+    formats = VIEW_FORMATS
+
+    def list_images(self, sequence: str, *, with_depth: bool) -> list[list[ImageFiles]]:
+        """See `SynthiaSequences`."""
+        folder = sequence_folder(self.root, sequence)
+        frames = choose_frames(list_frames(folder), self.frames)
+        if not frames:
+            raise DataError(
+                views_folder(folder, VIEWS[0]),
+                found="no views",
+                expected="000000.png and others",
+                remedy=GET_IT,
+            )
+        return [
+            [view_files(self.root, sequence, frame, v, with_depth=with_depth) for v in VIEWS]
+            for frame in frames
         ]

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from datamodules.zind.layout import DOOR, OPENING, WINDOW, Fixture, Layout
 from tangent_train.errors import DataError
+from tangent_train.files import parse_json
 from tangent_train.geometry import PanoramaPose, rotation_about
-from tangent_train.json_text import parse_json
 from tangent_train.registry import Text, check_fields
 
 if TYPE_CHECKING:

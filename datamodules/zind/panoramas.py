@@ -38,17 +38,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
-from datamodules.core.found import SPLITS, Split
-from datamodules.core.group_drawing import draw_groups
+from datamodules.core.found import SPLITS, Split, draw_groups
+from datamodules.core.image_module import PanoramaDataModule
 from datamodules.core.inputs import Input
 from datamodules.core.loading import at_least
-from datamodules.core.panorama_module import PanoramaDataModule
 from datamodules.core.reading import ImageFiles, ImageReader
 from datamodules.images.pixel_files import read_image_size, read_rgb
 from datamodules.zind.homes import HomePanorama, list_panoramas
 from datamodules.zind.layout import CLASSES, DOOR, Layout
 from tangent_train.errors import DataError, SettingError
-from tangent_train.json_text import parse_json
+from tangent_train.files import parse_json
 from tangent_train.registry import Text, check_fields, registered
 
 if TYPE_CHECKING:

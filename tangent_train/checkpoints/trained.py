@@ -21,7 +21,7 @@ from tangent_train.checkpoints.content import GROUPS, INPUTS, NORMALIZATION, rea
 from tangent_train.checkpoints.image_sizes import size_multiple_of
 from tangent_train.checkpoints.scores import Groups, Scores
 from tangent_train.errors import DataError, SettingError
-from tangent_train.json_text import parse_json
+from tangent_train.files import parse_json
 from tangent_train.registry import SettingsFile, Text, check_fields, check_plain, make
 
 __all__ = [

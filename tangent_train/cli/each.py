@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from datamodules.core.progress import progress_bar
 from tangent_train.errors import DataError, SettingError
@@ -15,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterable, Iterator
     from pathlib import Path
 
-__all__ = ["Job", "each"]
+__all__ = ["Job", "Shard", "each"]
 
 _THREADS = min(4, os.cpu_count() or 1)
 """Images that are read ahead, and that are written meanwhile, at most: all are in memory."""
@@ -89,3 +91,51 @@ def _stage(step: Callable[[Job], Any] | None, jobs: Iterable[Job]) -> Iterable[J
     if step is None:
         return jobs
     return in_threads(lambda job: job.then(step), jobs, _THREADS, _THREADS)
+
+
+_Item = TypeVar("_Item")
+
+
+@dataclass(frozen=True)
+class Shard:
+    """One of several parts of a list, which differ in length by one item at most.
+
+    Attributes:
+        number: 1 to `count`.
+        count: Of the parts.
+    """
+
+    number: int
+    count: int
+
+    @classmethod
+    def of(cls, setting: Any) -> Shard | None:
+        """The part that a setting names; without one, there are no parts.
+
+        Args:
+            setting: As ``3/16``, or None.
+
+        Raises:
+            SettingError: There is no such part.
+
+        >>> Shard.of("3/16")
+        Shard(number=3, count=16)
+        """
+        if setting is None:
+            return None
+        named = re.fullmatch(r"(\d{1,9})/(\d{1,9})", str(setting), re.ASCII)
+        number, count = map(int, named.groups()) if named else (0, 0)
+        if not 1 <= number <= count:
+            raise SettingError("shard", found=setting, expected="1/16 to 16/16, or of others; null")
+        return cls(number, count)
+
+    def __str__(self) -> str:
+        return f"{self.number}/{self.count}"
+
+    def part(self, items: Sequence[_Item]) -> list[_Item]:
+        """Its items of a list: every `count`-th.
+
+        >>> Shard(2, 3).part("abcdefg")
+        ['b', 'e']
+        """
+        return list(items[self.number - 1 :: self.count])

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+import threading
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +20,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 from rich.console import Console
 
+from datamodules.core.loading import explained
 from tangent_train.callbacks.checkpoints import AtomicCheckpointIO, CheckpointContents
 from tangent_train.callbacks.progress import ProgressBar
 from tangent_train.callbacks.results import evaluated, pictures, write_evaluation
@@ -26,15 +29,15 @@ from tangent_train.checkpoints.image_sizes import size_multiple_of
 from tangent_train.checkpoints.scores import Scores
 from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
 from tangent_train.cli.build import Settings, build, build_trained, check_fits, shown
-from tangent_train.cli.machine import machine_faults
 from tangent_train.cli.stored import GROUPS, run_settings
 from tangent_train.errors import SettingError
+from tangent_train.files import no_room
 from tangent_train.inference.judge import NetworkJudge
 from tangent_train.registry import SettingsFile, make
 from tangent_train.results.evaluation import headline, result_tables
 from tangent_train.results.record import Record
 
-__all__ = ["Run", "evaluate"]
+__all__ = ["Run", "evaluate", "machine_faults"]
 
 # lightning 2.6 asks torch's tree library in a way torch ≥ 2.13 deprecates: nothing to do about it.
 warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)`", FutureWarning)
@@ -213,3 +216,41 @@ def _choices(settings: Settings, source: SettingsFile | None) -> dict[str, str]:
         if chosen.get(group)
         and (source is None or group in stored or group == "experiment" or not source.owns(group))
     }
+
+
+@contextmanager
+def machine_faults(folder: Path, data: Any) -> Iterator[None]:
+    """Explain a full disk, and workers that died.
+
+    TensorBoard writes in a thread that ends with the error of a full disk; its stack is not shown.
+
+    Args:
+        folder: Of the run.
+        data: Its data module.
+
+    Raises:
+        NoRoomError: The disk is full for a file that is not written atomically, as TensorBoard's
+            events.
+        DataError: A worker died.
+    """
+    show = threading.excepthook
+    threading.excepthook = _all_but_full_disks(folder, show)
+    try:
+        yield
+    except (OSError, EOFError, RuntimeError, ValueError) as error:
+        told = no_room(folder, error) or explained(error, data.num_workers)
+        if told is error:
+            raise
+        raise told from error
+    finally:
+        threading.excepthook = show
+
+
+def _all_but_full_disks(
+    folder: Path, show: Callable[[threading.ExceptHookArgs], object]
+) -> Callable[[threading.ExceptHookArgs], None]:
+    def hook(failed: threading.ExceptHookArgs) -> None:
+        if failed.exc_value is None or no_room(folder, failed.exc_value) is None:
+            show(failed)
+
+    return hook

@@ -17,8 +17,7 @@ from datamodules.core.panorama_pairs import ImagePairs, PanoramaPair, PanoramaPa
 from datamodules.images.pixel_files import read_image_size
 from tangent_train.cli.settings import typed
 from tangent_train.errors import DataError, SettingError
-from tangent_train.files import write_bytes
-from tangent_train.json_text import parse_json
+from tangent_train.files import parse_json, write_bytes
 from tangent_train.keypoints.colmap import add_pair
 from tangent_train.keypoints.two_view import colmap
 from tangent_train.registry import make, maker_of

@@ -17,11 +17,10 @@ from datamodules.images.gpano import area_of_crop, whole_area
 from datamodules.images.masks import Mask, Masks
 from datamodules.images.pixel_files import read_pixels
 from tangent_train.checkpoints.trained import load_trained
-from tangent_train.cli.each import Job, each
+from tangent_train.cli.each import Job, Shard, each
 from tangent_train.cli.predict_inputs import Inputs, is_video
 from tangent_train.cli.predict_shards import PredictionShard
 from tangent_train.cli.settings import typed
-from tangent_train.cli.shard import Shard
 from tangent_train.errors import SettingError, counted
 from tangent_train.inference.class_maps import Unmapped, load_class_map, map_classes
 from tangent_train.inference.images import DepthFolder, read_panorama, read_photo, with_up

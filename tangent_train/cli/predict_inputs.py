@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Container, Iterator
     from pathlib import Path
 
-    from tangent_train.cli.shard import Shard
+    from tangent_train.cli.each import Shard
     from tangent_train.results.predictions import Entry
 
 __all__ = ["Inputs", "is_video"]

@@ -8,14 +8,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from tangent_train.errors import SettingError
-from tangent_train.files import write_text
-from tangent_train.json_text import parse_json
+from tangent_train.files import parse_json, write_text
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-    from tangent_train.cli.shard import Shard
+    from tangent_train.cli.each import Shard
     from tangent_train.results.predictions import Entry
 
 __all__ = ["PredictionShard"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from rich.console import Console
 
 from tangent_train.cli.build import Settings
-from tangent_train.cli.shard import Shard
+from tangent_train.cli.each import Shard
 from tangent_train.registry import make
 
 __all__ = ["prepare"]

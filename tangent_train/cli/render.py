@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 import numpy as np
 from rich.console import Console
 
-from datamodules.folder.masks import class_masks
+from datamodules.folder.reader import class_masks
 from datamodules.images.colmap_project import ColmapProject, flat_names
 from datamodules.images.image_files import image_paths, short_names
 from datamodules.images.masks import Mask, Masks

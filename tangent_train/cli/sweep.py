@@ -16,7 +16,7 @@ from hydra.types import RunMode
 
 from tangent_train.cli.processes import command_line, run_process
 from tangent_train.errors import SettingError
-from tangent_train.json_text import parse_json
+from tangent_train.files import parse_json
 
 if TYPE_CHECKING:
     from collections.abc import Collection

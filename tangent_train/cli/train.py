@@ -18,13 +18,11 @@ from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
-from tangent_train.callbacks.averaging import averaged_weights
-from tangent_train.callbacks.checkpoints import BestCheckpoint, LastCheckpoint
+from tangent_train.callbacks.checkpoints import BestCheckpoint, LastCheckpoint, averaged_weights
 from tangent_train.checkpoints.content import read_checkpoint
 from tangent_train.cli.build import Settings
-from tangent_train.cli.evaluate import Run
+from tangent_train.cli.evaluate import Run, machine_faults
 from tangent_train.cli.fine_tuning import begin_from, load_start
-from tangent_train.cli.machine import machine_faults
 from tangent_train.cli.sweep import OBJECTIVE_FILE
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import atomic_path, write_text

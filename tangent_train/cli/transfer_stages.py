@@ -31,8 +31,7 @@ from tangent_train.checkpoints.content import read_settings
 from tangent_train.cli.processes import command_line, run_process
 from tangent_train.cli.transfer_views import conditions_of, numbers
 from tangent_train.errors import DataError, SettingError
-from tangent_train.files import write_text
-from tangent_train.json_text import parse_json
+from tangent_train.files import parse_json, write_text
 from tangent_train.setting_rules import differing_settings
 
 __all__ = ["STUDY", "Stage", "State", "plan", "run_stage", "stage_command", "stage_state"]

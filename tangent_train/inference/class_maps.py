@@ -21,7 +21,7 @@ from typing import Any, Literal
 from tangent_train.checkpoints.scores import Scores
 from tangent_train.checkpoints.trained import TrainedNetwork
 from tangent_train.errors import DataError, SettingError
-from tangent_train.json_text import parse_json
+from tangent_train.files import parse_json
 from tangent_train.registry import Text, check_fields
 
 __all__ = ["ClassMap", "MappedNetwork", "Unmapped", "load_class_map", "map_classes"]

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from datamodules.core.panorama_module import Upright
+    from datamodules.core.image_module import Upright
     from tangent_train.inference.judge import NetworkJudge
 
 __all__ = ["DepthFolder", "read_panorama", "read_photo", "with_up"]

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import cv2
 import numpy as np
 
-from datamodules.core.panoramas import resize_area, resize_depth
-from datamodules.core.photos import distance_from_z_depth
+from datamodules.core.panoramas import distance_from_z_depth, resize_area, resize_depth
 from datamodules.core.samples import world_rays
 from tangent_train.errors import SettingError
 from tangent_train.registry import make

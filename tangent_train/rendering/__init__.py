@@ -15,7 +15,7 @@ from tangent_train.rendering.camera_files import (
     write_poses,
     write_rig,
 )
-from tangent_train.rendering.forward import Interpolation, equirect_to_tangent
+from tangent_train.rendering.forward import Interpolation, equirect_to_tangent, rotate_equirect
 from tangent_train.rendering.representations.equirect import EquirectRepresentation
 from tangent_train.rendering.representations.perspective import PerspectiveRepresentation
 from tangent_train.rendering.representations.pinhole import (
@@ -26,7 +26,6 @@ from tangent_train.rendering.representations.views import (
     Assembler,
     Representation,
 )
-from tangent_train.rendering.rotate import rotate_equirect
 from tangent_train.rendering.tables import set_table_cache_limit
 
 __all__ = [

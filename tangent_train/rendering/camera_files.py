@@ -19,9 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tangent_train.errors import DataError
-from tangent_train.files import write_text
+from tangent_train.files import parse_json, write_text
 from tangent_train.geometry import FLIP_Y, PanoramaPose, TangentGrid, checked_rotation
-from tangent_train.json_text import parse_json
 from tangent_train.registry import Text, check_fields
 
 __all__ = [

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tangent_train.csv_text import csv_text
 from tangent_train.errors import counted
-from tangent_train.files import write_text
+from tangent_train.files import csv_text, write_text
 from tangent_train.metrics.classification import classification_scores
 from tangent_train.metrics.segmentation import (
     BAND_EDGES_DEG,

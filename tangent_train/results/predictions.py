@@ -12,11 +12,9 @@ import numpy as np
 
 from datamodules.images.pixel_files import array_file, read_pixels, write_pixels
 from datamodules.images.videos import write_video
-from tangent_train.csv_text import csv_text
 from tangent_train.errors import SettingError
-from tangent_train.files import write_text
+from tangent_train.files import csv_text, parse_json, write_text
 from tangent_train.geometry import equirect_solid_angles
-from tangent_train.json_text import parse_json
 from tangent_train.results.html import EncodedImage, encode_image, write_report
 from tangent_train.results.pictures import colorize, mixed_picture, overlay_picture
 from tangent_train.results.tables import Table, percent

@@ -14,7 +14,7 @@ from typing import Any, Literal, NamedTuple
 
 from tangent_train.checkpoints.content import INPUTS, read_settings
 from tangent_train.errors import DataError
-from tangent_train.json_text import parse_json
+from tangent_train.files import parse_json
 from tangent_train.metrics.segmentation import Interval
 from tangent_train.registry import check_fields
 from tangent_train.setting_rules import flat_settings

@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from datamodules.stanford2d3ds.files import FOLDS
-from tangent_train.csv_text import csv_text
-from tangent_train.files import write_bytes, write_text
+from tangent_train.files import csv_text, write_bytes, write_text
 from tangent_train.results.chart import grid_png, report_png
 from tangent_train.results.record import SCORES, Band
 from tangent_train.results.rows import Row, Statistic

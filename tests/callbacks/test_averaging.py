@@ -11,12 +11,12 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.utils.data import DataLoader
 
-from tangent_train.callbacks.averaging import averaged_weights
 from tangent_train.callbacks.checkpoints import (
     AtomicCheckpointIO,
     BestCheckpoint,
     CheckpointContents,
     LastCheckpoint,
+    averaged_weights,
 )
 from tests.tasks.shapes import quiet_trainer
 

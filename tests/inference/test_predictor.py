@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from datamodules import Stanford2D3DS
 from datamodules.core.inputs import normalize
-from datamodules.core.photos import distance_from_z_depth
+from datamodules.core.panoramas import distance_from_z_depth
 from datamodules.core.samples import render_inputs
 from tangent_train.checkpoints.scores import Scores
 from tangent_train.checkpoints.trained import TrainedNetwork

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torchvision.models.segmentation import deeplabv3_mobilenet_v3_large
 
 from models import AuxiliaryHead, FCNResNet, UNet
-from models.stages import stage_channels
+from models.auxiliary_head import stage_channels
 from tangent_train.errors import SettingError
 from tests.models.sphere_networks import STAGE, small_unet
 

@@ -11,7 +11,7 @@ from torch import nn
 
 from datamodules.core.inputs import Normalization
 from tangent_train.errors import DataError, SettingError
-from tangent_train.json_text import parse_json
+from tangent_train.files import parse_json
 
 __all__ = ["USUAL_SIZE", "PhotoNetwork", "class_names_in"]
 

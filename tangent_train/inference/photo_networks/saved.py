@@ -11,7 +11,7 @@ from torch import Tensor
 
 from models.pretrained import read_tensors
 from tangent_train.errors import DataError, SettingError
-from tangent_train.json_text import parse_json
+from tangent_train.files import parse_json
 
 __all__ = ["json_in", "saved_folder", "tensors_in"]
 

@@ -19,7 +19,7 @@ from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_shape, random_rotation, rotation_about
 from tangent_train.registry import registered
 from tangent_train.rendering.checks import check_choice, check_count
-from tangent_train.rendering.forward import Interpolation
+from tangent_train.rendering.forward import Interpolation, rotate_equirect
 from tangent_train.rendering.mosaic import ScoreMosaic
 from tangent_train.rendering.representations.perspective import PhotoCrops
 from tangent_train.rendering.representations.pinhole import unless_identity
@@ -30,7 +30,6 @@ from tangent_train.rendering.representations.views import (
     RotationAugmentation,
     Views,
 )
-from tangent_train.rendering.rotate import rotate_equirect
 
 __all__ = ["EquirectRepresentation", "EquirectViews", "as_crop", "column_shifts"]
 

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tangent_train.csv_text import csv_text
-from tangent_train.files import write_text
+from tangent_train.files import csv_text, write_text
 from tangent_train.results.keypoints.compare import (
     AS_GIVEN,
     AUC_DEG,

@@ -14,7 +14,7 @@ from torch import nn
 
 import datamodules
 from datamodules import FolderPanoramas
-from datamodules.core.panorama_module import PanoramaDataModule
+from datamodules.core.image_module import PanoramaDataModule
 from datamodules.core.pipeline import RotatedPanoramas
 from datamodules.images.pixel_files import write_pixels
 from tangent_train.cli.compose import config_folder

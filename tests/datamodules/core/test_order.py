@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from datamodules.core.order import EpochSampler, sample_rng
+from datamodules.core.loading import EpochSampler, sample_rng
 from tangent_train.errors import SettingError
 
 

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from datamodules.core.found import Split
-from datamodules.core.panorama_module import PanoramaDataModule
+from datamodules.core.image_module import PanoramaDataModule
 from datamodules.core.problems import Problems
 from datamodules.core.reading import ImageFiles, ImageReader
 from datamodules.images.png import check_png, read_color_png, read_png

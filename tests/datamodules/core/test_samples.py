@@ -16,8 +16,13 @@ from datamodules.core.inputs import (
     normalize,
 )
 from datamodules.core.panoramas import Panorama
-from datamodules.core.samples import EvaluationImages, ImageSamples, TrainingImages, render_inputs
-from datamodules.images.colors import jitter_colors
+from datamodules.core.samples import (
+    EvaluationImages,
+    ImageSamples,
+    TrainingImages,
+    jitter_colors,
+    render_inputs,
+)
 from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_directions
 from tangent_train.rendering import EquirectRepresentation, TangentRepresentation

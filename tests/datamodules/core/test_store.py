@@ -14,7 +14,7 @@ import torch
 from datamodules import Stanford2D3DS
 from datamodules.core.found import Split
 from datamodules.core.store import Store
-from tangent_train.cli.shard import Shard
+from tangent_train.cli.each import Shard
 from tangent_train.errors import DataError, SettingError
 from tangent_train.rendering import EquirectRepresentation
 from tests.conftest import FabricateStanford

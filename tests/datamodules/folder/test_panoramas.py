@@ -10,7 +10,7 @@ from PIL import Image
 
 from datamodules.core.found import Split
 from datamodules.core.inputs import RGBD_NORMALIZATION, Normalization
-from datamodules.folder.panoramas import FolderPanoramas
+from datamodules.folder.labelled import FolderPanoramas
 from tangent_train.errors import DataError, SettingError
 from tests.datamodules.data_files import read_png
 from tests.datamodules.folder.folder_format import (

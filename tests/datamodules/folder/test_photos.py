@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datamodules.core.photos import Photo
-from datamodules.folder.photos import FolderPhotos
+from datamodules.core.panoramas import Photo
+from datamodules.folder.labelled import FolderPhotos
 from tangent_train.errors import DataError
 from tangent_train.rendering import PerspectiveRepresentation
 from tests.datamodules.data_files import write_png

@@ -8,7 +8,7 @@ import pytest
 
 from datamodules import Stanford2D3DS, Stanford2D3DSPerspective
 from datamodules.core.found import SPLITS
-from datamodules.core.photos import distance_from_z_depth
+from datamodules.core.panoramas import distance_from_z_depth
 from tangent_train.errors import DataError
 from tangent_train.geometry import camera_matrix_from_fov
 from tangent_train.rendering import PerspectiveRepresentation, TangentRepresentation

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datamodules.synthia.omnisynthia import OmniSynthia
-from datamodules.synthia.perspective import SynthiaPerspective
+from datamodules.synthia.omnisynthia import OmniSynthia, SynthiaPerspective
 from tangent_train.rendering import PerspectiveRepresentation
 from tests.datamodules.data_files import names_of
 from tests.datamodules.synthia import synthia_format as synthia

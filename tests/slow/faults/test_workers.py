@@ -14,7 +14,7 @@ import pytest
 from torch.utils.data import get_worker_info
 
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
-from tangent_train.cli.machine import machine_faults
+from tangent_train.cli.evaluate import machine_faults
 from tangent_train.errors import SettingError
 from tests.slow.faults.small_runs import Faulty, run_trainer, small_data, small_task
 
