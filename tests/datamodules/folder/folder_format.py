@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from tests.datamodules.data_files import read_png, write_png
+from tests.datamodules.data_files import write_png
 
 NAMES = ("wall", "floor", "window")
 VALUES = {"wall": 1, "floor": [2, 3], "window": 255}
@@ -64,13 +64,3 @@ def write_data_set(
             name = f"scene_{scene}/view.{number}"
             write_panorama(root, name, seed, height, suffixes[seed % 4], depth=depth)
     return root
-
-
-def pixels_of_classes(root: Path, names: list[str]) -> list[int]:
-    """Of the label files, read by another program; the unknown class, first, does not count."""
-    counts = np.zeros(len(NAMES) + 1, np.int64)
-    for name in names:
-        stored = read_png(root / "labels" / f"{name}.png")
-        for value, count in zip(*np.unique(stored, return_counts=True), strict=True):
-            counts[CLASS_OF_STORED[int(value)]] += count
-    return [0, *counts[1:].tolist()]

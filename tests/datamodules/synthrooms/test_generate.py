@@ -1,11 +1,34 @@
 from __future__ import annotations
 
+import math
+from collections import Counter
 from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
 
 from datamodules import SynthRoomsPerspective
 from datamodules.core.found import SPLITS
+from datamodules.synthrooms.camera import PanoramaView, PerspectiveView, Pose, euler_rotation
 from datamodules.synthrooms.generate import plan_rooms
+from datamodules.synthrooms.layout import FloorPlan, Rectangle
+from datamodules.synthrooms.raycast import RayScene
+from datamodules.synthrooms.render import MISSING, Picture, draw_camera, draw_holes, render
+from datamodules.synthrooms.room import UNKNOWN, Room
+from datamodules.synthrooms.scene import draw_room_type, furnish
 from datamodules.synthrooms.settings import RoomSettings
+from datamodules.synthrooms.writer import (
+    INSTANCES,
+    RoomPlan,
+    camera_identifier,
+    encode_picture,
+    label_indices,
+    label_strings,
+    pose_record,
+)
+from tangent_train.errors import SettingError
 from tangent_train.rendering import PerspectiveRepresentation
 from tests.datamodules.conftest import TINY_ROOMS
 from tests.datamodules.data_files import names_of
@@ -29,3 +52,160 @@ def test_views_are_read_like_photos_of_the_real_set(tiny_rooms: Path) -> None:
     photo = module.source("test").read(0)
     assert photo.rgb.shape == (8, 8, 3)
     assert photo.labels.max() > 0
+
+
+def test_rooms_come_in_the_order_of_the_areas() -> None:
+    settings = RoomSettings(rooms={"area_5b": 0, "1": 2})
+    assert list(settings.rooms.items()) == [("1", 2), ("5b", 0)]
+    assert settings.areas == ["1"]
+    assert sum(RoomSettings().rooms.values()) == 232
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"rooms": {"7": 1}}, "rooms: found"),
+        ({"rooms": {"1": 0}}, "rooms: found"),
+        ({"rooms": {"1": -1}}, r"rooms\[1\]: found -1"),
+        ({"seed": True}, "seed"),
+        ({"height": 7}, "height: found 7; expected an integer of 8 or more"),
+        ({"views": "all"}, "views: found all"),
+    ],
+)
+def test_what_cannot_work_is_named(wrong: dict[str, Any], message: str) -> None:
+    with pytest.raises(SettingError, match=message):
+        RoomSettings(**wrong)
+
+
+@pytest.mark.parametrize("notch", [None, (2.0, 1.5)])
+def test_what_stands_on_the_floor_keeps_apart_and_inside(
+    notch: tuple[float, float] | None,
+) -> None:
+    rng = np.random.default_rng(0)
+    plan = FloorPlan((6.0, 5.0, 2.8), notch)
+    areas = []
+    for _ in range(30):
+        at_wall = plan.against_wall(rng, 1.2, 0.5, "full")
+        if at_wall is not None:
+            areas.append(Rectangle.around(at_wall, (-0.6, 0.6), (0.01, 0.5)))
+        free = plan.in_the_open(rng, 0.8, 0.6)
+        if free is not None:
+            areas.append(Rectangle.around(free, (-0.4, 0.4), (-0.3, 0.3)))
+    assert len(areas) > 8
+    for k, area in enumerate(areas):
+        assert plan.contains(area)
+        assert not any(area.meets(other) for other in areas[:k])
+
+
+SEEDS = range(60)
+
+
+@pytest.fixture(scope="module")
+def rooms() -> list[Room]:
+    made = []
+    for seed in SEEDS:
+        rng = np.random.default_rng(seed)
+        made.append(furnish(rng, draw_room_type(rng)))
+    return made
+
+
+def test_everything_stands_inside(rooms: list[Room]) -> None:
+    for room in rooms:
+        corners = np.concatenate([part.triangles.reshape(-1, 3) for part in room.parts])
+        size = (room.plan.width, room.plan.depth, room.plan.height)
+        # Walls are 10 cm thick; bases of columns at walls reach a little further into them.
+        assert (corners > -0.13).all()
+        assert (corners < np.add(size, 0.13)).all()
+
+
+def test_every_class_covers_enough_pixels_in_enough_rooms(rooms: list[Room]) -> None:
+    names = list(INSTANCES)
+    pixels, present = np.zeros(len(names)), np.zeros(len(names))
+    total, unknown, missing = 0, 0, 0
+    for room in rooms:
+        limits = Counter(room.items)
+        assert all(limits[name] <= limit for name, limit in INSTANCES.items())
+        scene = RayScene(room)
+        holes = draw_holes(room.rng, scene)
+        camera = draw_camera(room.rng, scene, room.plan, [])
+        view = PanoramaView(Pose.looking(camera.location, camera.heading), 32)
+        items = render(scene, view, camera, holes, 1, room.rng).items
+        seen = Counter(room.items[k] for k in items[items != MISSING])
+        counts = np.array([seen[name] for name in names])
+        pixels, present = pixels + counts, present + (counts > 0)
+        total += items.size
+        unknown += seen[UNKNOWN]
+        missing += int((items == MISSING).sum())
+    shares = dict(zip(names, pixels / total, strict=True))
+    assert min(shares.values()) > 0.01, shares
+    assert (present / len(rooms)).min() > 0.45
+    assert unknown > 0
+    assert 0.02 < missing / total < 0.15
+
+
+CAMERA = camera_identifier(0, "5b", "WC_17", 0)
+RNG = np.random.default_rng(0)
+ROOMS = [
+    RoomPlan("1", "office", 1, 0, (), RNG),
+    RoomPlan("5b", "WC", 17, 1, (CAMERA,), RNG),
+]
+
+
+def test_every_item_has_its_own_label_until_the_numbers_run_out() -> None:
+    items = ["floor", "chair", "<UNK>", "chair", "board", *["board"] * 5]
+    table = label_strings(ROOMS)
+    names = [table[k] for k in label_indices(ROOMS[1], items)]
+    tail = "WC_17_5"
+    assert names[:5] == [
+        f"floor_1_{tail}",
+        f"chair_1_{tail}",
+        "<UNK>_0_<UNK>_0_0",
+        f"chair_2_{tail}",
+        f"board_1_{tail}",
+    ]
+    assert names[-3:] == [f"board_{INSTANCES['board']}_{tail}"] * 3
+
+
+def test_pictures_survive_the_files() -> None:
+    rgb = np.random.default_rng(0).integers(0, 256, (2, 3, 3)).astype(np.uint8)
+    depth = np.array([[1.0, np.nan, 2.5], [0.002, 100.0, np.nan]], np.float32)
+    items = np.array([[0, MISSING, 1], [2, 1, MISSING]])
+    labels = np.array([0, 70_000, 300], np.uint32)
+    files = encode_picture(Picture(rgb, depth, items), labels)
+    read: dict[str, Any] = {
+        kind: cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+        for kind, content in files.items()
+    }
+    np.testing.assert_array_equal(read["rgb"][..., ::-1], rgb)
+    assert read["depth"].dtype == np.uint16
+    assert read["depth"].tolist() == [[512, 65535, 1280], [1, 51200, 65535]]
+    blue, green, red = np.moveaxis(read["semantic"].astype(int), -1, 0)
+    assert (red * 65536 + green * 256 + blue).tolist() == [
+        [0, 855309, 70_000],
+        [300, 70_000, 855309],
+    ]
+
+
+@pytest.mark.parametrize("panorama", [True, False])
+def test_poses_have_every_key_and_agree_with_themselves(panorama: bool) -> None:
+    original = Pose.looking(np.array([1.0, 2.0, 1.5]), 0.7)
+    turned = Pose.looking(original.location, -1.2, 0.3, 0.1)
+    view = PanoramaView(original, 64) if panorama else PerspectiveView(turned, 100, 1.0)
+    frame = "equirectangular" if panorama else "4"
+    record = pose_record(ROOMS[1], CAMERA, frame, view, original)
+    assert record["camera_uuid"] == record["point_uuid"] == CAMERA
+    assert (record["room"], record["frame_num"]) == ("WC_17_5", frame)
+    # As the real set's: Blender's camera looks along -z with +y up.
+    final = euler_rotation(np.array(record["final_camera_rotation"]))
+    rt = np.array(record["camera_rt_matrix"])
+    np.testing.assert_allclose(rt[:, :3], np.diag([1, -1, -1]) @ final.T, atol=1e-12)
+    np.testing.assert_allclose(rt[:, :3] @ record["camera_location"] + rt[:, 3], 0, atol=1e-12)
+    first, turn = (
+        euler_rotation(np.array(record[key]))
+        for key in ("camera_original_rotation", "rotation_from_original_to_point")
+    )
+    np.testing.assert_allclose(turn @ first, final, atol=1e-12)
+    size = 64 if panorama else 100
+    K = np.array(record["camera_k_matrix"])
+    assert K[0, 2] == K[1, 2] == size / 2
+    assert 2 * math.atan(size / 2 / K[0, 0]) == pytest.approx(record["field_of_view_rads"])

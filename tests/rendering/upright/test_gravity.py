@@ -14,10 +14,118 @@ from scipy.spatial.transform import Rotation
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_directions, random_rotation, rotation_about
+from tangent_train.rendering.upright.cues import cues, up_probabilities
 from tangent_train.rendering.upright.gravity import estimate_up, up_from_pose, upright_rotation
-from tests.geometry.directions import angle_deg
+from tangent_train.rendering.upright.line_segments import LineSegments, find_line_segments
+from tangent_train.rendering.upright.manhattan import find_manhattan_frames
+from tests.geometry.directions import angle_deg, unit
 from tests.keypoints.textures import texture
 from tests.rendering.drawn_room import draw_room
+
+_NO_SEGMENTS = LineSegments(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+
+
+def test_names_and_signs_of_the_axes_do_not_matter() -> None:
+    room = draw_room((128, 256), np.eye(3))
+    segments = find_line_segments(room)
+    expected = up_probabilities(room, segments, np.eye(3))
+    np.testing.assert_allclose(expected.sum(), 1)
+    assert expected.argmax() == 2
+    # Column j of the new axes is `sign` times axis `order[j]`.
+    order, sign = [1, 2, 0], np.array([1, -1, -1])
+    found = up_probabilities(room, segments, np.eye(3)[:, order] * sign)
+    place = np.array([one + (0 if s > 0 else 3) for one, s in zip(order, sign, strict=True)])
+    np.testing.assert_allclose(found, expected[[*place, *(place + 3) % 6]], rtol=1e-9)
+
+
+def _lit(from_xyz: NDArray[np.float64]) -> NDArray[np.uint8]:
+    bright = equirect_directions((64, 128)) @ from_xyz > 0
+    return np.repeat(np.where(bright, 220, 40).astype(np.uint8)[..., None], 3, axis=-1)
+
+
+def test_light_comes_from_above() -> None:
+    for axis in range(3):
+        even, odd = cues(_lit(np.eye(3)[axis]), _NO_SEGMENTS, np.eye(3))
+        np.testing.assert_array_equal(even, 0)
+        np.testing.assert_array_equal(odd[:, :2], 0)
+        # Half of the sphere at 220, half at 40: they differ by two standard deviations.
+        np.testing.assert_allclose(odd[:, 2], 2 * np.eye(3)[axis], atol=0.02)
+        assert up_probabilities(_lit(np.eye(3)[axis]), _NO_SEGMENTS, np.eye(3)).argmax() == axis
+
+
+def test_what_is_measured_of_segments() -> None:
+    level = np.radians([0, 90, 180, 270])
+    around = np.stack([np.cos(level), np.sin(level), np.zeros(4)], axis=-1)
+    middles = np.concatenate([around, [[0, 0, -1.0], [0.6, 0, -0.8]]])
+    upright = np.stack([-np.sin(level), np.cos(level), np.zeros(4)], axis=-1)
+    oblique = np.array([[1, 1, 1], [2, 3, -4]]) / np.array([[3**0.5], [29**0.5]])
+    segments = LineSegments(np.concatenate([upright, oblique]), middles, np.full(6, 0.2))
+    image = np.full((64, 128, 3), 90, np.uint8)
+    even, odd = cues(image, segments, np.eye(3))
+    # The planes of the four hold the vertical, and a level axis as well: each counts once.
+    assert even.shape == (3, 5)
+    np.testing.assert_allclose(even[:, 0].sum(), 1)
+    np.testing.assert_allclose(even[2, 1], 4 / 6)
+    np.testing.assert_allclose(even[2, 2], (1 / 6) / 0.15)
+    np.testing.assert_allclose(odd[2, 1], -0.9)  # clutter, at −1 and −0.8
+    np.testing.assert_allclose(odd[:, 2], 0, atol=1e-12)
+
+
+@pytest.mark.parametrize("height", [128, 700])
+@pytest.mark.parametrize("seed", range(2))
+def test_an_edge_all_around_is_found_on_its_great_circle(height: int, seed: int) -> None:
+    normal = unit(np.random.default_rng(seed).normal(size=3))
+    side = np.clip(equirect_directions((height, 2 * height)) @ normal * height / 3, -1, 1)
+    gray = (130 + 60 * side).astype(np.uint8)
+    segments = find_line_segments(np.repeat(gray[..., None], 3, axis=-1))
+    sines = np.linalg.norm(np.cross(segments.normals_xyz, normal), axis=1)
+    assert np.median(sines) < math.radians(0.3)
+    # No end is two pixels off; where a corner of a face is cut, the piece is short.
+    pixel = math.radians(90) / max(128, height * 2 / math.pi)
+    assert (sines * segments.lengths_rad / 2).max() < 2 * pixel
+    assert 0.9 < segments.lengths_rad.sum() / (2 * math.pi) < 1.05
+    assert np.abs(segments.middles_xyz @ normal).max() < pixel
+    np.testing.assert_allclose(np.linalg.norm(segments.middles_xyz, axis=1), 1)
+    assert np.all(np.diff(segments.lengths_rad) <= 0)
+
+
+def _segments(
+    axes: NDArray[np.float64], counts: tuple[int, int, int], others: int, seed: int = 0
+) -> LineSegments:
+    """Exact segments along three axes, and some of random directions."""
+    rng = np.random.default_rng(seed)
+    along = np.concatenate([np.repeat(axes.T, counts, axis=0), unit(rng.normal(size=(others, 3)))])
+    normals = unit(np.cross(along, rng.normal(size=along.shape)))
+    middles = unit(np.cross(normals, rng.normal(size=along.shape)))
+    return LineSegments(normals, middles, rng.uniform(0.1, 0.6, len(along)))
+
+
+@pytest.mark.parametrize("counts", [(20, 20, 20), (40, 15, 0), (5, 30, 5)])
+@pytest.mark.parametrize("seed", range(2))
+def test_frames_of_exact_segments(counts: tuple[int, int, int], seed: int) -> None:
+    axes = random_rotation(np.random.default_rng(seed))
+    segments = _segments(axes, counts, others=30, seed=seed)
+    frame = find_manhattan_frames(segments)[0]
+    agreement = np.abs(frame.axes_xyz.T @ axes)
+    np.testing.assert_allclose(np.sort(agreement, axis=1), np.tile([0, 0, 1.0], (3, 1)), atol=0.02)
+    np.testing.assert_allclose(frame.axes_xyz.T @ frame.axes_xyz, np.eye(3), atol=1e-9)
+    order = agreement.argmax(axis=0)
+    weights = np.minimum(segments.lengths_rad, 0.5)
+    exact = np.add.reduceat(np.append(weights, 0), [0, *np.cumsum(counts)])[:3] * (
+        np.array(counts) > 0
+    )
+    assert np.all(frame.support[order] >= 0.9 * exact / weights.sum())
+    assert frame.significance > 3
+
+
+@pytest.mark.parametrize("count", [4, 40])
+def test_random_segments_are_not_significant(count: int) -> None:
+    best = [
+        find_manhattan_frames(_segments(np.eye(3), (0, 0, 0), count, seed))[0].significance
+        for seed in range(10)
+    ]
+    assert max(best) < 2.2
+
 
 _UP = np.array([0.0, 0.0, 1.0])
 

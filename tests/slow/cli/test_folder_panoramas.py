@@ -4,14 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import pytest
-import torch
 
-from tests.cli.tiny_runs import results, run_command, run_in
+from tests.cli.tiny_runs import results, run_command
 from tests.datamodules.folder.folder_format import (
-    NAMES,
-    pixels_of_classes,
     write_data_set,
 )
 
@@ -37,27 +33,6 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_data_set(folder, scenes=5, each=2, height=_ROWS, depth=True)
     (folder / "test.txt").write_text("\n".join(_TEST))
     return folder
-
-
-@pytest.fixture(scope="module")
-def own_run(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished run with depth."""
-    folder = tmp_path_factory.mktemp("run")
-    arguments = [*_SETTINGS, f"data.root='{root}'", "data.inputs=[rgb,depth]"]
-    arguments += ["data.normalization={mean:[0.1,0.2,0.3,2],std:[0.5,0.5,0.5,1.5]}"]
-    run_in(folder, "train", *arguments, "hydra.run.dir=finished")
-    return folder / "finished"
-
-
-def test_results_and_checkpoint_are_of_the_own_classes(root: Path, own_run: Path) -> None:
-    found = results(own_run)
-    assert found["images"] == 2
-    assert [row["class"] for row in found["classes"]] == list(NAMES)
-    assert np.array(found["confusion"]).sum(axis=1).tolist() == pixels_of_classes(root, _TEST)
-    assert len(list((own_run / "panels").glob("*.png"))) == 1
-    content = torch.load(own_run / "checkpoints" / "best.ckpt", weights_only=True)
-    assert content["class_names"] == ["unknown", *NAMES]
-    assert content["normalization"] == {"mean": [0.1, 0.2, 0.3, 2], "std": [0.5, 0.5, 0.5, 1.5]}
 
 
 def test_two_panoramas_train_and_the_last_epoch_is_tested(
