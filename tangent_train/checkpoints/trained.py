@@ -18,8 +18,7 @@ from torch import Tensor, nn
 from datamodules.core.inputs import Input, Normalization, channel_names
 from models.onnx_network import OnnxNetwork
 from tangent_train.checkpoints.content import GROUPS, INPUTS, NORMALIZATION, read_checkpoint
-from tangent_train.checkpoints.image_sizes import size_multiple_of
-from tangent_train.checkpoints.scores import Groups, Scores
+from tangent_train.checkpoints.scores import Groups, Scores, size_multiple_of
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import parse_json
 from tangent_train.registry import SettingsFile, Text, check_fields, check_plain, make

@@ -25,8 +25,7 @@ from tangent_train.callbacks.checkpoints import AtomicCheckpointIO, CheckpointCo
 from tangent_train.callbacks.progress import ProgressBar
 from tangent_train.callbacks.results import evaluated, pictures, write_evaluation
 from tangent_train.checkpoints.content import read_checkpoint, write_settings
-from tangent_train.checkpoints.image_sizes import size_multiple_of
-from tangent_train.checkpoints.scores import Scores
+from tangent_train.checkpoints.scores import Scores, size_multiple_of
 from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
 from tangent_train.cli.build import Settings, build, build_trained, check_fits, shown
 from tangent_train.cli.stored import GROUPS, run_settings

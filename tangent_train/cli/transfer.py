@@ -18,7 +18,6 @@ from rich.console import Console
 
 from tangent_train.cli.stored import StoredNetwork, run_settings
 from tangent_train.cli.transfer_stages import (
-    STUDY,
     Stage,
     plan,
     run_stage,
@@ -222,13 +221,14 @@ def _report(
     from tangent_train.results.record import load_record
 
     found: dict[Any, list[Any]] = defaultdict(list)
+    study = bool(config.study_levels)
     for stage in stages:
-        if not config.study or stage.view:
-            key = stage.config["level"] if config.study else stage.name
+        if not study or stage.view:
+            key = stage.config["level"] if study else stage.name
             found[key].append(load_record(stage.folder))
-    if config.study:
+    if study:
         level = trained_level(config) if trained is None else trained.level
-        name, report = STUDY, levels_report(found, level)
+        name, report = "angular_resolution", levels_report(found, level)
     else:
         cells = {s.name: (s.view or "S", s.condition) for s in stages if s.condition}
         name, report = "transfer", transfer_report(found, cells)

@@ -34,17 +34,14 @@ from tangent_train.errors import DataError, SettingError
 from tangent_train.files import parse_json, write_text
 from tangent_train.setting_rules import differing_settings
 
-__all__ = ["STUDY", "Stage", "State", "plan", "run_stage", "stage_command", "stage_state"]
-
-STUDY = "angular_resolution"
-"""The one study there is."""
+__all__ = ["Stage", "State", "plan", "run_stage", "stage_command", "stage_state"]
 
 State = Literal["new", "begun", "finished"]
 """Progress of a stage. One that only evaluates is either new or finished."""
 
 _OF_THE_TRANSFER = (
     *("photos", "fine_tuning", "compare", "conditions", "folds", "seeds", "checkpoint"),
-    *("study", "study_levels", "study_max_rows", "class_map", "unmapped", "trust"),
+    *("study_levels", "study_max_rows", "class_map", "unmapped", "trust"),
 )
 """Settings that a stage's config does not have."""
 
@@ -93,8 +90,6 @@ def plan(config: DictConfig, folder: Path, views: Mapping[str, Mapping[str, Any]
     Raises:
         SettingError: A setting of the transfer is invalid.
     """
-    if config.study not in (None, STUDY):
-        raise SettingError("study", found=repr(config.study), expected=f"{STUDY}, or null")
     if config.class_map is not None and config.checkpoint is None:
         raise SettingError(
             "class_map",
@@ -119,7 +114,7 @@ class _Planner:
         self._given = config.checkpoint
 
     def all(self, views: Mapping[str, Mapping[str, Any]]) -> Iterator[Stage]:
-        settings, study = self._settings(), self._config.study
+        settings, study = self._settings(), self._config.study_levels
         if self._has_photos() and not (study and self._given):
             yield self._stage("P", settings, "evaluate" if self._given else "train")
         for view, changes in (views if study else {"": {}, **views}).items():

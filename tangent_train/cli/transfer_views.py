@@ -42,7 +42,7 @@ def views_of(config: DictConfig, trained: TrainedNetwork | None) -> dict[str, di
     Raises:
         SettingError: The list is invalid.
     """
-    if config.study is not None:
+    if config.study_levels:
         most = config.study_max_rows
         levels = {n: 2 ** (n + 1) for n in numbers(config, "study_levels", 0)}
         rows = {n: own if most is None else min(own, most) for n, own in levels.items()}

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from tangent_train.checkpoints.content import read_checkpoint
-from tangent_train.checkpoints.image_sizes import size_multiple_of
+from tangent_train.checkpoints.scores import size_multiple_of
 from tangent_train.checkpoints.trained import completed_settings, load_trained
 from tangent_train.errors import DataError
 from tests.tasks.odd_networks import Looking, OneSize

@@ -171,7 +171,7 @@ def test_a_network_that_knows_no_run_is_only_evaluated(runs: PretendedRuns, tmp_
 
 
 def test_the_study_of_the_angular_resolution(runs: PretendedRuns) -> None:
-    run_transfer("study=angular_resolution", "study_levels=[4,6]")
+    run_transfer("study_levels=[4,6]")
     files = {path.name for path in HERE.glob("angular_resolution.*")}
     assert files == {f"angular_resolution.{suffix}" for suffix in ("md", "csv", "json", "png")}
     assert "against level 4" in (HERE / "angular_resolution.md").read_text()

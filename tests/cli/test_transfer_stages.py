@@ -149,7 +149,7 @@ def test_the_plan_for_networks_of_photos() -> None:
 
 
 def test_the_study_has_a_stage_for_every_level(rooms: DictConfig) -> None:
-    study: Any = {"study": "angular_resolution", "study_levels": [5, 7, 9]}
+    study: Any = {"study_levels": [5, 7, 9]}
     stages = _stages(rooms, **study, representation__dim=60)
     assert [(s.name, s.view) for s in stages.values()] == [
         *(("P", ""), ("S-level-5", "level-5"), ("S-level-7", "level-7"), ("S-level-9", "level-9"))
@@ -182,7 +182,6 @@ def test_data_without_folds() -> None:
         ("fine_tuning.epochs", [1, 1]),
         ("folds", [1.5]),
         ("seeds", [-1]),
-        ("study", "everything"),
         ("compare", "erp"),
         ("compare", ["erp", "erp"]),
         ("compare", [{"option": "erp"}]),

@@ -10,8 +10,7 @@ import torch
 from torch import nn
 
 from datamodules.core.inputs import Input, Normalization
-from tangent_train.checkpoints.image_sizes import size_multiple_of
-from tangent_train.checkpoints.scores import Scores
+from tangent_train.checkpoints.scores import Scores, size_multiple_of
 from tangent_train.checkpoints.trained import TrainedNetwork, completed_settings
 from tangent_train.cli.build import build
 from tangent_train.registry import SettingsFile, make

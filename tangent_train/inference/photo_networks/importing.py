@@ -12,8 +12,7 @@ from typing import Any
 import torch
 
 from models.onnx_network import OnnxNetwork
-from tangent_train.checkpoints.image_sizes import size_multiple_of
-from tangent_train.checkpoints.scores import Groups, Scores
+from tangent_train.checkpoints.scores import Groups, Scores, size_multiple_of
 from tangent_train.checkpoints.trained import (
     METADATA_KEY,
     TrainedNetwork,

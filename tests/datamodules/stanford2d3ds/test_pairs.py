@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datamodules.stanford2d3ds.pairs import StanfordPairs, published_pairs
-from datamodules.stanford2d3ds.poses import read_panorama_pose
+from datamodules.stanford2d3ds.pairs import StanfordPairs, published_pairs, read_panorama_pose
 from datamodules.synthrooms.datamodule import SynthRoomsPairs
 from datamodules.synthrooms.generate import generate_rooms
 from datamodules.synthrooms.settings import RoomSettings

@@ -26,7 +26,7 @@ from datamodules.images.pixel_files import read_depth_m, read_pixels
 from datamodules.images.png import check_png, read_color_png, read_depth_png
 from datamodules.modelnet40.meshes import read_off
 from datamodules.stanford2d3ds.label_table import CLASSES, LabelTable
-from datamodules.stanford2d3ds.poses import read_panorama_pose
+from datamodules.stanford2d3ds.pairs import read_panorama_pose
 from datamodules.stanford2d3ds.reader import read_camera_matrix
 from datamodules.zind.homes import list_panoramas
 from tangent_train.errors import DataError
