@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import redirect_stdout
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
@@ -24,7 +25,7 @@ def check(settings: Mapping[str, Any]) -> None:
     """Read the whole data set of a run; exit with status 1 if there are problems.
 
     On a terminal the problems are a table, elsewhere lines of file, finding and remedy with tabs
-    between them; the summary goes to standard error then.
+    between them; progress and the summary go to standard error then.
 
     Args:
         settings: The composed ``check.yaml``.
@@ -32,7 +33,8 @@ def check(settings: Mapping[str, Any]) -> None:
     representation = make(settings["representation"], "representation")
     data = make(settings["data"], "data", representation=representation)
     console = Console(highlight=False)
-    problems, count = data.check()
+    with redirect_stdout(sys.stderr):  # progress is none of the problems that are listed
+        problems, count = data.check()
     listed = problems.listed()
     read = f"{counted(count, data.noun)} of {_printable(str(data.root))} checked"
     if listed and console.is_terminal:
