@@ -20,16 +20,10 @@ from tangent_train.rendering import kernels
 from tangent_train.rendering.compiled import over_rows
 from tangent_train.rendering.tables import sight_of
 
-__all__ = ["NO_LABELS", "NO_OWNERS", "NO_TOTAL", "add_to_panorama", "zero_sums"]
+__all__ = ["NO_OWNERS", "add_to_panorama", "label_panorama", "without_blocks", "zero_sums"]
 
 NO_OWNERS: NDArray[np.uint8] = np.empty((0, 0), np.uint8)
 """Feather instead of taking each pixel from its owner."""
-
-NO_TOTAL: NDArray[np.float32] = np.empty((0, 0, 0), np.float32)
-"""Write labels instead of adding up."""
-
-NO_LABELS: NDArray[np.uint8] = np.empty((0, 0), np.uint8)
-"""Add up instead of writing labels."""
 
 _IN_MEMORY_BYTES = 2**31
 """Sums of more bytes are kept in a temporary file."""
@@ -44,13 +38,12 @@ def add_to_panorama(
     faces: NDArray[np.int64],
     shape: tuple[int, int],
     rows: slice,
-    owner: NDArray[np.integer] = NO_OWNERS,
-    total: NDArray[np.float32] = NO_TOTAL,
-    labels: NDArray[Any] = NO_LABELS,
+    owner: NDArray[np.integer],
+    total: NDArray[np.float32],
     *,
     softmax: bool = False,
 ) -> None:
-    """Add some images to rows of a panorama; the arrays are those of these rows.
+    """Add the weighted scores of some images to rows of a panorama.
 
     Args:
         scores: ``(n, K, d, d)`` of the images.
@@ -58,34 +51,54 @@ def add_to_panorama(
         faces: ``(n,)`` which images they are.
         shape: ``(H, W)`` of the panorama.
         rows: Rows of it, without a step.
-        owner: ``(rows, W)`` from `owners`; none to feather.
-        total: ``(rows, W, K)`` weighted sums, changed; for the sum of the weights, add a channel
-            of ones.
-        labels: ``(rows, W)`` best classes, written where there is no `total`; feathered ones need
-            all images at once.
-        softmax: Whether scores become probabilities: those of owners after they are interpolated,
-            feathered ones before.
+        owner: ``(rows, W)`` from `owners`, weights are 1 there; or `NO_OWNERS`.
+        total: Sums of these rows, from `zero_sums`, changed.
+        softmax: Whether to add probabilities: those of owners are of the interpolated scores,
+            feathered ones are interpolated.
     """
     step = max(64, _SPANS // max(1, len(faces)))
     for start in range(rows.start, rows.stop, step):
         band = slice(start, min(rows.stop, start + step))
         own = slice(band.start - rows.start, band.stop - rows.start)
         sight = sight_of(grid, faces, shape, band, owner[own])
-        arguments = (np.ascontiguousarray(scores), sight, softmax, total[own], labels[own])
+        arguments = (np.ascontiguousarray(scores), sight, softmax, total[own])
         over_rows(kernels.add_images, band.stop - band.start, shape[1], *arguments)
 
 
+def label_panorama(
+    scores: NDArray[np.float32],
+    grid: PinholeGrid,
+    faces: NDArray[np.int64],
+    owner: NDArray[np.integer],
+    labels: NDArray[Any],
+) -> None:
+    """Write the best classes of all pixels that some images own.
+
+    Args:
+        scores: ``(n, K, d, d)`` of the images.
+        grid: Their geometry.
+        faces: ``(n,)`` which images they are.
+        owner: ``(H, W)`` from `owners`.
+        labels: ``(H, W)``, changed.
+    """
+    sight = sight_of(grid, faces, owner.shape, slice(0, len(owner)), owner)
+    over_rows(kernels.label_images, *owner.shape, np.ascontiguousarray(scores), sight, labels)
+
+
 def zero_sums(shape: tuple[int, int], channels: int) -> NDArray[np.float32]:
-    """``(H, W, K)`` sums, 0; beyond 2 GiB in a temporary file without a name.
+    """Sums in blocks of eight channels, 0; beyond 2 GiB in a temporary file without a name.
 
     Args:
         shape: ``(H, W)``.
         channels: K.
 
+    Returns:
+        ``(H, K / 8, W, 8)``, see `kernels` and `without_blocks`.
+
     Raises:
         SettingError: They do not fit on the disk (of the folder TMPDIR).
     """
-    whole = (*shape, channels)
+    whole = (shape[0], -(-channels // kernels.LANES), shape[1], kernels.LANES)
     nbytes = math.prod(whole) * 4
     if nbytes <= _IN_MEMORY_BYTES:
         return np.zeros(whole, np.float32)
@@ -101,3 +114,8 @@ def zero_sums(shape: tuple[int, int], channels: int) -> NDArray[np.float32]:
                 remedy="Set TMPDIR to a folder on a larger disk, or use blend=nearest for labels.",
             ) from error
         return np.memmap(file, np.float32, "r+", shape=whole)
+
+
+def without_blocks(total: NDArray[np.float32], channels: int) -> NDArray[np.float32]:
+    """Sums ``(h, W, K)`` of those in blocks."""
+    return total.swapaxes(1, 2).reshape(len(total), total.shape[2], -1)[..., :channels]

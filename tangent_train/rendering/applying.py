@@ -10,7 +10,12 @@ import torch
 from torch import Tensor
 
 from tangent_train.errors import SettingError
-from tangent_train.rendering.accumulate import NO_OWNERS, add_to_panorama, zero_sums
+from tangent_train.rendering.accumulate import (
+    NO_OWNERS,
+    add_to_panorama,
+    without_blocks,
+    zero_sums,
+)
 from tangent_train.rendering.backward import Blend, tangent_to_equirect
 from tangent_train.rendering.checks import check_blend, check_panorama
 from tangent_train.rendering.forward import Pixels, equirect_to_tangent
@@ -109,29 +114,28 @@ class _Means:
     ) -> None:
         self._grid, self._shape, self._channels = grid, shape, first.shape[3:]
         self._owner = NO_OWNERS if blend == "feather" else owners(grid, shape)
-        self._sums = zero_sums(shape, math.prod(self._channels))
-        self._weights = zero_sums(shape, 1) if blend == "feather" else None
+        self._feathered = blend == "feather"
+        self._sums = zero_sums(shape, math.prod(self._channels) + self._feathered)
 
     def add(self, results: NDArray[Any], faces: NDArray[np.int64]) -> None:
-        """Add those of some images."""
+        """Add those of some images, and a channel of their weights."""
         _check_alike(results, self._channels, "f")
-        flat = results.reshape(*results.shape[:3], -1)
-        self._add_to(self._sums, np.moveaxis(flat, -1, 1).astype(np.float32), faces)
-        if self._weights is not None:
-            self._add_to(self._weights, np.ones_like(flat[:, None, ..., 0], np.float32), faces)
-
-    def _add_to(
-        self, total: NDArray[np.float32], images: NDArray[np.float32], faces: NDArray[np.int64]
-    ) -> None:
+        images = np.moveaxis(results.reshape(*results.shape[:3], -1), -1, 1).astype(np.float32)
+        if self._feathered:
+            images = np.concatenate([images, np.ones_like(images[:, :1])], axis=1)
         whole = slice(0, self._shape[0])
-        add_to_panorama(images, self._grid, faces, self._shape, whole, self._owner, total)
+        add_to_panorama(images, self._grid, faces, self._shape, whole, self._owner, self._sums)
 
     def panorama(self) -> NDArray[np.float32]:
         """``(H, W[, K])``, in the memory of the sums."""
-        if self._weights is not None:
-            for sums, weights in zip(self._sums, self._weights, strict=True):
-                np.divide(sums, weights, out=sums)
-        return np.asarray(self._sums).reshape(*self._shape, *self._channels)
+        height, width = self._shape
+        count = math.prod(self._channels)
+        flat = np.asarray(self._sums).reshape(-1)
+        for i in range(height):
+            means = without_blocks(self._sums[i : i + 1], count + self._feathered)
+            means = means[..., :count] / (means[..., count:] if self._feathered else 1)
+            flat[i * width * count : (i + 1) * width * count] = means.ravel()
+        return flat[: height * width * count].reshape(height, width, *self._channels)
 
 
 class _Copies:

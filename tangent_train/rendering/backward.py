@@ -12,13 +12,21 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tangent_train.geometry import PinholeGrid
-from tangent_train.rendering.accumulate import NO_OWNERS, add_to_panorama
+from tangent_train.rendering import kernels
+from tangent_train.rendering.accumulate import (
+    NO_OWNERS,
+    add_to_panorama,
+    label_panorama,
+    without_blocks,
+    zero_sums,
+)
 from tangent_train.rendering.checks import (
     check_blend,
     check_images,
     check_interpolation,
     check_shape,
 )
+from tangent_train.rendering.compiled import over_rows
 from tangent_train.rendering.forward import Interpolation, Pixels
 from tangent_train.rendering.sampling import map_dtype
 from tangent_train.rendering.tables import image_table, owners, tensors_on
@@ -118,10 +126,13 @@ def _render_labels(
     result = torch.zeros((len(stacks), *shape), dtype=small, device=logits.device)
     for stack, labels in zip(stacks, result, strict=True):
         if compiled:
-            owner = owners(grid, shape) if blend == "nearest" else NO_OWNERS
-            faces, rows = np.arange(grid.num_images), slice(0, shape[0])
-            scores = stack.float().numpy()
-            add_to_panorama(scores, grid, faces, shape, rows, owner, labels=labels.numpy())
+            scores, faces = stack.float().numpy(), grid.face_indices()
+            if blend == "nearest":
+                label_panorama(scores, grid, faces, owners(grid, shape), labels.numpy())
+                continue
+            for rows, sums in _feathered_sums(scores, grid, shape):
+                arguments = sums, scores.shape[1], 0.0, labels.numpy()[rows]
+                over_rows(kernels.best_classes, len(sums), shape[1], *arguments)
         else:
             _torch_labels(stack, grid, shape, blend, labels.view(-1))
     return result.reshape(*logits.shape[:-4], *shape)
@@ -161,17 +172,27 @@ def _from_arrays(
 def _feathered(
     images: NDArray[np.float32], grid: PinholeGrid, shape: tuple[int, int]
 ) -> NDArray[np.float32]:
-    """``(H, W, C)`` average of ``(N, C, d, d)`` images; a compiled kernel, in bands of rows."""
-    panorama = np.zeros((*shape, images.shape[1]), np.float32)
-    faces, ones = np.arange(len(images)), np.ones_like(images[:, :1])
+    """``(H, W, C)`` average of ``(N, C, d, d)`` images."""
+    channels, ones = images.shape[1], np.ones_like(images[:, :1])
+    panorama = np.empty((*shape, channels), np.float32)
+    of_weights = _feathered_sums(ones, grid, shape)
+    for (rows, sums), (_, weights) in zip(
+        _feathered_sums(images, grid, shape), of_weights, strict=True
+    ):
+        panorama[rows] = without_blocks(sums, channels) / without_blocks(weights, 1)
+    return panorama
+
+
+def _feathered_sums(
+    images: NDArray[np.float32], grid: PinholeGrid, shape: tuple[int, int]
+) -> Iterator[tuple[slice, NDArray[np.float32]]]:
+    """Bands of rows and their weighted sums of ``(N, C, d, d)`` images, see `zero_sums`."""
     step = max(1, _BAND // shape[1])
     for start in range(0, shape[0], step):
         rows = slice(start, min(shape[0], start + step))
-        weights = np.zeros((rows.stop - start, shape[1], 1), np.float32)
-        add_to_panorama(images, grid, faces, shape, rows, total=panorama[rows])
-        add_to_panorama(ones, grid, faces, shape, rows, total=weights)
-        panorama[rows] /= weights
-    return panorama
+        sums = zero_sums((rows.stop - start, shape[1]), images.shape[1])
+        add_to_panorama(images, grid, grid.face_indices(), shape, rows, NO_OWNERS, sums)
+        yield rows, sums
 
 
 def _bands(

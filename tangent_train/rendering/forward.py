@@ -13,7 +13,7 @@ from torch import Tensor
 from tangent_train.geometry import PinholeGrid, checked_rotation
 from tangent_train.geometry.pinhole_grid import Faces
 from tangent_train.rendering.checks import check_panorama
-from tangent_train.rendering.kernels import sphere_rays
+from tangent_train.rendering.rays import sphere_rays
 from tangent_train.rendering.sampling import (
     EquirectMap,
     equirect_map,

@@ -1,10 +1,11 @@
-"""Compiled loops: positions on the sphere, owners of pixels, and adding images to a canvas.
+"""Compiled loops that add images to a canvas.
 
-A *canvas* is what images are put together on: a panorama, or a photo made of crops. Its pixel
-(i, j) looks along the ray ``(rows[i, 0] columns[0, j], rows[i, 0] columns[1, j], rows[i, 1])``;
-`sphere_rays` and `plane_rays` give these factors. An image sees the ray at its pixel (u, v) where
-``(u, v, 1)`` is proportional to its ``(3, 3)`` matrix times the ray, if the third number is
-positive.
+A *canvas* is what images are put together on: a panorama, or a photo made of crops. Its pixels
+look along `rays.Rays`. An image sees a ray at its pixel (u, v) where ``(u, v, 1)`` is proportional
+to its ``(3, 3)`` matrix times the ray, if the third number is positive.
+
+Scores are interpolated eight classes at a time. Arrays of *blocks* are ``(h, B, w, 8)``: for every
+row, the scores of the first eight classes at all its pixels, then those of the next eight.
 """
 
 from __future__ import annotations
@@ -13,23 +14,24 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from tangent_train.rendering.compiled import njit_exact, njit_fast
 
-__all__ = [
-    "Sight",
-    "add_images",
-    "best_classes",
-    "equirect_map",
-    "owners",
-    "plane_rays",
-    "seen_table",
-    "sphere_rays",
-]
+__all__ = ["LANES", "Sight", "add_images", "best_classes", "label_images", "seen_table"]
+
+LANES = 8
+"""Classes of a block."""
 
 _TILE = 64
 """Rows and columns at the equator of what is added to at once: its sums stay in the cache."""
+
+_LINE = 16
+"""Numbers that come from memory together."""
 
 _ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
 _LN_2, _LOG2_E = np.float32(math.log(2)), np.float32(1 / math.log(2))
@@ -37,8 +39,6 @@ _C3, _C4, _C5, _C6 = np.float32(1 / 6), np.float32(1 / 24), np.float32(1 / 120),
 _FLUSHED = np.float32(-40)
 
 Array = NDArray[Any]
-Rays = tuple[Array, Array]
-"""``(2, W)`` factors of the columns and ``(H, 2)`` factors of the rows, float64."""
 Tile = tuple[int, int, int, int]
 """First row and the one after the last, first column and the one after the last."""
 
@@ -65,115 +65,102 @@ class Sight(NamedTuple):
     owner: Array
 
 
-class _Seen(NamedTuple):
-    """Pixels of a tile that an image contributes to.
+class _Room(NamedTuple):
+    """Pixels of a tile that an image contributes to, and runs of neighbors.
 
     Attributes:
-        pixel: Flat indices of them where results go.
-        u: Columns in the image.
-        v: Rows in the image.
-        weight: Weights.
+        pixel: Where results of a pixel go.
+        u: Its column in the image.
+        v: Its row in the image.
+        weight: Its weight.
+        column: Whole part of the column.
+        row: Whole part of the row.
+        right: Rest of the column.
+        below: Rest of the row.
+        runs: ``(n, 4)`` image, row of the canvas, first column and the one after the last.
     """
 
     pixel: Array
     u: Array
     v: Array
     weight: Array
+    column: Array
+    row: Array
+    right: Array
+    below: Array
+    runs: Array
 
 
-def sphere_rays(shape: tuple[int, int]) -> Rays:
-    """Unit directions of a panorama's pixels: cos λ, sin λ and cos φ, sin φ."""
-    height, width = shape
-    lon = (np.arange(width) + 0.5) / width * 2 * np.pi - np.pi
-    lat = np.pi / 2 - (np.arange(height) + 0.5) / height * np.pi
-    return np.stack([np.cos(lon), np.sin(lon)]), np.stack([np.cos(lat), np.sin(lat)], -1)
+class _Taps(NamedTuple):
+    """The four pixels of a patch around every position, and their weights.
 
-
-def plane_rays(shape: tuple[int, int]) -> Rays:
-    """``(j, 1, i)`` of the pixels of an image: its homogeneous pixels in another order."""
-    height, width = shape
-    columns = np.stack([np.arange(width, dtype=np.float64), np.ones(width)])
-    return columns, np.stack([np.ones(height), np.arange(height, dtype=np.float64)], -1)
-
-
-@njit_exact
-def equirect_map(
-    start: int, stop: int, matrices: Array, columns: Array, rows: Array,
-    height: int, width: int, u: Array, v: Array,
-) -> None:  # fmt: skip
-    """ERP positions of the rays of canvases, one below the other, rows ``start:stop``.
-
-    Args:
-        start: First row.
-        stop: One past the last row.
-        matrices: ``(n, 3, 3)`` from each canvas's rays to directions of any length.
-        columns: ``(2, w)`` factors of the rays.
-        rows: ``(h, 2)`` factors of the rays.
-        height: Rows H of the ERP.
-        width: Columns W of the ERP.
-        u: ``(n h, w)`` columns in the ERP, written.
-        v: ``(n h, w)`` rows in the ERP, written.
+    Attributes:
+        first: Places of the upper left one in the first block of its row.
+        a: Weights of the upper left one.
+        b: Of the upper right one.
+        c: Of the lower left one.
+        d: Of the lower right one.
     """
-    for row in range(start, stop):
-        m = matrices[row // len(rows)]
-        i = row % len(rows)
-        c = rows[i, 1]
-        for j in range(columns.shape[1]):
-            a, b = rows[i, 0] * columns[0, j], rows[i, 0] * columns[1, j]
-            x = m[0, 0] * a + m[0, 1] * b + m[0, 2] * c
-            y = m[1, 0] * a + m[1, 1] * b + m[1, 2] * c
-            z = m[2, 0] * a + m[2, 1] * b + m[2, 2] * c
-            u[row, j] = (math.atan2(y, x) / (2 * math.pi) + 0.5) * width - 0.5
-            v[row, j] = (0.5 - math.atan2(z, math.sqrt(x * x + y * y)) / math.pi) * height - 0.5
+
+    first: Array
+    a: Array
+    b: Array
+    c: Array
+    d: Array
 
 
-@njit_exact
-def owners(
-    start: int, stop: int, centers: Array, neighbors: Array, inner: float,
-    columns: Array, rows: Array, face: Array,
-) -> None:  # fmt: skip
-    """Find the image with the nearest centre, for the ERP rows ``start:stop``.
+def _address(context: Any, builder: Any, kind: Any, array: Any, index: Any, target: Any) -> Any:
+    """Address of a number of an array, as one of `target`."""
+    data = context.make_array(kind)(context, builder, array).data
+    return builder.bitcast(builder.gep(data, [index]), target.as_pointer())
 
-    Steps to ever nearer centres, starting from the owner of the previous pixel.
 
-    Args:
-        start: First row.
-        stop: One past the last row.
-        centers: ``(N, 3)`` directions of the images' centres.
-        neighbors: ``(N, k)`` images around every image.
-        inner: Cosine of half the angle between the nearest two centres: a centre nearer than that
-            is the nearest.
-        columns: From `sphere_rays`.
-        rows: From `sphere_rays`.
-        face: ``(H, W)`` owners, written.
-    """
-    own = 0
-    for i in range(start, stop):
-        z = rows[i, 1]
-        for j in range(columns.shape[1]):
-            x, y = rows[i, 0] * columns[0, j], rows[i, 0] * columns[1, j]
-            best = centers[own, 0] * x + centers[own, 1] * y + centers[own, 2] * z
-            while best < inner:
-                nearer = own
-                for other in neighbors[own]:
-                    dot = centers[other, 0] * x + centers[other, 1] * y + centers[other, 2] * z
-                    if dot > best:
-                        best, nearer = dot, other
-                if nearer == own:
-                    break
-                own = nearer
-            face[i, j] = own
+@intrinsic  # type: ignore[untyped-decorator]
+def _add_eight(typing: Any, sums: Any, at: Any, scores: Any, places: Any, weights: Any) -> Any:
+    """Add four weighted runs of eight numbers to a run of sums; numba's loops do it one by one."""
+
+    def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        eight = ir.VectorType(ir.FloatType(), LANES)
+        everywhere = ir.VectorType(ir.IntType(32), LANES)([0] * LANES)
+        sums, at, scores, places, weights = arguments
+        target = _address(context, builder, signature.args[0], sums, at, eight)
+        total = builder.load(target, align=4)
+        for n in range(4):
+            place, weight = (builder.extract_value(part, n) for part in (places, weights))
+            source = _address(context, builder, signature.args[2], scores, place, eight)
+            one = builder.insert_element(eight(ir.Undefined), weight, ir.IntType(32)(0))
+            factors = builder.shuffle_vector(one, one, everywhere)
+            product = builder.fmul(builder.load(source, align=4), factors, flags=("contract",))
+            total = builder.fadd(total, product, flags=("contract",))
+        builder.store(total, target, align=4)
+        return context.get_dummy_value()
+
+    return types.void(sums, at, scores, places, weights), build
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def _fetch(typing: Any, array: Any, at: Any) -> Any:
+    """Tell the processor that a number of an array will be read soon."""
+
+    def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        byte, number = ir.IntType(8), ir.IntType(32)
+        array, at = arguments
+        place = _address(context, builder, signature.args[0], array, at, byte)
+        kind = ir.FunctionType(ir.VoidType(), [place.type, number, number, number])
+        call = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
+        builder.call(call, [place, number(0), number(3), number(1)])  # for reading, as data
+        return context.get_dummy_value()
+
+    return types.void(array, at), build
 
 
 @njit_fast
 def _project(
-    side: tuple[int, int], m: Array, row: Array, columns: Array, start: int, stop: int,
-    u: Array, v: Array, weight: Array,
-) -> None:  # fmt: skip
-    """Project neighbors in a row of the canvas into an image.
+    m: Array, row: Array, columns: Array, start: int, stop: int, u: Array, v: Array
+) -> None:
+    """Project neighbors in a row of the canvas into an image; u is infinite where it looks away.
 
     Args:
-        side: Rows and columns of the image.
         m: ``(3, 3)`` from rays to homogeneous pixels.
         row: ``(2,)`` factors of the row.
         columns: ``(2, W)`` factors of the columns.
@@ -181,28 +168,57 @@ def _project(
         stop: One past the last column.
         u: ``(n,)`` columns in the image, written.
         v: ``(n,)`` rows in the image, written.
-        weight: ``(n,)`` feather weights, written.
     """
     ux, uy, uz = row[0] * m[0, 0], row[0] * m[0, 1], row[1] * m[0, 2]
     vx, vy, vz = row[0] * m[1, 0], row[0] * m[1, 1], row[1] * m[1, 2]
     wx, wy, wz = row[0] * m[2, 0], row[0] * m[2, 1], row[1] * m[2, 2]
     xs, ys = columns[0, start:stop], columns[1, start:stop]
-    per_column, per_row = 2 / side[1], 2 / side[0]
     for p in range(len(xs)):
         x, y = xs[p], ys[p]
         near = 1 / (wx * x + wy * y + wz)
-        across, down = (ux * x + uy * y + uz) * near, (vx * x + vy * y + vz) * near
-        u[p], v[p] = across, down
-        a, b = (across + 0.5) * per_column - 1, (down + 0.5) * per_row - 1
-        inside = max(1 - a * a, 0.0) * max(1 - b * b, 0.0)
-        weight[p] = math.sqrt(inside) if near > 0 else 0.0
+        u[p] = (ux * x + uy * y + uz) * near if near > 0 else np.inf
+        v[p] = (vx * x + vy * y + vz) * near
 
 
 @njit_fast
-def _room(pixels: int) -> _Seen:
-    """Room for a list; one array each, as numba takes the parts of a common one for strided."""
+def _feather(side: tuple[int, int], u: Array, v: Array, weight: Array) -> int:
+    """Write feather weights, 0 outside the image; returns how many are."""
+    per_column, per_row, outside = 2 / side[1], 2 / side[0], 0
+    for p in range(len(weight)):
+        a, b = (u[p] + 0.5) * per_column - 1, (v[p] + 0.5) * per_row - 1
+        weight[p] = math.sqrt(max(1 - a * a, 0.0) * max(1 - b * b, 0.0))
+        outside += weight[p] <= 0
+    return outside
+
+
+@njit_fast
+def _room(pixels: int) -> _Room:
+    """Room for a tile; one array each, as numba takes the parts of a common one for strided."""
     u, v, weight = np.empty(pixels), np.empty(pixels), np.empty(pixels)
-    return _Seen(np.empty(pixels, np.int64), u, v, weight)
+    column, row = np.empty(pixels, np.int32), np.empty(pixels, np.int32)
+    right, below = np.empty(pixels, np.float32), np.empty(pixels, np.float32)
+    pixel, runs = np.empty(pixels, np.int64), np.empty((pixels, 4), np.int32)
+    return _Room(pixel, u, v, weight, column, row, right, below, runs)
+
+
+@njit_fast
+def _room_for_taps(pixels: int) -> _Taps:
+    """Likewise."""
+    a, b = np.empty(pixels, np.float32), np.empty(pixels, np.float32)
+    c, d = np.empty(pixels, np.float32), np.empty(pixels, np.float32)
+    return _Taps(np.empty(pixels, np.int32), a, b, c, d)
+
+
+@njit_fast
+def _part(room: Array, shape: tuple[int, int, int, int]) -> Array:
+    """The beginning of an array, in a shape."""
+    return room[: shape[0] * shape[1] * shape[2] * shape[3]].reshape(shape)
+
+
+@njit_fast
+def _enough(room: Array, size: int) -> Array:
+    """A flat array, or a new one if it is too small."""
+    return room if len(room) >= size else np.empty(size, room.dtype)
 
 
 @njit_fast
@@ -213,113 +229,128 @@ def _count(sight: Sight) -> int:
 
 
 @njit_fast
-def _mark_owners(tile: Tile, owner: Array, owns: Array) -> None:
-    """Mark the images that own a pixel of a tile; all of them if they are feathered."""
-    top, bottom, left, right = tile
-    owns[:] = len(owner) == 0
-    if len(owner) == 0:
-        return
-    for i in range(top, bottom):
-        for j in range(left, right):
-            owns[owner[i, j]] = True
+def _owned_runs(tile: Tile, owner: Array, runs: Array, owns: Array) -> int:
+    """Find neighbors in the rows of a tile that one image owns; returns how many runs there are.
 
-
-@njit_fast
-def _list_owned(
-    tile: Tile, m: int, side: tuple[int, int], sight: Sight, step: tuple[int, int], seen: _Seen
-) -> int:
-    """See `_list_pixels`, of images that have weight 1 where they are the owner."""
+    Args:
+        tile: The tile.
+        owner: ``(H, W)``.
+        runs: ``(n, 4)`` image, row, first column and the one after the last, written.
+        owns: Whether an image owns a pixel, written.
+    """
     top, bottom, left, right = tile
-    pixel, u, v, weight = seen
-    count, image = 0, sight.images[m]
+    owns[:] = False
+    count = 0
     for i in range(top, bottom):
-        owner, at = sight.owner[i], i * step[0] + step[1]
-        stop = left
-        while stop < right:
-            start = stop
-            while start < right and owner[start] != image:
-                start += 1
-            stop = start
-            while stop < right and owner[stop] == image:
-                stop += 1
-            _project(
-                side, sight.matrices[m], sight.rows[i], sight.columns, start, stop,
-                u[count:], v[count:], weight[count:],
-            )  # fmt: skip
-            pixels, weights = pixel[count:], weight[count:]
-            for p in range(stop - start):
-                pixels[p], weights[p] = at + start + p, 1.0
-            count += stop - start
+        line, start = owner[i], left
+        for j in range(left + 1, right + 1):
+            if j == right or line[j] != line[start]:
+                owns[line[start]] = True
+                runs[count, 0], runs[count, 1] = line[start], i
+                runs[count, 2], runs[count, 3] = start, j
+                count, start = count + 1, j
     return count
 
 
 @njit_fast
-def _list_seen(
-    tile: Tile, m: int, side: tuple[int, int], sight: Sight, step: tuple[int, int], seen: _Seen
-) -> int:
-    """See `_list_pixels`, of images that are feathered."""
+def _seen_runs(tile: Tile, m: int, sight: Sight, runs: Array) -> int:
+    """See `_owned_runs`, of pixels of which image m may see something."""
     top, bottom, left, right = tile
-    columns, (pixel, u, v, weight) = sight.columns, seen
-    count = 0
+    width, count = sight.columns.shape[1], 0
     for i in range(top, bottom):
         begin, span = sight.spans[m, i, 0], sight.spans[m, i, 1]
-        at = i * step[0] + step[1]
-        for back in range(0, columns.shape[1] + 1, columns.shape[1]):
+        for back in range(0, width + 1, width):
             start, stop = max(left, begin - back), min(right, begin + span - back)
-            if start >= stop:
-                continue
-            _project(
-                side, sight.matrices[m], sight.rows[i], columns, start, stop,
-                u[count:], v[count:], weight[count:],
-            )  # fmt: skip
-            first = count
-            for p in range(first, first + stop - start):
-                if weight[p] > 0:
-                    u[count], v[count], weight[count] = u[p], v[p], weight[p]
-                    pixel[count] = at + start + p - first
-                    count += 1
+            if start < stop:
+                runs[count, 0], runs[count, 1] = sight.images[m], i
+                runs[count, 2], runs[count, 3] = start, stop
+                count += 1
     return count
 
 
 @njit_fast
 def _list_pixels(
-    tile: Tile, m: int, side: tuple[int, int], sight: Sight, step: tuple[int, int], seen: _Seen
+    m: int, side: tuple[int, int], sight: Sight, found: int, step: tuple[int, int], room: _Room
 ) -> int:
-    """List the pixels of a tile that image m contributes to; returns how many.
+    """List the pixels of runs that image m contributes to; returns how many.
 
     Args:
-        tile: The tile.
         m: Index of the image in `sight`.
         side: Rows and columns of the image.
         sight: Geometry of images and canvas.
+        found: Number of runs, of any images.
         step: From a row to the next one where results go, and there the place of pixel (0, 0).
-        seen: The list, written.
+        room: Holds the runs; pixels, columns, rows and weights are written.
     """
-    if len(sight.owner) == 0:
-        return _list_seen(tile, m, side, sight, step, seen)
-    return _list_owned(tile, m, side, sight, step, seen)
+    pixel, u, v, weight = room.pixel, room.u, room.v, room.weight
+    count = 0
+    for n in range(found):
+        image, i, start, stop = room.runs[n]
+        if image != sight.images[m]:
+            continue
+        first, count = count, count + stop - start
+        row = sight.rows[i]
+        _project(sight.matrices[m], row, sight.columns, start, stop, u[first:], v[first:])
+        pixels, weights = pixel[first:count], weight[first:count]
+        for p in range(len(pixels)):
+            pixels[p], weights[p] = i * step[0] + step[1] + start + p, 1
+        if len(sight.owner) == 0 and _feather(side, u[first:], v[first:], weights) > 0:
+            last, count = count, first
+            for p in range(first, last):
+                if weight[p] > 0:
+                    u[count], v[count], weight[count] = u[p], v[p], weight[p]
+                    pixel[count] = pixel[p]
+                    count += 1
+    return count
 
 
 @njit_fast
-def _split(places: Array, count: int, whole: Array, share: Array) -> tuple[int, int]:
-    """Split positions along an axis of `count` pixels, clamped to them, for interpolation.
+def _split_axis(places: Array, count: int, whole: Array, rest: Array) -> tuple[int, int]:
+    """Split positions on an axis of `count` pixels, clamped to it, for interpolation.
 
     Args:
         places: ``(n,)``.
         count: Pixels of the axis.
         whole: ``(n,)`` the first of the two pixels around a position, written.
-        share: ``(n,)`` of the second, 0 to 1, written.
+        rest: ``(n,)`` share of the second, 0 to 1, written.
 
     Returns:
-        Least and greatest `whole`.
+        The first pixel, and how many there are up to the last.
     """
     least, greatest = np.int32(count), np.int32(0)
     for p in range(len(places)):
         place = min(max(places[p], 0.0), count - 1.0)
         first = min(np.int32(place), np.int32(count - 2))
-        whole[p], share[p] = first, place - first
+        whole[p], rest[p] = first, place - first
         least, greatest = min(least, first), max(greatest, first)
-    return int(least), int(greatest)
+    return int(least), int(greatest) - int(least) + 2
+
+
+@njit_fast
+def _split(n: int, side: tuple[int, int], room: _Room) -> tuple[int, int, int, int]:
+    """Split the columns and rows of n pixels; returns first row, first column, rows, columns."""
+    left, wide = _split_axis(room.u[:n], side[1], room.column, room.right)
+    top, high = _split_axis(room.v[:n], side[0], room.row, room.below)
+    return top, left, high, wide
+
+
+@njit_fast
+def _weigh(n: int, step: tuple[int, int], room: _Room, taps: _Taps) -> None:
+    """Write the taps of n pixels.
+
+    Args:
+        n: How many.
+        step: Places from a row to the next one, and the place of pixel (0, 0) of the image.
+        room: Their columns, rows and weights.
+        taps: Written.
+    """
+    first, a, b, c, d = taps
+    for p in range(n):
+        first[p] = room.row[p] * step[0] + room.column[p] + step[1]
+        lower = np.float32(room.weight[p]) * room.below[p]
+        upper = np.float32(room.weight[p]) - lower
+        b[p], d[p] = room.right[p] * upper, room.right[p] * lower
+        a[p], c[p] = upper - b[p], lower - d[p]
 
 
 @njit_fast
@@ -361,184 +392,326 @@ def _softmax_lines(lines: Array, highest: Array, factor: Array) -> None:
 
 
 @njit_fast
-def _copy_patch(
-    scores: Array, left: int, top: int, width: int, height: int, softmax: bool, patch: Array
-) -> None:
-    """Copy a part of ``(K, h, w)`` scores so that those of a pixel lie together."""
-    num_classes = scores.shape[0]
-    lines = np.empty((num_classes, width), np.float32)
-    highest, factor = np.ones(width, np.float32), np.ones(width, np.float32)
-    for y in range(height):
-        for k in range(num_classes):
-            line, there = lines[k], scores[k, top + y]
-            for x in range(np.uint64(width)):
-                line[x] = there[np.uint64(left) + x]
-        if softmax:
-            _softmax_lines(lines, highest, factor)
-        pixels = patch[y * width * num_classes :]
-        for x in range(np.uint64(width)):
-            at = x * np.uint64(num_classes)
-            for k in range(np.uint64(num_classes)):
-                pixels[at + k] = lines[k, x] * factor[x]
+def _fetch_row(scores: Array, first: int, size: int, width: int) -> None:
+    """Fetch a part of a row of all ``(K, h, w)`` scores, which begins at a place of the first."""
+    flat = scores.reshape(-1)
+    for k in range(scores.shape[0]):
+        for at in range(first + k * size, first + k * size + width + _LINE - 1, _LINE):
+            _fetch(flat, at)
 
 
 @njit_fast
-def _add_patch(
-    patch: Array, num_classes: np.uint64, width: int, origin: int, column: Array, row: Array,
-    right_share: Array, below_share: Array, weight: Array, pixel: Array, sums: Array,
-) -> None:  # fmt: skip
-    """Add weighted bilinear samples of a patch to sums.
-
-    Unsigned indices spare numba's test for negative ones.
+def _copy_patch(scores: Array, left: int, top: int, softmax: bool, patch: Array) -> None:
+    """Copy a part of the ``(K, h, w)`` scores of an image to blocks.
 
     Args:
-        patch: Scores of an image's pixels, row by row.
-        num_classes: K, scores of a pixel.
-        width: Columns of the patch.
-        origin: Place in the patch of pixel (0, 0) of the image.
-        column: ``(n,)`` columns in the image.
-        row: ``(n,)`` rows in the image.
-        right_share: ``(n,)`` of the pixels to the right.
-        below_share: ``(n,)`` of the pixels below.
-        weight: ``(n,)``.
-        pixel: ``(n,)`` where the sums are.
-        sums: K for every pixel, changed.
+        scores: Of the image.
+        left: First column of the part.
+        top: First row of the part.
+        softmax: Whether to copy probabilities.
+        patch: ``(height, B, width, 8)``, written.
     """
-    for p in range(np.uint64(len(column))):
-        a = np.uint64(row[p] * width + column[p] + origin) * num_classes
-        b, c = a + num_classes, a + np.uint64(width) * num_classes
-        d, to = c + num_classes, np.uint64(pixel[p]) * num_classes
-        whole = np.float32(weight[p])
-        lower = whole * below_share[p]
-        upper = whole - lower
-        wb, wd = right_share[p] * upper, right_share[p] * lower
-        wa, wc = upper - wb, lower - wd
+    num_classes, image_height, image_width = scores.shape
+    height, blocks, width, _ = patch.shape
+    count = np.uint64(width)
+    lines = np.zeros((LANES * blocks, width), np.float32)
+    highest, factor = np.ones(width, np.float32), np.ones(width, np.float32)
+    for y in range(height):
+        ahead = (top + y + 1) * image_width + left
+        _fetch_row(scores, ahead, image_height * image_width, width)
         for k in range(num_classes):
-            sums[to + k] += (
-                wa * patch[a + k] + wb * patch[b + k] + wc * patch[c + k] + wd * patch[d + k]
-            )
+            line, there = lines[k], scores[k, top + y]
+            for x in range(count):
+                line[x] = there[np.uint64(left) + x]
+        if softmax:
+            _softmax_lines(lines[:num_classes], highest, factor)
+        for b in range(blocks):
+            block, pixels = lines[LANES * b : LANES * (b + 1)], patch[y, b]
+            for x in range(count):
+                for k in range(np.uint64(LANES)):
+                    pixels[x, k] = block[k, x] * factor[x]
 
 
 @njit_fast
-def _best_class(sums: Array) -> int:
-    """Of the largest sum: the first of equal ones, and NaN never wins."""
-    best, label = np.float32(-np.inf), 0
-    for k in range(len(sums)):
-        better = sums[k] > best
-        best, label = (sums[k], k) if better else (best, label)
-    return label
+def _add_patch(patch: Array, taps: _Taps, pixel: Array, sums: Array) -> None:
+    """Add weighted bilinear samples of a patch to sums.
+
+    Args:
+        patch: ``(height, B, width, 8)`` scores of a part of an image.
+        taps: Of pixels.
+        pixel: ``(n,)`` where their sums are in the first block.
+        sums: ``(h, B, w, 8)``, changed.
+    """
+    scores, flat = patch.reshape(-1), sums.reshape(-1)
+    blocks, width = patch.shape[1], patch.shape[2]
+    right, below = LANES, LANES * blocks * width
+    for b in range(blocks):
+        for p in range(len(pixel)):
+            a = LANES * (np.int64(taps.first[p]) + b * width)
+            places = a, a + right, a + below, a + below + right
+            weights = taps.a[p], taps.b[p], taps.c[p], taps.d[p]
+            _add_eight(flat, LANES * (pixel[p] + b * sums.shape[2]), scores, places, weights)
 
 
 @njit_fast
-def _finish(
-    tile: Tile, covered: Array, sight: Sight, sums: Array, total: Array, labels: Array
+def _add_probabilities(
+    tile: Tile, covered: Array, owner: Array, num_classes: int, sums: Array, total: Array
 ) -> None:
-    """Add the probabilities of a tile's pixels to the totals, or write their labels."""
-    top, bottom, left, right = tile
-    p = 0
+    """Add the softmax of a tile's scores to the totals.
+
+    Args:
+        tile: The tile.
+        covered: Whether an image is among those that were added.
+        owner: ``(H, W)``.
+        num_classes: K.
+        sums: ``(height, B, width, 8)`` scores of the tile.
+        total: ``(H, B, W, 8)``, changed.
+    """
+    top, bottom, left = tile[0], tile[1], tile[2]
+    blocks, width = sums.shape[1], sums.shape[2]
+    lines = np.empty((LANES * blocks, width), np.float32)
+    highest, factor = np.empty(width, np.float32), np.empty(width, np.float32)
     for i in range(top, bottom):
-        for j in range(left, right):
-            of_pixel = sums[p]
-            p += 1
-            if len(sight.owner) > 0 and not covered[sight.owner[i, j]]:
-                continue
-            if len(total) == 0:
-                labels[i, j] = _best_class(of_pixel)
-                continue
-            highest = of_pixel[_best_class(of_pixel)]
-            whole = np.float32(0)
-            for k in range(len(of_pixel)):
-                of_pixel[k] = _exp(of_pixel[k] - highest)
-                whole += of_pixel[k]
-            factor = _ONE / whole if whole > 0 else _ZERO
-            for k in range(len(of_pixel)):
-                total[i, j, k] += of_pixel[k] * factor
+        for b in range(blocks):
+            for k in range(LANES):
+                lines[LANES * b + k] = sums[i - top, b, :, k]
+        _softmax_lines(lines[:num_classes], highest, factor)
+        for x in range(width):
+            if not covered[owner[i, left + x]]:
+                factor[x] = 0
+        for b in range(blocks):
+            block, pixels = lines[LANES * b : LANES * (b + 1)], total[i, b, left:]
+            for x in range(np.uint64(width)):
+                for k in range(np.uint64(LANES)):
+                    pixels[x, k] += block[k, x] * factor[x]
 
 
 @njit_fast
-def _tile_size(stretch: float) -> tuple[int, int]:
-    """Rows and columns of a tile that is about square on the sphere, of its first row's cos φ."""
-    rows = max(1, int(_TILE * math.sqrt(stretch)))
-    return rows, _TILE**2 // rows
+def _tiles(start: int, stop: int, sight: Sight) -> list[Tile]:
+    """Tiles of rows ``start:stop``, about square on the sphere."""
+    tiles, bottom, width = [], start, sight.columns.shape[1]
+    while bottom < stop:
+        top, stretch = bottom, abs(sight.rows[bottom, 0])
+        rows = max(1, int(_TILE * math.sqrt(stretch)))
+        bottom, across = min(stop, top + rows), _TILE**2 // rows
+        for left in range(0, width, across):
+            tiles.append((top, bottom, left, min(width, left + across)))  # noqa: PERF401
+    return tiles
 
 
 @njit_fast
 def add_images(
-    start: int, stop: int, scores: Array, sight: Sight, softmax: bool, total: Array, labels: Array
+    start: int, stop: int, scores: Array, sight: Sight, softmax: bool, total: Array
 ) -> None:
-    """Add images to rows ``start:stop`` of a canvas: weighted scores, or at once the best class.
+    """Add weighted scores of images to rows ``start:stop`` of a canvas.
 
-    Works tile by tile. The part of an image that a tile sees is copied so that the scores of a
-    pixel lie together, and those of all classes are interpolated at once.
+    Works tile by tile: the part of an image that a tile sees is copied to blocks.
 
     Args:
         start: First row.
         stop: One past the last row.
         scores: ``(n, K, h, w)`` float32, h and w at least 2.
         sight: Geometry of these images and the canvas.
-        softmax: Whether scores become probabilities: those of owners after they are interpolated,
-            feathered ones before.
-        total: ``(H, W, K)`` weighted sums, changed. Empty where only labels are wanted, for which
-            all images of a pixel have to come at once.
-        labels: ``(H, W)`` best classes, written where `total` is empty.
+        softmax: Whether to add probabilities: those of owners are of the interpolated scores,
+            feathered ones are interpolated.
+        total: ``(H, B, W, 8)`` sums, changed.
     """
-    num_classes, side = scores.shape[1], (scores.shape[2], scores.shape[3])
-    owned = len(sight.owner) > 0
-    at_once = len(total) > 0 and not (owned and softmax)
-    owns, covered = np.empty(_count(sight), np.bool_), np.zeros(_count(sight), np.bool_)
+    side, (_, blocks, width, _) = (scores.shape[2], scores.shape[3]), total.shape
+    owned, owns = len(sight.owner) > 0, np.ones(_count(sight), np.bool_)
+    afterwards, covered = softmax and owned, np.zeros(_count(sight), np.bool_)
     for image in sight.images:
         covered[image] = True
-    seen = _room(_TILE**2)
-    column, row = np.empty(_TILE**2, np.int32), np.empty(_TILE**2, np.int32)
-    right, below = np.empty(_TILE**2, np.float32), np.empty(_TILE**2, np.float32)
-    sums = total.reshape(-1) if at_once else np.empty(_TILE**2 * num_classes, np.float32)
-    patch = np.empty(0, np.float32)
-    bottom = start
-    while bottom < stop:
-        top = bottom
-        height, across = _tile_size(abs(sight.rows[top, 0]))
-        bottom = min(stop, top + height)
-        for left in range(0, sight.columns.shape[1], across):
-            tile = top, bottom, left, min(sight.columns.shape[1], left + across)
-            step = sight.columns.shape[1], 0
-            if not at_once:
-                sums[:] = 0
-                step = tile[3] - left, -top * (tile[3] - left) - left
-            _mark_owners(tile, sight.owner, owns)
-            for m in range(len(scores)):
-                if not owns[sight.images[m]]:
-                    continue
-                n = _list_pixels(tile, m, side, sight, step, seen)
-                if n == 0:
-                    continue
-                first, last = _split(seen.u[:n], side[1], column, right)
-                upper, lower = _split(seen.v[:n], side[0], row, below)
-                wide, high = last - first + 2, lower - upper + 2
-                if len(patch) < high * wide * num_classes:
-                    patch = np.empty(high * wide * num_classes, np.float32)
-                _copy_patch(scores[m], first, upper, wide, high, softmax and not owned, patch)
-                _add_patch(
-                    patch, np.uint64(num_classes), wide, -upper * wide - first,
-                    column[:n], row, right, below, seen.weight, seen.pixel, sums,
-                )  # fmt: skip
-            if not at_once:
-                _finish(tile, covered, sight, sums.reshape(-1, num_classes), total, labels)
+    room, taps = _room(_TILE**2), _room_for_taps(_TILE**2)
+    of_tile = np.empty(_TILE**2 * blocks * LANES if afterwards else 0, np.float32)
+    patch, found = np.empty(0, np.float32), 0
+    for tile in _tiles(start, stop, sight):
+        sums, step = total, (blocks * width, 0)
+        if afterwards:
+            shape = tile[1] - tile[0], blocks, tile[3] - tile[2], LANES
+            sums = _part(of_tile, shape)
+            sums[:] = 0
+            step = blocks * shape[2], -tile[0] * blocks * shape[2] - tile[2]
+        if owned:
+            found = _owned_runs(tile, sight.owner, room.runs, owns)
+        for m in range(len(scores)):
+            if not owns[sight.images[m]]:
+                continue
+            if not owned:
+                found = _seen_runs(tile, m, sight, room.runs)
+            n = _list_pixels(m, side, sight, found, step, room)
+            if n == 0:
+                continue
+            top, left, high, wide = _split(n, side, room)
+            _weigh(n, (blocks * wide, -top * blocks * wide - left), room, taps)
+            patch = _enough(patch, high * blocks * wide * LANES)
+            part = _part(patch, (high, blocks, wide, LANES))
+            _copy_patch(scores[m], left, top, softmax and not owned, part)
+            _add_patch(part, taps, room.pixel[:n], sums)
+        if afterwards:
+            _add_probabilities(tile, covered, sight.owner, scores.shape[1], sums, total)
 
 
 @njit_fast
-def best_classes(start: int, stop: int, total: Array, min_confidence: float, labels: Array) -> None:
-    """Best class of the ``(H, W, K)`` totals of `add_images`, rows ``start:stop``.
+def _best_of_part(scores: Array, left: int, top: int, highest: Array, best: Array) -> None:
+    """Best classes of a part of the ``(K, h, w)`` scores of an image.
 
-    K where its probability is below `min_confidence`.
+    Args:
+        scores: Of the image.
+        left: First column of the part.
+        top: First row of the part.
+        highest: ``(width,)`` room.
+        best: ``(height, width)``, written; −1 where no score is finite and the largest.
     """
+    _, image_height, image_width = scores.shape
+    width = best.shape[1]
+    for y in range(len(best)):
+        ahead = (top + y + 1) * image_width + left
+        _fetch_row(scores, ahead, image_height * image_width, width)
+        highest[:], of_row = -np.inf, best[y]
+        of_row[:] = 0
+        for k in range(scores.shape[0]):
+            line, label = scores[k, top + y], np.int32(k)
+            for x in range(np.uint64(width)):
+                score = line[np.uint64(left) + x]
+                better = score > highest[x]
+                of_row[x] = label if better else of_row[x]
+                highest[x] = score if better else highest[x]
+        for x in range(np.uint64(width)):
+            finite = -np.inf < highest[x] < np.inf
+            of_row[x] = of_row[x] if finite else -1
+
+
+@njit_fast
+def _interpolated_classes(
+    scores: Array, count: int, taps: _Taps, highest: Array, best: Array
+) -> None:
+    """Classes of the largest interpolated scores: of equal ones the first, and never NaN.
+
+    Args:
+        scores: ``(K, h, w)`` of an image.
+        count: Number of pixels n.
+        taps: Of the pixels, in the image.
+        highest: Room.
+        best: Of the pixels, written.
+    """
+    right, below = np.uint64(1), np.uint64(scores.shape[2])
+    highest[:count], best[:count] = -np.inf, 0
+    for k in range(len(scores)):
+        plane, label = scores[k].reshape(-1), np.int32(k)
+        for p in range(np.uint64(count)):
+            at = np.uint64(taps.first[p])
+            score = taps.a[p] * plane[at] + taps.b[p] * plane[at + right]
+            score += taps.c[p] * plane[at + below] + taps.d[p] * plane[at + below + right]
+            better = score > highest[p]
+            best[p] = label if better else best[p]
+            highest[p] = score if better else highest[p]
+
+
+@njit_fast
+def _write_alike(n: int, best: Array, corner: tuple[int, int], room: _Room, labels: Array) -> int:
+    """Write labels of pixels around which all four pixels of the image have the same best class.
+
+    Args:
+        n: How many pixels there are.
+        best: From `_best_of_part`.
+        corner: Row and column of the part in the image.
+        room: The pixels; the others are moved to the front.
+        labels: Flat, written.
+
+    Returns:
+        How many others there are.
+    """
+    flat, below = best.reshape(-1), np.uint64(best.shape[1])
+    others, right = 0, np.uint64(1)
+    for p in range(n):
+        at = np.uint64((room.row[p] - corner[0]) * best.shape[1] + room.column[p] - corner[1])
+        label = flat[at]
+        if label == flat[at + right] == flat[at + below] == flat[at + below + right] >= 0:
+            labels[room.pixel[p]] = label
+            continue
+        room.pixel[others] = room.pixel[p]
+        room.column[others], room.row[others] = room.column[p], room.row[p]
+        room.right[others], room.below[others] = room.right[p], room.below[p]
+        others += 1
+    return others
+
+
+@njit_fast
+def label_images(start: int, stop: int, scores: Array, sight: Sight, labels: Array) -> None:
+    """Write the best classes of the pixels that images own, in rows ``start:stop`` of a canvas.
+
+    Where the four pixels of an image around a position have the same best class, so has the
+    interpolated score: others are not interpolated.
+
+    Args:
+        start: First row.
+        stop: One past the last row.
+        scores: ``(n, K, h, w)`` float32, h and w at least 2.
+        sight: Geometry of these images and the canvas, with owners.
+        labels: ``(H, W)``, written.
+    """
+    side, width = (scores.shape[2], scores.shape[3]), labels.shape[1]
+    room, taps, owns = _room(_TILE**2), _room_for_taps(_TILE**2), np.empty(_count(sight), np.bool_)
+    highest, unlike = np.empty(max(side[1], _TILE**2), np.float32), np.empty(_TILE**2, np.int32)
+    best, flat = np.empty(0, np.int32), labels.reshape(-1)
+    for tile in _tiles(start, stop, sight):
+        found = _owned_runs(tile, sight.owner, room.runs, owns)
+        for m in range(len(scores)):
+            if not owns[sight.images[m]]:
+                continue
+            n = _list_pixels(m, side, sight, found, (width, 0), room)
+            top, left, high, wide = _split(n, side, room)
+            best = _enough(best, high * wide)
+            part = best[: high * wide].reshape((high, wide))
+            _best_of_part(scores[m], left, top, highest[:wide], part)
+            n = _write_alike(n, part, (top, left), room, flat)
+            _weigh(n, (side[1], 0), room, taps)
+            _interpolated_classes(scores[m], n, taps, highest, unlike)
+            for p in range(n):
+                flat[room.pixel[p]] = unlike[p]
+
+
+@njit_fast
+def _largest_of_lanes(blocks: Array, num_classes: int, highest: Array, block: Array) -> None:
+    """Largest sum of every lane, and its block.
+
+    Args:
+        blocks: ``(B, w, 8)`` sums of the pixels of a row.
+        num_classes: K.
+        highest: ``(8 w,)``, written.
+        block: ``(8 w,)``, written.
+    """
+    highest[:], block[:] = -np.inf, 0
+    for b in range(len(blocks)):
+        sums, lanes, this = blocks[b].reshape(-1), np.uint64(num_classes - LANES * b), np.int32(b)
+        for n in range(np.uint64(len(sums))):
+            better = sums[n] > highest[n] and n % np.uint64(LANES) < lanes
+            block[n] = this if better else block[n]
+            highest[n] = sums[n] if better else highest[n]
+
+
+@njit_fast
+def best_classes(
+    start: int, stop: int, total: Array, num_classes: int, min_confidence: float, labels: Array
+) -> None:
+    """Class of the largest total of `add_images`, rows ``start:stop``.
+
+    Of equal ones the first, and never NaN; K where totals are probabilities and the largest is
+    below `min_confidence`.
+    """
+    width = labels.shape[1]
+    highest, block = np.empty(LANES * width, np.float32), np.empty(LANES * width, np.int32)
     for i in range(start, stop):
-        for j in range(labels.shape[1]):
-            of_pixel = total[i, j]
-            best, whole = _best_class(of_pixel), _ZERO
-            for k in range(len(of_pixel)):
-                whole += of_pixel[k]
-            unsure = of_pixel[best] < min_confidence * whole
-            labels[i, j] = len(of_pixel) if unsure else best
+        _largest_of_lanes(total[i], num_classes, highest, block)
+        for j in range(width):
+            best, label = np.float32(-np.inf), 0
+            for lane in range(LANES):
+                largest, k = highest[LANES * j + lane], LANES * block[LANES * j + lane] + lane
+                better = largest > best or (largest == best and k < label)
+                best, label = (largest, k) if better else (best, label)
+            labels[i, j] = label
+            if min_confidence > 0 and best < min_confidence * total[i, :, j].sum():
+                labels[i, j] = num_classes
 
 
 @njit_exact
@@ -560,18 +733,21 @@ def seen_table(
         weight: ``(R, H, W)`` weights, written.
     """
     width = sight.columns.shape[1]
-    owns = np.empty(_count(sight), np.bool_)
-    seen = _room(width)
+    owned, owns = len(sight.owner) > 0, np.ones(_count(sight), np.bool_)
+    room, found = _room(width), 0
     for i in range(start, stop):
         tile = i, i + 1, 0, width
-        _mark_owners(tile, sight.owner, owns)
+        if owned:
+            found = _owned_runs(tile, sight.owner, room.runs, owns)
         for m in range(len(sight.matrices)):
             if not owns[sight.images[m]]:
                 continue
-            for p in range(_list_pixels(tile, m, side, sight, (0, 0), seen)):
-                j = seen.pixel[p]
+            if not owned:
+                found = _seen_runs(tile, m, sight, room.runs)
+            for p in range(_list_pixels(m, side, sight, found, (0, 0), room)):
+                j = room.pixel[p]
                 rank = count[i, j]
                 count[i, j] += 1
                 if rank < len(face):
-                    face[rank, i, j], weight[rank, i, j] = m, seen.weight[p]
-                    u[rank, i, j], v[rank, i, j] = seen.u[p], seen.v[p]
+                    face[rank, i, j], weight[rank, i, j] = m, room.weight[p]
+                    u[rank, i, j], v[rank, i, j] = room.u[p], room.v[p]

@@ -13,9 +13,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tangent_train.rendering import kernels
-from tangent_train.rendering.accumulate import NO_OWNERS, add_to_panorama, zero_sums
+from tangent_train.rendering.accumulate import (
+    NO_OWNERS,
+    add_to_panorama,
+    label_panorama,
+    without_blocks,
+    zero_sums,
+)
 from tangent_train.rendering.checks import check_blend
 from tangent_train.rendering.compiled import over_rows
+from tangent_train.rendering.rays import plane_rays
 from tangent_train.rendering.tables import owners
 
 if TYPE_CHECKING:
@@ -63,6 +70,7 @@ class ScoreMosaic:
         self.blend = blend
         self._labels = np.zeros(shape, np.uint8 if num_classes < 256 else np.uint16)
         averaged = averaged or blend == "feather" or min_confidence > 0
+        self._num_classes = num_classes
         self._min_confidence = min_confidence
         self._total = zero_sums(shape if averaged else (0, 0), num_classes)
         self._owned: tuple[object, NDArray[np.integer]] = None, NO_OWNERS
@@ -79,17 +87,13 @@ class ScoreMosaic:
             SettingError: The images of the grid do not overlap, as `feather` needs.
         """
         check_blend(self.blend, grid)
-        add_to_panorama(
-            _on_cpu(scores),
-            grid,
-            faces,
-            self.shape,
-            slice(0, self.shape[0]),
-            self._owners(grid, lambda: owners(grid, self.shape)),
-            self._total,
-            self._labels,
-            softmax=True,
-        )
+        owner = self._owners(grid, lambda: owners(grid, self.shape))
+        images = _on_cpu(scores), grid, faces
+        if len(self._total):
+            everywhere = self.shape, slice(0, self.shape[0])
+            add_to_panorama(*images, *everywhere, owner, self._total, softmax=True)
+        else:
+            label_panorama(*images, owner, self._labels)
 
     def add_crops(self, scores: Tensor, crops: PhotoCrops, which: NDArray[np.int64]) -> None:
         """Add some crops of a photo; each must be added once.
@@ -113,22 +117,25 @@ class ScoreMosaic:
             ]
             first, last = max(0, math.floor(left)), min(width, math.ceil(right))
             spans[number, max(0, math.floor(top)) : math.ceil(bottom)] = first, last - first
-        rays = kernels.plane_rays(self.shape)
+        rays = plane_rays(self.shape)
         owner = self._owners(crops, lambda: crops.owners(self.shape))
         sight = kernels.Sight(which, views, spans, *rays, owner)
-        arguments = (prepared, sight, True, self._total, self._labels)
-        over_rows(kernels.add_images, height, width, *arguments)
+        if len(self._total):
+            over_rows(kernels.add_images, height, width, prepared, sight, True, self._total)
+        else:
+            over_rows(kernels.label_images, height, width, prepared, sight, self._labels)
 
     def labels(self) -> NDArray[np.unsignedinteger]:
         """``(H, W)`` places of the best classes, of equal ones the first; K where unsure."""
         if len(self._total):
             least = self._min_confidence
-            over_rows(kernels.best_classes, *self.shape, self._total, least, self._labels)
+            arguments = (self._total, self._num_classes, least, self._labels)
+            over_rows(kernels.best_classes, *self.shape, *arguments)
         return self._labels
 
     def probabilities(self, rows: slice | NDArray[np.intp]) -> NDArray[np.float32]:
         """``(h, W, K)`` probabilities of some rows, which add up to 1; only where averaged."""
-        total: NDArray[np.float32] = self._total[rows]
+        total = without_blocks(self._total[rows], self._num_classes)
         return total / np.maximum(total.sum(axis=-1, keepdims=True), np.float32(1e-37))
 
     def _owners(

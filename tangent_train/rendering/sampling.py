@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from tangent_train.rendering import kernels
 from tangent_train.rendering.compiled import over_rows
+from tangent_train.rendering.rays import Rays, equirect_positions, plane_rays
 from tangent_train.rendering.taps import bilinear_equirect_taps, nearest_equirect_index
 
 __all__ = ["EquirectMap", "equirect_map", "map_dtype", "pinhole_equirect_map", "sample_map"]
@@ -117,7 +117,7 @@ def _gather(
 
 def equirect_map(
     matrices: NDArray[np.float64],
-    rays: kernels.Rays,
+    rays: Rays,
     shape: tuple[int, int],
     dtype: np.dtype[np.floating],
 ) -> EquirectMap:
@@ -125,7 +125,7 @@ def equirect_map(
 
     Args:
         matrices: ``(n, 3, 3)`` from the rays of each canvas to directions of any length.
-        rays: Of a canvas of ``(h, w)`` pixels, see `tangent_train.rendering.kernels`.
+        rays: Of a canvas of ``(h, w)`` pixels, see `tangent_train.rendering.rays`.
         shape: ``(H, W)`` of the ERP.
         dtype: float32 or float64; computed in float64 either way.
 
@@ -134,7 +134,7 @@ def equirect_map(
     """
     columns, rows = rays
     u, v = np.empty((2, len(matrices) * len(rows), columns.shape[1]), dtype)
-    over_rows(kernels.equirect_map, *u.shape, np.ascontiguousarray(matrices), *rays, *shape, u, v)
+    over_rows(equirect_positions, *u.shape, np.ascontiguousarray(matrices), *rays, *shape, u, v)
     return EquirectMap(u, v, np.flatnonzero((v < 0) | (v > shape[0] - 1)))
 
 
@@ -154,4 +154,4 @@ def pinhole_equirect_map(
         dtype: float32 or float64; computed in float64 either way.
     """
     matrices = world_from_pixel.reshape(-1, 3, 3)[..., [0, 2, 1]]
-    return equirect_map(matrices, kernels.plane_rays(size), shape, dtype)
+    return equirect_map(matrices, plane_rays(size), shape, dtype)

@@ -16,6 +16,7 @@ from tangent_train.errors import SettingError
 from tangent_train.geometry import PinholeGrid, equirect_latitudes, xyz_to_lonlat
 from tangent_train.rendering import kernels
 from tangent_train.rendering.compiled import over_rows
+from tangent_train.rendering.rays import find_owners, sphere_rays
 from tangent_train.rendering.sampling import EquirectMap, pinhole_equirect_map
 
 __all__ = [
@@ -152,9 +153,9 @@ def owners(grid: PinholeGrid, shape: tuple[int, int]) -> NDArray[np.integer]:
         kinds = (np.uint8, np.int16, np.int32)
         face = np.empty(shape, next(k for k in kinds if grid.num_images <= np.iinfo(k).max + 1))
         centers = np.ascontiguousarray(grid.centers_xyz)
-        rays = kernels.sphere_rays(shape)
+        rays = sphere_rays(shape)
         mesh = (centers, grid.neighbors, _inner_cosine(grid))
-        over_rows(kernels.owners, *shape, *mesh, *rays, face)
+        over_rows(find_owners, *shape, *mesh, *rays, face)
         return (face,)
 
     return _cached(grid, ("owners", shape), build)[0]
@@ -214,7 +215,7 @@ def sight_of(
     """
     axes = grid.world_from_camera[faces]
     matrices = np.ascontiguousarray(grid.camera_matrix @ axes.transpose(0, 2, 1))
-    columns, lines = kernels.sphere_rays(shape)
+    columns, lines = sphere_rays(shape)
     if owner.size > 0:
         spans = np.empty((len(faces), 0, 2), np.int32)
     else:
