@@ -40,9 +40,11 @@ def labels(quick: bool) -> Iterator[Table]:
         tangent_to_labels(array, grid, shape)
         set_table_cache_limit(512 * 2**20)
 
+    noise = random_scores(grid, apart=1).numpy()
     ways = [
         Way(PLAIN, plain),
         Way(OURS, lambda: tangent_to_labels(array, grid, shape), ours=True),
+        Way(f"{OURS}, white noise", lambda: tangent_to_labels(noise, grid, shape), True, rounds=3),
         Way(f"{OURS}, feather", lambda: tangent_to_labels(array, grid, shape, "feather"), True),
         Way(f"{OURS}, first call", first, ours=True, rounds=3),
     ]
@@ -52,10 +54,12 @@ def labels(quick: bool) -> Iterator[Table]:
     yield _memory(level, scores.nbytes / 2**20)
 
 
-def random_scores(grid: TangentGrid, classes: int = NUM_CLASSES) -> torch.Tensor:
-    """Scores of all images, float32."""
-    size = (grid.num_images, classes, grid.dim, grid.dim)
-    return torch.randn(size, generator=torch.Generator().manual_seed(0))
+def random_scores(grid: TangentGrid, classes: int = NUM_CLASSES, apart: int = 32) -> torch.Tensor:
+    """Scores of all images, float32: normal numbers some pixels apart, interpolated."""
+    side = max(2, grid.dim // apart)
+    size = (grid.num_images, classes, side, side)
+    scores = torch.randn(size, generator=torch.Generator().manual_seed(0))
+    return functional.interpolate(scores, (grid.dim, grid.dim), mode="bilinear")
 
 
 def _plain(

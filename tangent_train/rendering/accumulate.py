@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import tempfile
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,9 @@ from tangent_train.rendering.compiled import over_rows
 from tangent_train.rendering.tables import sight_of
 
 __all__ = ["NO_OWNERS", "add_to_panorama", "label_panorama", "without_blocks", "zero_sums"]
+
+_NO_TOTAL: NDArray[np.float32] = np.empty((0, 0, 0, 0), np.float32)
+_NO_LABELS: NDArray[np.uint8] = np.empty((0, 0), np.uint8)
 
 NO_OWNERS: NDArray[np.uint8] = np.empty((0, 0), np.uint8)
 """Feather instead of taking each pixel from its owner."""
@@ -56,12 +60,9 @@ def add_to_panorama(
         softmax: Whether to add probabilities: those of owners are of the interpolated scores,
             feathered ones are interpolated.
     """
-    step = max(64, _SPANS // max(1, len(faces)))
-    for start in range(rows.start, rows.stop, step):
-        band = slice(start, min(rows.stop, start + step))
-        own = slice(band.start - rows.start, band.stop - rows.start)
+    for band, own in _bands(rows, len(faces)):
         sight = sight_of(grid, faces, shape, band, owner[own])
-        arguments = (np.ascontiguousarray(scores), sight, softmax, total[own])
+        arguments = (np.ascontiguousarray(scores), sight, softmax, total[own], _NO_LABELS)
         over_rows(kernels.add_images, band.stop - band.start, shape[1], *arguments)
 
 
@@ -72,17 +73,33 @@ def label_panorama(
     owner: NDArray[np.integer],
     labels: NDArray[Any],
 ) -> None:
-    """Write the best classes of all pixels that some images own.
+    """Write the best classes of all pixels that some images own or, feathered, see.
 
     Args:
         scores: ``(n, K, d, d)`` of the images.
         grid: Their geometry.
-        faces: ``(n,)`` which images they are.
-        owner: ``(H, W)`` from `owners`.
+        faces: ``(n,)`` which images they are; all, to feather.
+        owner: ``(H, W)`` from `owners`; or `NO_OWNERS`.
         labels: ``(H, W)``, changed.
     """
-    sight = sight_of(grid, faces, owner.shape, slice(0, len(owner)), owner)
-    over_rows(kernels.label_images, *owner.shape, np.ascontiguousarray(scores), sight, labels)
+    height, width = labels.shape
+    scores = np.ascontiguousarray(scores)
+    for band, _ in _bands(slice(0, height), len(faces)):
+        sight = sight_of(grid, faces, (height, width), band, owner[band])
+        if len(owner):
+            arguments: tuple[Any, ...] = scores, sight, labels[band]
+            over_rows(kernels.label_images, band.stop - band.start, width, *arguments)
+        else:
+            arguments = scores, sight, False, _NO_TOTAL, labels[band]
+            over_rows(kernels.add_images, band.stop - band.start, width, *arguments)
+
+
+def _bands(rows: slice, images: int) -> Iterator[tuple[slice, slice]]:
+    """Rows whose spans of all images are held at once, and where they are among these rows."""
+    step = max(64, _SPANS // max(1, images))
+    for start in range(rows.start, rows.stop, step):
+        stop = min(rows.stop, start + step)
+        yield slice(start, stop), slice(start - rows.start, stop - rows.start)
 
 
 def zero_sums(shape: tuple[int, int], channels: int) -> NDArray[np.float32]:

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tangent_train.geometry import PinholeGrid
-from tangent_train.rendering import kernels
 from tangent_train.rendering.accumulate import (
     NO_OWNERS,
     add_to_panorama,
@@ -26,7 +25,6 @@ from tangent_train.rendering.checks import (
     check_interpolation,
     check_shape,
 )
-from tangent_train.rendering.compiled import over_rows
 from tangent_train.rendering.forward import Interpolation, Pixels
 from tangent_train.rendering.sampling import map_dtype
 from tangent_train.rendering.tables import image_table, owners, tensors_on
@@ -127,12 +125,8 @@ def _render_labels(
     for stack, labels in zip(stacks, result, strict=True):
         if compiled:
             scores, faces = stack.float().numpy(), grid.face_indices()
-            if blend == "nearest":
-                label_panorama(scores, grid, faces, owners(grid, shape), labels.numpy())
-                continue
-            for rows, sums in _feathered_sums(scores, grid, shape):
-                arguments = sums, scores.shape[1], 0.0, labels.numpy()[rows]
-                over_rows(kernels.best_classes, len(sums), shape[1], *arguments)
+            owner = owners(grid, shape) if blend == "nearest" else NO_OWNERS
+            label_panorama(scores, grid, faces, owner, labels.numpy())
         else:
             _torch_labels(stack, grid, shape, blend, labels.view(-1))
     return result.reshape(*logits.shape[:-4], *shape)

@@ -500,10 +500,77 @@ def _tiles(start: int, stop: int, sight: Sight) -> list[Tile]:
 
 
 @njit_fast
+def _write_classes(blocks: Array, num_classes: int, least: float, labels: Array) -> None:
+    """Write classes of the largest sums of the pixels of a row: of equal ones the first, never NaN.
+
+    Args:
+        blocks: ``(B, w, 8)`` sums.
+        num_classes: K.
+        least: Share of the sum of all classes that the largest must have, else the class is K.
+        labels: ``(w,)``, written.
+    """
+    width = len(labels)
+    highest, best = np.full(width, -np.inf, np.float32), np.zeros(width, np.int32)
+    for k in range(num_classes):
+        sums, label = blocks[k // LANES].reshape(-1)[k % LANES :], np.int32(k)
+        for x in range(np.uint64(width)):
+            score = sums[np.uint64(LANES) * x]
+            better = score > highest[x]
+            best[x] = label if better else best[x]
+            highest[x] = score if better else highest[x]
+    for x in range(width):
+        unsure = least > 0 and highest[x] < least * blocks[:, x].sum()
+        labels[x] = num_classes if unsure else best[x]
+
+
+@njit_fast
+def _add_to_tile(
+    tile: Tile, scores: Array, sight: Sight, softmax: bool, step: tuple[int, int],
+    owns: Array, room: _Room, taps: _Taps, patch: Array, sums: Array,
+) -> Array:  # fmt: skip
+    """Add weighted scores of images to the sums of a tile.
+
+    Args:
+        tile: The tile.
+        scores: ``(n, K, h, w)``.
+        sight: Geometry of the images and the canvas.
+        softmax: Whether to add probabilities.
+        step: See `_list_pixels`.
+        owns: Room for all images, true at first.
+        room: Room for the tile's pixels.
+        taps: Likewise.
+        patch: Room for a part of an image.
+        sums: ``(h, B, w, 8)``, changed.
+
+    Returns:
+        Perhaps more room for a part of an image.
+    """
+    side, blocks, found = (scores.shape[2], scores.shape[3]), sums.shape[1], 0
+    owned = len(sight.owner) > 0
+    if owned:
+        found = _owned_runs(tile, sight.owner, room.runs, owns)
+    for m in range(len(scores)):
+        if not owns[sight.images[m]]:
+            continue
+        if not owned:
+            found = _seen_runs(tile, m, sight, room.runs)
+        n = _list_pixels(m, side, sight, found, step, room)
+        if n == 0:
+            continue
+        top, left, high, wide = _split(n, side, room)
+        _weigh(n, (blocks * wide, -top * blocks * wide - left), room, taps)
+        patch = _enough(patch, high * blocks * wide * LANES)
+        part = _part(patch, (high, blocks, wide, LANES))
+        _copy_patch(scores[m], left, top, softmax, part)
+        _add_patch(part, taps, room.pixel[:n], sums)
+    return patch
+
+
+@njit_fast
 def add_images(
-    start: int, stop: int, scores: Array, sight: Sight, softmax: bool, total: Array
+    start: int, stop: int, scores: Array, sight: Sight, softmax: bool, total: Array, labels: Array
 ) -> None:
-    """Add weighted scores of images to rows ``start:stop`` of a canvas.
+    """Add weighted scores of images to rows ``start:stop`` of a canvas, or write best classes.
 
     Works tile by tile: the part of an image that a tile sees is copied to blocks.
 
@@ -514,41 +581,33 @@ def add_images(
         sight: Geometry of these images and the canvas.
         softmax: Whether to add probabilities: those of owners are of the interpolated scores,
             feathered ones are interpolated.
-        total: ``(H, B, W, 8)`` sums, changed.
+        total: ``(H, B, W, 8)`` sums, changed. Empty where only labels are wanted, for which all
+            images of a pixel have to come at once.
+        labels: ``(H, W)`` classes of the largest sums, written where `total` is empty.
     """
-    side, (_, blocks, width, _) = (scores.shape[2], scores.shape[3]), total.shape
-    owned, owns = len(sight.owner) > 0, np.ones(_count(sight), np.bool_)
-    afterwards, covered = softmax and owned, np.zeros(_count(sight), np.bool_)
+    num_classes, width = scores.shape[1], sight.columns.shape[1]
+    blocks, afterwards = (num_classes + LANES - 1) // LANES, softmax and len(sight.owner) > 0
+    owns, covered = np.ones(_count(sight), np.bool_), np.zeros(_count(sight), np.bool_)
     for image in sight.images:
         covered[image] = True
-    room, taps = _room(_TILE**2), _room_for_taps(_TILE**2)
-    of_tile = np.empty(_TILE**2 * blocks * LANES if afterwards else 0, np.float32)
-    patch, found = np.empty(0, np.float32), 0
+    room, taps, patch = _room(_TILE**2), _room_for_taps(_TILE**2), np.empty(0, np.float32)
+    of_tile = np.empty(0, np.float32)
     for tile in _tiles(start, stop, sight):
+        top, bottom, left, right = tile
         sums, step = total, (blocks * width, 0)
-        if afterwards:
-            shape = tile[1] - tile[0], blocks, tile[3] - tile[2], LANES
+        if afterwards or len(total) == 0:
+            shape = bottom - top, blocks, right - left, LANES
+            of_tile = _enough(of_tile, _TILE**2 * blocks * LANES)
             sums = _part(of_tile, shape)
             sums[:] = 0
-            step = blocks * shape[2], -tile[0] * blocks * shape[2] - tile[2]
-        if owned:
-            found = _owned_runs(tile, sight.owner, room.runs, owns)
-        for m in range(len(scores)):
-            if not owns[sight.images[m]]:
-                continue
-            if not owned:
-                found = _seen_runs(tile, m, sight, room.runs)
-            n = _list_pixels(m, side, sight, found, step, room)
-            if n == 0:
-                continue
-            top, left, high, wide = _split(n, side, room)
-            _weigh(n, (blocks * wide, -top * blocks * wide - left), room, taps)
-            patch = _enough(patch, high * blocks * wide * LANES)
-            part = _part(patch, (high, blocks, wide, LANES))
-            _copy_patch(scores[m], left, top, softmax and not owned, part)
-            _add_patch(part, taps, room.pixel[:n], sums)
-        if afterwards:
-            _add_probabilities(tile, covered, sight.owner, scores.shape[1], sums, total)
+            step = blocks * shape[2], -top * blocks * shape[2] - left
+        before = softmax and not afterwards
+        patch = _add_to_tile(tile, scores, sight, before, step, owns, room, taps, patch, sums)
+        if len(total) == 0:
+            for i in range(top, bottom):
+                _write_classes(sums[i - top], num_classes, 0.0, labels[i, left:right])
+        elif afterwards:
+            _add_probabilities(tile, covered, sight.owner, num_classes, sums, total)
 
 
 @njit_fast
@@ -672,46 +731,12 @@ def label_images(start: int, stop: int, scores: Array, sight: Sight, labels: Arr
 
 
 @njit_fast
-def _largest_of_lanes(blocks: Array, num_classes: int, highest: Array, block: Array) -> None:
-    """Largest sum of every lane, and its block.
-
-    Args:
-        blocks: ``(B, w, 8)`` sums of the pixels of a row.
-        num_classes: K.
-        highest: ``(8 w,)``, written.
-        block: ``(8 w,)``, written.
-    """
-    highest[:], block[:] = -np.inf, 0
-    for b in range(len(blocks)):
-        sums, lanes, this = blocks[b].reshape(-1), np.uint64(num_classes - LANES * b), np.int32(b)
-        for n in range(np.uint64(len(sums))):
-            better = sums[n] > highest[n] and n % np.uint64(LANES) < lanes
-            block[n] = this if better else block[n]
-            highest[n] = sums[n] if better else highest[n]
-
-
-@njit_fast
 def best_classes(
     start: int, stop: int, total: Array, num_classes: int, min_confidence: float, labels: Array
 ) -> None:
-    """Class of the largest total of `add_images`, rows ``start:stop``.
-
-    Of equal ones the first, and never NaN; K where totals are probabilities and the largest is
-    below `min_confidence`.
-    """
-    width = labels.shape[1]
-    highest, block = np.empty(LANES * width, np.float32), np.empty(LANES * width, np.int32)
+    """Classes of the largest totals of `add_images`, rows ``start:stop``; see `_write_classes`."""
     for i in range(start, stop):
-        _largest_of_lanes(total[i], num_classes, highest, block)
-        for j in range(width):
-            best, label = np.float32(-np.inf), 0
-            for lane in range(LANES):
-                largest, k = highest[LANES * j + lane], LANES * block[LANES * j + lane] + lane
-                better = largest > best or (largest == best and k < label)
-                best, label = (largest, k) if better else (best, label)
-            labels[i, j] = label
-            if min_confidence > 0 and best < min_confidence * total[i, :, j].sum():
-                labels[i, j] = num_classes
+        _write_classes(total[i], num_classes, min_confidence, labels[i])
 
 
 @njit_exact

@@ -121,7 +121,8 @@ class ScoreMosaic:
         owner = self._owners(crops, lambda: crops.owners(self.shape))
         sight = kernels.Sight(which, views, spans, *rays, owner)
         if len(self._total):
-            over_rows(kernels.add_images, height, width, prepared, sight, True, self._total)
+            arguments = (prepared, sight, True, self._total, self._labels)
+            over_rows(kernels.add_images, height, width, *arguments)
         else:
             over_rows(kernels.label_images, height, width, prepared, sight, self._labels)
 
