@@ -33,7 +33,6 @@ from datamodules.core.image_module import PanoramaDataModule, PhotoDataModule
 from datamodules.core.panoramas import Unknown
 from datamodules.stanford2d3ds.reader import StanfordReader
 from datamodules.stanford2d3ds.splits import StanfordAreas
-from tangent_train.errors import SettingError
 from tangent_train.registry import registered
 
 __all__ = ["Stanford2D3DS", "Stanford2D3DSPerspective"]
@@ -57,10 +56,8 @@ class Stanford2D3DS(StanfordAreas, PanoramaDataModule):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.unknown not in ("labels", "any_black", "all_black"):
-            raise SettingError(
-                "data.unknown", found=repr(self.unknown), expected="labels, any_black or all_black"
-            )
+        known = ("labels", "any_black", "all_black")
+        self.require("unknown", self.unknown in known, "labels, any_black or all_black")
 
     @property
     def reader(self) -> StanfordReader:

@@ -13,7 +13,7 @@ from datamodules.core.reading import ImageFiles
 from datamodules.stanford2d3ds.files import AREAS, FOLDS, GET_IT, list_pictures
 from datamodules.stanford2d3ds.label_table import CLASSES
 from datamodules.stanford2d3ds.reader import StanfordReader
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError
 
 if TYPE_CHECKING:
     from datamodules.core.found import Split
@@ -51,16 +51,14 @@ class StanfordAreas(ImageDataModule):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.label_table = None if self.label_table is None else Path(self.label_table)
-        if self.fold not in FOLDS:
-            raise SettingError("data.fold", found=repr(self.fold), expected="1, 2 or 3")
+        self.require("fold", self.fold in FOLDS, "1, 2 or 3")
         areas, testing = set(self.areas), set(FOLDS[self.fold])
-        if not areas <= set(AREAS) or not testing & areas or areas <= testing:
-            raise SettingError(
-                "data.areas",
-                found=list(self.areas),
-                expected=f"some of {', '.join(AREAS)}: for testing (fold {self.fold}: "
-                f"{', '.join(FOLDS[self.fold])}) and for training (others)",
-            )
+        self.require(
+            "areas",
+            areas <= set(AREAS) and bool(testing & areas) and bool(areas - testing),
+            f"some of {', '.join(AREAS)}: for testing (fold {self.fold}: "
+            f"{', '.join(FOLDS[self.fold])}) and for training (others)",
+        )
 
     @property
     def reader(self) -> StanfordReader:
@@ -83,7 +81,7 @@ class StanfordAreas(ImageDataModule):
                     expected="all of " + ", ".join(f"area_{area}" for area in areas),
                     remedy=GET_IT,
                 )
-        with_depth = "depth" in self.samples.inputs
+        with_depth = "depth" in self.inputs
         listed = [list_pictures(root, area, self.group, with_depth, problems) for area in there]
         pictures = [picture for pictures in listed for picture in pictures]
         training = [picture for picture in pictures if picture.area not in FOLDS[self.fold]]

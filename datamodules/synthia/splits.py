@@ -92,12 +92,9 @@ class SynthiaSequences(ImageDataModule):
             # YAML reads 01 as a number.
             some = tuple(str(sequence).zfill(2) for sequence in getattr(self, name))
             setattr(self, name, some)
-            if not some or not set(some) <= set(SEQUENCES) - {str(o).zfill(2) for o in others}:
-                raise SettingError(
-                    f"data.{name}",
-                    found=list(some),
-                    expected=f"some of {', '.join(SEQUENCES)}, none for both training and test",
-                )
+            fine = some and set(some) <= set(SEQUENCES) - {str(o).zfill(2) for o in others}
+            expected = f"some of {', '.join(SEQUENCES)}, none for both training and test"
+            self.require(name, bool(fine), expected)
 
     @property
     def sequences(self) -> tuple[str, ...]:

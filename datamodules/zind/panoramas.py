@@ -41,12 +41,11 @@ from typing import TYPE_CHECKING, Literal
 from datamodules.core.found import SPLITS, Split, draw_groups
 from datamodules.core.image_module import PanoramaDataModule
 from datamodules.core.inputs import Input
-from datamodules.core.loading import at_least
 from datamodules.core.reading import ImageFiles, ImageReader
 from datamodules.images.pixel_files import read_image_size, read_rgb
 from datamodules.zind.homes import HomePanorama, list_panoramas
 from datamodules.zind.layout import CLASSES, DOOR, Layout
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError
 from tangent_train.files import parse_json
 from tangent_train.registry import Text, check_fields, registered
 
@@ -129,17 +128,10 @@ class Zind(PanoramaDataModule):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if "depth" in self.inputs:
-            raise SettingError(
-                "data.inputs", found=list(self.inputs), expected="no depth, ZInD has none"
-            )
-        if self.doors not in ("class", "ignore"):
-            raise SettingError("data.doors", found=self.doors, expected="class or ignore")
-        if not 0 < self.test_fraction <= 1:
-            raise SettingError(
-                "data.test_fraction", found=self.test_fraction, expected="above 0 to 1"
-            )
-        at_least("data.split_seed", self.split_seed, 0)
+        self.require("inputs", "depth" not in self.inputs, "no depth, ZInD has none")
+        self.require("doors", self.doors in ("class", "ignore"), "class or ignore")
+        self.require("test_fraction", 0 < self.test_fraction <= 1, "above 0 to 1")
+        self.require("split_seed", self.split_seed >= 0, "0 or more")
 
     def find_images(self, problems: Problems) -> tuple[ZindReader, dict[Split, list[ImageFiles]]]:
         """See `ImageDataModule`."""

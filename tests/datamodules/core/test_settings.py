@@ -22,6 +22,7 @@ from tangent_train.rendering import EquirectRepresentation, PerspectiveRepresent
 from tests.datamodules.folder.folder_format import write_classes
 
 ERP: Any = EquirectRepresentation(level=3)
+INPUTS: Any = [{"inputs": n} for n in ((), ("depth",), ("rgb", "rgb"), ("rgb", "heat"), "rgb")]
 CROPS: Any = PerspectiveRepresentation(level=5)
 
 
@@ -32,6 +33,10 @@ CROPS: Any = PerspectiveRepresentation(level=5)
         (Stanford2D3DS, {"seed": -1}, "seed"),
         (Stanford2D3DS, {"normalization": RGB_NORMALIZATION}, "normalization"),
         (Stanford2D3DS, {"color_jitter": 1.1}, "color_jitter"),
+        *(
+            (Stanford2D3DS, {"inputs": inputs}, "inputs: found .* expected a list")
+            for inputs in INPUTS
+        ),
         (Stanford2D3DS, {"upright": "maybe"}, "upright"),
         (Stanford2D3DS, {"max_tilt_deg": 0}, "max_tilt_deg"),
         (Stanford2D3DS, {"test_rotation": 200}, "test_rotation"),
