@@ -14,11 +14,11 @@ from datamodules.core.panoramas import (
     resize_area,
     resize_depth,
 )
-from datamodules.images.png import check_panorama_size
+from datamodules.images.png import check_panorama_size, check_png, read_color_png
 from tangent_train.errors import DataError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
     import numpy as np
@@ -26,7 +26,14 @@ if TYPE_CHECKING:
 
     from datamodules.core.problems import Problems
 
-__all__ = ["ImageFiles", "ImageReader", "PanoramaReading", "PhotoReading", "check_headers"]
+__all__ = [
+    "ImageFiles",
+    "ImageReader",
+    "PanoramaReading",
+    "PhotoReading",
+    "PngReader",
+    "check_headers",
+]
 
 
 class ImageFiles(NamedTuple):
@@ -56,12 +63,12 @@ class ImageReader(ABC):
     """Decoder of the files of a data set."""
 
     @property
-    @abstractmethod
     def settings(self) -> Mapping[str, str]:
         """Everything that affects labels and depth besides the files, such as a class table.
 
-        Each choice has a prepared store of its own.
+        Each choice has a prepared store of its own; by default there is nothing to choose.
         """
+        return {}
 
     @abstractmethod
     def size(self, part: str, path: Path) -> tuple[int, int] | None:
@@ -94,13 +101,32 @@ class ImageReader(ABC):
             DataError: The file is broken, or holds a value without a class.
         """
 
-    @abstractmethod
     def depth(self, files: ImageFiles) -> NDArray[np.uint16]:
         """Depth ``(H, W)`` in steps of 1/512 m, 0 where missing; z-depth of photos."""
+        raise NotImplementedError(files.name)
 
     def camera(self, files: ImageFiles) -> NDArray[np.float64]:
         """``(3, 3)`` K of a photo for integer pixel centres, without skew."""
         raise NotImplementedError(files.name)
+
+
+class PngReader(ImageReader):
+    """Decoder of the PNG files of a release.
+
+    Attributes:
+        formats: Bits per channel and kinds of colours (`PngHeader.color`) by part.
+    """
+
+    formats: Mapping[str, tuple[int, Sequence[str]]]
+
+    def size(self, part: str, path: Path) -> tuple[int, int]:
+        """See `ImageReader`."""
+        header = check_png(path, *self.formats[part])
+        return header.height, header.width
+
+    def rgb(self, files: ImageFiles) -> NDArray[np.uint8]:
+        """Colours; alpha is dropped."""
+        return read_color_png(files.rgb)
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from datamodules.core.inputs import RGBD_NORMALIZATION, Normalization
 from datamodules.core.panoramas import STEPS_PER_M, resize_nearest
-from datamodules.core.reading import ImageFiles, ImageReader
-from datamodules.images.png import check_png, read_color_png, read_png
+from datamodules.core.reading import ImageFiles, PngReader
+from datamodules.images.png import read_png
 from datamodules.synthia.files import read_camera
 from tangent_train.errors import DataError
 
@@ -85,7 +85,7 @@ _LABELS[: _LAST_ID + 1] = [*range(13), 0, 0, 13]
 
 
 @dataclass(frozen=True)
-class SynthiaReader(ImageReader):
+class SynthiaReader(PngReader):
     """Views and panoramas alike.
 
     Attributes:
@@ -93,20 +93,6 @@ class SynthiaReader(ImageReader):
     """
 
     formats: Formats
-
-    @property
-    def settings(self) -> dict[str, str]:
-        """None: all classes are those of the release."""
-        return {}
-
-    def size(self, part: str, path: Path) -> tuple[int, int]:
-        """See `ImageReader`, as all others."""
-        header = check_png(path, *self.formats[part])
-        return header.height, header.width
-
-    def rgb(self, files: ImageFiles) -> NDArray[np.uint8]:
-        """Colours; alpha is dropped."""
-        return read_color_png(files.rgb)
 
     def labels(self, files: ImageFiles, shape: tuple[int, int] | None = None) -> NDArray[np.uint8]:
         """Classes as in `CLASSES`, 0 where unknown."""

@@ -95,10 +95,6 @@ class ZindReader(ImageReader):
             labels[labels == DOOR] = 0
         return labels
 
-    def depth(self, files: ImageFiles) -> NDArray[np.uint16]:
-        """There is none."""
-        raise NotImplementedError(files.name)
-
 
 @registered
 @dataclass(kw_only=True, eq=False, repr=False)

@@ -13,32 +13,23 @@ from numpy.typing import NDArray
 from datamodules.core.found import Split
 from datamodules.core.image_module import PanoramaDataModule
 from datamodules.core.problems import Problems
-from datamodules.core.reading import ImageFiles, ImageReader
-from datamodules.images.png import check_png, read_color_png, read_png
+from datamodules.core.reading import ImageFiles, PngReader
+from datamodules.images.png import read_png
 from tangent_train.errors import DataError, SettingError
 from tangent_train.rendering import EquirectRepresentation
 from tests.datamodules.data_files import read_png as read_as_stored
 from tests.datamodules.data_files import write_png
 
 
-class ToyReader(ImageReader):
-    @property
-    def settings(self) -> dict[str, str]:
-        return {}
+FORMATS = {"rgb": (8, ("RGB",)), "labels": (8, ("grey",))}
 
-    def size(self, part: str, path: Path) -> tuple[int, int]:
-        header = check_png(path, 8, ("RGB",) if part == "rgb" else ("grey",))
-        return header.height, header.width
 
-    def rgb(self, files: ImageFiles) -> NDArray[np.uint8]:
-        return read_color_png(files.rgb)
+class ToyReader(PngReader):
+    formats = FORMATS
 
     def labels(self, files: ImageFiles, shape: tuple[int, int] | None = None) -> NDArray[np.uint8]:
         labels: NDArray[np.uint8] = read_png(files.labels, cv2.IMREAD_UNCHANGED)
         return labels if shape is None else cv2.resize(labels, shape[::-1], interpolation=0)
-
-    def depth(self, files: ImageFiles) -> NDArray[np.uint16]:
-        raise NotImplementedError(files.name)
 
 
 @dataclass(kw_only=True, eq=False, repr=False)
