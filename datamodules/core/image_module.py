@@ -25,12 +25,12 @@ from datamodules.core.inputs import (
 from datamodules.core.panoramas import Panorama, Photo, Turn
 from datamodules.core.pipeline import (
     EstimatedUp,
-    MaskedPanoramas,
     PanoramaJudge,
     PosedUp,
     RotatedPanoramas,
     SplitItems,
     Transform,
+    masked,
 )
 from datamodules.core.problems import Problems
 from datamodules.core.progress import show_progress
@@ -205,7 +205,7 @@ class PanoramaDataModule(ImageDataModule):
         """Panoramas from files or store: masked, rotated, then aligned with gravity."""
         transforms: list[Transform[Panorama, Any]] = []
         if self.mask is not None:
-            transforms.append(MaskedPanoramas(self._masks))
+            transforms.append(partial(masked, self._masks))
         if self.upright is not None:
             transforms.append(PosedUp())
         if split == "test" and self.test_rotation is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -136,16 +136,16 @@ class _Reading:
     Attributes:
         reader: Of the data set.
         num_classes: K + 1, the unknown class included.
+        shape: Rows and columns of the result; None for those of the files.
     """
 
     reader: ImageReader
     num_classes: int
+    shape: tuple[int, int] | None = None
 
-    def checked_labels(
-        self, files: ImageFiles, shape: tuple[int, int] | None = None
-    ) -> NDArray[np.uint8]:
-        """Its labels, none beyond the classes; see `ImageReader.labels`."""
-        labels = self.reader.labels(files, shape)
+    def labels(self, files: ImageFiles) -> NDArray[np.uint8]:
+        """Its labels alone, none beyond the classes."""
+        labels = self.reader.labels(files, self.shape)
         if labels.max(initial=0) >= self.num_classes:
             raise DataError(
                 files.labels,
@@ -157,31 +157,18 @@ class _Reading:
 
     def parts(self, files: ImageFiles) -> list[Callable[[], object]]:
         """Functions that decode each of its files separately."""
-        read = {"labels": self.checked_labels}
+        read = {"labels": replace(self, shape=None).labels}
         return [partial(read.get(part, getattr(self.reader, part)), files) for part in files.parts]
 
 
-@dataclass(frozen=True)
 class PanoramaReading(_Reading):
-    """Reads panoramas at one size.
-
-    Attributes:
-        shape: Rows and columns of the result.
-    """
-
-    shape: tuple[int, int]
+    """Reads panoramas at one size."""
 
     def __call__(self, files: ImageFiles) -> Panorama:
         """One panorama."""
-        depth = None
-        if files.depth is not None:
-            depth = resize_depth(self.reader.depth(files), self.shape)
-        rgb = resize_area(self.reader.rgb(files), self.shape)
-        return Panorama(rgb, depth, self.labels(files))
-
-    def labels(self, files: ImageFiles) -> NDArray[np.uint8]:
-        """Its labels alone."""
-        return self.checked_labels(files, self.shape)
+        shape: Any = self.shape
+        depth = None if files.depth is None else resize_depth(self.reader.depth(files), shape)
+        return Panorama(resize_area(self.reader.rgb(files), shape), depth, self.labels(files))
 
 
 class PhotoReading(_Reading):
@@ -194,10 +181,6 @@ class PhotoReading(_Reading):
         if files.depth is not None:
             depth = distance_from_z_depth(self.reader.depth(files), camera_matrix)
         return Photo(self.reader.rgb(files), depth, self.labels(files), camera_matrix)
-
-    def labels(self, files: ImageFiles) -> NDArray[np.uint8]:
-        """Its labels alone."""
-        return self.checked_labels(files)
 
 
 def check_headers(

@@ -23,8 +23,10 @@ from datamodules.core.progress import show_progress
 from datamodules.core.reading import check_headers
 from datamodules.images.png import read_color_png
 from datamodules.synthia.files import (
+    FRAMES,
     GET_IT,
     VIEWS,
+    choose_frames,
     list_frames,
     panorama_files,
     read_camera,
@@ -39,7 +41,6 @@ from datamodules.synthia.reader import (
     read_first_channel,
     read_ids,
 )
-from datamodules.synthia.splits import FRAMES, choose_frames
 from tangent_train.errors import DataError
 from tangent_train.files import write_bytes
 from tangent_train.geometry import (

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.core.inputs import RGBD_NORMALIZATION, Normalization
-from datamodules.core.panoramas import STEPS_PER_M, resize_nearest
+from datamodules.core.panoramas import meters_to_steps, resize_nearest
 from datamodules.core.reading import ImageFiles, PngReader
 from datamodules.images.png import read_png
 from datamodules.synthia.files import read_camera
@@ -24,7 +24,6 @@ __all__ = [
     "PANORAMA_FORMATS",
     "VIEW_FORMATS",
     "SynthiaReader",
-    "depth_steps",
     "read_first_channel",
     "read_ids",
 ]
@@ -76,7 +75,6 @@ PANORAMA_FORMATS: Formats = {
 }
 """Pixel formats of a panorama."""
 
-_MOST = np.iinfo(np.uint16).max
 _LAST_ID = 15
 _LABELS = np.zeros(256, np.uint8)
 # Traffic lights, 15, become 13. The reserved 13 and 14 are unknown: the published panoramas were
@@ -101,7 +99,8 @@ class SynthiaReader(PngReader):
 
     def depth(self, files: ImageFiles) -> NDArray[np.uint16]:
         """Depth in steps of 1/512 m."""
-        return depth_steps(read_first_channel(files.parts["depth"]))
+        centimeters = read_first_channel(files.parts["depth"])
+        return meters_to_steps((centimeters / 100).astype(np.float32))
 
     def camera(self, files: ImageFiles) -> NDArray[np.float64]:
         """The camera matrix of the sequence that the view is from."""
@@ -135,13 +134,3 @@ def read_ids(path: Path) -> NDArray[np.uint8]:
             remedy="Use the files as released (GT/LABELS, not GT/COLOR).",
         )
     return ids.astype(np.uint8)
-
-
-def depth_steps(centimeters: NDArray[np.uint16]) -> NDArray[np.uint16]:
-    """Depth in steps of 1/512 m, rounded, at most 65535 (128 m), of depth in cm.
-
-    >>> depth_steps(np.array([0, 1, 100, 65535], np.uint16)).tolist()
-    [0, 5, 512, 65535]
-    """
-    steps = np.minimum(centimeters * (STEPS_PER_M / 100) + 0.5, _MOST)
-    return steps.astype(np.uint16)

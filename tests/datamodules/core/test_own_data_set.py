@@ -20,7 +20,6 @@ from tangent_train.rendering import EquirectRepresentation
 from tests.datamodules.data_files import read_png as read_as_stored
 from tests.datamodules.data_files import write_png
 
-
 FORMATS = {"rgb": (8, ("RGB",)), "labels": (8, ("grey",))}
 
 

@@ -94,7 +94,7 @@ def test_panoramas_are_made_from_views(tmp_path: Path, erp: Any) -> None:
     # Numbers, as YAML reads them.
     sequences = {"train_sequences": [1], "test_sequences": [4]}
     module = two(root, erp, panorama_height=64, frames=2, **sequences)
-    with pytest.raises(DataError, match=r"pano/RGB: found no panoramas.*tangent-prepare"):
+    with pytest.raises(DataError, match=r"01-SUMMER: found no panoramas.*tangent-prepare"):
         module.setup()
     module.prepare_data()
     module.setup("fit")
