@@ -13,8 +13,7 @@ from datamodules.stanford2d3ds.panoramas import (
     Stanford2D3DSPerspective,
     StanfordAreas,
 )
-from datamodules.synthrooms.generate import generate_rooms
-from datamodules.synthrooms.settings import RoomSettings
+from datamodules.synthrooms.generate import RoomSettings, generate_rooms
 from tangent_train.errors import SettingError
 from tangent_train.registry import registered
 

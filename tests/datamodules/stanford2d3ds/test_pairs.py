@@ -14,8 +14,7 @@ import pytest
 
 from datamodules.stanford2d3ds.pairs import StanfordPairs, published_pairs, read_panorama_pose
 from datamodules.synthrooms.datamodule import SynthRoomsPairs
-from datamodules.synthrooms.generate import generate_rooms
-from datamodules.synthrooms.settings import RoomSettings
+from datamodules.synthrooms.generate import RoomSettings, generate_rooms
 from tangent_train.errors import DataError, SettingError
 from tangent_train.geometry import equirect_directions
 from tests.datamodules.stanford2d3ds.stanford_pairs_format import write_panorama, write_paper_pairs

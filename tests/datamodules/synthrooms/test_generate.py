@@ -12,13 +12,12 @@ import pytest
 from datamodules import SynthRoomsPerspective
 from datamodules.core.found import SPLITS
 from datamodules.synthrooms.camera import PanoramaView, PerspectiveView, Pose, euler_rotation
-from datamodules.synthrooms.generate import plan_rooms
+from datamodules.synthrooms.generate import RoomSettings, plan_rooms
 from datamodules.synthrooms.layout import FloorPlan, Rectangle
 from datamodules.synthrooms.raycast import RayScene
 from datamodules.synthrooms.render import MISSING, Picture, draw_camera, draw_holes, render
 from datamodules.synthrooms.room import UNKNOWN, Room
 from datamodules.synthrooms.scene import draw_room_type, furnish
-from datamodules.synthrooms.settings import RoomSettings
 from datamodules.synthrooms.writer import (
     INSTANCES,
     RoomPlan,

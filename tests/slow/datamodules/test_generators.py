@@ -7,8 +7,7 @@ from typing import Any
 
 import pytest
 
-from datamodules.synthrooms.generate import generate_rooms
-from datamodules.synthrooms.settings import RoomSettings
+from datamodules.synthrooms.generate import RoomSettings, generate_rooms
 from datamodules.synthshapes import generate as shapes
 from datamodules.synthshapes.generate import ShapeSettings, generate_shapes
 from tests.datamodules.data_files import contents

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
-from datamodules.synthrooms.settings import RoomSettings
+from datamodules.synthrooms.generate import RoomSettings
 from tangent_train.rendering import TangentRepresentation
 
 PROCESSES = 3
