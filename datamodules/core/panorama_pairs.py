@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from itertools import combinations, pairwise
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from datamodules.images.gpano import area_of
 from datamodules.images.image_files import image_paths, short_names
 from datamodules.images.pixel_files import read_rgb
 from datamodules.images.png import check_panorama_size
 from tangent_train.errors import DataError, SettingError
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from tangent_train.geometry import PanoramaPose
+from tangent_train.geometry import PanoramaPose
 
 __all__ = [
     "ImagePairs",

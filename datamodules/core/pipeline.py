@@ -6,25 +6,22 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, Literal, Protocol, TypeVar
+from typing import Any, Generic, Literal, Protocol, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from datamodules.core.loading import sample_rng
 from datamodules.core.panoramas import Panorama
 from datamodules.core.problems import Problems
+from datamodules.core.reading import ImageFiles
+from datamodules.core.store import Store
 from datamodules.images.gpano import up_of, whole_area
+from datamodules.images.masks import Masks
 from tangent_train.geometry import random_rotation, rotation_about
 from tangent_train.rendering import rotate_equirect
 from tangent_train.rendering.upright.gravity import estimate_up
 from tangent_train.threads import in_threads
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from datamodules.core.reading import ImageFiles
-    from datamodules.core.store import Store
-    from datamodules.images.masks import Masks
 
 __all__ = [
     "EstimatedUp",

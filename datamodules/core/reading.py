@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from datamodules.core.panoramas import (
     Panorama,
@@ -14,17 +19,9 @@ from datamodules.core.panoramas import (
     resize_area,
     resize_depth,
 )
+from datamodules.core.problems import Problems
 from datamodules.images.png import check_panorama_size, check_png, read_color_png
 from tangent_train.errors import DataError
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-    from pathlib import Path
-
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from datamodules.core.problems import Problems
 
 __all__ = [
     "ImageFiles",

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import Dataset
 from torchvision.transforms.v2 import functional
@@ -16,14 +17,10 @@ from torchvision.transforms.v2 import functional
 from datamodules.core.inputs import MAX_DEPTH_M, Input
 from datamodules.core.loading import Seed, sample_rng
 from datamodules.core.panoramas import STEPS_PER_M
+from datamodules.core.pipeline import SplitItems
 from tangent_train.geometry import equirect_elevations
+from tangent_train.rendering.representations.views import Views
 from tangent_train.rendering.upright.gravity import upright_rotation
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from datamodules.core.pipeline import SplitItems
-    from tangent_train.rendering.representations.views import Views
 
 __all__ = [
     "EvaluationImages",

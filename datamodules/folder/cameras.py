@@ -5,25 +5,20 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import PurePosixPath
-from typing import TYPE_CHECKING, Any
+from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from datamodules.core.problems import Problems
+from datamodules.core.reading import ImageFiles
 from datamodules.images.pixel_files import photo_fov_deg, read_image_size
 from tangent_train.errors import DataError
 from tangent_train.files import parse_json
 from tangent_train.geometry import camera_matrix_from_fov, is_camera_matrix
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from datamodules.core.problems import Problems
-    from datamodules.core.reading import ImageFiles
 
 __all__ = ["FolderCameras", "read_cameras"]
 

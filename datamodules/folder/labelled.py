@@ -14,27 +14,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
+from datamodules.core.found import Split
 from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
 from datamodules.core.inputs import Input
+from datamodules.core.problems import Problems
+from datamodules.core.reading import ImageFiles
 from datamodules.folder.cameras import FolderCameras, read_cameras
 from datamodules.folder.classes import UNKNOWN_NAME, read_classes
 from datamodules.folder.reader import FolderReader, list_images, note_ignored, read_codes
 from datamodules.folder.splits import FolderSplits
 from tangent_train.errors import DataError
 from tangent_train.registry import registered
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from datamodules.core.found import Split
-    from datamodules.core.problems import Problems
-    from datamodules.core.reading import ImageFiles
 
 __all__ = ["FolderPanoramas", "FolderPhotos", "LabelledFolder"]
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from datamodules.core.panoramas import ray_lengths
 from datamodules.images.pixel_files import (
@@ -19,17 +21,10 @@ from datamodules.images.pixel_files import (
     write_pixels,
 )
 from tangent_train.errors import DataError, SettingError
-from tangent_train.geometry import ResizedGrid
+from tangent_train.geometry import PinholeGrid, ResizedGrid
 from tangent_train.rendering import Blend, tangent_to_equirect
+from tangent_train.rendering.camera_files import CameraFile
 from tangent_train.threads import in_threads
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from tangent_train.geometry import PinholeGrid
-    from tangent_train.rendering.camera_files import CameraFile
 
 __all__ = ["Kind", "TangentResults", "result_files"]
 

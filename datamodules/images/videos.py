@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Generator, Iterator
 from contextlib import closing, contextmanager
 from functools import partial
 from itertools import count, takewhile
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from datamodules.images.png import check_pixels
 from tangent_train.errors import DataError
 from tangent_train.files import atomic_path
 from tangent_train.threads import in_threads
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Iterator
-    from pathlib import Path
-
-    from numpy.typing import NDArray
 
 __all__ = ["VIDEO_SUFFIXES", "read_frames", "read_video_size", "write_video"]
 

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 from torch import Tensor
 
 from datamodules.core.found import Found, Split, draw_groups
 from datamodules.core.pipeline import SplitItems
+from datamodules.core.problems import Problems
 from datamodules.core.processes import in_processes
 from datamodules.core.split_module import Kind, SplitDataModule
 from datamodules.core.store import Store
@@ -31,9 +32,6 @@ from datamodules.modelnet40.shape_samples import (
 )
 from tangent_train.errors import DataError
 from tangent_train.registry import registered
-
-if TYPE_CHECKING:
-    from datamodules.core.problems import Problems
 
 __all__ = ["ModelNet40"]
 

@@ -3,28 +3,24 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import Dataset
 
 from datamodules.core.inputs import Normalization, normalize_channels
 from datamodules.core.loading import Seed, sample_rng
+from datamodules.core.pipeline import SplitItems
 from datamodules.modelnet40.meshes import clean_mesh, mesh_spheres, read_off
+from datamodules.modelnet40.shape_files import ShapeFile
 from tangent_train.geometry import random_rotation, rotation_about
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from numpy.typing import NDArray
-
-    from datamodules.core.pipeline import SplitItems
-    from datamodules.modelnet40.shape_files import ShapeFile
-
-    _Shapes = SplitItems[ShapeFile, Any]
+_Shapes = SplitItems[ShapeFile, Any]
 
 __all__ = [
     "SPHERE_NORMALIZATION",

@@ -6,11 +6,11 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
-from datamodules.core.reading import ImageFiles
+from datamodules.core.problems import Problems
 from tangent_train.errors import DataError
 
-if TYPE_CHECKING:
-    from datamodules.core.problems import Problems
+if TYPE_CHECKING:  # slow, and SynthRooms needs the names alone
+    from datamodules.core.reading import ImageFiles
 
 __all__ = [
     "AREAS",
@@ -104,6 +104,8 @@ class PictureFiles(NamedTuple):
     @property
     def image(self) -> ImageFiles:
         """The files of this panorama or photo."""
+        from datamodules.core.reading import ImageFiles
+
         if self.name.frame == "equirectangular":
             return ImageFiles(self.short_name, self.rgb, self.semantic, self.depth)
         name = f"{self.short_name}/{self.name.frame}"

@@ -30,21 +30,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import ClassVar, Literal
 
-from datamodules.core.found import draw_groups
+from datamodules.core.found import Split, draw_groups
 from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
 from datamodules.core.panoramas import Unknown
+from datamodules.core.problems import Problems
 from datamodules.core.reading import ImageFiles
 from datamodules.stanford2d3ds.files import AREAS, FOLDS, GET_IT, list_pictures
 from datamodules.stanford2d3ds.label_table import CLASSES, LabelTable
 from datamodules.stanford2d3ds.reader import StanfordReader
 from tangent_train.errors import DataError
 from tangent_train.registry import registered
-
-if TYPE_CHECKING:
-    from datamodules.core.found import Split
-    from datamodules.core.problems import Problems
 
 __all__ = ["Stanford2D3DS", "Stanford2D3DSPerspective", "StanfordAreas"]
 

@@ -18,8 +18,9 @@ from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
+from datamodules.core.found import Found, Split
 from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
 from datamodules.core.inputs import Input
 from datamodules.core.problems import Problems
@@ -46,9 +47,6 @@ from datamodules.synthia.reader import (
 )
 from tangent_train.errors import DataError
 from tangent_train.registry import registered
-
-if TYPE_CHECKING:
-    from datamodules.core.found import Found, Split
 
 __all__ = ["OmniSynthia", "SynthiaPerspective", "divide"]
 

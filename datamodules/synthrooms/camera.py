@@ -18,9 +18,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tangent_train.geometry import (
     camera_matrix_from_fov,
@@ -29,9 +30,6 @@ from tangent_train.geometry import (
     perspective_directions,
     rotation_about,
 )
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 __all__ = [
     "CAMERA_FROM_SPHERE",

@@ -13,19 +13,17 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from datamodules.core.problems import Problems
 from datamodules.zind.layout import DOOR, OPENING, WINDOW, Fixture, Layout
 from tangent_train.errors import DataError
 from tangent_train.files import parse_json
 from tangent_train.geometry import PanoramaPose, rotation_about
 from tangent_train.registry import Text, check_fields
-
-if TYPE_CHECKING:
-    from datamodules.core.problems import Problems
 
 __all__ = ["HomePanorama", "list_panoramas"]
 

@@ -36,11 +36,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
 
 from datamodules.core.found import SPLITS, Split, draw_groups
 from datamodules.core.image_module import PanoramaDataModule
 from datamodules.core.inputs import Input
+from datamodules.core.problems import Problems
 from datamodules.core.reading import ImageFiles, ImageReader
 from datamodules.images.pixel_files import read_image_size, read_rgb
 from datamodules.zind.homes import HomePanorama, list_panoramas
@@ -48,14 +53,6 @@ from datamodules.zind.layout import CLASSES, DOOR, Layout
 from tangent_train.errors import DataError
 from tangent_train.files import parse_json
 from tangent_train.registry import Text, check_fields, registered
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from datamodules.core.problems import Problems
 
 __all__ = ["Zind", "ZindReader"]
 
