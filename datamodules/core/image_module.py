@@ -184,7 +184,13 @@ class PanoramaDataModule(ImageDataModule):
         )
         self.erp_height: int = self.representation.erp_height
         self.judge: PanoramaJudge | None = None
-        self._check_rotations()
+        rotation = self.test_rotation
+        tilt = type(rotation) in (int, float) and 0 <= float(rotation or 0) <= _HALF_TURN_DEG
+        fine = tilt or rotation in (None, "so3")
+        self.require("test_rotation", fine, "null, a tilt of 0 to 180 degrees, or so3")
+        self.require("upright", self.upright in (None, "pose", "auto"), "null, pose or auto")
+        fine = 0 < self.max_tilt_deg <= _HALF_TURN_DEG
+        self.require("max_tilt_deg", fine, "more than 0, at most 180")
         self._masks = Masks(self.mask, "data.mask")
         if not self._masks.of_each:
             self._masks.read("", whole_area(Path(), (self.erp_height, 2 * self.erp_height)))
@@ -223,15 +229,6 @@ class PanoramaDataModule(ImageDataModule):
             read = (source.read(index) for index in range(len(source)))
             show_progress(read, "Estimating up", self.noun, len(source))
         return super().test_dataloader()
-
-    def _check_rotations(self) -> None:
-        rotation = self.test_rotation
-        tilt = type(rotation) in (int, float) and 0 <= float(rotation or 0) <= _HALF_TURN_DEG
-        fine = tilt or rotation in (None, "so3")
-        self.require("test_rotation", fine, "null, a tilt of 0 to 180 degrees, or so3")
-        self.require("upright", self.upright in (None, "pose", "auto"), "null, pose or auto")
-        fine = 0 < self.max_tilt_deg <= _HALF_TURN_DEG
-        self.require("max_tilt_deg", fine, "more than 0, at most 180")
 
 
 @dataclass(kw_only=True, eq=False, repr=False)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar
 
 from torch import Tensor
@@ -25,9 +26,9 @@ from datamodules.modelnet40.shape_samples import (
     SPHERE_NORMALIZATION,
     ShapeSample,
     ShapeViews,
-    SphereReading,
     Spheres,
     TestRotation,
+    make_spheres,
     normalize_spheres,
 )
 from tangent_train.errors import DataError
@@ -101,7 +102,7 @@ class ModelNet40(SplitDataModule[ShapeFile]):
                 raise DataError(self.root, found=f"no {split} shape", expected="some")
         shape = self.erp_height, 2 * self.erp_height
         folder = (self.store or self.root) / f"spheres_{shape[0]}x{shape[1]}"
-        return Found(self.noun, splits, SphereReading(shape), Store(folder), _in_processes)
+        return Found(self.noun, splits, partial(make_spheres, shape), Store(folder), _in_processes)
 
     def pipeline(self, found: Found[ShapeFile], split: Split) -> SplitItems[ShapeFile, Spheres]:
         """The spheres in the store."""

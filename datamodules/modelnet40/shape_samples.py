@@ -27,9 +27,9 @@ __all__ = [
     "STEPS",
     "ShapeSample",
     "ShapeViews",
-    "SphereReading",
     "Spheres",
     "TestRotation",
+    "make_spheres",
     "normalize_spheres",
 ]
 
@@ -62,20 +62,10 @@ class Spheres(NamedTuple):
     spheres: NDArray[np.uint16]
 
 
-@dataclass(frozen=True)
-class SphereReading:
-    """Makes the spheres of a mesh.
-
-    Attributes:
-        shape: ``(H, W)``.
-    """
-
-    shape: tuple[int, int]
-
-    def __call__(self, mesh: ShapeFile) -> Spheres:
-        """Those of one mesh."""
-        values = mesh_spheres(clean_mesh(read_off(mesh.path)), self.shape)
-        return Spheres(np.rint(values * STEPS).astype(np.uint16))
+def make_spheres(shape: tuple[int, int], mesh: ShapeFile) -> Spheres:
+    """The spheres of a mesh, of a shape ``(H, W)``."""
+    values = mesh_spheres(clean_mesh(read_off(mesh.path)), shape)
+    return Spheres(np.rint(values * STEPS).astype(np.uint16))
 
 
 class ShapeSample(NamedTuple):

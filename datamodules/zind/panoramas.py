@@ -51,7 +51,7 @@ from datamodules.images.pixel_files import read_image_size, read_rgb
 from datamodules.zind.homes import HomePanorama, list_panoramas
 from datamodules.zind.layout import CLASSES, DOOR, Layout
 from tangent_train.errors import DataError
-from tangent_train.files import parse_json
+from tangent_train.files import read_json
 from tangent_train.registry import Text, check_fields, registered
 
 __all__ = ["Zind", "ZindReader"]
@@ -170,10 +170,7 @@ class Zind(PanoramaDataModule):
 def _read_partition(path: Path, homes: set[str]) -> dict[str, Split]:
     """The split of every home in a ``zind_partition.json``."""
     expected = "lists of homes for train, val and test"
-    try:
-        content = parse_json(path.read_bytes())
-    except (OSError, ValueError) as error:
-        raise DataError(path, found=error, expected=expected) from error
+    content = read_json(path, expected)
     lists = check_fields(path, content, dict.fromkeys(SPLITS, list[Text]), expected)
     split_of = {home: split for split in SPLITS for home in lists[split]}
     missing = sorted(homes - split_of.keys())
