@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
-from torch import nn
 
 import datamodules
 from datamodules import FolderPanoramas
@@ -21,10 +18,8 @@ from tangent_train.cli.compose import config_folder
 from tangent_train.errors import DataError
 from tangent_train.geometry import equirect_directions
 from tangent_train.rendering import EquirectRepresentation
-from tangent_train.tasks import SegmentationTask
 from tests.datamodules.data_files import names_of
 from tests.datamodules.folder.folder_format import CLASS_OF_STORED, write_data_set
-from tests.tasks.shapes import quiet_trainer
 
 SHAPE = (32, 64)
 ERP: Any = EquirectRepresentation(level=4)
@@ -95,28 +90,6 @@ def test_the_mask_rotates_with_the_panorama(root: Path, tmp_path: Path) -> None:
         found = masked.source("test").read(index).labels
         np.testing.assert_array_equal(found[clear], expected[clear])
         assert clear.mean() > 0.99
-
-
-def test_metrics_are_those_of_the_pixels_that_count(root: Path) -> None:
-    network = nn.Conv2d(3, 3, 1)
-    nn.init.eye_(network.weight[..., 0, 0])
-    module = FolderPanoramas(root, ERP, mask=-30)
-    optimizer = partial(torch.optim.SGD, lr=0.1)
-    task = SegmentationTask(network, ERP, module.class_names, optimizer)
-    quiet_trainer().test(task, datamodule=module, verbose=False)
-    normalization: Any = module.normalization
-    weight = network.weight.detach().numpy()[..., 0, 0].astype(np.float64)
-    bias = network.bias.detach().numpy()  # type: ignore[union-attr]
-    expected = np.zeros((4, 4), np.int64)
-    for name in names_of(module, "test"):
-        (path,) = (root / "images").glob(f"{name}.*")
-        rgb = np.array(Image.open(path).convert("RGB")) / 255
-        scores = (rgb - normalization.mean) / normalization.std @ weight.T + bias
-        truth = stored_labels(root, name)
-        counted = (truth > 0) & ~BELOW[:, None]
-        np.add.at(expected, (truth[counted], 1 + scores.argmax(-1)[counted]), 1)
-    np.testing.assert_array_equal(task.matrices.pixels, expected)
-    assert (expected[1:].sum(axis=0)[1:] > 0).sum() > 1
 
 
 def test_missing_masks_are_listed_before_training(root: Path, tmp_path: Path) -> None:

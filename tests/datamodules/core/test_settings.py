@@ -15,6 +15,7 @@ from datamodules import (
     Stanford2D3DSPerspective,
     SynthRooms,
     SynthRoomsPerspective,
+    Zind,
 )
 from datamodules.core.inputs import RGB_NORMALIZATION
 from tangent_train.errors import SettingError
@@ -50,6 +51,9 @@ CROPS: Any = PerspectiveRepresentation(level=5)
         (FolderPanoramas, {"test_fraction": 0}, "test_fraction"),
         (FolderPanoramas, {"split_seed": -1}, "split_seed"),
         (FolderPanoramas, {"normalization": {"mean": [0]}}, "normalization"),
+        (Zind, {"inputs": ["rgb", "depth"]}, "inputs"),
+        (Zind, {"doors": "open"}, "doors"),
+        (Zind, {"test_fraction": 1.1}, "test_fraction"),
         (ModelNet40, {"shapes_per_step": 0}, "shapes_per_step"),
         (ModelNet40, {"test_rotation": "z"}, "test_rotation"),
         (ModelNet40, {"normalization": {"mean": [0] * 3, "std": [1] * 3}}, "normalization"),

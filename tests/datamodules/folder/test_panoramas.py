@@ -50,22 +50,6 @@ def test_pixels_are_those_of_the_files(root: Path, erp: Any, split: Split) -> No
         np.testing.assert_array_equal(source.labels(index), panorama.labels)
 
 
-def test_depth_in_metres_near_far_and_missing(own_root: Path, erp: Any) -> None:
-    meters = np.full((32, 64), 2.5, np.float32)
-    meters[:16] = np.nan
-    meters[16:, :2] = 1e-4
-    meters[16:, 2:4] = 200
-    (own_root / "depth" / "scene_0" / "view.0.png").unlink()
-    np.save(own_root / "depth" / "scene_0" / "view.0.npy", meters)
-    (own_root / "test.txt").write_text("scene_0/view.0")
-    source = FolderPanoramas(own_root, erp, inputs=["rgb", "depth"]).source("test")
-    depth = source.read(0).depth
-    assert depth is not None
-    assert depth.dtype == np.uint16
-    assert not depth[:8].any()
-    assert depth[8:, :3].tolist() == [[1, 65535, 1280]] * 8, "near is not missing"
-
-
 def _one_panorama(root: Path, stored: Image.Image, classes: Any, **settings: Any) -> None:
     """A data set whose only test panorama has these labels, the others having class 1."""
     write_classes(root, classes)

@@ -23,6 +23,7 @@ from tangent_train.rendering import (
     TangentRepresentation,
     equirect_to_tangent,
 )
+from tests.datamodules.data_files import names_of
 from tests.datamodules.modelnet40.shapes_format import COUNTS, write_tree
 
 PARTS = ("train", "test")
@@ -90,19 +91,6 @@ def _labels(module: ModelNet40, split: Split) -> list[int]:
 # --- splits ------------------------------------------------------------------------------------
 
 
-def test_every_shape_is_in_one_split_with_the_class_of_its_folder(make_module: MakeModule) -> None:
-    module = make_module(validation_fraction=0.34)
-    names: list[str] = []
-    for split in SPLITS:
-        source = module.source(split)
-        for index, label in enumerate(_labels(module, split)):
-            name = source.name(index)
-            assert name.startswith(f"{module.class_names[label]}/")
-            assert ("/test/" in name) is (split == "test")
-            names.append(name)
-    assert len(set(names)) == len(names) == TRAINING + TEST
-
-
 def test_validation_is_drawn_from_every_class_alike(make_module: MakeModule) -> None:
     drawn = set()
     for seed in range(4):
@@ -110,9 +98,12 @@ def test_validation_is_drawn_from_every_class_alike(make_module: MakeModule) -> 
         labels = _labels(module, "val")
         # A third of 6, 4 and 5.
         assert [labels.count(k) for k in range(3)] == [2, 1, 2]
-        drawn.add(tuple(module.source("val").name(i) for i in range(5)))
+        drawn.add(tuple(names_of(module, "val")))
         again = make_module(validation_fraction=0.34, seed=seed)
-        assert again.source("val").name(3) == module.source("val").name(3)
+        assert names_of(again, "val") == names_of(module, "val")
+        names = {name for split in SPLITS for name in names_of(module, split)}
+        assert len(names) == sum(len(_labels(module, split)) for split in SPLITS) == TRAINING + TEST
+        assert all("/test/" in name for name in names_of(module, "test"))
     assert len(drawn) > 1
     assert len(make_module(validation_fraction=0).source("val")) == 0
     assert make_module(validation_fraction=0).val_dataloader() == []
