@@ -102,6 +102,9 @@ def test_samples(photo_root: Path) -> None:
 
 def test_a_photo_that_sees_less_than_a_crop_is_named(broken_root: Path) -> None:
     module = Stanford2D3DSPerspective(broken_root, PerspectiveRepresentation(5, fov_deg=70))
+    next(broken_root.glob("area_5a/data/pose/*.json")).unlink()
+    with pytest.raises(DataError, match=r"pose\.json: found .*No such file"):
+        module.setup()
     message = r"rgb\.png: found 70° × 70° for an image that spans 60° × 60°; expected all of a crop"
     with pytest.raises(DataError, match=message):
         module.setup()

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from tangent_train.geometry import equirect_directions
+from tests.datamodules.rays import hit_distances
 
 __all__ = ["KINDS", "Camera", "Room", "brute_force_labels", "write_home", "write_homes"]
 
@@ -173,25 +174,6 @@ def brute_force_labels(
         quads += [
             (label, [(*a, low), (*b, low), (*b, high), (*a, high)]) for a, b, (low, high) in points
         ]
-    nearest, labels = np.full(len(rays), np.inf), np.full(len(rays), 255, np.uint8)
-    for label, (p, q, r, s) in quads:
-        for triangle in ((p, q, r), (p, r, s)):
-            away = _triangle_distances(rays, np.array(triangle, float))
-            labels[away < nearest] = label
-            nearest = np.minimum(nearest, away)
-    return labels.reshape(shape)
-
-
-def _triangle_distances(
-    rays: NDArray[np.float64], triangle: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    origin, one, other = triangle[0], triangle[1] - triangle[0], triangle[2] - triangle[0]
-    p = np.cross(rays, other)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = 1 / (p @ one)
-        u = (p @ -origin) * inverse
-        q = np.cross(-origin, one)
-        v = (rays @ q) * inverse
-        away = (q @ other) * inverse
-        hit = (u >= -1e-12) & (v >= -1e-12) & (u + v <= 1 + 1e-12) & (away > 0)
-    return np.where(hit, away, np.inf)
+    triangles = [(*corner[:1], *corner[k : k + 2]) for _, corner in quads for k in (1, 2)]
+    nearest = hit_distances(0.0, rays, triangles).argmin(axis=1)
+    return np.array([label for label, _ in quads], np.uint8)[nearest // 2].reshape(shape)
