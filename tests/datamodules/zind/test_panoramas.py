@@ -104,15 +104,11 @@ def test_the_partition_of_the_release_decides(root: Path) -> None:
         _zind(root).setup()
 
 
-def test_the_prepared_store_holds_the_same(root: Path, tmp_path: Path) -> None:
+def test_a_store_is_of_one_choice_of_doors_and_one_layout(root: Path, tmp_path: Path) -> None:
     settings: dict[str, Any] = {"test_fraction": 1, "store": tmp_path / "store"}
-    stored, plain = _zind(root, **settings), _zind(root, test_fraction=1)
+    stored = _zind(root, **settings)
     stored.prepare_data()
-    for index in range(6):
-        for one, other in zip(
-            *(d.source("test").read(index) for d in (stored, plain)), strict=True
-        ):
-            np.testing.assert_array_equal(one, other)
+    assert (stored.source("test").read(0).labels == 4).any()
     ignoring = _zind(root, doors="ignore", **settings)
     ignoring.prepare_data()
     assert not (ignoring.source("test").read(0).labels == 4).any()

@@ -64,21 +64,16 @@ class Camera:
         }
         return {"vertices": self.local(room.vertices).tolist(), **fixtures, "internal": []}
 
-    def record(self, room: Room, image_path: str, *, primary: bool) -> dict[str, Any]:
+    def record(self, room: Room, image_path: str) -> dict[str, Any]:
         """What the file says of the panorama."""
         layout = self.layout(room)
         seen = {"layout_visible": layout} if self.is_inside else {}
         return {
-            "label": "bedroom",
-            "is_primary": primary,
             "is_inside": self.is_inside,
-            "is_ceiling_flat": True,
             "camera_height": 1,
             "ceiling_height": 1 + room.ceiling_z,
-            "floor_number": 1,
             "image_path": image_path,
             "layout_raw": layout,
-            "layout_complete": layout,
             **seen,
             "floor_plan_transformation": {
                 "translation": [SCALE * xy for xy in self.xy],
@@ -107,14 +102,12 @@ def write_home(
             path = f"panos/floor_01_partial_room_{number:02}_{camera.name}.jpg"
             pixels = rng.integers(0, 256, (rows, 2 * rows, 3), np.uint8)
             Image.fromarray(pixels).save(folder / path, quality=95)
-            panoramas[camera.name] = camera.record(room, path, primary=not panoramas)
+            panoramas[camera.name] = camera.record(room, path)
         floor[f"complete_room_{number:02}"] = {f"partial_room_{number:02}": panoramas}
     file = folder / "zind_data.json"
     content = {
         "scale_meters_per_coordinate": {"floor_01": METERS},
         "merger": {"floor_01": floor},
-        "redraw": {},
-        "floorplan_to_redraw_transformation": {},
     }
     file.write_text(json.dumps(content))
     return file
