@@ -13,7 +13,6 @@ import torch
 from lightning import LightningModule, Trainer
 
 from datamodules.core.class_weights import class_weights
-from datamodules.core.found import Split
 from datamodules.core.loading import EpochSampler, sample_rng
 from datamodules.core.samples import EvaluationSample, TrainingSample
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
@@ -21,9 +20,6 @@ from tangent_train.errors import SettingError
 from tangent_train.rendering import TangentRepresentation
 
 MakeModule = Callable[..., Stanford2D3DS]
-
-
-SPLITS: tuple[Split, ...] = ("train", "val", "test")
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ import pytest
 import torch
 import trimesh
 
-from datamodules.core.found import Split
+from datamodules.core.found import SPLITS, Split
 from datamodules.modelnet40.datamodule import ModelNet40
 from datamodules.modelnet40.meshes import CHANNELS, clean_mesh, mesh_spheres, read_off
 from datamodules.modelnet40.shape_files import MODELNET40, find_shapes
@@ -62,7 +62,6 @@ def test_a_class_that_is_only_tested(tmp_path: Path) -> None:
 
 MakeModule = Callable[..., ModelNet40]
 
-SPLITS: tuple[Split, ...] = ("train", "val", "test")
 LEVEL = 3
 TRAINING = sum(train for train, _ in COUNTS.values())
 TEST = sum(test for _, test in COUNTS.values())
