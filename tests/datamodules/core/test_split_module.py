@@ -187,16 +187,6 @@ def test_training_gives_every_process_as_much(length: int, world_size: int) -> N
     assert len(set(together)) == len(together)
 
 
-def test_the_dropped_tail_changes() -> None:
-    dropped = set()
-    for epoch in range(10):
-        parts = [EpochSampler(3, 0, True, rank, 2) for rank in range(2)]
-        for sampler in parts:
-            sampler.set_epoch(epoch)
-        dropped |= {0, 1, 2} - {i for sampler in parts for i in _indices(sampler)}
-    assert dropped == {0, 1, 2}
-
-
 def test_impossible_processes() -> None:
     for shuffle in (True, False):
         with pytest.raises(SettingError, match="2 processes for 1 samples"):
