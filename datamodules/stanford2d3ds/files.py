@@ -82,40 +82,24 @@ class FileName(NamedTuple):
 
 
 class PictureFiles(NamedTuple):
-    """The files of one panorama (`pano`) or photo (`data`)."""
+    """One panorama (`pano`) or photo (`data`).
+
+    Attributes:
+        area: One of `AREAS`.
+        name: Of its colours.
+        image: Its files, named ``area_3/office_2/<32 hex>``; of photos with the frame.
+        pose: Its camera and pose.
+    """
 
     area: str
     name: FileName
-    rgb: Path
-    semantic: Path
-    depth: Path | None
+    image: ImageFiles
+    pose: Path
 
     @property
     def room(self) -> tuple[str, str, int]:
         """Building, kind and number of the room: 5a and 5b are one building."""
         return self.area.rstrip("ab"), self.name.room, self.name.room_number
-
-    @property
-    def short_name(self) -> str:
-        """Area, room and camera, as ``area_3/office_2/<32 hex>``."""
-        room = f"{self.name.room}_{self.name.room_number}"
-        return f"area_{self.area}/{room}/{self.name.camera}"
-
-    @property
-    def image(self) -> ImageFiles:
-        """The files of this panorama or photo."""
-        from datamodules.core.reading import ImageFiles
-
-        if self.name.frame == "equirectangular":
-            return ImageFiles(self.short_name, self.rgb, self.semantic, self.depth)
-        name = f"{self.short_name}/{self.name.frame}"
-        return ImageFiles(name, self.rgb, self.semantic, self.depth, self.pose)
-
-    @property
-    def pose(self) -> Path:
-        """Camera and pose."""
-        name = self.name._replace(domain="pose", suffix=".json")
-        return self.rgb.parents[1] / "pose" / str(name)
 
 
 def list_pictures(
@@ -134,6 +118,8 @@ def list_pictures(
         with_depth: Whether depth is wanted.
         problems: That there are none, or other files, is added.
     """
+    from datamodules.core.reading import ImageFiles
+
     folder = root / f"area_{area}" / group
     found = []
     images: list[Path] = []
@@ -148,7 +134,16 @@ def list_pictures(
     for rgb in sorted(images):
         with problems.noted(str(rgb), rgb):
             name = FileName.parse(rgb.name)
-            depth = folder / "depth" / str(name._replace(domain="depth"))
-            semantic = folder / "semantic" / str(name._replace(domain="semantic"))
-            found.append(PictureFiles(area, name, rgb, semantic, depth if with_depth else None))
+            semantic, depth, pose = (
+                folder / domain / str(name._replace(domain=domain, suffix=suffix))
+                for domain, suffix in (("semantic", ".png"), ("depth", ".png"), ("pose", ".json"))
+            )
+            image = ImageFiles(
+                f"area_{area}/{name.room}_{name.room_number}/{name.camera}", rgb, semantic
+            )
+            if with_depth:
+                image = image._replace(depth=depth)
+            if group == "data":
+                image = image._replace(name=f"{image.name}/{name.frame}", camera=pose)
+            found.append(PictureFiles(area, name, image, pose))
     return found

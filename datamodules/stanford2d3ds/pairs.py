@@ -154,18 +154,17 @@ class StanfordPairs(PanoramaPairs):
 
     def image(self, files: PictureFiles) -> Path:
         """See `PanoramaPairs`."""
-        return files.rgb
+        return files.image.rgb
 
     def panorama(self, files: PictureFiles) -> PairedPanorama:
         """See `PanoramaPairs`."""
-        rgb = read_color_png(files.rgb)
-        shape = paired_shape(files.rgb, rgb, self._height)
-        steps = resize_depth(read_depth(files.image.parts["depth"]), shape)
+        image = files.image
+        rgb = read_color_png(image.rgb)
+        shape = paired_shape(image.rgb, rgb, self._height)
+        steps = resize_depth(read_depth(image.parts["depth"]), shape)
         distance_m = np.where(steps == 0, np.float32(np.nan), steps_to_meters(steps))
         pose = read_panorama_pose(files.pose)
-        return PairedPanorama(
-            files.short_name, resize_area(rgb, shape), files.rgb, distance_m, pose
-        )
+        return PairedPanorama(image.name, resize_area(rgb, shape), image.rgb, distance_m, pose)
 
 
 def _room(files: PictureFiles) -> str:
@@ -192,7 +191,7 @@ def _resolve(names: Iterable[str], files: Sequence[PictureFiles]) -> dict[str, P
     ]
     if wrong:
         raise DataError(
-            files[0].rgb.parent,
+            files[0].image.rgb.parent,
             found=", ".join(wrong),
             expected="one panorama for each image of the paper's pairs",
             remedy="Copy or extract area_1 again; data.pairs=rooms uses the panoramas present.",
