@@ -138,6 +138,7 @@ def _with(row: int, column: int, value: object) -> list[list[Any]]:
     [
         "70",
         K[:2],
+        [[70, 0, 30], [0, 72], [0, 0, 1]],
         _with(0, 0, -70),
         _with(0, 1, 2),
         _with(0, 0, float("nan")),

@@ -14,7 +14,7 @@ from PIL import Image
 
 from datamodules import Zind, ZindPairs
 from datamodules.core.found import SPLITS
-from tangent_train.errors import DataError
+from tangent_train.errors import DataError, SettingError
 from tangent_train.geometry import equirect_directions
 from tangent_train.rendering import EquirectRepresentation
 from tests.datamodules.data_files import names_of
@@ -212,6 +212,8 @@ def test_panoramas_inside_one_room_are_paired(tmp_path: Path) -> None:
     assert pair.left.name.endswith("pano_3")
     assert pair.right.file.name.endswith("pano_5.jpg")
     assert pair.left.rgb.shape == (64, 128, 3)
+    with pytest.raises(SettingError, match=r"erp_height: found 65; expected at most the 64 rows"):
+        ZindPairs(tmp_path, erp_height=65).read(1)
 
 
 def test_both_panoramas_see_the_same_room(tmp_path: Path) -> None:
