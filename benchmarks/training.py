@@ -157,7 +157,7 @@ class _StepClock(Callback):
 
     def _step(self) -> None:
         batch = next(self._batches)
-        images = self._data.samples.normalized(batch).flatten(0, 1)
+        images = self._data.normalized(batch).flatten(0, 1)
         labels = batch.labels.flatten(0, 1).long() - 1
         self._optimizer.zero_grad()
         scores = self._network(images.contiguous(memory_format=self._format))

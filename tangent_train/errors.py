@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 
-__all__ = ["DataError", "SettingError", "counted", "printable"]
+__all__ = ["DataError", "SettingError", "counted", "of_extra", "printable"]
 
 
 _LONGEST = 400  # characters of what was found: a file may hold anything
@@ -63,3 +65,26 @@ class SettingError(_ExplainedError):
 
 class DataError(_ExplainedError):
     """A file or folder that cannot be used."""
+
+
+@contextmanager
+def of_extra(extra: str, subject: object, remedy: str = "") -> Iterator[None]:
+    """A block that imports packages of an extra of tangent-train.
+
+    Args:
+        extra: Its name.
+        subject: What needs them.
+        remedy: Another remedy.
+
+    Raises:
+        SettingError: One is not installed.
+    """
+    try:
+        yield
+    except ImportError as error:
+        raise SettingError(
+            subject,
+            found=f"a missing package ({error})",
+            expected=f"the packages of the extra {extra}",
+            remedy=f"Run: pip install 'tangent-train[{extra}]'. {remedy}".rstrip(),
+        ) from error

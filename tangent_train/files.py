@@ -24,6 +24,7 @@ __all__ = [
     "load_plain",
     "no_room",
     "parse_json",
+    "read_json",
     "reserve",
     "write_bytes",
     "write_text",
@@ -195,6 +196,23 @@ def parse_json(text: str | bytes, **options: Any) -> Any:
         return json.loads(text, **options)
     except RecursionError as error:
         raise ValueError("its brackets are nested too deeply") from error
+
+
+def read_json(path: Path, expected: str, remedy: str = "") -> Any:
+    """The content of a JSON file.
+
+    Args:
+        path: The file.
+        expected: For the message.
+        remedy: For the message.
+
+    Raises:
+        DataError: It cannot be read, or is no JSON.
+    """
+    try:
+        return parse_json(path.read_bytes())
+    except (OSError, ValueError) as error:
+        raise DataError(path, found=error, expected=expected, remedy=remedy) from error
 
 
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")

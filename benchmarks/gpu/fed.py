@@ -43,7 +43,7 @@ def fed(quick: bool) -> Iterator[Table]:
         source = data.source("train")
         source.items = [*source.items] * 64  # one long epoch
         batch = next(iter(data.train_dataloader()))
-        batch = move_data_to_device(batch._replace(images=data.samples.normalized(batch)), DEVICE)
+        batch = move_data_to_device(batch._replace(images=data.normalized(batch)), DEVICE)
         cores = len(os.sched_getaffinity(0))
         fits = {"the step alone": partial(_fit, task, train_dataloaders=repeat(batch))}
         for workers in (0,) if quick else [n for n in (2, 4, 8, 12, 15) if n < cores]:

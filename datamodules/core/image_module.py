@@ -9,19 +9,28 @@ from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
+from torch import Tensor
 from torch.utils.data import DataLoader
 
 from datamodules.core.found import Found, Split
-from datamodules.core.inputs import RGB_NORMALIZATION, RGBD_NORMALIZATION, Input, Normalization
+from datamodules.core.inputs import (
+    RGB_NORMALIZATION,
+    RGBD_NORMALIZATION,
+    Input,
+    Normalization,
+    channel_names,
+    normalize,
+    ordered_inputs,
+)
 from datamodules.core.panoramas import Panorama, Photo, Turn
 from datamodules.core.pipeline import (
     EstimatedUp,
-    MaskedPanoramas,
     PanoramaJudge,
     PosedUp,
     RotatedPanoramas,
     SplitItems,
     Transform,
+    masked,
 )
 from datamodules.core.problems import Problems
 from datamodules.core.progress import show_progress
@@ -32,7 +41,7 @@ from datamodules.core.reading import (
     PhotoReading,
     check_headers,
 )
-from datamodules.core.samples import ImageSamples
+from datamodules.core.samples import EvaluationImages, TrainingImages
 from datamodules.core.split_module import SplitDataModule
 from datamodules.core.store import Store
 from datamodules.images.gpano import whole_area
@@ -72,9 +81,10 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        default = self.normalizations["depth" in self.inputs]
-        self.samples = ImageSamples(self.inputs, self.normalization or default, self.color_jitter)
-        self.inputs, self.normalization = self.samples.inputs, self.samples.normalization
+        self.inputs = ordered_inputs(self.inputs)
+        with_depth = "depth" in self.inputs
+        self.set_normalization(self.normalizations[with_depth], 3 + with_depth)
+        self.require("color_jitter", 0 <= self.color_jitter <= 1, "0 to 1")
 
     @abstractmethod
     def find_images(
@@ -106,6 +116,25 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
         for _ in in_threads(check, found.of()):
             pass
         return found
+
+    def training_samples(self) -> TrainingImages:
+        """Samples `TrainingSample`."""
+        source, seed = self.source("train"), self.drawn_from
+        return TrainingImages(source, self.representation, seed, self.inputs, self.color_jitter)
+
+    def evaluation_samples(self, split: Split) -> EvaluationImages:
+        """Samples `EvaluationSample`."""
+        return EvaluationImages(self.source(split), self.representation, self.inputs)
+
+    @property
+    def in_channels(self) -> int:
+        """Total channels of all inputs."""
+        return len(channel_names(self.inputs))
+
+    def normalized(self, batch: Any) -> Tensor:
+        """See `SplitDataModule`."""
+        normalization: Any = self.normalization
+        return normalize(batch.images, normalization, self.inputs)
 
 
 _HALF_TURN_DEG = 180
@@ -155,7 +184,13 @@ class PanoramaDataModule(ImageDataModule):
         )
         self.erp_height: int = self.representation.erp_height
         self.judge: PanoramaJudge | None = None
-        self._check_rotations()
+        rotation = self.test_rotation
+        tilt = type(rotation) in (int, float) and 0 <= float(rotation or 0) <= _HALF_TURN_DEG
+        fine = tilt or rotation in (None, "so3")
+        self.require("test_rotation", fine, "null, a tilt of 0 to 180 degrees, or so3")
+        self.require("upright", self.upright in (None, "pose", "auto"), "null, pose or auto")
+        fine = 0 < self.max_tilt_deg <= _HALF_TURN_DEG
+        self.require("max_tilt_deg", fine, "more than 0, at most 180")
         self._masks = Masks(self.mask, "data.mask")
         if not self._masks.of_each:
             self._masks.read("", whole_area(Path(), (self.erp_height, 2 * self.erp_height)))
@@ -176,7 +211,7 @@ class PanoramaDataModule(ImageDataModule):
         """Panoramas from files or store: masked, rotated, then aligned with gravity."""
         transforms: list[Transform[Panorama, Any]] = []
         if self.mask is not None:
-            transforms.append(MaskedPanoramas(self._masks))
+            transforms.append(partial(masked, self._masks))
         if self.upright is not None:
             transforms.append(PosedUp())
         if split == "test" and self.test_rotation is not None:
@@ -194,19 +229,6 @@ class PanoramaDataModule(ImageDataModule):
             read = (source.read(index) for index in range(len(source)))
             show_progress(read, "Estimating up", self.noun, len(source))
         return super().test_dataloader()
-
-    def _check_rotations(self) -> None:
-        rotation = self.test_rotation
-        tilt = type(rotation) in (int, float) and 0 <= float(rotation or 0) <= _HALF_TURN_DEG
-        if rotation not in (None, "so3") and not tilt:
-            expected = "null, a tilt of 0 to 180 degrees, or so3"
-            raise SettingError("data.test_rotation", found=repr(rotation), expected=expected)
-        if self.upright not in (None, "pose", "auto"):
-            raise SettingError("data.upright", found=self.upright, expected="null, pose or auto")
-        if not 0 < self.max_tilt_deg <= _HALF_TURN_DEG:
-            raise SettingError(
-                "data.max_tilt_deg", found=self.max_tilt_deg, expected="more than 0, at most 180"
-            )
 
 
 @dataclass(kw_only=True, eq=False, repr=False)
@@ -233,14 +255,13 @@ class PhotoDataModule(ImageDataModule):
             "one for photos",
             "Choose representation=perspective, or panoramas, as data=synthrooms.",
         )
-        if "elevation" in self.inputs:
-            raise SettingError(
-                "data.inputs",
-                found=list(self.inputs),
-                expected="no elevation: the horizon of a photo is unknown",
-                remedy="Train on photos without it, then on panoramas with it and init_from=…: "
-                "its filters start at zero.",
-            )
+        self.require(
+            "inputs",
+            "elevation" not in self.inputs,
+            "no elevation: the horizon of a photo is unknown",
+            "Train on photos without it, then on panoramas with it and init_from=…: "
+            "its filters start at zero.",
+        )
 
     def reading(self, reader: ImageReader) -> tuple[str, PhotoReading]:
         """See `ImageDataModule`."""

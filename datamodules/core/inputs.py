@@ -23,6 +23,7 @@ __all__ = [
     "channel_names",
     "normalize",
     "normalize_channels",
+    "ordered_inputs",
 ]
 
 Input = Literal["rgb", "depth", "elevation"]
@@ -136,6 +137,23 @@ def channel_names(inputs: Sequence[Input]) -> tuple[str, ...]:
     ('red', 'green', 'blue', 'depth')
     """
     return tuple(name for each in inputs for name in (_COLORS if each == "rgb" else (each,)))
+
+
+def ordered_inputs(inputs: Sequence[Input]) -> tuple[Input, ...]:
+    """Names of inputs in the order of their channels.
+
+    Raises:
+        SettingError: There are other names, or no `rgb`.
+    """
+    ordered = tuple(name for name in INPUTS if name in inputs)
+    known = not isinstance(inputs, str) and sorted(ordered) == sorted(inputs)
+    if not known or "rgb" not in inputs:
+        raise SettingError(
+            "data.inputs",
+            found=inputs if isinstance(inputs, str) else list(inputs),
+            expected="a list: rgb, perhaps depth and elevation",
+        )
+    return ordered
 
 
 def normalize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -28,18 +29,21 @@ def claim_folder(
     Raises:
         DataError: The folder holds other files, or data of other settings. Nothing is written.
     """
-    wanted = {"generator": generator, "version": version, "settings": dict(settings)}
+    about = {"generator": generator, "version": version}
+    wanted, found = {**about, **settings}, dict[str, Any]()
     path = root / manifest
     # Before the manifest: whoever makes the same at the same time writes that first.
     foreign = sorted(p.name for p in root.iterdir() if p.name[0] != ".") if root.is_dir() else []
     if path.exists():
-        found = _read(path)
+        with suppress(ValueError, TypeError, KeyError):  # it is no manifest then
+            content = parse_json(path.read_bytes())
+            found = {key: content[key] for key in about} | content["settings"]
         if found != wanted:
-            one, other = _flat(found), _flat(wanted)
+            other = [key for key in wanted if found.get(key) != wanted[key]]
             raise DataError(
                 path,
-                found=", ".join(f"{k}={one.get(k)}" for k in other if one.get(k) != other[k]),
-                expected=", ".join(f"{k}={v}" for k, v in other.items() if one.get(k) != v),
+                found=", ".join(f"{key}={found.get(key)}" for key in other),
+                expected=", ".join(f"{key}={wanted[key]}" for key in other),
                 remedy="Name another folder, or remove this one to make it anew.",
             )
         return
@@ -50,19 +54,4 @@ def claim_folder(
             expected="a new or empty folder",
             remedy="Name another folder.",
         )
-    write_text(path, json.dumps(wanted, indent=1) + "\n")
-
-
-def _read(manifest: Path) -> Any:
-    try:
-        return parse_json(manifest.read_bytes())
-    except ValueError:
-        return None
-
-
-def _flat(manifest: Any) -> dict[str, Any]:
-    """Generator, version and settings; nothing of what is no manifest."""
-    if not isinstance(manifest, dict) or not isinstance(manifest.get("settings"), dict):
-        return {}
-    return {"generator": manifest.get("generator"), "version": manifest.get("version"),
-            **manifest["settings"]}  # fmt: skip
+    write_text(path, json.dumps({**about, "settings": dict(settings)}, indent=1) + "\n")

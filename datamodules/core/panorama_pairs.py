@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from itertools import combinations, pairwise
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from datamodules.images.gpano import area_of
 from datamodules.images.image_files import image_paths, short_names
 from datamodules.images.pixel_files import read_rgb
+from datamodules.images.png import check_panorama_size
 from tangent_train.errors import DataError, SettingError
+from tangent_train.geometry import PanoramaPose
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from tangent_train.geometry import PanoramaPose
-
-__all__ = ["ImagePairs", "PairedPanorama", "PanoramaPair", "PanoramaPairs", "PublishedPair"]
+__all__ = [
+    "ImagePairs",
+    "PairedPanorama",
+    "PanoramaPair",
+    "PanoramaPairs",
+    "PublishedPair",
+    "paired_shape",
+]
 
 
 class PairedPanorama(NamedTuple):
@@ -92,21 +97,53 @@ class PanoramaPairs(ABC):
 
     @property
     @abstractmethod
-    def names(self) -> Sequence[str]:
-        """Names of the pairs, in their order."""
+    def pairs(self) -> Sequence[tuple[str, Any, Any]]:
+        """Unique names of the pairs, each with the files of its two panoramas."""
+
+    @abstractmethod
+    def image(self, files: Any) -> Path:
+        """The image of a panorama of `pairs`."""
+
+    @abstractmethod
+    def panorama(self, files: Any) -> PairedPanorama:
+        """Read a panorama of `pairs`.
+
+        Raises:
+            DataError: A file cannot be used.
+        """
 
     @property
-    @abstractmethod
-    def files(self) -> Sequence[Path]:
-        """The images of all panoramas."""
+    def names(self) -> list[str]:
+        """Names of the pairs, in their order."""
+        return [name for name, _, _ in self.pairs]
 
-    @abstractmethod
+    @property
+    def files(self) -> list[Path]:
+        """The images of all panoramas, each once."""
+        sides = (side for _, *both in self.pairs for side in both)
+        return list(dict.fromkeys(map(self.image, sides)))
+
     def read(self, index: int) -> PanoramaPair:
         """Read a pair.
 
         Raises:
             DataError: A file cannot be used.
         """
+        name, left, right = self.pairs[index]
+        split = self.published[name].split if name in self.published else None
+        return PanoramaPair(name, split, self.panorama(left), self.panorama(right))
+
+
+def paired_shape(path: Path, rgb: NDArray[np.uint8], erp_height: int | None) -> tuple[int, int]:
+    """Rows and columns to downsample a panorama to: `erp_height`, or those of its image.
+
+    Raises:
+        DataError: It is no panorama.
+        SettingError: It has fewer rows.
+    """
+    size = (rgb.shape[0], rgb.shape[1])
+    check_panorama_size(path, size, erp_height or 1)
+    return size if erp_height is None else (erp_height, 2 * erp_height)
 
 
 class ImagePairs(PanoramaPairs):
@@ -150,30 +187,21 @@ class ImagePairs(PanoramaPairs):
         self._paths = paths
         indices = range(len(paths))
         chosen = pairwise(indices) if pairing == "consecutive" else combinations(indices, 2)
-        self._pairs = list(chosen)
         self._names = short_names(paths)
+        self._pairs = [(f"{self._names[k]} – {self._names[j]}", k, j) for k, j in chosen]
 
     @property
-    def names(self) -> list[str]:
-        """The names of both files."""
-        return [f"{self._names[left]} – {self._names[right]}" for left, right in self._pairs]
+    def pairs(self) -> list[tuple[str, int, int]]:
+        """The names of both files, and their places among the paths."""
+        return self._pairs
 
-    @property
-    def files(self) -> list[Path]:
+    def image(self, files: int) -> Path:
         """See `PanoramaPairs`."""
-        return self._paths
+        return self._paths[files]
 
-    def read(self, index: int) -> PanoramaPair:
-        """Read a pair; of panoramas that are a part of the sphere the rest is black.
-
-        Raises:
-            DataError: A file cannot be used.
-        """
-        left, right = (self._panorama(k) for k in self._pairs[index])
-        return PanoramaPair(self.names[index], None, left, right)
-
-    def _panorama(self, index: int) -> PairedPanorama:
-        path = self._paths[index]
+    def panorama(self, files: int) -> PairedPanorama:
+        """See `PanoramaPairs`; of one that is a part of the sphere the rest is black."""
+        path = self._paths[files]
         rgb = read_rgb(path)
         size = (rgb.shape[0], rgb.shape[1])
-        return PairedPanorama(self._names[index], area_of(path, size).place(rgb), path)
+        return PairedPanorama(self._names[files], area_of(path, size).place(rgb), path)

@@ -34,6 +34,7 @@ __all__ = [
     "distance_from_z_depth",
     "mask_black",
     "meters_to_steps",
+    "ray_lengths",
     "resize_area",
     "resize_depth",
     "resize_nearest",
@@ -50,6 +51,9 @@ Turn = float | Literal["so3"] | None
 
 STEPS_PER_M = 512
 """Depth is in steps of 1/512 m, as in the files of Stanford2D3DS."""
+
+
+_MOST_STEPS = np.iinfo(np.uint16).max
 
 
 class Panorama(NamedTuple):
@@ -164,12 +168,8 @@ def meters_to_steps(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
     >>> meters_to_steps(np.array([0, 1e-4, 1, 1000], np.float32)).tolist()
     [0, 1, 512, 65535]
     """
-    most = np.iinfo(np.uint16).max
-    steps = np.minimum(depth_m * np.float32(STEPS_PER_M) + np.float32(0.5), most)
+    steps = np.minimum(depth_m * np.float32(STEPS_PER_M) + np.float32(0.5), _MOST_STEPS)
     return np.maximum(steps.astype(np.uint16), depth_m > 0)
-
-
-_MOST_STEPS = np.iinfo(np.uint16).max
 
 
 class Photo(NamedTuple):
@@ -181,6 +181,7 @@ class Photo(NamedTuple):
             missing: the same meaning as in panoramas; or None. See `distance_from_z_depth`.
         labels: ``(H, W)`` uint8, 0 where unknown.
         camera_matrix: ``(3, 3)`` K for integer pixel centres, without skew.
+        up: Unknown.
 
     The arrays may be shared or read-only: not to be written to.
     """
@@ -189,11 +190,7 @@ class Photo(NamedTuple):
     depth: NDArray[np.uint16] | None
     labels: NDArray[np.uint8]
     camera_matrix: NDArray[np.float64]
-
-    @property
-    def up(self) -> None:
-        """Unknown."""
-        return
+    up: None = None
 
     def sampler(self, representation: PerspectiveRepresentation) -> PhotoSampler:
         """The sampler of its crops, which depend on its camera."""
@@ -218,10 +215,16 @@ def distance_from_z_depth(
     Returns:
         ``(H, W)`` in the same unit, rounded, at most 65535; 0 where missing.
     """
+    lengths = ray_lengths(camera_matrix, z_depth.shape)
+    return np.minimum(z_depth * lengths + 0.5, _MOST_STEPS).astype(np.uint16)
+
+
+def ray_lengths(camera_matrix: NDArray[np.float64], size: tuple[int, ...]) -> NDArray[np.float64]:
+    """Distance per z-depth of all pixels of an image of some rows and columns, ``(H, W)``."""
     # A ray (x, y, 1) is √(1 + x² + y²) long.
     y_squared, x_squared = (
         ((np.arange(count) - camera_matrix[axis, 2]) / camera_matrix[axis, axis]) ** 2
-        for axis, count in ((1, z_depth.shape[0]), (0, z_depth.shape[1]))
+        for axis, count in ((1, size[0]), (0, size[1]))
     )
-    length = np.sqrt(1 + np.add.outer(y_squared, x_squared))
-    return np.minimum(z_depth * length + 0.5, _MOST_STEPS).astype(np.uint16)
+    lengths: NDArray[np.float64] = np.sqrt(1 + np.add.outer(y_squared, x_squared))
+    return lengths

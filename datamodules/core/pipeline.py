@@ -6,36 +6,33 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, Literal, Protocol, TypeVar
+from typing import Any, Generic, Literal, Protocol, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from datamodules.core.loading import sample_rng
 from datamodules.core.panoramas import Panorama
 from datamodules.core.problems import Problems
+from datamodules.core.reading import ImageFiles
+from datamodules.core.store import Store
 from datamodules.images.gpano import up_of, whole_area
+from datamodules.images.masks import Masks
 from tangent_train.geometry import random_rotation, rotation_about
 from tangent_train.rendering import rotate_equirect
 from tangent_train.rendering.upright.gravity import estimate_up
 from tangent_train.threads import in_threads
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from datamodules.core.reading import ImageFiles
-    from datamodules.core.store import Store
-    from datamodules.images.masks import Masks
-
 __all__ = [
     "EstimatedUp",
     "Item",
-    "MaskedPanoramas",
     "PanoramaJudge",
     "PosedUp",
     "Reading",
     "RotatedPanoramas",
     "SplitItems",
     "Transform",
+    "masked",
 ]
 
 
@@ -141,15 +138,13 @@ class SplitItems(Generic[_Item, _Image]):
         """
         problems = Problems()
 
-        def keep(index: int) -> list[_Image]:
-            kept: list[_Image] = []
+        def keep(index: int) -> Any:
             with problems.noted(self.name(index)):
                 image: Any = self.read(index)
                 # Copies: arrays that are views of a file would keep it open.
-                kept.append(image._make(None if a is None else np.array(a) for a in image))
-            return kept
+                return image._make(None if a is None else np.array(a) for a in image)
 
-        kept = [image for read in in_threads(keep, range(len(self))) for image in read]
+        kept = list(in_threads(keep, range(len(self))))
         problems.refuse(root)
         self._kept = kept
 
@@ -162,22 +157,18 @@ class SplitItems(Generic[_Item, _Image]):
         return image
 
 
-class MaskedPanoramas:
-    """Panoramas with labels that are unknown where they do not count.
+def masked(masks: Masks, panorama: Panorama, index: int, files: ImageFiles) -> Panorama:
+    """The panorama with labels that are unknown where it does not count; a `Transform`.
 
     Args:
-        masks: Where they count.
+        masks: Where panoramas count.
+        panorama: Its colours and depth stay.
+        index: Ignored.
+        files: Of the panorama.
     """
-
-    def __init__(self, masks: Masks) -> None:
-        self._masks = masks
-
-    def __call__(self, panorama: Panorama, index: int, files: ImageFiles) -> Panorama:
-        """One masked panorama; its colours and depth stay."""
-        del index
-        labels = panorama.labels
-        counts = self._masks.read(files.name, whole_area(files.rgb, labels.shape))
-        return panorama._replace(labels=labels & counts)
+    del index
+    counts = masks.read(files.name, whole_area(files.rgb, panorama.labels.shape))
+    return panorama._replace(labels=panorama.labels & counts)
 
 
 class PosedUp:

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from datamodules.core.panoramas import (
     Panorama,
@@ -14,19 +19,18 @@ from datamodules.core.panoramas import (
     resize_area,
     resize_depth,
 )
-from datamodules.images.png import check_panorama_size
+from datamodules.core.problems import Problems
+from datamodules.images.png import check_panorama_size, check_png, read_color_png
 from tangent_train.errors import DataError
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-    from pathlib import Path
-
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from datamodules.core.problems import Problems
-
-__all__ = ["ImageFiles", "ImageReader", "PanoramaReading", "PhotoReading", "check_headers"]
+__all__ = [
+    "ImageFiles",
+    "ImageReader",
+    "PanoramaReading",
+    "PhotoReading",
+    "PngReader",
+    "check_headers",
+]
 
 
 class ImageFiles(NamedTuple):
@@ -56,12 +60,12 @@ class ImageReader(ABC):
     """Decoder of the files of a data set."""
 
     @property
-    @abstractmethod
     def settings(self) -> Mapping[str, str]:
         """Everything that affects labels and depth besides the files, such as a class table.
 
-        Each choice has a prepared store of its own.
+        Each choice has a prepared store of its own; by default there is nothing to choose.
         """
+        return {}
 
     @abstractmethod
     def size(self, part: str, path: Path) -> tuple[int, int] | None:
@@ -94,13 +98,32 @@ class ImageReader(ABC):
             DataError: The file is broken, or holds a value without a class.
         """
 
-    @abstractmethod
     def depth(self, files: ImageFiles) -> NDArray[np.uint16]:
         """Depth ``(H, W)`` in steps of 1/512 m, 0 where missing; z-depth of photos."""
+        raise NotImplementedError(files.name)
 
     def camera(self, files: ImageFiles) -> NDArray[np.float64]:
         """``(3, 3)`` K of a photo for integer pixel centres, without skew."""
         raise NotImplementedError(files.name)
+
+
+class PngReader(ImageReader):
+    """Decoder of the PNG files of a release.
+
+    Attributes:
+        formats: Bits per channel and kinds of colours (`PngHeader.color`) by part.
+    """
+
+    formats: Mapping[str, tuple[int, Sequence[str]]]
+
+    def size(self, part: str, path: Path) -> tuple[int, int]:
+        """See `ImageReader`."""
+        header = check_png(path, *self.formats[part])
+        return header.height, header.width
+
+    def rgb(self, files: ImageFiles) -> NDArray[np.uint8]:
+        """Colours; alpha is dropped."""
+        return read_color_png(files.rgb)
 
 
 @dataclass(frozen=True)
@@ -110,16 +133,16 @@ class _Reading:
     Attributes:
         reader: Of the data set.
         num_classes: K + 1, the unknown class included.
+        shape: Rows and columns of the result; None for those of the files.
     """
 
     reader: ImageReader
     num_classes: int
+    shape: tuple[int, int] | None = None
 
-    def checked_labels(
-        self, files: ImageFiles, shape: tuple[int, int] | None = None
-    ) -> NDArray[np.uint8]:
-        """Its labels, none beyond the classes; see `ImageReader.labels`."""
-        labels = self.reader.labels(files, shape)
+    def labels(self, files: ImageFiles) -> NDArray[np.uint8]:
+        """Its labels alone, none beyond the classes."""
+        labels = self.reader.labels(files, self.shape)
         if labels.max(initial=0) >= self.num_classes:
             raise DataError(
                 files.labels,
@@ -131,31 +154,18 @@ class _Reading:
 
     def parts(self, files: ImageFiles) -> list[Callable[[], object]]:
         """Functions that decode each of its files separately."""
-        read = {"labels": self.checked_labels}
+        read = {"labels": replace(self, shape=None).labels}
         return [partial(read.get(part, getattr(self.reader, part)), files) for part in files.parts]
 
 
-@dataclass(frozen=True)
 class PanoramaReading(_Reading):
-    """Reads panoramas at one size.
-
-    Attributes:
-        shape: Rows and columns of the result.
-    """
-
-    shape: tuple[int, int]
+    """Reads panoramas at one size."""
 
     def __call__(self, files: ImageFiles) -> Panorama:
         """One panorama."""
-        depth = None
-        if files.depth is not None:
-            depth = resize_depth(self.reader.depth(files), self.shape)
-        rgb = resize_area(self.reader.rgb(files), self.shape)
-        return Panorama(rgb, depth, self.labels(files))
-
-    def labels(self, files: ImageFiles) -> NDArray[np.uint8]:
-        """Its labels alone."""
-        return self.checked_labels(files, self.shape)
+        shape: Any = self.shape
+        depth = None if files.depth is None else resize_depth(self.reader.depth(files), shape)
+        return Panorama(resize_area(self.reader.rgb(files), shape), depth, self.labels(files))
 
 
 class PhotoReading(_Reading):
@@ -168,10 +178,6 @@ class PhotoReading(_Reading):
         if files.depth is not None:
             depth = distance_from_z_depth(self.reader.depth(files), camera_matrix)
         return Photo(self.reader.rgb(files), depth, self.labels(files), camera_matrix)
-
-    def labels(self, files: ImageFiles) -> NDArray[np.uint8]:
-        """Its labels alone."""
-        return self.checked_labels(files)
 
 
 def check_headers(

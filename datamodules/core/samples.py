@@ -2,41 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import Dataset
 from torchvision.transforms.v2 import functional
 
-from datamodules.core.inputs import (
-    INPUTS,
-    MAX_DEPTH_M,
-    Input,
-    Normalization,
-    channel_names,
-    normalize,
-)
+from datamodules.core.inputs import MAX_DEPTH_M, Input
 from datamodules.core.loading import Seed, sample_rng
 from datamodules.core.panoramas import STEPS_PER_M
-from tangent_train.errors import SettingError
+from datamodules.core.pipeline import SplitItems
 from tangent_train.geometry import equirect_elevations
+from tangent_train.rendering.representations.views import Views
 from tangent_train.rendering.upright.gravity import upright_rotation
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from datamodules.core.pipeline import SplitItems
-    from tangent_train.rendering.representations.views import Views
 
 __all__ = [
     "EvaluationImages",
     "EvaluationSample",
-    "ImageSamples",
     "Inputs",
     "TrainingImages",
     "TrainingSample",
@@ -86,51 +74,6 @@ class EvaluationSample(NamedTuple, Generic[_Images]):
     rays: Tensor
     rotations: Tensor
     index: int  # type: ignore[assignment]  # hides tuple.index
-
-
-class ImageSamples:
-    """Makes the samples of labelled images, and the input of a network.
-
-    Args:
-        inputs: Inputs of the network, `rgb` and optionally others, see `Input`.
-        normalization: Of RGB and depth, see `Normalization.of`.
-        color_jitter: Strength of the colour augmentation, 0 (none) to 1, see `jitter_colors`.
-
-    Attributes:
-        inputs: As given, in the order of the channels.
-        normalization: As given.
-        in_channels: Total channels of all inputs.
-
-    Raises:
-        SettingError: A setting is invalid.
-    """
-
-    def __init__(
-        self,
-        inputs: Sequence[Input],
-        normalization: Normalization | str | Mapping[str, Sequence[float]],
-        color_jitter: float,
-    ) -> None:
-        self.inputs = _checked_inputs(inputs)
-        self.normalization = Normalization.of(
-            normalization, 3 + ("depth" in inputs), "data.normalization"
-        )
-        self.in_channels = len(channel_names(self.inputs))
-        if not isinstance(color_jitter, int | float) or not 0 <= color_jitter <= 1:
-            raise SettingError("data.color_jitter", found=color_jitter, expected="0 to 1")
-        self._color_jitter = color_jitter
-
-    def training(self, source: Any, representation: Any, seed: Seed) -> TrainingImages:
-        """Samples `TrainingSample`."""
-        return TrainingImages(source, representation, seed, self.inputs, self._color_jitter)
-
-    def evaluation(self, source: Any, representation: Any) -> EvaluationImages:
-        """Samples `EvaluationSample`."""
-        return EvaluationImages(source, representation, self.inputs)
-
-    def normalized(self, batch: Any) -> Tensor:
-        """The images of a batch, normalized for the network."""
-        return normalize(batch.images, self.normalization, self.inputs)
 
 
 @dataclass(frozen=True)
@@ -195,19 +138,6 @@ class EvaluationImages(Dataset[EvaluationSample[Inputs]]):
             torch.from_numpy(views.rotations().astype(np.float32)),
             index,
         )
-
-
-def _checked_inputs(inputs: Sequence[Input]) -> tuple[Input, ...]:
-    """Names of inputs in the order of their channels."""
-    ordered = tuple(name for name in INPUTS if name in inputs)
-    known = not isinstance(inputs, str) and sorted(ordered) == sorted(inputs)
-    if not known or "rgb" not in inputs:
-        raise SettingError(
-            "data.inputs",
-            found=inputs if isinstance(inputs, str) else list(inputs),
-            expected="a list: rgb, perhaps depth and elevation",
-        )
-    return ordered
 
 
 def render_inputs(image: Any, views: Views, inputs: Sequence[Input]) -> tuple[Tensor, ...]:

@@ -19,7 +19,7 @@ from torch.utils.data import DataLoader, Dataset
 from datamodules.core.class_weights import ClassWeights, class_weights
 from datamodules.core.found import SPLITS, Found, Split
 from datamodules.core.inputs import Normalization
-from datamodules.core.loading import EpochSampler, at_least, make_loader, this_process
+from datamodules.core.loading import EpochSampler, make_loader, this_process
 from datamodules.core.pipeline import Item, SplitItems
 from datamodules.core.problems import Problems
 from tangent_train.errors import DataError, SettingError
@@ -42,7 +42,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
     """A data set split for training, validation and test.
 
     A data set is a dataclass: its fields are the settings `data.*` of a config. It defines the
-    items of its splits (`find`), how they are read (`pipeline`) and their samples (`samples`).
+    items of its splits (`find`), how they are read (`pipeline`) and their samples.
 
     The trainer must be made with ``use_distributed_sampler=False``, see `EpochSampler`.
 
@@ -65,7 +65,6 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
         class_names: Name of every label; in segmentation the first is unknown, which is no class.
         kind: Kind of its labels.
         noun: Name of the items, in the plural.
-        samples: Makes the samples of a split and the input of the network, see `ImageSamples`.
         is_made: Whether `make_files` generates all of it.
 
     Raises:
@@ -87,19 +86,16 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
     in_memory: bool = False
     skip_broken: bool = False
     class_names: tuple[str, ...] = field(init=False)
-    samples: Any = field(init=False)
 
     def __post_init__(self) -> None:
         super().__init__()
         self.root = Path(self.root)
         self.store = None if self.store is None else Path(self.store)
-        if not 0 <= self.validation_fraction < 1:
-            raise SettingError(
-                "data.validation_fraction", found=self.validation_fraction, expected="0 to below 1"
-            )
+        fine = 0 <= self.validation_fraction < 1
+        self.require("validation_fraction", fine, "0 to below 1")
         for name in ("num_workers", "seed", "stream"):
-            at_least(f"data.{name}", getattr(self, name), 0)
-        at_least(f"data.{self._per_step}", self.per_step, 1)
+            self.require(name, getattr(self, name) >= 0, "0 or more")
+        self.require(self._per_step, self.per_step >= 1, "1 or more")
         self._found: Found[_Item] | None = None
         self._sources: dict[Split, SplitItems[_Item, Any]] = {}
         self._start = (0, 0)
@@ -121,10 +117,51 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
     def pipeline(self, found: Found[_Item], split: Split) -> SplitItems[_Item, Any]:
         """Reading pipeline of the items of a split."""
 
+    @abstractmethod
+    def training_samples(self) -> Dataset[Any]:
+        """Samples of the training split, by (epoch, index)."""
+
+    @abstractmethod
+    def evaluation_samples(self, split: Split) -> Dataset[Any]:
+        """Samples of a whole split, by (epoch, index); the epoch changes nothing."""
+
+    @property
+    @abstractmethod
+    def in_channels(self) -> int:
+        """Number of input channels."""
+
+    @abstractmethod
+    def normalized(self, batch: Any) -> Tensor:
+        """The images of a batch, normalized for the network."""
+
     def make_files(self) -> None:
         """Generate the files of the data set, if it is a synthetic one."""
 
     # --- checks --------------------------------------------------------------------------------
+
+    def require(self, setting: str, fine: bool, expected: str, remedy: str = "") -> None:
+        """Refuse the value of a setting ``data.<setting>`` that is not fine.
+
+        Raises:
+            SettingError: It is not.
+        """
+        if not fine:
+            found = getattr(self, setting)
+            found = list(found) if isinstance(found, tuple) else found
+            raise SettingError(f"data.{setting}", found=found, expected=expected, remedy=remedy)
+
+    def set_normalization(self, default: Normalization, channels: int) -> None:
+        """Settle the normalization, which is a `Normalization` from now on.
+
+        Args:
+            default: Where none is set.
+            channels: Required number of channels.
+
+        Raises:
+            SettingError: It is something else, or has other channels.
+        """
+        given = self.normalization or default
+        self.normalization = Normalization.of(given, channels, "data.normalization")
 
     def need_representation(self, attribute: str, expected: str, remedy: str) -> None:
         """Refuse a representation of another kind of images.
@@ -285,18 +322,6 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
 
     # --- samples and loaders -------------------------------------------------------------------
 
-    def training_samples(self) -> Dataset[Any]:
-        """Samples of the training split, by (epoch, index)."""
-        samples: Dataset[Any] = self.samples.training(
-            self.source("train"), self.representation, self.drawn_from
-        )
-        return samples
-
-    def evaluation_samples(self, split: Split) -> Dataset[Any]:
-        """Samples of a whole split, by (epoch, index); the epoch changes nothing."""
-        samples: Dataset[Any] = self.samples.evaluation(self.source(split), self.representation)
-        return samples
-
     @property
     def num_classes(self) -> int:
         """Classes K: the scores of a network."""
@@ -337,11 +362,6 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
     def per_step(self) -> int:
         """Images or shapes per training step and process."""
         return int(getattr(self, self._per_step))
-
-    @property
-    def in_channels(self) -> int:
-        """Number of input channels."""
-        return int(self.samples.in_channels)
 
     @property
     def drawn_from(self) -> tuple[int, int]:
@@ -400,7 +420,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
         Returns:
             The same with float32 images, channels first.
         """
-        images = self.samples.normalized(batch)
+        images = self.normalized(batch)
         if self.trainer is not None:  # which converted the batch when it had no float images yet
             images = self.trainer.precision_plugin.convert_input(images)
         return batch._replace(images=images)

@@ -5,25 +5,21 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import os
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import PurePosixPath
-from typing import TYPE_CHECKING, Any
+from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from datamodules.core.problems import Problems
+from datamodules.core.reading import ImageFiles
 from datamodules.images.pixel_files import photo_fov_deg, read_image_size
 from tangent_train.errors import DataError
-from tangent_train.files import parse_json
+from tangent_train.files import read_json
 from tangent_train.geometry import camera_matrix_from_fov, is_camera_matrix
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from datamodules.core.problems import Problems
-    from datamodules.core.reading import ImageFiles
 
 __all__ = ["FolderCameras", "read_cameras"]
 
@@ -154,12 +150,7 @@ def read_cameras(path: Path, fov_deg: float | None) -> FolderCameras:
     Raises:
         DataError: It cannot be read, or does not hold such names.
     """
-    try:
-        content = parse_json(path.read_bytes())
-    except FileNotFoundError:
-        content = {}
-    except (OSError, ValueError) as error:
-        raise DataError(path, found=error, expected=_EXAMPLE) from error
+    content = read_json(path, _EXAMPLE) if os.path.lexists(path) else {}
     if not isinstance(content, dict):
         raise DataError(path, found=json.dumps(content), expected=_EXAMPLE)
     given = {PurePosixPath(name).as_posix(): value for name, value in content.items()}

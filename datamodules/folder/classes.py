@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tangent_train.errors import DataError, counted
-from tangent_train.files import parse_json
+from tangent_train.files import read_json
 
 __all__ = ["UNKNOWN_NAME", "FolderClasses", "read_classes"]
 
@@ -128,18 +128,14 @@ def read_classes(path: Path) -> FolderClasses:
     Raises:
         DataError: It cannot be read, is in another form, gives a value twice, or nothing.
     """
-    try:
-        content = parse_json(path.read_bytes())
-    except FileNotFoundError as error:
+    if not path.exists():
         raise DataError(
             path,
             found="no such file" if path.parent.is_dir() else f"no folder {path.parent}",
             expected="the classes of your images",
             remedy="Give data.root=<folder>; docs/own_data.md says what is in it.",
-        ) from error
-    except (OSError, ValueError) as error:
-        remedy = "docs/own_data.md shows how to bring your own data."
-        raise DataError(path, found=error, expected=_EXPECTED, remedy=remedy) from error
+        )
+    content = read_json(path, _EXPECTED, "docs/own_data.md shows how to bring your own data.")
     if isinstance(content, list):
         named = [(name, [place]) for place, name in enumerate(content) if name is not None]
     elif isinstance(content, dict):

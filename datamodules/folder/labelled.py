@@ -14,28 +14,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
+from datamodules.core.found import Split
 from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
 from datamodules.core.inputs import Input
-from datamodules.core.loading import at_least
+from datamodules.core.problems import Problems
+from datamodules.core.reading import ImageFiles
 from datamodules.folder.cameras import FolderCameras, read_cameras
 from datamodules.folder.classes import UNKNOWN_NAME, read_classes
 from datamodules.folder.reader import FolderReader, list_images, note_ignored, read_codes
 from datamodules.folder.splits import FolderSplits
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError
 from tangent_train.registry import registered
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from datamodules.core.found import Split
-    from datamodules.core.problems import Problems
-    from datamodules.core.reading import ImageFiles
 
 __all__ = ["FolderPanoramas", "FolderPhotos", "LabelledFolder"]
 
@@ -68,15 +62,9 @@ class LabelledFolder(ImageDataModule):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.depth_units_per_m > 0:
-            raise SettingError(
-                "data.depth_units_per_m", found=self.depth_units_per_m, expected="more than 0"
-            )
-        if not 0 < self.test_fraction < 1:
-            raise SettingError(
-                "data.test_fraction", found=self.test_fraction, expected="above 0 to below 1"
-            )
-        at_least("data.split_seed", self.split_seed, 0)
+        self.require("depth_units_per_m", self.depth_units_per_m > 0, "more than 0")
+        self.require("test_fraction", 0 < self.test_fraction < 1, "above 0 to below 1")
+        self.require("split_seed", self.split_seed >= 0, "0 or more")
         # Now, not with the files: the network is made for as many classes.
         self._classes = read_classes(self.classes_from)
         self.class_names = (UNKNOWN_NAME, *self._classes.names)
@@ -185,10 +173,8 @@ class FolderPhotos(LabelledFolder, PhotoDataModule):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.fov is not None and not 0 < self.fov < 180:
-            raise SettingError(
-                "data.fov", found=self.fov, expected="degrees, more than 0 and less than 180"
-            )
+        fine = self.fov is None or 0 < self.fov < 180
+        self.require("fov", fine, "degrees, more than 0 and less than 180")
 
     def make_reader(self, images: Sequence[ImageFiles], problems: Problems) -> FolderReader:
         """See `LabelledFolder`."""

@@ -7,14 +7,14 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.core.panoramas import meters_to_steps, resize_nearest
+from datamodules.core.problems import Problems
 from datamodules.core.reading import ImageFiles, ImageReader
-from datamodules.folder.classes import read_classes
+from datamodules.folder.classes import FolderClasses, read_classes
 from datamodules.images.image_files import IMAGE_SUFFIXES, find_depth, image_paths, walk_files
 from datamodules.images.masks import Masks
 from datamodules.images.pixel_files import (
@@ -26,10 +26,6 @@ from datamodules.images.pixel_files import (
 )
 from datamodules.images.png import PngHeader, read_png_header
 from tangent_train.errors import DataError, SettingError
-
-if TYPE_CHECKING:
-    from datamodules.core.problems import Problems
-    from datamodules.folder.classes import FolderClasses
 
 __all__ = ["FolderReader", "class_masks", "list_images", "note_ignored", "read_codes"]
 

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from lightning.pytorch.utilities import rank_zero_warn
 
 from datamodules.core.found import SPLITS, Split, draw_groups
+from datamodules.core.problems import Problems
+from datamodules.core.reading import ImageFiles
 from tangent_train.errors import DataError, counted
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from datamodules.core.problems import Problems
-    from datamodules.core.reading import ImageFiles
 
 __all__ = ["FolderSplits"]
 

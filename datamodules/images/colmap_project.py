@@ -6,24 +6,20 @@ camera for each folder (``--ImageReader.single_camera_per_folder``), so these ha
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from datamodules.images.image_files import short_names
 from datamodules.images.pixel_files import write_pixels
 from datamodules.images.tangent_folders import face_name, shrink_to_level, write_each
 from tangent_train.errors import DataError
-from tangent_train.rendering import equirect_to_tangent
+from tangent_train.geometry import TangentGrid
+from tangent_train.rendering import Interpolation, equirect_to_tangent
 from tangent_train.rendering.camera_files import RIG_FILE, write_rig
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-    from pathlib import Path
-
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from tangent_train.geometry import TangentGrid
-    from tangent_train.rendering import Interpolation
 
 __all__ = ["ColmapProject", "flat_names"]
 

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
 
 from datamodules.images.png import check_pixels
-from tangent_train.errors import DataError
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from numpy.typing import NDArray
+from tangent_train.errors import DataError, of_extra
 
 __all__ = ["read_exr", "read_exr_size"]
 
@@ -24,7 +22,8 @@ def read_exr_size(path: Path) -> tuple[int, int]:
     """Rows and columns of an OpenEXR image, from its header.
 
     Raises:
-        DataError: It cannot be read, or the OpenEXR package is missing.
+        DataError: It cannot be read.
+        SettingError: The OpenEXR package is missing.
     """
     with _opened(path, header_only=True) as file:
         (left, top), (right, bottom) = (corner.tolist() for corner in file.header()["dataWindow"])
@@ -45,7 +44,8 @@ def read_exr(path: Path) -> NDArray[Any]:
 
     Raises:
         DataError: It cannot be read, or has several parts, several depths per pixel or no such
-            channel; or the OpenEXR package is missing.
+            channel.
+        SettingError: The OpenEXR package is missing.
     """
     size = read_exr_size(path)
     with _opened(path, header_only=False) as file:
@@ -60,15 +60,8 @@ def read_exr(path: Path) -> NDArray[Any]:
 
 @contextmanager
 def _opened(path: Path, *, header_only: bool) -> Iterator[Any]:
-    try:
+    with of_extra("exr", path, "Or convert the file to a float TIFF."):
         import OpenEXR
-    except ImportError as error:
-        raise DataError(
-            path,
-            found="an OpenEXR file",
-            expected="the OpenEXR package",
-            remedy="Run: pip install 'tangent-train[exr]', or convert the file to a float TIFF.",
-        ) from error
     try:
         with OpenEXR.File(str(path), separate_channels=True, header_only=header_only) as file:
             yield file

@@ -8,20 +8,17 @@ have, the place of the image in it, and the pitch and roll of the camera.
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeVar
+from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from datamodules.core.panoramas import resize_nearest
 from tangent_train.errors import DataError, SettingError
 from tangent_train.rendering.upright.gravity import up_from_pose
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from numpy.typing import NDArray
 
 __all__ = ["PanoramaArea", "area_of", "area_of_crop", "up_of", "whole_area"]
 

@@ -5,16 +5,13 @@ from __future__ import annotations
 import glob
 import os
 from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from tangent_train.errors import DataError
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-    from contextlib import AbstractContextManager
-
-    Noted = Callable[..., AbstractContextManager[None]]
+Noted = Callable[..., AbstractContextManager[None]]
 
 __all__ = [
     "DEPTH_SUFFIXES",

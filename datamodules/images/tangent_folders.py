@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import shutil
 import tempfile
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from datamodules.images.gpano import area_of, whole_area
+from datamodules.images.gpano import PanoramaArea, area_of, whole_area
 from datamodules.images.image_files import IMAGE_SUFFIXES
 from datamodules.images.pixel_files import read_pixels, write_pixels
 from tangent_train.errors import SettingError
-from tangent_train.geometry import equirect_shape
+from tangent_train.geometry import TangentGrid, equirect_shape
 from tangent_train.rendering import Interpolation, equirect_to_tangent
 from tangent_train.rendering.camera_files import (
     CAMERAS_FILE,
@@ -26,14 +28,6 @@ from tangent_train.rendering.camera_files import (
     write_cameras,
 )
 from tangent_train.threads import in_threads
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
-
-    from numpy.typing import NDArray
-
-    from datamodules.images.gpano import PanoramaArea
-    from tangent_train.geometry import TangentGrid
 
 __all__ = [
     "face_name",

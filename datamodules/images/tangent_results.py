@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
+from datamodules.core.panoramas import ray_lengths
 from datamodules.images.pixel_files import (
     LOSSY_SUFFIXES,
     READABLE_SUFFIXES,
@@ -20,16 +21,10 @@ from datamodules.images.pixel_files import (
     write_pixels,
 )
 from tangent_train.errors import DataError, SettingError
-from tangent_train.geometry import ResizedGrid
+from tangent_train.geometry import PinholeGrid, ResizedGrid
 from tangent_train.rendering import Blend, tangent_to_equirect
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from tangent_train.geometry import PinholeGrid
-    from tangent_train.rendering.camera_files import CameraFile
+from tangent_train.rendering.camera_files import CameraFile
+from tangent_train.threads import in_threads
 
 __all__ = ["Kind", "TangentResults", "result_files"]
 
@@ -115,8 +110,7 @@ class TangentResults:
             DataError: A file cannot be read, is not square, differs from the others, or cannot be
                 of this kind.
         """
-        with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-            arrays = list(pool.map(partial(read_pixels, indices=kind != "color"), files))
+        arrays = list(in_threads(partial(read_pixels, indices=kind != "color"), files))
         first = arrays[0]
         square = f"{first.shape[0]}×{first.shape[0]} pixels of {first.dtype}"
         for file, array in zip(files, arrays, strict=True):
@@ -219,8 +213,7 @@ def _kind_of(file: Path, array: NDArray[Any]) -> Kind:
 
 def _distances(depth: NDArray[Any], grid: PinholeGrid, path: Path) -> NDArray[Any]:
     """Distances from the centre, of depth ``(d, d)`` along the axis of an image's camera."""
-    line = (np.arange(grid.dim) - (grid.dim - 1) / 2) * grid.pitch
-    lengths = np.sqrt(1 + line[:, None] ** 2 + line**2)
+    lengths = ray_lengths(grid.camera_matrix, depth.shape)
     if depth.dtype.kind == "f":
         return (depth * lengths).astype(depth.dtype)
     missing = (depth == _NO_DEPTH) & (depth.dtype == np.uint16)

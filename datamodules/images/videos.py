@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Generator, Iterator
 from contextlib import closing, contextmanager
 from functools import partial
 from itertools import count, takewhile
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from datamodules.images.png import check_pixels
-from tangent_train.errors import DataError
+from tangent_train.errors import DataError, of_extra
 from tangent_train.files import atomic_path
 from tangent_train.threads import in_threads
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Iterator
-    from pathlib import Path
-
-    from numpy.typing import NDArray
 
 __all__ = ["VIDEO_SUFFIXES", "read_frames", "read_video_size", "write_video"]
 
@@ -34,15 +31,8 @@ _BT709 = 1  # of the matrix, primaries and transfer: what players assume of larg
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
     """A container and its first video stream; errors in the block name the file."""
-    try:
+    with of_extra("video", path):
         import av
-    except ImportError as error:
-        raise DataError(
-            path,
-            found="a video, but not the package that reads it",
-            expected="PyAV",
-            remedy="pip install 'tangent-train[video]'",
-        ) from error
     try:
         with av.open(str(path)) as container:
             if not container.streams.video:
@@ -63,7 +53,8 @@ def read_video_size(path: Path) -> tuple[int, int, int]:
     """Number of frames, rows and columns of a video; nothing is decoded.
 
     Raises:
-        DataError: It cannot be read, has no video stream or no frames, or PyAV is missing.
+        DataError: It cannot be read, or has no video stream or no frames.
+        SettingError: PyAV is missing.
     """
     with _opened(path) as (container, stream):
         # Some formats do not say it: their packets are counted.

@@ -9,27 +9,30 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from functools import partial
+from typing import Any, ClassVar
+
+from torch import Tensor
 
 from datamodules.core.found import Found, Split, draw_groups
 from datamodules.core.pipeline import SplitItems
+from datamodules.core.problems import Problems
 from datamodules.core.processes import in_processes
 from datamodules.core.split_module import Kind, SplitDataModule
 from datamodules.core.store import Store
+from datamodules.modelnet40.meshes import CHANNELS
 from datamodules.modelnet40.shape_files import MODELNET40, ShapeFile, find_shapes
 from datamodules.modelnet40.shape_samples import (
     SPHERE_NORMALIZATION,
-    ShapeSamples,
+    ShapeSample,
     ShapeViews,
-    SphereReading,
     Spheres,
     TestRotation,
+    make_spheres,
+    normalize_spheres,
 )
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError
 from tangent_train.registry import registered
-
-if TYPE_CHECKING:
-    from datamodules.core.problems import Problems
 
 __all__ = ["ModelNet40"]
 
@@ -73,15 +76,12 @@ class ModelNet40(SplitDataModule[ShapeFile]):
             "one for panoramas, such as the spheres of shapes",
             "Choose representation=tangent.",
         )
-        if self.test_rotation not in (None, "yaw", "so3"):
-            raise SettingError(
-                "data.test_rotation", found=repr(self.test_rotation), expected="null, yaw or so3"
-            )
+        self.require(
+            "test_rotation", self.test_rotation in (None, "yaw", "so3"), "null, yaw or so3"
+        )
         self.erp_height: int = self.representation.erp_height
         self.class_names = self.find_classes()
-        normalization = self.normalization or SPHERE_NORMALIZATION
-        self.samples = samples = ShapeSamples(self.class_names, normalization)
-        self.normalization = samples.normalization
+        self.set_normalization(SPHERE_NORMALIZATION, CHANNELS)
 
     def find_classes(self) -> tuple[str, ...]:
         """Names of the classes, even before the files exist."""
@@ -102,20 +102,35 @@ class ModelNet40(SplitDataModule[ShapeFile]):
                 raise DataError(self.root, found=f"no {split} shape", expected="some")
         shape = self.erp_height, 2 * self.erp_height
         folder = (self.store or self.root) / f"spheres_{shape[0]}x{shape[1]}"
-        return Found(self.noun, splits, SphereReading(shape), Store(folder), _in_processes)
+        return Found(self.noun, splits, partial(make_spheres, shape), Store(folder), _in_processes)
 
     def pipeline(self, found: Found[ShapeFile], split: Split) -> SplitItems[ShapeFile, Spheres]:
         """The spheres in the store."""
         return SplitItems(found.splits[split], found.read, Spheres, found.store)
 
+    def training_samples(self) -> ShapeViews:
+        """Samples `ShapeSample`: random views, drawn and rotated as the representation says."""
+        source, labels = self.source("train"), self._labels
+        return ShapeViews(source, labels, self.representation, self.drawn_from, random=True)
+
     def evaluation_samples(self, split: Split) -> ShapeViews:
-        """Samples `ShapeSample`; those of the test split are rotated if set."""
-        rotation = self.test_rotation if split == "test" else None
-        samples: Any = self.samples
-        views: ShapeViews = samples.evaluation(
-            self.source(split), self.representation, rotation, self.seed
-        )
-        return views
+        """Samples `ShapeSample` of all views; those of the test split are rotated if set."""
+        source, rotation = self.source(split), self.test_rotation if split == "test" else None
+        return ShapeViews(source, self._labels, self.representation, self.seed, rotation=rotation)
+
+    @property
+    def in_channels(self) -> int:
+        """Channels of a sphere."""
+        return CHANNELS
+
+    def normalized(self, batch: ShapeSample) -> Tensor:
+        """The views of a `ShapeSample`, ``(B, N, 6, h, w)`` float32."""
+        normalization: Any = self.normalization
+        return normalize_spheres(batch.images, normalization)
+
+    @property
+    def _labels(self) -> dict[str, int]:
+        return {name: label for label, name in enumerate(self.class_names)}
 
     def evaluation_size(self) -> int:
         """Shapes per evaluation batch: as many as in training."""

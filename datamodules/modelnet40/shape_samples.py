@@ -3,38 +3,33 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import Dataset
 
 from datamodules.core.inputs import Normalization, normalize_channels
 from datamodules.core.loading import Seed, sample_rng
-from datamodules.modelnet40.meshes import CHANNELS, clean_mesh, mesh_spheres, read_off
+from datamodules.core.pipeline import SplitItems
+from datamodules.modelnet40.meshes import clean_mesh, mesh_spheres, read_off
+from datamodules.modelnet40.shape_files import ShapeFile
 from tangent_train.geometry import random_rotation, rotation_about
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from numpy.typing import NDArray
-
-    from datamodules.core.pipeline import SplitItems
-    from datamodules.modelnet40.shape_files import ShapeFile
-
-    _Shapes = SplitItems[ShapeFile, Any]
+_Shapes = SplitItems[ShapeFile, Any]
 
 __all__ = [
     "SPHERE_NORMALIZATION",
     "STEPS",
     "ShapeSample",
-    "ShapeSamples",
     "ShapeViews",
-    "SphereReading",
     "Spheres",
     "TestRotation",
+    "make_spheres",
     "normalize_spheres",
 ]
 
@@ -67,20 +62,10 @@ class Spheres(NamedTuple):
     spheres: NDArray[np.uint16]
 
 
-@dataclass(frozen=True)
-class SphereReading:
-    """Makes the spheres of a mesh.
-
-    Attributes:
-        shape: ``(H, W)``.
-    """
-
-    shape: tuple[int, int]
-
-    def __call__(self, mesh: ShapeFile) -> Spheres:
-        """Those of one mesh."""
-        values = mesh_spheres(clean_mesh(read_off(mesh.path)), self.shape)
-        return Spheres(np.rint(values * STEPS).astype(np.uint16))
+def make_spheres(shape: tuple[int, int], mesh: ShapeFile) -> Spheres:
+    """The spheres of a mesh, of a shape ``(H, W)``."""
+    values = mesh_spheres(clean_mesh(read_off(mesh.path)), shape)
+    return Spheres(np.rint(values * STEPS).astype(np.uint16))
 
 
 class ShapeSample(NamedTuple):
@@ -96,38 +81,6 @@ class ShapeSample(NamedTuple):
     images: Tensor
     label: Tensor
     index: Tensor  # type: ignore[assignment]  # hides tuple.index
-
-
-class ShapeSamples:
-    """Makes the samples of shapes, and the input of a network.
-
-    Args:
-        class_names: Of the shapes, in the order of their labels.
-        normalization: Of the six channels, see `Normalization.of`.
-    """
-
-    def __init__(
-        self,
-        class_names: Sequence[str],
-        normalization: Normalization | str | Mapping[str, Sequence[float]],
-    ) -> None:
-        self._labels = {name: label for label, name in enumerate(class_names)}
-        self.normalization = Normalization.of(normalization, CHANNELS, "data.normalization")
-        self.in_channels = CHANNELS
-
-    def training(self, source: _Shapes, representation: Any, seed: Seed) -> ShapeViews:
-        """Random views, drawn and rotated as the representation says."""
-        return ShapeViews(source, self._labels, representation, seed, random=True)
-
-    def evaluation(
-        self, source: _Shapes, representation: Any, rotation: TestRotation = None, seed: int = 0
-    ) -> ShapeViews:
-        """All views, of rotated shapes if set."""
-        return ShapeViews(source, self._labels, representation, seed, rotation=rotation)
-
-    def normalized(self, batch: ShapeSample) -> Tensor:
-        """The views of a `ShapeSample`, ``(B, N, 6, h, w)`` float32."""
-        return normalize_spheres(batch.images, self.normalization)
 
 
 @dataclass(frozen=True)

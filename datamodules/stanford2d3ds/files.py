@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import os
 import re
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from datamodules.core.problems import Problems
-from datamodules.core.reading import ImageFiles
 from tangent_train.errors import DataError
+
+if TYPE_CHECKING:  # slow, and SynthRooms needs the names alone
+    from datamodules.core.reading import ImageFiles
 
 __all__ = [
     "AREAS",
     "FOLDS",
     "GET_IT",
-    "MISSING_DEPTH",
     "FileName",
     "PictureFiles",
     "list_pictures",
@@ -32,9 +32,6 @@ GET_IT = (
     "the folder with area_1 … area_6, or train on data=synthrooms, which needs no download."
 )
 """Remedy if the data set is missing."""
-
-MISSING_DEPTH = 65535
-"""Marks pixels without depth in depth files."""
 
 _NAME = re.compile(
     r"camera_([0-9a-f]{32})_([A-Za-z]+)_(\d+)_frame_(equirectangular|\d+)"
@@ -85,38 +82,24 @@ class FileName(NamedTuple):
 
 
 class PictureFiles(NamedTuple):
-    """The files of one panorama (`pano`) or photo (`data`)."""
+    """One panorama (`pano`) or photo (`data`).
+
+    Attributes:
+        area: One of `AREAS`.
+        name: Of its colours.
+        image: Its files, named ``area_3/office_2/<32 hex>``; of photos with the frame.
+        pose: Its camera and pose.
+    """
 
     area: str
     name: FileName
-    rgb: Path
-    semantic: Path
-    depth: Path | None
+    image: ImageFiles
+    pose: Path
 
     @property
     def room(self) -> tuple[str, str, int]:
         """Building, kind and number of the room: 5a and 5b are one building."""
         return self.area.rstrip("ab"), self.name.room, self.name.room_number
-
-    @property
-    def short_name(self) -> str:
-        """Area, room and camera, as ``area_3/office_2/<32 hex>``."""
-        room = f"{self.name.room}_{self.name.room_number}"
-        return f"area_{self.area}/{room}/{self.name.camera}"
-
-    @property
-    def image(self) -> ImageFiles:
-        """The files of this panorama or photo."""
-        if self.name.frame == "equirectangular":
-            return ImageFiles(self.short_name, self.rgb, self.semantic, self.depth)
-        name = f"{self.short_name}/{self.name.frame}"
-        return ImageFiles(name, self.rgb, self.semantic, self.depth, self.pose)
-
-    @property
-    def pose(self) -> Path:
-        """Camera and pose."""
-        name = self.name._replace(domain="pose", suffix=".json")
-        return self.rgb.parents[1] / "pose" / str(name)
 
 
 def list_pictures(
@@ -124,7 +107,7 @@ def list_pictures(
     area: str,
     group: Literal["pano", "data"],
     with_depth: bool,
-    problems: Problems | None = None,
+    problems: Problems,
 ) -> list[PictureFiles]:
     """The panoramas or photos of one area, in the order of their names.
 
@@ -133,38 +116,34 @@ def list_pictures(
         area: One of `AREAS`.
         group: Panoramas or photos.
         with_depth: Whether depth is wanted.
-        problems: Problems are added, and the search continues.
-
-    Raises:
-        DataError: There are none, or other files.
+        problems: That there are none, or other files, is added.
     """
+    from datamodules.core.reading import ImageFiles
+
     folder = root / f"area_{area}" / group
     found = []
     images: list[Path] = []
-    noted = (problems or (raised := Problems())).noted
-    with noted():
-        images = _list_images(folder / "rgb", "panoramas" if group == "pano" else "photos")
-    for rgb in images:
-        with noted(str(rgb), rgb):
+    with problems.noted():
+        if (folder / "rgb").is_dir():
+            # Hidden files are leftovers of archives made on a Mac.
+            images = [p for p in (folder / "rgb").iterdir() if p.match("[!.]*.png")]
+        if not images:
+            none = "no panoramas" if group == "pano" else "no photos"
+            expected = "camera_….png files"
+            raise DataError(folder / "rgb", found=none, expected=expected, remedy=GET_IT)
+    for rgb in sorted(images):
+        with problems.noted(str(rgb), rgb):
             name = FileName.parse(rgb.name)
-            depth = folder / "depth" / str(name._replace(domain="depth"))
-            semantic = folder / "semantic" / str(name._replace(domain="semantic"))
-            found.append(PictureFiles(area, name, rgb, semantic, depth if with_depth else None))
-    if problems is None:
-        raised.refuse(folder)
+            semantic, depth, pose = (
+                folder / domain / str(name._replace(domain=domain, suffix=suffix))
+                for domain, suffix in (("semantic", ".png"), ("depth", ".png"), ("pose", ".json"))
+            )
+            image = ImageFiles(
+                f"area_{area}/{name.room}_{name.room_number}/{name.camera}", rgb, semantic
+            )
+            if with_depth:
+                image = image._replace(depth=depth)
+            if group == "data":
+                image = image._replace(name=f"{image.name}/{name.frame}", camera=pose)
+            found.append(PictureFiles(area, name, image, pose))
     return found
-
-
-def _list_images(folder: Path, kind: str) -> list[Path]:
-    """The images in a folder, in the order of their names."""
-    why = f"no {kind}"
-    try:
-        # Hidden files are leftovers of archives made on a Mac.
-        paths = [p for p in folder.iterdir() if p.suffix == ".png" and not p.name.startswith(".")]
-    except FileNotFoundError:
-        paths = []
-    except OSError as error:
-        paths, why = [], os.strerror(error.errno or 0)
-    if not paths:
-        raise DataError(folder, found=why, expected="camera_….png files", remedy=GET_IT)
-    return sorted(paths)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tangent_train.errors import DataError, counted
-from tangent_train.files import parse_json
+from tangent_train.files import read_json
 
 __all__ = ["CLASSES", "UNKNOWN", "LabelTable"]
 
@@ -51,7 +51,7 @@ class LabelTable:
     class_ids: NDArray[np.uint8]
 
     @classmethod
-    def from_json(cls, path: str | Path) -> LabelTable:
+    def from_json(cls, path: Path) -> LabelTable:
         """Read `semantic_labels.json`, a list of names ``class_instance_room_number_area``.
 
         Args:
@@ -62,10 +62,7 @@ class LabelTable:
         """
         expected = f"a JSON list of names that begin with {', '.join(CLASSES)} or <UNK>"
         remedy = "Copy semantic_labels.json of the Stanford2D3DS release."
-        try:
-            names = parse_json(Path(path).read_bytes())
-        except (OSError, ValueError) as error:
-            raise DataError(path, found=error, expected=expected, remedy=remedy) from error
+        names = read_json(path, expected, remedy)
         if not isinstance(names, list) or not names:
             raise DataError(path, found=type(names).__name__, expected=expected, remedy=remedy)
         ids = {"<UNK>": UNKNOWN} | {name: i for i, name in enumerate(CLASSES, start=1)}

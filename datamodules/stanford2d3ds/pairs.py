@@ -16,26 +16,22 @@ from collections.abc import Iterable, Sequence
 from functools import cached_property
 from itertools import combinations
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.core.panorama_pairs import (
     PairedPanorama,
-    PanoramaPair,
     PanoramaPairs,
     PublishedPair,
+    paired_shape,
 )
 from datamodules.core.panoramas import resize_area, resize_depth, steps_to_meters
-from datamodules.images.png import check_panorama_size, read_color_png, read_depth_png
-from datamodules.stanford2d3ds.files import (
-    AREAS,
-    GET_IT,
-    MISSING_DEPTH,
-    PictureFiles,
-    list_pictures,
-)
+from datamodules.core.problems import Problems
+from datamodules.images.png import read_color_png
+from datamodules.stanford2d3ds.files import AREAS, GET_IT, PictureFiles, list_pictures
+from datamodules.stanford2d3ds.reader import read_depth
 from datamodules.synthrooms.camera import CAMERA_FROM_SPHERE, euler_rotation
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import parse_json
@@ -99,15 +95,8 @@ def published_pairs() -> list[PublishedPair]:
     return pairs
 
 
-class _Chosen(NamedTuple):
-    name: str
-    split: str | None
-    left: PictureFiles
-    right: PictureFiles
-
-
 class StanfordPairs(PanoramaPairs):
-    """Pairs of Stanford2D3DS's panoramas with depth and pose; see `stanford2d3ds.poses`.
+    """Pairs of Stanford2D3DS's panoramas with depth and pose; see `read_panorama_pose`.
 
     Args:
         root: Folder with ``area_1`` …, of which ``pano/rgb``, ``pano/depth`` and ``pano/pose`` are
@@ -134,33 +123,27 @@ class StanfordPairs(PanoramaPairs):
         self._areas = areas
         self._height = erp_height
 
-    @property
-    def names(self) -> list[str]:
-        """The paper's numbers of pairs, or their rooms and the beginnings of their cameras."""
-        return [chosen.name for chosen in self._chosen]
-
-    @property
-    def files(self) -> list[Path]:
-        """See `PanoramaPairs`."""
-        return [side.rgb for chosen in self._chosen for side in (chosen.left, chosen.right)]
-
-    def read(self, index: int) -> PanoramaPair:
-        """Read a pair; see `PanoramaPairs`."""
-        chosen = self._chosen[index]
-        left, right = self._panorama(chosen.left), self._panorama(chosen.right)
-        return PanoramaPair(chosen.name, chosen.split, left, right)
-
     @cached_property
-    def _chosen(self) -> list[_Chosen]:
-        if self.published:
-            files = list_pictures(self.root, "1", "pano", True)
-            pairs = self.published.values()
-            found = _resolve({name for pair in pairs for name in (pair.left, pair.right)}, files)
-            return [_Chosen(str(p.number), p.split, found[p.left], found[p.right]) for p in pairs]
+    def pairs(self) -> list[tuple[str, PictureFiles, PictureFiles]]:
+        """The paper's numbers of pairs, or their rooms and the beginnings of their cameras.
+
+        Raises:
+            DataError: Panoramas are missing.
+        """
         areas = self._areas or [a for a in AREAS if (self.root / f"area_{a}").is_dir()]
-        files = [file for area in areas for file in list_pictures(self.root, area, "pano", True)]
+        problems = Problems()
+        files = [
+            files
+            for area in (["1"] if self.published else areas)
+            for files in list_pictures(self.root, area, "pano", True, problems)
+        ]
+        problems.refuse(self.root)
+        if self.published:
+            pairs = self.published.items()
+            found = _resolve({name for _, p in pairs for name in (p.left, p.right)}, files)
+            return [(name, found[pair.left], found[pair.right]) for name, pair in pairs]
         chosen = [
-            _Chosen(f"{one.area}_{_room(one)}_{_camera(one)}_{_camera(other)}", None, one, other)
+            (f"{one.area}_{_room(one)}_{_camera(one)}_{_camera(other)}", one, other)
             for one, other in combinations(files, 2)
             if one.room == other.room
         ]
@@ -169,27 +152,19 @@ class StanfordPairs(PanoramaPairs):
             raise DataError(self.root, found=found_, expected=expected, remedy=GET_IT)
         return chosen
 
-    def _panorama(self, files: PictureFiles) -> PairedPanorama:
-        if files.depth is None:
-            raise DataError(files.rgb, found="no depth", expected="depth of the panorama")
-        rgb, steps = read_color_png(files.rgb), read_depth_png(files.depth)
-        size = (rgb.shape[0], rgb.shape[1])
-        check_panorama_size(files.rgb, size, self._height or 1)
-        if steps.shape != size:
-            raise DataError(
-                files.depth,
-                found=f"{steps.shape[0]}×{steps.shape[1]} pixels",
-                expected=f"{size[0]}×{size[1]}, as {files.rgb.name}",
-                remedy="Copy or extract both files again.",
-            )
-        shape = size if self._height is None else (self._height, 2 * self._height)
-        steps[steps == MISSING_DEPTH] = 0
-        steps = resize_depth(steps, shape)
+    def image(self, files: PictureFiles) -> Path:
+        """See `PanoramaPairs`."""
+        return files.image.rgb
+
+    def panorama(self, files: PictureFiles) -> PairedPanorama:
+        """See `PanoramaPairs`."""
+        image = files.image
+        rgb = read_color_png(image.rgb)
+        shape = paired_shape(image.rgb, rgb, self._height)
+        steps = resize_depth(read_depth(image.parts["depth"]), shape)
         distance_m = np.where(steps == 0, np.float32(np.nan), steps_to_meters(steps))
         pose = read_panorama_pose(files.pose)
-        return PairedPanorama(
-            files.short_name, resize_area(rgb, shape), files.rgb, distance_m, pose
-        )
+        return PairedPanorama(image.name, resize_area(rgb, shape), image.rgb, distance_m, pose)
 
 
 def _room(files: PictureFiles) -> str:
@@ -216,7 +191,7 @@ def _resolve(names: Iterable[str], files: Sequence[PictureFiles]) -> dict[str, P
     ]
     if wrong:
         raise DataError(
-            files[0].rgb.parent,
+            files[0].image.rgb.parent,
             found=", ".join(wrong),
             expected="one panorama for each image of the paper's pairs",
             remedy="Copy or extract area_1 again; data.pairs=rooms uses the panoramas present.",

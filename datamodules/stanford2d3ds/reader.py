@@ -10,23 +10,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.core.panoramas import Unknown, mask_black, resize_nearest
-from datamodules.core.reading import ImageFiles, ImageReader
-from datamodules.images.png import check_png, read_color_png, read_depth_png
-from datamodules.stanford2d3ds.files import MISSING_DEPTH
+from datamodules.core.reading import ImageFiles, PngReader
+from datamodules.images.png import read_color_png, read_depth_png
 from datamodules.stanford2d3ds.label_table import LabelTable
 from tangent_train.errors import DataError
 from tangent_train.files import parse_json
 from tangent_train.geometry import is_camera_matrix
 
-__all__ = ["StanfordReader", "read_camera_matrix"]
+__all__ = ["StanfordReader", "read_camera_matrix", "read_depth"]
 
 _FORMATS = {"rgb": (8, ("RGB", "RGBA")), "labels": (8, ("RGB", "RGBA")), "depth": (16, ("grey",))}
 _CENTERS_FROM_CORNERS = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
-_TABLE_NAME = "semantic_labels.json"
+_MISSING_DEPTH = 65535
 
 
 @dataclass(frozen=True)
-class StanfordReader(ImageReader):
+class StanfordReader(PngReader):
     """Reader of panoramas and photos.
 
     Attributes:
@@ -37,47 +36,13 @@ class StanfordReader(ImageReader):
     table: LabelTable
     unknown: Unknown = "labels"
 
-    @classmethod
-    def of(
-        cls, root: Path, label_table: Path | None, unknown: Unknown = "labels"
-    ) -> StanfordReader:
-        """The reader of a data set.
-
-        Args:
-            root: Its folder.
-            label_table: The class table, if not at the place of the release.
-            unknown: See `mask_black`.
-
-        Raises:
-            DataError: There is no class table.
-        """
-        places = [root / _TABLE_NAME, root / "assets" / _TABLE_NAME]
-        if label_table is not None:
-            places = [label_table]
-        table = next((place for place in places if place.is_file()), None)
-        if table is None:
-            raise DataError(
-                places[0],
-                found="no class table",
-                expected=f"it there or at {places[-1]}",
-                remedy="Copy it from the release (assets), or name it in data.label_table.",
-            )
-        return cls(LabelTable.from_json(table), unknown)
+    formats = _FORMATS
 
     @property
     def settings(self) -> dict[str, str]:
         """Unknown pixels and the class table in short."""
         classes = hashlib.sha256(self.table.class_ids.tobytes()).hexdigest()
         return {"unknown": self.unknown, "class table": classes}
-
-    def size(self, part: str, path: Path) -> tuple[int, int]:
-        """See `ImageReader`, as all others."""
-        header = check_png(path, *_FORMATS[part])
-        return header.height, header.width
-
-    def rgb(self, files: ImageFiles) -> NDArray[np.uint8]:
-        """Colours; alpha is dropped."""
-        return read_color_png(files.rgb)
 
     def labels(self, files: ImageFiles, shape: tuple[int, int] | None = None) -> NDArray[np.uint8]:
         """Classes by the class table, 0 where black pixels are masked."""
@@ -90,13 +55,22 @@ class StanfordReader(ImageReader):
 
     def depth(self, files: ImageFiles) -> NDArray[np.uint16]:
         """Depth in steps of 1/512 m, as in the files."""
-        steps = read_depth_png(files.parts["depth"])
-        steps[steps == MISSING_DEPTH] = 0
-        return steps
+        return read_depth(files.parts["depth"])
 
     def camera(self, files: ImageFiles) -> NDArray[np.float64]:
         """The camera matrix in the pose file."""
         return read_camera_matrix(files.parts["camera"])
+
+
+def read_depth(path: Path) -> NDArray[np.uint16]:
+    """Depth in steps of 1/512 m, 0 where missing.
+
+    Raises:
+        DataError: The file is broken.
+    """
+    steps = read_depth_png(path)
+    steps[steps == _MISSING_DEPTH] = 0
+    return steps
 
 
 def read_camera_matrix(path: Path) -> NDArray[np.float64]:

@@ -19,7 +19,7 @@ each rotated by a further 90° to the right.
 from __future__ import annotations
 
 import math
-import os
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -27,18 +27,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.core.reading import ImageFiles
-from tangent_train.errors import DataError
+from tangent_train.errors import DataError, SettingError
 
 __all__ = [
+    "FRAMES",
     "GET_IT",
     "VIEWS",
+    "choose_frames",
     "list_frames",
     "list_panoramas",
     "panorama_files",
     "read_camera",
     "sequence_folder",
     "view_files",
-    "views_folder",
 ]
 
 VIEWS: tuple[str, ...] = ("F", "R", "B", "L")
@@ -49,6 +50,9 @@ GET_IT = (
     "data.root at the folder that holds them."
 )
 """Remedy if the data set is missing."""
+
+FRAMES = 500
+"""About as many frames of each sequence became panoramas of OmniSYNTHIA."""
 
 _SIZE = (760, 1280)
 _CAMERA = (532.740352, 640.0, 380.0)  # of views of that size, centre from pixel corners
@@ -68,11 +72,6 @@ def sequence_folder(root: Path, sequence: str) -> Path:
     if not root.is_dir():
         raise DataError(root, found="no such folder", expected="the data set", remedy=GET_IT)
     return root / f"SYNTHIA-SEQS-{sequence}-SUMMER"
-
-
-def views_folder(folder: Path, view: str) -> Path:
-    """Folder of the colour images of one of `VIEWS` of the sequence in `folder`."""
-    return folder / "RGB" / "Stereo_Left" / f"Omni_{view}"
 
 
 def view_files(root: Path, sequence: str, frame: str, view: str, *, with_depth: bool) -> ImageFiles:
@@ -102,7 +101,7 @@ def panorama_files(root: Path, sequence: str, frame: str, *, with_depth: bool) -
 
 def list_frames(folder: Path) -> list[str]:
     """Frames of which a view has a colour image, as ``000000``, in order; none is no error."""
-    return _names(*(views_folder(folder, view) for view in VIEWS))
+    return _names(*(folder / "RGB" / "Stereo_Left" / f"Omni_{view}" for view in VIEWS))
 
 
 def list_panoramas(folder: Path) -> list[str]:
@@ -111,19 +110,26 @@ def list_panoramas(folder: Path) -> list[str]:
 
 
 def _names(*folders: Path) -> list[str]:
-    paths = (path for folder in folders for path in _listed(folder))
-    return sorted({path.stem for path in paths if path.match(_NAME)})
+    # Of a folder that is missing or closed there is none.
+    return sorted({path.stem for folder in folders for path in folder.glob(_NAME)})
 
 
-def _listed(folder: Path) -> list[Path]:
-    try:
-        return list(folder.iterdir())
-    except FileNotFoundError:
-        return []
-    except OSError as error:
-        raise DataError(
-            folder, found=os.strerror(error.errno or 0), expected="a folder of images"
-        ) from error
+def choose_frames(frames: Sequence[str], count: int = FRAMES) -> list[str]:
+    """The frames that become panoramas: all, or every n-th from the first, about `count`.
+
+    As OmniSYNTHIA's authors chose them (Zhang et al. 2019): n is the number of frames divided by
+    `count`, rounded, halves up.
+
+    Raises:
+        SettingError: `count` is less than 1.
+
+    >>> len(choose_frames([str(i) for i in range(1250)]))
+    417
+    """
+    if count < 1:
+        raise SettingError("data.frames", found=count, expected="1 or more")
+    step = math.floor(len(frames) / count + 0.5) if len(frames) > count else 1
+    return list(frames[::step])
 
 
 def read_camera(folder: Path, size: tuple[int, int]) -> NDArray[np.float64]:

@@ -8,23 +8,28 @@ labels included.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal
+from pathlib import Path
+from typing import Any, Literal
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from datamodules.core.loading import at_least
 from datamodules.core.made_folders import claim_folder
 from datamodules.core.panoramas import distance_from_z_depth
 from datamodules.core.problems import Problems
 from datamodules.core.progress import show_progress
-from datamodules.core.reading import check_headers
+from datamodules.core.reading import ImageFiles, check_headers
 from datamodules.images.png import read_color_png
 from datamodules.synthia.files import (
+    FRAMES,
     GET_IT,
     VIEWS,
+    choose_frames,
     list_frames,
     panorama_files,
     read_camera,
@@ -39,7 +44,6 @@ from datamodules.synthia.reader import (
     read_first_channel,
     read_ids,
 )
-from datamodules.synthia.splits import FRAMES, choose_frames
 from tangent_train.errors import DataError
 from tangent_train.files import write_bytes
 from tangent_train.geometry import (
@@ -49,14 +53,6 @@ from tangent_train.geometry import (
     rotation_about,
 )
 from tangent_train.threads import in_threads
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from datamodules.core.reading import ImageFiles
 
 __all__ = ["HEIGHT", "MANIFEST", "ViewStitcher", "make_panoramas"]
 

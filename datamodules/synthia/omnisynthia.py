@@ -14,32 +14,147 @@ Icosahedron Spheres", ICCV 2019.
 
 from __future__ import annotations
 
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from itertools import chain
+from typing import ClassVar
 
-from datamodules.core.image_module import PanoramaDataModule, PhotoDataModule
+from datamodules.core.found import Found, Split
+from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
+from datamodules.core.inputs import Input
 from datamodules.core.problems import Problems
+from datamodules.core.reading import ImageFiles
 from datamodules.synthia.files import (
+    FRAMES,
     GET_IT,
     VIEWS,
+    choose_frames,
     list_frames,
     list_panoramas,
     panorama_files,
     sequence_folder,
     view_files,
-    views_folder,
 )
 from datamodules.synthia.generate import HEIGHT, make_panoramas
-from datamodules.synthia.reader import PANORAMA_FORMATS, VIEW_FORMATS
-from datamodules.synthia.splits import SynthiaSequences, choose_frames
+from datamodules.synthia.reader import (
+    CLASSES,
+    NORMALIZATIONS,
+    PANORAMA_FORMATS,
+    VIEW_FORMATS,
+    Formats,
+    SynthiaReader,
+)
 from tangent_train.errors import DataError
 from tangent_train.registry import registered
 
-if TYPE_CHECKING:
-    from datamodules.core.found import Found
-    from datamodules.core.reading import ImageFiles
+__all__ = ["OmniSynthia", "SynthiaPerspective", "divide"]
 
-__all__ = ["OmniSynthia", "SynthiaPerspective"]
+SEQUENCES: tuple[str, ...] = ("01", "02", "04", "05", "06")
+"""The sequences there are; OmniSYNTHIA has their summers."""
+
+TRAIN: tuple[str, ...] = ("01", "02", "05", "06")
+TEST: tuple[str, ...] = ("04",)
+"""The split of Zhang et al. 2019."""
+
+
+@dataclass(kw_only=True, eq=False, repr=False)
+class SynthiaSequences(ImageDataModule):
+    """The training and test sequences of OmniSYNTHIA's authors.
+
+    Validation takes the last frames of each training sequence. Depth is clipped to 4 m, which is
+    short for streets.
+
+    Args:
+        train_sequences: As ``01``.
+        test_sequences: As ``04``.
+        frames: Approximate number of frames per sequence, see `choose_frames`.
+
+    Attributes:
+        formats: Of the files.
+        remedy: Where there are no images.
+
+    Raises:
+        SettingError: A setting is invalid.
+    """
+
+    class_names = ("unknown", *CLASSES)
+    normalizations = NORMALIZATIONS
+    formats: ClassVar[Formats]
+    remedy: ClassVar[str] = GET_IT
+
+    inputs: Sequence[Input] = ("rgb",)
+    train_sequences: Sequence[str] = TRAIN
+    test_sequences: Sequence[str] = TEST
+    frames: int = FRAMES
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, others in (("train_sequences", ()), ("test_sequences", self.train_sequences)):
+            # YAML reads 01 as a number.
+            some = tuple(str(sequence).zfill(2) for sequence in getattr(self, name))
+            setattr(self, name, some)
+            fine = some and set(some) <= set(SEQUENCES) - {str(o).zfill(2) for o in others}
+            expected = f"some of {', '.join(SEQUENCES)}, none for both training and test"
+            self.require(name, bool(fine), expected)
+
+    @property
+    def sequences(self) -> tuple[str, ...]:
+        """Those of training, then those of the test."""
+        return (*self.train_sequences, *self.test_sequences)
+
+    @abstractmethod
+    def list_images(self, sequence: str, *, with_depth: bool) -> list[list[ImageFiles]]:
+        """The images of every frame of a sequence, if there are any."""
+
+    def find_images(
+        self, problems: Problems
+    ) -> tuple[SynthiaReader, dict[Split, list[ImageFiles]]]:
+        """See `ImageDataModule`."""
+        found: dict[str, list[list[ImageFiles]]] = {}
+        for sequence in self.sequences:
+            found[sequence] = []
+            with problems.noted():
+                with_depth = "depth" in self.inputs
+                found[sequence] = self.list_images(sequence, with_depth=with_depth)
+                if not found[sequence]:
+                    raise DataError(
+                        sequence_folder(self.root, sequence),
+                        found=f"no {self.noun}",
+                        expected="000000.png and others",
+                        remedy=self.remedy,
+                    )
+        splits = divide(found, self.test_sequences, self.validation_fraction)
+        return SynthiaReader(self.formats), splits
+
+
+def divide(
+    frames: Mapping[str, Sequence[Sequence[ImageFiles]]],
+    test: Sequence[str],
+    validation_fraction: float,
+) -> dict[Split, list[ImageFiles]]:
+    """Assign frames to splits.
+
+    Neighbouring frames are nearly identical, so validation takes those at the end of each training
+    sequence.
+
+    Args:
+        frames: Of every sequence, in order: the images of each frame.
+        test: Sequences for the test; all others are for training.
+        validation_fraction: Share of each training sequence for validation: at least one frame,
+            never all, so none of a single one; 0 for no validation.
+    """
+    splits: dict[Split, list[ImageFiles]] = {"train": [], "val": [], "test": []}
+    for sequence, found in frames.items():
+        count = len(found)
+        if sequence in test:
+            splits["test"] += chain.from_iterable(found)
+            continue
+        held = min(max(1, round(validation_fraction * count)), count - 1)
+        last = count - held if validation_fraction else count
+        splits["train"] += chain.from_iterable(found[:last])
+        splits["val"] += chain.from_iterable(found[last:])
+    return splits
 
 
 @registered
@@ -59,6 +174,7 @@ class OmniSynthia(SynthiaSequences, PanoramaDataModule):
     """
 
     formats = PANORAMA_FORMATS
+    remedy = f"Run tangent-prepare to make them from the views. {GET_IT}"
 
     panorama_height: int = HEIGHT
 
@@ -90,17 +206,9 @@ class OmniSynthia(SynthiaSequences, PanoramaDataModule):
 
     def list_images(self, sequence: str, *, with_depth: bool) -> list[list[ImageFiles]]:
         """See `SynthiaSequences`."""
-        folder = sequence_folder(self.root, sequence)
-        frames = list_panoramas(folder)
-        if not frames:
-            raise DataError(
-                folder / "pano" / "RGB",
-                found="no panoramas",
-                expected="000000.png and others",
-                remedy=f"Run tangent-prepare to make them from the views. {GET_IT}",
-            )
         return [
-            [panorama_files(self.root, sequence, frame, with_depth=with_depth)] for frame in frames
+            [panorama_files(self.root, sequence, frame, with_depth=with_depth)]
+            for frame in list_panoramas(sequence_folder(self.root, sequence))
         ]
 
 
@@ -117,16 +225,8 @@ class SynthiaPerspective(SynthiaSequences, PhotoDataModule):
 
     def list_images(self, sequence: str, *, with_depth: bool) -> list[list[ImageFiles]]:
         """See `SynthiaSequences`."""
-        folder = sequence_folder(self.root, sequence)
-        frames = choose_frames(list_frames(folder), self.frames)
-        if not frames:
-            raise DataError(
-                views_folder(folder, VIEWS[0]),
-                found="no views",
-                expected="000000.png and others",
-                remedy=GET_IT,
-            )
+        frames = list_frames(sequence_folder(self.root, sequence))
         return [
             [view_files(self.root, sequence, frame, v, with_depth=with_depth) for v in VIEWS]
-            for frame in frames
+            for frame in choose_frames(frames, self.frames)
         ]

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.core.inputs import RGBD_NORMALIZATION, Normalization
-from datamodules.core.panoramas import STEPS_PER_M, resize_nearest
-from datamodules.core.reading import ImageFiles, ImageReader
-from datamodules.images.png import check_png, read_color_png, read_png
+from datamodules.core.panoramas import meters_to_steps, resize_nearest
+from datamodules.core.reading import ImageFiles, PngReader
+from datamodules.images.png import read_png
 from datamodules.synthia.files import read_camera
 from tangent_train.errors import DataError
 
@@ -24,7 +24,6 @@ __all__ = [
     "PANORAMA_FORMATS",
     "VIEW_FORMATS",
     "SynthiaReader",
-    "depth_steps",
     "read_first_channel",
     "read_ids",
 ]
@@ -76,7 +75,6 @@ PANORAMA_FORMATS: Formats = {
 }
 """Pixel formats of a panorama."""
 
-_MOST = np.iinfo(np.uint16).max
 _LAST_ID = 15
 _LABELS = np.zeros(256, np.uint8)
 # Traffic lights, 15, become 13. The reserved 13 and 14 are unknown: the published panoramas were
@@ -85,7 +83,7 @@ _LABELS[: _LAST_ID + 1] = [*range(13), 0, 0, 13]
 
 
 @dataclass(frozen=True)
-class SynthiaReader(ImageReader):
+class SynthiaReader(PngReader):
     """Views and panoramas alike.
 
     Attributes:
@@ -94,20 +92,6 @@ class SynthiaReader(ImageReader):
 
     formats: Formats
 
-    @property
-    def settings(self) -> dict[str, str]:
-        """None: all classes are those of the release."""
-        return {}
-
-    def size(self, part: str, path: Path) -> tuple[int, int]:
-        """See `ImageReader`, as all others."""
-        header = check_png(path, *self.formats[part])
-        return header.height, header.width
-
-    def rgb(self, files: ImageFiles) -> NDArray[np.uint8]:
-        """Colours; alpha is dropped."""
-        return read_color_png(files.rgb)
-
     def labels(self, files: ImageFiles, shape: tuple[int, int] | None = None) -> NDArray[np.uint8]:
         """Classes as in `CLASSES`, 0 where unknown."""
         ids = read_ids(files.labels)
@@ -115,7 +99,8 @@ class SynthiaReader(ImageReader):
 
     def depth(self, files: ImageFiles) -> NDArray[np.uint16]:
         """Depth in steps of 1/512 m."""
-        return depth_steps(read_first_channel(files.parts["depth"]))
+        centimeters = read_first_channel(files.parts["depth"])
+        return meters_to_steps((centimeters / 100).astype(np.float32))
 
     def camera(self, files: ImageFiles) -> NDArray[np.float64]:
         """The camera matrix of the sequence that the view is from."""
@@ -149,13 +134,3 @@ def read_ids(path: Path) -> NDArray[np.uint8]:
             remedy="Use the files as released (GT/LABELS, not GT/COLOR).",
         )
     return ids.astype(np.uint8)
-
-
-def depth_steps(centimeters: NDArray[np.uint16]) -> NDArray[np.uint16]:
-    """Depth in steps of 1/512 m, rounded, at most 65535 (128 m), of depth in cm.
-
-    >>> depth_steps(np.array([0, 1, 100, 65535], np.uint16)).tolist()
-    [0, 5, 512, 65535]
-    """
-    steps = np.minimum(centimeters * (STEPS_PER_M / 100) + 0.5, _MOST)
-    return steps.astype(np.uint16)

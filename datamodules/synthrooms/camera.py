@@ -18,9 +18,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import Literal, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tangent_train.geometry import (
     camera_matrix_from_fov,
@@ -30,21 +31,20 @@ from tangent_train.geometry import (
     rotation_about,
 )
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from datamodules.synthrooms.settings import ViewKind
-
 __all__ = [
     "CAMERA_FROM_SPHERE",
     "PanoramaView",
     "PerspectiveView",
     "Pose",
     "View",
+    "ViewKind",
     "draw_view",
     "euler_angles",
     "euler_rotation",
 ]
+
+ViewKind = Literal["stanford", "uniform"]
+"""Viewing directions of photos, see `RoomSettings.views`."""
 
 _X, _Y, _Z = np.eye(3)
 _BLENDER = np.diag([1.0, -1.0, -1.0])  # Blender's camera axes <-> x right, y down, z forward
@@ -108,18 +108,6 @@ class Pose:
         return np.hstack([rotation, -(rotation @ self.location)[:, None]])
 
 
-class View(Protocol):
-    """The pixels of a picture: their rays, and depth from distances along them."""
-
-    def rays(self, dx: float = 0.0, dy: float = 0.0) -> NDArray[np.float32]:
-        """Directions in the room of all pixels, moved by (dx, dy) pixels: ``(h, w, 3)`` units."""
-        ...
-
-    def depth_m(self, distance_m: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Depth ``(h, w)`` as stored, of distances along `rays`."""
-        ...
-
-
 @dataclass(frozen=True)
 class PanoramaView:
     """A panorama of ``height × 2 height`` pixels; its depth is the distance."""
@@ -175,6 +163,10 @@ class PerspectiveView:
     def depth_m(self, distance_m: NDArray[np.float32]) -> NDArray[np.float32]:
         """Depth along the optical axis of distances along all rays, ``(h, w)``."""
         return distance_m * (self.rays() @ self.pose.world_from_camera[:, 2].astype(np.float32))
+
+
+View: TypeAlias = PanoramaView | PerspectiveView
+"""The pixels of a picture: their rays, and depth from distances along them."""
 
 
 def draw_view(

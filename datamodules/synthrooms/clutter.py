@@ -1,7 +1,7 @@
 """Clutter on tables, floor and walls, and lamps; a few items are unlabelled.
 
 In a frame against a wall x runs along the wall and y into the room; free-standing furniture has its
-back at +y. Functions skip what does not fit.
+back at +y. What does not fit raises `NoPlaceError`.
 """
 
 from __future__ import annotations
@@ -73,12 +73,9 @@ def add_floor_clutter(room: Room) -> None:
     rng = room.rng
     size = rng.uniform(0.4, 0.65)
     if room.chance(0.6):
-        frame = room.plan.against_wall(rng, size + 0.1, size, "low")
-        frame = frame and frame.at(0, size / 2 + 0.02)
+        frame = room.plan.against_wall(rng, size + 0.1, size, "low").at(0, size / 2 + 0.02)
     else:
         frame = room.plan.in_the_open(rng, size, size)
-    if frame is None:
-        return
     build = _FLOOR_THINGS[room.pick(_FLOOR_SHARES)]
     build(room, _new(room, frame), size)
 
@@ -139,8 +136,6 @@ def add_wall_clutter(room: Room) -> None:
     wide, high = rng.uniform(0.5, 1.3), rng.uniform(0.45, 0.9)
     kind = room.pick((0.4, 0.25, 0.2, 0.15))
     frame = room.plan.against_wall(rng, wide, 0, "high")
-    if frame is None:
-        return
     z = min(rng.uniform(1.45, 1.75), room.plan.height - high / 2 - 0.1)
     thing = _new(room, frame)
     face, trim = room.palette.material(), room.palette.material(Pattern.PLAIN)

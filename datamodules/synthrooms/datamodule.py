@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from datamodules.stanford2d3ds.pairs import StanfordPairs
-from datamodules.stanford2d3ds.panoramas import Stanford2D3DS, Stanford2D3DSPerspective
-from datamodules.stanford2d3ds.splits import StanfordAreas
-from datamodules.synthrooms.generate import generate_rooms
-from datamodules.synthrooms.settings import RoomSettings
+from datamodules.stanford2d3ds.panoramas import (
+    Stanford2D3DS,
+    Stanford2D3DSPerspective,
+    StanfordAreas,
+)
+from datamodules.synthrooms.generate import RoomSettings, generate_rooms
 from tangent_train.errors import SettingError
 from tangent_train.registry import registered
 

@@ -1,7 +1,7 @@
 """Chairs, sofas, tables, boards and bookcases.
 
 In a frame against a wall x runs along the wall and y into the room; free-standing furniture has its
-back at +y. Functions skip what does not fit.
+back at +y. What does not fit raises `NoPlaceError`.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from datamodules.synthrooms.clutter import add_desk_things
-from datamodules.synthrooms.layout import Frame, Rectangle
+from datamodules.synthrooms.layout import Frame, NoPlaceError, Rectangle
 from datamodules.synthrooms.materials import Material, Pattern
 from datamodules.synthrooms.room import Item, Room
 
@@ -26,8 +26,7 @@ __all__ = [
 def add_chair(room: Room) -> None:
     """Add a chair in the open with a random heading."""
     frame = room.plan.in_the_open(room.rng, 0.6, 0.6)
-    if frame is not None:
-        _build_chair(room, frame.at(0, 0, yaw=room.rng.uniform(0, 2 * np.pi)))
+    _build_chair(room, frame.at(0, 0, yaw=room.rng.uniform(0, 2 * np.pi)))
 
 
 def add_chair_at(room: Room, frame: Frame) -> None:
@@ -96,14 +95,11 @@ def add_sofa(room: Room) -> None:
     design = room.pick((0.45, 0.15, 0.2, 0.2))
     wide, deep = rng.uniform(1.5, 2.4), rng.uniform(0.8, 1.0)
     reach = deep + (0.7 if design == 3 else 0.0)
-    frame = room.plan.against_wall(rng, wide, reach, "low")
-    if frame is not None:
-        frame = frame.at(0, deep / 2 + 0.03, yaw=np.pi)
-    else:
+    try:
+        frame = room.plan.against_wall(rng, wide, reach, "low").at(0, deep / 2 + 0.03, yaw=np.pi)
+    except NoPlaceError:
         design = 0 if design == 3 else design
         frame = room.plan.in_the_open(rng, wide, deep)
-        if frame is None:
-            return
         frame = frame.at(0, 0, yaw=np.pi * room.count(0, 1))
     sofa = room.item("sofa", frame)
     cover = room.palette.material(Pattern.PLAIN, Pattern.SPECKLE, Pattern.STRIPES)
@@ -152,8 +148,6 @@ def add_table(room: Room) -> None:
     rotated = room.chance(0.5)
     footprint = (deep, wide) if rotated else (wide, deep)
     frame = room.plan.in_the_open(rng, *footprint, gap=0.35)
-    if frame is None:
-        return
     frame = frame.at(0, 0, yaw=np.pi / 2 if rotated else 0)
     _build_table(room, frame, design, wide, deep)
     seats = 1 + int(wide > 1.6)
@@ -170,8 +164,6 @@ def add_desk(room: Room) -> None:
     rng = room.rng
     wide, deep = rng.uniform(1.2, 1.9), rng.uniform(0.65, 0.85)
     frame = room.plan.against_wall(rng, wide, deep, "low")
-    if frame is None:
-        return
     _build_table(room, frame.at(0, deep / 2 + 0.02), 0 if room.chance(0.5) else 2, wide, deep)
     if room.chance(0.8):
         turn = rng.normal(0, 0.4)
@@ -219,8 +211,6 @@ def add_board(room: Room) -> None:
     wide, high = rng.uniform(1.5, 3.2), rng.uniform(1.05, 1.45)
     bottom = min(rng.uniform(0.75, 0.95), room.plan.height - high - 0.15)
     frame = room.plan.against_wall(rng, wide + 0.1, 0, "high")
-    if frame is None:
-        return
     design = room.pick((0.45, 0.2, 0.2, 0.15))
     color = (
         room.palette.hsv((0, 1), (0, 0.04), (0.85, 1.0)),
@@ -254,8 +244,6 @@ def add_bookcase(room: Room) -> None:
     high = rng.uniform(1.0, 1.3) if design == 2 else rng.uniform(1.7, 2.3)
     high = min(high, room.plan.height - 0.3)
     frame = room.plan.against_wall(rng, wide, deep, "full")
-    if frame is None:
-        return
     case = room.item("bookcase", frame)
     body = room.palette.material()
     columns = 1 + int(wide > 1.3) + int(wide > 2.0)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any, get_args
 
 import numpy as np
 
@@ -12,11 +14,10 @@ from datamodules.core.made_folders import claim_folder
 from datamodules.core.processes import in_processes
 from datamodules.core.progress import show_progress
 from datamodules.stanford2d3ds.files import AREAS
-from datamodules.synthrooms.camera import PanoramaView, PerspectiveView, Pose, draw_view
+from datamodules.synthrooms.camera import PanoramaView, Pose, View, ViewKind, draw_view
 from datamodules.synthrooms.raycast import RayScene
 from datamodules.synthrooms.render import Camera, draw_camera, draw_holes, render
 from datamodules.synthrooms.scene import draw_room_type, furnish
-from datamodules.synthrooms.settings import RoomSettings
 from datamodules.synthrooms.writer import (
     PANORAMA,
     SUFFIXES,
@@ -27,9 +28,10 @@ from datamodules.synthrooms.writer import (
     label_strings,
     pose_record,
 )
+from tangent_train.errors import SettingError
 from tangent_train.files import write_bytes, write_text
 
-__all__ = ["MANIFEST", "RoomPlan", "generate_rooms", "make_room", "plan_rooms"]
+__all__ = ["MANIFEST", "RoomPlan", "RoomSettings", "generate_rooms", "make_room", "plan_rooms"]
 
 MANIFEST = "synthrooms.json"
 """File that marks a folder as SynthRooms and holds its settings."""
@@ -37,7 +39,63 @@ MANIFEST = "synthrooms.json"
 _VERSION = 1
 """Version of the generator; another one makes other pictures from the same settings."""
 
+_LEAST = {"height": 8, "view_size": 8, "supersample": 1, "least_cameras": 1}
 _CAMERA_SHARES = (0.75, 0.15, 0.1)  # of rooms with one, two and three cameras
+
+
+@dataclass(frozen=True)
+class RoomSettings:
+    """Settings of a data set; the same settings give the same bytes.
+
+    Attributes:
+        seed: Seed of everything, 0 or more.
+        rooms: Number of rooms per area (a subset of `AREAS`, also written ``area_5a``).
+        height: Rows of the panoramas; they have twice as many columns.
+        views: Viewing directions of photos: ``"stanford"`` upright as in the real set (pitch
+            about N(0, 20°)), ``"uniform"`` in directions uniform on the sphere.
+        views_per_camera: Perspective views per panorama.
+        view_size: Side of the square perspective views in pixels.
+        supersample: Rays per pixel side for the colours (labels and depth: one ray at the centre).
+        least_cameras: Least number of panoramas per room; most rooms have one otherwise.
+
+    Raises:
+        SettingError: A setting is invalid.
+    """
+
+    seed: int = 0
+    rooms: Mapping[str, int] = field(
+        default_factory=lambda: {a: 16 if a[0] == "5" else 40 for a in AREAS}
+    )
+    height: int = 512
+    views: ViewKind = "stanford"
+    views_per_camera: int = 0
+    view_size: int = 540
+    supersample: int = 2
+    least_cameras: int = 1
+
+    @classmethod
+    def of(cls, given: RoomSettings | Mapping[str, Any]) -> RoomSettings:
+        """Settings from a config."""
+        return given if isinstance(given, RoomSettings) else cls(**given)
+
+    def __post_init__(self) -> None:
+        rooms = {str(area).removeprefix("area_"): count for area, count in self.rooms.items()}
+        if not set(rooms) <= set(AREAS) or not any(rooms.values()):
+            raise SettingError("rooms", found=rooms, expected=f"numbers of rooms by area: {AREAS}")
+        object.__setattr__(self, "rooms", {area: rooms[area] for area in AREAS if area in rooms})
+        if self.views not in get_args(ViewKind):
+            raise SettingError("views", found=self.views, expected=get_args(ViewKind))
+        numbers = {f"rooms[{area}]": count for area, count in rooms.items()}
+        names = ("seed", "views_per_camera", *_LEAST)
+        for name, value in {**numbers, **{name: getattr(self, name) for name in names}}.items():
+            least = _LEAST.get(name, 0)
+            if type(value) is not int or value < least:
+                raise SettingError(name, found=value, expected=f"an integer of {least} or more")
+
+    @property
+    def areas(self) -> list[str]:
+        """The areas that have rooms."""
+        return [area for area, count in self.rooms.items() if count]
 
 
 def plan_rooms(settings: RoomSettings) -> list[RoomPlan]:
@@ -110,9 +168,7 @@ def make_room(root: Path, settings: RoomSettings, plan: RoomPlan) -> None:
         camera = draw_camera(rng, scene, room.plan, cameras)
         cameras.append(camera)
         original = Pose.looking(camera.location, camera.heading)
-        views: dict[str, PanoramaView | PerspectiveView] = {
-            PANORAMA: PanoramaView(original, settings.height)
-        }
+        views: dict[str, View] = {PANORAMA: PanoramaView(original, settings.height)}
         for k in range(settings.views_per_camera):
             views[str(k)] = draw_view(rng, settings.views, camera.location, settings.view_size)
         for frame, view in views.items():

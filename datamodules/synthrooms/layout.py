@@ -11,13 +11,17 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-__all__ = ["FloorPlan", "Frame", "Rectangle", "Wall", "Zone"]
+__all__ = ["FloorPlan", "Frame", "NoPlaceError", "Rectangle", "Wall", "Zone"]
 
 Zone = Literal["low", "high", "full"]
 """Part of a wall's height that an item occupies: up to about a metre, above it, or all of it."""
 
 _TRIES = 24
 _GAP = 0.06
+
+
+class NoPlaceError(Exception):
+    """What does not fit into a room: it is left out."""
 
 
 class Frame(NamedTuple):
@@ -156,7 +160,7 @@ class FloorPlan:
 
     def against_wall(
         self, rng: np.random.Generator, width: float, depth: float, zone: Zone
-    ) -> Frame | None:
+    ) -> Frame:
         """Find and take a place at a wall.
 
         Args:
@@ -166,8 +170,10 @@ class FloorPlan:
             zone: Part of the wall's height.
 
         Returns:
-            Frame at the middle of the stretch on the floor, x along the wall, y into the room; None
-            if no place was found.
+            Frame at the middle of the stretch on the floor, x along the wall, y into the room.
+
+        Raises:
+            NoPlaceError: No place was found.
         """
         lengths = np.array([wall.length for wall in self.walls])
         for _ in range(_TRIES):
@@ -181,18 +187,22 @@ class FloorPlan:
             if room > 0 and wall.is_free(start, end, zone) and fits(area):
                 wall.taken.append((start, end, zone))
                 return frame
-        return None
+        raise NoPlaceError
 
     def in_the_open(
         self, rng: np.random.Generator, width: float, depth: float, gap: float = 0.12
-    ) -> Frame | None:
-        """Find and take a place away from the walls, ``width × depth`` metres, axis-aligned."""
+    ) -> Frame:
+        """Find and take a place away from the walls, ``width × depth`` metres, axis-aligned.
+
+        Raises:
+            NoPlaceError: No place was found.
+        """
         for _ in range(_TRIES):
             frame = Frame(rng.uniform(0, self.width), rng.uniform(0, self.depth))
             area = Rectangle.around(frame, (-width / 2, width / 2), (-depth / 2, depth / 2))
             if self.claim(area, 0.1, gap):
                 return frame
-        return None
+        raise NoPlaceError
 
 
 def _wall_between(start: tuple[float, float], end: tuple[float, float]) -> Wall:

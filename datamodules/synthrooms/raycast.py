@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
+from numpy.typing import NDArray
 
 from datamodules.synthrooms.materials import albedo, material_table
+from datamodules.synthrooms.room import Light, Room
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from datamodules.synthrooms.room import Light, Room
-
-    Floats = NDArray[np.float32]
+Floats = NDArray[np.float32]
 
 __all__ = ["Hits", "RayScene", "even_directions"]
 

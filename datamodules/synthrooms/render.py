@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from datamodules.synthrooms.raycast import even_directions
+from datamodules.synthrooms.camera import View
+from datamodules.synthrooms.layout import FloorPlan
+from datamodules.synthrooms.raycast import Hits, RayScene, even_directions
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from numpy.typing import NDArray
-
-    from datamodules.synthrooms.camera import View
-    from datamodules.synthrooms.layout import FloorPlan
-    from datamodules.synthrooms.raycast import Hits, RayScene
-
-    Floats = NDArray[np.float32]
+Floats = NDArray[np.float32]
 
 __all__ = ["MISSING", "Camera", "Holes", "Picture", "draw_camera", "draw_holes", "render"]
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
 
 from datamodules.synthrooms import clutter, furniture, structure
-from datamodules.synthrooms.layout import FloorPlan
+from datamodules.synthrooms.layout import FloorPlan, NoPlaceError
 from datamodules.synthrooms.materials import Palette
 from datamodules.synthrooms.room import Room
 
@@ -84,7 +85,8 @@ def furnish(rng: np.random.Generator, room_type: str) -> Room:
     for add, share, least, most in _PROGRAM:
         if room.chance(share):
             for _ in range(room.count(least, most)):
-                add(room)
+                with suppress(NoPlaceError):
+                    add(room)
     return room
 
 

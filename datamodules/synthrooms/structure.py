@@ -1,7 +1,7 @@
 """Floor, ceiling, walls, columns, beams, doors and windows.
 
 In a frame against a wall x runs along the wall and y into the room; free-standing furniture has its
-back at +y. Functions skip what does not fit.
+back at +y. What does not fit raises `NoPlaceError`.
 """
 
 from __future__ import annotations
@@ -93,11 +93,9 @@ def add_column(room: Room) -> None:
     size = room.rng.uniform(0.34, 0.62)
     if room.chance(0.5):
         frame = room.plan.against_wall(room.rng, size + 0.1, size * 0.9, "full")
-        frame = frame and frame.at(0, size * 0.4)
+        frame = frame.at(0, size * 0.4)
     else:
         frame = room.plan.in_the_open(room.rng, size + 0.1, size + 0.1)
-    if frame is None:
-        return
     column = room.item("column", frame)
     shape = ("box", "cylinder", "prism")[room.pick((0.45, 0.4, 0.15))]
     material = room.palette.material()
@@ -165,8 +163,6 @@ def add_door(room: Room) -> None:
     wide = rng.uniform(1.4, 1.9) if design == 3 else rng.uniform(0.85, 1.15)
     top = min(room.plan.height - 0.2, rng.uniform(2.0, 2.3))
     frame = room.plan.against_wall(rng, wide + 0.15, 0.85, "full")
-    if frame is None:
-        return
     door = room.item("door", frame)
     leaf = room.palette.material(Pattern.PLAIN, Pattern.WOOD)
     trim = room.palette.material(Pattern.PLAIN, Pattern.WOOD)
@@ -195,8 +191,6 @@ def add_window(room: Room) -> None:
     top = min(height - 0.25, bottom + rng.uniform(1.0, 1.5) + (0.7 if tall else 0))
     zone: Zone = "full" if tall else "high"
     frame = room.plan.against_wall(rng, wide + 0.15, 0.25 if tall else 0, zone)
-    if frame is None:
-        return
     window = room.item("window", frame)
     trim = room.palette.material(Pattern.PLAIN)
     middle, high = (bottom + top) / 2, top - bottom

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.synthrooms.camera import PanoramaView, PerspectiveView, Pose, euler_angles
+from datamodules.synthrooms.camera import PanoramaView, Pose, View, euler_angles
 from datamodules.synthrooms.render import MISSING, Picture
 from datamodules.synthrooms.room import UNKNOWN
 
@@ -160,11 +160,7 @@ def _encode_png(image: NDArray[Any]) -> bytes:
 
 
 def pose_record(
-    room: RoomPlan,
-    camera: str,
-    frame: str,
-    view: PanoramaView | PerspectiveView,
-    original: Pose,
+    room: RoomPlan, camera: str, frame: str, view: View, original: Pose
 ) -> dict[str, Any]:
     """Pose file of a picture, with all keys of the real set.
 

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
+from datamodules.synthshapes.parts import Parts
 from tangent_train.geometry import rotation_about
-
-if TYPE_CHECKING:
-    from datamodules.synthshapes.parts import Parts
 
 __all__ = ["bench", "chair", "lamp", "stool", "table"]
 

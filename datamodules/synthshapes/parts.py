@@ -5,17 +5,15 @@ Everything is in metres, z up, and stands on z = 0; the front of an object faces
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from trimesh import Trimesh, creation, util
 from trimesh.convex import convex_hull
 from trimesh.geometry import align_vectors
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    Point = Sequence[float]
+Point = Sequence[float]
 
 __all__ = ["Parts"]
 

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
+from datamodules.synthshapes.parts import Parts, Point
 from tangent_train.geometry import rotation_about
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from datamodules.synthshapes.parts import Parts, Point
 
 __all__ = ["airplane", "bottle", "bowl", "cup", "vase"]
 

@@ -13,19 +13,17 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from datamodules.core.problems import Problems
 from datamodules.zind.layout import DOOR, OPENING, WINDOW, Fixture, Layout
 from tangent_train.errors import DataError
-from tangent_train.files import parse_json
+from tangent_train.files import read_json
 from tangent_train.geometry import PanoramaPose, rotation_about
 from tangent_train.registry import Text, check_fields
-
-if TYPE_CHECKING:
-    from datamodules.core.problems import Problems
 
 __all__ = ["HomePanorama", "list_panoramas"]
 
@@ -195,10 +193,7 @@ def list_panoramas(root: Path, problems: Problems) -> list[HomePanorama]:
 
 
 def _read_home(file: Path) -> list[HomePanorama]:
-    try:
-        content = parse_json(file.read_bytes())
-    except (OSError, ValueError) as error:
-        raise DataError(file, found=error, expected=_EXPECTED, remedy=_COPY) from error
+    content = read_json(file, _EXPECTED, _COPY)
     kinds = {"merger": dict, "scale_meters_per_coordinate": dict}
     given = check_fields(file, content, kinds, _EXPECTED)
     branches: list[tuple[tuple[str, ...], Any]] = [((), given["merger"])]

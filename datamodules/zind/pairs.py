@@ -9,11 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from datamodules.core.panorama_pairs import PairedPanorama, PanoramaPair, PanoramaPairs
+from datamodules.core.panorama_pairs import PairedPanorama, PanoramaPairs, paired_shape
 from datamodules.core.panoramas import resize_area
 from datamodules.core.problems import Problems
 from datamodules.images.pixel_files import read_rgb
-from datamodules.images.png import check_panorama_size
 from datamodules.zind.homes import HomePanorama, list_panoramas
 from tangent_train.errors import DataError
 
@@ -42,30 +41,20 @@ class ZindPairs(PanoramaPairs):
         self._max_distance_m = math.inf if max_distance_m is None else max_distance_m
         self._height = erp_height
 
-    @property
-    def names(self) -> list[str]:
-        """The room and both panoramas."""
-        return [f"{one.room}/{one.path[-1]} – {other.path[-1]}" for one, other in self._pairs]
-
-    @property
-    def files(self) -> list[Path]:
-        """See `PanoramaPairs`."""
-        return [panorama.image() for pair in self._pairs for panorama in pair]
-
-    def read(self, index: int) -> PanoramaPair:
-        """Read a pair; see `PanoramaPairs`."""
-        left, right = map(self._panorama, self._pairs[index])
-        return PanoramaPair(self.names[index], None, left, right)
-
     @cached_property
-    def _pairs(self) -> list[tuple[HomePanorama, HomePanorama]]:
+    def pairs(self) -> list[tuple[str, HomePanorama, HomePanorama]]:
+        """The room and both panoramas.
+
+        Raises:
+            DataError: There are none, or a file is broken.
+        """
         problems = Problems()
         listed = list_panoramas(self.root, problems)
         problems.refuse(self.root)
         usable = [p for p in listed if p.has_layout and p.is_inside and p.unit_m is not None]
         location_m = {panorama.name: panorama.pose()[0].location_m for panorama in usable}
         pairs = [
-            (one, other)
+            (f"{one.room}/{one.path[-1]} – {other.path[-1]}", one, other)
             for one, other in combinations(usable, 2)
             if one.room == other.room
             and math.dist(location_m[one.name], location_m[other.name]) <= self._max_distance_m
@@ -79,12 +68,15 @@ class ZindPairs(PanoramaPairs):
             )
         return pairs
 
-    def _panorama(self, panorama: HomePanorama) -> PairedPanorama:
-        path = panorama.image()
+    def image(self, files: HomePanorama) -> Path:
+        """See `PanoramaPairs`."""
+        return files.image()
+
+    def panorama(self, files: HomePanorama) -> PairedPanorama:
+        """See `PanoramaPairs`."""
+        path = files.image()
         rgb = read_rgb(path)
-        size = (rgb.shape[0], rgb.shape[1])
-        check_panorama_size(path, size, self._height or 1)
-        shape = size if self._height is None else (self._height, 2 * self._height)
-        pose, unit_m = panorama.pose()
-        distance_m = (panorama.layout().distances(shape) * unit_m).astype(np.float32)
-        return PairedPanorama(panorama.name, resize_area(rgb, shape), path, distance_m, pose)
+        shape = paired_shape(path, rgb, self._height)
+        pose, unit_m = files.pose()
+        distance_m = (files.layout().distances(shape) * unit_m).astype(np.float32)
+        return PairedPanorama(files.name, resize_area(rgb, shape), path, distance_m, pose)

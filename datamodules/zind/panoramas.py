@@ -36,27 +36,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
 
 from datamodules.core.found import SPLITS, Split, draw_groups
 from datamodules.core.image_module import PanoramaDataModule
 from datamodules.core.inputs import Input
-from datamodules.core.loading import at_least
+from datamodules.core.problems import Problems
 from datamodules.core.reading import ImageFiles, ImageReader
 from datamodules.images.pixel_files import read_image_size, read_rgb
 from datamodules.zind.homes import HomePanorama, list_panoramas
 from datamodules.zind.layout import CLASSES, DOOR, Layout
-from tangent_train.errors import DataError, SettingError
-from tangent_train.files import parse_json
+from tangent_train.errors import DataError
+from tangent_train.files import read_json
 from tangent_train.registry import Text, check_fields, registered
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from datamodules.core.problems import Problems
 
 __all__ = ["Zind", "ZindReader"]
 
@@ -96,10 +92,6 @@ class ZindReader(ImageReader):
             labels[labels == DOOR] = 0
         return labels
 
-    def depth(self, files: ImageFiles) -> NDArray[np.uint16]:
-        """There is none."""
-        raise NotImplementedError(files.name)
-
 
 @registered
 @dataclass(kw_only=True, eq=False, repr=False)
@@ -129,17 +121,10 @@ class Zind(PanoramaDataModule):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if "depth" in self.inputs:
-            raise SettingError(
-                "data.inputs", found=list(self.inputs), expected="no depth, ZInD has none"
-            )
-        if self.doors not in ("class", "ignore"):
-            raise SettingError("data.doors", found=self.doors, expected="class or ignore")
-        if not 0 < self.test_fraction <= 1:
-            raise SettingError(
-                "data.test_fraction", found=self.test_fraction, expected="above 0 to 1"
-            )
-        at_least("data.split_seed", self.split_seed, 0)
+        self.require("inputs", "depth" not in self.inputs, "no depth, ZInD has none")
+        self.require("doors", self.doors in ("class", "ignore"), "class or ignore")
+        self.require("test_fraction", 0 < self.test_fraction <= 1, "above 0 to 1")
+        self.require("split_seed", self.split_seed >= 0, "0 or more")
 
     def find_images(self, problems: Problems) -> tuple[ZindReader, dict[Split, list[ImageFiles]]]:
         """See `ImageDataModule`."""
@@ -185,10 +170,7 @@ class Zind(PanoramaDataModule):
 def _read_partition(path: Path, homes: set[str]) -> dict[str, Split]:
     """The split of every home in a ``zind_partition.json``."""
     expected = "lists of homes for train, val and test"
-    try:
-        content = parse_json(path.read_bytes())
-    except (OSError, ValueError) as error:
-        raise DataError(path, found=error, expected=expected) from error
+    content = read_json(path, expected)
     lists = check_fields(path, content, dict.fromkeys(SPLITS, list[Text]), expected)
     split_of = {home: split for split in SPLITS for home in lists[split]}
     missing = sorted(homes - split_of.keys())

@@ -94,7 +94,7 @@ def test_the_same_images_are_shown_after_every_validation(
         steps = views.render(panorama.depth, "nearest").astype(np.float32) / 512
         depth = torch.from_numpy(steps).clamp(max=4)
         values = torch.cat([rgb, depth[:, None]], dim=1)
-        normalization = data.samples.normalization
+        normalization: Any = data.normalization
         mean, std = (torch.tensor(v) for v in (normalization.mean, normalization.std))
         with torch.no_grad():
             scores = task.network((values - mean[:, None, None]) / std[:, None, None])

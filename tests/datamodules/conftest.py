@@ -4,8 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from datamodules.synthrooms.generate import generate_rooms
-from datamodules.synthrooms.settings import RoomSettings
+from datamodules.synthrooms.generate import RoomSettings, generate_rooms
 from datamodules.synthshapes.generate import ShapeSettings, generate_shapes
 from tangent_train.rendering import EquirectRepresentation
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from datamodules.core.found import Split
 from datamodules.core.split_module import SplitDataModule
 
-__all__ = ["contents", "names_of", "read_png", "write_png"]
+__all__ = ["contents", "gpano_xmp", "names_of", "read_png", "write_png"]
 
 
 def write_png(path: Path, image: NDArray[Any]) -> None:
@@ -25,6 +26,17 @@ def read_png(path: Path) -> NDArray[Any]:
     image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     assert image is not None
     return image
+
+
+def gpano_xmp(tags: Mapping[str, object], *, elements: bool = False) -> bytes:
+    """XMP data with GPano tags as attributes or, beside those of another program, elements."""
+    begin = '<r:Description xmlns:GPano="http://ns.google.com/photos/1.0/panorama/"'
+    if elements:
+        listed = "".join(f"<GPano:{name}>\n {v}\n</GPano:{name}>" for name, v in tags.items())
+        other = "<o:CroppedAreaTopPixels>7</o:CroppedAreaTopPixels>"
+        return f"{other}{begin}>{listed}</r:Description>".encode()
+    listed = " ".join(f'GPano:{name}="{value}"' for name, value in tags.items())
+    return f"{begin} {listed}/>".encode()
 
 
 def contents(root: Path) -> dict[str, bytes]:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import shutil
+from collections import namedtuple
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import pytest
 
@@ -17,25 +17,14 @@ from tangent_train.rendering import TangentRepresentation
 from tests.datamodules.conftest import TINY_ROOMS, TINY_SHAPES
 from tests.datamodules.data_files import contents, names_of
 
-
-class _Generated(NamedTuple):
-    """A generated data set, and some of its files."""
-
-    fixture: str
-    generate: Any
-    settings: Any
-    module: Any
-    setting: str
-    some_files: tuple[str, ...]
-
-
 ROOM_FILES = ("area_5a/pano/*/*_depth.png", "area_1/data/*/*_pose.json", "semantic_labels.json")
 SHAPE_FILES = ("vase/test/vase_0003.off", "cup/train/cup_0001.off")
+_Generated = namedtuple("_Generated", "setting generate settings module some_files")
 every_generator = pytest.mark.parametrize(
     "of",
     [
-        _Generated("tiny_rooms", generate_rooms, TINY_ROOMS, SynthRooms, "rooms", ROOM_FILES),
-        _Generated("tiny_shapes", generate_shapes, TINY_SHAPES, SynthShapes, "shapes", SHAPE_FILES),
+        _Generated("rooms", generate_rooms, TINY_ROOMS, SynthRooms, ROOM_FILES),
+        _Generated("shapes", generate_shapes, TINY_SHAPES, SynthShapes, SHAPE_FILES),
     ],
     ids=lambda of: of.setting,
 )
@@ -45,7 +34,7 @@ every_generator = pytest.mark.parametrize(
 def test_missing_files_are_generated_again_and_others_kept(
     of: _Generated, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
-    original = request.getfixturevalue(of.fixture)
+    original = request.getfixturevalue(f"tiny_{of.setting}")
     copy = shutil.copytree(original, tmp_path / "copy")
     for pattern in of.some_files:
         next(copy.glob(pattern)).unlink()
@@ -60,7 +49,7 @@ def test_missing_files_are_generated_again_and_others_kept(
 def test_folders_of_other_settings_and_of_others_are_left_alone(
     of: _Generated, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
-    root = request.getfixturevalue(of.fixture)
+    root = request.getfixturevalue(f"tiny_{of.setting}")
     before = contents(root)
     with pytest.raises(DataError, match=r"found seed=3; expected seed=9\. Name another"):
         of.generate(root, replace(of.settings, seed=9))

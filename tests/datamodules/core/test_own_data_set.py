@@ -13,32 +13,22 @@ from numpy.typing import NDArray
 from datamodules.core.found import Split
 from datamodules.core.image_module import PanoramaDataModule
 from datamodules.core.problems import Problems
-from datamodules.core.reading import ImageFiles, ImageReader
-from datamodules.images.png import check_png, read_color_png, read_png
+from datamodules.core.reading import ImageFiles, PngReader
+from datamodules.images.png import read_png
 from tangent_train.errors import DataError, SettingError
 from tangent_train.rendering import EquirectRepresentation
 from tests.datamodules.data_files import read_png as read_as_stored
 from tests.datamodules.data_files import write_png
 
+FORMATS = {"rgb": (8, ("RGB",)), "labels": (8, ("grey",))}
 
-class ToyReader(ImageReader):
-    @property
-    def settings(self) -> dict[str, str]:
-        return {}
 
-    def size(self, part: str, path: Path) -> tuple[int, int]:
-        header = check_png(path, 8, ("RGB",) if part == "rgb" else ("grey",))
-        return header.height, header.width
-
-    def rgb(self, files: ImageFiles) -> NDArray[np.uint8]:
-        return read_color_png(files.rgb)
+class ToyReader(PngReader):
+    formats = FORMATS
 
     def labels(self, files: ImageFiles, shape: tuple[int, int] | None = None) -> NDArray[np.uint8]:
         labels: NDArray[np.uint8] = read_png(files.labels, cv2.IMREAD_UNCHANGED)
         return labels if shape is None else cv2.resize(labels, shape[::-1], interpolation=0)
-
-    def depth(self, files: ImageFiles) -> NDArray[np.uint16]:
-        raise NotImplementedError(files.name)
 
 
 @dataclass(kw_only=True, eq=False, repr=False)
@@ -53,10 +43,6 @@ class Toy(PanoramaDataModule):
         return ToyReader(), {"train": files[:-1], "val": [], "test": files[-1:]}
 
 
-class Nameless(Toy):
-    class_names = ("sky", "wall", "ground", "door")
-
-
 def _write(root: Path, largest: int) -> None:
     rng = np.random.default_rng(0)
     for folder, high, size in (("rgb", 255, (32, 64, 3)), ("labels", largest, (32, 64))):
@@ -65,8 +51,8 @@ def _write(root: Path, largest: int) -> None:
             write_png(root / folder / f"{name}.png", image)
 
 
-def _toy(root: Path, kind: type[Toy] = Toy) -> Toy:
-    return kind(root, EquirectRepresentation(level=4), inputs=["rgb"], validation_fraction=0)
+def _toy(root: Path) -> Toy:
+    return Toy(root, EquirectRepresentation(level=4), inputs=["rgb"], validation_fraction=0)
 
 
 def test_a_data_set_is_a_reader_and_its_files(tmp_path: Path) -> None:
@@ -90,19 +76,17 @@ def test_labels_past_the_classes_are_found(tmp_path: Path) -> None:
         data.source("test").labels(0)
 
 
-def test_the_first_class_is_the_unknown_one(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("names", "found"), [(("sky", "wall"), "sky first"), ((), "none")])
+def test_the_first_class_is_the_unknown_one(
+    tmp_path: Path, names: tuple[str, ...], found: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     _write(tmp_path, 2)
-    with pytest.raises(SettingError, match=r"class_names .*found sky first; expected unknown"):
-        _toy(tmp_path, Nameless).prepare_data()
-
-
-def test_a_data_set_without_names_of_classes_is_refused(tmp_path: Path) -> None:
-    class Unnamed(PanoramaDataModule):
-        find_images = Toy.find_images
-
-    data = Unnamed(tmp_path, EquirectRepresentation(level=4), inputs=["rgb"])
-    with pytest.raises(SettingError, match=r"class_names of Unnamed: found none; expected unknown"):
-        data.check_classes()
+    data = _toy(tmp_path)
+    monkeypatch.delattr(Toy, "class_names")
+    if names:
+        monkeypatch.setattr(Toy, "class_names", names, raising=False)
+    with pytest.raises(SettingError, match=f"class_names of Toy: found {found}; expected unknown"):
+        data.prepare_data()
 
 
 def test_a_data_set_without_images_is_refused(tmp_path: Path) -> None:

@@ -18,12 +18,10 @@ from datamodules.core.inputs import (
 from datamodules.core.panoramas import Panorama
 from datamodules.core.samples import (
     EvaluationImages,
-    ImageSamples,
     TrainingImages,
     jitter_colors,
     render_inputs,
 )
-from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_directions
 from tangent_train.rendering import EquirectRepresentation, TangentRepresentation
 from tangent_train.rendering.representations.views import Representation
@@ -94,12 +92,6 @@ def test_elevation_is_how_far_a_pixel_looks_up(
         expected = directions @ np.array((0, 0, 1) if up is None else up)
         np.testing.assert_allclose(elevation, expected, atol=1e-5)
         assert elevation.dtype == np.float32
-
-
-@pytest.mark.parametrize("inputs", [(), ("depth",), ("rgb", "rgb"), ("rgb", "heat"), "rgb"])
-def test_impossible_inputs(inputs: Any) -> None:
-    with pytest.raises(SettingError, match=r"data\.inputs: found .* expected a list: rgb"):
-        ImageSamples(inputs, RGB_NORMALIZATION, 0)
 
 
 # --- samples -----------------------------------------------------------------------------------

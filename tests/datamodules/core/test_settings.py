@@ -15,6 +15,7 @@ from datamodules import (
     Stanford2D3DSPerspective,
     SynthRooms,
     SynthRoomsPerspective,
+    Zind,
 )
 from datamodules.core.inputs import RGB_NORMALIZATION
 from tangent_train.errors import SettingError
@@ -22,6 +23,7 @@ from tangent_train.rendering import EquirectRepresentation, PerspectiveRepresent
 from tests.datamodules.folder.folder_format import write_classes
 
 ERP: Any = EquirectRepresentation(level=3)
+INPUTS: Any = [{"inputs": n} for n in ((), ("depth",), ("rgb", "rgb"), ("rgb", "heat"), "rgb")]
 CROPS: Any = PerspectiveRepresentation(level=5)
 
 
@@ -32,6 +34,10 @@ CROPS: Any = PerspectiveRepresentation(level=5)
         (Stanford2D3DS, {"seed": -1}, "seed"),
         (Stanford2D3DS, {"normalization": RGB_NORMALIZATION}, "normalization"),
         (Stanford2D3DS, {"color_jitter": 1.1}, "color_jitter"),
+        *(
+            (Stanford2D3DS, {"inputs": inputs}, "inputs: found .* expected a list")
+            for inputs in INPUTS
+        ),
         (Stanford2D3DS, {"upright": "maybe"}, "upright"),
         (Stanford2D3DS, {"max_tilt_deg": 0}, "max_tilt_deg"),
         (Stanford2D3DS, {"test_rotation": 200}, "test_rotation"),
@@ -45,6 +51,9 @@ CROPS: Any = PerspectiveRepresentation(level=5)
         (FolderPanoramas, {"test_fraction": 0}, "test_fraction"),
         (FolderPanoramas, {"split_seed": -1}, "split_seed"),
         (FolderPanoramas, {"normalization": {"mean": [0]}}, "normalization"),
+        (Zind, {"inputs": ["rgb", "depth"]}, "inputs"),
+        (Zind, {"doors": "open"}, "doors"),
+        (Zind, {"test_fraction": 1.1}, "test_fraction"),
         (ModelNet40, {"shapes_per_step": 0}, "shapes_per_step"),
         (ModelNet40, {"test_rotation": "z"}, "test_rotation"),
         (ModelNet40, {"normalization": {"mean": [0] * 3, "std": [1] * 3}}, "normalization"),

@@ -13,7 +13,6 @@ import torch
 from lightning import LightningModule, Trainer
 
 from datamodules.core.class_weights import class_weights
-from datamodules.core.found import Split
 from datamodules.core.loading import EpochSampler, sample_rng
 from datamodules.core.samples import EvaluationSample, TrainingSample
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
@@ -21,9 +20,6 @@ from tangent_train.errors import SettingError
 from tangent_train.rendering import TangentRepresentation
 
 MakeModule = Callable[..., Stanford2D3DS]
-
-
-SPLITS: tuple[Split, ...] = ("train", "val", "test")
 
 
 @pytest.fixture
@@ -147,13 +143,12 @@ def test_effective_weights_are_those_of_cui_for_the_mean_count() -> None:
 
 
 @pytest.mark.parametrize("kind", ["log", "sqrt", "effective", "none"])
-def test_only_the_shares_count(kind: str) -> None:
+def test_only_the_shares_count_and_weights_are_finite(kind: str) -> None:
     once = class_weights(COUNTS, kind)  # type: ignore[arg-type]
     torch.testing.assert_close(once, class_weights(COUNTS * 1000, kind))  # type: ignore[arg-type]
 
-
-@pytest.mark.parametrize("kind", ["log", "sqrt", "effective"])
-def test_extreme_counts_give_finite_weights(kind: str) -> None:
+    if kind == "none":
+        return
     for counts in ([0, 0], [7, 0], [1, 1], [1, 10**13]):
         weights = class_weights(np.array(counts), kind)  # type: ignore[arg-type]
         assert torch.isfinite(weights).all()
@@ -183,13 +178,6 @@ def test_shuffled_order_is_new_every_epoch_and_reproducible() -> None:
     assert _indices(EpochSampler(20, 8, shuffle=True)) != first
 
 
-@pytest.mark.parametrize(("length", "world_size"), [(11, 1), (11, 2), (11, 3), (4, 3), (12, 4)])
-def test_evaluation_sees_everything_once(length: int, world_size: int) -> None:
-    samplers = [EpochSampler(length, 0, False, rank, world_size) for rank in range(world_size)]
-    assert sorted(i for s in samplers for i in _indices(s)) == list(range(length))
-    assert [len(s) for s in samplers] == [len(_indices(s)) for s in samplers]
-
-
 @pytest.mark.parametrize(("length", "world_size"), [(11, 1), (11, 2), (11, 3), (12, 4)])
 def test_training_gives_every_process_as_much(length: int, world_size: int) -> None:
     samplers = [EpochSampler(length, 0, True, rank, world_size) for rank in range(world_size)]
@@ -197,16 +185,6 @@ def test_training_gives_every_process_as_much(length: int, world_size: int) -> N
     assert {len(part) for part in parts} == {length // world_size} == {len(s) for s in samplers}
     together = [i for part in parts for i in part]
     assert len(set(together)) == len(together)
-
-
-def test_the_dropped_tail_changes() -> None:
-    dropped = set()
-    for epoch in range(10):
-        parts = [EpochSampler(3, 0, True, rank, 2) for rank in range(2)]
-        for sampler in parts:
-            sampler.set_epoch(epoch)
-        dropped |= {0, 1, 2} - {i for sampler in parts for i in _indices(sampler)}
-    assert dropped == {0, 1, 2}
 
 
 def test_impossible_processes() -> None:

@@ -12,7 +12,6 @@ import pytest
 import torch
 
 from datamodules import Stanford2D3DS
-from datamodules.core.found import Split
 from datamodules.core.store import Store
 from tangent_train.cli.each import Shard
 from tangent_train.errors import DataError, SettingError
@@ -22,7 +21,6 @@ from tests.datamodules.data_files import contents
 
 MakeModule = Callable[..., Stanford2D3DS]
 
-SPLITS: tuple[Split, ...] = ("train", "val", "test")
 PANORAMAS = 8
 
 

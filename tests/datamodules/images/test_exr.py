@@ -11,7 +11,7 @@ import OpenEXR
 import pytest
 
 from datamodules.images.exr import read_exr, read_exr_size
-from tangent_train.errors import DataError
+from tangent_train.errors import DataError, SettingError
 
 _DEPTH = np.fromfunction(lambda row, column: (row // 8 + column % 12) / 4 + 0.5, (40, 96)).astype(
     np.float32
@@ -70,5 +70,5 @@ def test_several_parts_and_deep_pixels(tmp_path: Path) -> None:
 def test_the_missing_package_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = _write(tmp_path / "a.exr", {"Z": _DEPTH})
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
-    with pytest.raises(DataError, match=r"a\.exr: .* pip install 'tangent-train\[exr\]'"):
+    with pytest.raises(SettingError, match=r"a\.exr: .* pip install 'tangent-train\[exr\]'"):
         read_exr(path)

@@ -13,6 +13,7 @@ from datamodules.images.gpano import PanoramaArea, area_of, area_of_crop, up_of,
 from tangent_train.errors import DataError, SettingError
 from tangent_train.geometry import equirect_to_lonlat
 from tangent_train.rendering.upright.gravity import up_from_pose
+from tests.datamodules.data_files import gpano_xmp
 
 _TAGS = {
     "ProjectionType": "equirectangular",
@@ -23,38 +24,21 @@ _TAGS = {
     "CroppedAreaLeftPixels": "100",
     "CroppedAreaTopPixels": "30",
 }
-_HEAD = (
-    '<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>'
-    '<x:xmpmeta xmlns:x="adobe:ns:meta/" x:xmptk="x">'
-    '<rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
-)
-_TAIL = '</rdf:RDF></x:xmpmeta>\n   \n<?xpacket end="w"?>'
-_NAMESPACE = 'xmlns:GPano="http://ns.google.com/photos/1.0/panorama/"'
 
 
-def _attributes(tags: Mapping[str, str]) -> str:
-    listed = " ".join(f'GPano:{name}="{value}"' for name, value in tags.items())
-    return f'{_HEAD}<rdf:Description rdf:about="" {_NAMESPACE} {listed}/>{_TAIL}'
-
-
-def _elements(tags: Mapping[str, str]) -> str:
-    listed = "\n".join(f"<GPano:{name}>\n {v}\n</GPano:{name}>" for name, v in tags.items())
-    other = "<rdf:Description rdf:about='' xmlns:o='x:y'><o:CroppedAreaTopPixels>7"
-    other += "</o:CroppedAreaTopPixels></rdf:Description>"
-    mine = f"<rdf:Description rdf:about='' {_NAMESPACE}>{listed}</rdf:Description>"
-    return f"{_HEAD}{other}{mine}{_TAIL}"
-
-
-def _save(path: Path, xmp: str, shape: tuple[int, int] = (40, 60)) -> Path:
-    image = Image.new("RGB", (shape[1], shape[0]))
+def _save(
+    path: Path,
+    tags: Mapping[str, str],
+    shape: tuple[int, int] = (40, 60),
+    *,
+    elements: bool = False,
+) -> Path:
+    xmp = gpano_xmp(tags, elements=elements)
     text = PngImagePlugin.PngInfo()
-    text.add_itxt("XML:com.adobe.xmp", xmp)
-    settings: dict[str, Any] = {"xmp": xmp.encode()}
-    if path.suffix == ".png":
-        settings = {"pnginfo": text}
-    elif path.suffix == ".tif":
-        settings = {"tiffinfo": {700: xmp.encode()}}
-    image.save(path, **settings)
+    text.add_itxt("XML:com.adobe.xmp", xmp.decode())
+    formats: dict[str, Any] = {".png": {"pnginfo": text}, ".tif": {"tiffinfo": {700: xmp}}}
+    settings = formats.get(path.suffix, {"xmp": xmp})
+    Image.new("RGB", (shape[1], shape[0])).save(path, **settings)
     return path
 
 
@@ -62,22 +46,18 @@ _AREA = PanoramaArea((180, 360), (30, 70), (100, 160), (40, 60))
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif", ".webp"])
-@pytest.mark.parametrize("written", [_attributes, _elements])
-def test_tags_of_all_formats(tmp_path: Path, suffix: str, written: Any) -> None:
-    path = _save(tmp_path / f"image{suffix}", written(_TAGS))
+@pytest.mark.parametrize("elements", [False, True])
+def test_tags_of_all_formats(tmp_path: Path, suffix: str, elements: bool) -> None:
+    path = _save(tmp_path / f"image{suffix}", _TAGS, elements=elements)
     assert area_of(path, (40, 60)) == _AREA
 
 
 def test_images_that_say_nothing(tmp_path: Path) -> None:
     Image.new("RGB", (60, 40)).save(tmp_path / "none.jpg")
     incomplete = {k: v for k, v in _TAGS.items() if k != "CroppedAreaTopPixels"}
-    other = _attributes(_TAGS).replace("photos/1.0/panorama", "photos/1.0/image")
-    paths = [
-        tmp_path / "none.jpg",
-        _save(tmp_path / "incomplete.jpg", _attributes(incomplete)),
-        _save(tmp_path / "other.jpg", other),
-    ]
-    for path in paths:
+    other = _save(tmp_path / "other.jpg", _TAGS)
+    other.write_bytes(other.read_bytes().replace(b"photos/1.0/panorama", b"photos/1.0/image"))
+    for path in (tmp_path / "none.jpg", _save(tmp_path / "incomplete.jpg", incomplete), other):
         assert area_of(path, (30, 60)) == whole_area(path, (30, 60)), path.name
         with pytest.raises(DataError, match="a whole panorama"):
             area_of(path, (40, 60))
@@ -86,7 +66,7 @@ def test_images_that_say_nothing(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("size", [(20, 30), (80, 120), (27, 40), (33, 50)])
 def test_resized_images_show_the_same(tmp_path: Path, size: tuple[int, int]) -> None:
-    path = _save(tmp_path / "image.jpg", _attributes(_TAGS), size)
+    path = _save(tmp_path / "image.jpg", _TAGS, size)
     area = area_of(path, size)
     assert area is not None
     assert area.image_shape == size
@@ -119,7 +99,7 @@ def _angles_deg(area: PanoramaArea, corner_xy: tuple[int, int]) -> NDArray[np.fl
 def test_tags_that_cannot_be_are_refused(
     tmp_path: Path, changes: dict[str, str], size: tuple[int, int], found: str
 ) -> None:
-    path = _save(tmp_path / "image.jpg", _attributes(_TAGS | changes))
+    path = _save(tmp_path / "image.jpg", _TAGS | changes)
     with pytest.raises(DataError, match=rf"image\.jpg: found .*{found}"):
         area_of(path, size)
 
@@ -226,32 +206,19 @@ def test_impossible_crops(crop: tuple[float, ...], message: str) -> None:
 # Pose
 
 
-@pytest.mark.parametrize("written", [_attributes, _elements])
-@pytest.mark.parametrize(("pitch_deg", "roll_deg"), [(-24.49, -121.0), (5.0, 0.0)])
-def test_pose(tmp_path: Path, written: Any, pitch_deg: float, roll_deg: float) -> None:
-    tags = {"PosePitchDegrees": str(pitch_deg), "PoseRollDegrees": str(roll_deg)}
-    up = up_of(_save(tmp_path / "image.jpg", written(tags)))
-    assert up is not None
-    np.testing.assert_array_equal(up, up_from_pose(pitch_deg, roll_deg))
+@pytest.mark.parametrize("elements", [False, True])
+@pytest.mark.parametrize(("pitch", "roll"), [("-24.49", "-121"), ("5.0", "0"), ("0.0", "-0")])
+def test_pose(tmp_path: Path, elements: bool, pitch: str, roll: str) -> None:
+    """Zero pitch and roll is what programs write that do not know."""
+    tags = {"PosePitchDegrees": pitch, "PoseRollDegrees": roll}
+    up = up_of(_save(tmp_path / "image.jpg", tags, elements=elements))
+    expected = None if float(pitch) == 0 else up_from_pose(float(pitch), float(roll))
+    np.testing.assert_array_equal(up, expected)
 
 
-def test_zero_pitch_and_roll_is_what_programs_write_that_do_not_know(tmp_path: Path) -> None:
-    tags = {"PosePitchDegrees": "0.0", "PoseRollDegrees": "-0"}
-    assert up_of(_save(tmp_path / "image.jpg", _attributes(tags))) is None
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("PosePitchDegrees", "91"),
-        ("PoseRollDegrees", "nan"),
-        ("PoseRollDegrees", "180.5"),
-        ("PoseRollDegrees", "steep"),
-    ],
-)
-def test_impossible_poses(tmp_path: Path, name: str, value: str) -> None:
-    path = _save(tmp_path / "image.jpg", _attributes({name: value}))
-    with pytest.raises(
-        DataError, match=rf"image\.jpg: found GPano:{name} .*expected a number from"
-    ):
-        up_of(path)
+def test_impossible_poses(tmp_path: Path) -> None:
+    for axis, value in (("Pitch", "91"), ("Roll", "nan"), ("Roll", "180.5"), ("Roll", "steep")):
+        path = _save(tmp_path / "image.jpg", {f"Pose{axis}Degrees": value})
+        message = rf"image\.jpg: found GPano:Pose{axis}Degrees .*expected a number from"
+        with pytest.raises(DataError, match=message):
+            up_of(path)

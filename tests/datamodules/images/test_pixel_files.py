@@ -21,7 +21,16 @@ from datamodules.images.pixel_files import (
     read_rgb,
     write_pixels,
 )
+from datamodules.images.png import (
+    PngHeader,
+    check_panorama_size,
+    check_png,
+    read_color_png,
+    read_depth_png,
+    read_png_header,
+)
 from tangent_train.errors import DataError, SettingError
+from tests.datamodules.data_files import write_png
 
 
 def _noise(shape: tuple[int, ...], dtype: Any = np.uint8) -> NDArray[Any]:
@@ -33,11 +42,6 @@ def _smooth(height: int, width: int) -> NDArray[np.uint8]:
     v, u = np.mgrid[:height, :width]
     slopes = [255 * u / width, 255 * v / height, 255 - 120 * (u / width + v / height)]
     return np.stack(slopes, axis=-1).astype(np.uint8)
-
-
-def _pixels(dtype: Any, *shape: int) -> Any:
-    numbers = np.random.default_rng(0).random(shape)
-    return (numbers * (1 if np.dtype(dtype).kind == "f" else 250)).astype(dtype)
 
 
 @pytest.mark.parametrize("channels", [(), (3,)])
@@ -56,7 +60,7 @@ def _pixels(dtype: Any, *shape: int) -> Any:
 def test_what_is_written_is_read(
     suffix: str, dtype: Any, channels: tuple[int, ...], tmp_path: Path
 ) -> None:
-    pixels = _pixels(dtype, 7, 9, *channels)
+    pixels = (_noise((7, 9, *channels)) / 255 * 250).astype(dtype)
     path = tmp_path / "new" / f"a (1){suffix}"
     write_pixels(path, pixels)
     again = read_pixels(path, indices=True)
@@ -222,3 +226,50 @@ def test_what_is_no_depth(tmp_path: Path) -> None:
     ]:
         with pytest.raises(DataError, match=rf"{name}: found .*{found}"):
             read_depth_m(tmp_path / name, 1000)
+
+
+# --- PNG files of data sets -----------------------------------------------------------------------
+
+
+READERS = [read_png_header, read_color_png, read_depth_png]
+
+
+def _written(folder: Path, image: np.ndarray[Any, Any]) -> Path:
+    write_png(folder / "image.png", image)
+    return folder / "image.png"
+
+
+@pytest.mark.parametrize(
+    ("shape", "dtype", "bits", "color"),
+    [
+        ((4, 8, 3), np.uint8, 8, "RGB"),
+        ((4, 8, 4), np.uint8, 8, "RGBA"),
+        ((4, 8), np.uint8, 8, "grey"),
+        ((4, 8), np.uint16, 16, "grey"),
+    ],
+)
+def test_header(tmp_path: Path, shape: tuple[int, ...], dtype: Any, bits: int, color: str) -> None:
+    path = _written(tmp_path, np.zeros(shape, dtype))
+    assert check_png(path, bits, (color,)) == PngHeader(4, 8, bits, color)
+    with pytest.raises(DataError, match=rf"found {bits}-bit {color}; expected 8-bit palette"):
+        check_png(path, 8, ("palette",))
+
+
+@pytest.mark.parametrize("read", READERS)
+@pytest.mark.parametrize("missing", [slice(-20, None), slice(-1, None), slice(1000, 3000)])
+def test_truncated_files_are_named(tmp_path: Path, missing: slice, read: Any) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (64, 128, 3), np.uint8)
+    path = _written(tmp_path, noise)
+    content = bytearray(path.read_bytes())
+    del content[missing]
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=r"image\.png: found .* truncated"):
+        read(path)
+
+
+def test_size_of_panoramas(tmp_path: Path) -> None:
+    check_panorama_size(tmp_path, (64, 128), 64)
+    with pytest.raises(DataError, match="found 64×127 pixels; expected twice as wide as high"):
+        check_panorama_size(tmp_path, (64, 127), 64)
+    with pytest.raises(SettingError, match="at most the 64 rows"):
+        check_panorama_size(tmp_path, (64, 128), 65)

@@ -9,7 +9,7 @@ import pytest
 import torch
 import trimesh
 
-from datamodules.core.found import Split
+from datamodules.core.found import SPLITS, Split
 from datamodules.modelnet40.datamodule import ModelNet40
 from datamodules.modelnet40.meshes import CHANNELS, clean_mesh, mesh_spheres, read_off
 from datamodules.modelnet40.shape_files import MODELNET40, find_shapes
@@ -23,6 +23,7 @@ from tangent_train.rendering import (
     TangentRepresentation,
     equirect_to_tangent,
 )
+from tests.datamodules.data_files import names_of
 from tests.datamodules.modelnet40.shapes_format import COUNTS, write_tree
 
 PARTS = ("train", "test")
@@ -61,7 +62,6 @@ def test_a_class_that_is_only_tested(tmp_path: Path) -> None:
 
 MakeModule = Callable[..., ModelNet40]
 
-SPLITS: tuple[Split, ...] = ("train", "val", "test")
 LEVEL = 3
 TRAINING = sum(train for train, _ in COUNTS.values())
 TEST = sum(test for _, test in COUNTS.values())
@@ -90,19 +90,6 @@ def _labels(module: ModelNet40, split: Split) -> list[int]:
 # --- splits ------------------------------------------------------------------------------------
 
 
-def test_every_shape_is_in_one_split_with_the_class_of_its_folder(make_module: MakeModule) -> None:
-    module = make_module(validation_fraction=0.34)
-    names: list[str] = []
-    for split in SPLITS:
-        source = module.source(split)
-        for index, label in enumerate(_labels(module, split)):
-            name = source.name(index)
-            assert name.startswith(f"{module.class_names[label]}/")
-            assert ("/test/" in name) is (split == "test")
-            names.append(name)
-    assert len(set(names)) == len(names) == TRAINING + TEST
-
-
 def test_validation_is_drawn_from_every_class_alike(make_module: MakeModule) -> None:
     drawn = set()
     for seed in range(4):
@@ -110,9 +97,12 @@ def test_validation_is_drawn_from_every_class_alike(make_module: MakeModule) -> 
         labels = _labels(module, "val")
         # A third of 6, 4 and 5.
         assert [labels.count(k) for k in range(3)] == [2, 1, 2]
-        drawn.add(tuple(module.source("val").name(i) for i in range(5)))
+        drawn.add(tuple(names_of(module, "val")))
         again = make_module(validation_fraction=0.34, seed=seed)
-        assert again.source("val").name(3) == module.source("val").name(3)
+        assert names_of(again, "val") == names_of(module, "val")
+        names = {name for split in SPLITS for name in names_of(module, split)}
+        assert len(names) == sum(len(_labels(module, split)) for split in SPLITS) == TRAINING + TEST
+        assert all("/test/" in name for name in names_of(module, "test"))
     assert len(drawn) > 1
     assert len(make_module(validation_fraction=0).source("val")) == 0
     assert make_module(validation_fraction=0).val_dataloader() == []
@@ -152,7 +142,7 @@ def test_views_are_those_of_the_float_spheres(make_module: MakeModule, root: Pat
     mesh = read_off(root / f"{module.sample_name('test', 3)}.off")
     spheres = torch.from_numpy(mesh_spheres(clean_mesh(mesh), (16, 32))).movedim(-1, 0)
     views = equirect_to_tangent(spheres, module.representation.grid)
-    normalization = module.samples.normalization
+    normalization: Any = module.normalization
     mean, std = torch.tensor([normalization.mean, normalization.std])[..., None, None]
     torch.testing.assert_close(
         batch.images[3], ((views - mean) / std).float(), atol=4 / STEPS / 0.19, rtol=0

@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from datamodules.core.problems import Problems
+from datamodules.synthia.generate import MANIFEST, make_panoramas
 from tests.datamodules.data_files import write_png
 
 SIZE = (38, 64)  # the real 760×1280 by 20
@@ -91,20 +93,8 @@ def write_views(root: Path, frames: Mapping[str, int]) -> Path:
 
 
 def write_panoramas(root: Path, frames: Mapping[str, int], height: int = 32) -> Path:
-    """Panoramas as published, of blocks of 4×4 pixels; returns `root`."""
-    for name, count in frames.items():
-        pano = sequence(root, name) / "pano"
-        for number in range(count):
-            rng = np.random.default_rng((int(name), number))
-            blocks = rng.choice([*IDS, 255], (height // 4, height // 2))
-            ids = np.kron(blocks, np.ones((4, 4), int)).astype(np.uint8)
-            ids[: height // 8] = 255
-            rgb = np.stack([10 * (ids % 16) + 5, 200 - ids % 16, 0 * ids + 50], axis=-1)
-            rgb[ids == 255] = 0
-            depth = np.where(ids == 255, 0, 100 + 10 * ids.astype(np.uint16)).astype(np.uint16)
-            depth[ids == 8] = 60000
-            file = f"{number:06d}.png"
-            write_png(pano / "RGB" / file, rgb[..., ::-1].astype(np.uint8))
-            write_png(pano / "GT" / "LABELS_Correct" / file, ids)
-            write_png(pano / "Depth" / file, depth)
+    """Panoramas as if they were published, beside the views; returns `root`."""
+    make_panoramas(write_views(root, frames), list(frames), Problems(), height=height)
+    for name in frames:
+        (sequence(root, name) / "pano" / MANIFEST).unlink()
     return root

@@ -10,14 +10,9 @@ import pytest
 from numpy.typing import NDArray
 
 from datamodules.core.reading import ImageFiles
-from datamodules.synthia.files import read_camera
-from datamodules.synthia.reader import (
-    CLASSES,
-    VIEW_FORMATS,
-    SynthiaReader,
-    depth_steps,
-)
-from datamodules.synthia.splits import choose_frames, divide
+from datamodules.synthia.files import choose_frames, read_camera
+from datamodules.synthia.omnisynthia import divide
+from datamodules.synthia.reader import CLASSES, VIEW_FORMATS, SynthiaReader
 from tangent_train.errors import DataError
 from tests.datamodules.data_files import write_png
 
@@ -88,9 +83,10 @@ def test_there_are_no_other_labels(tmp_path: Path, value: int) -> None:
         _labels(tmp_path, image)
 
 
-def test_steps_of_depth() -> None:
-    centimeters = np.arange(65536).astype(np.uint16)
-    steps = depth_steps(centimeters)
+def test_steps_of_depth(tmp_path: Path) -> None:
+    path = tmp_path / "depth.png"
+    write_png(path, np.arange(65536, dtype=np.uint16).reshape(256, 256))
+    steps = SynthiaReader(VIEW_FORMATS).depth(ImageFiles("a", path, path, path)).ravel()
     assert steps.dtype == np.uint16
     exact = np.arange(65536) / 100 * 512
     near = exact < 65535

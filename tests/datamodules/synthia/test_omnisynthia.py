@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 
 from datamodules.core.found import SPLITS
-from datamodules.synthia.omnisynthia import OmniSynthia
+from datamodules.synthia.omnisynthia import OmniSynthia, SynthiaPerspective
 from tangent_train.errors import DataError
-from tangent_train.rendering import EquirectRepresentation
+from tangent_train.rendering import EquirectRepresentation, PerspectiveRepresentation
 from tests.datamodules.data_files import names_of, read_png, write_png
 from tests.datamodules.synthia import synthia_format as synthia
 
+SEQUENCES: dict[str, Any] = {"train_sequences": ["01"], "test_sequences": ["04"]}
+CROPS = PerspectiveRepresentation(level=5)
 FRAMES = {"01": 5, "02": 3, "04": 2, "05": 2, "06": 4}
 
 
@@ -29,9 +31,7 @@ def broken_root(tmp_path: Path) -> Path:
 
 
 def two(root: Path, erp: Any, **settings: Any) -> OmniSynthia:
-    return OmniSynthia(
-        root, erp, **{"train_sequences": ["01"], "test_sequences": ["04"], **settings}
-    )
+    return OmniSynthia(root, erp, **{**SEQUENCES, **settings})
 
 
 # --- splits --------------------------------------------------------------------------------------
@@ -57,32 +57,56 @@ def test_splits(root: Path, erp: Any) -> None:
 # --- reading -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("erp_height", [32, 8])
-def test_reads_what_was_written(root: Path, erp_height: int) -> None:
-    module = OmniSynthia(
-        root, EquirectRepresentation(3, erp_height=erp_height), inputs=("rgb", "depth")
-    )
+def test_reads_what_was_written(root: Path) -> None:
+    module = OmniSynthia(root, EquirectRepresentation(4), inputs=("rgb", "depth"))
     source = module.source("test")
     panorama = source.read(1)
     pano = synthia.sequence(root, "04") / "pano"
-    # Blocks of 4×4 pixels: at these sizes every pixel is one block's.
-    step = 32 // erp_height
-    labels = read_png(pano / "GT" / "LABELS_Correct" / "000001.png")
-    ids = labels[::step, ::step].astype(int)
+    ids = read_png(pano / "GT" / "LABELS_Correct" / "000001.png")
     assert {15, 255} <= set(np.unique(ids).tolist())
     expected = np.where(ids == 15, 13, np.where(ids == 255, 0, ids))
     np.testing.assert_array_equal(panorama.labels, expected)
-    rgb = np.stack([10 * (ids % 16) + 5, 200 - ids % 16, 0 * ids + 50], axis=-1)
-    rgb[ids == 255] = 0
+    np.testing.assert_array_equal(source.labels(1), expected)
+    rgb = read_png(pano / "RGB" / "000001.png")[..., ::-1]
     np.testing.assert_array_equal(panorama.rgb, rgb)
     assert panorama.depth is not None
-    meters = np.where(ids == 255, 0, 1 + ids / 10)
-    near = ids != 8  # which are 600 m away
-    assert np.abs(panorama.depth / 512 - meters)[near].max() <= 0.5 / 512
-    assert (panorama.depth[~near] == 65535).all()
-    dtypes = [a.dtype.name for a in (panorama.rgb, panorama.depth, panorama.labels)]
-    assert dtypes == ["uint8", "uint16", "uint8"]
-    np.testing.assert_array_equal(source.labels(1), expected)
+    meters = read_png(pano / "Depth" / "000001.png") / 100
+    assert np.abs(panorama.depth / 512 - meters).max() <= 0.5 / 512
+
+
+# --- photos --------------------------------------------------------------------------------------
+
+
+def test_the_photos_are_the_views_of_the_panoramas(erp: Any, tmp_path: Path) -> None:
+    synthia.write_views(tmp_path, {"01": 4, "04": 2})
+    photos = SynthiaPerspective(tmp_path, CROPS, frames=2, **SEQUENCES)
+    panoramas = OmniSynthia(tmp_path, erp, frames=2, panorama_height=32, **SEQUENCES)
+    panoramas.prepare_data()
+    for split in SPLITS:
+        views = [f"{name}/{view}" for name in names_of(panoramas, split) for view in "FRBL"]
+        assert names_of(photos, split) == views
+    assert names_of(photos, "val") == [f"sequence_01/000002/{view}" for view in "FRBL"]
+
+
+def test_photos_are_what_was_written(root: Path) -> None:
+    photos = SynthiaPerspective(root, CROPS, inputs=("rgb", "depth"), **SEQUENCES)
+    source = photos.source("test")
+    for index, view in enumerate("FRBL"):
+        for frame in (0, 1):
+            photo = source.read(4 * frame + index)
+            rays = synthia.view_rays(view)
+            np.testing.assert_allclose(photo.rgb, synthia.rgb_of(rays), atol=0.5001)
+            ids = synthia.labels_of(rays, frame)
+            np.testing.assert_array_equal(photo.labels, np.where(ids == 15, 13, ids))
+            meters = (500 + 10 * rays[..., 2]) / 100 * np.linalg.norm(rays, axis=-1)
+            meters[:2, :3] = 0
+            assert photo.depth is not None
+            assert photo.depth.dtype == np.uint16
+            np.testing.assert_allclose(photo.depth / 512, meters, atol=0.013)  # whole cm
+            np.testing.assert_array_equal(photo.depth == 0, meters == 0)
+            K = np.array([[synthia.FOCAL, 0, 31.5], [0, synthia.FOCAL, 18.5], [0, 0, 1]])
+            np.testing.assert_allclose(photo.camera_matrix, K, rtol=1e-12)
+            np.testing.assert_array_equal(source.labels(4 * frame + index), photo.labels)
 
 
 # --- making --------------------------------------------------------------------------------------
@@ -94,7 +118,7 @@ def test_panoramas_are_made_from_views(tmp_path: Path, erp: Any) -> None:
     # Numbers, as YAML reads them.
     sequences = {"train_sequences": [1], "test_sequences": [4]}
     module = two(root, erp, panorama_height=64, frames=2, **sequences)
-    with pytest.raises(DataError, match=r"pano/RGB: found no panoramas.*tangent-prepare"):
+    with pytest.raises(DataError, match=r"01-SUMMER: found no panoramas.*tangent-prepare"):
         module.setup()
     module.prepare_data()
     module.setup("fit")

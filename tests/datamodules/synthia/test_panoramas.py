@@ -136,6 +136,7 @@ def test_ready_panoramas_stay_as_they_are(views: Path) -> None:
     synthia.write_panoramas(views, {"01": 1})
     pano = synthia.sequence(views, "01") / "pano"
     (pano / "Depth" / "000000.png").unlink()
+    (pano / "RGB" / "000001.png").unlink()
 
     def state() -> dict[str, tuple[int, int]]:
         return {p.name: (p.stat().st_mtime_ns, p.stat().st_size) for p in pano.rglob("*")}

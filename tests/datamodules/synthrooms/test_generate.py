@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +13,12 @@ import pytest
 from datamodules import SynthRoomsPerspective
 from datamodules.core.found import SPLITS
 from datamodules.synthrooms.camera import PanoramaView, PerspectiveView, Pose, euler_rotation
-from datamodules.synthrooms.generate import plan_rooms
-from datamodules.synthrooms.layout import FloorPlan, Rectangle
+from datamodules.synthrooms.generate import RoomSettings, plan_rooms
+from datamodules.synthrooms.layout import FloorPlan, NoPlaceError, Rectangle
 from datamodules.synthrooms.raycast import RayScene
 from datamodules.synthrooms.render import MISSING, Picture, draw_camera, draw_holes, render
 from datamodules.synthrooms.room import UNKNOWN, Room
 from datamodules.synthrooms.scene import draw_room_type, furnish
-from datamodules.synthrooms.settings import RoomSettings
 from datamodules.synthrooms.writer import (
     INSTANCES,
     RoomPlan,
@@ -85,11 +85,11 @@ def test_what_stands_on_the_floor_keeps_apart_and_inside(
     plan = FloorPlan((6.0, 5.0, 2.8), notch)
     areas = []
     for _ in range(30):
-        at_wall = plan.against_wall(rng, 1.2, 0.5, "full")
-        if at_wall is not None:
+        with suppress(NoPlaceError):
+            at_wall = plan.against_wall(rng, 1.2, 0.5, "full")
             areas.append(Rectangle.around(at_wall, (-0.6, 0.6), (0.01, 0.5)))
-        free = plan.in_the_open(rng, 0.8, 0.6)
-        if free is not None:
+        with suppress(NoPlaceError):
+            free = plan.in_the_open(rng, 0.8, 0.6)
             areas.append(Rectangle.around(free, (-0.4, 0.4), (-0.3, 0.3)))
     assert len(areas) > 8
     for k, area in enumerate(areas):

@@ -68,24 +68,6 @@ def test_labels_are_those_of_brute_force(view: str, shape: tuple[int, int]) -> N
     assert seen <= set(np.unique(found))
 
 
-def test_random_rooms_around_the_camera() -> None:
-    rng = np.random.default_rng(0)
-    for _ in range(40):
-        angles = np.sort(rng.uniform(0, 2 * math.pi, rng.integers(5, 12)))
-        radii = rng.uniform(0.2, 6, len(angles))
-        corners = (radii * [np.cos(angles), np.sin(angles)]).T[:: rng.choice([1, -1])]
-        if np.diff(angles, append=angles[0] + 2 * math.pi).max() > 3:
-            continue  # the camera would be outside
-        walls = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
-        given: dict[str, Any] = {"vertices": corners.tolist()} | {kind: [] for kind in KINDS}
-        for kind, (start, end) in zip(KINDS, walls[rng.permutation(len(walls))], strict=False):
-            places = np.sort(rng.uniform(0, 1, (2, 1)), axis=0)[:: rng.choice([1, -1])]
-            heights = np.sort(rng.uniform(-1.2, 1.0, 2))
-            given[kind] = [*(start + places * (end - start)).tolist(), heights.tolist()]
-        expected = brute_force_labels(given, 0.7, (40, 80))
-        np.testing.assert_array_equal(_layout(given, 0.7).labels((40, 80)), expected)
-
-
 def test_the_frame_is_x_left_y_to_the_middle() -> None:
     door = Fixture(np.array([[0.2, 1.0], [0.8, 1.0]]), -1.0, 0.5, DOOR)
     labels = Layout(np.array([[-1.0, -1], [1, -1], [1, 1], [-1, 1]]), -1, 1, [door]).labels(

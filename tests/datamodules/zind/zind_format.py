@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from tangent_train.geometry import equirect_directions
+from tests.datamodules.rays import hit_distances
 
 __all__ = ["KINDS", "Camera", "Room", "brute_force_labels", "write_home", "write_homes"]
 
@@ -63,21 +64,16 @@ class Camera:
         }
         return {"vertices": self.local(room.vertices).tolist(), **fixtures, "internal": []}
 
-    def record(self, room: Room, image_path: str, *, primary: bool) -> dict[str, Any]:
+    def record(self, room: Room, image_path: str) -> dict[str, Any]:
         """What the file says of the panorama."""
         layout = self.layout(room)
         seen = {"layout_visible": layout} if self.is_inside else {}
         return {
-            "label": "bedroom",
-            "is_primary": primary,
             "is_inside": self.is_inside,
-            "is_ceiling_flat": True,
             "camera_height": 1,
             "ceiling_height": 1 + room.ceiling_z,
-            "floor_number": 1,
             "image_path": image_path,
             "layout_raw": layout,
-            "layout_complete": layout,
             **seen,
             "floor_plan_transformation": {
                 "translation": [SCALE * xy for xy in self.xy],
@@ -106,14 +102,12 @@ def write_home(
             path = f"panos/floor_01_partial_room_{number:02}_{camera.name}.jpg"
             pixels = rng.integers(0, 256, (rows, 2 * rows, 3), np.uint8)
             Image.fromarray(pixels).save(folder / path, quality=95)
-            panoramas[camera.name] = camera.record(room, path, primary=not panoramas)
+            panoramas[camera.name] = camera.record(room, path)
         floor[f"complete_room_{number:02}"] = {f"partial_room_{number:02}": panoramas}
     file = folder / "zind_data.json"
     content = {
         "scale_meters_per_coordinate": {"floor_01": METERS},
         "merger": {"floor_01": floor},
-        "redraw": {},
-        "floorplan_to_redraw_transformation": {},
     }
     file.write_text(json.dumps(content))
     return file
@@ -173,25 +167,6 @@ def brute_force_labels(
         quads += [
             (label, [(*a, low), (*b, low), (*b, high), (*a, high)]) for a, b, (low, high) in points
         ]
-    nearest, labels = np.full(len(rays), np.inf), np.full(len(rays), 255, np.uint8)
-    for label, (p, q, r, s) in quads:
-        for triangle in ((p, q, r), (p, r, s)):
-            away = _triangle_distances(rays, np.array(triangle, float))
-            labels[away < nearest] = label
-            nearest = np.minimum(nearest, away)
-    return labels.reshape(shape)
-
-
-def _triangle_distances(
-    rays: NDArray[np.float64], triangle: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    origin, one, other = triangle[0], triangle[1] - triangle[0], triangle[2] - triangle[0]
-    p = np.cross(rays, other)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = 1 / (p @ one)
-        u = (p @ -origin) * inverse
-        q = np.cross(-origin, one)
-        v = (rays @ q) * inverse
-        away = (q @ other) * inverse
-        hit = (u >= -1e-12) & (v >= -1e-12) & (u + v <= 1 + 1e-12) & (away > 0)
-    return np.where(hit, away, np.inf)
+    triangles = [(*corner[:1], *corner[k : k + 2]) for _, corner in quads for k in (1, 2)]
+    nearest = hit_distances(0.0, rays, triangles).argmin(axis=1)
+    return np.array([label for label, _ in quads], np.uint8)[nearest // 2].reshape(shape)

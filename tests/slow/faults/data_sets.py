@@ -11,11 +11,8 @@ import numpy as np
 
 from datamodules import (
     FolderPanoramas,
-    FolderPhotos,
     ModelNet40,
-    OmniSynthia,
     Stanford2D3DS,
-    Stanford2D3DSPerspective,
     SynthiaPerspective,
 )
 from datamodules.core.found import SPLITS
@@ -23,9 +20,8 @@ from datamodules.core.split_module import SplitDataModule
 from tangent_train.rendering import EquirectRepresentation, PerspectiveRepresentation
 from tests.conftest import FabricateStanford
 from tests.datamodules.folder.folder_format import write_data_set
-from tests.datamodules.folder.photo_format import write_photos
 from tests.datamodules.modelnet40.shapes_format import write_tree
-from tests.datamodules.synthia.synthia_format import write_panoramas, write_views
+from tests.datamodules.synthia.synthia_format import write_views
 
 NAME = "Küche 1 [b] 部屋 ∕ a,b=c"
 ERP = EquirectRepresentation(level=3)
@@ -34,33 +30,25 @@ BOTH: Any = ("rgb", "depth")
 SEQUENCES = {"01": 4, "02": 3, "04": 2}
 _OF_SYNTHIA: dict[str, Any] = {"train_sequences": ("01", "02"), "test_sequences": ("04",)}
 
-_PHOTOS = ("folder photos", "stanford photos", "synthia photos")
-KINDS = ("folder", "stanford", "omnisynthia", *_PHOTOS, "shapes")
+KINDS = ("folder", "stanford", "synthia photos", "shapes")
 
 
 def write(kind: str, root: Path, fabricate: FabricateStanford) -> Path:
     """Write a data set of one of `KINDS`; returns its root."""
     if kind == "folder":
         return write_data_set(root, depth=True)
-    if kind == "folder photos":
-        return write_photos(root)
     if kind == "shapes":
         return write_tree(root)
-    if kind == "omnisynthia":
-        return write_panoramas(root, SEQUENCES)
     if kind == "synthia photos":
         return write_views(root, SEQUENCES)
-    return fabricate(root, photos=int(kind == "stanford photos"))
+    return fabricate(root)
 
 
 def module(kind: str, root: Path, **settings: Any) -> SplitDataModule[Any]:
     """Its data module, with depth."""
     make: dict[str, Callable[..., SplitDataModule[Any]]] = {
         "folder": lambda **more: FolderPanoramas(root, ERP, inputs=BOTH, **more),
-        "folder photos": lambda **more: FolderPhotos(root, CROPS, **more),
         "stanford": lambda **more: Stanford2D3DS(root, ERP, inputs=BOTH, **more),
-        "stanford photos": lambda **more: Stanford2D3DSPerspective(root, CROPS, **more),
-        "omnisynthia": lambda **more: OmniSynthia(root, ERP, inputs=BOTH, **_OF_SYNTHIA, **more),
         "synthia photos": lambda **more: SynthiaPerspective(
             root, CROPS, inputs=BOTH, **_OF_SYNTHIA, **more
         ),
@@ -73,10 +61,7 @@ def colors(kind: str, root: Path) -> list[Path]:
     """The files of the colours, or the meshes, in order."""
     pattern = {
         "folder": "images/**/*.*",
-        "folder photos": "images/**/*.*",
         "stanford": "area_*/pano/rgb/*.png",
-        "stanford photos": "area_*/data/rgb/*.png",
-        "omnisynthia": "*/pano/RGB/*.png",
         "synthia photos": "*/RGB/**/*.png",
         "shapes": "**/*.off",
     }
@@ -84,22 +69,19 @@ def colors(kind: str, root: Path) -> list[Path]:
 
 
 def partner(kind: str, path: Path, part: str) -> Path:
-    """The labels, the depth or the pose of an image.
+    """The labels or the depth of an image.
 
     Args:
         kind: One of `KINDS`.
         path: From `colors`.
-        part: ``labels``, ``depth`` or ``pose``.
+        part: ``labels`` or ``depth``.
     """
     if kind == "folder":
         return path.parents[2] / part / path.parent.name / f"{path.stem}.png"
-    if kind.startswith("stanford"):
+    if kind == "stanford":
         domain = "semantic" if part == "labels" else part
-        name = path.name.replace("domain_rgb", f"domain_{domain}")
-        other = path.parents[1] / domain / name
-        return other.with_suffix(".json") if part == "pose" else other
+        return path.parents[1] / domain / path.name.replace("domain_rgb", f"domain_{domain}")
     folder = {"depth": "Depth", "labels": "GT/LABELS"}[part]
-    folder += "_Correct" if (kind, part) == ("omnisynthia", "labels") else ""
     place = path.parts.index("RGB")
     return path.__class__(*path.parts[:place]) / folder / path.__class__(*path.parts[place + 1 :])
 
@@ -146,7 +128,7 @@ def link_to_itself(path: Path) -> None:
 
 def set_pixel(path: Path, value: Any) -> None:
     def edit(image: Any) -> Any:
-        image[-1, -1] = value
+        image[-2, -2] = value  # which training at half the size never reads
         return image
 
     change(path, edit)

@@ -56,7 +56,6 @@ _FAULTS = [
     ("stanford", "labels", _past_the_table, r"instance 521 in 1 pixel; expected 0 to 520"),
     ("stanford", "rgb", sets.link_to_itself, _LOOP),
     ("stanford", "rgb", _other_shape, "expected twice as wide"),
-    ("stanford photos", "pose", Path.unlink, "No such file"),
     ("synthia photos", "labels", sets.corrupt, _BROKEN),
     ("folder", "labels", sets.corrupt, _NO_IMAGE),
     ("folder", "depth", sets.to_8_bits, "uint8 of shape"),
@@ -87,9 +86,3 @@ def test_a_damaged_file_is_found(
     assert re.search(expected, finding), finding
     if damage not in (_other_shape, sets.to_8_bits):  # its partners do not fit then
         assert len(by_file) == 1
-
-
-# --- folders, names, copies ---------------------------------------------------------------------
-
-
-# --- what may not be opened, and links ----------------------------------------------------------

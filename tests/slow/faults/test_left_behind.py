@@ -19,7 +19,7 @@ MAKER = """
 import sys
 from pathlib import Path
 from datamodules.synthrooms.generate import generate_rooms
-from datamodules.synthrooms.settings import RoomSettings
+from datamodules.synthrooms.generate import RoomSettings
 print("begun", flush=True)
 generate_rooms(Path(sys.argv[1]), RoomSettings(height=256), workers=2)
 """

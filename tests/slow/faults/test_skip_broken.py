@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 from lightning.pytorch.trainer.states import TrainerFn
 
-from datamodules import Stanford2D3DS
 from datamodules.core import found as found_module
-from datamodules.core.found import Found
+from datamodules.core.found import Found, Split
 from datamodules.core.problems import Problems
 from datamodules.core.reading import ImageFiles
 from datamodules.core.split_module import SplitDataModule
@@ -134,31 +133,22 @@ def test_training_begins_with_a_look_at_some_images_of_all_splits(
     assert "data.skip_broken=true" in text
 
 
-class _Images(Stanford2D3DS):
-    """Two thousand images that note which of them are read."""
-
-    def find(self, problems: Problems) -> Found[ImageFiles]:
-        def items(split: str, count: int) -> list[ImageFiles]:
-            return [ImageFiles(f"{split} {k}", Path(), Path()) for k in range(count)]
-
-        self.seen: list[str] = []
-        splits: Any = {split: items(split, count) for split, count in LENGTHS.items()}
-        return Found(self.noun, splits, lambda files: self.seen.append(files.name))
-
-
-LENGTHS = {"train": 1000, "val": 100, "test": 400}
-
-
-def _seen(seed: int) -> list[str]:
-    data = _Images(Path(), sets.ERP, seed=seed)
-    _as_in_training(data).prepare_data()
-    return data.seen
-
-
 def test_the_look_is_short_and_goes_everywhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    lengths: dict[Split, int] = {"train": 1000, "val": 100, "test": 400}
+    items = {
+        split: [ImageFiles(f"{split} {k}", Path(), Path()) for k in range(count)]
+        for split, count in lengths.items()
+    }
+
+    def _seen(seed: int) -> list[str]:
+        seen: list[str] = []
+        found = Found("images", items, lambda files: seen.append(files.name))
+        found.read_some(seed, Problems())
+        return seen
+
     first = _seen(seed=0)
     assert len(first) == len(set(first)) == found_module.SAMPLED
-    counts = [sum(name.startswith(split) for name in first) for split in LENGTHS]
+    counts = [sum(name.startswith(split) for name in first) for split in lengths]
     assert np.abs(np.array(counts) - np.array([1000, 100, 400]) * 32 / 1500).max() <= 1
     assert set(_seen(seed=1)) != set(first), "other runs look at others"
     assert set(_seen(seed=0)) == set(first)

@@ -38,6 +38,7 @@ from tangent_train.rendering.camera_files import (
     write_cameras,
     write_rig,
 )
+from tests.datamodules.data_files import gpano_xmp
 from tests.datamodules.zind.zind_format import SQUARE, Camera, write_home
 
 __all__ = ["TARGETS"]
@@ -212,12 +213,8 @@ def _gpano_seeds() -> list[bytes]:
     tags |= {"FullPanoHeightPixels": 180, "CroppedAreaImageWidthPixels": 60}
     tags |= {"CroppedAreaImageHeightPixels": 40, "CroppedAreaLeftPixels": 100}
     tags |= {"CroppedAreaTopPixels": 30, "PosePitchDegrees": -3.5, "PoseRollDegrees": 12}
-    start = '<r:Description xmlns:GPano="http://ns.google.com/photos/1.0/panorama/"'
-    attributes = " ".join(f'GPano:{name}="{value}"' for name, value in tags.items())
-    elements = "".join(f"<GPano:{name}>{value}</GPano:{name}>" for name, value in tags.items())
-    texts = [f"{start} {attributes}/>", f"{start}>{elements}</r:Description>"]
     black = np.zeros((40, 60, 3), np.uint8)
-    return [_image(black, "webp", xmp=text.encode()) for text in texts]
+    return [_image(black, "webp", xmp=gpano_xmp(tags, elements=e)) for e in (False, True)]
 
 
 def _read_gpano(path: Path) -> None:
