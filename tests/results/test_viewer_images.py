@@ -36,7 +36,7 @@ def test_noisy_labels_are_halved_and_the_picture_made_coarser_until_they_fit(bud
 
 
 def _base64_size(image: EncodedImage) -> int:
-    files = (image.jpeg, image.thumbnail, image.truth or b"", image.prediction or b"")
+    files = (image.input, image.thumbnail, image.truth or b"", image.prediction or b"")
     return sum(-(-len(file) // 3) * 4 for file in files)
 
 
@@ -47,7 +47,7 @@ def test_a_larger_image_is_shrunk_by_area_and_its_labels_to_the_nearest() -> Non
     labels[100:200, 2000:5000] = 7
     image = encode_image("large", rgb, CLASSES, prediction=labels, sphere=False)
     assert (image.width, image.height) == (8192, 256)
-    shrunk = decoded(image.jpeg)
+    shrunk = decoded(image.input)
     assert shrunk.shape == (128, 4096, 3)
     assert np.abs(shrunk.astype(int) - 100).max() <= 2
     np.testing.assert_array_equal(decoded(image.prediction)[50:100, 1000:2500], 7)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -21,11 +20,11 @@ MOST_PIXELS = 4096
 """The longer side of an image in the report."""
 
 _THUMBNAIL_PIXELS = 216
-_QUALITY = 88
+_JPEG = (cv2.IMWRITE_JPEG_QUALITY, 88)
+_PNG = (cv2.IMWRITE_PNG_COMPRESSION, 6)
 
 
-@dataclass(frozen=True)
-class EncodedImage:
+class EncodedImage(NamedTuple):
     """A compressed image of the viewer, with its label maps; see `encode_image`.
 
     Attributes:
@@ -34,7 +33,7 @@ class EncodedImage:
         sphere: Whether it is a whole equirectangular panorama; others are shown flat.
         width: Columns of the image before it was compressed.
         height: Rows of the image before it was compressed.
-        jpeg: The image.
+        input: The image, a JPEG.
         thumbnail: A small JPEG of it.
         prediction: 8-bit grey PNG of class indices, perhaps of fewer pixels.
         truth: Likewise.
@@ -47,7 +46,7 @@ class EncodedImage:
     sphere: bool
     width: int
     height: int
-    jpeg: bytes
+    input: bytes
     thumbnail: bytes
     prediction: bytes | None
     truth: bytes | None
@@ -82,27 +81,19 @@ def encode_image(
     """
     maps = {"truth": truth, "prediction": prediction}
     labels = {k: v.astype(np.uint8, copy=False) for k, v in maps.items() if v is not None}
-    thumbnail = _jpeg(_shrunk(rgb, _THUMBNAIL_PIXELS, cv2.INTER_AREA))
+    thumbnail = _jpeg(rgb, _THUMBNAIL_PIXELS)
     room, side = budget_bytes * 3 // 4 - len(thumbnail), MOST_PIXELS
     while True:
         small = {k: _shrunk(v, side, cv2.INTER_NEAREST_EXACT) for k, v in labels.items()}
-        pngs = {k: _encoded(".png", v, [cv2.IMWRITE_PNG_COMPRESSION, 6]) for k, v in small.items()}
-        jpeg = _jpeg(_shrunk(rgb, side, cv2.INTER_AREA))
+        pngs = {k: cv2.imencode(".png", v, _PNG)[1].tobytes() for k, v in small.items()}
+        jpeg = _jpeg(rgb, side)
         if len(jpeg) + sum(map(len, pngs.values())) <= room or side == 1:
             break
         side //= 2
-    return EncodedImage(
-        name=name,
-        note=note,
-        sphere=sphere,
-        width=rgb.shape[1],
-        height=rgb.shape[0],
-        jpeg=jpeg,
-        thumbnail=thumbnail,
-        prediction=pngs.get("prediction"),
-        truth=pngs.get("truth"),
-        shares=_shares(list(small.values()), class_count, sphere=sphere),
-    )
+    height, width = rgb.shape[:2]
+    both = pngs.get("prediction"), pngs.get("truth")
+    shares = _shares(list(small.values()), class_count, sphere=sphere)
+    return EncodedImage(name, note, sphere, width, height, jpeg, thumbnail, *both, shares)
 
 
 def _shrunk(pixels: NDArray[np.uint8], side: int, interpolation: int) -> NDArray[np.uint8]:
@@ -115,32 +106,20 @@ def _shrunk(pixels: NDArray[np.uint8], side: int, interpolation: int) -> NDArray
     return resized
 
 
-def _jpeg(rgb: NDArray[np.uint8]) -> bytes:
-    bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
-    return _encoded(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
-
-
-def _encoded(suffix: str, pixels: Any, settings: Sequence[int]) -> bytes:
-    return bytes(cv2.imencode(suffix, pixels, settings)[1])
+def _jpeg(rgb: NDArray[np.uint8], side: int) -> bytes:
+    bgr = cv2.cvtColor(_shrunk(rgb, side, cv2.INTER_AREA), cv2.COLOR_RGB2BGR)
+    return cv2.imencode(".jpg", bgr, _JPEG)[1].tobytes()
 
 
 def _shares(
     maps: Sequence[NDArray[np.uint8]], class_count: int, *, sphere: bool
 ) -> tuple[tuple[float, ...], ...]:
-    shares = [_class_shares(indices, class_count, sphere=sphere) for indices in maps]
-    return tuple(
-        (index, *(float(share[index]) for share in shares))
-        for index in range(class_count)
-        if any(share[index] > 0 for share in shares)
-    )
-
-
-def _class_shares(
-    indices: NDArray[np.uint8], class_count: int, *, sphere: bool
-) -> NDArray[np.float64]:
-    height, width = indices.shape
-    weights = equirect_solid_angles((height, width)) if sphere else np.ones(height)
-    # Row by row: no array of weights as large as the image.
-    counts = np.stack([np.bincount(row, minlength=class_count) for row in indices])
-    weighed: NDArray[np.float64] = weights.reshape(-1) @ counts
-    return weighed / weighed.sum()
+    shares = []
+    for indices in maps:
+        # Row by row: no array of weights as large as the image.
+        counts = np.stack([np.bincount(row, minlength=class_count) for row in indices])
+        height, width = indices.shape
+        weights = equirect_solid_angles((height, width)) if sphere else np.ones(height)
+        weighed = weights.reshape(-1) @ counts
+        shares.append(weighed / weighed.sum())
+    return tuple((k, *map(float, of)) for k, of in enumerate(zip(*shares, strict=True)) if any(of))

@@ -82,27 +82,15 @@ def _write_image(file: TextIO, image: EncodedImage) -> None:
         f'{_base64(image.thumbnail)}"><span class="name">{html.escape(image.name)}</span>{note}'
         '</button>\n<script type="application/json">'
     )
-    file.write(
-        _json(
-            {
-                "name": image.name,
-                "note": image.note,
-                "sphere": image.sphere,
-                "width": image.width,
-                "height": image.height,
-                "shares": image.shares,
-                "input": _base64(image.jpeg),
-                "truth": image.truth and _base64(image.truth),
-                "prediction": image.prediction and _base64(image.prediction),
-            }
-        )
-    )
-    file.write("</script></li>\n")
+    content = image._asdict()
+    del content["thumbnail"]
+    file.write(f"{_json(content)}</script></li>\n")
 
 
 def _json(content: Any) -> str:
     """JSON that can neither close the script element around it nor start a comment in it."""
-    return json.dumps(content, separators=(",", ":")).replace("<", "\\u003c")
+    text = json.dumps(content, separators=(",", ":"), default=_base64)
+    return text.replace("<", "\\u003c")
 
 
 def _base64(content: bytes) -> str:

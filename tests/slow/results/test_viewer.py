@@ -49,7 +49,7 @@ def test_seam_and_poles_are_interpolated_like_the_rest(browser: Browser, tmp_pat
     """Pixels of 15°: what is wrong with half a pixel at a border shows."""
     grey = np.random.default_rng(0).integers(0, 256, (12, 24, 1), np.uint8)
     image = encode_image("coarse", grey.repeat(3, axis=2), 1)
-    pixels: Any = cv2.imdecode(np.frombuffer(image.jpeg, np.uint8), cv2.IMREAD_COLOR)
+    pixels: Any = cv2.imdecode(np.frombuffer(image.input, np.uint8), cv2.IMREAD_COLOR)
     write_report(tmp_path / "report.html", "t", images=[image], class_names=NAMES[:1])
     with opened(browser, tmp_path / "report.html") as report:
         step = step_rad(report)
