@@ -12,7 +12,12 @@ from tangent_train.results.rows import Row, check_alike, group_runs
 
 __all__ = ["levels_report", "runs_report", "transfer_report"]
 
-_REPRESENTATIONS = {"Cubemap": "cube map", "Equirect": "ERP", "Perspective": "photos"}
+_REPRESENTATIONS = {
+    "Cubemap": "cube map",
+    "Equirect": "ERP",
+    "Perspective": "photos",
+    "Tangent": "tangent images",
+}
 _CHANGE_OF_STAGES = (
     "Change: against photos after as much fine-tuning, over the folds and seeds that both have."
 )
@@ -28,13 +33,10 @@ def runs_report(records: Sequence[Record], notes: Sequence[str] = ()) -> Report:
         notes: Further ones.
     """
     rows = [replace(row, facts=_facts(row.records)) for row in group_runs(records)]
-    together = sorted([*published(records), *rows], key=_by_data)
+    together = sorted(
+        [*published(records), *rows], key=lambda row: (row.facts["data"], row.facts["s"].zfill(2))
+    )
     return Report("Report", together, [*_repeated(rows), *notes])
-
-
-def _by_data(row: Row) -> tuple[str, int]:
-    level = row.facts["s"]
-    return row.facts["data"], int(level) if level.isdigit() else 0
 
 
 def _repeated(rows: Sequence[Row]) -> Iterator[str]:
@@ -135,13 +137,10 @@ def _inputs(record: Record) -> str:
 
 
 def _base_level(record: Record) -> str:
-    """The base level b of tangent images, or the representation that has none."""
+    """The base level b of tangent images, or the short name of a representation that has none."""
     base = record.settings.get("representation.base_level")
-    return _representation(record) if base is None else str(base)
-
-
-def _representation(record: Record) -> str:
-    """Short name of the representation."""
+    if base is not None:
+        return str(base)
     target = str(record.settings.get("representation._target_")).rpartition(".")[2]
     name = target.removesuffix("Representation")
-    return _REPRESENTATIONS.get(name, "tangent images" if name == "Tangent" else name)
+    return _REPRESENTATIONS.get(name, name)
