@@ -14,8 +14,7 @@ import pytest
 from datamodules.modelnet40.shape_files import MODELNET40
 from datamodules.stanford2d3ds.label_table import CLASSES
 from tangent_train.results.chart import report_png
-from tangent_train.results.comparisons import runs_report, transfer_report
-from tangent_train.results.paper import published
+from tangent_train.results.comparisons import published, runs_report, transfer_report
 from tangent_train.results.record import Record
 from tangent_train.results.report import Report
 from tangent_train.results.rows import Row

@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tangent_train.results.html import EncodedImage, encode_image
-from tangent_train.results.html.images import BUDGET_BYTES
+from tangent_train.results.html.page import BUDGET_BYTES
 from tests.decoded import decoded
 
 CLASSES = 14
