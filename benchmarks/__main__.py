@@ -115,7 +115,7 @@ def machine() -> dict[str, Any]:
     return {
         "cores": len(os.sched_getaffinity(0)),
         "versions": {library: version(library) for library in libraries},
-        "environment": get_pretty_env_info().splitlines(),  # of torch: its version, CPU, GPU
+        "environment": get_pretty_env_info().splitlines(),  # type: ignore[no-untyped-call]
     }
 
 

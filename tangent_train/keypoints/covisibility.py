@@ -62,10 +62,9 @@ class DepthView:
             all four pixels are missing.
         """
         height, width = self.distance_m.shape
-        pixels = torch.from_numpy(
-            lonlat_to_equirect(xyz_to_lonlat(directions_xyz), (height, width))
-        )
-        taps = bilinear_equirect_taps(*pixels.unbind(-1), (height, width))
+        pixels = lonlat_to_equirect(xyz_to_lonlat(directions_xyz), (height, width))
+        u, v = torch.from_numpy(pixels).unbind(-1)
+        taps = bilinear_equirect_taps(u, v, (height, width))
         weight = taps.weight.numpy()
         four = self.distance_m.reshape(-1)[taps.source.numpy()].astype(np.float64)
         touched = weight > 1e-6  # others are among the four by rounding only

@@ -20,7 +20,7 @@ from tangent_train.metrics.segmentation import (
     bootstrap_intervals,
     segmentation_scores,
 )
-from tangent_train.results.record import RESULTS_FILE, SCORES, Record
+from tangent_train.results.record import RESULTS_FILE, SCORES, Record, with_solid_angle
 from tangent_train.results.tables import Table, percent
 
 __all__ = [
@@ -57,39 +57,25 @@ def segmentation_record(
         noun: Plural name of the images. Photos have neither solid angles nor latitude bands.
     """
     on_sphere = bool(matrices.solid_angle.any())
-    pixels = segmentation_scores(matrices.pixels, absent_class)
-    solid = segmentation_scores(matrices.solid_angle, absent_class if on_sphere else "skip")
-    of_class = {
-        "iou": pixels.iou,
-        "accuracy": pixels.accuracy,
-        "iou_solid_angle": solid.iou,
-        "accuracy_solid_angle": solid.accuracy,
-        "share": pixels.share,
-    }
-    means = {
-        "miou": pixels.miou,
-        "macc": pixels.macc,
-        "miou_solid_angle": solid.miou,
-        "macc_solid_angle": solid.macc,
-    }
+    absent = absent_class, absent_class if on_sphere else "skip"
+    both = list(map(segmentation_scores, (matrices.pixels, matrices.solid_angle), absent))
+    means = with_solid_angle(*({"miou": s.miou, "macc": s.macc} for s in both))
+    of_class = with_solid_angle(*({"iou": s.iou, "accuracy": s.accuracy} for s in both))
     bands = [segmentation_scores(band, absent_class) for band in matrices.bands if on_sphere]
-    intervals = bootstrap_intervals(matrices.of_images[:, 0], absent_class)
-    if on_sphere:
-        by_angle = bootstrap_intervals(matrices.of_images[:, 1], absent_class)
-        intervals |= {f"{name}_solid_angle": ends for name, ends in by_angle.items()}
+    of_images = matrices.of_images.swapaxes(0, 1)
     return Record(
         "segmentation",
         noun,
         matrices.images,
         _plain(means),
-        _entries(of_class, matrices.pixels, class_names, first=1),
+        _entries(of_class | {"share": both[0].share}, matrices.pixels, class_names, first=1),
         [
             {"latitude_deg": [south, north], **_plain({"miou": band.miou, "macc": band.macc})}
             for north, south, band in zip(BAND_EDGES_DEG, BAND_EDGES_DEG[1:], bands, strict=False)
         ],
         matrices.pixels.tolist(),
         absent_class,
-        intervals,
+        with_solid_angle(*map(bootstrap_intervals, of_images, absent)),
     )
 
 

@@ -28,6 +28,7 @@ __all__ = [
     "find_runs",
     "load_record",
     "unfinished_runs",
+    "with_solid_angle",
 ]
 
 RESULTS_FILE = "results.json"
@@ -55,26 +56,23 @@ class Scores(NamedTuple):
     worst: str
 
 
+def with_solid_angle(
+    by_pixels: Mapping[str, Any], by_angle: Mapping[str, Any] | None = None
+) -> dict[str, Any]:
+    """Scores by pixels, and those by solid angle under their names; or the headings of both."""
+    if by_angle is None:
+        by_angle = {name: f"{heading} by solid angle" for name, heading in by_pixels.items()}
+    return {**by_pixels, **{f"{name}_solid_angle": value for name, value in by_angle.items()}}
+
+
 SCORES: Mapping[str, Scores] = {
     "segmentation": Scores(
-        {
-            "macc": "mAcc",
-            "miou": "mIoU",
-            "macc_solid_angle": "mAcc by solid angle",
-            "miou_solid_angle": "mIoU by solid angle",
-        },
-        {
-            "accuracy": "accuracy",
-            "iou": "IoU",
-            "accuracy_solid_angle": "accuracy by solid angle",
-            "iou_solid_angle": "IoU by solid angle",
-        },
-        {
-            "accuracy": "macc",
-            "iou": "miou",
-            "accuracy_solid_angle": "macc_solid_angle",
-            "iou_solid_angle": "miou_solid_angle",
-        },
+        with_solid_angle({"macc": "mAcc", "miou": "mIoU"}),
+        with_solid_angle({"accuracy": "accuracy", "iou": "IoU"}),
+        with_solid_angle(
+            {"accuracy": "macc", "iou": "miou"},
+            {"accuracy": "macc_solid_angle", "iou": "miou_solid_angle"},
+        ),
         ("macc", "miou"),
         "iou",
     ),

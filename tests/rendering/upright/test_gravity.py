@@ -111,6 +111,12 @@ def _tilted(tilt_deg: float, azimuth_deg: float, yaw_deg: float) -> NDArray[np.f
 # From the picture
 
 
+def _up(*given: Any) -> NDArray[np.float64]:
+    up = estimate_up(*given)
+    assert up is not None
+    return up
+
+
 @pytest.mark.parametrize("shape", [(128, 256), (151, 303)])
 @pytest.mark.parametrize(
     ("tilt_deg", "azimuth_deg", "yaw_deg"),
@@ -120,13 +126,13 @@ def test_tilted_rooms(
     shape: tuple[int, int], tilt_deg: float, azimuth_deg: float, yaw_deg: float
 ) -> None:
     turn = _tilted(tilt_deg, azimuth_deg, yaw_deg)
-    assert angle_deg(estimate_up(draw_room(shape, turn)), turn[:, 2]) < 0.5
+    assert angle_deg(_up(draw_room(shape, turn)), turn[:, 2]) < 0.5
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_rooms_held_at_any_angle(seed: int) -> None:
     turn = random_rotation(np.random.default_rng(seed))
-    assert angle_deg(estimate_up(draw_room((128, 256), turn), 180), turn[:, 2]) < 0.5
+    assert angle_deg(_up(draw_room((128, 256), turn), 180), turn[:, 2]) < 0.5
 
 
 def test_a_judge_chooses_among_the_axes_of_the_best_frame(
@@ -158,7 +164,7 @@ def test_what_is_hopeless_or_the_only_one_is_not_judged(monkeypatch: pytest.Monk
         raise AssertionError(ups)
 
     turn = _tilted(3, 200, 180)
-    assert angle_deg(estimate_up(draw_room((128, 256), turn), 60, judge), turn[:, 2]) < 0.5
+    assert angle_deg(_up(draw_room((128, 256), turn), 60, judge), turn[:, 2]) < 0.5
     estimate_up(_without_structure()["black"], 180, judge)
     certain = np.array([0.001, 0.001, 0.996, 0.001, 0.001, 0])
     place = "tangent_train.rendering.upright.gravity.up_probabilities"
@@ -169,9 +175,9 @@ def test_what_is_hopeless_or_the_only_one_is_not_judged(monkeypatch: pytest.Monk
 def test_upside_down() -> None:
     turn = rotation_about((1, 0, 0), math.pi)
     room = draw_room((128, 256), turn)
-    assert angle_deg(estimate_up(room, 180), -_UP) < 0.5
+    assert angle_deg(_up(room, 180), -_UP) < 0.5
     # Not to be considered: the axis that is nearest to upright is that of the floor.
-    assert angle_deg(estimate_up(room), _UP) < 0.5
+    assert angle_deg(_up(room), _UP) < 0.5
 
 
 def test_no_direction_beyond_the_largest_tilt() -> None:
@@ -205,7 +211,7 @@ def test_dark_rooms_with_missing_parts() -> None:
     turn = _tilted(18, 130, 60)
     room = draw_room((128, 256), turn) // 8
     room[:12], room[-9:], room[:, 30:45] = 0, 0, 0
-    assert angle_deg(estimate_up(room), turn[:, 2]) < 0.5
+    assert angle_deg(_up(room), turn[:, 2]) < 0.5
 
 
 @pytest.mark.parametrize(
