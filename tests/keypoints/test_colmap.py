@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tangent_train.geometry import FLIP_Y, PanoramaPose, lonlat_to_xyz, random_rotation
+from tangent_train.geometry import FLIP_Y, PanoramaPose, random_rotation
 from tangent_train.keypoints import TwoView
 from tangent_train.keypoints.colmap import add_pair
 from tangent_train.keypoints.two_view import estimate_two_view
@@ -47,7 +47,7 @@ def test_colmap_reads_what_was_written(tmp_path: Path) -> None:
         for k, points in enumerate(found):
             image_id = images[f"room a/{k}.png"].image_id
             stored = database.read_keypoints(image_id)
-            # COLMAP's own rays of these pixels are the keypoints' directions.
+            # COLMAP's own rays of these pixels, from corners, are the keypoints' directions.
             rays = camera.cam_ray_from_img(stored[:, :2].astype(np.float64))
             np.testing.assert_allclose(rays @ axes, points.directions_xyz, atol=1e-5)
             descriptors = database.read_descriptors(image_id)
@@ -61,25 +61,6 @@ def test_colmap_reads_what_was_written(tmp_path: Path) -> None:
             assert geometry.config == pycolmap.TwoViewGeometryConfiguration.CALIBRATED.value
             rotation = axes.T @ geometry.cam2_from_cam1.rotation.matrix() @ axes
             np.testing.assert_allclose(rotation, np.asarray(two_view.rotation, np.float64))
-
-
-def test_keypoints_in_colmaps_units(tmp_path: Path) -> None:
-    # The middle of the image, a quarter to the right, near the right border, and near the top.
-    lonlat = np.radians([(0, 0), (90, -45), (179.9, 10), (20, 89)])
-    points = keypoints_at(lonlat_to_xyz(lonlat))
-    none = np.empty((0, 2), np.int64)
-    nothing = none, TwoView(np.empty(0, bool))
-    shapes = (100, 200), (100, 200)
-    add_pair(tmp_path / "a.db", ("a", "b"), shapes, (points, points), *nothing)
-    with pycolmap.Database.open(tmp_path / "a.db") as database:
-        numbers = database.read_keypoints(1)
-    # Corner-origin pixels: x = (λ + 180) / 360 · W, y = (90 − φ) / 180 · H.
-    expected = [(100, 50), (150, 75), (199.9444, 44.4444), (111.1111, 0.5556)]
-    np.testing.assert_allclose(numbers[:, :2], expected, atol=1e-4)
-    # 2° are 100/90 pixels; the area of a pixel shrinks with cos φ; the scale is half of the size.
-    scales = 100 / 90 / 2 / np.sqrt(np.cos(lonlat[:, 1]))
-    np.testing.assert_allclose(numbers[:, 2], scales, atol=1e-4)
-    np.testing.assert_allclose(numbers[:, 3], 0, atol=1e-5)
 
 
 @pytest.mark.parametrize("kind", ["PANORAMIC", "DEGENERATE"])
