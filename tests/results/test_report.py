@@ -62,13 +62,12 @@ def test_the_tables_show_means_spreads_and_what_is_missing() -> None:
 
 
 def test_a_single_run_is_shown_with_its_interval_over_images(tmp_path: Path) -> None:
+    def run(found: dict[str, tuple[float, float]], **settings: Any) -> Record:
+        return replace(made_record([0.1, 0.5, 0.5], **settings), intervals=found)
+
     intervals = {"miou": (0.25, 0.31)}  # a mean of few images may lie outside
-    single = replace(made_record([0.1, 0.5, 0.5], name="single"), intervals=intervals)
-    several = [
-        replace(made_record([0.1, 0.5, 0.5], data__fold=fold), intervals=intervals)
-        for fold in (1, 2)
-    ]
-    report = _runs_report(single, *several)
+    several = [run(intervals, data__fold=fold) for fold in (1, 2)]
+    report = _runs_report(run(intervals, name="single"), *several)
     cells = _cells(report)
     assert cells["single"]["mIoU %"] == "36.7 [25.0, 31.0]"
     assert cells["single"]["mAcc %"] == "36.7"
@@ -76,22 +75,19 @@ def test_a_single_run_is_shown_with_its_interval_over_images(tmp_path: Path) -> 
     explained = "95 % bootstrap interval over its images"
     assert explained in report.tables()[0].note
     assert explained not in _runs_report(*several).tables()[0].note
-    report.write(tmp_path, "x")
     with_bar, without = (
-        decoded(report_png("", [Row("", (replace(single, intervals=found),))]))
-        for found in (intervals, {})
+        decoded(report_png("", [Row("", (run(found),))])) for found in (intervals, {})
     )
     assert (with_bar != without).any()
-    with (tmp_path / "x.csv").open(newline="") as file:
-        ends_of = {
-            (row["row"], row["fold"]): (row["low"], row["high"])
-            for row in csv.DictReader(file)
-            if row["score"] == "miou" and row["class"] == "mean"
-        }
-    ends, none = ("0.25", "0.31"), ("", "")
+    ends_of = {
+        (figure["row"], figure["fold"]): (figure["low"], figure["high"])
+        for figure in report.figures()
+        if figure["score"] == "miou" and figure["class"] == "mean"
+    }
+    ends, none = (0.25, 0.31), (None, None)
     assert ends_of == {
-        ("single", "1"): ends, ("single", "mean"): ends,
-        ("mine", "1"): ends, ("mine", "2"): ends, ("mine", "mean"): none,
+        ("single", 1): ends, ("single", "mean"): ends,
+        ("mine", 1): ends, ("mine", 2): ends, ("mine", "mean"): none,
     }  # fmt: skip
 
 
