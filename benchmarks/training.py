@@ -24,7 +24,6 @@ from lightning.pytorch.callbacks import Callback
 from omegaconf import OmegaConf
 from torch import Tensor, nn
 from torch.nn import functional
-from torch.nn.utils import parameters_to_vector
 
 from benchmarks.measuring import Goal, Row, Table, Way, measure
 from tangent_train.callbacks.checkpoints import LastCheckpoint
@@ -171,7 +170,8 @@ class _StepClock(Callback):
             RuntimeError: The weights of the network differ by more than rounding.
         """
         bare, ours = (
-            parameters_to_vector(one.parameters()).double() for one in (self._network, network)
+            torch.cat([weights.detach().double().flatten() for weights in one.parameters()])
+            for one in (self._network, network)
         )
         if not (bare - ours).norm() <= 1e-3 * bare.norm():
             raise RuntimeError("the two trainings end with other weights; the comparison is void")
