@@ -148,6 +148,11 @@ def test_the_papers_rows_stand_beside_the_same_data_and_resolution() -> None:
     assert (per_class["beam"], per_class["board"]) == ("30.4", "57.2")
 
 
+def test_rows_are_in_the_order_of_their_levels() -> None:
+    records = [made_record([0.5] * 3, name=str(level), level=level) for level in (10, 9)]
+    assert list(_cells(_runs_report(*records))) == ["9", "10"]
+
+
 @pytest.mark.parametrize(
     "changes",
     [{"data___target_": "datamodules.SynthRooms"}, {"data__test_rotation": "so3"}, {"level": 6}],
