@@ -118,7 +118,7 @@ def found_on_texture(base_level: int, *, rotate: bool = False) -> SphericalKeypo
     return detect_on_tangent_images(image, TangentGrid(base_level, LEVEL), Detector(), 16)
 
 
-@pytest.mark.parametrize("base_level", [0, 1])
+@pytest.mark.parametrize("base_level", [0, 2])
 def test_a_rotated_panorama_has_rotated_keypoints(base_level: int) -> None:
     left = rotated(found_on_texture(base_level), ROTATION)
     right = found_on_texture(base_level, rotate=True)
@@ -149,7 +149,8 @@ def test_the_gnomonic_jacobian_is_the_derivative(base_level: int) -> None:
         np.testing.assert_allclose(jacobian, np.stack(numeric, axis=-1), atol=1e-9)
 
 
-@pytest.mark.parametrize("base_level", [0, 1])
+# At base level 2 two keypoints of this texture are found on both sides of a border.
+@pytest.mark.parametrize("base_level", [0, 2])
 def test_every_keypoint_is_owned_by_its_image_and_there_once(base_level: int) -> None:
     points = found_on_texture(base_level)
     grid = TangentGrid(base_level, LEVEL)
