@@ -14,9 +14,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import platform
 import statistics
-import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -27,9 +25,10 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import torch
+from torch.utils.collect_env import get_pretty_env_info
 
 from benchmarks.measuring import DEVICE, FAILURES, Table, attempted
+from tangent_train.results.tables import Table as TextTable
 
 MEASURED = {
     "images": "benchmarks.images",
@@ -97,7 +96,8 @@ def run(modules: Mapping[str, str], output: Path, *, quick: bool) -> Path:
     for name, module in modules.items():
         with attempted(name) if module in ON_A_GPU.values() else nullcontext():
             for table in getattr(import_module(module), name)(quick):
-                print(f"{table_text(table)}\n[{time.perf_counter() - start:.0f} s]", flush=True)
+                show(table)
+                print(f"[{time.perf_counter() - start:.0f} s]", flush=True)
                 tables.append(table)
                 content["tables"] = [asdict(table) for table in tables]
                 content["quotients"] = quotients(tables)
@@ -111,32 +111,26 @@ def run(modules: Mapping[str, str], output: Path, *, quick: bool) -> Path:
 
 def machine() -> dict[str, Any]:
     """What figures depend on."""
-    libraries = ("torch", "numpy", "opencv-python-headless", "numba", "lightning")
-    facts: dict[str, Any] = {
+    libraries = ("numpy", "opencv-python-headless", "numba", "lightning")
+    return {
         "cores": len(os.sched_getaffinity(0)),
-        "machine": f"{platform.processor()} {platform.platform(terse=True)}",
         "versions": {library: version(library) for library in libraries},
+        "environment": get_pretty_env_info().splitlines(),  # type: ignore[no-untyped-call]
     }
-    if DEVICE.type == "cuda":
-        query = ["nvidia-smi", "--query-gpu=name,memory.total,driver_version", "--format=csv"]
-        told = subprocess.run(query, capture_output=True, text=True, check=False).stdout
-        facts |= {"device": told.splitlines(), "cuda": torch.version.cuda}
-    return facts
 
 
-def table_text(table: Table) -> str:
-    """A table for the terminal, with its goals."""
-    width = max(len(row.name) for row in table.rows)
-    lines = [f"\n{table.name}"]
+def show(table: Table) -> None:
+    """Print a table with its goals."""
+    rows = []
     for row in table.rows:
-        low, high = min(table.ratios(row.name)), max(table.ratios(row.name))
-        quotient = f"{table.ratio(row.name):8.3g}×  ({low:.3g} to {high:.3g})"
-        lines.append(f"  {row.name:{width}} {row.median:10.4g} {table.unit} {quotient}")
+        ratios = table.ratios(row.name)
+        spread = f"{min(ratios):.3g} to {max(ratios):.3g}"
+        quotient = f"{table.ratio(row.name):.3g}×"
+        rows.append((row.name, f"{row.median:.4g} {table.unit}", quotient, spread))
+    TextTable(table.name, ("", "median", "of the first", "rounds"), rows).print()
     for goal in table.goals:
         bound = f"at {'least' if goal.least else 'most'} {goal.bound:.3g}"
-        verdict = "met" if goal.met else "MISSED"
-        lines.append(f"  {verdict}: {goal.what} {goal.found:.3g} ({bound})")
-    return "\n".join(lines)
+        print(f"{'met' if goal.met else 'MISSED'}: {goal.what} {goal.found:.3g} ({bound})")
 
 
 def quotients(tables: Sequence[Table]) -> dict[str, dict[str, float]]:

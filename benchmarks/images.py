@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Any
 
 import cv2
@@ -31,7 +32,7 @@ SOME = "equirect_to_tangent, 4 images"
 _LARGE = 9
 """From this level on other libraries render a fifth of the images, which is multiplied."""
 
-Render = Callable[[Sequence[int]], Sequence[NDArray[Any]]]
+Render = Callable[[int], NDArray[Any]]
 
 
 def images(quick: bool) -> Iterator[Table]:
@@ -59,8 +60,9 @@ def _table(level: int, dtype: np.dtype[Any], rounds: int) -> Table:
     ours = equirect_to_tangent(panorama, grid, faces)
     libraries = []
     for name, render in _rivals(panorama, grid).items():
-        _check_same_views(name, ours, render(faces))
-        libraries.append(Way(name, lambda r=render: r(faces), scale=step, rounds=3))  # type: ignore[misc]
+        run = partial(lambda one: [one(face) for face in faces], render)
+        _check_same_views(name, ours, run())
+        libraries.append(Way(name, run, scale=step, rounds=3))
     four = [3, 20, 41, 77]
     own = [
         Way(BARE, bare),
@@ -111,14 +113,11 @@ def _rivals(panorama: NDArray[Any], grid: TangentGrid) -> dict[str, Render]:
         return image.transpose(1, 2, 0)
 
     return {
-        "py360convert": lambda faces: [
-            py360convert.e2p(panorama, fov_deg, *degrees[face], size) for face in faces
-        ],
-        "pyequilib": lambda faces: [pyequilib(face) for face in faces],
-        "pytorch360convert": lambda faces: [
-            e2p(floats, fov_deg, *degrees[face], size, channels_first=False).numpy()
-            for face in faces
-        ],
+        "py360convert": lambda face: py360convert.e2p(panorama, fov_deg, *degrees[face], size),
+        "pyequilib": pyequilib,
+        "pytorch360convert": lambda face: e2p(
+            floats, fov_deg, *degrees[face], size, channels_first=False
+        ).numpy(),
     }
 
 

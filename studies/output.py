@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
+
+from tangent_train.files import csv_text, write_text
+from tangent_train.results.tables import Table
 
 __all__ = ["COLORS", "Row", "save"]
 
@@ -30,20 +32,16 @@ def save(
         folder: Output folder; created if missing.
         digits: Significant digits of the printed table; the CSV file has all.
     """
-    Path(folder).mkdir(parents=True, exist_ok=True)
-    with (Path(folder) / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+    write_text(Path(folder) / f"{name}.csv", csv_text(list(rows[0]), rows))
     figure.savefig(Path(folder) / f"{name}.png", dpi=110)
-    print("\n".join(markdown(rows, digits)))
+    print(markdown(rows, digits))
 
 
-def markdown(rows: Sequence[Row], digits: int = 6) -> list[str]:
-    """The lines of the table; floats with `digits` significant digits."""
+def markdown(rows: Sequence[Row], digits: int = 6) -> str:
+    """The table; floats with `digits` significant digits."""
+    header = list(rows[0])
     cells = [
         [f"{v:.{digits}g}" if isinstance(v, float) else str(v) for v in row.values()]
         for row in rows
     ]
-    header = list(rows[0])
-    return [f"| {' | '.join(line)} |" for line in (header, ["---"] * len(header), *cells)]
+    return Table("", header, cells, text_columns=range(len(header))).markdown()

@@ -207,7 +207,7 @@ class EstimatedUp:
             return panorama
         if index not in self._ups:
             judge = None if self._judge is None else partial(self._judge, panorama)
-            self._ups[index] = estimate_up(panorama.rgb, self._max_tilt_deg, judge).found
+            self._ups[index] = estimate_up(panorama.rgb, self._max_tilt_deg, judge)
         return panorama._replace(up=self._ups[index])
 
     def __getstate__(self) -> dict[str, Any]:

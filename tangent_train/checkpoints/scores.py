@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any
 
 import torch
@@ -148,18 +149,12 @@ def size_multiple_of(network: nn.Module, in_channels: int) -> int | None:
     return found or _least_multiple(network, in_channels, "cpu")
 
 
+@torch.no_grad()
 def _least_multiple(network: nn.Module, in_channels: int, device: str) -> int | None:
     for multiple, counts in _PROBED.items():
-        rows, columns = (multiple * count for count in counts)
-        if _keeps_size(network, torch.zeros(1, in_channels, rows, columns, device=device)):
-            return multiple
+        size = torch.Size(multiple * count for count in counts)
+        with suppress(Exception):  # each network refuses sizes in its own words
+            scores = network(torch.zeros(1, in_channels, *size, device=device))
+            if scores.shape[-2:] == size:
+                return multiple
     return None
-
-
-@torch.no_grad()
-def _keeps_size(network: nn.Module, images: Tensor) -> bool:
-    try:
-        scores = network(images)
-    except Exception:  # each network refuses sizes in its own words
-        return False
-    return tuple(scores.shape[-2:]) == tuple(images.shape[-2:])

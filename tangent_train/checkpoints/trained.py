@@ -296,20 +296,16 @@ def _trained(
     rows, columns = described["image_size"]
     names, groups = tuple(described["class_names"]), described["groups"]
     tile = None if fixed is None else (fixed[0], fixed[1])
-    return TrainedNetwork(
-        network=Scores(network, len(names) - 1, groups, tile).eval(),
-        class_names=names,
-        inputs=tuple(described["inputs"]),
-        normalization=Normalization(normalization.get("mean", ()), normalization.get("std", ())),
-        level=described["level"],
-        representation=described["representation"],
-        image_size=(rows, columns),
-        size_multiple=described["size_multiple"],
-        fixed_size=tile,
-        groups=groups,
-        settings=described["settings"],
-        source=source,
-    )
+    known = {
+        "network": Scores(network, len(names) - 1, groups, tile).eval(),
+        "class_names": names,
+        "inputs": tuple(described["inputs"]),
+        "normalization": Normalization(normalization.get("mean", ()), normalization.get("std", ())),
+        "image_size": (rows, columns),
+        "fixed_size": tile,
+        "source": source,
+    }
+    return TrainedNetwork(**{**described, **known})
 
 
 def _described(path: Path, text: str | bytes | None) -> dict[str, Any]:

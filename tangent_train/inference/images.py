@@ -114,8 +114,7 @@ def with_up(image: InputImage, max_tilt_deg: float, judge: NetworkJudge) -> Inpu
     """
     if image.up is not None:
         return image
-    estimate = estimate_up(image.rgb, max_tilt_deg, partial(judge, image))
-    return replace(image, up=estimate.found)
+    return replace(image, up=estimate_up(image.rgb, max_tilt_deg, partial(judge, image)))
 
 
 def read_photo(

@@ -1,8 +1,7 @@
 """COLMAP databases of panoramas, their keypoints and matches; poses that COLMAP found.
 
-In COLMAP the centre of the first pixel is (½, ½), a keypoint's scale is that of the Gaussian, half
-of OpenCV's size, and its angle runs from right to down. Panoramas have the camera model
-EQUIRECTANGULAR, whose parameters are their size.
+In COLMAP the centre of the first pixel is (½, ½). Panoramas have the camera model EQUIRECTANGULAR,
+whose parameters are their size.
 """
 
 from __future__ import annotations
@@ -75,12 +74,8 @@ def _image_id(
     frame = pycolmap.Frame(rig_id=camera_id)
     frame.add_data_id(pycolmap.Image(camera_id=camera_id, image_id=image_id).data_id)
     database.write_frame(frame)
-    columns = [
-        keypoints.equirect_pixels(shape) + 0.5,
-        keypoints.equirect_sizes(shape) / 2,
-        keypoints.equirect_angles(shape),
-    ]
-    database.write_keypoints(image_id, np.column_stack(columns).astype(np.float32))
+    pixels = keypoints.equirect_pixels(shape) + 0.5
+    database.write_keypoints(image_id, pixels.astype(np.float32))
     if keypoints.descriptors.shape[1] == _SIFT:
         numbers = np.rint(keypoints.descriptors).clip(0, 255).astype(np.uint8)
         kind = pycolmap.FeatureExtractorType.SIFT

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from tangent_train.geometry import (
@@ -17,6 +18,7 @@ from tangent_train.geometry import (
     xyz_to_lonlat,
 )
 from tangent_train.keypoints.spherical import angles_between
+from tangent_train.rendering.taps import bilinear_equirect_taps
 
 __all__ = ["DepthView", "MatchTruth", "correct_matches", "fov_overlap", "visible_from"]
 
@@ -60,17 +62,11 @@ class DepthView:
             all four pixels are missing.
         """
         height, width = self.distance_m.shape
-        u, v = lonlat_to_equirect(xyz_to_lonlat(directions_xyz), (height, width)).T
-        column, row = np.floor(u), np.floor(v)
-        right, below = u - column, v - row
-        taps = [
-            self._tap(
-                row + i, column + j, (below if i else 1 - below) * (right if j else 1 - right)
-            )
-            for i in (0, 1)
-            for j in (0, 1)
-        ]
-        four, weight = (np.array(values) for values in zip(*taps, strict=True))
+        pixels = lonlat_to_equirect(xyz_to_lonlat(directions_xyz), (height, width))
+        u, v = torch.from_numpy(pixels).unbind(-1)
+        taps = bilinear_equirect_taps(u, v, (height, width))
+        weight = taps.weight.numpy()
+        four = self.distance_m.reshape(-1)[taps.source.numpy()].astype(np.float64)
         touched = weight > 1e-6  # others are among the four by rounding only
         there = touched & ~np.isnan(four)
         farthest = np.where(there, four, -np.inf).max(axis=0)
@@ -81,19 +77,6 @@ class DepthView:
         distance[smooth] = 1 / np.where(there, weight / four, 0.0).sum(axis=0)[smooth]
         distance[~there.any(axis=0)] = np.nan
         return distance, distance * np.where(smooth, 1.0, _SMOOTH)
-
-    def _tap(
-        self,
-        row: NDArray[np.float64],
-        column: NDArray[np.float64],
-        weight: NDArray[np.float64],
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Distances of pixels, across the seam and beyond the poles, and their weights."""
-        height, width = self.distance_m.shape
-        beyond = (row < 0) | (row >= height)
-        columns = (column + beyond * (width / 2)).astype(np.int64) % width
-        rows = np.clip(row, 0, height - 1).astype(np.int64)
-        return self.distance_m[rows, columns].astype(np.float64), weight
 
 
 def visible_from(
@@ -135,23 +118,17 @@ def fov_overlap(left: DepthView, right: DepthView) -> float:
 
 
 def _seen_share(source: DepthView, target: DepthView) -> float:
-    shape = (source.distance_m.shape[0], source.distance_m.shape[1])
-    rows, columns = (
-        np.arange(step // 2, size, step)
-        for size, step in zip(
-            shape, (_step(shape[0], _ROWS), _step(shape[1], 2 * _ROWS)), strict=True
-        )
+    height, width = source.distance_m.shape
+    across, down = (
+        max(1, round(size / most)) for size, most in ((width, 2 * _ROWS), (height, _ROWS))
     )
-    there = ~np.isnan(source.distance_m[np.ix_(rows, columns)])
+    rows, columns = np.mgrid[down // 2 : height : down, across // 2 : width : across]
+    there = ~np.isnan(source.distance_m[rows, columns])
     if not there.any():
         return math.nan
-    pixels = np.stack(np.meshgrid(columns, rows), axis=-1)[there]
-    directions = lonlat_to_xyz(equirect_to_lonlat(pixels, shape))
+    pixels = np.stack([columns, rows], axis=-1)[there]
+    directions = lonlat_to_xyz(equirect_to_lonlat(pixels, (height, width)))
     return float(visible_from(directions, source, target).mean())
-
-
-def _step(size: int, wanted: int) -> int:
-    return max(1, round(size / wanted))
 
 
 class MatchTruth(NamedTuple):

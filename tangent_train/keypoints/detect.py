@@ -66,11 +66,6 @@ class Detections(NamedTuple):
     responses: NDArray[np.float32]
     descriptors: NDArray[np.float32] | NDArray[np.uint8]
 
-    def select(self, chosen: NDArray[np.bool_]) -> Detections:
-        """Some of them, by a mask."""
-        parts: Any = (values[chosen] for values in self)
-        return Detections(*parts)
-
 
 @dataclass(frozen=True)
 class Detector:
@@ -152,10 +147,9 @@ def detect_on_equirect(image: NDArray[np.uint8], detector: Detector) -> Spherica
     found = detector.detect(np.pad(gray, ((0, 0), (pad, pad)), mode="wrap"))
     found.points_xy[:, 0] -= pad
     u = found.points_xy[:, 0]
-    found = found.select((u >= -0.5) & (u < width - 0.5))
     directions = lonlat_to_xyz(equirect_to_lonlat(found.points_xy, (height, width)))
-    jacobian = equirect_jacobian(directions, (height, width))
-    return detector.strongest(_on_sphere(found, directions, jacobian, 0))
+    keypoints = _on_sphere(found, directions, equirect_jacobian(directions, (height, width)), 0)
+    return detector.strongest(keypoints.select((u >= -0.5) & (u < width - 0.5)))
 
 
 def detect_on_tangent_images(
@@ -186,9 +180,9 @@ def detect_on_tangent_images(
         rays = np.column_stack([plane, np.ones(len(plane))])
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         directions = rays @ wide.world_from_camera[face].T
-        own = wide.owners(directions) == face
-        directions, found = directions[own], found.select(own)
-        return _on_sphere(found, directions, gnomonic_jacobian(directions, wide, face), face)
+        jacobian = gnomonic_jacobian(directions, wide, face)
+        keypoints = _on_sphere(found, directions, jacobian, face)
+        return keypoints.select(wide.owners(directions) == face)
 
     threads = min(torch.get_num_threads(), max(1, _PIXELS_AT_ONCE // wide.dim**2))
     with ThreadPoolExecutor(threads) as pool:

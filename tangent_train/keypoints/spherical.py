@@ -56,21 +56,6 @@ class SphericalKeypoints:
         """``(n, 2)`` columns and rows in a panorama ``(H, W)``; pixel centres are integers."""
         return lonlat_to_equirect(xyz_to_lonlat(self.directions_xyz), shape)
 
-    def equirect_sizes(self, shape: tuple[int, int]) -> NDArray[np.float64]:
-        """``(n,)`` diameters in pixels of discs of the same area in a panorama ``(H, W)``.
-
-        At most its height: near the poles the panorama is stretched without bound.
-        """
-        columns, rows = np.moveaxis(equirect_jacobian(self.directions_xyz, shape), -1, 0)
-        area = np.linalg.norm(np.cross(columns, rows), axis=-1)
-        return np.minimum(self.sizes_rad / np.sqrt(np.maximum(area, 1e-30)), shape[0])
-
-    def equirect_angles(self, shape: tuple[int, int]) -> NDArray[np.float64]:
-        """``(n,)`` orientations in a panorama ``(H, W)``, radians from right towards down."""
-        jacobian = equirect_jacobian(self.directions_xyz, shape)
-        gradient = np.einsum("nc,nci->ni", self.orientations_xyz, jacobian)
-        return np.arctan2(gradient[:, 1], gradient[:, 0])
-
 
 def angles_between(first_xyz: ArrayLike, second_xyz: ArrayLike) -> NDArray[np.float64]:
     """``(...)`` angles between ``(..., 3)`` unit vectors in radians, precise near 0 and π alike."""

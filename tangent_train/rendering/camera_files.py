@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -214,13 +213,16 @@ def write_rig(
         faces: Index of the image of each camera, by prefix.
         panoramas: See `RigFile`.
     """
+    from scipy.spatial.transform import Rotation  # slow to import
+
     focal, center = 1 / grid.pitch, grid.dim / 2
     reference = _world_from_camera(grid, next(iter(faces.values())))
     cameras: list[dict[str, Any]] = []
     for prefix, face in faces.items():
         axes = _world_from_camera(grid, face)
+        turn = Rotation.from_matrix(axes.T @ reference)
         of_rig = {
-            "cam_from_rig_rotation": _quaternion(axes.T @ reference),
+            "cam_from_rig_rotation": turn.as_quat(canonical=True, scalar_first=True).tolist(),
             "cam_from_rig_translation": (0, 0, 0),
         }
         cameras.append(
@@ -279,11 +281,3 @@ def write_poses(path: Path, poses: Mapping[str, PanoramaPose]) -> None:
 def _write_json(path: Path, content: Any) -> None:
     text = json.dumps(content, indent=1, ensure_ascii=False)
     write_text(path, _NUMBERS.sub(lambda match: " ".join(match[0].split()), text) + "\n")
-
-
-def _quaternion(rotation: NDArray[np.float64]) -> tuple[float, ...]:
-    """Unit quaternion (w, x, y, z), w ≥ 0, of a rotation matrix."""
-    rotation_vector = cv2.Rodrigues(rotation)[0].ravel()
-    half_angle = float(np.linalg.norm(rotation_vector)) / 2
-    xyz = rotation_vector / 2 * np.sinc(half_angle / np.pi)
-    return (math.cos(half_angle), *xyz.tolist())

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
@@ -37,21 +37,11 @@ def report_png(title: str, rows: Sequence[Row]) -> bytes:
         A PNG file.
     """
     scores, names = SCORES[rows[0].records[0].kind], rows[0].records[0].class_names
-    banded = [row for row in rows if row.bands]
-    panels = 2 + bool(banded)
-    width = max(10.0, 0.12 * len(names) * len(rows))
-    figure = _figure(width, 3.6 * panels + 0.2 * len(rows))
-    means, classes, *latitude = figure.subplots(panels, 1)
-    means.set_title(f"{title}\n{_ERROR_BARS}", loc="left")
-    _bars(
-        means, rows, list(scores.means.values()), [[r.score(n) for n in scores.means] for r in rows]
-    )
-    classes.set_title(f"{scores.per_class[scores.worst]} of each class", loc="left")
-    _bars(classes, rows, names, [[r.score(scores.worst, name) for name in names] for r in rows])
-    for axes in latitude:
-        axes.set_title("mIoU by latitude", loc="left")
-        _band_lines(axes, banded)
-    return _png(figure, means)
+    worst = scores.worst
+    means = [[row.score(name) for name in scores.means] for row in rows]
+    classes = [[row.score(worst, name) for name in names] for row in rows]
+    second = _Panel(f"{scores.per_class[worst]} of each class", names, classes)
+    return _png(rows, _Panel(title, list(scores.means.values()), means), second)
 
 
 def grid_png(title: str, grid: Mapping[str, Mapping[str, Row]], score: str) -> bytes:
@@ -65,24 +55,34 @@ def grid_png(title: str, grid: Mapping[str, Mapping[str, Row]], score: str) -> b
     Returns:
         A PNG file.
     """
-    conditions = list(next(iter(grid.values())))
-    figure = _figure(max(10.0, 0.2 * len(conditions) * len(grid)), 4.2 + 0.12 * len(grid))
-    axes = figure.subplots()
-    axes.set_title(f"{title}\n{_ERROR_BARS}", loc="left")
     scores = [[row.score(score) for row in found.values()] for found in grid.values()]
-    _bars(axes, [Row(view, ()) for view in grid], conditions, scores)
-    return _png(figure, axes)
+    conditions = list(next(iter(grid.values())))
+    return _png([Row(view, ()) for view in grid], _Panel(title, conditions, scores))
 
 
-def _figure(width: float, height: float) -> Figure:
-    figure = Figure(figsize=(width, height), dpi=120, layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
+class _Panel(NamedTuple):
+    """A group of bars for each tick; `scores` by row and tick."""
+
+    title: str
+    ticks: Sequence[str]
+    scores: Sequence[Sequence[Statistic]]
 
 
-def _png(figure: Figure, axes: Axes) -> bytes:
-    """The figure with a legend of the bars."""
-    handles, labels = axes.get_legend_handles_labels()
+def _png(rows: Sequence[Row], *panels: _Panel) -> bytes:
+    """Panels of bars, and lines over the latitude of the rows that have bands."""
+    banded = [row for row in rows if row.bands]
+    count = len(panels) + bool(banded)
+    width = max(10.0, 0.12 * len(panels[-1].ticks) * len(rows))
+    figure = Figure((width, 3.6 * count + 0.2 * len(rows)), dpi=120, layout="constrained")
+    plots = figure.subplots(count, 1, squeeze=False)[:, 0]
+    for axes, panel in zip(plots, panels, strict=False):
+        axes.set_title(panel.title, loc="left")
+        _bars(axes, rows, panel.ticks, panel.scores)
+    plots[0].set_title(f"{panels[0].title}\n{_ERROR_BARS}", loc="left")
+    if banded:
+        plots[-1].set_title("mIoU by latitude", loc="left")
+        _band_lines(plots[-1], banded)
+    handles, labels = plots[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper left", frameon=False, ncols=2)
     for text in figure.findobj(Text):
         text.set_parse_math(False)  # "$" in a name is no formula

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from tangent_train.metrics.segmentation import (
     bootstrap_intervals,
     segmentation_scores,
 )
-from tangent_train.results.record import RESULTS_FILE, SCORES, Record
+from tangent_train.results.record import RESULTS_FILE, SCORES, Record, with_solid_angle
 from tangent_train.results.tables import Table, percent
 
 __all__ = [
@@ -41,17 +41,6 @@ _HEADINGS = {
 }
 """Of the columns per class that are no scores."""
 
-_MEAN_OF = {
-    "segmentation": {
-        "iou": "miou",
-        "accuracy": "macc",
-        "iou_solid_angle": "miou_solid_angle",
-        "accuracy_solid_angle": "macc_solid_angle",
-    },
-    "classification": {"accuracy": "class_accuracy"},
-}
-"""By kind, the mean over the classes of each score."""
-
 
 def segmentation_record(
     matrices: ConfusionMatrices,
@@ -68,48 +57,25 @@ def segmentation_record(
         noun: Plural name of the images. Photos have neither solid angles nor latitude bands.
     """
     on_sphere = bool(matrices.solid_angle.any())
-    pixels = segmentation_scores(matrices.pixels, absent_class)
-    solid = segmentation_scores(matrices.solid_angle, absent_class if on_sphere else "skip")
-    classes = [
-        {
-            "class": name,
-            "iou": _plain(pixels.iou[k]),
-            "accuracy": _plain(pixels.accuracy[k]),
-            "iou_solid_angle": _plain(solid.iou[k]),
-            "accuracy_solid_angle": _plain(solid.accuracy[k]),
-            "share": _plain(pixels.share[k]),
-            **_taken_for(matrices.pixels[k + 1], k + 1, class_names),
-        }
-        for k, name in enumerate(class_names[1:])
-    ]
-    bands = [
-        {"latitude_deg": [south, north], "miou": _plain(scores.miou), "macc": _plain(scores.macc)}
-        for north, south, band in zip(
-            BAND_EDGES_DEG[:-1], BAND_EDGES_DEG[1:], matrices.bands, strict=True
-        )
-        for scores in [segmentation_scores(band, absent_class)]
-        if on_sphere
-    ]
-    means = {
-        "miou": _plain(pixels.miou),
-        "macc": _plain(pixels.macc),
-        "miou_solid_angle": _plain(solid.miou),
-        "macc_solid_angle": _plain(solid.macc),
-    }
-    intervals = bootstrap_intervals(matrices.of_images[:, 0], absent_class)
-    if on_sphere:
-        by_angle = bootstrap_intervals(matrices.of_images[:, 1], absent_class)
-        intervals |= {f"{name}_solid_angle": ends for name, ends in by_angle.items()}
+    absent = absent_class, absent_class if on_sphere else "skip"
+    both = list(map(segmentation_scores, (matrices.pixels, matrices.solid_angle), absent))
+    means = with_solid_angle(*({"miou": s.miou, "macc": s.macc} for s in both))
+    of_class = with_solid_angle(*({"iou": s.iou, "accuracy": s.accuracy} for s in both))
+    bands = [segmentation_scores(band, absent_class) for band in matrices.bands if on_sphere]
+    of_images = matrices.of_images.swapaxes(0, 1)
     return Record(
         "segmentation",
         noun,
         matrices.images,
-        means,
-        classes,
-        bands,
+        _plain(means),
+        _entries(of_class | {"share": both[0].share}, matrices.pixels, class_names, first=1),
+        [
+            {"latitude_deg": [south, north], **_plain({"miou": band.miou, "macc": band.macc})}
+            for north, south, band in zip(BAND_EDGES_DEG, BAND_EDGES_DEG[1:], bands, strict=False)
+        ],
         matrices.pixels.tolist(),
         absent_class,
-        intervals,
+        with_solid_angle(*map(bootstrap_intervals, of_images, absent)),
     )
 
 
@@ -124,21 +90,31 @@ def classification_record(
         noun: Plural name of the images.
     """
     scores = classification_scores(confusion)
-    classes = [
-        {
-            "class": name,
-            "images": int(scores.counts[k]),
-            "accuracy": _plain(scores.of_class[k]),
-            **_taken_for(confusion[k], k, class_names),
-        }
-        for k, name in enumerate(class_names)
+    means = {"accuracy": scores.accuracy, "class_accuracy": scores.class_accuracy}
+    of_class = {"images": scores.counts, "accuracy": scores.of_class}
+    return Record(
+        "classification",
+        noun,
+        int(confusion.sum()),
+        _plain(means),
+        _entries(of_class, confusion, class_names),
+        confusion=confusion.tolist(),
+    )
+
+
+def _entries(
+    scores: Mapping[str, NDArray[Any]],
+    confusion: NDArray[np.int64],
+    class_names: Sequence[str],
+    first: int = 0,
+) -> list[dict[str, Any]]:
+    """For each class from the first its name and scores, and what it was most often taken for."""
+    return [
+        {"class": class_names[k]}
+        | _plain({name: values[k - first].item() for name, values in scores.items()})
+        | _taken_for(confusion[k], k, class_names)
+        for k in range(first, len(class_names))
     ]
-    means = {
-        "accuracy": _plain(scores.accuracy),
-        "class_accuracy": _plain(scores.class_accuracy),
-    }
-    images = int(confusion.sum())
-    return Record("classification", noun, images, means, classes, confusion=confusion.tolist())
 
 
 def _taken_for(row: NDArray[np.int64], own: int, class_names: Sequence[str]) -> dict[str, Any]:
@@ -151,8 +127,9 @@ def _taken_for(row: NDArray[np.int64], own: int, class_names: Sequence[str]) -> 
     return {"taken_for": class_names[other], "taken_for_share": float(missed[other] / row.sum())}
 
 
-def _plain(value: float) -> float | None:
-    return None if math.isnan(value) else float(value)
+def _plain(scores: Mapping[str, Any]) -> dict[str, Any]:
+    """None for NaN, which JSON does not have."""
+    return {name: None if math.isnan(value) else value for name, value in scores.items()}
 
 
 def headline(record: Record) -> str:
@@ -189,7 +166,7 @@ def result_tables(record: Record) -> list[Table]:
     Args:
         record: Of an evaluation.
     """
-    scores, mean_of = SCORES[record.kind], _MEAN_OF[record.kind]
+    scores = SCORES[record.kind]
     columns = [
         name
         for name in record.classes[0]
@@ -203,7 +180,7 @@ def result_tables(record: Record) -> list[Table]:
         for e, count in zip(record.classes, predicted, strict=True)
         if count or e["accuracy"] is not None
     ]
-    names = (mean_of.get(column) for column in columns)
+    names = map(scores.mean_of.get, columns)
     means = (percent(record.means[n], record.intervals.get(n)) if n else "" for n in names)
     rows.append(["mean", *means])
     texts = [0, *(1 + k for k, name in enumerate(columns) if name == "taken_for")]

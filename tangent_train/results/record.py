@@ -6,17 +6,16 @@ A finished run holds it as ``results.json`` beside its settings, ``config.yaml``
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from tangent_train.checkpoints.content import INPUTS, read_settings
 from tangent_train.errors import DataError
 from tangent_train.files import parse_json
-from tangent_train.metrics.segmentation import Interval
-from tangent_train.registry import check_fields
+from tangent_train.metrics.segmentation import AbsentClass, Interval
+from tangent_train.registry import Text, check_fields
 from tangent_train.setting_rules import flat_settings
 
 __all__ = [
@@ -29,12 +28,13 @@ __all__ = [
     "find_runs",
     "load_record",
     "unfinished_runs",
+    "with_solid_angle",
 ]
 
 RESULTS_FILE = "results.json"
 
 Kind = Literal["segmentation", "classification"]
-Band = tuple[float, float]
+Band = tuple[float, ...]
 """South and north of a latitude band, in degrees."""
 
 
@@ -44,36 +44,42 @@ class Scores(NamedTuple):
     Attributes:
         means: Over all classes.
         per_class: Of one class.
+        mean_of: The mean over the classes of each score of one class.
         per_band: Of a latitude band.
         worst: The score per class that says which class is the worst.
     """
 
     means: Mapping[str, str]
     per_class: Mapping[str, str]
+    mean_of: Mapping[str, str]
     per_band: Sequence[str]
     worst: str
 
 
+def with_solid_angle(
+    by_pixels: Mapping[str, Any], by_angle: Mapping[str, Any] | None = None
+) -> dict[str, Any]:
+    """Scores by pixels, and those by solid angle under their names; or the headings of both."""
+    if by_angle is None:
+        by_angle = {name: f"{heading} by solid angle" for name, heading in by_pixels.items()}
+    return {**by_pixels, **{f"{name}_solid_angle": value for name, value in by_angle.items()}}
+
+
 SCORES: Mapping[str, Scores] = {
     "segmentation": Scores(
-        {
-            "macc": "mAcc",
-            "miou": "mIoU",
-            "macc_solid_angle": "mAcc by solid angle",
-            "miou_solid_angle": "mIoU by solid angle",
-        },
-        {
-            "accuracy": "accuracy",
-            "iou": "IoU",
-            "accuracy_solid_angle": "accuracy by solid angle",
-            "iou_solid_angle": "IoU by solid angle",
-        },
+        with_solid_angle({"macc": "mAcc", "miou": "mIoU"}),
+        with_solid_angle({"accuracy": "accuracy", "iou": "IoU"}),
+        with_solid_angle(
+            {"accuracy": "macc", "iou": "miou"},
+            {"accuracy": "macc_solid_angle", "iou": "miou_solid_angle"},
+        ),
         ("macc", "miou"),
         "iou",
     ),
     "classification": Scores(
         {"accuracy": "accuracy", "class_accuracy": "mean of the classes"},
         {"accuracy": "accuracy"},
+        {"accuracy": "class_accuracy"},
         (),
         "accuracy",
     ),
@@ -88,6 +94,20 @@ _SHOWN = {
     "seed": int | None,
 }
 """Types of the settings that reports show."""
+
+_FIELDS = {
+    "kind": Kind,
+    "noun": Text,
+    "images": int,
+    "classes": list,
+    "latitude_bands": list,
+    "confusion": list[list[int]],
+    "absent_class": AbsentClass | None,
+    "intervals": dict[str, list[float]],
+    "checkpoint": Text,
+    "class_map": Text | None,
+}
+_EXPECTED = "results written by tangent-train or tangent-evaluate"
 
 
 @dataclass(frozen=True)
@@ -132,7 +152,7 @@ class Record:
     @property
     def bands(self) -> tuple[Band, ...]:
         """The latitude bands."""
-        return tuple(_edges(entry) for entry in self.latitude_bands)
+        return tuple(tuple(entry["latitude_deg"]) for entry in self.latitude_bands)
 
     @property
     def data(self) -> str:
@@ -165,29 +185,15 @@ class Record:
         Returns:
             A share of 1; None where it is undefined, or there is no such part.
         """
-        source: Mapping[str, Any] = self.means
-        if isinstance(part, str):
-            source = next((entry for entry in self.classes if entry["class"] == part), {})
-        elif part is not None:
-            source = next((e for e in self.latitude_bands if _edges(e) == part), {})
-        return source.get(name)
+        parts: dict[Any, Mapping[str, Any]] = {None: self.means}
+        parts |= zip(self.class_names, self.classes, strict=True)
+        parts |= zip(self.bands, self.latitude_bands, strict=True)
+        return parts.get(part, {}).get(name)
 
     def json(self) -> str:
         """The content of ``results.json``."""
-        content = {
-            "kind": self.kind,
-            "noun": self.noun,
-            "images": self.images,
-            "checkpoint": self.checkpoint,
-            "class_map": self.class_map,
-            **self.means,
-            **({"intervals": self.intervals} if self.intervals else {}),
-            **({} if self.absent_class is None else {"absent_class": self.absent_class}),
-            "classes": self.classes,
-            "latitude_bands": self.latitude_bands,
-            "confusion": self.confusion,
-        }
-        return json.dumps(content, indent=1) + "\n"
+        content = {f.name: getattr(self, f.name) for f in fields(self) if f.name in _FIELDS}
+        return json.dumps({**self.means, **content}, indent=1) + "\n"
 
 
 def load_record(folder: Path) -> Record:
@@ -200,61 +206,29 @@ def load_record(folder: Path) -> Record:
         DataError: A file is missing, or is not what ``tangent-train`` writes.
     """
     path = folder / RESULTS_FILE
-    expected = "results written by tangent-train or tangent-evaluate"
     try:
-        record = _parsed(parse_json(path.read_text()))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        found = f"{type(error).__name__}: {error}".partition("\n")[0]
-        raise DataError(path, found=found, expected=expected) from error
+        content = parse_json(path.read_bytes())
+    except (OSError, ValueError) as error:
+        raise DataError(path, found=error, expected=_EXPECTED) from error
+    found = check_fields(path, content, _FIELDS, _EXPECTED)
+    scores = SCORES[found["kind"]]
+    kinds_of: dict[str, dict[str, Any]] = {
+        "classes": {"class": Text, **dict.fromkeys(scores.per_class, float | None)},
+        "latitude_bands": {
+            "latitude_deg": list[float],
+            **dict.fromkeys(scores.per_band, float | None),
+        },
+    }
+    for part, kinds in kinds_of.items():
+        for entry in found[part]:
+            check_fields(path, entry, kinds, _EXPECTED, part)
+    found["means"] = check_fields(
+        path, content, dict.fromkeys(scores.means, float | None), _EXPECTED
+    )
     path = folder / "config.yaml"
     settings = dict(flat_settings(read_settings(path)))
     check_fields(path, settings, _SHOWN, "the settings of a run")
-    return Record(**record, settings=settings, folder=folder)
-
-
-def _parsed(content: Any) -> dict[str, Any]:
-    """The fields of a record that come from its results; all scores must be there."""
-    scores = SCORES[content["kind"]]
-    means = {name: _share(content[name]) for name in scores.means}
-    classes, bands = list(content["classes"]), list(content["latitude_bands"])
-    for entry in classes:
-        _ = str(entry["class"]), [_share(entry[name]) for name in scores.per_class]
-    for entry in bands:
-        _ = _edges(entry), [_share(entry[name]) for name in scores.per_band]
-    for name, kinds in {"images": int, "checkpoint": str, "class_map": str | None}.items():
-        if not isinstance(content[name], kinds):
-            raise TypeError(f"{name}={content[name]!r}")
-    kept = ("kind", "noun", "images", "checkpoint", "class_map", "confusion")
-    return {
-        **{name: content[name] for name in kept},
-        "absent_class": content.get("absent_class"),
-        "intervals": {k: _interval(v) for k, v in content.get("intervals", {}).items()},
-        "means": means,
-        "classes": classes,
-        "latitude_bands": bands,
-    }
-
-
-def _share(value: Any) -> float | None:
-    if value is None:
-        return None
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= 1:
-        raise ValueError(f"{value!r} instead of a share of 1, or null")
-    return float(value)
-
-
-def _interval(value: Any) -> Interval:
-    low, high = map(_share, value)
-    if low is None or high is None:
-        raise ValueError(f"{value!r} instead of two shares of 1")
-    return low, high
-
-
-def _edges(band: Mapping[str, Any]) -> Band:
-    south, north = map(float, band["latitude_deg"])
-    if math.isnan(south + north):
-        raise ValueError("a latitude is NaN")
-    return south, north
+    return Record(**found, settings=settings, folder=folder)
 
 
 def find_runs(folders: Sequence[Path]) -> list[Path]:

@@ -107,26 +107,23 @@ class Report:
 
     def _overall(self) -> Table:
         scores = SCORES[self.kind].means
-        names = list(dict.fromkeys(name for row in self.rows for name in row.facts))
-        values = {name: [row.facts.get(name, "–") for row in self.rows] for name in names}
-        alike = [name for name in names if len(set(values[name])) == 1]
-        facts = [name for name in names if name not in alike]
-        changes = {name for name in scores if self.compared and not name.endswith("_solid_angle")}
-        header = ["", *facts]
+        names = dict.fromkeys(name for row in self.rows for name in row.facts)
+        facts = {name: [row.facts.get(name, "–") for row in self.rows] for name in names}
+        alike = [f"{name} {cells[0]}" for name, cells in facts.items() if len(set(cells)) == 1]
+        columns = [("", [row.label for row in self.rows])]
+        columns += [(name, cells) for name, cells in facts.items() if len(set(cells)) > 1]
+        texts = range(len(columns))
         for name, heading in scores.items():
-            header += [f"{heading} %", "change"] if name in changes else [f"{heading} %"]
-        rows = []
-        for k, row in enumerate(self.rows):
-            cells = [row.label, *(values[name][k] for name in facts)]
-            for name in scores:
-                cells.append(_cell(row.score(name), len(row.folds)))
-                cells += [_change(row.kept(name).mean)] if name in changes else []
-            rows.append(cells)
-        common = "; ".join(f"{name} {values[name][0]}" for name in alike)
+            cells = [_cell(row.score(name), len(row.folds)) for row in self.rows]
+            columns.append((f"{heading} %", cells))
+            if self.compared and not name.endswith("_solid_angle"):
+                columns.append(("change", [_change(row.kept(name).mean) for row in self.rows]))
+        header, cells_of = zip(*columns, strict=True)
+        common = f"{'; '.join(alike)}." if alike else ""
         shown = any(row.score(name).interval for row in self.rows for name in scores)
         told = _LEGEND_OF_INTERVALS if shown else ""
-        note = " ".join(filter(None, (f"{common}." if alike else "", _LEGEND, told, self.compared)))
-        return Table(self.title, header, rows, note, range(1 + len(facts)))
+        note = " ".join(filter(None, (common, _LEGEND, told, self.compared)))
+        return Table(self.title, header, list(zip(*cells_of, strict=True)), note, texts)
 
     def _per_class(self) -> Iterator[Table]:
         for name, heading in SCORES[self.kind].per_class.items():

@@ -9,7 +9,7 @@ training).
 from __future__ import annotations
 
 import json
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from statistics import fmean, stdev
@@ -208,8 +208,7 @@ def _identity(record: Record) -> dict[str, Any]:
 
 
 def _labels(firsts: Sequence[Record]) -> list[str]:
-    labels: list[str] = []
-    used: Counter[str] = Counter()
+    labels = []
     for record in firsts:
         own = _identity(record)
         others = [o for o in map(_identity, firsts) if o.get("name") == own.get("name")]
@@ -219,7 +218,5 @@ def _labels(firsts: Sequence[Record]) -> list[str]:
             if any(other.get(setting) != own.get(setting) for other in others)
         ]
         text = ", ".join(differing[:3]) + (", …" if len(differing) > 3 else "")
-        label = str(own.get("name") or record.folder.name) + (f" ({text})" if text else "")
-        used[label] += 1
-        labels.append(f"{label} #{used[label]}" if used[label] > 1 else label)
+        labels.append(str(own.get("name") or record.folder.name) + (f" ({text})" if text else ""))
     return labels

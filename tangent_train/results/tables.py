@@ -37,14 +37,10 @@ class Table:
     text_columns: Sequence[int] = (0,)
     shades: Sequence[Sequence[float]] | None = None
 
-    def markdown(self, heading: str = "##") -> str:
-        """The table as Markdown, below a heading.
-
-        Args:
-            heading: Marks the level of the heading.
-        """
+    def markdown(self) -> str:
+        """The table as Markdown, below a heading."""
         rule = ["---" if k in self.text_columns else "---:" for k in range(len(self.header))]
-        lines = [f"{heading} {self.title}", ""] if self.title else []
+        lines = [f"## {self.title}", ""] if self.title else []
         lines += map(markdown_line, (self.header, rule, *self.rows))
         lines += ["", self.note] if self.note else []
         return "\n".join(lines) + "\n"

@@ -56,7 +56,7 @@ def test_the_panoramas_of_the_panels_are_kept_for_the_report(tmp_path: Path) -> 
     assert {path.stem for path in tmp_path.iterdir()} == {f"area_room {k}" for k in chosen}
     for image, k in zip(panels.images, chosen, strict=True):
         assert image.sphere
-        assert np.abs(decoded(image.jpeg).astype(int) - 20 * k).max() <= 1
+        assert np.abs(decoded(image.input).astype(int) - 20 * k).max() <= 1
         assert np.all(decoded(image.truth) == 1)
         prediction = decoded(image.prediction)
         assert prediction[0, 0] == 2

@@ -18,53 +18,35 @@ from tests.tasks.odd_networks import Looking, OneSize
 from tests.tasks.small_networks import save_checkpoint
 
 SMALL_UNET = ["network=unet", "network.widths=[4,8,8]"]
+PHOTOS = ["data=synthrooms_perspective", "representation=perspective", "representation.dim=[12,20]"]
 
 
 @pytest.mark.parametrize(
-    ("overrides", "inputs", "size", "multiple"),
+    ("overrides", "size", "multiple"),
     [
-        (SMALL_UNET, ("rgb", "depth"), (16, 16), 4),
-        ([*SMALL_UNET, "representation=erp_crops"], ("rgb", "depth"), (32, 64), 4),
-        (
-            [
-                *SMALL_UNET,
-                "data=synthrooms_perspective",
-                "representation=perspective",
-                "representation.dim=[12,20]",
-            ],
-            ("rgb", "depth"),
-            (12, 20),
-            4,
-        ),
-        (
-            ["network=deeplabv3_mobilenet", "data.inputs=[rgb]", "level=5"],  # its result is a dict
-            ("rgb",),
-            (32, 32),
-            1,
-        ),
+        (SMALL_UNET, (16, 16), 4),
+        ([*SMALL_UNET, "representation=erp_crops"], (32, 64), 4),
+        ([*SMALL_UNET, *PHOTOS], (12, 20), 4),
+        (["network=deeplabv3_mobilenet", "data.inputs=[rgb]", "level=5"], (32, 32), 1),
     ],
     ids=["tangent", "erp", "photos", "dict"],
 )
 def test_a_network_computes_what_its_task_does(
-    overrides: list[str],
-    inputs: tuple[str, ...],
-    size: tuple[int, int],
-    multiple: int,
-    tmp_path: Path,
+    overrides: list[str], size: tuple[int, int], multiple: int, tmp_path: Path
 ) -> None:
     path = tmp_path / "best.ckpt"
     task = save_checkpoint(path, *overrides)
     trained = load_trained(path)
-    images = torch.randn(2, 2 + len(inputs), *size)
+    assert trained.inputs == (("rgb", "depth") if "network=unet" in overrides else ("rgb",))
+    images = torch.randn(2, trained.in_channels, *size)
     with torch.no_grad():
         torch.testing.assert_close(trained.network(images), task(images), rtol=0, atol=0)
     assert not any(module.training for module in trained.network.modules())
-    assert trained.inputs == inputs
     assert trained.image_size == size
     assert (trained.size_multiple, trained.fixed_size) == (multiple, None)
     assert trained.class_names == task.class_names
     assert trained.level == (5 if "level=5" in overrides else 4)
-    assert trained.normalization.channels == images.shape[1]
+    assert trained.normalization.channels == 2 + len(trained.inputs)
     assert trained.representation["_target_"].startswith("tangent_train.rendering.")
 
 

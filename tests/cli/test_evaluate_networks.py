@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from datamodules.stanford2d3ds.label_table import CLASSES
 from tangent_train.checkpoints.content import read_settings
-from tangent_train.rendering.upright.gravity import Gravity
 from tests.cli.tiny_runs import SMALL_ROOMS, Run, results
 from tests.inference.trained import write_checkpoint
 
@@ -130,12 +129,12 @@ def test_the_network_judges_which_way_is_up(
     """Asked in this process, once for every test panorama, before workers read them."""
     asked: list[Any] = []
 
-    def estimate(rgb: NDArray[np.uint8], max_tilt_deg: float, judge: Any) -> Gravity:
+    def estimate(rgb: NDArray[np.uint8], max_tilt_deg: float, judge: Any) -> NDArray[np.float64]:
         likely = judge(np.eye(3))
         assert likely.shape == (3,)
         assert np.isfinite(likely).all()
         asked.append(max_tilt_deg)
-        return Gravity(np.array([0.0, 0, -1]), 1.0, np.eye(3))
+        return np.array([0.0, 0, -1])
 
     monkeypatch.setattr("datamodules.core.pipeline.estimate_up", estimate)
     given = ["data.upright=auto", "data.max_tilt_deg=180", "data.num_workers=1", rooms]

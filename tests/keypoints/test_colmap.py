@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from tangent_train.geometry import FLIP_Y, PanoramaPose, lonlat_to_xyz, random_rotation
-from tangent_train.keypoints import SphericalKeypoints, TwoView
+from tangent_train.geometry import FLIP_Y, PanoramaPose, random_rotation
+from tangent_train.keypoints import TwoView
 from tangent_train.keypoints.colmap import add_pair
 from tangent_train.keypoints.two_view import estimate_two_view
 from tests.geometry.directions import random_directions, unit
@@ -21,44 +19,25 @@ SHAPE = (512, 1024)
 CAMERA_FROM_PANORAMA = np.array([[0, 1.0, 0], [0, 0, -1.0], [1.0, 0, 0]])
 
 
-class Walk(NamedTuple):
-    """Panoramas of the same points, and their pairs by numbers."""
-
-    poses: list[PanoramaPose]
-    found: list[SphericalKeypoints]
-    pairs: dict[tuple[int, int], tuple[NDArray[np.int64], TwoView]]
-
-
-def walk(count: int, path: Path) -> Walk:
+def test_colmap_reads_what_was_written(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     points_m = random_directions(250, 4) * rng.uniform(1.5, 5, (250, 1))
-    poses, found, places = [], [], []
-    for _ in range(count):
+    found, places, pairs = [], [], {}
+    for left in range(3):
         pose = PanoramaPose(random_rotation(rng) @ FLIP_Y, rng.normal(size=3) * 0.6)
         order = rng.permutation(250)
-        seen = unit(pose.seen(points_m[order])[0] + rng.normal(size=(250, 3)) * 3e-4)
-        poses.append(pose)
+        seen_xyz = pose.seen(points_m[order])[0] + rng.normal(size=(250, 3)) * 3e-4
+        found.append(keypoints_at(unit(seen_xyz)))
         places.append(np.argsort(order))
-        found.append(keypoints_at(seen))
-    pairs = {}
-    for left in range(count):
         for right in range(left):  # the order of names and of images differ
             matches = np.stack([places[left], places[right]], axis=1)
-            first, second = (
-                found[side].directions_xyz[matches[:, column]]
-                for column, side in enumerate((left, right))
-            )
-            pairs[left, right] = matches, estimate_two_view(first, second)
+            both = found[left], found[right]
+            rays = (side.directions_xyz[k] for side, k in zip(both, matches.T, strict=True))
+            pairs[left, right] = matches, estimate_two_view(*rays)
             names = f"room a/{left}.png", f"room a/{right}.png"
             for _ in range(2):  # added again it changes nothing
-                add_pair(
-                    path, names, (SHAPE, SHAPE), (found[left], found[right]), *pairs[left, right]
-                )
-    return Walk(poses, found, pairs)
-
-
-def test_colmap_reads_what_was_written(tmp_path: Path) -> None:
-    _, found, pairs = walk(3, tmp_path / "a" / "rooms.db")
+                path = tmp_path / "a" / "rooms.db"
+                add_pair(path, names, (SHAPE, SHAPE), both, *pairs[left, right])
     axes = CAMERA_FROM_PANORAMA
     with pycolmap.Database.open(tmp_path / "a" / "rooms.db") as database:
         images = {image.name: image for image in database.read_all_images()}
@@ -68,7 +47,7 @@ def test_colmap_reads_what_was_written(tmp_path: Path) -> None:
         for k, points in enumerate(found):
             image_id = images[f"room a/{k}.png"].image_id
             stored = database.read_keypoints(image_id)
-            # COLMAP's own rays of these pixels are the keypoints' directions.
+            # COLMAP's own rays of these pixels, from corners, are the keypoints' directions.
             rays = camera.cam_ray_from_img(stored[:, :2].astype(np.float64))
             np.testing.assert_allclose(rays @ axes, points.directions_xyz, atol=1e-5)
             descriptors = database.read_descriptors(image_id)
@@ -82,31 +61,6 @@ def test_colmap_reads_what_was_written(tmp_path: Path) -> None:
             assert geometry.config == pycolmap.TwoViewGeometryConfiguration.CALIBRATED.value
             rotation = axes.T @ geometry.cam2_from_cam1.rotation.matrix() @ axes
             np.testing.assert_allclose(rotation, np.asarray(two_view.rotation, np.float64))
-
-
-def test_keypoints_in_colmaps_units(tmp_path: Path) -> None:
-    # The middle of the image, a quarter to the right, near the right border, and near the top.
-    lonlat = np.radians([(0, 0), (90, -45), (179.9, 10), (20, 89)])
-    points = keypoints_at(lonlat_to_xyz(lonlat))
-    none = np.empty((0, 2), np.int64)
-    path = tmp_path / "a.db"
-    add_pair(
-        path,
-        ("a", "b"),
-        ((100, 200), (100, 200)),
-        (points, points),
-        none,
-        TwoView(np.empty(0, bool)),
-    )
-    with pycolmap.Database.open(path) as database:
-        numbers = database.read_keypoints(1)
-    # Corner-origin pixels: x = (λ + 180) / 360 · W, y = (90 − φ) / 180 · H.
-    expected = [(100, 50), (150, 75), (199.9444, 44.4444), (111.1111, 0.5556)]
-    np.testing.assert_allclose(numbers[:, :2], expected, atol=1e-4)
-    # 2° are 100/90 pixels; the area of a pixel shrinks with cos φ; the scale is half of the size.
-    scales = 100 / 90 / 2 / np.sqrt(np.cos(lonlat[:, 1]))
-    np.testing.assert_allclose(numbers[:, 2], scales, atol=1e-4)
-    np.testing.assert_allclose(numbers[:, 3], 0, atol=1e-5)
 
 
 @pytest.mark.parametrize("kind", ["PANORAMIC", "DEGENERATE"])

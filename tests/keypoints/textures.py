@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -21,12 +22,19 @@ def texture(
     directions = equirect_directions(shape)
     if rotation is not None:
         directions = directions @ np.asarray(rotation)
+    return volume_texture(directions, (10, 20, 40, 80), seed)
+
+
+def volume_texture(
+    points_xyz: NDArray[np.float64], cells: Sequence[int], seed: int = 0
+) -> NDArray[np.uint8]:
+    """Grey values of random volumes, of so many cells along a side, in the unit ball."""
     rng = np.random.default_rng(seed)
-    grey = np.zeros(shape)
-    for cells in (10, 20, 40, 80):
-        volume = rng.standard_normal((cells + 4,) * 3)
-        places = np.moveaxis((directions + 1) / 2 * cells + 1.5, -1, 0)
-        grey += map_coordinates(volume, places, order=3) * cells**-0.25
+    grey = np.zeros(points_xyz.shape[:-1])
+    for side in cells:
+        volume = rng.standard_normal((side + 4,) * 3)
+        places = np.moveaxis((points_xyz + 1) / 2 * side + 1.5, -1, 0)
+        grey += map_coordinates(volume, places, order=3) * side**-0.25
     return _as_bytes(127 + 75 * grey)
 
 

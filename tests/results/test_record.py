@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -21,7 +22,6 @@ def test_a_record_is_read_as_it_was_written(tmp_path: Path) -> None:
     read = load_record(write_run(tmp_path / "a", record))
     assert read.json() == record.json()
     assert read.settings == record.settings
-    assert read.intervals == record.intervals
     assert (read.fold, read.seed, read.data) == (1, 0, "Stanford2D3DS")
     assert read.bands == BANDS
     assert read.score("miou", BANDS[1]) == 0.25
@@ -46,11 +46,10 @@ def test_runs_are_found_once_and_unfinished_ones_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (None, "FileNotFoundError"),
-        ("{", "JSONDecodeError"),
-        ("[]", "TypeError"),
-        ('{"kind": "segmentation"}', "KeyError: 'macc'"),
-        ('{"kind": "keypoints"}', "KeyError"),
+        (None, "No such file"),
+        ("{", "Expecting property name"),
+        ("[]", "list instead of a mapping"),
+        ('{"kind": "keypoints"}', "kind='keypoints'"),
         ("[" * 100_000, "nested too deeply"),
     ],
 )
@@ -63,25 +62,17 @@ def test_broken_results_are_named(content: str | None, message: str, tmp_path: P
         load_record(path.parent)
 
 
+@pytest.mark.parametrize("value", ["0.5", True])
 @pytest.mark.parametrize(
-    ("place", "value"),
-    [
-        *(("miou", value) for value in (52.5, "0.5", True, -0.1, float("nan"))),
-        ("classes", 52.5),
-        ("latitude_bands", -0.1),
-        *(
-            ("intervals", value)
-            for value in ([0.5], [0.1, 0.2, 0.3], [None, 0.5], [0.1, 1.5], "01")
-        ),
-    ],
+    "place",
+    [["miou"], ["classes", 0, "iou"], ["latitude_bands", 0, "miou"], ["intervals", "miou"]],
 )
-def test_scores_must_be_shares(place: str, value: object, tmp_path: Path) -> None:
+def test_scores_must_be_numbers(place: list[Any], value: Any, tmp_path: Path) -> None:
     path = write_run(tmp_path / "a", made_record(SCORES, bands=(0.5,))) / "results.json"
-    results = json.loads(path.read_text())
-    if place in ("classes", "latitude_bands"):
-        results[place][0]["iou" if place == "classes" else "miou"] = value
-    else:
-        results[place] = {"miou": value} if place == "intervals" else value
+    part = results = json.loads(path.read_text())
+    for name in place[:-1]:
+        part = part[name]
+    part[place[-1]] = value
     path.write_text(json.dumps(results))
-    with pytest.raises(DataError, match=r"results\.json: found ValueError: "):
+    with pytest.raises(DataError, match=r"results\.json: found (miou|iou|intervals)="):
         load_record(path.parent)

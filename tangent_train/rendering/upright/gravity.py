@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,12 +14,11 @@ from tangent_train.rendering.upright.cues import up_probabilities
 from tangent_train.rendering.upright.line_segments import LineSegments, find_line_segments
 from tangent_train.rendering.upright.manhattan import ManhattanFrame, find_manhattan_frames
 
-__all__ = ["Gravity", "Judge", "estimate_up", "up_from_pose", "upright_rotation"]
+__all__ = ["Judge", "estimate_up", "up_from_pose", "upright_rotation"]
 
 Judge = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 """Maps directions ``(n, 3)`` to log-likelihoods ``(n,)`` of being up, up to a constant."""
 
-_UP = np.array([0.0, 0.0, 1.0])
 _EVEN_CHANCE = 3.1  # significance of frames of which half are right
 _STEEPNESS = 3.0
 _ACCEPTED = 0.5
@@ -31,29 +29,9 @@ _LEAST_ROWS = 64
 _DISTINCT = np.cos(np.radians(6))
 
 
-class Gravity(NamedTuple):
-    """An estimate of the direction of up.
-
-    Attributes:
-        up: ``(3,)`` unit vector in the panorama's frame (`tangent_train.geometry`): where the
-            zenith is seen. ``(0, 0, 1)``, as if it were upright, where nothing was found.
-        confidence: Estimated probability, from 0 to 1, that it is right; 0 where nothing was found.
-        candidates: ``(n, 3)`` all directions considered, the most probable first, accepted or not.
-    """
-
-    up: NDArray[np.float64]
-    confidence: float
-    candidates: NDArray[np.float64]
-
-    @property
-    def found(self) -> NDArray[np.float64] | None:
-        """`up`, where one was found."""
-        return self.up if self.confidence else None
-
-
 def estimate_up(
     rgb: NDArray[np.uint8], max_tilt_deg: float = 60.0, judge: Judge | None = None
-) -> Gravity:
+) -> NDArray[np.float64] | None:
     """Estimate the direction of up from the straight edges of rooms and buildings.
 
     Most of them follow three directions at right angles, one of which is the vertical: the frame
@@ -85,14 +63,13 @@ def estimate_up(
     if not 0 < max_tilt_deg <= 180:
         raise SettingError("max_tilt_deg", found=max_tilt_deg, expected="above 0, at most 180")
     if rgb.shape[0] < _LEAST_ROWS:
-        return Gravity(_UP.copy(), 0.0, np.zeros((0, 3)))
+        return None
     segments = find_line_segments(rgb)
     frames = find_manhattan_frames(segments)
     lowest = math.cos(math.radians(max_tilt_deg)) - 1e-9
     directions, chances = _candidates(rgb, segments, frames, lowest, judge)
-    if not len(chances) or chances[0] < _ACCEPTED:
-        return Gravity(_UP.copy(), 0.0, directions)
-    return Gravity(directions[0].copy(), float(chances[0]), directions)
+    best = int(chances.argmax()) if len(chances) else None
+    return None if best is None or chances[best] < _ACCEPTED else directions[best]
 
 
 def _candidates(
@@ -102,7 +79,7 @@ def _candidates(
     lowest: float,
     judge: Judge | None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Directions of up in reach ``(n, 3)`` and their probabilities ``(n,)``, best first."""
+    """Directions of up in reach ``(n, 3)`` and their probabilities ``(n,)``."""
     # A logit model of all frames and of none of them; frames with the same vertical add up.
     odds = [math.exp(_STEEPNESS * (frame.significance - _EVEN_CHANCE)) for frame in frames]
     directions = np.zeros((0, 3))
@@ -127,8 +104,7 @@ def _candidates(
             else:
                 directions = np.concatenate([directions, axis[None]])
                 chances = np.append(chances, share)
-    order = np.argsort(-chances, kind="stable")
-    return directions[order], chances[order] / (1 + sum(odds))
+    return directions, chances / (1 + sum(odds))
 
 
 def upright_rotation(up: ArrayLike) -> NDArray[np.float64]:

@@ -30,14 +30,12 @@ class ManhattanFrame(NamedTuple):
 
     Attributes:
         axes_xyz: ``(3, 3)`` unit directions as columns, of either sign and in any order.
-        support: ``(3,)`` share of all segments that follows each, by weight.
-        significance: By how many standard deviations that is more than segments of random
-            directions would have at a given frame. Of the best of all frames it is about 1.5
+        significance: By how many standard deviations more segments follow them than would with
+            random directions at a given frame. Of the best of all frames it is about 1.5
             for random segments, never above 2.
     """
 
     axes_xyz: NDArray[np.float64]
-    support: NDArray[np.float64]
     significance: float
 
 
@@ -165,7 +163,7 @@ def _same(axes: NDArray[np.float64], others: NDArray[np.float64]) -> bool:
 def _assessed(
     axes: NDArray[np.float64], segments: LineSegments, weights: NDArray[np.float64]
 ) -> ManhattanFrame:
-    column, agreement = followed_axes(segments, axes)
-    support = np.bincount(column, weights * agreement, minlength=3) / weights.sum()
+    _, agreement = followed_axes(segments, axes)
+    support = (weights * agreement).sum() / weights.sum()
     number = weights.sum() ** 2 / (weights**2).sum()
-    return ManhattanFrame(axes, support, float((support.sum() - _CHANCE) * np.sqrt(number)))
+    return ManhattanFrame(axes, float((support - _CHANCE) * np.sqrt(number)))

@@ -1,4 +1,4 @@
-"""Writing the report as one self-contained HTML file."""
+"""The report as one self-contained HTML file, with compressed panoramas and photos."""
 
 from __future__ import annotations
 
@@ -9,18 +9,133 @@ from base64 import b64encode
 from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, NamedTuple, TextIO
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
 
 from datamodules.images.palette import class_colors
 from tangent_train.files import atomic_path
-from tangent_train.results.html.images import EncodedImage
+from tangent_train.geometry import equirect_solid_angles
 from tangent_train.results.tables import Table
 
-__all__ = ["write_report"]
+__all__ = ["BUDGET_BYTES", "MOST_PIXELS", "EncodedImage", "encode_image", "write_report"]
+
+BUDGET_BYTES = 8_000_000
+"""Of the HTML file, for one image with its label maps."""
+
+MOST_PIXELS = 4096
+"""The longer side of an image in the report."""
+
+_THUMBNAIL_PIXELS = 216
+_JPEG = (cv2.IMWRITE_JPEG_QUALITY, 88)
+_PNG = (cv2.IMWRITE_PNG_COMPRESSION, 6)
 
 _SCRIPTS = ("view.js", "surfaces.js", "gestures.js", "viewer.js")
 _IMAGES = "<!--images-->\n"
 _PLACEHOLDER = re.compile(r"\{\{(\w+)\}\}")
+
+
+class EncodedImage(NamedTuple):
+    """A compressed image of the viewer, with its label maps; see `encode_image`.
+
+    Attributes:
+        name: Shown beside it.
+        note: A line about it, such as a score.
+        sphere: Whether it is a whole equirectangular panorama; others are shown flat.
+        width: Columns of the image before it was compressed.
+        height: Rows of the image before it was compressed.
+        input: The image, a JPEG.
+        thumbnail: A small JPEG of it.
+        prediction: 8-bit grey PNG of class indices, perhaps of fewer pixels.
+        truth: Likewise.
+        shares: ``(class index, share of the truth, share of the prediction)``, without the maps
+            that are missing, of the classes that appear; by solid angle on panoramas.
+    """
+
+    name: str
+    note: str
+    sphere: bool
+    width: int
+    height: int
+    input: bytes
+    thumbnail: bytes
+    prediction: bytes | None
+    truth: bytes | None
+    shares: tuple[tuple[float, ...], ...]
+
+
+def encode_image(
+    name: str,
+    rgb: NDArray[np.uint8],
+    class_count: int,
+    *,
+    prediction: NDArray[np.integer] | None = None,
+    truth: NDArray[np.integer] | None = None,
+    sphere: bool = True,
+    note: str = "",
+    budget_bytes: int = BUDGET_BYTES,
+) -> EncodedImage:
+    """Compress an image to its share of the report.
+
+    Sides longer than `MOST_PIXELS` are downsampled, colours by area, labels by nearest neighbour,
+    then halved until they fit.
+
+    Args:
+        name: Shown beside it.
+        rgb: ``(H, W, 3)`` the image.
+        class_count: K + 1, the unknown class 0 included; at most 256.
+        prediction: ``(h, w)`` class indices, 0 where there is none; of any size.
+        truth: ``(h, w)`` class indices, 0 unknown; of any size.
+        sphere: Whether it is a whole equirectangular panorama.
+        note: A line about it.
+        budget_bytes: Of the HTML file, where files are written in base64.
+    """
+    maps = {"truth": truth, "prediction": prediction}
+    labels = {k: v.astype(np.uint8, copy=False) for k, v in maps.items() if v is not None}
+    thumbnail = _jpeg(rgb, _THUMBNAIL_PIXELS)
+    room, side = budget_bytes * 3 // 4 - len(thumbnail), MOST_PIXELS
+    while True:
+        small = {k: _shrunk(v, side, cv2.INTER_NEAREST_EXACT) for k, v in labels.items()}
+        pngs = {k: cv2.imencode(".png", v, _PNG)[1].tobytes() for k, v in small.items()}
+        jpeg = _jpeg(rgb, side)
+        if len(jpeg) + sum(map(len, pngs.values())) <= room or side == 1:
+            break
+        side //= 2
+    height, width = rgb.shape[:2]
+    both = pngs.get("prediction"), pngs.get("truth")
+    shares = _shares(list(small.values()), class_count, sphere=sphere)
+    return EncodedImage(name, note, sphere, width, height, jpeg, thumbnail, *both, shares)
+
+
+def _shrunk(pixels: NDArray[np.uint8], side: int, interpolation: int) -> NDArray[np.uint8]:
+    """With a longer side of at most `side` pixels."""
+    scale = side / max(pixels.shape[:2])
+    if scale >= 1:
+        return pixels
+    height, width = (max(1, round(length * scale)) for length in pixels.shape[:2])
+    resized: Any = cv2.resize(pixels, (width, height), interpolation=interpolation)
+    return resized
+
+
+def _jpeg(rgb: NDArray[np.uint8], side: int) -> bytes:
+    bgr = cv2.cvtColor(_shrunk(rgb, side, cv2.INTER_AREA), cv2.COLOR_RGB2BGR)
+    return cv2.imencode(".jpg", bgr, _JPEG)[1].tobytes()
+
+
+def _shares(
+    maps: Sequence[NDArray[np.uint8]], class_count: int, *, sphere: bool
+) -> tuple[tuple[float, ...], ...]:
+    shares = []
+    for indices in maps:
+        # Row by row: no array of weights as large as the image.
+        counts = np.stack([np.bincount(row, minlength=class_count) for row in indices])
+        height, width = indices.shape
+        weights = equirect_solid_angles((height, width)) if sphere else np.ones(height)
+        weighed = weights.reshape(-1) @ counts
+        shares.append(weighed / weighed.sum())
+    return tuple((k, *map(float, of)) for k, of in enumerate(zip(*shares, strict=True)) if any(of))
 
 
 def write_report(
@@ -82,27 +197,15 @@ def _write_image(file: TextIO, image: EncodedImage) -> None:
         f'{_base64(image.thumbnail)}"><span class="name">{html.escape(image.name)}</span>{note}'
         '</button>\n<script type="application/json">'
     )
-    file.write(
-        _json(
-            {
-                "name": image.name,
-                "note": image.note,
-                "sphere": image.sphere,
-                "width": image.width,
-                "height": image.height,
-                "shares": image.shares,
-                "input": _base64(image.jpeg),
-                "truth": image.truth and _base64(image.truth),
-                "prediction": image.prediction and _base64(image.prediction),
-            }
-        )
-    )
-    file.write("</script></li>\n")
+    content = image._asdict()
+    del content["thumbnail"]
+    file.write(f"{_json(content)}</script></li>\n")
 
 
 def _json(content: Any) -> str:
     """JSON that can neither close the script element around it nor start a comment in it."""
-    return json.dumps(content, separators=(",", ":")).replace("<", "\\u003c")
+    text = json.dumps(content, separators=(",", ":"), default=_base64)
+    return text.replace("<", "\\u003c")
 
 
 def _base64(content: bytes) -> str:

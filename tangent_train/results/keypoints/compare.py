@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -91,8 +90,8 @@ class Comparison(NamedTuple):
     """
 
     rows: list[Row]
-    found: Mapping[str, Mapping[str, MatchedPair]]
-    images: Mapping[str, tuple[NDArray[np.uint8], NDArray[np.uint8]]]
+    found: dict[str, dict[str, MatchedPair]]
+    images: dict[str, tuple[NDArray[np.uint8], NDArray[np.uint8]]]
 
 
 @dataclass(frozen=True)
@@ -163,38 +162,38 @@ class Comparer:
         """
         level = self._level(pair)
         sides = (pair.left, pair.right)
+        images = [_shrunk(side.rgb, equirect_shape(level)[0]) for side in sides]
         # A panorama of the pair before is not searched again.
-        self._kept = {(side.name, level): self._kept.get((side.name, level), {}) for side in sides}
-        left, right = (_at_level(side.rgb, level) for side in sides)
-        rotations = {AS_GIVEN: np.eye(3)}
+        self._kept = {
+            (side.name, level): self._kept.get((side.name, level)) or self._detect(image, level)
+            for side, image in zip(sides, images, strict=True)
+        }
+        left, right = (self._kept[side.name, level] for side in sides)
+        conditions = {AS_GIVEN: (np.eye(3), images[1], right)}
         if self.ways.controls:
             rng = np.random.default_rng([self.ways.seed, zlib.crc32(pair.name.encode())])
-            rotations[ROTATED] = random_rotation(rng)
+            rotation = random_rotation(rng)
+            image = rotate_equirect(images[1], rotation)
+            conditions[ROTATED] = rotation, image, self._detect(image, level)
         views = [_depth_view(side) for side in sides]
         overlap = None if None in views else _defined(fov_overlap(*views))  # type: ignore[arg-type]
-        rows: list[Row] = []
-        found: dict[str, dict[str, MatchedPair]] = {}
-        images: dict[str, tuple[NDArray[np.uint8], NDArray[np.uint8]]] = {}
-        for condition, rotation in rotations.items():
-            images[condition] = (
-                left,
-                right if condition == AS_GIVEN else rotate_equirect(right, rotation),
-            )
-            found[condition] = self._matched(pair, images[condition], level, condition)
-            for name, one in found[condition].items():
-                row = {
-                    "pair": pair.name,
-                    "split": pair.split,
-                    "left": pair.left.name,
-                    "right": pair.right.name,
-                    "level": level,
-                    "fov_overlap": overlap,
-                    "visible_by": "all keypoints" if overlap is None else "depth",
-                    "condition": condition,
-                    "representation": name,
-                }
-                rows.append(row | self._figures(one, rotation, *views))
-        return Comparison(rows, found, images)
+        known = {
+            "pair": pair.name,
+            "split": pair.split,
+            "left": pair.left.name,
+            "right": pair.right.name,
+            "level": level,
+            "fov_overlap": overlap,
+            "visible_by": "all keypoints" if overlap is None else "depth",
+        }
+        comparison = Comparison([], {}, {})
+        for condition, (rotation, image, right) in conditions.items():
+            found = {name: self._matched(left[name], right[name]) for name in left}
+            comparison.images[condition], comparison.found[condition] = (images[0], image), found
+            for name, one in found.items():
+                row = known | {"condition": condition, "representation": name}
+                comparison.rows.append(row | self._figures(one, rotation, *views))
+        return comparison
 
     def _level(self, pair: PanoramaPair) -> int:
         rows = max(side.rgb.shape[0] for side in (pair.left, pair.right))
@@ -204,48 +203,26 @@ class Comparer:
             raise SettingError("level", found=self.ways.level, expected=expected)
         return own if self.ways.level is None else self.ways.level
 
-    def _matched(
-        self,
-        pair: PanoramaPair,
-        images: tuple[NDArray[np.uint8], NDArray[np.uint8]],
-        level: int,
-        condition: str,
-    ) -> dict[str, MatchedPair]:
-        grids: dict[str, TangentGrid | CubeGrid]
-        grids = {f"L{b}": TangentGrid(b, level) for b in self.ways.base_level}
-        grids[CUBE] = CubeGrid(2**level)
-        found: dict[str, MatchedPair] = {}
-        for name in self.ways.representations:
-            both = []
-            for side, image in zip((pair.left, pair.right), images, strict=True):
-                rotated = condition == ROTATED and side is pair.right
-                kept = {} if rotated else self._kept[side.name, level]
-                if name not in kept:
-                    kept[name] = self._detect(image, level, name, grids.get(name))
-                both.append(kept[name])
-            left, right = both
-            matches = match(
-                left.descriptors,
-                right.descriptors,
-                Detector(self.ways.detector).norm,
-                self.ways.ratio,
-                mutual=self.ways.mutual,
-            )
-            rays = left.directions_xyz[matches[:, 0]], right.directions_xyz[matches[:, 1]]
-            geometry = estimate_two_view(*rays, self.ways.max_error_deg, seed=self.ways.seed)
-            found[name] = MatchedPair(left, right, matches, geometry)
+    def _detect(self, rgb: NDArray[np.uint8], level: int) -> dict[str, SphericalKeypoints]:
+        """Keypoints of a panorama by representation, in the order of `Ways.representations`."""
+        detector = Detector(self.ways.detector)
+        found = {"ERP": detect_on_equirect(rgb, detector)}
+        grids: dict[str, TangentGrid | CubeGrid] = {}
+        if self.ways.controls:
+            found[SHRUNK] = detect_on_equirect(_shrunk(rgb, shrunk_rows(level)), detector)
+            grids[CUBE] = CubeGrid(2**level)
+        grids |= {f"L{b}": TangentGrid(b, level) for b in self.ways.base_level}
+        for name, grid in grids.items():
+            found[name] = detect_on_tangent_images(rgb, grid, detector, self.ways.margin)
         return found
 
-    def _detect(
-        self, rgb: NDArray[np.uint8], level: int, name: str, grid: TangentGrid | CubeGrid | None
-    ) -> SphericalKeypoints:
-        if grid is not None:
-            return detect_on_tangent_images(
-                rgb, grid, Detector(self.ways.detector), self.ways.margin
-            )
-        if name == SHRUNK:
-            rgb = _shrunk(rgb, shrunk_rows(level))
-        return detect_on_equirect(rgb, Detector(self.ways.detector))
+    def _matched(self, left: SphericalKeypoints, right: SphericalKeypoints) -> MatchedPair:
+        ways = self.ways
+        both = left.descriptors, right.descriptors
+        matches = match(*both, Detector(ways.detector).norm, ways.ratio, mutual=ways.mutual)
+        rays = left.directions_xyz[matches[:, 0]], right.directions_xyz[matches[:, 1]]
+        geometry = estimate_two_view(*rays, ways.max_error_deg, seed=ways.seed)
+        return MatchedPair(left, right, matches, geometry)
 
     def _figures(
         self,
@@ -330,10 +307,6 @@ def shrunk_rows(level: int) -> int:
     1453
     """
     return round(math.pi / TangentGrid(0, level).pitch)
-
-
-def _at_level(rgb: NDArray[np.uint8], level: int) -> NDArray[np.uint8]:
-    return _shrunk(rgb, equirect_shape(level)[0])
 
 
 def _shrunk(rgb: NDArray[np.uint8], rows: int) -> NDArray[np.uint8]:

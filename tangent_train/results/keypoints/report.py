@@ -41,14 +41,14 @@ _METRICS = {
 }
 """Columns of the rows by what tables call them."""
 
-_BY_DEPTH = (
-    "n_L and n_R are the keypoints visible to the other panorama, by depth and pose and with "
-    "occlusion."
-)
-_ALL = (
-    "n_L and n_R are all keypoints, as depth and pose are unknown: PMR and MS are smaller than "
-    "among the visible ones."
-)
+_VISIBLE = {
+    "depth": "n_L and n_R are the keypoints visible to the other panorama, by depth and pose and "
+    "with occlusion.",
+    "all keypoints": "n_L and n_R are all keypoints, as depth and pose are unknown: PMR and MS are "
+    "smaller than among the visible ones.",
+}
+"""What tables say of n_L and n_R."""
+
 _MOST_LINES = 150
 
 
@@ -81,11 +81,8 @@ class KeypointReport:
     def markdown(self) -> str:
         """All tables."""
         settings = ", ".join(f"{k} {v}" for k, v in self.settings.items() if k != "data")
-        by_depth = {row["visible_by"] == "depth" for row in self.rows}
-        head = [f"# Keypoints\n\nSettings: {settings}.\n"]
-        head += [
-            f"{text}\n" for known, text in ((True, _BY_DEPTH), (False, _ALL)) if known in by_depth
-        ]
+        visible = dict.fromkeys(f"{_VISIBLE[row['visible_by']]}\n" for row in self.rows)
+        head = [f"# Keypoints\n\nSettings: {settings}.\n", *visible]
         tables = [*self.means(), *map(self._per_pair, self._conditions())]
         return "\n".join([*head, *(table.markdown() for table in tables)])
 
@@ -93,13 +90,8 @@ class KeypointReport:
         """Means over the pairs of each split, a table for each condition."""
         header = ("split", "metric", *self.representations)
         return [
-            Table(
-                _CONDITIONS[condition],
-                header,
-                list(self._mean_rows(condition)),
-                text_columns=(0, 1),
-            )
-            for condition in self._conditions()
+            Table(_CONDITIONS[c], header, list(self._mean_rows(c)), text_columns=(0, 1))
+            for c in self._conditions()
         ]
 
     def _conditions(self) -> list[str]:
@@ -110,16 +102,12 @@ class KeypointReport:
         for split, rows in _by_split(self.rows).items():
             printed = _paper().get(split, {}) if self.published and condition == AS_GIVEN else {}
             title = f"{split} ({len({row['pair'] for row in rows})})"
+            of = _grouped([row for row in rows if row["condition"] == condition], "representation")
             for metric, key in _METRICS.items():
-                values = [
-                    [
-                        r[key]
-                        for r in rows
-                        if (r["condition"], r["representation"]) == (condition, n)
-                    ]
-                    for n in self.representations
+                known = [
+                    [row[key] for row in of.get(name, ()) if row[key] is not None]
+                    for name in self.representations
                 ]
-                known = [[value for value in column if value is not None] for column in values]
                 if not any(known) and key not in _SCORES.values():
                     continue
                 average = np.median if metric.endswith("median") else np.mean
@@ -185,7 +173,7 @@ def _paper() -> dict[str, dict[str, dict[str, str]]]:
     """The tables of the paper by split, figure and representation."""
     text = Path(__file__).with_name("paper.csv").read_text(encoding="utf-8")
     found: dict[str, dict[str, dict[str, str]]] = {}
-    for row in csv.DictReader(io.StringIO(text)):
+    for row in csv.DictReader(text.splitlines()):
         found.setdefault(row["split"], {})[row["figure"]] = row
     return found
 

@@ -20,7 +20,6 @@ from datamodules.core.pipeline import (
 from datamodules.core.reading import ImageFiles
 from tangent_train.errors import DataError
 from tangent_train.geometry import equirect_directions
-from tangent_train.rendering.upright.gravity import Gravity
 
 FILES = [ImageFiles(name, Path(name), Path("labels")) for name in ("0", "1")]
 UP = np.array([0.6, 0.0, 0.8])
@@ -84,24 +83,22 @@ def test_files_are_asked_once_where_up_is(monkeypatch: pytest.MonkeyPatch) -> No
     assert asked == ["0", "1"]
 
 
-@pytest.mark.parametrize("confidence", [0.0, 0.9])
+@pytest.mark.parametrize("found", [None, UP])
 def test_only_what_nothing_says_is_estimated_and_only_once(
-    monkeypatch: pytest.MonkeyPatch, confidence: float
+    monkeypatch: pytest.MonkeyPatch, found: NDArray[np.float64] | None
 ) -> None:
     asked: list[float] = []
 
-    def estimate(rgb: NDArray[np.uint8], max_tilt_deg: float, judge: Any) -> Gravity:
+    def estimate(rgb: NDArray[np.uint8], max_tilt_deg: float, judge: Any) -> Any:
         assert judge is None
         asked.append(max_tilt_deg)
-        return Gravity(UP if confidence else np.array([0.0, 0, 1]), confidence, UP[None])
+        return found
 
     monkeypatch.setattr("datamodules.core.pipeline.estimate_up", estimate)
     upright = EstimatedUp(50)
     for _ in range(2):
         np.testing.assert_array_equal(upright(_heights()._replace(up=-UP), 1, FILES[1]).up, -UP)
-        np.testing.assert_array_equal(
-            upright(_heights(), 0, FILES[0]).up, UP if confidence else None
-        )
+        assert upright(_heights(), 0, FILES[0]).up is found
     assert asked == [50]
 
 
@@ -112,10 +109,10 @@ def test_a_judge_sees_the_panorama_and_stays_in_its_process(
         np.testing.assert_array_equal(panorama.rgb, _heights().rgb)
         return -ups[:, 0]
 
-    def estimate(rgb: NDArray[np.uint8], max_tilt_deg: float, judge: Any) -> Gravity:
+    def estimate(rgb: NDArray[np.uint8], max_tilt_deg: float, judge: Any) -> Any:
         up = np.array([-1.0, 0, 0])
         assert judge is None or judge(np.eye(3)).argmax() != 0
-        return Gravity(up if judge is not None else UP, 1.0, UP[None])
+        return up if judge is not None else UP
 
     monkeypatch.setattr("datamodules.core.pipeline.estimate_up", estimate)
     upright = EstimatedUp(180, judge)

@@ -25,19 +25,6 @@ from tests.rendering.drawn_room import draw_room
 _NO_SEGMENTS = LineSegments(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
 
 
-def test_names_and_signs_of_the_axes_do_not_matter() -> None:
-    room = draw_room((128, 256), np.eye(3))
-    segments = find_line_segments(room)
-    expected = up_probabilities(room, segments, np.eye(3))
-    np.testing.assert_allclose(expected.sum(), 1)
-    assert expected.argmax() == 2
-    # Column j of the new axes is `sign` times axis `order[j]`.
-    order, sign = [1, 2, 0], np.array([1, -1, -1])
-    found = up_probabilities(room, segments, np.eye(3)[:, order] * sign)
-    place = np.array([one + (0 if s > 0 else 3) for one, s in zip(order, sign, strict=True)])
-    np.testing.assert_allclose(found, expected[[*place, *(place + 3) % 6]], rtol=1e-9)
-
-
 def _lit(from_xyz: NDArray[np.float64]) -> NDArray[np.uint8]:
     bright = equirect_directions((64, 128)) @ from_xyz > 0
     return np.repeat(np.where(bright, 220, 40).astype(np.uint8)[..., None], 3, axis=-1)
@@ -65,6 +52,7 @@ def test_what_is_measured_of_segments() -> None:
     # The planes of the four hold the vertical, and a level axis as well: each counts once.
     assert even.shape == (3, 5)
     np.testing.assert_allclose(even[:, 0].sum(), 1)
+    np.testing.assert_allclose(even[0, 3], 1)  # what follows the first axis lies on it
     np.testing.assert_allclose(even[2, 1], 4 / 6)
     np.testing.assert_allclose(even[2, 2], (1 / 6) / 0.15)
     np.testing.assert_allclose(odd[2, 1], -0.9)  # clutter, at −1 and −0.8
@@ -72,9 +60,8 @@ def test_what_is_measured_of_segments() -> None:
 
 
 @pytest.mark.parametrize("height", [128, 700])
-@pytest.mark.parametrize("seed", range(2))
-def test_an_edge_all_around_is_found_on_its_great_circle(height: int, seed: int) -> None:
-    normal = unit(np.random.default_rng(seed).normal(size=3))
+def test_an_edge_all_around_is_found_on_its_great_circle(height: int) -> None:
+    normal = unit(np.random.default_rng(height).normal(size=3))
     side = np.clip(equirect_directions((height, 2 * height)) @ normal * height / 3, -1, 1)
     gray = (130 + 60 * side).astype(np.uint8)
     segments = find_line_segments(np.repeat(gray[..., None], 3, axis=-1))
@@ -89,42 +76,27 @@ def test_an_edge_all_around_is_found_on_its_great_circle(height: int, seed: int)
     assert np.all(np.diff(segments.lengths_rad) <= 0)
 
 
-def _segments(
-    axes: NDArray[np.float64], counts: tuple[int, int, int], others: int, seed: int = 0
-) -> LineSegments:
-    """Exact segments along three axes, and some of random directions."""
-    rng = np.random.default_rng(seed)
-    along = np.concatenate([np.repeat(axes.T, counts, axis=0), unit(rng.normal(size=(others, 3)))])
-    normals = unit(np.cross(along, rng.normal(size=along.shape)))
-    middles = unit(np.cross(normals, rng.normal(size=along.shape)))
-    return LineSegments(normals, middles, rng.uniform(0.1, 0.6, len(along)))
-
-
 @pytest.mark.parametrize("counts", [(20, 20, 20), (40, 15, 0), (5, 30, 5)])
-@pytest.mark.parametrize("seed", range(2))
-def test_frames_of_exact_segments(counts: tuple[int, int, int], seed: int) -> None:
-    axes = random_rotation(np.random.default_rng(seed))
-    segments = _segments(axes, counts, others=30, seed=seed)
+def test_frames_of_exact_segments(counts: tuple[int, int, int]) -> None:
+    rng = np.random.default_rng(0)
+    axes = random_rotation(rng)
+    others = unit(rng.normal(size=(30, 3)))
+    along = np.concatenate([np.repeat(axes.T, counts, axis=0), others])
+    normals, middles = (unit(np.cross(along, rng.normal(size=along.shape))) for _ in range(2))
+    segments = LineSegments(normals, middles, rng.uniform(0.1, 0.6, len(along)))
     frame = find_manhattan_frames(segments)[0]
     agreement = np.abs(frame.axes_xyz.T @ axes)
     np.testing.assert_allclose(np.sort(agreement, axis=1), np.tile([0, 0, 1.0], (3, 1)), atol=0.02)
     np.testing.assert_allclose(frame.axes_xyz.T @ frame.axes_xyz, np.eye(3), atol=1e-9)
-    order = agreement.argmax(axis=0)
-    weights = np.minimum(segments.lengths_rad, 0.5)
-    exact = np.add.reduceat(np.append(weights, 0), [0, *np.cumsum(counts)])[:3] * (
-        np.array(counts) > 0
-    )
-    assert np.all(frame.support[order] >= 0.9 * exact / weights.sum())
     assert frame.significance > 3
 
 
-@pytest.mark.parametrize("count", [4, 40])
+@pytest.mark.parametrize("count", [4, 200])
 def test_random_segments_are_not_significant(count: int) -> None:
-    best = [
-        find_manhattan_frames(_segments(np.eye(3), (0, 0, 0), count, seed))[0].significance
-        for seed in range(10)
-    ]
-    assert max(best) < 2.2
+    for seed in range(5):
+        normals, middles = unit(np.random.default_rng(seed).normal(size=(2, count, 3)))
+        segments = LineSegments(normals, middles, np.linspace(0.1, 0.6, count))
+        assert find_manhattan_frames(segments)[0].significance < 1.8
 
 
 _UP = np.array([0.0, 0.0, 1.0])
@@ -139,6 +111,12 @@ def _tilted(tilt_deg: float, azimuth_deg: float, yaw_deg: float) -> NDArray[np.f
 # From the picture
 
 
+def _up(*given: Any) -> NDArray[np.float64]:
+    up = estimate_up(*given)
+    assert up is not None
+    return up
+
+
 @pytest.mark.parametrize("shape", [(128, 256), (151, 303)])
 @pytest.mark.parametrize(
     ("tilt_deg", "azimuth_deg", "yaw_deg"),
@@ -148,22 +126,13 @@ def test_tilted_rooms(
     shape: tuple[int, int], tilt_deg: float, azimuth_deg: float, yaw_deg: float
 ) -> None:
     turn = _tilted(tilt_deg, azimuth_deg, yaw_deg)
-    gravity = estimate_up(draw_room(shape, turn))
-    assert angle_deg(gravity.up, turn[:, 2]) < 0.5
-    assert 0.9 < gravity.confidence <= 1
-    np.testing.assert_array_equal(gravity.candidates[0], gravity.up)
-    np.testing.assert_allclose(np.linalg.norm(gravity.candidates, axis=1), 1)
+    assert angle_deg(_up(draw_room(shape, turn)), turn[:, 2]) < 0.5
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_rooms_held_at_any_angle(seed: int) -> None:
     turn = random_rotation(np.random.default_rng(seed))
-    gravity = estimate_up(draw_room((128, 256), turn), max_tilt_deg=180)
-    assert angle_deg(gravity.up, turn[:, 2]) < 0.5
-    assert len(gravity.candidates) >= 6
-    # All axes of the room are candidates, upside down as well.
-    for axis in (*turn.T, *-turn.T):
-        assert min(angle_deg(axis, one) for one in gravity.candidates) < 0.5
+    assert angle_deg(_up(draw_room((128, 256), turn), 180), turn[:, 2]) < 0.5
 
 
 def test_a_judge_chooses_among_the_axes_of_the_best_frame(
@@ -187,9 +156,7 @@ def test_a_judge_chooses_among_the_axes_of_the_best_frame(
         assert min(angle_deg(axis, one) for axis in (*turn.T, *-turn.T)) < 0.5
     assert (axes @ axes.T - np.eye(6) < 0.01).all()
     for wanted in axes:
-        gravity = estimate_up(room, 180, judge)
-        np.testing.assert_array_equal(gravity.up, wanted)
-        assert gravity.confidence > 0.9
+        np.testing.assert_array_equal(estimate_up(room, 180, judge), wanted)
 
 
 def test_what_is_hopeless_or_the_only_one_is_not_judged(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -197,26 +164,24 @@ def test_what_is_hopeless_or_the_only_one_is_not_judged(monkeypatch: pytest.Monk
         raise AssertionError(ups)
 
     turn = _tilted(3, 200, 180)
-    assert angle_deg(estimate_up(draw_room((128, 256), turn), 60, judge).up, turn[:, 2]) < 0.5
+    assert angle_deg(_up(draw_room((128, 256), turn), 60, judge), turn[:, 2]) < 0.5
     estimate_up(_without_structure()["black"], 180, judge)
     certain = np.array([0.001, 0.001, 0.996, 0.001, 0.001, 0])
     place = "tangent_train.rendering.upright.gravity.up_probabilities"
     monkeypatch.setattr(place, lambda *_: certain)
-    assert estimate_up(draw_room((128, 256), turn), 180, judge).confidence > 0.9
+    assert estimate_up(draw_room((128, 256), turn), 180, judge) is not None
 
 
 def test_upside_down() -> None:
     turn = rotation_about((1, 0, 0), math.pi)
     room = draw_room((128, 256), turn)
-    assert angle_deg(estimate_up(room, 180).up, -_UP) < 0.5
+    assert angle_deg(_up(room, 180), -_UP) < 0.5
     # Not to be considered: the axis that is nearest to upright is that of the floor.
-    assert angle_deg(estimate_up(room).up, _UP) < 0.5
+    assert angle_deg(_up(room), _UP) < 0.5
 
 
 def test_no_direction_beyond_the_largest_tilt() -> None:
-    gravity = estimate_up(draw_room((128, 256), _tilted(20, 0, 45)), max_tilt_deg=5)
-    assert angle_deg(gravity.up, _UP) < 5
-    assert all(angle_deg(one, _UP) < 5 for one in gravity.candidates)
+    assert estimate_up(draw_room((128, 256), _tilted(20, 0, 45)), max_tilt_deg=5) is None
     with pytest.raises(SettingError, match="max_tilt_deg: found 181"):
         estimate_up(draw_room((8, 16), np.eye(3)), max_tilt_deg=181)
 
@@ -239,17 +204,14 @@ def _without_structure() -> dict[str, NDArray[np.uint8]]:
 @pytest.mark.parametrize("name", list(_without_structure()))
 @pytest.mark.parametrize("max_tilt_deg", [45, 180])
 def test_nothing_is_done_where_nothing_is_found(name: str, max_tilt_deg: float) -> None:
-    up, confidence, candidates = estimate_up(_without_structure()[name], max_tilt_deg)
-    np.testing.assert_array_equal(up, _UP)
-    assert confidence == 0
-    assert candidates.shape[1:] == (3,)
+    assert estimate_up(_without_structure()[name], max_tilt_deg) is None
 
 
 def test_dark_rooms_with_missing_parts() -> None:
     turn = _tilted(18, 130, 60)
     room = draw_room((128, 256), turn) // 8
     room[:12], room[-9:], room[:, 30:45] = 0, 0, 0
-    assert angle_deg(estimate_up(room).up, turn[:, 2]) < 0.5
+    assert angle_deg(_up(room), turn[:, 2]) < 0.5
 
 
 @pytest.mark.parametrize(

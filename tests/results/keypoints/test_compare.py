@@ -12,7 +12,6 @@ from tangent_train.results.keypoints.compare import (
     ROTATED,
     SHRUNK,
     Comparer,
-    Comparison,
     Ways,
 )
 from tests.results.keypoints.ball_room import ball_pair
@@ -25,24 +24,16 @@ def pair() -> PanoramaPair:
     return ball_pair()
 
 
-@pytest.fixture(scope="module")
-def comparison(pair: PanoramaPair) -> Comparison:
-    return Comparer(Ways((1,), margin=16, seed=3)).compare(pair)
-
-
-def test_every_way_in_every_condition(comparison: Comparison) -> None:
+def test_figures_are_those_of_the_counts_and_of_the_truth(pair: PanoramaPair) -> None:
+    comparison = Comparer(Ways((1,), margin=16, seed=3)).compare(pair)
     assert [(row["condition"], row["representation"]) for row in comparison.rows] == [
         (condition, name)
         for condition in (AS_GIVEN, ROTATED)
         for name in ("ERP", SHRUNK, CUBE, "L1")
     ]
     for row in comparison.rows:
-        assert (row["pair"], row["left"], row["right"]) == ("ball", "ball_l", "ball_r")
-        assert row["level"] == 7
-
-
-def test_figures_are_those_of_the_counts_and_of_the_truth(comparison: Comparison) -> None:
-    for row in comparison.rows:
+        named = (row["pair"], row["left"], row["right"], row["level"])
+        assert named == ("ball", "ball_l", "ball_r", 7)
         # Nothing is hidden in a ball.
         assert row["fov_overlap"] == pytest.approx(1.0, abs=1e-3)
         assert row["visible_by"] == "depth"

@@ -21,14 +21,12 @@ ALL = ("ERP", SHRUNK, "L0", "L1", "L2")
 
 
 def row(pair: str = "a", representation: str = "ERP", **figures: Any) -> Row:
-    unknown = ("split", "fov_overlap", "rotation_error_deg", "translation_error_deg")
+    errors = ("rotation_error_deg", "translation_error_deg", "correct_share")
     areas = (f"pose_auc_{degrees}" for degrees in (5, 10, 20))
-    base = dict.fromkeys((*unknown, *areas, "correct_share"))
-    scores = {"pmr": 0.2, "ms": 0.1, "p": 0.5, "inliers": 20, "visible_by": "depth"}
-    counts = {"keypoints_left": 100, "keypoints_right": 120, "condition": AS_GIVEN}
-    return {
-        "pair": pair, "representation": representation, **base, **scores, **counts, **figures
-    }  # fmt: skip
+    base = dict.fromkeys(("split", "fov_overlap", *errors, *areas))
+    scores = {"pmr": 0.2, "ms": 0.1, "p": 0.5, "inliers": 20, "keypoints_left": 100}
+    kind = {"pair": pair, "representation": representation, "condition": AS_GIVEN}
+    return {**base, **scores, **kind, "visible_by": "depth", **figures}
 
 
 def of_paper() -> list[Row]:
@@ -109,10 +107,8 @@ def test_other_data_have_nothing_of_the_papers() -> None:
 def test_files_hold_every_figure(tmp_path: Path) -> None:
     rows = of_paper()
     KeypointReport(rows, ALL, {"seed": 0}, PUBLISHED).write(tmp_path)
-    assert json.loads((tmp_path / "results.json").read_text()) == {
-        "settings": {"seed": 0},
-        "rows": rows,
-    }
+    written = json.loads((tmp_path / "results.json").read_text())
+    assert written == {"settings": {"seed": 0}, "rows": rows}
     read = list(csv.DictReader((tmp_path / "pairs.csv").read_text().splitlines()))
     assert len(read) == 60 * 5
     assert (read[1]["pair"], read[1]["representation"], read[1]["pmr"]) == ("0", "L0", "0.28")

@@ -3,38 +3,142 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 from playwright.sync_api import Browser
 
-from tangent_train.results.html import encode_image, write_report
-from tests.slow.results.browser import OpenReport, opened
-from tests.slow.results.reference import (
-    classes_of,
-    colors_of,
-    erp_directions,
-    interpolated,
-)
-from tests.slow.results.scene import (
-    COLORS,
-    EDGE,
-    FLAT_PHOTO,
-    HEIGHT,
-    NAMES,
-    PHOTO,
-    PLANET_DEG,
-    START_DEG,
-    UNLABELLED,
-    WIDTH,
-    WRONG,
-    close,
-    step_rad,
-    view_of,
-)
+from datamodules.images.palette import class_colors
+from tangent_train.geometry import equirect_directions
+from tangent_train.results.html import EncodedImage, encode_image, write_report
+from tangent_train.results.tables import Table
+from tests.rendering.reference import sample_panorama, to_lonlat
+from tests.slow.results.browser import OpenReport, chromium, opened
+
+HEIGHT, WIDTH = 251, 503  # odd, no powers of two
+PHOTO = (120, 200)
+NAMES = ("unknown", *(f"octant {k}" for k in range(1, 8)), "<i>last</i>")
+COLORS = class_colors(len(NAMES)).astype(np.int64)
+START_DEG, PLANET_DEG = 95.0, 250.0
+TOLERANCE = 6  # of 255: JPEG and interpolation
+EDGE = 8  # pixels at the rounded corners of the canvas
+WRONG, UNLABELLED = (214, 39, 40), (110, 110, 110)
+PANORAMA, BARE_PANORAMA, FLAT_PHOTO = range(3)
+
+
+def colors_of(directions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A colour for every direction, smooth over the whole sphere, no two directions alike."""
+    return 127.5 + 100 * directions
+
+
+def classes_of(directions: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """Classes 1 to 8: octants of the sphere; 0 within 20° of longitude 0, latitude 0."""
+    signs = directions > 0
+    octants = 1 + signs[..., 0] + 2 * signs[..., 1] + 4 * signs[..., 2]
+    ahead = directions[..., 0] > np.cos(np.radians(20))
+    classes: NDArray[np.uint8] = np.where(ahead, 0, octants).astype(np.uint8)
+    return classes
+
+
+def panorama_rgb() -> NDArray[np.uint8]:
+    return colors_of(equirect_directions((HEIGHT, WIDTH))).round().astype(np.uint8)
+
+
+def panorama() -> EncodedImage:
+    directions = equirect_directions((HEIGHT, WIDTH))
+    truth = classes_of(directions)
+    prediction = np.maximum(truth, 1)
+    prediction[directions[..., 1] < -0.9] = 8
+    rgb = panorama_rgb()
+    name, note = "a <b>sphere</b>", "mIoU 61.2 %"
+    return encode_image(name, rgb, len(NAMES), prediction=prediction, truth=truth, note=note)
+
+
+def photo() -> EncodedImage:
+    v, u = np.meshgrid(*(np.linspace(0, 1, n) for n in PHOTO), indexing="ij")
+    rgb = np.stack([40 + 180 * u, 40 + 180 * v, 0 * u + 90], axis=-1).round().astype(np.uint8)
+    prediction = (1 + 2 * (v > 0.5) + (u > 0.5)).astype(np.uint8)
+    return encode_image("a photo", rgb, len(NAMES), prediction=prediction, sphere=False)
+
+
+def close(shown: NDArray[Any], expected: NDArray[Any], but: float = 0.0) -> None:
+    """All colours equal within the tolerance, but for a share of the pixels."""
+    assert shown.shape == expected.shape
+    if shown.ndim == 3:
+        shown, expected = (image[EDGE:-EDGE, EDGE:-EDGE] for image in (shown, expected))
+    far = np.abs(shown - expected).max(axis=-1) > TOLERANCE
+    assert far.mean() <= but, f"{far.sum()} of {far.size} pixels, first at {np.argwhere(far)[:3]}"
+
+
+def view_of(
+    report: OpenReport, lon_deg: float, lat_deg: float, width_deg: float, projection: str = "inside"
+) -> NDArray[np.float64]:
+    """Directions of the pixels of the picture: x at longitude 0, y at longitude 90°, z up.
+
+    Args:
+        report: In the browser.
+        lon_deg: Longitude of the middle.
+        lat_deg: Latitude of the middle.
+        width_deg: Angle along the longer side.
+        projection: ``inside`` (gnomonic) or ``planet`` (stereographic).
+    """
+    height, width = report.pixels().shape[:2]
+    half = max(height, width) / 2
+    x = (np.arange(width) + 0.5 - width / 2) / half
+    y = (height / 2 - np.arange(height) - 0.5) / half
+    right, up = np.meshgrid(x, y)
+    radius, turn = np.hypot(right, up), np.arctan2(up, right)
+    edge = np.radians(width_deg) / 2
+    angle = (
+        np.arctan(radius * np.tan(edge))
+        if projection == "inside"
+        else 2 * np.arctan(radius * np.tan(edge / 2))
+    )
+    local = np.stack(
+        [np.cos(angle), np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn)], axis=-1
+    )
+    lon, lat = np.radians(lon_deg), np.radians(lat_deg)
+    tilt = np.array([[np.cos(lat), 0, -np.sin(lat)], [0, 1, 0], [np.sin(lat), 0, np.cos(lat)]])
+    spin = np.array([[np.cos(lon), -np.sin(lon), 0], [np.sin(lon), np.cos(lon), 0], [0, 0, 1]])
+    directions: NDArray[np.float64] = local @ (spin @ tilt).T
+    return directions
+
+
+def step_rad(report: OpenReport, width_deg: float = START_DEG) -> float:
+    """Angle that one pixel of a drag turns: what lies in the middle follows the pointer."""
+    return math.tan(math.radians(width_deg) / 2) / (max(report.box()[2:]) / 2)
+
+
+# Not for the whole session: while it runs, no other test could start an event loop.
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with chromium() as running:
+        yield running
+
+
+@pytest.fixture(scope="session")
+def page_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("html") / "a report.html"
+    write_report(
+        path,
+        "Test",
+        tables=[Table("Wide", [f"column {k}" for k in range(30)], [["12345.6"] * 30])],
+        images=[panorama(), encode_image("bare", panorama_rgb(), len(NAMES)), photo()],
+        class_names=NAMES,
+        notes=["a note without any place to break: " + "x" * 200],
+    )
+    return path
+
+
+@pytest.fixture
+def report(browser: Browser, page_path: Path) -> Iterator[OpenReport]:
+    with opened(browser, page_path) as open_report:
+        yield open_report
 
 
 def test_the_first_picture_is_the_overlay_ahead(report: OpenReport) -> None:
@@ -49,17 +153,21 @@ def test_seam_and_poles_are_interpolated_like_the_rest(browser: Browser, tmp_pat
     """Pixels of 15°: what is wrong with half a pixel at a border shows."""
     grey = np.random.default_rng(0).integers(0, 256, (12, 24, 1), np.uint8)
     image = encode_image("coarse", grey.repeat(3, axis=2), 1)
-    pixels: Any = cv2.imdecode(np.frombuffer(image.jpeg, np.uint8), cv2.IMREAD_COLOR)
+    pixels: Any = cv2.imdecode(np.frombuffer(image.input, np.uint8), cv2.IMREAD_COLOR)
     write_report(tmp_path / "report.html", "t", images=[image], class_names=NAMES[:1])
     with opened(browser, tmp_path / "report.html") as report:
-        step = step_rad(report)
-        report.drag(math.pi / step, 0)
-        close(report.pixels(), interpolated(pixels, view_of(report, 180, 0, START_DEG)))
+
+        def check(longitude: float, latitude: float) -> None:
+            lonlat = to_lonlat(view_of(report, longitude, latitude, START_DEG))
+            close(report.pixels(), sample_panorama(pixels.astype(np.float64), lonlat, "bilinear"))
+
+        report.drag(math.pi / step_rad(report), 0)
+        check(180, 0)
         report.press("0")
         report.drag(0, 4000)
-        close(report.pixels(), interpolated(pixels, view_of(report, 0, 90, START_DEG)))
+        check(0, 90)
         report.drag(0, -8000)
-        close(report.pixels(), interpolated(pixels, view_of(report, 0, -90, START_DEG)))
+        check(0, -90)
 
 
 def test_the_little_planet_and_the_flat_map(report: OpenReport) -> None:
@@ -75,7 +183,7 @@ def test_the_little_planet_and_the_flat_map(report: OpenReport) -> None:
     assert top > EDGE
     assert pixels[EDGE : top - 1, EDGE:-EDGE].max() < 40, "nothing beyond the poles"
     fitted = pixels[top + 2 : top + rows - 2]
-    expected = colors_of(erp_directions(height=rows, width=width))[2 : 2 + len(fitted)]
+    expected = colors_of(equirect_directions((rows, width)))[2 : 2 + len(fitted)]
     close(fitted, expected)
 
 
