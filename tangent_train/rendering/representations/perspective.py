@@ -23,7 +23,7 @@ from tangent_train.geometry import normalize_camera, shift_range
 from tangent_train.registry import registered
 from tangent_train.rendering.checks import check_choice
 from tangent_train.rendering.forward import Interpolation
-from tangent_train.rendering.representations.views import NO_RAYS, NOT_ROTATED
+from tangent_train.rendering.representations.views import Views
 
 __all__ = ["PerspectiveRepresentation", "PhotoCrops", "PhotoSampler"]
 
@@ -37,7 +37,7 @@ _NEGLIGIBLE = 1e-6
 
 
 @dataclass(frozen=True)
-class PhotoCrops:
+class PhotoCrops(Views):
     """Crops of one photo.
 
     Attributes:
@@ -61,14 +61,6 @@ class PhotoCrops:
         draw = _nearest if interpolation == "nearest" else _smooth
         crops = np.stack([draw(image, box, self.size) for box in self.boxes])
         return np.ascontiguousarray(crops[:, :, ::-1]) if self.mirrored else crops
-
-    def rays(self) -> NDArray[np.float32]:
-        """None: the direction of a photo on the sphere is unknown."""
-        return NO_RAYS
-
-    def rotations(self) -> NDArray[np.float64]:
-        """None."""
-        return NOT_ROTATED
 
     def owned(self) -> NDArray[np.bool_]:
         """Pixels of each crop that lie nearer to its centre than to any other's, ``(n, h, w)``.

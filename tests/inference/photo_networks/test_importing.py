@@ -234,12 +234,7 @@ def test_what_does_not_fit_is_one_clear_message(
     assert set(here.iterdir()) == before
 
 
-@pytest.mark.parametrize(
-    "content", [{"3": "d", "0": "a", "1": "b", "2": "c"}, {"d": 3, "a": 0, "b": 1, "c": 2}]
-)
-def test_classes_may_be_given_by_place(
-    content: dict[str, Any], here: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (here / "classes.json").write_text(json.dumps(content))
+def test_classes_may_be_given_by_place(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (here / "classes.json").write_text(json.dumps({"3": "d", "0": "a", "1": "b", "2": "c"}))
     _run("import", monkeypatch, *OF_ONNX, "output=ours.onnx")
     assert load_trained(here / "ours.onnx").class_names == ("unknown", "a", "b", "c", "d")
