@@ -15,9 +15,6 @@ from tangent_train.errors import DataError, printable
 
 __all__ = ["Origins", "initialize", "tensors_for"]
 
-_NOT_ALL = 0.999
-"""The share is not rounded to all of a network whose small last layer is new."""
-
 
 class Origins(NamedTuple):
     """Origin of each tensor of a network.
@@ -38,8 +35,7 @@ class Origins(NamedTuple):
 
     def __str__(self) -> str:
         """A few lines for the terminal."""
-        share = min(self.share, _NOT_ALL) if self.fresh else self.share
-        lines = [f"loaded: {len(self.loaded)} tensors, {share:.1%} of the network's numbers"]
+        lines = [f"loaded: {len(self.loaded)} tensors, {self.share:.1%} of the network's numbers"]
         everything = (*self.loaded, *self.adapted, *self.fresh, *self.unused)
         for kind, reasons in (
             ("adapted", self.adapted),

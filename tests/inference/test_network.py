@@ -118,7 +118,6 @@ def test_tensors_get_what_arrays_get(network: Network) -> None:
 
 
 @pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 def test_a_gpu_gives_what_the_cpu_gives(tmp_path: Path, network: Network) -> None:
     panorama = torch.from_numpy(sphere(33)).permute(2, 0, 1)
     on_gpu = tt.load(tmp_path / "net.ckpt", device="cuda").labels(panorama.cuda())

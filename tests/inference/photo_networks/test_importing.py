@@ -10,10 +10,9 @@ from typing import Any
 
 import numpy as np
 import onnx
-import onnxruntime
 import pytest
 import torch
-from onnx import TensorProto, helper, numpy_helper
+from onnx import helper
 from torchvision import models as torchvision_models
 
 from models import UNet
@@ -24,32 +23,18 @@ from tangent_train.geometry import TangentGrid, camera_matrix_from_fov
 from tangent_train.inference.photo_networks.importing import View, view_of
 from tangent_train.inference.predictor import Predictor
 from tangent_train.inference.views import InputImage, PanoramaViews
+from tests.models.onnx_files import write_linear
 
 NAMES = ["background", "dark", "green", "bright"]
 WEIGHT = np.array([[0, 0, 0], [-1, -1, -1], [-1, 2, -1], [1, 1, 1]], np.float32)
 BIAS = np.array([0.1, 1, 0, -1.5], np.float32)
 
 
-def _onnx(path: Path, size: tuple[Any, Any] = (32, 32)) -> Path:
-    """A network of single pixels of 0 to 1, in a file of another program."""
-    images = helper.make_tensor_value_info("image", TensorProto.FLOAT, ("n", 3, *size))
-    scores = helper.make_tensor_value_info("scores", TensorProto.FLOAT, None)
-    weights = [
-        numpy_helper.from_array(WEIGHT[:, :, None, None], "w"),
-        numpy_helper.from_array(BIAS, "b"),
-    ]
-    node = helper.make_node("Conv", ["image", "w", "b"], ["scores"])
-    graph = helper.make_graph([node], "theirs", [images], [scores], weights)
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
-    onnx.save(model, path)
-    return path
-
-
 @pytest.fixture
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The current folder, with a network and the names of its scores."""
     monkeypatch.chdir(tmp_path)
-    _onnx(tmp_path / "net.onnx")
+    write_linear(tmp_path / "net.onnx", WEIGHT, BIAS, shape=("n", 3, 32, 32))
     (tmp_path / "classes.json").write_text(json.dumps(NAMES))
     return tmp_path
 
@@ -60,16 +45,6 @@ def _run(command: str, monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None
 
 
 OF_ONNX = ("network=onnx", "file=net.onnx", "classes=classes.json", "normalization=unit")
-
-
-def test_an_onnx_file_gives_the_scores_of_its_runtime(
-    here: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    _run("import", monkeypatch, *OF_ONNX, "output=ours.onnx")
-    photos = np.random.default_rng(0).integers(0, 256, (2, 3, 32, 32)).astype(np.float32) / 255
-    (expected,) = onnxruntime.InferenceSession("net.onnx").run(None, {"image": photos})
-    found = load_trained(here / "ours.onnx").network(torch.from_numpy(photos))
-    np.testing.assert_array_equal(found.numpy(), expected)
 
 
 def test_an_imported_file_is_imported_again(
