@@ -58,7 +58,7 @@ def nearest_level(height: int) -> int:
     """
     if height < 2:
         raise SettingError("panorama", found=f"{height} rows", expected="2 or more")
-    return max(0, round(math.log2(height)) - 1)
+    return round(math.log2(height)) - 1
 
 
 def equirect_to_lonlat(pixels_xy: ArrayLike, shape: tuple[int, int]) -> NDArray[np.float64]:
