@@ -131,7 +131,7 @@ _ARRAY = np.zeros((8, 16, 3), np.float32)
     ("function", "message"),
     [
         (lambda images: images[1:], r"expected a ndarray of numbers \(10, 16, 16\[, K\]\)"),
-        (lambda images: images.astype(complex), "complex"),
+        (lambda images: images.astype(complex), "complex128; expected a ndarray of numbers"),
         (torch.from_numpy, "found a Tensor"),
         (lambda _: None, "found a NoneType"),
         (lambda images: images.astype(np.uint8), "blend: found 'feather' of results of uint8"),
