@@ -16,8 +16,6 @@ from models.stem import widen_stem
 from tangent_train.errors import SettingError
 from tangent_train.registry import registered
 
-__all__ = ["FCNResNet"]
-
 _PUBLISHED = {
     "coco": "FCN_ResNet{}_Weights.COCO_WITH_VOC_LABELS_V1",
     "imagenet": "ResNet{}_Weights.IMAGENET1K_V1",

@@ -13,8 +13,6 @@ from models.pretrained import read_tensors
 from models.stem import select_channels
 from tangent_train.errors import DataError, printable
 
-__all__ = ["Origins", "initialize", "tensors_for"]
-
 
 class Origins(NamedTuple):
     """Origin of each tensor of a network.

@@ -15,8 +15,6 @@ from models.unet import check_sides
 from tangent_train.errors import SettingError
 from tangent_train.registry import registered
 
-__all__ = ["HuggingFaceNetwork", "architecture"]
-
 _Value = bool | int | float | str | None
 _Values = _Value | Sequence[_Value | Sequence[_Value | Sequence[_Value]]]
 _Section = Mapping[str, _Values | Mapping[str, _Values]]

@@ -17,8 +17,6 @@ from models.auxiliary_head import stage_channels
 from tangent_train.errors import SettingError
 from tangent_train.registry import registered
 
-__all__ = ["SphereContext", "token_directions"]
-
 
 class _ReachedError(Exception):
     """Ends a run of the network at the stage, whose features it carries."""

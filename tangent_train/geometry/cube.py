@@ -12,8 +12,6 @@ from tangent_train.errors import SettingError
 from tangent_train.geometry.pinhole_grid import PinholeGrid
 from tangent_train.geometry.sphere import checked_rotation
 
-__all__ = ["CubeGrid"]
-
 _X, _Y, _Z = np.eye(3)
 
 _AXES = np.stack(

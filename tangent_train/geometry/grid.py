@@ -16,8 +16,6 @@ from tangent_train.geometry.icosphere import icosphere, vertex_resolution
 from tangent_train.geometry.pinhole_grid import PinholeGrid
 from tangent_train.geometry.sphere import checked_rotation
 
-__all__ = ["TangentGrid"]
-
 _MOST_LEVEL = 30  # a panorama of 2³¹ rows; much larger powers of two take for ever to compute
 
 

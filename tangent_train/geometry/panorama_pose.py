@@ -10,8 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 from tangent_train.errors import SettingError
 from tangent_train.geometry.sphere import checked_rotation
 
-__all__ = ["PanoramaPose"]
-
 
 @dataclass(frozen=True, eq=False, init=False)
 class PanoramaPose:

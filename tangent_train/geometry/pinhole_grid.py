@@ -14,8 +14,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from tangent_train.errors import SettingError
 
-__all__ = ["Faces", "PinholeGrid", "ResizedGrid"]
-
 Faces = Sequence[int] | NDArray[np.integer]
 """Indices of images."""
 

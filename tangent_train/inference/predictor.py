@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from tangent_train.checkpoints.trained import TrainedNetwork
     from tangent_train.inference.views import InputImage, ViewSets
 
-__all__ = ["Predictor", "sees_rays", "view_images", "view_scores", "views_per_forward"]
-
 _PIXELS_PER_FORWARD = 2**20
 
 

@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 
     _Part = tuple[NDArray[np.int64], NDArray[Any]]
 
-__all__ = ["apply"]
-
 _PIXELS_PER_CALL = 2**20
 
 

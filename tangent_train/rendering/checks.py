@@ -12,16 +12,6 @@ from torch import Tensor
 from tangent_train.errors import SettingError
 from tangent_train.geometry import PinholeGrid
 
-__all__ = [
-    "check_blend",
-    "check_choice",
-    "check_count",
-    "check_images",
-    "check_interpolation",
-    "check_panorama",
-    "check_shape",
-]
-
 _MOST_COLORS = 4
 """Channels of an image of colours."""
 

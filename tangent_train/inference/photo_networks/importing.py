@@ -25,8 +25,6 @@ from tangent_train.geometry import vertex_resolution
 from tangent_train.inference.photo_networks.network import PhotoNetwork
 from tangent_train.registry import SettingsFile
 
-__all__ = ["Imported", "View", "import_network", "view_of"]
-
 _TANGENT = "tangent_train.rendering.TangentRepresentation"
 _LEVELS = (5, 13)
 

@@ -13,8 +13,6 @@ from datamodules.core.inputs import Normalization
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import parse_json
 
-__all__ = ["USUAL_SIZE", "PhotoNetwork", "class_names_in"]
-
 USUAL_SIZE = (512, 512)
 """Rows and columns of the photos, where nothing says what they were."""
 

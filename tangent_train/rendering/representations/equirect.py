@@ -30,8 +30,6 @@ from tangent_train.rendering.representations.views import (
     Views,
 )
 
-__all__ = ["EquirectRepresentation", "EquirectViews", "as_crop", "column_shifts"]
-
 Image = NDArray[Any]
 
 

@@ -25,8 +25,6 @@ from tangent_train.rendering.checks import check_choice
 from tangent_train.rendering.forward import Interpolation
 from tangent_train.rendering.representations.views import Views
 
-__all__ = ["PerspectiveRepresentation", "PhotoCrops", "PhotoSampler"]
-
 Crops = Literal["grid", "center"]
 """Crops of an evaluation: all over the photo, or one in the middle."""
 

@@ -33,15 +33,6 @@ from tangent_train.rendering.representations.views import (
     Views,
 )
 
-__all__ = [
-    "CubemapRepresentation",
-    "PinholeRepresentation",
-    "TangentRepresentation",
-    "spun",
-    "turns",
-    "unless_identity",
-]
-
 _SYMMETRY_DEG = 72.0
 """The icosahedron looks the same after this rotation about the vertical."""
 

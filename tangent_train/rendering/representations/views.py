@@ -19,18 +19,6 @@ from torch import Tensor
 from tangent_train.geometry import PinholeGrid
 from tangent_train.rendering.forward import Interpolation, equirect_to_tangent
 
-__all__ = [
-    "NOT_ROTATED",
-    "NO_RAYS",
-    "Assembler",
-    "ManyViews",
-    "PinholeViews",
-    "Representation",
-    "RotationAugmentation",
-    "Sampler",
-    "Views",
-]
-
 RotationAugmentation = Literal["none", "yaw", "so3"]
 """Rotation of training panoramas: none, about the vertical, or uniformly over SO(3)."""
 
