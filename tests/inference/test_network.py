@@ -194,15 +194,10 @@ def test_impossible_settings_are_refused(tmp_path: Path, network: Network) -> No
         network.scores(_RGB, fov=180)
     with pytest.raises(DataError, match=r"missing\.ckpt"):
         tt.load(tmp_path / "missing.ckpt")
-    for settings, message in (
-        ({"rotations": 0}, "rotations"),
-        ({"device": "nonsense"}, "device"),
-        ({"base_level": 9}, "base_level"),
-        ({"class_map": "night"}, "class_map: found night"),
-        ({"unmapped": "0"}, "unmapped: found '0'"),
-    ):
-        with pytest.raises(SettingError, match=message):
-            tt.load(tmp_path / "net.ckpt", **settings)
+    with pytest.raises(SettingError, match="class_map: found night"):
+        tt.load(tmp_path / "net.ckpt", class_map="night")
+    with pytest.raises(SettingError, match="unmapped: found '0'"):
+        tt.load(tmp_path / "net.ckpt", unmapped="0")  # type: ignore[arg-type]
 
 
 def test_a_name_of_trusted_code_is_one_name(tmp_path: Path) -> None:

@@ -12,10 +12,9 @@ from tangent_train.errors import SettingError
 from tests.tasks.small_networks import with_statistics
 
 
-@pytest.mark.parametrize(("width", "parameters"), [(16, 1_309_976), (32, 5_135_880)])
-def test_parameters_are_those_of_the_released_code(width: int, parameters: int) -> None:
-    network = ShapeClassifier(6, 40, width)
-    assert sum(p.numel() for p in network.parameters() if p.requires_grad) == parameters
+def test_parameters_are_those_of_the_released_code() -> None:
+    """Of the other width the docstring counts them."""
+    assert sum(p.numel() for p in ShapeClassifier(6, 40, width=32).parameters()) == 5_135_880
 
 
 def test_scores_are_of_the_mean_over_views_and_positions() -> None:

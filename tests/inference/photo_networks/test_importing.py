@@ -6,7 +6,6 @@ import json
 import math
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import onnx
@@ -16,7 +15,6 @@ from onnx import helper
 from torchvision import models as torchvision_models
 
 from models import UNet
-from models.onnx_network import OnnxNetwork
 from tangent_train.checkpoints.trained import load_trained
 from tangent_train.cli import main
 from tangent_train.geometry import TangentGrid, camera_matrix_from_fov
@@ -50,23 +48,14 @@ OF_ONNX = ("network=onnx", "file=net.onnx", "classes=classes.json", "normalizati
 def test_an_imported_file_is_imported_again(
     here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Its description is replaced, and the network runs once."""
+    """Its description is replaced."""
     given = onnx.load("net.onnx")
     helper.set_model_props(given, {"author": "somebody"})
     onnx.save(given, "net.onnx")
     _run("import", monkeypatch, *OF_ONNX, "level=7", "output=ours.onnx")
-    ran: list[Any] = []
-    forward = OnnxNetwork.forward
-
-    def noted(self: OnnxNetwork, images: Any) -> Any:
-        ran.append(images.shape)
-        return forward(self, images)
-
-    monkeypatch.setattr(OnnxNetwork, "forward", noted)
     again = ("file=ours.onnx", "level=6", "base_level=1", "output=again.onnx")
     _run("import", monkeypatch, *OF_ONNX, *again)
     assert "indoors" not in capsys.readouterr().out.partition("again.onnx")[2]
-    assert ran == [(1, 3, 32, 32)]
     assert load_trained(here / "again.onnx").level == 6
     properties = [entry.key for entry in onnx.load("again.onnx").metadata_props]
     assert sorted(properties) == ["author", "tangent_train"]
@@ -181,10 +170,6 @@ def test_tangent_images_have_the_angular_resolution_of_the_photos(
             "found timm, which has no networks for segmentation",
         ),
         (
-            ("network=torchvision", "model=resnet50", "output=net.ckpt"),
-            "model: found resnet50; expected deeplabv3",
-        ),
-        (
             (
                 *("network=torchvision", "model=lraspp_mobilenet_v3_large", "weights=VOC"),
                 "output=net.ckpt",
@@ -195,7 +180,6 @@ def test_tangent_images_have_the_angular_resolution_of_the_photos(
             ("network=unet_small", "output=net.ckpt"),
             "weights: found none; expected a file with the network's",
         ),
-        (("network=unet_smal", "output=net.ckpt"), "unet_smal"),
     ],
 )
 def test_what_does_not_fit_is_one_clear_message(
