@@ -73,6 +73,7 @@ def test_grids_are_values() -> None:
         CubeGrid(33),
         CubeGrid(32, ROTATION),
         CubeGrid(32, margin=1),
+        TangentGrid(0, 5).resized(33),
     ]
     assert len(set(different)) == len({hash(grid) for grid in different}) == len(different)
     for grid in different:
@@ -80,6 +81,7 @@ def test_grids_are_values() -> None:
         assert (again, hash(again)) == (grid, hash(grid))
     assert TangentGrid(0, 5) == TangentGrid(0, 5, 32)
     assert CubeGrid(32, ROTATION) == CubeGrid(32, ROTATION.tolist())
+    assert CubeGrid(32).widened(1) == CubeGrid(34, margin=1) != CubeGrid(34)
     assert CubeGrid(32) != (32, None)
 
 
