@@ -210,8 +210,9 @@ class EquirectRepresentation:
         """
         parts = iter(scores)
         first = next(parts)
-        mosaic = ScoreMosaic(shape, first.shape[1], "nearest", averaged=True)
-        for one, shift in zip(chain([first], parts), self._shifts, strict=False):
+        mosaic = ScoreMosaic(shape, first.shape[1], "nearest", averaged=len(rotations) > 1)
+        shifts = self._shifts[: len(rotations)]
+        for one, shift in zip(chain([first], parts), shifts, strict=True):
             mosaic.add_crops(*as_crop(one.roll(shift, -1), shape), np.array([0]))
         return _turned_back(torch.from_numpy(mosaic.labels().astype(np.int64)), rotations[0])
 
