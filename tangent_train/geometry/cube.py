@@ -30,8 +30,6 @@ _AXES = np.stack(
 _NEIGHBORS = np.nonzero(_AXES[..., 2] @ _AXES[..., 2].T == 0)[1].reshape(6, 4).astype(np.int32)
 _NEIGHBORS.setflags(write=False)
 
-_ROUNDING = 1e-9
-
 
 @dataclass(frozen=True, eq=False, init=False)
 class CubeGrid(PinholeGrid):
@@ -82,7 +80,7 @@ class CubeGrid(PinholeGrid):
     @property
     def overlapping(self) -> bool:
         """Whether there is a margin; else neighbours meet at their outer edges."""
-        return self.dim * self.pitch > 2 + _ROUNDING
+        return self.dim * self.pitch > 2
 
     def _resting_axes(self) -> NDArray[np.float64]:
         return _AXES
