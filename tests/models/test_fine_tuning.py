@@ -169,13 +169,15 @@ def test_every_tensor_that_is_not_loaded_is_named(tmp_path: Path) -> None:
     """By module where all of one have the same fate."""
     network = nn.ModuleDict({"encoder": _network(64), "head": nn.Sequential(nn.Linear(2, 2))})
     found = {f"encoder.{name}": t for name, t in _network(64).state_dict().items()}
+    found["encoder.0.weight"] = torch.ones(4, 64, 5, 5)
     found["encoder.1.weight"] = torch.ones(7)
     del found["encoder.3.bias"]
     found |= {f"aux.{name}": tensor for name, tensor in _network().state_dict().items()}
     torch.save(found | {"encoder.odd": torch.ones(2)}, tmp_path / "x.pt")
     lines = str(initialize(network, tmp_path / "x.pt")).splitlines()
     assert lines[1:] == [
-        "untrained: 4",
+        "untrained: 5",
+        "  encoder.0.weight: (4, 64, 5, 5) in the file, (4, 64, 3, 3) here",
         "  encoder.1.weight: (7,) in the file, (4,) here",
         "  encoder.3.bias: not in the file",
         "  head (2 tensors): not in the file",
