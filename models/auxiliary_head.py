@@ -14,8 +14,6 @@ from torch import Tensor, nn
 from tangent_train.errors import SettingError
 from tangent_train.registry import registered
 
-__all__ = ["AuxiliaryHead", "stage_channels"]
-
 _TRIALS = list(product(("meta", "cpu"), (256, 224)))
 """Devices and sides of the empty images: some networks depend on values, some fix their input."""
 

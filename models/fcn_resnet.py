@@ -3,33 +3,22 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.modules.batchnorm import _BatchNorm
-from torchvision.models import ResNet50_Weights, ResNet101_Weights
-from torchvision.models.segmentation import (
-    FCN_ResNet50_Weights,
-    FCN_ResNet101_Weights,
-    fcn_resnet50,
-    fcn_resnet101,
-)
+from torchvision.models import get_model, get_weight
 
 from models.pretrained import fetch_tensors, load_tensors, read_tensors
 from models.stem import widen_stem
 from tangent_train.errors import SettingError
 from tangent_train.registry import registered
 
-__all__ = ["FCNResNet"]
-
-_MAKE = {50: fcn_resnet50, 101: fcn_resnet101}
 _PUBLISHED = {
-    "coco": {
-        50: FCN_ResNet50_Weights.COCO_WITH_VOC_LABELS_V1,
-        101: FCN_ResNet101_Weights.COCO_WITH_VOC_LABELS_V1,
-    },
-    "imagenet": {50: ResNet50_Weights.IMAGENET1K_V1, 101: ResNet101_Weights.IMAGENET1K_V1},
+    "coco": "FCN_ResNet{}_Weights.COCO_WITH_VOC_LABELS_V1",
+    "imagenet": "ResNet{}_Weights.IMAGENET1K_V1",
 }
 _HEAD = "classifier."
 _LAST = "classifier.4."
@@ -67,12 +56,11 @@ class FCNResNet(nn.Module):
         frozen_statistics: bool = False,
     ) -> None:
         super().__init__()
-        if depth not in _MAKE:
+        if depth not in (50, 101):
             raise SettingError("network.depth", found=depth, expected="50 or 101")
         tensors = None if weights is None else _tensors(str(weights), depth)
-        fcn = _MAKE[depth](
-            weights=None, weights_backbone=None, num_classes=num_classes, aux_loss=False
-        )
+        untrained = {"weights": None, "weights_backbone": None, "aux_loss": False}
+        fcn: Any = get_model(f"fcn_resnet{depth}", num_classes=num_classes, **untrained)
         self.backbone: nn.Module = fcn.backbone
         self.classifier: nn.Module = fcn.classifier
         self.frozen_statistics = frozen_statistics
@@ -101,7 +89,7 @@ class FCNResNet(nn.Module):
 def _tensors(weights: str, depth: int) -> dict[str, Tensor]:
     """The tensors that `weights` names, under the names of the FCN."""
     if weights in _PUBLISHED:
-        tensors = fetch_tensors(_PUBLISHED[weights][depth])
+        tensors = fetch_tensors(get_weight(_PUBLISHED[weights].format(depth)))
     elif Path(weights).is_file():
         tensors = read_tensors(Path(weights))
     else:

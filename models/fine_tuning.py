@@ -10,13 +10,8 @@ from typing import NamedTuple
 from torch import Tensor, nn
 
 from models.pretrained import read_tensors
-from models.stem import first_convolution, select_channels
-from tangent_train.errors import DataError, SettingError, printable
-
-__all__ = ["Origins", "initialize", "tensors_for"]
-
-_NOT_ALL = 0.999
-"""The share is not rounded to all of a network whose small last layer is new."""
+from models.stem import select_channels
+from tangent_train.errors import DataError, printable
 
 
 class Origins(NamedTuple):
@@ -38,8 +33,7 @@ class Origins(NamedTuple):
 
     def __str__(self) -> str:
         """A few lines for the terminal."""
-        share = min(self.share, _NOT_ALL) if self.fresh else self.share
-        lines = [f"loaded: {len(self.loaded)} tensors, {share:.1%} of the network's numbers"]
+        lines = [f"loaded: {len(self.loaded)} tensors, {self.share:.1%} of the network's numbers"]
         everything = (*self.loaded, *self.adapted, *self.fresh, *self.unused)
         for kind, reasons in (
             ("adapted", self.adapted),
@@ -80,7 +74,8 @@ def initialize(
     path = Path(path)
     own = network.state_dict()
     found = tensors_for(network, path)
-    stem = _stem(network)
+    convolutions = (name for name, m in network.named_modules() if isinstance(m, nn.Conv2d))
+    stem = f"{next(convolutions, None)}.weight".removeprefix(".")
     loaded: dict[str, Tensor] = {}
     adapted: dict[str, str] = {}
     fresh: dict[str, str] = {}
@@ -90,7 +85,7 @@ def initialize(
             fresh[name] = "not in the file"
         elif name in of_other_classes and given.shape == tensor.shape:
             fresh[name] = "of other classes in the file"
-        elif name == stem and _is_stem_of(given, tensor):
+        elif name == stem and given.ndim == 4 and given[:, 0].shape == tensor[:, 0].shape:
             before, now = _channel_names(given, tensor, channels)
             loaded[name], changes = _by_channel(given, before, now)
             if changes:
@@ -123,19 +118,15 @@ def tensors_for(network: nn.Module, path: Path) -> dict[str, Tensor]:
     Raises:
         DataError: The file cannot be read.
     """
-    return _renamed(read_tensors(path), network.state_dict())
-
-
-def _stem(network: nn.Module) -> str | None:
-    """The name of the weight of the first convolution."""
-    try:
-        return f"{first_convolution(network)[0]}.weight".removeprefix(".")
-    except SettingError:
-        return None
-
-
-def _is_stem_of(given: Tensor, wanted: Tensor) -> bool:
-    return given.ndim == wanted.ndim and given[:, 0].shape == wanted[:, 0].shape
+    inner_own = {_inner(name): name for name in network.state_dict()}
+    inner = {_inner(name): tensor for name, tensor in read_tensors(path).items()}
+    outside, inside = _prefix(inner, inner_own), _prefix(inner_own, inner)
+    renamed = {}
+    for name, tensor in inner.items():
+        if name.startswith(outside):
+            place = inside + name.removeprefix(outside)
+            renamed[inner_own.get(place, place)] = tensor
+    return renamed
 
 
 def _channel_names(
@@ -155,19 +146,6 @@ def _by_channel(given: Tensor, before: Sequence[str], now: Sequence[str]) -> tup
     notes = [f"starts at zero: {new}"] * bool(new) + [f"left out: {lost}"] * bool(lost)
     places = [before.index(name) if name in before else None for name in now]
     return select_channels(given, places), "; ".join(notes)
-
-
-def _renamed(tensors: Mapping[str, Tensor], own: Iterable[str]) -> dict[str, Tensor]:
-    """The tensors by the network's names, whatever modules wrap the network here and there."""
-    inner_own = {_inner(name): name for name in own}
-    inner = {_inner(name): tensor for name, tensor in tensors.items()}
-    outside, inside = _prefix(inner, inner_own), _prefix(inner_own, inner)
-    renamed = {}
-    for name, tensor in inner.items():
-        if name.startswith(outside):
-            place = inside + name.removeprefix(outside)
-            renamed[inner_own.get(place, place)] = tensor
-    return renamed
 
 
 def _inner(name: str) -> str:

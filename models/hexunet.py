@@ -9,8 +9,6 @@ from torch import Tensor, nn
 from models.unet import check_sides
 from tangent_train.registry import registered
 
-__all__ = ["HexUNet"]
-
 _ENCODERS = (32, 64, 128, 256)
 _DECODERS = ((512, 256), (256, 128), (128, 64), (64, 32))
 """Bottleneck and output channels, coarsest first."""

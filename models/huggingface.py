@@ -11,10 +11,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
+from models.unet import check_sides
 from tangent_train.errors import SettingError
 from tangent_train.registry import registered
-
-__all__ = ["HuggingFaceNetwork", "architecture"]
 
 _Value = bool | int | float | str | None
 _Values = _Value | Sequence[_Value | Sequence[_Value | Sequence[_Value]]]
@@ -137,12 +136,7 @@ class HuggingFaceNetwork(nn.Module):
         if self._bgr:
             images = torch.cat([images[:, :3].flip(1), images[:, 3:]], dim=1)
         size = (images.shape[-2], images.shape[-1])
-        if any(side % self._patch for side in size):
-            raise SettingError(
-                "images of the network",
-                found="×".join(map(str, size)),
-                expected=f"multiples of {self._patch} pixels, its patches",
-            )
+        check_sides(images, self._patch, type(self.network).__name__)
         task = {} if self._task is None else {"task_inputs": self._task.expand(len(images), -1)}
         returned = self.network(pixel_values=images, **task)
         masks = returned.get("masks_queries_logits", returned.get("pred_masks"))

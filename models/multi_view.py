@@ -9,8 +9,6 @@ from models.stem import first_convolution, widen_stem
 from tangent_train.errors import SettingError
 from tangent_train.registry import registered
 
-__all__ = ["MultiView"]
-
 
 @registered
 class MultiView(nn.Module):

@@ -13,8 +13,6 @@ from torch.nn import functional
 
 from tangent_train.errors import DataError, SettingError
 
-__all__ = ["OnnxNetwork"]
-
 _TYPES = {"tensor(float)": torch.float32, "tensor(float16)": torch.float16}
 _COLORS = 3
 _LABEL_MAP = 3

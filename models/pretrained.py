@@ -15,8 +15,6 @@ from torchvision.models import WeightsEnum
 from tangent_train.errors import DataError
 from tangent_train.files import load_plain
 
-__all__ = ["fetch_tensors", "load_tensors", "read_tensors"]
-
 _PREFIX = "network."
 """Begins the names of the network's tensors in a checkpoint of this package."""
 

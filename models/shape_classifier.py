@@ -8,8 +8,6 @@ from torch import Tensor, nn
 from models.unet import Down, check_sides
 from tangent_train.registry import registered
 
-__all__ = ["ShapeClassifier"]
-
 _WIDTHS = (1, 4, 16, 64)
 """Channels after the first convolution and after each residual block, in units of `width`."""
 

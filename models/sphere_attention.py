@@ -12,8 +12,6 @@ from torch.nn import functional
 from tangent_train.errors import SettingError
 from tangent_train.registry import registered
 
-__all__ = ["SphereAttention", "angular_attention"]
-
 _KAPPAS = (0.1, 30.0)
 """Initial concentrations: from heads that see the whole sphere to ones that see about 15°."""
 

@@ -17,15 +17,9 @@ from models.auxiliary_head import stage_channels
 from tangent_train.errors import SettingError
 from tangent_train.registry import registered
 
-__all__ = ["SphereContext", "token_directions"]
-
 
 class _ReachedError(Exception):
     """Ends a run of the network at the stage, whose features it carries."""
-
-    def __init__(self, features: Tensor) -> None:
-        super().__init__("the stage was reached")
-        self.features = features
 
 
 @registered
@@ -111,7 +105,7 @@ class SphereContext(nn.Module):
         try:
             self._run(images, _stop)
         except _ReachedError as reached:
-            return self._pooled(reached.features)
+            return self._pooled(reached.args[0])
         raise SettingError(
             "network.stage", found="one that was not run", expected="one that every image passes"
         )
@@ -153,9 +147,8 @@ class SphereContext(nn.Module):
         """Encode in chunks, mix the tokens of all, decode in chunks."""
         chunks = torch.split(images, size)
         # Evaluation draws nothing.
-        seeds = (
-            torch.randint(2**62, (len(chunks),)).tolist() if self.training else [0] * len(chunks)
-        )
+        first = int(torch.randint(2**62, ())) if self.training else 0
+        seeds = range(first, first + len(chunks))
         tokens = [
             self._recomputed(self.encode, chunk, seed=seed, counted=False)
             for chunk, seed in zip(chunks, seeds, strict=True)
@@ -170,7 +163,7 @@ class SphereContext(nn.Module):
         return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
 
     def _recomputed(
-        self, step: Callable[..., Any], *arguments: Tensor, seed: int | None, counted: bool
+        self, step: Callable[..., Any], *arguments: Tensor, seed: int, counted: bool
     ) -> Any:
         """Run a step without keeping activations; the backward pass runs it again.
 
@@ -181,7 +174,10 @@ class SphereContext(nn.Module):
 
         def run(*inputs: Tensor) -> Any:
             frozen = () if next(first, False) else self.network.modules()
-            with _same_draws(seed, inputs[0].device), _frozen_statistics(frozen):
+            device = inputs[0].device
+            forked = torch.random.fork_rng([device] if device.type == "cuda" else [])
+            with forked, _frozen_statistics(frozen):
+                torch.manual_seed(seed)
                 return step(*inputs)
 
         return checkpoint(run, *arguments, use_reentrant=False, preserve_rng_state=False)
@@ -214,16 +210,6 @@ def _add(features: Tensor, tokens: Tensor) -> Tensor:
 
 def _stop(features: Tensor) -> Tensor:
     raise _ReachedError(features)
-
-
-@contextmanager
-def _same_draws(seed: int | None, device: torch.device) -> Iterator[None]:
-    """Random numbers that depend on the seed only; the generators are as before afterwards."""
-    devices = [device] if device.type == "cuda" else []
-    with torch.random.fork_rng(devices, enabled=seed is not None):
-        if seed is not None:
-            torch.manual_seed(seed)
-        yield
 
 
 @contextmanager

@@ -10,8 +10,6 @@ from torch import Tensor, nn
 from tangent_train.errors import SettingError
 from tangent_train.registry import registered
 
-__all__ = ["first_convolution", "select_channels", "widen_stem"]
-
 _RGB = 3
 
 

@@ -12,8 +12,6 @@ from torch import Tensor, nn
 from tangent_train.errors import SettingError
 from tangent_train.registry import registered
 
-__all__ = ["Down", "Residual", "UNet", "check_sides"]
-
 
 class Residual(nn.Module):
     """Bottleneck 1×1 – 3×3 – 1×1 with a 1×1 shortcut, all batch-normalized (Jiang et al. 2019).

@@ -12,6 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import torch
 from numpy.typing import NDArray
 
 from datamodules.stanford2d3ds.label_table import CLASSES
@@ -36,10 +37,12 @@ FabricateStanford = Callable[..., Path]
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests in `tests/slow`, which are for `make test-all`."""
+    """Mark the tests in `tests/slow`, which are for `make test-all`; skip those without a GPU."""
     for item in items:
         if SLOW in item.path.parents:
             item.add_marker("slow")
+        if item.get_closest_marker("gpu") and not torch.cuda.is_available():
+            item.add_marker(pytest.mark.skip(reason="no CUDA device"))
 
 
 def fabricate(

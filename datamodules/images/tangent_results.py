@@ -21,7 +21,7 @@ from datamodules.images.pixel_files import (
     write_pixels,
 )
 from tangent_train.errors import DataError, SettingError
-from tangent_train.geometry import PinholeGrid, ResizedGrid
+from tangent_train.geometry import PinholeGrid
 from tangent_train.rendering import Blend, tangent_to_equirect
 from tangent_train.rendering.camera_files import CameraFile
 from tangent_train.threads import in_threads
@@ -167,7 +167,7 @@ class TangentResults:
         dtype = self._image_dtype() if suffix != ".npy" else self.arrays[0].dtype
         check_writable(suffix, dtype, channels[0] if channels else 1)
         size = self.arrays[0].shape[0]
-        grid = self.grid if size == self.grid.dim else ResizedGrid(self.grid, size)
+        grid = self.grid if size == self.grid.dim else self.grid.resized(size)
         arrays = self.arrays
         if z_depth:
             arrays = [_distances(array, grid, path) for array in arrays]

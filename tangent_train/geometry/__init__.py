@@ -35,7 +35,7 @@ from tangent_train.geometry.equirect import (
 from tangent_train.geometry.grid import TangentGrid
 from tangent_train.geometry.icosphere import Icosphere, icosphere, vertex_resolution
 from tangent_train.geometry.panorama_pose import PanoramaPose
-from tangent_train.geometry.pinhole_grid import PinholeGrid, ResizedGrid
+from tangent_train.geometry.pinhole_grid import PinholeGrid
 from tangent_train.geometry.sphere import (
     FLIP_Y,
     checked_rotation,
@@ -51,7 +51,6 @@ __all__ = [
     "Icosphere",
     "PanoramaPose",
     "PinholeGrid",
-    "ResizedGrid",
     "TangentGrid",
     "camera_matrix_from_fov",
     "checked_rotation",

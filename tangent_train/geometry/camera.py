@@ -10,15 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from tangent_train.errors import SettingError
 
-__all__ = [
-    "NormalizedCamera",
-    "camera_matrix_from_fov",
-    "is_camera_matrix",
-    "normalize_camera",
-    "perspective_directions",
-    "shift_range",
-]
-
 
 class NormalizedCamera(NamedTuple):
     """A common camera and the way to it.

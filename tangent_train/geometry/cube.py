@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,8 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 from tangent_train.errors import SettingError
 from tangent_train.geometry.pinhole_grid import PinholeGrid
 from tangent_train.geometry.sphere import checked_rotation
-
-__all__ = ["CubeGrid"]
 
 _X, _Y, _Z = np.eye(3)
 
@@ -65,23 +62,12 @@ class CubeGrid(PinholeGrid):
 
     dim: int
     rotation: NDArray[np.float64] | None
-    margin: int
 
     def __init__(self, dim: int, rotation: ArrayLike | None = None, margin: int = 0) -> None:
-        object.__setattr__(self, "margin", _whole("margin", margin, 0))
-        object.__setattr__(self, "dim", _whole("dim", dim, 2 + 2 * self.margin))
+        across = _whole("dim", dim, 2 + 2 * _whole("margin", margin, 0)) - 2 * margin
         turn = None if rotation is None else checked_rotation(rotation)
-        object.__setattr__(self, "rotation", turn)
-
-    @property
-    def num_images(self) -> int:
-        """6."""
-        return 6
-
-    @property
-    def pitch(self) -> float:
-        """Distance of neighbouring pixels on the face, in focal lengths: 2/(d − 2m)."""
-        return 2 / (self.dim - 2 * self.margin)
+        for name, value in {"dim": int(dim), "pitch": 2 / across, "rotation": turn}.items():
+            object.__setattr__(self, name, value)
 
     @property
     def neighbors(self) -> NDArray[np.int32]:
@@ -94,25 +80,10 @@ class CubeGrid(PinholeGrid):
     @property
     def overlapping(self) -> bool:
         """Whether there is a margin; else neighbours meet at their outer edges."""
-        return self.margin > 0
-
-    def with_rotation(self, rotation: ArrayLike | None) -> Self:
-        """The same cube, rotated by this instead of its own.
-
-        Raises:
-            SettingError: The rotation is none.
-        """
-        return type(self)(self.dim, rotation, self.margin)
-
-    def widened(self, margin: int) -> Self:
-        """The same faces with more pixels on every side, at the same pitch."""
-        return type(self)(self.dim + 2 * margin, self.rotation, self.margin + margin)
+        return self.dim * self.pitch > 2
 
     def _resting_axes(self) -> NDArray[np.float64]:
         return _AXES
-
-    def _key(self) -> tuple[object, ...]:
-        return self.dim, self.margin
 
 
 def _whole(name: str, value: int, least: int) -> int:

@@ -10,17 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 from tangent_train.errors import SettingError
 from tangent_train.geometry.sphere import lonlat_to_xyz
 
-__all__ = [
-    "equirect_directions",
-    "equirect_elevations",
-    "equirect_latitudes",
-    "equirect_shape",
-    "equirect_solid_angles",
-    "equirect_to_lonlat",
-    "lonlat_to_equirect",
-    "nearest_level",
-]
-
 
 def equirect_shape(level: int) -> tuple[int, int]:
     """Rows and columns of the panorama that matches a level-s icosahedron.
@@ -58,7 +47,7 @@ def nearest_level(height: int) -> int:
     """
     if height < 2:
         raise SettingError("panorama", found=f"{height} rows", expected="2 or more")
-    return max(0, round(math.log2(height)) - 1)
+    return round(math.log2(height)) - 1
 
 
 def equirect_to_lonlat(pixels_xy: ArrayLike, shape: tuple[int, int]) -> NDArray[np.float64]:

@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import combinations
-from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,8 +14,6 @@ from tangent_train.errors import SettingError
 from tangent_train.geometry.icosphere import icosphere, vertex_resolution
 from tangent_train.geometry.pinhole_grid import PinholeGrid
 from tangent_train.geometry.sphere import checked_rotation
-
-__all__ = ["TangentGrid"]
 
 _MOST_LEVEL = 30  # a panorama of 2³¹ rows; much larger powers of two take for ever to compute
 
@@ -132,37 +129,25 @@ class TangentGrid(PinholeGrid):
             "base_level": base_level,
             "level": level,
             "dim": 2 ** (level - base_level) if dim is None else dim,
+            "pitch": _pitch(base_level, level),
             "rotation": None if rotation is None else checked_rotation(rotation),
         }
         for name, value in values.items():
             object.__setattr__(self, name, value)
-        self._check_coverage()
+        least = self.least_dim(base_level, level)
+        if self.dim < least:
+            raise SettingError(
+                "dim",
+                found=self.dim,
+                expected=f"at least {least} at base level {base_level} and level {level}",
+                remedy="Smaller images would leave parts of the sphere uncovered.",
+            )
 
     @staticmethod
     def least_dim(base_level: int, level: int) -> int:
         """The least `dim` whose images cover every owned cell."""
         extent = _face_table(base_level).owned_extent
         return math.ceil(2 * extent / _pitch(base_level, level) - 1e-9) + 1
-
-    def _check_coverage(self) -> None:
-        least = self.least_dim(self.base_level, self.level)
-        if self.dim < least:
-            raise SettingError(
-                "dim",
-                found=self.dim,
-                expected=f"at least {least} at base level {self.base_level} and level {self.level}",
-                remedy="Smaller images would leave parts of the sphere uncovered.",
-            )
-
-    @property
-    def num_images(self) -> int:
-        """N = 20·4^b."""
-        return int(20 * 4**self.base_level)
-
-    @property
-    def pitch(self) -> float:
-        """Distance of neighbouring pixels on the tangent plane, in focal lengths."""
-        return _pitch(self.base_level, self.level)
 
     @property
     def neighbors(self) -> NDArray[np.int32]:
@@ -177,23 +162,8 @@ class TangentGrid(PinholeGrid):
         """True: even the least images reach half a pixel beyond the owned cells."""
         return True
 
-    def with_rotation(self, rotation: ArrayLike | None) -> Self:
-        """The same images on an icosahedron rotated by this instead of its own.
-
-        Raises:
-            SettingError: The rotation is none.
-        """
-        return type(self)(self.base_level, self.level, self.dim, rotation)
-
-    def widened(self, margin: int) -> Self:
-        """The same images with more pixels on every side, at the same pitch."""
-        return type(self)(self.base_level, self.level, self.dim + 2 * margin, self.rotation)
-
     def _resting_axes(self) -> NDArray[np.float64]:
         return _face_table(self.base_level).world_from_camera
-
-    def _key(self) -> tuple[object, ...]:
-        return self.base_level, self.level, self.dim
 
 
 def _pitch(base_level: int, level: int) -> float:

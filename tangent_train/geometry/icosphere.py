@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from tangent_train.errors import SettingError
 
-__all__ = ["Icosphere", "icosphere", "vertex_resolution"]
-
 MAX_LEVEL = 8
 
 

@@ -10,8 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 from tangent_train.errors import SettingError
 from tangent_train.geometry.sphere import checked_rotation
 
-__all__ = ["PanoramaPose"]
-
 
 @dataclass(frozen=True, eq=False, init=False)
 class PanoramaPose:
@@ -37,15 +35,10 @@ class PanoramaPose:
     def __init__(self, world_from_panorama: ArrayLike, location_m: ArrayLike) -> None:
         matrix = np.array(world_from_panorama, np.float64)
         location = np.array(location_m, np.float64)
-        if matrix.shape != (3, 3) or location.shape != (3,):
-            raise SettingError(
-                "pose",
-                found=f"arrays {matrix.shape} and {location.shape}",
-                expected="(3, 3) and (3,)",
-            )
-        if not (np.isfinite(matrix).all() and np.isfinite(location).all()):
-            raise SettingError("pose", found="numbers that are not finite", expected="finite ones")
-        checked_rotation(matrix if np.linalg.det(matrix) > 0 else -matrix)
+        if location.shape != (3,) or not np.isfinite(location).all():
+            raise SettingError("location_m", found=location.tolist(), expected="3 finite numbers")
+        mirrored = matrix.shape == (3, 3) and np.linalg.det(matrix) < 0
+        checked_rotation(-matrix if mirrored else matrix)
         for array in (matrix, location):
             array.setflags(write=False)
         object.__setattr__(self, "world_from_panorama", matrix)

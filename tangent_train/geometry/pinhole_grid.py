@@ -5,16 +5,14 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tangent_train.errors import SettingError
-
-__all__ = ["Faces", "PinholeGrid", "ResizedGrid"]
+from tangent_train.geometry.sphere import checked_rotation
 
 Faces = Sequence[int] | NDArray[np.integer]
 """Indices of images."""
@@ -30,21 +28,13 @@ class PinholeGrid(ABC):
 
     Attributes:
         dim: Side d in pixels.
+        pitch: Distance p of neighbouring pixels on the image plane, in focal lengths.
         rotation: ``(3, 3)`` proper rotation R of all images: directions become R·d.
     """
 
     dim: int
+    pitch: float
     rotation: NDArray[np.float64] | None
-
-    @property
-    @abstractmethod
-    def num_images(self) -> int:
-        """N."""
-
-    @property
-    @abstractmethod
-    def pitch(self) -> float:
-        """Distance p of neighbouring pixels on the image plane, in focal lengths."""
 
     @property
     @abstractmethod
@@ -60,20 +50,48 @@ class PinholeGrid(ABC):
         """Whether every direction is inside an image, not only on its outer edge."""
 
     @abstractmethod
+    def _resting_axes(self) -> NDArray[np.float64]:
+        """``(N, 3, 3)`` camera axes before the rotation."""
+
+    @property
+    def num_images(self) -> int:
+        """N."""
+        return len(self._resting_axes())
+
     def with_rotation(self, rotation: ArrayLike | None) -> Self:
         """The same images, rotated by this instead of their own.
 
         Raises:
             SettingError: The rotation is none.
         """
+        return self._changed(rotation=None if rotation is None else checked_rotation(rotation))
 
-    @abstractmethod
-    def _resting_axes(self) -> NDArray[np.float64]:
-        """``(N, 3, 3)`` camera axes before the rotation."""
+    def widened(self, margin: int) -> Self:
+        """The same images with more pixels on every side, at the same pitch."""
+        return self._changed(dim=self.dim + 2 * margin)
 
-    @abstractmethod
-    def _key(self) -> tuple[object, ...]:
-        """Values that make two grids of this class equal, besides the rotation."""
+    def resized(self, dim: int) -> Self:
+        """The same images at another resolution: their outer edges agree.
+
+        The output of a network that downsamples or upsamples tangent images lies on such a grid.
+
+        Args:
+            dim: Side d' in pixels; the pitch becomes p·d/d'.
+
+        Raises:
+            SettingError: The side is less than 2 pixels.
+        """
+        if dim < 2:
+            raise SettingError("dim", found=dim, expected="2 or more")
+        return self._changed(dim=dim, pitch=self.pitch * self.dim / dim)
+
+    def _changed(self, **values: Any) -> Self:
+        """This grid with other values, and nothing that was computed from its own."""
+        other = object.__new__(type(self))
+        for name, value in (vars(self) | values).items():
+            if not isinstance(getattr(type(self), name, None), cached_property):
+                vars(other)[name] = value
+        return other
 
     @property
     def half_extent(self) -> float:
@@ -180,74 +198,12 @@ class PinholeGrid(ABC):
         return np.stack([x / depth, y / depth], axis=-1) / self.pitch + (self.dim - 1) / 2
 
     @cached_property
-    def _whole_key(self) -> tuple[object, ...]:
+    def _key(self) -> tuple[object, ...]:
         rotation = None if self.rotation is None else self.rotation.tobytes()
-        return type(self), *self._key(), rotation
+        return type(self), self.num_images, self.dim, self.pitch, rotation
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, PinholeGrid) and self._whole_key == other._whole_key
+        return isinstance(other, PinholeGrid) and self._key == other._key
 
     def __hash__(self) -> int:
-        return hash(self._whole_key)
-
-
-@dataclass(frozen=True, eq=False)
-class ResizedGrid(PinholeGrid):
-    """The images of another grid at another resolution; their outer edges agree.
-
-    The output of a network that downsamples or upsamples tangent images lies on such a grid. With d
-    pixels of pitch p there and d' here, the pitch here is p·d/d'.
-
-    Args:
-        original: The other grid.
-        dim: Side d' in pixels, 2 or more.
-
-    Raises:
-        SettingError: The side is less than 2 pixels.
-    """
-
-    original: PinholeGrid
-    dim: int
-
-    def __post_init__(self) -> None:
-        if self.dim < 2:
-            raise SettingError("dim", found=self.dim, expected="2 or more")
-
-    @property
-    def rotation(self) -> NDArray[np.float64] | None:  # type: ignore[override]
-        """That of the other grid."""
-        return self.original.rotation
-
-    @property
-    def num_images(self) -> int:
-        """N of the other grid."""
-        return self.original.num_images
-
-    @property
-    def pitch(self) -> float:
-        """Distance p·d/d' of neighbouring pixels on the image plane, in focal lengths."""
-        return self.original.pitch * self.original.dim / self.dim
-
-    @property
-    def neighbors(self) -> NDArray[np.int32]:
-        """Those of the other grid."""
-        return self.original.neighbors
-
-    @property
-    def overlapping(self) -> bool:
-        """Whether the images of the other grid overlap: their edges are these."""
-        return self.original.overlapping
-
-    def with_rotation(self, rotation: ArrayLike | None) -> Self:
-        """The same images, rotated by this instead of their own.
-
-        Raises:
-            SettingError: The rotation is none.
-        """
-        return type(self)(self.original.with_rotation(rotation), self.dim)
-
-    def _resting_axes(self) -> NDArray[np.float64]:
-        return self.original._resting_axes()
-
-    def _key(self) -> tuple[object, ...]:
-        return self.original, self.dim
+        return hash(self._key)

@@ -7,15 +7,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from tangent_train.errors import SettingError
 
-__all__ = [
-    "FLIP_Y",
-    "checked_rotation",
-    "lonlat_to_xyz",
-    "random_rotation",
-    "rotation_about",
-    "xyz_to_lonlat",
-]
-
 FLIP_Y: NDArray[np.float64] = np.diag([1.0, -1.0, 1.0])
 """Sphere frame (y right) <-> right-handed room frame (y left); its own inverse."""
 FLIP_Y.setflags(write=False)

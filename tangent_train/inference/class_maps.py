@@ -24,8 +24,6 @@ from tangent_train.errors import DataError, SettingError
 from tangent_train.files import parse_json
 from tangent_train.registry import Text, check_fields
 
-__all__ = ["ClassMap", "MappedNetwork", "Unmapped", "load_class_map", "map_classes"]
-
 Unmapped = Literal["unknown", "never"]
 """Whether a source class that a map does not name may win, which is label 0, or never wins."""
 

@@ -25,8 +25,6 @@ from tangent_train.checkpoints.trained import (
 from tangent_train.errors import SettingError
 from tangent_train.files import atomic_path
 
-__all__ = ["SUFFIXES", "TOLERANCE", "Export", "export_network"]
-
 SUFFIXES = (".onnx", ".safetensors")
 
 TOLERANCE = 1e-4

@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from datamodules.core.image_module import Upright
     from tangent_train.inference.judge import NetworkJudge
 
-__all__ = ["DepthFolder", "read_panorama", "read_photo", "with_up"]
-
 _ASPECT_TOLERANCE = 0.01
 
 

@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from datamodules.core.inputs import Input, Normalization
     from tangent_train.checkpoints.trained import TrainedNetwork
 
-__all__ = ["NetworkJudge"]
-
 _AROUND = np.arange(4)  # faces of a cube: all but up and down
 _WEIGHT = 6.0  # fitted to one network on the real panoramas of one home, checked with another
 _LEAST_DOUBT = 1e-4

@@ -25,8 +25,6 @@ from tangent_train.rendering.checks import check_choice
 from tangent_train.rendering.forward import Pixels
 from tangent_train.rendering.mosaic import ScoreMosaic
 
-__all__ = ["Depth", "Network", "load"]
-
 Depth = Tensor | NDArray[Any] | None
 """``(H, W)`` floats: metres, 0 or NaN where missing."""
 

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from tangent_train.checkpoints.trained import TrainedNetwork
     from tangent_train.inference.views import InputImage, ViewSets
 
-__all__ = ["Predictor", "sees_rays", "view_images", "view_scores", "views_per_forward"]
-
 _PIXELS_PER_FORWARD = 2**20
 
 
@@ -169,7 +167,9 @@ class Predictor:
         for views in sets:
 
             def images(part: slice, views: Any = views) -> Tensor:
-                return self._images(views.image, views.views(part))
+                known = self._trained.inputs, self._trained.normalization
+                seen = view_images(views.image, views.views(part), *known, self.device)
+                return seen.contiguous(memory_format=self._format)
 
             rays = torch.from_numpy(views.rays).to(self.device)
             of_sphere = rays if self._sees_rays and len(rays) else None
@@ -179,8 +179,3 @@ class Predictor:
                 views.add(mosaic, scores, part)
                 progress((part.stop - part.start) / views.count / len(sets))
         return mosaic
-
-    def _images(self, image: InputImage, views: Any) -> Tensor:
-        known = self._trained.inputs, self._trained.normalization
-        images = view_images(image, views, *known, self.device)
-        return images.contiguous(memory_format=self._format)

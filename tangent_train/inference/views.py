@@ -31,17 +31,6 @@ if TYPE_CHECKING:
     from tangent_train.rendering import Blend
     from tangent_train.rendering.mosaic import ScoreMosaic
 
-__all__ = [
-    "InputImage",
-    "PanoramaViews",
-    "PhotoViews",
-    "ViewSet",
-    "ViewSets",
-    "check_size",
-    "panorama_settings",
-    "resized",
-]
-
 _TANGENT = "tangent_train.rendering.TangentRepresentation"
 _PERSPECTIVE = "tangent_train.rendering.PerspectiveRepresentation"
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,13 +23,13 @@ from tangent_train.rendering.forward import Pixels, equirect_to_tangent
 from tangent_train.rendering.tables import owners
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable, Iterator
 
     from numpy.typing import NDArray
 
     from tangent_train.geometry import PinholeGrid
 
-__all__ = ["apply"]
+    _Part = tuple[NDArray[np.int64], NDArray[Any]]
 
 _PIXELS_PER_CALL = 2**20
 
@@ -84,93 +85,69 @@ def apply(
         raise SettingError("images_per_call", found=images_per_call, expected="1 or more")
     step = images_per_call or max(1, _PIXELS_PER_CALL // grid.dim**2)
     rows, columns = panorama.shape[-2:] if isinstance(panorama, Tensor) else panorama.shape[:2]
-
-    def results_of(faces: NDArray[np.int64]) -> NDArray[Any]:
-        images = equirect_to_tangent(panorama, grid, faces)
-        return _as_array(function(images), images)
-
-    first, *others = np.split(np.arange(grid.num_images), range(step, grid.num_images, step))
-    results = results_of(first)
-    made = _Means if results.dtype.kind == "f" else _Copies
-    canvas = made(grid, (rows, columns), blend, results)
-    canvas.add(results, first)
-    for faces in others:
-        canvas.add(results_of(faces), faces)
-    return _like(panorama, canvas.panorama())
-
-
-class _Means:
-    """Adds up results that are floats.
-
-    Args:
-        grid: Their grid.
-        shape: ``(H, W)`` of the panorama.
-        blend: Their blending.
-        first: ``(n, d, d[, K])`` some of them.
-    """
-
-    def __init__(
-        self, grid: PinholeGrid, shape: tuple[int, int], blend: Blend, first: NDArray[Any]
-    ) -> None:
-        self._grid, self._shape, self._channels = grid, shape, first.shape[3:]
-        self._owner = NO_OWNERS if blend == "feather" else owners(grid, shape)
-        self._feathered = blend == "feather"
-        self._sums = zero_sums(shape, math.prod(self._channels) + self._feathered)
-
-    def add(self, results: NDArray[Any], faces: NDArray[np.int64]) -> None:
-        """Add those of some images, and a channel of their weights."""
-        _check_alike(results, self._channels, "f")
-        images = np.moveaxis(results.reshape(*results.shape[:3], -1), -1, 1).astype(np.float32)
-        if self._feathered:
-            images = np.concatenate([images, np.ones_like(images[:, :1])], axis=1)
-        whole = slice(0, self._shape[0])
-        add_to_panorama(images, self._grid, faces, self._shape, whole, self._owner, self._sums)
-
-    def panorama(self) -> NDArray[np.float32]:
-        """``(H, W[, K])``, in the memory of the sums."""
-        height, width = self._shape
-        count = math.prod(self._channels)
-        flat = np.asarray(self._sums).reshape(-1)
-        for i in range(height):
-            means = without_blocks(self._sums[i : i + 1], count + self._feathered)
-            means = means[..., :count] / (means[..., count:] if self._feathered else 1)
-            flat[i * width * count : (i + 1) * width * count] = means.ravel()
-        return flat[: height * width * count].reshape(height, width, *self._channels)
-
-
-class _Copies:
-    """Keeps results that are whole numbers or booleans, to copy their pixels; see `_Means`."""
-
-    def __init__(
-        self, grid: PinholeGrid, shape: tuple[int, int], blend: Blend, first: NDArray[Any]
-    ) -> None:
-        if blend != "nearest":
-            raise SettingError(
-                "blend",
-                found=f"{blend!r} of results of {first.dtype}",
-                expected="'nearest': labels and masks cannot be averaged",
-                remedy="To average numbers, return them as floats.",
-            )
-        self._grid, self._shape = grid, shape
-        self._images = np.empty((grid.num_images, *first.shape[1:]), first.dtype)
-
-    def add(self, results: NDArray[Any], faces: NDArray[np.int64]) -> None:
-        """Add those of some images."""
-        _check_alike(results, self._images.shape[3:], self._images.dtype.kind)
-        self._images[faces] = results
-
-    def panorama(self) -> NDArray[Any]:
-        """``(H, W[, K])``."""
-        return tangent_to_equirect(self._images, self._grid, self._shape, interpolation="nearest")
-
-
-def _check_alike(results: NDArray[Any], channels: tuple[int, ...], kind: str) -> None:
-    if (results.shape[3:], results.dtype.kind) != (channels, kind):
+    parts: Iterator[_Part] = _results(function, panorama, grid, step)
+    start = next(parts)
+    first: NDArray[Any] = start[1]
+    parts = chain([start], parts)
+    if first.dtype.kind == "f":
+        array = _mean(parts, grid, (rows, columns), blend, first.shape[3:])
+    elif blend == "nearest":
+        images = np.empty((grid.num_images, *first.shape[1:]), first.dtype)
+        for faces, results in parts:
+            images[faces] = results
+        array = tangent_to_equirect(images, grid, (rows, columns), interpolation="nearest")
+    else:
         raise SettingError(
-            "result of the function",
-            found=f"K = {results.shape[3:]} of {results.dtype} for some images",
-            expected=f"K = {channels} of the first ones' kind of numbers",
+            "blend",
+            found=f"{blend!r} of results of {first.dtype}",
+            expected="'nearest': labels and masks cannot be averaged",
+            remedy="To average numbers, return them as floats.",
         )
+    return _like(panorama, array)
+
+
+def _results(
+    function: Callable[[Pixels], Pixels], panorama: Pixels, grid: PinholeGrid, step: int
+) -> Iterator[_Part]:
+    """The results for some images after the other, all of the kind of the first."""
+    first: Any = None
+    for faces in np.split(np.arange(grid.num_images), range(step, grid.num_images, step)):
+        images = equirect_to_tangent(panorama, grid, faces)
+        results = _as_array(function(images), images)
+        kind = results.shape[3:], results.dtype.kind
+        first = first or kind
+        if kind != first:
+            raise SettingError(
+                "result of the function",
+                found=f"K = {kind[0]} of {results.dtype} for some images",
+                expected=f"K = {first[0]} of the first ones' kind of numbers",
+            )
+        yield faces, results
+
+
+def _mean(
+    parts: Iterable[_Part],
+    grid: PinholeGrid,
+    shape: tuple[int, int],
+    blend: Blend,
+    channels: tuple[int, ...],
+) -> NDArray[np.float32]:
+    """The blended results ``(H, W, *channels)``, in the memory of their sums."""
+    (height, width), count, feather = shape, math.prod(channels), blend == "feather"
+    owner = NO_OWNERS if feather else owners(grid, shape)
+    sums = zero_sums(shape, count + feather)  # and of the weights
+    for faces, results in parts:
+        flat = results.reshape(*results.shape[:3], -1)
+        images = np.moveaxis(flat, -1, 1).astype(np.float32)
+        if feather:
+            images = np.concatenate([images, np.ones_like(images[:, :1])], axis=1)
+        add_to_panorama(images, grid, faces, shape, slice(0, height), owner, sums)
+    means, size = np.asarray(sums).reshape(-1), width * count
+    for i in range(height):
+        row = without_blocks(sums[i : i + 1], count + feather)
+        row = row[..., :count] / (row[..., count:] if feather else 1)
+        means[i * size : (i + 1) * size] = row.ravel()
+    return means[: height * size].reshape(*shape, *channels)
 
 
 def _as_array(returned: Any, images: Tensor | NDArray[Any]) -> NDArray[Any]:

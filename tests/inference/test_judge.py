@@ -10,7 +10,6 @@ import torch
 from torch import Tensor, nn
 
 from datamodules.core.inputs import Input, Normalization
-from datamodules.core.panoramas import Panorama
 from tangent_train.geometry import equirect_directions, random_rotation
 from tangent_train.inference.judge import NetworkJudge
 from tangent_train.inference.views import InputImage
@@ -58,12 +57,6 @@ def test_the_network_is_surest_of_what_is_upright(height: int) -> None:
         # Lying on a side, two views see the border upright (half of each fits), two one colour.
         others = np.delete(likely, [true, (true + 3) % 6])
         np.testing.assert_allclose(others, 6 * np.log(4), atol=0.2)
-
-
-def test_a_panorama_of_a_data_set_is_judged_alike() -> None:
-    rgb = _bright_above(AXES[1])
-    panorama = Panorama(rgb, None, rgb[..., 0])
-    np.testing.assert_array_equal(_judge()(panorama, AXES), _judge()(InputImage(rgb), AXES))
 
 
 def test_who_is_told_where_up_is_does_not_judge() -> None:

@@ -18,7 +18,6 @@ from tangent_train.inference.network import Network
 from tests.cli.tiny_runs import run_command
 from tests.inference.trained import (
     CUBE,
-    ERP,
     PERSPECTIVE,
     TANGENT,
     sphere,
@@ -56,7 +55,6 @@ def network(tmp_path: Path) -> Network:
         (TANGENT, ["rotations=2", "level=5"], {"rotations": 2, "level": 5}),
         (TANGENT, ["levels=[4,5]", "base_level=1"], {"levels": (4, 5), "base_level": 1}),
         (CUBE, ["blend=nearest"], {"blend": "nearest"}),
-        (ERP, [], {}),
         (PERSPECTIVE, ["level=5"], {"level": 5}),
         (TANGENT, ["min_confidence=0.6"], {"min_confidence": 0.6}),
     ],
@@ -118,7 +116,6 @@ def test_tensors_get_what_arrays_get(network: Network) -> None:
 
 
 @pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 def test_a_gpu_gives_what_the_cpu_gives(tmp_path: Path, network: Network) -> None:
     panorama = torch.from_numpy(sphere(33)).permute(2, 0, 1)
     on_gpu = tt.load(tmp_path / "net.ckpt", device="cuda").labels(panorama.cuda())
@@ -177,13 +174,10 @@ _RGB = np.zeros((16, 32, 3), np.uint8)
     ("image", "message"),
     [
         (_RGB[:, :31], "found 16×31 pixels; expected the whole sphere.*fov="),
-        (_RGB[..., 0], r"ndarray \(16, 32\) of uint8"),
-        (np.zeros((16, 32, 4), np.uint8), r"array \(H, W, 3\)"),
+        (_RGB[..., 0], r"ndarray \(16, 32\) of uint8; expected .* array \(H, W, 3\)"),
         (_RGB.transpose(2, 0, 1), r"transpose\(1, 2, 0\)"),
-        (_RGB.astype(np.float32), "times 255"),
         (torch.zeros(16, 32, 3, dtype=torch.uint8), r"tensor \(3, H, W\).*permute\(2, 0, 1\)"),
         (torch.zeros(3, 16, 32), "found Tensor.*float32.*times 255"),
-        (torch.zeros(1, 3, 16, 32, dtype=torch.uint8), r"\(1, 3, 16, 32\)"),
         (_RGB[:0, :0], r"\(0, 0, 3\)"),
         ("room.jpg", "found str"),
     ],
@@ -200,15 +194,10 @@ def test_impossible_settings_are_refused(tmp_path: Path, network: Network) -> No
         network.scores(_RGB, fov=180)
     with pytest.raises(DataError, match=r"missing\.ckpt"):
         tt.load(tmp_path / "missing.ckpt")
-    for settings, message in (
-        ({"rotations": 0}, "rotations"),
-        ({"device": "nonsense"}, "device"),
-        ({"base_level": 9}, "base_level"),
-        ({"class_map": "night"}, "class_map: found night"),
-        ({"unmapped": "0"}, "unmapped: found '0'"),
-    ):
-        with pytest.raises(SettingError, match=message):
-            tt.load(tmp_path / "net.ckpt", **settings)
+    with pytest.raises(SettingError, match="class_map: found night"):
+        tt.load(tmp_path / "net.ckpt", class_map="night")
+    with pytest.raises(SettingError, match="unmapped: found '0'"):
+        tt.load(tmp_path / "net.ckpt", unmapped="0")  # type: ignore[arg-type]
 
 
 def test_a_name_of_trusted_code_is_one_name(tmp_path: Path) -> None:

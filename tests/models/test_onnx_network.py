@@ -7,39 +7,28 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnx
 import onnxruntime
 import pytest
 import torch
-from onnx import TensorProto, helper, numpy_helper
+from onnx import TensorProto, helper
 
 from models.onnx_network import OnnxNetwork
 from tangent_train.errors import DataError, SettingError
+from tests.models.onnx_files import write_linear, write_onnx
 
 WEIGHT = np.array([[1.0, -2, 0.5], [0, 3, 1]], np.float32)
 BIAS = np.array([0.25, -1], np.float32)
 
 
-def _write(path: Path, shape: Any = ("b", 3, "h", "w"), outputs: tuple[str, ...] = ("a",)) -> Path:
-    """Two scores of every pixel, from its three channels."""
-    images = helper.make_tensor_value_info("pictures", TensorProto.FLOAT, shape)
-    values = [helper.make_tensor_value_info(n, TensorProto.FLOAT, None) for n in outputs]
-    nodes = [helper.make_node("Conv", ["pictures", "weight", "bias"], [n]) for n in outputs]
-    weights = [
-        numpy_helper.from_array(WEIGHT[:, :, None, None], "weight"),
-        numpy_helper.from_array(BIAS, "bias"),
-    ]
-    graph = helper.make_graph(nodes, "by hand", [images], values, weights)
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
-    helper.set_model_props(model, {"who": "a test"})
-    onnx.save(model, path)
-    return path
+def _linear(path: Path, **settings: Any) -> Path:
+    return write_linear(path, WEIGHT, BIAS, **settings)
 
 
 @pytest.mark.parametrize("shape", [(1, 3, 2, 5), (4, 3, 7, 3)])
 def test_scores_are_those_of_the_file(shape: tuple[int, ...], tmp_path: Path) -> None:
-    network, images = OnnxNetwork(_write(tmp_path / "net.onnx")), torch.randn(*shape)
+    network = OnnxNetwork(_linear(tmp_path / "net.onnx", properties={"who": "a test"}))
     assert network.metadata == {"who": "a test"}
+    images = torch.randn(*shape)
     scores = network(images)
     expected = np.einsum("kc,bchw->bkhw", WEIGHT.astype(np.float64), images.double().numpy())
     np.testing.assert_allclose(scores.numpy(), expected + BIAS[:, None, None], atol=1e-6)
@@ -53,7 +42,7 @@ def test_scores_are_those_of_the_file(shape: tuple[int, ...], tmp_path: Path) ->
 def test_threads_are_torchs_and_cuda_is_used_where_there_is_any(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path, opened, session = _write(tmp_path / "net.onnx"), [], onnxruntime.InferenceSession
+    path, opened, session = _linear(tmp_path / "net.onnx"), [], onnxruntime.InferenceSession
 
     def record(file: Path, options: Any, providers: list[str]) -> Any:
         opened.append((options.intra_op_num_threads, providers))
@@ -69,13 +58,13 @@ def test_threads_are_torchs_and_cuda_is_used_where_there_is_any(
 
 
 def test_images_of_another_shape_are_refused(tmp_path: Path) -> None:
-    network = OnnxNetwork(_write(tmp_path / "net.onnx", ("b", 3, 2, 5)))
+    network = OnnxNetwork(_linear(tmp_path / "net.onnx", shape=("b", 3, 2, 5)))
     with pytest.raises(SettingError, match=r"net\.onnx: found 1×4×2×5; .* b×3×2×5"):
         network(torch.zeros(1, 4, 2, 5))
 
 
 def test_other_files_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = _write(tmp_path / "net.onnx")
+    whole = _linear(tmp_path / "net.onnx")
     files = {"missing": None, "empty": b"no protobuf", "cut": whole.read_bytes()[:100]}
     for name, content in files.items():
         path = tmp_path / f"{name}.onnx"
@@ -84,52 +73,36 @@ def test_other_files_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         with pytest.raises(DataError, match=rf"{name}\.onnx: found (no such|an unreadable) file"):
             OnnxNetwork(path)
     with pytest.raises(DataError, match=r"outputs \['a', 'b'\]; .* the only output"):
-        OnnxNetwork(_write(tmp_path / "two.onnx", outputs=("a", "b")))
+        OnnxNetwork(_linear(tmp_path / "two.onnx", outputs=("a", "b")))
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     with pytest.raises(DataError, match=r"onnxruntime.*pip install 'tangent-train\[export\]'"):
         OnnxNetwork(whole)
 
 
-def _of_nodes(path: Path, shape: Any, *nodes: Any, kind: int = TensorProto.FLOAT) -> OnnxNetwork:
-    """A network of nodes from "pictures" to "a"."""
-    images = helper.make_tensor_value_info("pictures", kind, shape)
-    last = {"ArgMax": TensorProto.INT64}.get(nodes[-1].op_type, kind)
-    graph = helper.make_graph(
-        nodes,
-        "by hand",
-        [images],
-        [helper.make_tensor_value_info("a", last, None)],
-        [numpy_helper.from_array(np.array([2], np.int64), "half")],
-    )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
-    onnx.save(model, path)
-    return OnnxNetwork(path)
-
-
-_IDENTITY = helper.make_node("Identity", ["pictures"], ["a"])
+IDENTITY = helper.make_node("Identity", ["images"], ["scores"])
 
 
 def test_channels_may_be_last(tmp_path: Path) -> None:
     images = torch.randn(2, 3, 4, 5)
-    last = _of_nodes(tmp_path / "last.onnx", ("b", "h", "w", 3), _IDENTITY)
+    last = OnnxNetwork(write_onnx(tmp_path / "last.onnx", IDENTITY, shape=("b", "h", "w", 3)))
     torch.testing.assert_close(last(images), images)
-    to_last = helper.make_node("Transpose", ["pictures"], ["a"], perm=[0, 2, 3, 1])
-    mixed = _of_nodes(tmp_path / "mixed.onnx", ("b", 3, 4, 5), to_last)
+    to_last = helper.make_node("Transpose", ["images"], ["scores"], perm=[0, 2, 3, 1])
+    mixed = OnnxNetwork(write_onnx(tmp_path / "mixed.onnx", to_last, shape=("b", 3, 4, 5)))
     assert mixed.image_size == (4, 5)
     torch.testing.assert_close(mixed(images), images)
 
 
 def test_coarser_scores_are_interpolated_and_labels_repeated(tmp_path: Path) -> None:
     images = torch.randn(2, 3, 8, 12)
-    pool = helper.make_node("AveragePool", ["pictures"], ["p"], kernel_shape=[4, 4], strides=[4, 4])
-    scores = helper.make_node("Identity", ["p"], ["a"])
+    pool = helper.make_node("AveragePool", ["images"], ["p"], kernel_shape=[4, 4], strides=[4, 4])
+    scores = helper.make_node("Identity", ["p"], ["scores"])
     coarse = torch.nn.functional.avg_pool2d(images, 4)
-    network = _of_nodes(tmp_path / "coarse.onnx", ("b", 3, "h", "w"), pool, scores)
+    network = OnnxNetwork(write_onnx(tmp_path / "coarse.onnx", pool, scores))
     expected = torch.nn.functional.interpolate(coarse, (8, 12), mode="bilinear")
     torch.testing.assert_close(network(images), expected)
     for keep in (0, 1):
-        best = helper.make_node("ArgMax", ["p"], ["a"], axis=1, keepdims=keep)
-        labels = _of_nodes(tmp_path / f"labels{keep}.onnx", ("b", 3, "h", "w"), pool, best)(images)
+        best = helper.make_node("ArgMax", ["p"], ["scores"], axis=1, keepdims=keep)
+        labels = OnnxNetwork(write_onnx(tmp_path / f"labels{keep}.onnx", pool, best))(images)
         assert labels.dtype == torch.int64
         torch.testing.assert_close(labels[:, 1::4, 2::4], coarse.argmax(dim=1))
         assert labels.shape == (2, 8, 12)
@@ -137,17 +110,17 @@ def test_coarser_scores_are_interpolated_and_labels_repeated(tmp_path: Path) -> 
 
 def test_files_of_a_fixed_batch_and_of_half_precision(tmp_path: Path) -> None:
     images = torch.randn(5, 3, 4, 4)
-    fixed = _of_nodes(tmp_path / "fixed.onnx", (2, 3, 4, 4), _IDENTITY)
+    fixed = OnnxNetwork(write_onnx(tmp_path / "fixed.onnx", IDENTITY, shape=(2, 3, 4, 4)))
     torch.testing.assert_close(fixed(images), images)
-    half = _of_nodes(tmp_path / "half.onnx", ("b", 3, 4, 4), _IDENTITY, kind=TensorProto.FLOAT16)
+    half = OnnxNetwork(write_onnx(tmp_path / "half.onnx", IDENTITY, kind=TensorProto.FLOAT16))
     assert half(images).dtype == torch.float32
     torch.testing.assert_close(half(images), images.half().float())
 
 
 def test_what_is_no_network_of_photos_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"found images as tensor\(int64\); expected tensor"):
-        _of_nodes(tmp_path / "whole.onnx", ("b", 3, 4, 4), _IDENTITY, kind=TensorProto.INT64)
-    flat = helper.make_node("Flatten", ["pictures"], ["a"])
-    network = _of_nodes(tmp_path / "flat.onnx", ("b", 3, 4, 4), flat)
+        OnnxNetwork(write_onnx(tmp_path / "whole.onnx", IDENTITY, kind=TensorProto.INT64))
+    flat = helper.make_node("Flatten", ["images"], ["scores"])
+    network = OnnxNetwork(write_onnx(tmp_path / "flat.onnx", flat))
     with pytest.raises(SettingError, match=r"output of flat\.onnx: found 1×48; expected scores"):
         network(torch.zeros(1, 3, 4, 4))

@@ -12,15 +12,9 @@ from tangent_train.errors import SettingError
 from tests.tasks.small_networks import with_statistics
 
 
-@pytest.mark.parametrize(
-    ("classes", "width", "parameters"),
-    [(40, 16, 1_309_976), (40, 32, 5_135_880), (10, 16, 1_309_976 - 30 * (64 * 16 + 1))],
-)
-def test_parameters_are_those_of_the_released_code(
-    classes: int, width: int, parameters: int
-) -> None:
-    network = ShapeClassifier(6, classes, width)
-    assert sum(p.numel() for p in network.parameters() if p.requires_grad) == parameters
+def test_parameters_are_those_of_the_released_code() -> None:
+    """Of the other width the docstring counts them."""
+    assert sum(p.numel() for p in ShapeClassifier(6, 40, width=32).parameters()) == 5_135_880
 
 
 def test_scores_are_of_the_mean_over_views_and_positions() -> None:
@@ -71,20 +65,6 @@ def test_trained_layers_stay_and_the_first_and_last_are_fitted(name: str) -> Non
     assert {n.rpartition(".")[0] for n in head} == {list(after)[-1].rpartition(".")[0]}
     assert all(torch.equal(t, before[n]) for n, t in after.items() if n not in changed)
     assert network(torch.randn(2, 3, 6, 64, 64)).shape == (2, 7)
-
-
-def test_further_channels_change_nothing_at_first_and_are_learned() -> None:
-    torch.manual_seed(0)
-    network = _torchvision("mobilenet_v3_small").eval()
-    images = torch.randn(2, 5, 64, 64)
-    expected = network(images[:, :3])
-    assert widen_stem(network, 5) is network
-    scores = network(images)
-    assert torch.equal(scores, expected)
-    scores.square().sum().backward()
-    stem = next(network.parameters())
-    assert stem.grad is not None
-    assert stem.grad[:, 3:].abs().amax(dim=(0, 2, 3)).min() > 0
 
 
 @pytest.mark.parametrize(

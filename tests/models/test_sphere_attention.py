@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from models import SphereAttention
 from models.sphere_attention import angular_attention
@@ -74,28 +73,6 @@ def test_it_computes_its_formula() -> None:
     torch.testing.assert_close(mixer(tokens, directions).double(), expected, rtol=1e-4, atol=1e-5)
     exact = mixer.double()(tokens.double(), directions)
     torch.testing.assert_close(exact, expected, rtol=1e-6, atol=1e-6)
-
-
-def test_gradients_are_those_of_a_mask() -> None:
-    """The bias as a mask of torch's attention, which needs tokens × tokens of memory."""
-    queries, keys, values = torch.randn(3, 2, 3, 7, 5, dtype=torch.float64).unbind(0)
-    directions = functional.normalize(torch.randn(2, 7, 3, dtype=torch.float64), dim=-1)
-    kappa = torch.tensor([0.2, 3.0, 20.0], dtype=torch.float64)
-    leaves = [leaf.requires_grad_() for leaf in (queries, keys, values, kappa)]
-    weight = torch.randn_like(values)
-
-    def masked() -> Tensor:
-        cosine = (directions @ directions.mT)[:, None]
-        mask = kappa[:, None, None] * (cosine - 1)
-        return functional.scaled_dot_product_attention(queries, keys, values, attn_mask=mask)
-
-    found = angular_attention(queries, keys, values, directions, kappa)
-    torch.testing.assert_close(found, masked())
-    torch.testing.assert_close(
-        torch.autograd.grad((found * weight).sum(), leaves),
-        torch.autograd.grad((masked() * weight).sum(), leaves),
-    )
-    assert torch.autograd.gradcheck(angular_attention, (*leaves[:3], directions, kappa))
 
 
 def test_an_image_alone_learns_nothing() -> None:

@@ -25,6 +25,9 @@ from tests.models.sphere_networks import (
     tangent_rays,
 )
 
+GPU = pytest.mark.gpu
+DEVICES = ["cpu", pytest.param("cuda", marks=GPU)]
+
 
 @pytest.mark.parametrize("size", [(16, 16), (4, 20)])
 def test_before_training_it_computes_what_the_network_computes(size: tuple[int, int]) -> None:
@@ -74,19 +77,6 @@ def test_an_image_alone_or_without_rays_has_no_context() -> None:
         assert not torch.allclose(context(images, rays), expected, rtol=0, atol=1e-5)
 
 
-def test_mirrored_images_give_mirrored_scores() -> None:
-    """With a network that has no left and right itself."""
-    network = nn.Sequential(nn.Conv2d(3, 8, 1), nn.AvgPool2d(2), nn.Conv2d(8, 2, 1))
-    context = SphereContext(network, "1", ATTENTION, in_channels=3, tokens=3).eval()
-    awake(context.mixer)
-    images, rays = torch.randn(4, 3, 12, 12), sphere_rays(4)
-    mirrored = rays * torch.tensor([-1.0, 1.0, 1.0])
-    with torch.no_grad():
-        scores = context(images, rays)
-        torch.testing.assert_close(context(images.flip(-1), mirrored).flip(-1), scores)
-        assert not torch.allclose(context(images.flip(-1), rays).flip(-1), scores, atol=1e-3)
-
-
 @pytest.mark.parametrize("size", [(15, 15), (5, 3)])
 def test_tokens_look_along_the_middle_of_their_pixels(size: tuple[int, int]) -> None:
     grid = TangentGrid(0, 4, 15, random_rotation(np.random.default_rng(0)))
@@ -112,22 +102,6 @@ def test_copies_are_on_their_own_and_the_network_by_itself_is_as_before() -> Non
     torch.testing.assert_close(other(images, rays), expected)
 
 
-class _Dropping(nn.Module):
-    """Drops out before the stage and behind it, and keeps what it dropped."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.encode = nn.Sequential(nn.Conv2d(3, 8, 1), nn.Dropout(0.5))
-        self.decode = nn.Sequential(nn.Dropout(0.5), nn.Conv2d(8, 4, 1))
-        self.drawn: list[Tensor] = []
-
-    def forward(self, images: Tensor) -> Tensor:
-        features = self.encode(images)
-        self.drawn.append(self.encode[0](images) * 2 == features)
-        scores: Tensor = self.decode(features)
-        return scores
-
-
 def _gradients(
     context: nn.Module, images: Tensor, rays: Tensor | None, size: int | None
 ) -> tuple[Any, dict[str, Tensor]]:
@@ -136,10 +110,10 @@ def _gradients(
     scores = context(images, rays, images_per_chunk=size)
     named = scores if isinstance(scores, dict) else {"out": scores}
     generator = torch.Generator().manual_seed(0)
-    loss: Any = torch.zeros((), dtype=images.dtype)
+    loss: Any = 0
     for tensor in named.values():
         weight = torch.randn(tensor.shape, generator=generator, dtype=images.dtype)
-        loss = loss + (tensor.square() * weight).sum()
+        loss = loss + (tensor.square() * weight.to(tensor.device)).sum()
     loss.backward()
     found = {n: p.grad.clone() for n, p in context.named_parameters() if p.grad is not None}
     return scores, found
@@ -214,34 +188,52 @@ def test_evaluation_and_errors_leave_no_traces() -> None:
     torch.testing.assert_close(dict(context.named_buffers()), before, rtol=0, atol=0)
 
 
-def test_a_chunk_drops_out_the_same_in_every_run() -> None:
-    network = _Dropping()
-    context = SphereContext(network, "encode", ATTENTION, in_channels=3, tokens=2).train()
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_chunk_drops_out_the_same_in_every_run(device: str) -> None:
+    encoder = nn.Sequential(nn.Conv2d(3, 8, 1), nn.Dropout(0.5))
+    network = nn.Sequential(encoder, nn.Conv2d(8, 4, 1))
+    context = SphereContext(network, "0", ATTENTION, in_channels=3, tokens=2).to(device).train()
     awake(context.mixer)
+    images, rays = torch.randn(6, 3, 8, 8).to(device), sphere_rays(6).to(device)
+    dropped: list[Tensor] = []
+    encoder[1].register_forward_hook(lambda _m, _i, result: dropped.append(result == 0))
+    generator: Any = torch if device == "cpu" else torch.cuda
     torch.manual_seed(3)
-    images = torch.randn(6, 3, 8, 8)
-    encoded: list[Tensor] = []
-
-    def keep(_module: nn.Module, _inputs: Any, result: Tensor) -> None:
-        encoded.append(result == 0)
-
-    network.encode[1].register_forward_hook(keep)
-    state = torch.get_rng_state()
-    _, gradients = _gradients(context, images, sphere_rays(6), 3)
-    after = torch.get_rng_state()
+    _, gradients = _gradients(context, images, rays, 3)
+    after = generator.get_rng_state()
     # Two chunks: encoded, decoded, then both again for the gradient, the last one first.
-    assert len(encoded) == 8
-    first, second = encoded[0], encoded[1]
-    assert not torch.equal(first, second), "chunks draw differently"
-    runs = [torch.equal(run, first) for run in encoded]
-    assert [torch.equal(run, second) for run in encoded] == [not same for same in runs]
-    assert sum(runs) == 4
-    assert 0.3 < float(first.float().mean()) < 0.7
-    torch.set_rng_state(state)
-    _, again = _gradients(context, images, sphere_rays(6), 3)
+    assert len(dropped) == 8
+    assert not torch.equal(dropped[0], dropped[1]), "chunks draw differently"
+    for chunk in dropped[:2]:
+        assert sum(torch.equal(run, chunk) for run in dropped) == 4
+    assert 0.3 < float(dropped[0].float().mean()) < 0.7
+    torch.manual_seed(3)
+    assert torch.equal(generator.get_rng_state(), after) == (device == "cuda")
+    _, again = _gradients(context, images, rays, 3)
     torch.testing.assert_close(again, gradients, rtol=0, atol=0)
-    assert torch.equal(torch.get_rng_state(), after)
-    assert not torch.equal(after, state), "the next step draws something else"
+    assert torch.equal(generator.get_rng_state(), after)
+
+
+@GPU
+def test_scores_and_gradients_on_a_gpu_are_those_of_the_cpu() -> None:
+    context = small_context().double().eval()
+    images, rays = torch.randn(6, 3, 16, 16).double(), sphere_rays(3, 2).double()
+    for size in (None, 4):
+        expected = _gradients(context, images, rays, size)
+        scores, found = _gradients(copy.deepcopy(context).cuda(), images.cuda(), rays.cuda(), size)
+        torch.testing.assert_close((scores, found), expected, check_device=False)
+
+
+@GPU
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_half_precision(dtype: torch.dtype) -> None:
+    context = small_context().cuda().eval()
+    images, rays = torch.randn(4, 3, 16, 16).cuda(), sphere_rays(4).cuda()
+    with torch.no_grad():
+        expected = context(images, rays)
+        with torch.autocast("cuda", dtype):
+            for found in (context(images, rays), context(images, rays, 3)):
+                torch.testing.assert_close(found.float(), expected, rtol=0.1, atol=0.1)
 
 
 def test_only_one_chunk_is_kept_for_the_gradient() -> None:

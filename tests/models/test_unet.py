@@ -15,19 +15,6 @@ from tangent_train.errors import SettingError
 from tests.running import run_python
 
 
-@pytest.mark.parametrize(
-    ("network", "parameters"),
-    [
-        (UNet(4, 14), 2_896_654),
-        (UNet(3, 13), 2_896_654 - 9 * 16 - 9 * 16 - 1),
-        (HexUNet(3, 14), 7_248_718),
-        (HexUNet(4, 14), 7_248_718 + 9 * 32),
-    ],
-)
-def test_parameters_are_those_of_the_released_code(network: nn.Module, parameters: int) -> None:
-    assert sum(p.numel() for p in network.parameters() if p.requires_grad) == parameters
-
-
 def test_pooling_first_equals_halving_after_the_first_convolution() -> None:
     down = Down(6, 10).eval()
     x = torch.randn(2, 6, 8, 12)

@@ -100,8 +100,6 @@ def test_files_that_are_no_json(content: bytes | None, tmp_path: Path) -> None:
     "content",
     [
         "[]",
-        "{}",
-        '[{"cameras": 1, "panoramas": {}}]',
         '[{"cameras": [{"image_prefix": "a/", "ref_sensor": true}], "panoramas": {}}]',
         '[{"cameras": [], "panoramas": ["a.png"]}]',
         '[{"cameras": [{"image_prefix": "a/", "world_from_camera": [1, 2]}], "panoramas": {}}]',

@@ -17,10 +17,7 @@ from tangent_train.rendering import (
     tangent_to_labels,
 )
 
-pytestmark = [
-    pytest.mark.gpu,
-    pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device"),
-]
+pytestmark = pytest.mark.gpu
 
 GRID = TangentGrid(1, 6)
 SHAPE = equirect_shape(6)

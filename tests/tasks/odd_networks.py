@@ -45,16 +45,6 @@ class TwoSizes(nn.Conv2d):
         return super().forward(images) * (2 if images.shape[-1] > 35 else 1)
 
 
-class Counting(nn.Conv2d):
-    """Another computation for two images: no exporter leaves their number open."""
-
-    def __init__(self) -> None:
-        super().__init__(4, 4, 1)
-
-    def forward(self, images: Tensor) -> Tensor:
-        return super().forward(images) * (2 if images.shape[0] == 2 else 1)
-
-
 class Tracing(nn.Conv2d):
     """Another computation while it is traced."""
 

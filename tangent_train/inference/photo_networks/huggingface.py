@@ -19,8 +19,6 @@ from tangent_train.inference.photo_networks.network import (
 from tangent_train.inference.photo_networks.saved import json_in, saved_folder, tensors_in
 from tangent_train.registry import SettingsFile, make
 
-__all__ = ["load"]
-
 _TASK = "the task is semantic"
 _VOCABULARIES = ("tokenizer.json", "vocab.json")
 _BYTE = 255

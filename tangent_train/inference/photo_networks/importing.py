@@ -23,8 +23,7 @@ from tangent_train.errors import SettingError
 from tangent_train.files import atomic_path
 from tangent_train.geometry import vertex_resolution
 from tangent_train.inference.photo_networks.network import PhotoNetwork
-
-__all__ = ["Imported", "View", "import_network", "view_of"]
+from tangent_train.registry import SettingsFile
 
 _TANGENT = "tangent_train.rendering.TangentRepresentation"
 _LEVELS = (5, 13)
@@ -86,7 +85,6 @@ def import_network(
         NoRoomError: The disk is full.
     """
     view = view_of(network.image_size, fov_deg, level, base_level)
-    _try(network)
     names, groups = _groups(network.score_names, nothing, nothing_wins)
     with atomic_path(path) as temporary:
         if isinstance(network.network, OnnxNetwork):
@@ -94,10 +92,8 @@ def import_network(
         else:
             _write_checkpoint(network, temporary, names, groups, view)
         trained = load_trained(temporary)
-        if network.image_size != (view.dim, view.dim):  # else it was tried
-            _use(trained, view, network.image_size)
-    source = None if trained.source is None else replace(trained.source, path=path)
-    return Imported(replace(trained, source=source), tuple(nothing), view)
+        _use(trained, view, network.image_size)
+    return Imported(replace(trained, source=SettingsFile(path)), tuple(nothing), view)
 
 
 def view_of(
@@ -133,21 +129,6 @@ def view_of(
     return View(level, base_level, max(side, 2 ** (level - base_level)))
 
 
-@torch.no_grad()
-def _try(network: PhotoNetwork) -> None:
-    """Refuse names that do not fit the scores."""
-    images = torch.zeros(1, 3, *network.image_size)
-    try:
-        Scores(network.network.eval(), len(network.score_names))(images)
-    except RuntimeError as error:
-        raise SettingError(
-            "network",
-            found=f"one that does not take images of {'×'.join(map(str, network.image_size))} "
-            f"({str(error).partition(chr(10))[0]})",
-            expected="one for RGB images of that size",
-        ) from error
-
-
 def _groups(
     score_names: Collection[str], nothing: Collection[str], wins: bool
 ) -> tuple[list[str], Groups | None]:
@@ -170,7 +151,7 @@ def _groups(
 
 @torch.no_grad()
 def _use(trained: TrainedNetwork, view: View, photos: tuple[int, int]) -> None:
-    """Label one image as the commands will."""
+    """Label one image as the commands will: names that do not fit the scores are refused."""
     try:
         trained.network(torch.zeros(1, 3, view.dim, view.dim))
     except (RuntimeError, ValueError) as error:

@@ -13,8 +13,6 @@ from datamodules.core.inputs import Normalization
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import parse_json
 
-__all__ = ["USUAL_SIZE", "PhotoNetwork", "class_names_in"]
-
 USUAL_SIZE = (512, 512)
 """Rows and columns of the photos, where nothing says what they were."""
 
@@ -45,8 +43,8 @@ def class_names_in(path: Path | None) -> tuple[str, ...]:
     """The names of a network's scores, in their order.
 
     Args:
-        path: A JSON file: a list of names, or an object with the place of each name, as
-            ``{"wall": 0}``, or with the name of each place, as ``{"0": "wall"}`` (``id2label``).
+        path: A JSON file: a list of names, or an object with the name of each place, as
+            ``{"0": "wall"}`` (``id2label``).
 
     Raises:
         SettingError: No file is given.
@@ -59,19 +57,9 @@ def class_names_in(path: Path | None) -> tuple[str, ...]:
         content = parse_json(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise DataError(path, found=f"an unreadable file ({error})", expected=expected) from error
+    names = content if isinstance(content, list) else []
     if isinstance(content, dict):
-        names = _by_place(content)
-    else:
-        names = content if isinstance(content, list) else []
+        names = [content.get(str(place)) for place in range(len(content))]
     if not names or not all(isinstance(name, str) and name for name in names):
         raise DataError(path, found=str(content)[:80], expected=expected)
     return tuple(names)
-
-
-def _by_place(content: dict[str, Any]) -> list[Any]:
-    """Names in their order; empty where places are missing."""
-    if all(key.isdecimal() for key in content):
-        content = {str(name): int(place) for place, name in content.items()}
-    places = sorted(content.items(), key=lambda item: str(item[1]).zfill(8))
-    whole = [place for _, place in places] == list(range(len(places)))
-    return [name for name, _ in places] if whole else []

@@ -17,8 +17,6 @@ from tangent_train.inference.photo_networks.network import (
 )
 from tangent_train.registry import make
 
-__all__ = ["load"]
-
 
 def load(
     settings: Mapping[str, Any], weights: str | None, classes: Path | None, normalization: Any

@@ -14,8 +14,6 @@ from tangent_train.inference.photo_networks.network import (
     class_names_in,
 )
 
-__all__ = ["load"]
-
 
 def load(*, file: Path | None, classes: Path | None, normalization: Any, **_: Any) -> PhotoNetwork:
     """The network of an ONNX file, see `OnnxNetwork`.

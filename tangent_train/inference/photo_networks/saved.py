@@ -13,8 +13,6 @@ from models.pretrained import read_tensors
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import parse_json
 
-__all__ = ["json_in", "saved_folder", "tensors_in"]
-
 _WEIGHTS = "model.safetensors"
 _SHARDS = "model-*-of-*.safetensors"
 _FILES = ("*.json", _WEIGHTS, _SHARDS, "merges.txt")

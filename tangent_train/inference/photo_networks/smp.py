@@ -16,8 +16,6 @@ from tangent_train.inference.photo_networks.network import (
 from tangent_train.inference.photo_networks.saved import json_in, saved_folder, tensors_in
 from tangent_train.registry import SettingsFile, make
 
-__all__ = ["load"]
-
 _CLASS = "_model_class"
 _NORMALIZATION = "imagenet, unit, symmetric, or {mean: […], std: […]} of RGB from 0 to 1"
 

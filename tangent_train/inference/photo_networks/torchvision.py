@@ -17,8 +17,6 @@ from tangent_train.inference.photo_networks.network import (
     class_names_in,
 )
 
-__all__ = ["load"]
-
 _AUXILIARY = "aux_classifier."
 
 

@@ -24,20 +24,17 @@ from tangent_train.rendering.mosaic import ScoreMosaic
 from tangent_train.rendering.representations.perspective import PhotoCrops
 from tangent_train.rendering.representations.pinhole import unless_identity
 from tangent_train.rendering.representations.views import (
-    NO_RAYS,
     NOT_ROTATED,
     ManyViews,
     RotationAugmentation,
     Views,
 )
 
-__all__ = ["EquirectRepresentation", "EquirectViews", "as_crop", "column_shifts"]
-
 Image = NDArray[Any]
 
 
 @dataclass(frozen=True)
-class EquirectViews:
+class EquirectViews(Views):
     """The panorama itself.
 
     Attributes:
@@ -65,10 +62,6 @@ class EquirectViews:
         if self.mirrored:
             image = image[:, ::-1]
         return np.ascontiguousarray(image[None])
-
-    def rays(self) -> NDArray[np.float32]:
-        """None: this is no pinhole image."""
-        return NO_RAYS
 
     def rotations(self) -> NDArray[np.float64]:
         """That of the panorama."""
@@ -199,10 +192,8 @@ class EquirectRepresentation:
         """The best class of every pixel; the scores are already those of the rotated panorama."""
         if self._rows is None:
             return _turned_back(scores[0].argmax(dim=0), rotation)
-        mosaic = ScoreMosaic(shape, scores.shape[1], "nearest")
-        mosaic.add_crops(*as_crop(scores, shape), np.array([0]))
-        labels = torch.from_numpy(mosaic.labels().astype(np.int64))
-        return _turned_back(labels.to(scores.device), rotation)
+        rotations = NOT_ROTATED if rotation is None else rotation[None]
+        return self.to_averaged_labels([scores], shape, rotations).to(scores.device)
 
     def to_averaged_labels(
         self, scores: Iterable[Tensor], shape: tuple[int, int], rotations: NDArray[np.float64]
@@ -210,7 +201,7 @@ class EquirectRepresentation:
         """The class with the highest mean probability over all rotations.
 
         Args:
-            scores: ``(1, K, h, w)`` of each of the views of `whole`.
+            scores: ``(1, K, h, w)`` of each of the views of `whole`, or of the first of them.
             shape: ``(H, W)`` of the panorama.
             rotations: Of each of them, see `Views.rotations`.
 
@@ -219,8 +210,9 @@ class EquirectRepresentation:
         """
         parts = iter(scores)
         first = next(parts)
-        mosaic = ScoreMosaic(shape, first.shape[1], "nearest", averaged=True)
-        for one, shift in zip(chain([first], parts), self._shifts, strict=True):
+        mosaic = ScoreMosaic(shape, first.shape[1], "nearest", averaged=len(rotations) > 1)
+        shifts = self._shifts[: len(rotations)]
+        for one, shift in zip(chain([first], parts), shifts, strict=True):
             mosaic.add_crops(*as_crop(one.roll(shift, -1), shape), np.array([0]))
         return _turned_back(torch.from_numpy(mosaic.labels().astype(np.int64)), rotations[0])
 

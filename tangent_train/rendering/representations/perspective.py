@@ -19,13 +19,11 @@ from PIL import Image
 from torch import Tensor
 
 from tangent_train.errors import SettingError
-from tangent_train.geometry import normalize_camera, shift_range
+from tangent_train.geometry import shift_range
 from tangent_train.registry import registered
 from tangent_train.rendering.checks import check_choice
 from tangent_train.rendering.forward import Interpolation
-from tangent_train.rendering.representations.views import NO_RAYS, NOT_ROTATED
-
-__all__ = ["PerspectiveRepresentation", "PhotoCrops", "PhotoSampler"]
+from tangent_train.rendering.representations.views import Views
 
 Crops = Literal["grid", "center"]
 """Crops of an evaluation: all over the photo, or one in the middle."""
@@ -37,7 +35,7 @@ _NEGLIGIBLE = 1e-6
 
 
 @dataclass(frozen=True)
-class PhotoCrops:
+class PhotoCrops(Views):
     """Crops of one photo.
 
     Attributes:
@@ -61,14 +59,6 @@ class PhotoCrops:
         draw = _nearest if interpolation == "nearest" else _smooth
         crops = np.stack([draw(image, box, self.size) for box in self.boxes])
         return np.ascontiguousarray(crops[:, :, ::-1]) if self.mirrored else crops
-
-    def rays(self) -> NDArray[np.float32]:
-        """None: the direction of a photo on the sphere is unknown."""
-        return NO_RAYS
-
-    def rotations(self) -> NDArray[np.float64]:
-        """None."""
-        return NOT_ROTATED
 
     def owned(self) -> NDArray[np.bool_]:
         """Pixels of each crop that lie nearer to its centre than to any other's, ``(n, h, w)``.
@@ -180,17 +170,11 @@ class PhotoSampler:
         return np.diag(self.camera_matrix)[:2] * width * (1, rows / columns)
 
     def _crops(self, shifts: NDArray[np.float64], *, mirrored: bool = False) -> PhotoCrops:
-        wanted = self.representation
-        rows, columns = wanted.image_size
-        corners = np.array([[-0.5, -0.5, 1], [columns - 0.5, rows - 0.5, 1]])
-        boxes = []
-        for dx, dy in shifts:
-            camera = normalize_camera(
-                self.camera_matrix, self.size, wanted.fov_deg, wanted.image_size, (dx, dy)
-            )
-            box = (corners @ np.linalg.inv(camera.homography).T)[:, :2] + 0.5
-            boxes.append(np.clip(box, 0, self.size[::-1]).ravel())  # rounding may lead outside
-        return PhotoCrops(np.array(boxes), wanted.image_size, mirrored)
+        """Crops whose corners `normalize_camera` moves there, see its homography."""
+        centers, half = self.camera_matrix[:2, 2] + 0.5 + shifts, self._extent() / 2
+        boxes = np.concatenate([centers - half, centers + half], axis=1)
+        inside = boxes.clip(0, np.tile(self.size[::-1], 2))  # rounding may lead outside
+        return PhotoCrops(inside, self.representation.image_size, mirrored)
 
 
 @registered

@@ -33,15 +33,6 @@ from tangent_train.rendering.representations.views import (
     Views,
 )
 
-__all__ = [
-    "CubemapRepresentation",
-    "PinholeRepresentation",
-    "TangentRepresentation",
-    "spun",
-    "turns",
-    "unless_identity",
-]
-
 _SYMMETRY_DEG = 72.0
 """The icosahedron looks the same after this rotation about the vertical."""
 
@@ -76,7 +67,7 @@ class PinholeRepresentation:
     ) -> None:
         self.grid = grid
         check_choice("representation.rotation", rotation, ("none", "yaw", "so3"))
-        check_choice("representation.blend", blend, ("nearest", "feather"))
+        check_blend(blend, grid)
         self.rotation = rotation
         self.mirror = mirror
         self.erp_height = equirect_shape(level)[0] if erp_height is None else erp_height
@@ -246,7 +237,6 @@ class CubemapRepresentation(PinholeRepresentation):
     ) -> None:
         quarter = equirect_shape(level)[1] // 4
         grid = CubeGrid(quarter + 2 * margin if dim is None else dim, margin=margin)
-        check_blend(blend, grid)
         super().__init__(grid, level, rotation, mirror, erp_height, blend)
 
 

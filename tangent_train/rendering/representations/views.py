@@ -19,18 +19,6 @@ from torch import Tensor
 from tangent_train.geometry import PinholeGrid
 from tangent_train.rendering.forward import Interpolation, equirect_to_tangent
 
-__all__ = [
-    "NOT_ROTATED",
-    "NO_RAYS",
-    "Assembler",
-    "ManyViews",
-    "PinholeViews",
-    "Representation",
-    "RotationAugmentation",
-    "Sampler",
-    "Views",
-]
-
 RotationAugmentation = Literal["none", "yaw", "so3"]
 """Rotation of training panoramas: none, about the vertical, or uniformly over SO(3)."""
 
@@ -44,7 +32,7 @@ NOT_ROTATED: NDArray[np.float64] = np.eye(3)[None]
 
 
 class Views(Protocol):
-    """Views of one panorama or photo."""
+    """Views of one panorama or photo; neither on the sphere nor rotated, unless they say so."""
 
     def render(self, image: Image, interpolation: Interpolation) -> Image:
         """Render it ``(H, W[, C])`` to images ``(n, h, w[, C])``, dtype kept."""
@@ -56,11 +44,11 @@ class Views(Protocol):
         Each matrix maps ``(x, y, 1)``, with x and y from −1 at the left and upper edge of an image
         to 1 at the opposite one, to a direction (of any length) on the sphere.
         """
-        ...
+        return NO_RAYS
 
     def rotations(self) -> NDArray[np.float64]:
         """``(K, 3, 3)`` rotations of the whole representation they are of: directions are R·d."""
-        ...
+        return NOT_ROTATED
 
 
 class Sampler(Protocol):

@@ -22,15 +22,15 @@ _SIDE = 64
 _SIZE = {"height": _SIDE, "width": _SIDE}
 _LABELS = {"id2label": dict(enumerate(NAMES)), "label2id": {n: k for k, n in enumerate(NAMES)}}
 _STAGES = ["stage1", "stage2", "stage3", "stage4"]
-_TRANSFORMER = {
-    "hidden_size": 16,
-    "num_hidden_layers": 4,
+_MASKS = {
+    "encoder_feedforward_dim": 16,
+    "encoder_layers": 1,
+    "decoder_layers": 2,
     "num_attention_heads": 2,
-    "intermediate_size": 16,
-    "image_size": _SIDE,
-    "patch_size": 16,
+    "num_queries": 7,
+    "hidden_dim": 32,
+    "dim_feedforward": 16,
 }
-_MASKS = {"mask_feature_size": 32, "num_queries": 7}
 
 Made = tuple[Any, Any]
 """A network and its image processor."""
@@ -57,18 +57,6 @@ def segformer() -> Made:
     return transformers.SegformerForSemanticSegmentation(config), processor
 
 
-def upernet() -> Made:
-    backbone = transformers.ConvNextConfig(
-        hidden_sizes=[8, 8, 16, 16], depths=[1] * 4, out_features=_STAGES
-    )
-    auxiliary = {"auxiliary_channels": 8, "auxiliary_in_channels": 16}
-    config = transformers.UperNetConfig(
-        backbone_config=backbone, hidden_size=16, pool_scales=[1, 2], **auxiliary, **_LABELS
-    )
-    processor = transformers.SegformerImageProcessor(size=_SIZE)
-    return transformers.UperNetForSemanticSegmentation(config), processor
-
-
 def mobilevit() -> Made:
     config = transformers.MobileViTConfig(
         hidden_sizes=[16, 16, 16],
@@ -88,42 +76,29 @@ def _swin() -> Any:
 
 
 def mask2former() -> Made:
-    sizes = {"feature_size": 32, "hidden_dim": 32, "dim_feedforward": 16}
-    config = transformers.Mask2FormerConfig(
-        backbone_config=_swin(),
-        encoder_feedforward_dim=16,
-        encoder_layers=1,
-        decoder_layers=2,
-        num_attention_heads=2,
-        **sizes,
-        **_MASKS,
-        **_LABELS,
-    )
+    sizes = {"feature_size": 32, "mask_feature_size": 32}
+    config = transformers.Mask2FormerConfig(backbone_config=_swin(), **sizes, **_MASKS, **_LABELS)
     processor = transformers.Mask2FormerImageProcessor(size=_SIZE)
     return transformers.Mask2FormerForUniversalSegmentation(config), processor
 
 
 def oneformer(**processor_settings: Any) -> Made:
-    sizes = {"conv_dim": 32, "mask_dim": 32, "hidden_dim": 32, "dim_feedforward": 16}
-    config = transformers.OneFormerConfig(
-        backbone_config=_swin(),
-        encoder_feedforward_dim=16,
-        encoder_layers=1,
-        decoder_layers=2,
-        num_attention_heads=2,
-        num_queries=7,
-        task_seq_len=24,
-        **sizes,
-        **_LABELS,
-    )
+    sizes = {"conv_dim": 32, "mask_dim": 32, "task_seq_len": 24}
+    config = transformers.OneFormerConfig(backbone_config=_swin(), **sizes, **_MASKS, **_LABELS)
     processor = transformers.OneFormerImageProcessor(size=_SIZE, **processor_settings)
     return transformers.OneFormerForUniversalSegmentation(config), processor
 
 
 def eomt() -> Made:
-    sizes = {name: value for name, value in _TRANSFORMER.items() if name != "intermediate_size"}
     config = transformers.EomtConfig(
-        num_queries=7, num_blocks=1, num_upscale_blocks=1, **sizes, **_LABELS
+        hidden_size=16,
+        num_hidden_layers=4,
+        num_attention_heads=2,
+        image_size=_SIDE,
+        num_queries=7,
+        num_blocks=1,
+        num_upscale_blocks=1,
+        **_LABELS,
     )
     processor = transformers.EomtImageProcessor(size={"shortest_edge": 64, "longest_edge": 64})
     return transformers.EomtForUniversalSegmentation(config), processor

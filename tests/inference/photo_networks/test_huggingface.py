@@ -80,11 +80,8 @@ def test_float16_weights_are_stored_as_float32(folder: Path) -> None:
             "other weights: no segformer.*expected those of SegformerFor",
         ),
         ("config.json", {"model_type": "bert"}, "model_type: found bert; expected a network for"),
-        ("config.json", {"depths": "many"}, "config.json: found network"),
         ("config.json", {"hidden_act": "https://x.org/gelu"}, "config.json: found network.config"),
-        ("preprocessor_config.json", {"image_mean": [0.5]}, "no normalization in"),
         ("preprocessor_config.json", {"image_std": [0, 1, 1]}, "no normalization in"),
-        ("preprocessor_config.json", {"rescale_factor": 0}, "no normalization in"),
         ("preprocessor_config.json", {"size": {"height": 0, "width": 4}}, "found size: "),
     ],
 )

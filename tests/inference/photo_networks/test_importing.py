@@ -6,50 +6,33 @@ import json
 import math
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import onnx
-import onnxruntime
 import pytest
 import torch
-from onnx import TensorProto, helper, numpy_helper
+from onnx import helper
 from torchvision import models as torchvision_models
 
 from models import UNet
-from models.onnx_network import OnnxNetwork
 from tangent_train.checkpoints.trained import load_trained
 from tangent_train.cli import main
 from tangent_train.geometry import TangentGrid, camera_matrix_from_fov
 from tangent_train.inference.photo_networks.importing import View, view_of
 from tangent_train.inference.predictor import Predictor
 from tangent_train.inference.views import InputImage, PanoramaViews
+from tests.models.onnx_files import write_linear
 
 NAMES = ["background", "dark", "green", "bright"]
 WEIGHT = np.array([[0, 0, 0], [-1, -1, -1], [-1, 2, -1], [1, 1, 1]], np.float32)
 BIAS = np.array([0.1, 1, 0, -1.5], np.float32)
 
 
-def _onnx(path: Path, size: tuple[Any, Any] = (32, 32)) -> Path:
-    """A network of single pixels of 0 to 1, in a file of another program."""
-    images = helper.make_tensor_value_info("image", TensorProto.FLOAT, ("n", 3, *size))
-    scores = helper.make_tensor_value_info("scores", TensorProto.FLOAT, None)
-    weights = [
-        numpy_helper.from_array(WEIGHT[:, :, None, None], "w"),
-        numpy_helper.from_array(BIAS, "b"),
-    ]
-    node = helper.make_node("Conv", ["image", "w", "b"], ["scores"])
-    graph = helper.make_graph([node], "theirs", [images], [scores], weights)
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
-    onnx.save(model, path)
-    return path
-
-
 @pytest.fixture
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The current folder, with a network and the names of its scores."""
     monkeypatch.chdir(tmp_path)
-    _onnx(tmp_path / "net.onnx")
+    write_linear(tmp_path / "net.onnx", WEIGHT, BIAS, shape=("n", 3, 32, 32))
     (tmp_path / "classes.json").write_text(json.dumps(NAMES))
     return tmp_path
 
@@ -62,36 +45,17 @@ def _run(command: str, monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None
 OF_ONNX = ("network=onnx", "file=net.onnx", "classes=classes.json", "normalization=unit")
 
 
-def test_an_onnx_file_gives_the_scores_of_its_runtime(
-    here: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    _run("import", monkeypatch, *OF_ONNX, "output=ours.onnx")
-    photos = np.random.default_rng(0).integers(0, 256, (2, 3, 32, 32)).astype(np.float32) / 255
-    (expected,) = onnxruntime.InferenceSession("net.onnx").run(None, {"image": photos})
-    found = load_trained(here / "ours.onnx").network(torch.from_numpy(photos))
-    np.testing.assert_array_equal(found.numpy(), expected)
-
-
 def test_an_imported_file_is_imported_again(
     here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Its description is replaced, and the network runs once."""
+    """Its description is replaced."""
     given = onnx.load("net.onnx")
     helper.set_model_props(given, {"author": "somebody"})
     onnx.save(given, "net.onnx")
     _run("import", monkeypatch, *OF_ONNX, "level=7", "output=ours.onnx")
-    ran: list[Any] = []
-    forward = OnnxNetwork.forward
-
-    def noted(self: OnnxNetwork, images: Any) -> Any:
-        ran.append(images.shape)
-        return forward(self, images)
-
-    monkeypatch.setattr(OnnxNetwork, "forward", noted)
     again = ("file=ours.onnx", "level=6", "base_level=1", "output=again.onnx")
     _run("import", monkeypatch, *OF_ONNX, *again)
     assert "indoors" not in capsys.readouterr().out.partition("again.onnx")[2]
-    assert ran == [(1, 3, 32, 32)]
     assert load_trained(here / "again.onnx").level == 6
     properties = [entry.key for entry in onnx.load("again.onnx").metadata_props]
     assert sorted(properties) == ["author", "tangent_train"]
@@ -206,10 +170,6 @@ def test_tangent_images_have_the_angular_resolution_of_the_photos(
             "found timm, which has no networks for segmentation",
         ),
         (
-            ("network=torchvision", "model=resnet50", "output=net.ckpt"),
-            "model: found resnet50; expected deeplabv3",
-        ),
-        (
             (
                 *("network=torchvision", "model=lraspp_mobilenet_v3_large", "weights=VOC"),
                 "output=net.ckpt",
@@ -220,7 +180,6 @@ def test_tangent_images_have_the_angular_resolution_of_the_photos(
             ("network=unet_small", "output=net.ckpt"),
             "weights: found none; expected a file with the network's",
         ),
-        (("network=unet_smal", "output=net.ckpt"), "unet_smal"),
     ],
 )
 def test_what_does_not_fit_is_one_clear_message(
@@ -234,12 +193,7 @@ def test_what_does_not_fit_is_one_clear_message(
     assert set(here.iterdir()) == before
 
 
-@pytest.mark.parametrize(
-    "content", [{"3": "d", "0": "a", "1": "b", "2": "c"}, {"d": 3, "a": 0, "b": 1, "c": 2}]
-)
-def test_classes_may_be_given_by_place(
-    content: dict[str, Any], here: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (here / "classes.json").write_text(json.dumps(content))
+def test_classes_may_be_given_by_place(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (here / "classes.json").write_text(json.dumps({"3": "d", "0": "a", "1": "b", "2": "c"}))
     _run("import", monkeypatch, *OF_ONNX, "output=ours.onnx")
     assert load_trained(here / "ours.onnx").class_names == ("unknown", "a", "b", "c", "d")
