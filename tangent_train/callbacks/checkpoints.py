@@ -10,8 +10,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import lightning
 import torch
+from lightning import LightningModule, Trainer
 from lightning.fabric.plugins import TorchCheckpointIO
 from lightning.pytorch.callbacks import Callback, Checkpoint, ModelCheckpoint, WeightAveraging
 from lightning.pytorch.utilities.exceptions import SIGTERMException
@@ -67,27 +67,19 @@ class CheckpointContents(Callback):
         self._random_states: list[dict[str, Any]] | None = None
 
     def on_save_checkpoint(
-        self,
-        trainer: lightning.Trainer,
-        pl_module: lightning.LightningModule,
-        checkpoint: dict[str, Any],
+        self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
     ) -> None:
         """Add the contents, and under ``random`` the generators of every process."""
         checkpoint.update(self.contents)
         checkpoint["random"] = _of_all_processes(trainer, _random_state())
 
     def on_load_checkpoint(
-        self,
-        trainer: lightning.Trainer,
-        pl_module: lightning.LightningModule,
-        checkpoint: dict[str, Any],
+        self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
     ) -> None:
         """Take the generators' states."""
         self._random_states = checkpoint.get("random")
 
-    def on_train_start(
-        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
-    ) -> None:
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Restore them: the random state (dropout) continues, on as many processes as before."""
         states = self._random_states
         if states is not None and len(states) == trainer.world_size:
@@ -103,7 +95,7 @@ def _random_state() -> dict[str, Any]:
     return {"cpu": torch.get_rng_state(), "cuda": cuda}
 
 
-def _of_all_processes(trainer: lightning.Trainer, value: Any) -> list[Any]:
+def _of_all_processes(trainer: Trainer, value: Any) -> list[Any]:
     if trainer.world_size == 1:
         return [value]
     values: list[Any] = [None] * trainer.world_size
@@ -142,9 +134,7 @@ class LastCheckpoint(Checkpoint):
         self._told_to_end = False
         self._processes: Any = None
 
-    def on_train_start(
-        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
-    ) -> None:
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Save the untrained state of a new run, and listen for SIGTERM.
 
         Not by Lightning's handler: it communicates with the other processes inside the signal
@@ -166,12 +156,7 @@ class LastCheckpoint(Checkpoint):
             self._save(trainer)
 
     def on_train_batch_end(  # noqa: D102 - a hook of Lightning
-        self,
-        trainer: lightning.Trainer,
-        pl_module: lightning.LightningModule,
-        outputs: Any,
-        batch: Any,
-        batch_idx: int,
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         stepped = (batch_idx + 1) % trainer.accumulate_grad_batches == 0
         ends_epoch = batch_idx + 1 == trainer.num_training_batches  # saved in a moment
@@ -184,19 +169,14 @@ class LastCheckpoint(Checkpoint):
         if ending:
             raise SIGTERMException
 
-    def on_train_epoch_end(
-        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
-    ) -> None:
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Save the state after every epoch."""
         self._save(trainer)
         if self._any_told_to_end(trainer):
             raise SIGTERMException
 
     def on_exception(
-        self,
-        trainer: lightning.Trainer,
-        pl_module: lightning.LightningModule,
-        exception: BaseException,
+        self, trainer: Trainer, pl_module: LightningModule, exception: BaseException
     ) -> None:
         """Print how to resume the run."""
         if trainer.is_global_zero and self.has_begun:
@@ -205,14 +185,14 @@ class LastCheckpoint(Checkpoint):
             text = f"{self.path} has all up to {saved}; resume with\n  tangent-train {command}"
             Console(stderr=True).print(text, soft_wrap=True, highlight=False)
 
-    def _any_told_to_end(self, trainer: lightning.Trainer) -> bool:
+    def _any_told_to_end(self, trainer: Trainer) -> bool:
         """Whether some process got SIGTERM: all end after the same step."""
         told = torch.tensor(int(self._told_to_end))
         if trainer.world_size > 1:
             torch.distributed.all_reduce(told, group=self._processes)
         return bool(told)
 
-    def _save(self, trainer: lightning.Trainer) -> None:
+    def _save(self, trainer: Trainer) -> None:
         trainer.save_checkpoint(self.path, weights_only=False)
 
 

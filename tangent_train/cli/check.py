@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping, Sequence
 from contextlib import redirect_stdout
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from datamodules.core.problems import Problem
 from tangent_train.errors import counted
 from tangent_train.registry import make
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from datamodules.core.problems import Problem
 
 __all__ = ["check"]
 

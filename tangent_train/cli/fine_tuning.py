@@ -5,25 +5,22 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch.utilities import rank_zero_only
-from rich.console import Console
+from torch import nn
 
 from datamodules.core.inputs import RGBD_NORMALIZATION, channel_names
 from models import initialize
 from models.fine_tuning import tensors_for
 from tangent_train.checkpoints.trained import Start, completed_settings, start_in
+from tangent_train.cli.build import Settings
+from tangent_train.cli.evaluate import Run
+from tangent_train.cli.say import say
 from tangent_train.cli.settings import Trust, typed
 from tangent_train.errors import DataError, printable
 from tangent_train.registry import SettingsFile, make
-
-if TYPE_CHECKING:
-    from torch import nn
-
-    from tangent_train.cli.build import Settings
-    from tangent_train.cli.evaluate import Run
 
 __all__ = ["begin_from", "load_start"]
 
@@ -111,7 +108,7 @@ def load_start(path: Path, run: Run) -> None:
 
 @rank_zero_only
 def _print(text: str) -> None:
-    Console(soft_wrap=True, highlight=False).print(printable(text), markup=False)
+    say(printable(text))
 
 
 def _wraps(section: Mapping[str, Any], target: Any) -> bool:

@@ -8,20 +8,15 @@ panoramas, rotated alike.
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from typing import Any
 
+from hydra import compose
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import ListConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 
-from tangent_train.cli.compose import compose_option
+from tangent_train.checkpoints.trained import TrainedNetwork
 from tangent_train.errors import SettingError
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from omegaconf import DictConfig
-
-    from tangent_train.checkpoints.trained import TrainedNetwork
 
 __all__ = ["conditions_of", "numbers", "views_of"]
 
@@ -96,9 +91,11 @@ def _view(
 ) -> dict[str, Any]:
     level = given.get("level")
     own: Any = OmegaConf.to_container(config.representation)
+    section: Any
     if option is not None:
         search = [s for s in HydraConfig.get().overrides.hydra if s.startswith("hydra.searchpath")]
-        section = compose_option("representation", option, search)
+        # The option alone: its references to other settings stay as they are.
+        section = OmegaConf.to_container(compose(f"representation/{option}", search).representation)
     elif trained is not None and {"level", "base_level"} & given.keys():
         section = _of_network(own, trained, level, given.get("base_level"))
     else:

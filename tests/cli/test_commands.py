@@ -192,7 +192,6 @@ def test_settings_of_an_evaluation(run_folder: Path, rooms: str, run: Run) -> No
         (["ema=1"], "ema: found 1"),
         (["panels=-1"], "panels: found -1"),
         (["hydra.run.dir=file/run"], "file/run: found not a directory"),
-        (["trainer=ddp", "trainer.sync_batchnorm=true"], r"trainer\.sync_batchnorm: found true"),
     ],
 )
 def test_impossible_settings_are_refused_before_any_data_is_made(

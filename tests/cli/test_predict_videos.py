@@ -109,7 +109,7 @@ def test_an_interrupted_video_is_resumed(
     with pytest.raises(SystemExit) as stopped:
         _predict(run, tmp_path, input=video)
     assert stopped.value.code == 130
-    assert "4 of 7 frames are done. resume=true" in capsys.readouterr().out
+    assert "4 of 7 images are done. resume=true" in capsys.readouterr().out
     assert len(_entries(tmp_path / "out")) == 4
     assert not (tmp_path / "out" / "overlay").exists()
     monkeypatch.setattr("tangent_train.cli.predict_inputs.read_frames", read_frames)
