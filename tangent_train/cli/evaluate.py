@@ -66,13 +66,8 @@ def evaluate(
     if trained is None and (mapped or run_settings(checkpoint) is None):
         trained = load_trained(checkpoint, settings.get("trust", ()))
     run = Run.begin(settings, source, trained)
-    try:
-        with machine_faults(run.folder, run.data):
-            run.test(run.trainer([]), checkpoint)
-    except (KeyboardInterrupt, SystemExit):
-        told = "Nothing is kept of an interrupted evaluation; the same command begins it anew."
-        say(told, error=True)
-        raise
+    with machine_faults(run.folder, run.data):
+        run.test(run.trainer([]), checkpoint)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,6 @@ import torch
 from lightning.pytorch.strategies import DDPStrategy
 from torch import Tensor, nn
 from torch.distributed.algorithms.ddp_comm_hooks import default_hooks
-from torch.optim.lr_scheduler import LinearLR, OneCycleLR, StepLR
 from torch.utils.data import DataLoader
 
 from tangent_train.rendering import TangentRepresentation
@@ -148,67 +147,26 @@ def test_processes_exchange_gradients_once_after_the_last_chunk() -> None:
     torch.testing.assert_close(found, expected)
 
 
-class _Together:
-    """The strategy of one of several processes, of which the others' norms are known."""
-
-    def __init__(self, norms: list[Tensor]) -> None:
-        self._mean = torch.stack(norms).mean(dim=0)
-        self._asked = 0
-
-    def reduce(self, value: Tensor, reduce_op: str) -> Tensor:
-        assert reduce_op == "mean"
-        self._asked += 1
-        return self._mean if self._asked == 1 else value  # then the loss, which is only shown
-
-    def backward(self, loss: Tensor, _: None) -> None:
-        loss.backward()  # type: ignore[no-untyped-call]
-
-
-@pytest.mark.parametrize("chunk", [None, 7])
-def test_the_mean_of_processes_gradients_is_that_of_their_batches_together(
-    chunk: int | None,
-) -> None:
+def test_the_mean_of_processes_gradients_is_that_of_their_batches_together() -> None:
     """Though one has many more labelled pixels than the other."""
-    generator = torch.Generator().manual_seed(0)
-    images = torch.randn(2, 20, 2, 16, 16, generator=generator)
-    labels = torch.randint(0, 4, (2, 20, 16, 16), generator=generator).to(torch.uint8)
-    labels[0, :, 1:] = 0
-    task: Any = _task(chunk)
+    (batch,) = Data(3).train_dataloader()
+    task: Any = _task(7)
     task.class_weights.copy_(torch.tensor([1.0, 3.0, 0.2]))
     task.log = lambda *_, **__: None
 
-    def gradient(part: slice, norms: list[Tensor]) -> Tensor:
-        optimizer = torch.optim.SGD(task.parameters())
-        task._trainer = SimpleNamespace(
-            accumulate_grad_batches=1, optimizers=[optimizer], strategy=_Together(norms)
+    def gradient(part: slice, norm: Tensor) -> Tensor:
+        means = {"mean": iter((norm, torch.zeros(())))}  # that of the loss is only shown
+        strategy = SimpleNamespace(
+            reduce=lambda _, reduce_op: next(means[reduce_op]),
+            backward=lambda loss, _: loss.backward(),
         )
-        task.training_step(Sample(images[part], labels[part]), 0).backward()
+        optimizers = [torch.optim.SGD(task.parameters())]
+        task._trainer = SimpleNamespace(
+            accumulate_grad_batches=1, optimizers=optimizers, strategy=strategy
+        )
+        task.training_step(Sample(batch.images[part], batch.labels[part]), 0).backward()
         return torch.cat([p.grad.flatten() for p in task.network.parameters()])
 
-    norms = [task.loss_norm(part) for part in labels]
-    of_each = [gradient(slice(k, k + 1), norms) for k in (0, 1)]
-    together = gradient(slice(0, 2), [task.loss_norm(labels.flatten(0, 1))])
-    torch.testing.assert_close(sum(of_each) / 2, together, rtol=1e-4, atol=1e-6)
-
-
-@pytest.mark.parametrize("scheduler", [StepLR, LinearLR, OneCycleLR])
-def test_schedulers_step_by_epoch_or_over_the_whole_training(scheduler: Any) -> None:
-    settings = {
-        StepLR: {"step_size": 1, "gamma": 0.5},
-        LinearLR: {"start_factor": 1.0, "end_factor": 0.5, "total_iters": 1},
-        OneCycleLR: {"max_lr": 0.1},
-    }
-    seen: list[float] = []
-
-    class Watch(lightning.Callback):
-        def on_train_batch_start(self, trainer: Any, *_: Any) -> None:
-            seen.append(trainer.optimizers[0].param_groups[0]["lr"])
-
-    task = _task(scheduler=partial(scheduler, **settings[scheduler]))
-    trainer = quiet_trainer(max_epochs=2, limit_val_batches=0, callbacks=[Watch()])
-    trainer.fit(task, datamodule=Data(1))
-    if scheduler is OneCycleLR:
-        assert len(set(seen)) == 6, "stepped every step"
-        assert seen[-1] < 1e-5, "ends at the end of training"
-    else:
-        assert seen == pytest.approx([0.1] * 3 + [0.05] * 3)
+    norm = task.loss_norm(batch.labels.flatten(0, 1))
+    of_each = gradient(slice(0, 1), norm / 2) + gradient(slice(1, 3), norm / 2)
+    torch.testing.assert_close(of_each / 2, gradient(slice(0, 3), norm), rtol=1e-4, atol=1e-6)
