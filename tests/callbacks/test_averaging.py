@@ -36,7 +36,7 @@ class WithStatistics(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         scores: Tensor = self.layers(images.flatten(0, 1)).mean(dim=(2, 3))
-        return scores.unflatten(0, images.shape[:2]).mean(dim=1)
+        return scores.view(*images.shape[:2], 3).mean(dim=1)
 
 
 class Reference(Callback):
