@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import logging
-import threading
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -205,8 +204,6 @@ def _choices(settings: Settings, source: SettingsFile | None) -> dict[str, str]:
 def machine_faults(folder: Path, data: Any) -> Iterator[None]:
     """Explain a full disk, and workers that died.
 
-    TensorBoard writes in a thread that ends with the error of a full disk; its stack is not shown.
-
     Args:
         folder: Of the run.
         data: Its data module.
@@ -216,8 +213,6 @@ def machine_faults(folder: Path, data: Any) -> Iterator[None]:
             events.
         DataError: A worker died.
     """
-    show = threading.excepthook
-    threading.excepthook = _all_but_full_disks(folder, show)
     try:
         yield
     except (OSError, EOFError, RuntimeError, ValueError) as error:
@@ -225,15 +220,3 @@ def machine_faults(folder: Path, data: Any) -> Iterator[None]:
         if told is error:
             raise
         raise told from error
-    finally:
-        threading.excepthook = show
-
-
-def _all_but_full_disks(
-    folder: Path, show: Callable[[threading.ExceptHookArgs], object]
-) -> Callable[[threading.ExceptHookArgs], None]:
-    def hook(failed: threading.ExceptHookArgs) -> None:
-        if failed.exc_value is None or no_room(folder, failed.exc_value) is None:
-            show(failed)
-
-    return hook
