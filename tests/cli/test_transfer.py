@@ -128,7 +128,7 @@ def test_stages_of_a_network_that_was_trained_again_are_refused(runs: PretendedR
         run_transfer(*SHORT)
     network.unlink()  # to save space: what was found stays found
     run_transfer(*SHORT)
-    with pytest.raises(REFUSED, match=r"seed_0/P: found no checkpoints/best\.ckpt; "):
+    with pytest.raises(REFUSED, match=r"P/checkpoints/best\.ckpt: found no such file; "):
         run_transfer("compare=[erp]", "fine_tuning.epochs=[]")
 
 
