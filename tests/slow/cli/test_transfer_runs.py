@@ -6,17 +6,14 @@ import json
 import re
 import shutil
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
 import torch
 
 from tests.cli.pretended_runs import HERE, OF_SEED_0, SETTINGS
-from tests.cli.tiny_runs import SMALL_ROOMS, Run, results
+from tests.cli.tiny_runs import Run
 from tests.datamodules.folder.folder_format import write_classes, write_data_set
 from tests.datamodules.folder.photo_format import write_photo, write_photos
-from tests.inference.trained import write_checkpoint
 
 
 def test_real_runs_from_photos_to_panoramas(
@@ -103,48 +100,3 @@ def test_classes_scenes_and_cameras_are_compared_before_training(
     message = r"stage P, in photos: my_photos/images/scene_1/new\.png: found no K in cameras\.json"
     with pytest.raises(SystemExit, match=message):
         run("transfer", *_SETTINGS)
-
-
-_ROOMS = [text for text in SMALL_ROOMS if text.startswith(("data.rooms.", "trainer."))]
-_MAP = {"classes": {"floor": ["dark"], "ceiling": ["bright"], "wall": ["green"]}}
-_VIEWS = {
-    "S": [],
-    "S-coarse": ["level=3", "representation.erp_height=32", "representation.blend=feather"],
-    "S-erp": ["representation=erp", "representation.rows=24", "representation.erp_height=32"],
-}
-_CONDITIONS = {"": [], "-rotated": ["data.test_rotation=so3"]}
-_COMPARE = "compare=[{name: coarse, level: 3, blend: feather}, {name: erp, option: erp, rows: 24}]"
-
-
-def test_every_row_is_that_of_an_evaluation(
-    tmp_path: Path, rooms: str, run: Run, capsys: pytest.CaptureFixture[str]
-) -> None:
-    network = f"checkpoint={write_checkpoint(tmp_path / 'photo.ckpt')}"
-    (tmp_path / "map.json").write_text(json.dumps(_MAP))
-    settings = [network, *_ROOMS, rooms, "class_map=map.json", "panels=0"]
-    conditions = "conditions=[upright, {name: rotated, test_rotation: so3}]"
-    run("transfer", *settings, _COMPARE, conditions, "name=zero")
-    found = tmp_path / "runs" / "transfer" / "zero"
-    stages = found / "fold_1" / "seed_0"
-    evaluated: dict[str, Any] = {}
-    for view, of_view in _VIEWS.items():
-        for condition, of_data in _CONDITIONS.items():
-            folder = f"hydra.run.dir={tmp_path / 'again'}"
-            run("evaluate", *settings, "data=synthrooms", *of_view, *of_data, folder)
-            evaluated[view + condition] = results(tmp_path / "again")
-            assert results(stages / (view + condition)) == evaluated[view + condition]
-    assert {path.name for path in stages.iterdir()} == evaluated.keys()
-    rows = {row["row"]: row for row in json.loads((found / "transfer.json").read_text())["rows"]}
-    assert rows.keys() == evaluated.keys()
-    assert {row["class map"] for row in rows.values()} == {"map.json"}
-    confusions = [np.asarray(evaluated[view]["confusion"]) for view in _VIEWS]
-    for matrix in confusions:  # all on the same labels
-        np.testing.assert_array_equal(matrix.sum(axis=1), confusions[0].sum(axis=1))
-    assert len({str(matrix.tolist()) for matrix in confusions}) == len(_VIEWS), "other views"
-
-    tables = (found / "transfer.csv").read_text()
-    capsys.readouterr()
-    (stages / "S-erp" / "results.json").unlink()
-    run("transfer", *settings, _COMPARE, conditions, "name=zero")
-    assert capsys.readouterr().out.count("finished before") == len(rows) - 1
-    assert (found / "transfer.csv").read_text() == tables
