@@ -71,7 +71,12 @@ class CheckpointContents(Callback):
     ) -> None:
         """Add the contents, and under ``random`` the generators of every process."""
         checkpoint.update(self.contents)
-        checkpoint["random"] = _of_all_processes(trainer, _random_state())
+        # Data has generators of its own, see `sample_rng`.
+        cuda = [torch.cuda.get_rng_state()] if torch.cuda.is_available() else []
+        state = {"cpu": torch.get_rng_state(), "cuda": cuda}
+        checkpoint["random"] = [state] * trainer.world_size
+        if trainer.world_size > 1:
+            torch.distributed.all_gather_object(checkpoint["random"], state)
 
     def on_load_checkpoint(
         self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
@@ -87,20 +92,6 @@ class CheckpointContents(Callback):
             torch.set_rng_state(state["cpu"])
             if torch.cuda.is_available() and state["cuda"]:
                 torch.cuda.set_rng_state(state["cuda"][0])
-
-
-def _random_state() -> dict[str, Any]:
-    """The random state of this process; data has generators of its own, see `sample_rng`."""
-    cuda = [torch.cuda.get_rng_state()] if torch.cuda.is_available() else []
-    return {"cpu": torch.get_rng_state(), "cuda": cuda}
-
-
-def _of_all_processes(trainer: Trainer, value: Any) -> list[Any]:
-    if trainer.world_size == 1:
-        return [value]
-    values: list[Any] = [None] * trainer.world_size
-    torch.distributed.all_gather_object(values, value)
-    return values
 
 
 class LastCheckpoint(Checkpoint):
@@ -153,7 +144,7 @@ class LastCheckpoint(Checkpoint):
         if threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGTERM, listen)  # Lightning puts back what there was before
         if trainer.global_step == 0:
-            self._save(trainer)
+            trainer.save_checkpoint(self.path, weights_only=False)
 
     def on_train_batch_end(  # noqa: D102 - a hook of Lightning
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
@@ -165,13 +156,13 @@ class LastCheckpoint(Checkpoint):
         due = bool(self.every_n_steps) and trainer.global_step % (self.every_n_steps or 1) == 0
         ending = self._any_told_to_end(trainer)
         if due or ending:
-            self._save(trainer)
+            trainer.save_checkpoint(self.path, weights_only=False)
         if ending:
             raise SIGTERMException
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Save the state after every epoch."""
-        self._save(trainer)
+        trainer.save_checkpoint(self.path, weights_only=False)
         if self._any_told_to_end(trainer):
             raise SIGTERMException
 
@@ -191,9 +182,6 @@ class LastCheckpoint(Checkpoint):
         if trainer.world_size > 1:
             torch.distributed.all_reduce(told, group=self._processes)
         return bool(told)
-
-    def _save(self, trainer: Trainer) -> None:
-        trainer.save_checkpoint(self.path, weights_only=False)
 
 
 class BestCheckpoint(ModelCheckpoint):
