@@ -75,7 +75,9 @@ def keypoints(config: Mapping[str, Any]) -> None:
             say(f"Pair {name}: {error or 'too little memory'}")
             continue
         if index < given.pictures:
-            _draw(output / "matches" / f"{index:03}_{file_name(name)}", comparison)
+            for condition in comparison.images:
+                file = f"{index:03}_{file_name(name)}_{condition}.png"
+                write_bytes(output / "matches" / file, matches_png(comparison, condition))
         done[name] = comparison.rows
         report().write(output)
     for table in report().means():
@@ -86,11 +88,6 @@ def keypoints(config: Mapping[str, Any]) -> None:
     failed = len(set(names) - set(done))
     if failed:
         sys.exit(f"tangent-keypoints: {failed} of {len(names)} pairs could not be used, see above")
-
-
-def _draw(stem: Path, comparison: Comparison) -> None:
-    for condition in comparison.images:
-        write_bytes(Path(f"{stem}_{condition}.png"), matches_png(comparison, condition))
 
 
 def _pairs(config: Mapping[str, Any]) -> tuple[Any, PanoramaPairs]:
