@@ -32,7 +32,6 @@ __all__ = [
     "Weights",
     "check_fields",
     "check_plain",
-    "check_registered",
     "import_named",
     "make",
     "maker_of",
@@ -154,39 +153,15 @@ def import_named(target: Any, place: str) -> Any:
     try:
         return resolve_name(str(target))
     except (ImportError, AttributeError, ValueError) as error:
-        module = str(target).rpartition(".")[0]
         remedy = "Install its package, or add the folder it is in to PYTHONPATH."
-        if module.partition(".")[0] in sys.modules:
+        if str(target).partition(".")[0] in sys.modules:
             remedy = "Correct the name."
-        if module in _HOMES:
-            remedy = f"Correct the name, or add it to {module.replace('.', '/')}/__init__.py."
         raise SettingError(
             f"{place}._target_",
             found=f"{target}, which cannot be imported ({error})",
             expected="the full name of a class or function",
             remedy=remedy,
         ) from error
-
-
-def check_registered(target: str, place: str) -> None:
-    """Check that a checkpoint may name a class of our own packages.
-
-    Raises:
-        SettingError: It may not: what is trained with it could not be evaluated.
-    """
-    home, _, name = target.rpartition(".")
-    package = home.partition(".")[0]
-    if package not in _HOMES or _find(target) is not None:
-        return
-    made = import_named(target, place)
-    first = "" if made in _registered else f"Put @registered above class {name}. "
-    named = f"Name it {package}.{name}, and list it in {package}/__init__.py."
-    raise SettingError(
-        f"{place}._target_",
-        found=f"{target}, which no checkpoint may name",
-        expected="a registered class: the run could not be evaluated",
-        remedy=(first if home == package else first + named).rstrip(),
-    )
 
 
 def check_fields(

@@ -10,8 +10,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import lightning
 import torch
+from lightning import LightningModule, Trainer
 from lightning.fabric.plugins import TorchCheckpointIO
 from lightning.pytorch.callbacks import Callback, Checkpoint, ModelCheckpoint, WeightAveraging
 from lightning.pytorch.utilities.exceptions import SIGTERMException
@@ -67,27 +67,24 @@ class CheckpointContents(Callback):
         self._random_states: list[dict[str, Any]] | None = None
 
     def on_save_checkpoint(
-        self,
-        trainer: lightning.Trainer,
-        pl_module: lightning.LightningModule,
-        checkpoint: dict[str, Any],
+        self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
     ) -> None:
         """Add the contents, and under ``random`` the generators of every process."""
         checkpoint.update(self.contents)
-        checkpoint["random"] = _of_all_processes(trainer, _random_state())
+        # Data has generators of its own, see `sample_rng`.
+        cuda = [torch.cuda.get_rng_state()] if torch.cuda.is_available() else []
+        state = {"cpu": torch.get_rng_state(), "cuda": cuda}
+        checkpoint["random"] = [state] * trainer.world_size
+        if trainer.world_size > 1:
+            torch.distributed.all_gather_object(checkpoint["random"], state)
 
     def on_load_checkpoint(
-        self,
-        trainer: lightning.Trainer,
-        pl_module: lightning.LightningModule,
-        checkpoint: dict[str, Any],
+        self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
     ) -> None:
         """Take the generators' states."""
         self._random_states = checkpoint.get("random")
 
-    def on_train_start(
-        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
-    ) -> None:
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Restore them: the random state (dropout) continues, on as many processes as before."""
         states = self._random_states
         if states is not None and len(states) == trainer.world_size:
@@ -95,20 +92,6 @@ class CheckpointContents(Callback):
             torch.set_rng_state(state["cpu"])
             if torch.cuda.is_available() and state["cuda"]:
                 torch.cuda.set_rng_state(state["cuda"][0])
-
-
-def _random_state() -> dict[str, Any]:
-    """The random state of this process; data has generators of its own, see `sample_rng`."""
-    cuda = [torch.cuda.get_rng_state()] if torch.cuda.is_available() else []
-    return {"cpu": torch.get_rng_state(), "cuda": cuda}
-
-
-def _of_all_processes(trainer: lightning.Trainer, value: Any) -> list[Any]:
-    if trainer.world_size == 1:
-        return [value]
-    values: list[Any] = [None] * trainer.world_size
-    torch.distributed.all_gather_object(values, value)
-    return values
 
 
 class LastCheckpoint(Checkpoint):
@@ -142,9 +125,7 @@ class LastCheckpoint(Checkpoint):
         self._told_to_end = False
         self._processes: Any = None
 
-    def on_train_start(
-        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
-    ) -> None:
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Save the untrained state of a new run, and listen for SIGTERM.
 
         Not by Lightning's handler: it communicates with the other processes inside the signal
@@ -163,15 +144,10 @@ class LastCheckpoint(Checkpoint):
         if threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGTERM, listen)  # Lightning puts back what there was before
         if trainer.global_step == 0:
-            self._save(trainer)
+            trainer.save_checkpoint(self.path, weights_only=False)
 
     def on_train_batch_end(  # noqa: D102 - a hook of Lightning
-        self,
-        trainer: lightning.Trainer,
-        pl_module: lightning.LightningModule,
-        outputs: Any,
-        batch: Any,
-        batch_idx: int,
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         stepped = (batch_idx + 1) % trainer.accumulate_grad_batches == 0
         ends_epoch = batch_idx + 1 == trainer.num_training_batches  # saved in a moment
@@ -180,23 +156,18 @@ class LastCheckpoint(Checkpoint):
         due = bool(self.every_n_steps) and trainer.global_step % (self.every_n_steps or 1) == 0
         ending = self._any_told_to_end(trainer)
         if due or ending:
-            self._save(trainer)
+            trainer.save_checkpoint(self.path, weights_only=False)
         if ending:
             raise SIGTERMException
 
-    def on_train_epoch_end(
-        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
-    ) -> None:
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Save the state after every epoch."""
-        self._save(trainer)
+        trainer.save_checkpoint(self.path, weights_only=False)
         if self._any_told_to_end(trainer):
             raise SIGTERMException
 
     def on_exception(
-        self,
-        trainer: lightning.Trainer,
-        pl_module: lightning.LightningModule,
-        exception: BaseException,
+        self, trainer: Trainer, pl_module: LightningModule, exception: BaseException
     ) -> None:
         """Print how to resume the run."""
         if trainer.is_global_zero and self.has_begun:
@@ -205,15 +176,12 @@ class LastCheckpoint(Checkpoint):
             text = f"{self.path} has all up to {saved}; resume with\n  tangent-train {command}"
             Console(stderr=True).print(text, soft_wrap=True, highlight=False)
 
-    def _any_told_to_end(self, trainer: lightning.Trainer) -> bool:
+    def _any_told_to_end(self, trainer: Trainer) -> bool:
         """Whether some process got SIGTERM: all end after the same step."""
         told = torch.tensor(int(self._told_to_end))
         if trainer.world_size > 1:
             torch.distributed.all_reduce(told, group=self._processes)
         return bool(told)
-
-    def _save(self, trainer: lightning.Trainer) -> None:
-        trainer.save_checkpoint(self.path, weights_only=False)
 
 
 class BestCheckpoint(ModelCheckpoint):

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import lightning
 import numpy as np
 import torch
+from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback
 from numpy.typing import NDArray
 
@@ -50,16 +50,10 @@ class PredictionPanels(Callback):
         self.images: list[EncodedImage] = []
         self._encoded: dict[int, EncodedImage] = {}
 
-    def on_test_start(
-        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
-    ) -> None:
-        """Reset."""
-        self._encoded = {}
-
     def on_test_batch_end(  # noqa: D102 - a hook of Lightning
         self,
-        trainer: lightning.Trainer,
-        pl_module: lightning.LightningModule,
+        trainer: Trainer,
+        pl_module: LightningModule,
         outputs: Any,
         batch: Any,
         batch_idx: int,
@@ -88,7 +82,7 @@ class PredictionPanels(Callback):
             name, rgb, classes, prediction=labels, truth=truth, sphere=sphere, note=note
         )
 
-    def on_test_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+    def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Gather the images of all processes."""
         parts = [self._encoded]
         if torch.distributed.is_available() and torch.distributed.is_initialized():

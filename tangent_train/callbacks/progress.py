@@ -6,7 +6,7 @@ import time
 from datetime import timedelta
 from typing import Any
 
-import lightning
+from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import RichProgressBar
 from rich import get_console
 
@@ -30,9 +30,7 @@ class ProgressBar(RichProgressBar):
         self._begun = 0.0
         self._epochs = 0
 
-    def get_metrics(
-        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
-    ) -> dict[str, Any]:
+    def get_metrics(self, trainer: Trainer, pl_module: LightningModule) -> dict[str, Any]:
         """Metrics shown behind the bar."""
         figures = dict(super().get_metrics(trainer, pl_module))
         figures.pop("v_num", None)
@@ -58,9 +56,7 @@ class ProgressBar(RichProgressBar):
         super().on_test_batch_end(*args)
         self._tell("Test", args[4], args[0].num_test_batches[0])
 
-    def on_train_epoch_end(
-        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
-    ) -> None:
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """A line with the metrics and the time left."""
         super().on_train_epoch_end(trainer, pl_module)
         self._epochs += 1

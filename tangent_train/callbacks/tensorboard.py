@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-import cv2
-import lightning
 import numpy as np
+from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import TensorBoardLogger
 from numpy.typing import NDArray
@@ -41,8 +40,8 @@ class ValidationPictures(Callback):
 
     def on_validation_batch_end(  # noqa: D102 - a hook of Lightning
         self,
-        trainer: lightning.Trainer,
-        pl_module: lightning.LightningModule,
+        trainer: Trainer,
+        pl_module: LightningModule,
         outputs: Any,
         batch: Any,
         batch_idx: int,
@@ -71,7 +70,7 @@ class ClassScores(Callback):
     """
 
     def on_validation_end(  # noqa: D102 - a hook of Lightning; the scores are there now
-        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
+        self, trainer: Trainer, pl_module: LightningModule
     ) -> None:
         writer = _writer(trainer)
         if writer is None:
@@ -91,17 +90,12 @@ class ClassScores(Callback):
 
 
 def _smaller(image: NDArray[Any]) -> NDArray[Any]:
-    """Downsample to at most `_MOST_ROWS` rows: labels by striding, colours by averaging."""
+    """Downsample to at most `_MOST_ROWS` rows."""
     step = -(-image.shape[0] // _MOST_ROWS)
-    labels = image[step // 2 :: step, step // 2 :: step]
-    if image.ndim == 2 or step == 1:
-        return labels
-    rows, columns = labels.shape[:2]
-    colors: NDArray[Any] = cv2.resize(image, (columns, rows), interpolation=cv2.INTER_AREA)
-    return colors
+    return image[step // 2 :: step, step // 2 :: step]
 
 
-def _writer(trainer: lightning.Trainer) -> Any:
+def _writer(trainer: Trainer) -> Any:
     """TensorBoard's writer in the first process, otherwise None."""
     if trainer.sanity_checking or not trainer.is_global_zero:
         return None
@@ -109,6 +103,6 @@ def _writer(trainer: lightning.Trainer) -> Any:
     return next(found, None)
 
 
-def _step(trainer: lightning.Trainer) -> int:
+def _step(trainer: Trainer) -> int:
     """Step at which Lightning logs a validation (one less than `global_step` then)."""
     return trainer.fit_loop.epoch_loop._batches_that_stepped

@@ -16,7 +16,7 @@ from tangent_train.cli.settings import typed
 from tangent_train.errors import SettingError
 from tangent_train.inference.class_maps import Unmapped, load_class_map, map_classes
 from tangent_train.inference.views import check_size
-from tangent_train.registry import SettingsFile, check_registered, make, maker_of
+from tangent_train.registry import SettingsFile, make, maker_of
 
 __all__ = ["Settings", "build", "build_data", "build_trained", "check_fits", "shown"]
 
@@ -44,8 +44,6 @@ def build(settings: Settings, source: SettingsFile | None = None) -> tuple[Any, 
         SettingError: A setting, or a combination of settings, is invalid.
     """
     data = build_data(settings, source)
-    if source is None or not source.owns("network"):
-        _check_registered(settings["network"], "network")
     restored = settings.get("resume") is not None or settings.get("checkpoint") is not None
     section = completed_settings(
         settings["network"], data.in_channels, data.num_classes, restored=restored
@@ -67,8 +65,6 @@ def build_data(settings: Settings, source: SettingsFile | None = None) -> Any:
     kind = getattr(maker_of(settings["task"], "task", source), "kind", data.kind)
     if kind != data.kind:
         raise SettingError("task", found=f"{kind}, with {data.noun}", expected=data.kind)
-    if source is None or not source.owns("data"):
-        _check_registered(settings["data"], "data")
     return data
 
 
@@ -156,15 +152,6 @@ def _build_task(
         backbone_lr_factor=backbone_lr_factor,
         **parts,
     )
-
-
-def _check_registered(section: Any, place: str) -> None:
-    """Check the classes of a section and of those in it, which will stand in checkpoints."""
-    if isinstance(section, Mapping):
-        if "_target_" in section:
-            check_registered(str(section["_target_"]), place)
-        for name, value in section.items():
-            _check_registered(value, f"{place}.{name}")
 
 
 def _try_network(task: Any, channels: int) -> None:

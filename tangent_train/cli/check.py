@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping, Sequence
 from contextlib import redirect_stdout
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from datamodules.core.problems import Problem
+from tangent_train.cli.say import say
 from tangent_train.errors import counted
 from tangent_train.registry import make
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from datamodules.core.problems import Problem
 
 __all__ = ["check"]
 
@@ -42,8 +40,7 @@ def check(settings: Mapping[str, Any]) -> None:
     for problem in () if console.is_terminal else listed:
         sys.stdout.write("\t".join(map(_printable, problem[:3])) + "\n")
     found = counted(len(listed), "problems") if listed else "Nothing is wrong"
-    told = console if console.is_terminal or not listed else Console(stderr=True, highlight=False)
-    told.print(Text(f"{found}; {read}."), soft_wrap=True)
+    say(f"{found}; {read}.", error=bool(listed) and not console.is_terminal)
     if listed:
         sys.exit(1)
 

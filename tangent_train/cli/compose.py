@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-from hydra import compose
 from hydra.core.override_parser.types import Quote, QuotedString
-from omegaconf import OmegaConf
 
-__all__ = ["compose_option", "config_folder", "quote_path", "quoted"]
+__all__ = ["config_folder", "quote_path", "quoted"]
 
 _PATHS = (
     *("back", "cameras", "checkpoint", "class_map", "classes", "depth", "figure", "file"),
@@ -49,18 +45,3 @@ def quoted(text: str) -> str:
     if re.fullmatch(r"[\w/.+-]+", text):
         return text
     return QuotedString(text.replace("${", r"\${"), Quote.single).with_quotes()
-
-
-def compose_option(group: str, option: str, search: Sequence[str] = ()) -> dict[str, Any]:
-    """Compose an option of a config group alone; references elsewhere stay unresolved.
-
-    Hydra must be initialized.
-
-    Args:
-        group: The group, without folders.
-        option: The option.
-        search: Overrides with further search paths of Hydra.
-    """
-    config = OmegaConf.to_container(compose(f"{group}/{option}", list(search)), resolve=False)
-    section: dict[str, Any] = config[group]  # type: ignore[index, call-overload, assignment]
-    return section

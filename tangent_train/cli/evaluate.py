@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import logging
-import threading
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,11 +13,9 @@ from typing import Any
 import lightning
 import torch
 from hydra.core.hydra_config import HydraConfig
-from lightning.pytorch.accelerators import CPUAccelerator
 from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
-from rich.console import Console
 
 from datamodules.core.loading import explained
 from tangent_train.callbacks.checkpoints import AtomicCheckpointIO, CheckpointContents
@@ -28,6 +25,7 @@ from tangent_train.checkpoints.content import read_checkpoint, write_settings
 from tangent_train.checkpoints.scores import Scores, size_multiple_of
 from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
 from tangent_train.cli.build import Settings, build, build_trained, check_fits, shown
+from tangent_train.cli.say import say
 from tangent_train.cli.stored import GROUPS, run_settings
 from tangent_train.errors import SettingError
 from tangent_train.files import no_room
@@ -67,13 +65,8 @@ def evaluate(
     if trained is None and (mapped or run_settings(checkpoint) is None):
         trained = load_trained(checkpoint, settings.get("trust", ()))
     run = Run.begin(settings, source, trained)
-    try:
-        with machine_faults(run.folder, run.data):
-            run.test(run.trainer([]), checkpoint)
-    except (KeyboardInterrupt, SystemExit):
-        told = "Nothing is kept of an interrupted evaluation; the same command begins it anew."
-        Console(stderr=True, soft_wrap=True, highlight=False).print(told)
-        raise
+    with machine_faults(run.folder, run.data):
+        run.test(run.trainer([]), checkpoint)
 
 
 @dataclass(frozen=True)
@@ -132,7 +125,7 @@ class Run:
         # Devices found, advertisements, what the settings say anyway.
         logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
         every, epochs = section.get("check_val_every_n_epoch"), section.get("max_epochs")
-        trainer: lightning.Trainer = make(
+        return make(
             section,
             "trainer",
             self.source,
@@ -145,13 +138,6 @@ class Run:
             # The data module's samplers count every image once on any number of processes.
             use_distributed_sampler=False,
         )
-        if section.get("sync_batchnorm") and isinstance(trainer.accelerator, CPUAccelerator):
-            raise SettingError(
-                "trainer.sync_batchnorm",
-                found="true, on a CPU",
-                expected="false: torch synchronizes batch statistics on GPUs only",
-            )
-        return trainer
 
     def test(self, trainer: lightning.Trainer, checkpoint: Path) -> None:
         """Evaluate weights on the test fold and write the results.
@@ -197,13 +183,10 @@ class Run:
         name = str(checkpoint.relative_to(self.folder) if own else checkpoint)
         record = replace(record, checkpoint=name, class_map=self.settings.get("class_map"))
         write_evaluation(self.task, record, self.folder, self.notes)
-        console = Console(soft_wrap=True, highlight=False)
-        for note in self.notes:
-            console.print(note, markup=False)
-        console.print(headline(record), markup=False)
+        for line in (*self.notes, headline(record)):
+            say(line)
         result_tables(record)[0].print()
-        told = f"Results, pictures and logs: {self.folder}; report.html opens in a browser."
-        console.print(told, markup=False)
+        say(f"Results, pictures and logs: {self.folder}; report.html opens in a browser.")
 
 
 def _choices(settings: Settings, source: SettingsFile | None) -> dict[str, str]:
@@ -221,8 +204,6 @@ def _choices(settings: Settings, source: SettingsFile | None) -> dict[str, str]:
 def machine_faults(folder: Path, data: Any) -> Iterator[None]:
     """Explain a full disk, and workers that died.
 
-    TensorBoard writes in a thread that ends with the error of a full disk; its stack is not shown.
-
     Args:
         folder: Of the run.
         data: Its data module.
@@ -232,8 +213,6 @@ def machine_faults(folder: Path, data: Any) -> Iterator[None]:
             events.
         DataError: A worker died.
     """
-    show = threading.excepthook
-    threading.excepthook = _all_but_full_disks(folder, show)
     try:
         yield
     except (OSError, EOFError, RuntimeError, ValueError) as error:
@@ -241,15 +220,3 @@ def machine_faults(folder: Path, data: Any) -> Iterator[None]:
         if told is error:
             raise
         raise told from error
-    finally:
-        threading.excepthook = show
-
-
-def _all_but_full_disks(
-    folder: Path, show: Callable[[threading.ExceptHookArgs], object]
-) -> Callable[[threading.ExceptHookArgs], None]:
-    def hook(failed: threading.ExceptHookArgs) -> None:
-        if failed.exc_value is None or no_room(folder, failed.exc_value) is None:
-            show(failed)
-
-    return hook

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
+from rich import get_console
 
 from tangent_train.checkpoints.trained import load_trained
+from tangent_train.cli.say import say
 from tangent_train.cli.settings import check_new, typed
 from tangent_train.inference.export import export_network
 from tangent_train.inference.predictor import sees_rays
@@ -42,21 +43,19 @@ def export(config: Mapping[str, Any]) -> None:
     """
     settings = typed(Settings, config)
     output = settings.output
-    check_new(output, overwrite=settings.overwrite)
-    console = Console(soft_wrap=True, highlight=False)
-    with console.status(f"Writing {output.name} …"):
+    check_new(settings, output)
+    with get_console().status(f"Writing {output.name} …"):
         trained = load_trained(settings.checkpoint, settings.trust)
         size, opset = settings.image_size, settings.opset
         written = export_network(trained, output, image_size=size, opset=opset)
     fixed, multiple = written.trained.fixed_size, trained.size_multiple
     sides = "{}×{}".format(*fixed) if fixed else "h×w"
     sides += f", multiples of {multiple}" if multiple > 1 and not fixed else ""
-    console.print(
+    say(
         f"{output}: {output.stat().st_size / 1e6:.1f} MB\n"
         f"images: {trained.in_channels} channels, {sides}; scores: {trained.network.num_scores} "
         f"classes\nlargest difference to PyTorch: {written.difference:.1e} of the range of the "
-        "scores",
-        markup=False,
+        "scores"
     )
     if output.suffix.lower() == ".onnx" and sees_rays(trained.network):
-        console.print(f"{output.name} has no cross-image attention; .safetensors keeps it.")
+        say(f"{output.name} has no cross-image attention; .safetensors keeps it.")

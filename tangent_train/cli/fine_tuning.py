@@ -3,27 +3,22 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch.utilities import rank_zero_only
-from rich.console import Console
 
 from datamodules.core.inputs import RGBD_NORMALIZATION, channel_names
 from models import initialize
-from models.fine_tuning import tensors_for
 from tangent_train.checkpoints.trained import Start, completed_settings, start_in
+from tangent_train.cli.build import Settings
+from tangent_train.cli.evaluate import Run
+from tangent_train.cli.say import say
 from tangent_train.cli.settings import Trust, typed
 from tangent_train.errors import DataError, printable
 from tangent_train.registry import SettingsFile, make
-
-if TYPE_CHECKING:
-    from torch import nn
-
-    from tangent_train.cli.build import Settings
-    from tangent_train.cli.evaluate import Run
 
 __all__ = ["begin_from", "load_start"]
 
@@ -88,19 +83,14 @@ def load_start(path: Path, run: Run) -> None:
         run: Its network is changed in place; its task learns which tensors are new.
 
     Raises:
-        DataError: The file cannot be read, nothing in it fits, or its scores are not as many as its
-            class names.
+        DataError: The file cannot be read, or nothing in it fits.
     """
     start, network = start_in(path), run.task.network
     channels = None
     others: Collection[str] = ()
     if start is not None:
-        heads = _heads(run)
-        names = tuple(run.data.class_names)
-        if start.groups is None:
-            _check_heads(path, heads, network, len(start.class_names) - len(names))
-        if start.groups is not None or start.class_names != names:
-            others = heads
+        if start.groups is not None or start.class_names != tuple(run.data.class_names):
+            others = _heads(run)
         inputs = getattr(run.data, "inputs", None)
         if start.inputs is not None and inputs is not None:
             channels = (channel_names(start.inputs), channel_names(inputs))
@@ -111,7 +101,7 @@ def load_start(path: Path, run: Run) -> None:
 
 @rank_zero_only
 def _print(text: str) -> None:
-    Console(soft_wrap=True, highlight=False).print(printable(text), markup=False)
+    say(printable(text))
 
 
 def _wraps(section: Mapping[str, Any], target: Any) -> bool:
@@ -148,30 +138,11 @@ def _normalization(start: Start, data: Mapping[str, Any]) -> dict[str, list[floa
     }
 
 
-def _heads(run: Run) -> dict[str, list[int]]:
-    """By how much every dimension of a tensor grows with another class, of tensors that do."""
+def _heads(run: Run) -> set[str]:
+    """Names of the tensors that grow with another class."""
     more = completed_settings(
         run.settings["network"], run.data.in_channels, run.data.num_classes + 1, restored=True
     )
     larger = make(more, "network", run.source).state_dict()
-    growth = {
-        name: [b - a for a, b in zip(tensor.shape, larger[name].shape, strict=True)]
-        for name, tensor in run.task.network.state_dict().items()
-    }
-    return {name: by for name, by in growth.items() if any(by)}
-
-
-def _check_heads(
-    path: Path, heads: Mapping[str, Sequence[int]], network: nn.Module, more: int
-) -> None:
-    """Refuse a file with so many more classes than the data, if it has not the scores of these."""
-    own, found = network.state_dict(), tensors_for(network, path)
-    for name in filter(found.__contains__, heads):
-        shape = tuple(found[name].shape)
-        for size, now, by in zip(shape, own[name].shape, heads[name], strict=False):
-            if by and size != now + more * by:
-                raise DataError(
-                    path,
-                    found=f"{size} scores in {name} {shape}",
-                    expected=f"{now + more * by}, one for each of its class names",
-                )
+    own = run.task.network.state_dict()
+    return {name for name, tensor in own.items() if tensor.shape != larger[name].shape}

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 from hydra import compose
 from omegaconf import OmegaConf
-from rich.console import Console
+from rich import get_console
 
 from tangent_train.cli.compose import config_folder
+from tangent_train.cli.say import say
 from tangent_train.cli.settings import check_new, typed
 from tangent_train.errors import SettingError
 
@@ -60,9 +61,8 @@ def import_network(config: Mapping[str, Any]) -> None:
     suffix = ".onnx" if settings.network == "onnx" else ".ckpt"
     if output.suffix.lower() != suffix:
         raise SettingError("output", found=output.name, expected=f"a name ending in {suffix}")
-    check_new(output, overwrite=settings.overwrite)
-    console = Console(soft_wrap=True, highlight=False)
-    with console.status(f"Writing {output.name} …"):
+    check_new(settings, output)
+    with get_console().status(f"Writing {output.name} …"):
         network = _load(settings, config["normalization"])
         imported = photo_networks.import_network(
             network,
@@ -73,10 +73,10 @@ def import_network(config: Mapping[str, Any]) -> None:
             nothing=settings.nothing,
             nothing_wins=settings.nothing_wins,
         )
-    console.print(_understood(output, imported, settings), markup=False)
+    say(_understood(output, imported, settings))
     indoors = _indoors(imported.view.level, network.image_size, settings)
     for remark in (*indoors, *network.remarks):
-        console.print(remark, markup=False)
+        say(remark)
 
 
 def _load(settings: Settings, normalization: Any) -> PhotoNetwork:

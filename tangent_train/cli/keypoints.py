@@ -10,11 +10,11 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.progress import track
 
 from datamodules.core.panorama_pairs import ImagePairs, PanoramaPair, PanoramaPairs
 from datamodules.images.pixel_files import read_image_size
+from tangent_train.cli.say import say
 from tangent_train.cli.settings import typed
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import parse_json, write_bytes
@@ -58,41 +58,36 @@ def keypoints(config: Mapping[str, Any]) -> None:
     done = earlier_results(output, settings)
     pairs.make_files()
     names = pairs.names[: given.max_pairs]
-    console = Console(soft_wrap=True, highlight=False)
 
     def report() -> KeypointReport:
         rows = [row for name in pairs.names for row in done.get(name, ())]
         return KeypointReport(rows, comparer.ways.representations, settings, pairs.published)
 
     missing = [(k, name) for k, name in enumerate(names) if name not in done]
-    console.print(f"{len(names) - len(missing)} of {len(names)} pairs are done already")
-    for index, name in track(missing, "Comparing pairs", console=console, disable=not missing):
+    say(f"{len(names) - len(missing)} of {len(names)} pairs are done already")
+    for index, name in track(missing, "Comparing pairs", disable=not missing):
         try:
             pair = pairs.read(index)
             comparison = comparer.compare(pair)
             if given.export:
                 _export(output / "export", pairs.files, pair, comparison)
         except (DataError, MemoryError) as error:  # of this pair; a SettingError is of all
-            console.print(f"Pair {name}: {error or 'too little memory'}", markup=False)
+            say(f"Pair {name}: {error or 'too little memory'}")
             continue
         if index < given.pictures:
-            _draw(output / "matches" / f"{index:03}_{file_name(name)}", comparison)
+            for condition in comparison.images:
+                file = f"{index:03}_{file_name(name)}_{condition}.png"
+                write_bytes(output / "matches" / file, matches_png(comparison, condition))
         done[name] = comparison.rows
         report().write(output)
     for table in report().means():
         table.print()
-    console.print(f"Results are in {output}." if done else "There are no results.", markup=False)
+    say(f"Results are in {output}." if done else "There are no results.")
     if given.export:
-        root = _root(pairs.files)
-        console.print(f"For COLMAP: {output / 'export'}, image_path {root}", markup=False)
+        say(f"For COLMAP: {output / 'export'}, image_path {_root(pairs.files)}")
     failed = len(set(names) - set(done))
     if failed:
         sys.exit(f"tangent-keypoints: {failed} of {len(names)} pairs could not be used, see above")
-
-
-def _draw(stem: Path, comparison: Comparison) -> None:
-    for condition in comparison.images:
-        write_bytes(Path(f"{stem}_{condition}.png"), matches_png(comparison, condition))
 
 
 def _pairs(config: Mapping[str, Any]) -> tuple[Any, PanoramaPairs]:

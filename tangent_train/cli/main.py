@@ -80,7 +80,7 @@ def _main(command: str) -> None:
         except (HydraException, OmegaConfBaseException) as error:
             cause = str(error.__cause__ or "").partition("\n")[0]
             sys.exit(f"tangent-{command}: {error}" + f"\n{cause}" * bool(cause))
-        except (NotADirectoryError, PermissionError) as error:
+        except (IsADirectoryError, NotADirectoryError, PermissionError) as error:
             raise SettingError(
                 error.filename or "output",
                 found=(error.strerror or str(error)).lower(),

@@ -5,44 +5,37 @@ from __future__ import annotations
 import math
 import sys
 import time
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from rich.console import Console
+from numpy.typing import NDArray
 
-from datamodules.images.gpano import area_of_crop, whole_area
+from datamodules.images.gpano import PanoramaArea, area_of_crop, whole_area
 from datamodules.images.masks import Mask, Masks
 from datamodules.images.pixel_files import read_pixels
-from tangent_train.checkpoints.trained import load_trained
+from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
 from tangent_train.cli.each import Job, Shard, each
 from tangent_train.cli.predict_inputs import Inputs, is_video
 from tangent_train.cli.predict_shards import PredictionShard
+from tangent_train.cli.say import say
 from tangent_train.cli.settings import typed
 from tangent_train.errors import SettingError, counted
 from tangent_train.inference.class_maps import Unmapped, load_class_map, map_classes
 from tangent_train.inference.images import DepthFolder, read_panorama, read_photo, with_up
 from tangent_train.inference.judge import NetworkJudge
 from tangent_train.inference.predictor import Predictor
-from tangent_train.inference.views import PanoramaViews, PhotoViews
+from tangent_train.inference.views import InputImage, PanoramaViews, PhotoViews
+from tangent_train.results.html import EncodedImage
 from tangent_train.results.predictions import (
     Entry,
     Kind,
     PredictionFolder,
     class_shares,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
-    from numpy.typing import NDArray
-
-    from datamodules.images.gpano import PanoramaArea
-    from tangent_train.checkpoints.trained import TrainedNetwork
-    from tangent_train.inference.views import InputImage
-    from tangent_train.results.html import EncodedImage
 
 __all__ = ["predict"]
 
@@ -115,7 +108,7 @@ def predict(config: Mapping[str, Any]) -> None:
         done = _label(settings, decisive, inputs.part(shard), label, folder, part)
         part.save(done, done=True)
         count, entries = part.together()
-        _say(f"Shard {shard} is done: {count} of {shard.count} in all.")
+        say(f"Shard {shard} is done: {count} of {shard.count} in all.")
         if count == shard.count:
             folder.write_summary(decisive, entries)
             _finish(settings, inputs, label, folder, entries)
@@ -147,7 +140,7 @@ def _label(
             folder.write_summary(decisive, entries)
 
     count = inputs.count()
-    _say(f"{counted(count, inputs.noun)}, {len(entries)} done already.")
+    say(f"{counted(count, 'images')}, {len(entries)} done already.")
     missing = count - len(entries)
     steps = label, label.read, label.write
     labelled = set()
@@ -162,7 +155,7 @@ def _label(
                     save()
                     saved = time.monotonic()
     except KeyboardInterrupt:
-        _say(f"{len(entries)} of {count} {inputs.noun} are done. resume=true continues.")
+        say(f"{len(entries)} of {count} images are done. resume=true continues.")
         raise
     finally:
         save()
@@ -187,7 +180,7 @@ def _finish(
     if pictures:
         folder.write_page(entries, pictures)
     folder.mean_shares(entries).print()
-    _say(f"Results are in {settings.output}.")
+    say(f"Results are in {settings.output}.")
 
 
 class _Labelled(NamedTuple):
@@ -298,7 +291,7 @@ def _networks(settings: Settings) -> tuple[TrainedNetwork, TrainedNetwork]:
     class_map = load_class_map(settings.class_map)
     trained = load_trained(settings.checkpoint, settings.trust)
     mapped = map_classes(trained, class_map, settings.unmapped)
-    _say(f"Class map {class_map.name}: {mapped}.")
+    say(f"Class map {class_map.name}: {mapped}.")
     return trained, mapped.trained
 
 
@@ -353,7 +346,3 @@ def _depth_folder(settings: Settings, trained: TrainedNetwork) -> DepthFolder | 
             f"takes {' and '.join(trained.inputs)}",
         )
     return None if folder is None else DepthFolder(folder, settings.depth_scale)
-
-
-def _say(content: str) -> None:
-    Console(soft_wrap=True, highlight=False).print(content, markup=False)

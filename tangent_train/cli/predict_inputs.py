@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Container, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from datamodules.images.image_files import IMAGE_SUFFIXES, image_paths, short_names
 from datamodules.images.videos import VIDEO_SUFFIXES, read_frames, read_video_size
-from tangent_train.cli.each import Job
+from tangent_train.cli.each import Job, Shard
 from tangent_train.errors import DataError, SettingError
-from tangent_train.results.predictions import frame_name
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Container, Iterator
-    from pathlib import Path
-
-    from tangent_train.cli.each import Shard
-    from tangent_train.results.predictions import Entry
+from tangent_train.results.predictions import Entry, frame_name
 
 __all__ = ["Inputs", "is_video"]
 
@@ -102,13 +96,6 @@ class Inputs:
         """Number of images and frames; a video that cannot be read counts as one."""
         frames = sum(1 if job.error else job.value for job in self.videos.values())
         return len(self.files) - len(self.videos) + frames
-
-    @property
-    def noun(self) -> str:
-        """What is labelled, in the plural."""
-        if not self.videos:
-            return "images"
-        return "frames" if len(self.videos) == len(self.files) else "images and frames"
 
     def has(self, entry: Entry) -> bool:
         """Whether an entry of an earlier summary is of one of these."""

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NoReturn
+from pathlib import Path
+from typing import Any, NoReturn
 
+from tangent_train.cli.each import Shard
 from tangent_train.errors import SettingError
 from tangent_train.files import parse_json, write_text
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-    from pathlib import Path
-
-    from tangent_train.cli.each import Shard
-    from tangent_train.results.predictions import Entry
+from tangent_train.results.predictions import Entry
 
 __all__ = ["PredictionShard"]
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from rich.console import Console
-
 from tangent_train.cli.build import Settings
 from tangent_train.cli.each import Shard
+from tangent_train.cli.say import say
 from tangent_train.registry import make
 
 __all__ = ["prepare"]
@@ -22,10 +21,9 @@ def prepare(settings: Settings) -> None:
     data = make(settings["data"], "data", representation=representation)
     if shard is not None:
         count = data.prepare_part(shard.part)
-        told = f"Shard {shard}: {count} {data.noun} are in {data.store}."
+        say(f"Shard {shard}: {count} {data.noun} are in {data.store}.")
     else:
         data.prepare_data()
         data.setup()
         counts = ", ".join(f"{len(data.found().splits[s])} {s}" for s in ("train", "val", "test"))
-        told = f"{data.root} is ready. {data.noun.capitalize()}: {counts}."
-    Console(soft_wrap=True, highlight=False).print(told, markup=False)
+        say(f"{data.root} is ready. {data.noun.capitalize()}: {counts}.")

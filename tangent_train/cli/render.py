@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import Any, Literal
 
 import numpy as np
-from rich.console import Console
+from numpy.typing import NDArray
 
 from datamodules.folder.reader import class_masks
 from datamodules.images.colmap_project import ColmapProject, flat_names
@@ -31,7 +32,8 @@ from datamodules.images.tangent_folders import (
 )
 from datamodules.images.tangent_results import Kind, TangentResults, result_files
 from tangent_train.cli.each import Job, each
-from tangent_train.cli.settings import typed
+from tangent_train.cli.say import say
+from tangent_train.cli.settings import check_new, typed
 from tangent_train.errors import DataError, SettingError, counted
 from tangent_train.geometry import TangentGrid, nearest_level, random_rotation, rotation_about
 from tangent_train.keypoints.colmap import panorama_poses
@@ -45,16 +47,9 @@ from tangent_train.rendering.camera_files import (
 )
 from tangent_train.rendering.figure import tangent_figure
 
-_Item = TypeVar("_Item")
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
-    from numpy.typing import NDArray
-
-    _Work = Callable[[_Item, Path, Callable[[float], object]], Path]
-
 __all__ = ["render"]
+
+_Work = Callable[[Job, Callable[[float], object]], Path]
 
 
 @dataclass(frozen=True)
@@ -115,43 +110,36 @@ def render(config: Mapping[str, Any]) -> None:
     elif colmap:
         _colmap(settings)
     else:
-        work, jobs = _forward(settings) if settings.input is not None else _back(settings)
+        jobs, work = _forward(settings) if settings.input is not None else _back(settings)
         _end(_each(jobs, work), len(jobs))
 
 
-def _each(jobs: Mapping[_Item, Path], work: _Work[_Item]) -> list[Path]:
+def _each(jobs: Sequence[Job], work: _Work) -> list[Path]:
     """Results of the panoramas that could be rendered."""
-    done = each(
-        "Rendering",
-        [Job(item, path) for item, path in jobs.items()],
-        len(jobs),
-        lambda job, progress: work(job.item, job.path, progress),
-    )
-    return [job.value for job in done if not job.error]
+    return [job.value for job in each("Rendering", jobs, len(jobs), work) if not job.error]
 
 
 def _end(done: Sequence[Path], count: int) -> None:
     """Say what was written, and exit with 1 if not all panoramas were."""
     if done:
         written = list(dict.fromkeys(done))
-        listed = f"{written[0]}" + (f" and {len(written) - 1} more" if written[1:] else "")
-        Console(highlight=False).print(f"Written: {listed}", soft_wrap=True, markup=False)
+        say(f"Written: {written[0]}" + (f" and {len(written) - 1} more" if written[1:] else ""))
     if len(done) < count:
         failed = f"{count - len(done)} of {count} panoramas"
         sys.exit(f"tangent-render: {failed} could not be rendered, see above")
 
 
-def _forward(settings: Settings) -> tuple[_Work[Path], dict[Path, Path]]:
-    """Function that renders a panorama to a folder, and the panorama of every folder."""
+def _forward(settings: Settings) -> tuple[list[Job], _Work]:
+    """The folder of every panorama, and the function that renders to it."""
     paths, suffix = _panoramas(settings), _suffix(settings)
     if settings.figure is not None and len(paths) > 1:
         raise SettingError("figure", found=f"{len(paths)} panoramas", expected="one")
     output = Path() if settings.output is None else settings.output
-    jobs = {output / name: path for name, path in zip(short_names(paths), paths, strict=True)}
-    _refuse_existing(settings, [*(jobs if settings.output else ()), settings.figure])
+    jobs = [Job(output / name, path) for name, path in zip(short_names(paths), paths, strict=True)]
+    check_new(settings, *(job.item for job in jobs if settings.output), settings.figure)
 
-    def work(folder: Path, path: Path, progress: Callable[[float], object]) -> Path:
-        image = read_panorama(path, settings.interpolation)
+    def work(job: Job, progress: Callable[[float], object]) -> Path:
+        image = read_panorama(job.path, settings.interpolation)
         shape = image.shape[0], image.shape[1]
         grid, faces = _grid(settings, shape[0])
         if settings.figure is not None:
@@ -161,11 +149,11 @@ def _forward(settings: Settings) -> tuple[_Work[Path], dict[Path, Path]]:
         files = tuple(f"{face_name(grid, face)}{suffix}" for face in faces)
         if settings.interpolation == "bilinear":
             image = shrink_to_level(image, grid.level)
-        cameras = CameraFile(path.name, shape, grid, faces, files)
-        write_tangent_folder(folder, image, cameras, settings.interpolation, progress)
-        return folder
+        cameras = CameraFile(job.path.name, shape, grid, faces, files)
+        write_tangent_folder(job.item, image, cameras, settings.interpolation, progress)
+        return Path(job.item)
 
-    return work, jobs
+    return jobs, work
 
 
 def _panoramas(settings: Settings) -> list[Path]:
@@ -201,22 +189,23 @@ def _colmap(settings: Settings) -> None:
     paths, suffix, output = _panoramas(settings), _suffix(settings), settings.output or Path()
     if suffix == ".npy":
         raise SettingError("format", found="npy", expected="png, jpg, webp or tif for COLMAP")
-    _refuse_existing(settings, [output])
+    check_new(settings, output)
     masks = _masks(settings)
-    names = dict(zip(flat_names(paths), short_names(paths), strict=True))
+    names = dict(zip(paths, short_names(paths), strict=True))
     # One camera has images of one size. If no panorama can be read, each says why below.
     grid, faces = _grid(settings, max(map(_rows, paths)) or 512)
     with replaced_folder(output) as folder:
         project = ColmapProject(folder, grid, faces, suffix, settings.interpolation)
 
-        def work(name: str, path: Path, progress: Callable[[float], object]) -> Path:
+        def work(job: Job, progress: Callable[[float], object]) -> Path:
+            path, name = job.path, names[job.path]
             image = read_panorama(path, settings.interpolation)
-            file = names[name].removesuffix(path.suffix) + path.suffix
-            counts = masks.read(names[name], panorama_area(path, read_image_size(path)))
-            project.add(name, file, image, counts, progress)
+            counts = masks.read(name, panorama_area(path, read_image_size(path)))
+            file = name.removesuffix(path.suffix) + path.suffix
+            project.add(job.item, file, image, counts, progress)
             return output
 
-        done = _each(dict(zip(names, paths, strict=True)), work)
+        done = _each(list(map(Job, flat_names(paths), paths)), work)
         if not done:
             _end(done, len(paths))
         project.write_rig()
@@ -245,12 +234,11 @@ def _rows(path: Path) -> int:
 def _poses(settings: Settings, model: Path) -> None:
     """Write the poses of panoramas in a model of COLMAP."""
     output = settings.output or Path()
-    _refuse_existing(settings, [output])
+    check_new(settings, output)
     rig = read_rig((settings.cameras or model.absolute().parent.parent) / RIG_FILE)
     poses = panorama_poses(model, rig)
     write_poses(output, poses)
-    said = f"Written: {output}, poses of {len(poses)} of {counted(len(rig.panoramas), 'panoramas')}"
-    Console(highlight=False).print(said, soft_wrap=True, markup=False)
+    say(f"Written: {output}, poses of {len(poses)} of {counted(len(rig.panoramas), 'panoramas')}")
 
 
 def _rotation(settings: Settings) -> NDArray[np.float64] | None:
@@ -268,8 +256,8 @@ def _rotation(settings: Settings) -> NDArray[np.float64] | None:
     )
 
 
-def _back(settings: Settings) -> tuple[_Work[Path], dict[Path, Path]]:
-    """Function that renders the results in a folder, and the folder of every panorama."""
+def _back(settings: Settings) -> tuple[list[Job], _Work]:
+    """The folder of the results of every panorama, and the function that renders them."""
     back, output = settings.back or Path(), settings.output or Path()
     if not back.is_dir():
         raise DataError(back, found="no such folder", expected="a folder of results")
@@ -277,14 +265,14 @@ def _back(settings: Settings) -> tuple[_Work[Path], dict[Path, Path]]:
     of_one = root if root.is_file() else root / CAMERAS_FILE
     found = sorted(path.parent.relative_to(root) for path in root.rglob(CAMERAS_FILE))
     cameras = {output / name: root / name / CAMERAS_FILE for name in found}
-    jobs = {output / name: back / name for name in found if (back / name).is_dir()}
+    jobs = [Job(output / name, back / name) for name in found if (back / name).is_dir()]
     if of_one.is_file():
         if output.suffix.lower() not in PIXEL_SUFFIXES:
             raise SettingError(
                 "output", found=output, expected=f"a name ending in {', '.join(PIXEL_SUFFIXES)}"
             )
-        _refuse_existing(settings, [output])
-        cameras, jobs = {output: of_one}, {output: back}
+        check_new(settings, output)
+        cameras, jobs = {output: of_one}, [Job(output, back)]
     if not jobs:
         raise DataError(
             root,
@@ -293,28 +281,16 @@ def _back(settings: Settings) -> tuple[_Work[Path], dict[Path, Path]]:
             remedy="Give cameras=<the folder that tangent-render wrote>.",
         )
 
-    def work(path: Path, folder: Path, _: Callable[[float], object]) -> Path:
+    def work(job: Job, _: Callable[[float], object]) -> Path:
+        path: Path = job.item
         of = read_cameras(cameras[path])
-        results = TangentResults.read(result_files(folder, of), of.grid, settings.kind)
+        results = TangentResults.read(result_files(job.path, of), of.grid, settings.kind)
         if not of_one.is_file():
             path = path.with_name(path.name + results.suffix)
-            _refuse_existing(settings, [path])
+            check_new(settings, path)
         rows = settings.height
         shape = of.shape if rows is None else (rows, 2 * rows)
         results.write(path, shape, settings.blend, z_depth=settings.z_depth)
         return path
 
-    return work, jobs
-
-
-def _refuse_existing(settings: Settings, paths: list[Path | None]) -> None:
-    if settings.overwrite:
-        return
-    for path in filter(None, paths):
-        if any(path.iterdir()) if path.is_dir() else path.exists():
-            raise SettingError(
-                "output",
-                found=f"{path}, which exists",
-                expected="nothing there yet",
-                remedy="Choose another output, or overwrite=true.",
-            )
+    return jobs, work

@@ -6,6 +6,8 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
+from tangent_train.cli.say import say
+
 __all__ = ["report"]
 
 
@@ -20,8 +22,6 @@ def report(arguments: Sequence[str]) -> None:
     """
     options = _parser().parse_args(arguments)
     # Heavy, and not needed to say what is wrong with the command line.
-    from rich.console import Console
-
     from tangent_train.results.comparisons import runs_report
     from tangent_train.results.record import find_runs, load_record, unfinished_runs
 
@@ -29,10 +29,10 @@ def report(arguments: Sequence[str]) -> None:
     notes = [f"{run}: not finished, left out." for run in unfinished_runs(options.folders)]
     found = runs_report(records, notes)
     found.write(options.output, "report")
-    console = Console(highlight=False)
     found.tables()[0].print()
-    for line in (*(f"- {note}" for note in found.all_notes()), f"Files: {options.output}/report.*"):
-        console.print(line, soft_wrap=True, markup=False)
+    for note in found.all_notes():
+        say(f"- {note}")
+    say(f"Files: {options.output}/report.*")
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -51,19 +51,20 @@ def typed(kind: type[_Settings], config: Mapping[str, Any]) -> _Settings:
     return kind(**{name: _converted(name, config[name], hint) for name, hint in hints.items()})
 
 
-def check_new(output: Path, *, overwrite: bool) -> None:
-    """Refuse to replace a file without being told, and a folder in any case.
+def check_new(settings: Any, *outputs: Path | None) -> None:
+    """Refuse to replace files and folders without `settings.overwrite`; empty folders are new.
 
     Raises:
         SettingError: There is one.
     """
-    if output.is_dir() or (output.exists() and not overwrite):
-        raise SettingError(
-            "output",
-            found=f"{output}, which exists",
-            expected="a new file",
-            remedy="" if output.is_dir() else "Give another name, or set overwrite=true.",
-        )
+    for path in () if settings.overwrite else filter(None, outputs):
+        if any(path.iterdir()) if path.is_dir() else path.exists():
+            raise SettingError(
+                "output",
+                found=f"{path}, which exists",
+                expected="nothing there yet",
+                remedy="Give another output, or overwrite=true.",
+            )
 
 
 def _converted(name: str, value: Any, hint: Any) -> Any:

@@ -7,21 +7,17 @@ run; but a launcher of Hydra runs jobs in its own process. So a job starts one a
 from __future__ import annotations
 
 import os
+from collections.abc import Collection
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import CompactHydraException
 from hydra.types import RunMode
+from omegaconf import DictConfig
 
 from tangent_train.cli.processes import command_line, run_process
 from tangent_train.errors import SettingError
 from tangent_train.files import parse_json
-
-if TYPE_CHECKING:
-    from collections.abc import Collection
-
-    from omegaconf import DictConfig
 
 __all__ = ["OBJECTIVE_FILE", "in_sweep", "run_job"]
 

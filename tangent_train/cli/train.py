@@ -12,10 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import lightning
-import torch
 from hydra.core.hydra_config import HydraConfig
 from lightning.fabric.utilities.exceptions import MisconfigurationException
-from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint
+from lightning.pytorch.callbacks import LearningRateMonitor
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from tangent_train.callbacks.checkpoints import BestCheckpoint, LastCheckpoint, averaged_weights
@@ -29,7 +28,7 @@ from tangent_train.files import atomic_path, write_text
 from tangent_train.registry import SettingsFile
 from tangent_train.setting_rules import differing_settings, from_file
 
-__all__ = ["best_on_validation", "train"]
+__all__ = ["train"]
 
 
 def train(settings: Settings, source: SettingsFile | None = None) -> float | None:
@@ -68,7 +67,7 @@ def train(settings: Settings, source: SettingsFile | None = None) -> float | Non
     with machine_faults(run.folder, run.data):
         _fit(run, trainer, resumed, last)
         # First: an error in the test must not cost a sweep its figure.
-        score = best_on_validation(trainer, run.folder)
+        score = _best_on_validation(trainer, best, run.folder)
         run.test(trainer, _tested(trainer, best, last.path))
     return score
 
@@ -83,17 +82,11 @@ def _tested(trainer: lightning.Trainer, best: BestCheckpoint, last: Path) -> Pat
     return tested
 
 
-def best_on_validation(trainer: lightning.Trainer, folder: Path) -> float | None:
-    """The best validation score, kept for sweeps; None if there is none.
-
-    Args:
-        trainer: Of the run.
-        folder: Of the run.
-    """
-    best = next((c for c in trainer.checkpoint_callbacks if isinstance(c, ModelCheckpoint)), None)
-    if best is None or best.best_model_score is None:
-        return None
-    if not torch.isfinite(best.best_model_score):  # no labelled pixel
+def _best_on_validation(
+    trainer: lightning.Trainer, best: BestCheckpoint, folder: Path
+) -> float | None:
+    """The best validation score, kept for sweeps; None if there is none."""
+    if best.best_model_score is None or not best.best_model_score.isfinite():  # of no label
         return None
     score = float(best.best_model_score)
     if trainer.is_global_zero:

@@ -7,15 +7,17 @@ import re
 import shlex
 import sys
 from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import OmegaConf
-from rich.console import Console
+from omegaconf import DictConfig, OmegaConf
 
+from tangent_train.checkpoints.trained import TrainedNetwork
+from tangent_train.cli.say import say
 from tangent_train.cli.stored import StoredNetwork, run_settings
 from tangent_train.cli.transfer_stages import (
     Stage,
@@ -26,13 +28,6 @@ from tangent_train.cli.transfer_stages import (
 )
 from tangent_train.cli.transfer_views import views_of
 from tangent_train.errors import DataError, SettingError
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-
-    from omegaconf import DictConfig
-
-    from tangent_train.checkpoints.trained import TrainedNetwork
 
 __all__ = ["trained_level", "transfer"]
 
@@ -51,7 +46,6 @@ def transfer(config: DictConfig) -> None:
         DataError: The given checkpoint, or a file of a stage, cannot be used.
     """
     folder = Path(HydraConfig.get().runtime.output_dir)
-    _check_typed(config)
     given = trained = None
     if config.checkpoint is not None:
         config.checkpoint = str(Path(config.checkpoint).absolute())
@@ -68,22 +62,9 @@ def transfer(config: DictConfig) -> None:
         for number, stage in enumerate(stages, start=1):
             _run(stage, f"Stage {number} of {len(stages)}, {stage.name} in {stage.folder}")
     except (KeyboardInterrupt, SystemExit):
-        _say("Finished stages are kept; the same command continues.", error=True)
+        say("Finished stages are kept; the same command continues.", error=True)
         raise
     _report(config, folder, stages, trained)
-
-
-def _check_typed(config: DictConfig) -> None:
-    """Refuse a single fold or seed beside a list of them, which would be ignored."""
-    for text in HydraConfig.get().overrides.task:
-        name, _, number = text.partition("=")
-        several = {"data.fold": "folds", "seed": "seeds"}.get(name)
-        if several is not None and config[several] is not None:
-            raise SettingError(
-                text,
-                found=f"{several}={list(config[several])} beside it",
-                expected=f"{several}=[{number}], or {several}=null",
-            )
 
 
 def _of_network(config: DictConfig) -> tuple[DictConfig, TrainedNetwork]:
@@ -182,7 +163,7 @@ def _tell_shared_scenes(built: Sequence[tuple[Stage, Any]]) -> None:
     shared = sorted(trained & tested)
     if shared:
         more = f" and {len(shared) - _MOST_SHOWN} others" if len(shared) > _MOST_SHOWN else ""
-        _say(
+        say(
             f"Note: P is trained on photos, and S tested on panoramas, of "
             f"{', '.join(shared[:_MOST_SHOWN])}{more}. If they show the same places, hold them out "
             "of both, for example in test.txt."
@@ -202,14 +183,14 @@ def _named(stage: Stage) -> Iterator[None]:
 def _run(stage: Stage, what: str) -> None:
     state = stage_state(stage)
     if state == "finished":
-        _say(f"{what}: finished before.")
+        say(f"{what}: finished before.")
         return
     _, _, _, command, *arguments = stage_command(stage)
-    _say(f"{what}: tangent-{command} {shlex.join(arguments)}")
+    say(f"{what}: tangent-{command} {shlex.join(arguments)}")
     status = run_stage(stage, state)
     if status:
         name = f"stage {stage.name} in {stage.folder}"
-        _say(f"tangent-transfer: {name} ended with status {status}.", error=True)
+        say(f"tangent-transfer: {name} ended with status {status}.", error=True)
         sys.exit(status)
 
 
@@ -235,8 +216,8 @@ def _report(
     report.write(folder, name)
     report.tables()[0].print()
     for note in report.all_notes():
-        _say(f"- {note}")
-    _say(f"Tables and a chart: {folder / name}.md, .csv, .json, .png")
+        say(f"- {note}")
+    say(f"Tables and a chart: {folder / name}.md, .csv, .json, .png")
 
 
 def trained_level(config: DictConfig) -> float:
@@ -259,7 +240,3 @@ def trained_level(config: DictConfig) -> float:
     grid = getattr(panoramas, "grid", None)
     pitch = math.pi / panoramas.erp_height if grid is None else grid.pitch
     return float(config.level + math.log2(focal * pitch))
-
-
-def _say(text: str, *, error: bool = False) -> None:
-    Console(stderr=error, soft_wrap=True, highlight=False).print(text, markup=False)

@@ -61,8 +61,7 @@ class Stage:
         folder: Of the run.
         command: train or evaluate.
         config: All its settings, resolved, but for where its weights come from.
-        weights: Its network: a checkpoint, or the folder of the run that leaves it; None to start
-            from scratch.
+        weights: Checkpoint of its network; None to start from scratch.
         view: Of a stage that only evaluates on panoramas; "" for the transfer's own.
         condition: Of the panoramas of such a stage.
     """
@@ -187,7 +186,7 @@ class _Planner:
         if command == "evaluate":
             mapping = () if settings["class_map"] is None else ("class_map", "unmapped")
             own |= {key: settings[key] for key in ("trust", *mapping)}
-        weights = Path(self._given) if self._given else self._folder / "P"
+        trained = self._folder / "P" / "checkpoints" / "best.ckpt"
         scratch = name == "P" and not self._given
         return Stage(
             name=name,
@@ -196,7 +195,7 @@ class _Planner:
             folder=self._folder / name,
             command=command,
             config=own,
-            weights=None if scratch else weights,
+            weights=None if scratch else Path(self._given or trained),
         )
 
 
@@ -232,9 +231,9 @@ def stage_state(stage: Stage) -> State:
             expected="the settings of this command",
             remedy=_REMEDY,
         )
-    weights = stage.weights and _checkpoint_in(stage.weights)
+    weights = stage.weights
     # A network that was trained again is another one; one that is gone is not missed.
-    if weights is not None and _weights_in(record) != _digest(weights, stage.config):
+    if weights and weights.is_file() and _weights_in(record) != _digest(weights, stage.config):
         raise SettingError(
             stage.folder,
             found=f"stage {stage.name} of another network, or with another class map",
@@ -262,16 +261,15 @@ def run_stage(stage: Stage, state: State) -> int:
     if state == "begun":
         config["resume"] = str(stage.folder)
     elif stage.weights is not None:
-        weights = _checkpoint_in(stage.weights)
-        if weights is None:
+        if not stage.weights.is_file():
             raise DataError(
                 stage.weights,
-                found="no checkpoints/best.ckpt",
+                found="no such file",
                 expected=f"the network that {stage.name} starts from",
                 remedy="Delete the stages of this seed to run it all again.",
             )
-        config["init_from" if stage.command == "train" else "checkpoint"] = str(weights)
-        digest = _digest(weights, config)
+        config["init_from" if stage.command == "train" else "checkpoint"] = str(stage.weights)
+        digest = _digest(stage.weights, config)
     stage.folder.mkdir(parents=True, exist_ok=True)
     try:
         with FileLock(stage.folder / ".lock", blocking=False):
@@ -295,12 +293,6 @@ def stage_command(stage: Stage) -> list[str]:
     """The command line of the stage's run."""
     config = (f"--config-dir={stage.folder}", "--config-name=stage")
     return command_line(stage.command, config, stage.folder)
-
-
-def _checkpoint_in(weights: Path) -> Path | None:
-    """The checkpoint: a file itself, or the one that a run has tested; None if missing."""
-    places = (weights, weights / "checkpoints" / "best.ckpt")
-    return next((path for path in places if path.is_file()), None)
 
 
 def _weights_in(record: Path) -> Any:

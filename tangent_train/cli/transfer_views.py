@@ -8,20 +8,15 @@ panoramas, rotated alike.
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from hydra import compose
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import ListConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 
-from tangent_train.cli.compose import compose_option
+from tangent_train.checkpoints.trained import TrainedNetwork
 from tangent_train.errors import SettingError
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from omegaconf import DictConfig
-
-    from tangent_train.checkpoints.trained import TrainedNetwork
+from tangent_train.inference.views import panorama_settings
 
 __all__ = ["conditions_of", "numbers", "views_of"]
 
@@ -96,11 +91,15 @@ def _view(
 ) -> dict[str, Any]:
     level = given.get("level")
     own: Any = OmegaConf.to_container(config.representation)
+    section: Any
     if option is not None:
         search = [s for s in HydraConfig.get().overrides.hydra if s.startswith("hydra.searchpath")]
-        section = compose_option("representation", option, search)
+        # The option alone: its references to other settings stay as they are.
+        section = OmegaConf.to_container(compose(f"representation/{option}", search).representation)
     elif trained is not None and {"level", "base_level"} & given.keys():
-        section = _of_network(own, trained, level, given.get("base_level"))
+        of_size = panorama_settings(trained, level, given.get("base_level"))
+        section = own if own["_target_"] == of_size["_target_"] else {}
+        section |= of_size
     else:
         section = own
         dim = config.representation.get("dim")
@@ -111,16 +110,6 @@ def _view(
         rows = 2 ** (config.level + 1)
     section |= ({} if rows is None else {"erp_height": rows}) | given
     return {"representation": section} | ({} if level is None else {"level": level})
-
-
-def _of_network(
-    own: Mapping[str, Any], trained: TrainedNetwork, level: int | None, base_level: int | None
-) -> dict[str, Any]:
-    """Tangent images for a network that takes those of a size."""
-    from tangent_train.inference.views import panorama_settings
-
-    section = panorama_settings(trained, level, base_level)
-    return {**own, **section} if own["_target_"] == section["_target_"] else section
 
 
 def _named(config: DictConfig, setting: str) -> dict[str, dict[str, Any]]:

@@ -231,28 +231,21 @@ class Task(lightning.LightningModule, ABC):
         """Nothing: `training_step` clears the gradients before its first part."""
 
     def validation_step(self, batch: Any, batch_idx: int) -> Tensor:
-        """Evaluate a batch of the validation split."""
-        return self.evaluate(batch)
-
-    def test_step(self, batch: Any, batch_idx: int) -> Tensor:
-        """Evaluate a batch of the test split."""
+        """Evaluate a batch of the validation or test split."""
         return self.evaluate(batch)
 
     def on_validation_epoch_end(self) -> None:
-        """Log the scores of the validation split."""
-        self._log_scores("val")
-
-    def on_test_epoch_end(self) -> None:
-        """Log the scores of the test split."""
-        self._log_scores("test")
-
-    def _log_scores(self, stage: str) -> None:
+        """Log the scores of the validation or test split."""
+        stage = "test" if self.trainer.testing else "val"
         self.matrices = self.confusion.compute()
         self.confusion.reset()
         for name, score in self.scores().items():
             key = f"{stage}/{name}"
             # Every process has the same number: the mean over processes changes nothing.
             self.log(key, score, prog_bar=key == self.monitor, sync_dist=True)
+
+    test_step = validation_step
+    on_test_epoch_end = on_validation_epoch_end
 
     def configure_optimizers(self) -> Any:
         """Optimizer, and scheduler if there is one."""

@@ -29,13 +29,16 @@ def freeze(network: nn.Module, names: Iterable[str]) -> list[nn.Module]:
         SettingError: There is no such part, or nothing is left to train.
     """
     modules, parameters = dict(network.named_modules()), dict(network.named_parameters())
+    del modules[""]
     frozen = []
     for name in names:
-        if not name or (name not in modules and name not in parameters):
+        if name not in modules and name not in parameters:
+            beside = [n for n in (*modules, *parameters) if _parent(n) == _parent(name)]
+            near = ", ".join(beside or dict(network.named_children()))
             raise SettingError(
                 "task.frozen",
                 found=name or "an empty name",
-                expected=f"modules or parameters, such as {', '.join(_near(name, modules))}",
+                expected=f"modules or parameters, such as {near}",
             )
         if name in modules:
             frozen.append(modules[name].requires_grad_(False).eval())
@@ -46,20 +49,8 @@ def freeze(network: nn.Module, names: Iterable[str]) -> list[nn.Module]:
     return frozen
 
 
-def _near(name: str, modules: Mapping[str, nn.Module]) -> list[str]:
-    """Names to suggest for a wrong one: the parts of its last module that exists."""
-    while name not in modules:
-        name = name.rpartition(".")[0]
-    return _parts(modules[name], f"{name}." if name else "") or [name]
-
-
-def _parts(network: nn.Module, prefix: str = "") -> list[str]:
-    """Names of the largest modules, within a module that holds all of them."""
-    children = dict(network.named_children())
-    if len(children) == 1:
-        (name,) = children
-        return _parts(children[name], f"{prefix}{name}.") or [f"{prefix}{name}"]
-    return [prefix + name for name in children]
+def _parent(name: str) -> str:
+    return name.rpartition(".")[0]
 
 
 def groups_of(parameters: Mapping[str, Tensor], fresh: Collection[str]) -> list[dict[str, Any]]:

@@ -183,27 +183,17 @@ class SegmentationTask(Task):
         Returns:
             Class indices 1 … K of that shape; 0 where an imported network sees nothing.
         """
-        best = self._best(images, shape, rays, rotations)
-        return (best + 1).where(best < len(self.class_weights), 0)
-
-    def _best(
-        self,
-        images: Tensor,
-        shape: tuple[int, ...],
-        rays: Tensor | None,
-        rotations: Tensor | None,
-    ) -> Tensor:
-        """Place of the best score of every pixel; see `predict_labels`."""
         count = 1 if rotations is None else len(rotations)
         of_turns = [None] * count if rays is None else rays.chunk(count)
         scores = (self._scores(*part) for part in zip(images.chunk(count), of_turns, strict=True))
         turns = None if rotations is None else rotations.cpu().double().numpy()
         if turns is None or count == 1:
             turn = None if turns is None else turns[0]
-            return self.representation.to_labels(next(scores), shape, turn)
-        representation: Any = self.representation  # one whose `whole` has several rotations
-        labels: Tensor = representation.to_averaged_labels(scores, shape, turns)
-        return labels.to(images.device)
+            best = self.representation.to_labels(next(scores), shape, turn)
+        else:
+            representation: Any = self.representation  # one whose `whole` has several rotations
+            best = representation.to_averaged_labels(scores, shape, turns).to(images.device)
+        return (best + 1).where(best < len(self.class_weights), 0)
 
     def _scores(self, images: Tensor, rays: Tensor | None) -> Tensor:
         """Scores of all views of one rotation, see `view_scores`."""

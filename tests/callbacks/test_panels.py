@@ -38,7 +38,6 @@ def _tested(folder: Path, count: int, *shape: int) -> PredictionPanels:
     panels = PredictionPanels(folder, count)
     trainer: Any = SimpleNamespace(datamodule=SimpleNamespace(source=lambda split: _Source()))
     task: Any = SimpleNamespace(class_names=NAMES, representation=None)
-    panels.on_test_start(trainer, task)
     for first in range(0, 10, 2):
         target = torch.ones((2, *shape), dtype=torch.uint8)
         prediction = target.clone().long()

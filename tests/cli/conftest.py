@@ -10,7 +10,8 @@ import pytest
 
 from tangent_train.errors import DataError, SettingError
 from tests.cli.rendering import Refused, render_with
-from tests.cli.tiny_runs import SETTINGS, Run, run_command, run_in
+from tests.cli.tiny_runs import SETTINGS, Predict, Run, predicted, run_command, run_in
+from tests.inference.trained import write_checkpoint
 
 
 @pytest.fixture
@@ -18,6 +19,19 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
     """Runs a command in this process, in an empty folder."""
     monkeypatch.chdir(tmp_path)
     return partial(run_command, monkeypatch)
+
+
+@pytest.fixture
+def predict(tmp_path: Path, run: Run) -> Predict:
+    """Labels ``in`` with a small network, into ``out``."""
+    checkpoint = write_checkpoint(tmp_path / "model.ckpt")
+
+    def typed(**settings: Any) -> dict[str, Any]:
+        given = {"checkpoint": checkpoint, "input": "in", "output": "out", **settings}
+        run("predict", *(f"{name}={value}" for name, value in given.items()))
+        return predicted(Path(given["output"]))
+
+    return typed
 
 
 @pytest.fixture

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shlex
 import shutil
 import signal
@@ -95,27 +94,15 @@ def test_ctrl_c_ends_a_run_as_a_shell_says_it(
     assert ended.value.code == 128 + signal.SIGINT
 
 
-def test_sigterm_ends_an_evaluation_with_a_line(
-    run_folder: Path,
-    rooms: str,
-    run: Run,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    def terminated(*_: object) -> None:
-        os.kill(os.getpid(), signal.SIGTERM)
-
-    monkeypatch.setattr(SegmentationTask, "test_step", terminated)
-    checkpoint = run_folder / "checkpoints" / "best.ckpt"
-    before = signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)
-    with pytest.raises(SystemExit) as ended:
-        run("evaluate", f"checkpoint={checkpoint}", rooms, "hydra.run.dir=cut")
-    signal.signal(signal.SIGINT, before[1])
-    assert signal.getsignal(signal.SIGTERM) == before[0]
-    assert ended.value.code == 128 + signal.SIGTERM
-    told = capsys.readouterr().err.splitlines()
-    assert "the same command" in told[-2]
-    assert told[-1] == "tangent-evaluate: ended by SIGTERM"
+def test_without_validation_the_last_epoch_is_tested(rooms: str, tmp_path: Path, run: Run) -> None:
+    checkpoints = tmp_path / "run" / "checkpoints"
+    typed = ("scheduler=constant", "data.validation_fraction=0", "trainer.max_epochs=1")
+    run("train", *SETTINGS, rooms, *typed, "hydra.run.dir=run")
+    first = (checkpoints / "best.ckpt").read_bytes()
+    assert first == (checkpoints / "last.ckpt").read_bytes()
+    run("train", "resume=run", rooms, "trainer.max_epochs=2")
+    assert first != (checkpoints / "best.ckpt").read_bytes()
+    assert results(tmp_path / "run")["images"] == 2
 
 
 def test_an_evaluation_repeats_the_figures_exactly(
@@ -192,7 +179,6 @@ def test_settings_of_an_evaluation(run_folder: Path, rooms: str, run: Run) -> No
         (["ema=1"], "ema: found 1"),
         (["panels=-1"], "panels: found -1"),
         (["hydra.run.dir=file/run"], "file/run: found not a directory"),
-        (["trainer=ddp", "trainer.sync_batchnorm=true"], r"trainer\.sync_batchnorm: found true"),
     ],
 )
 def test_impossible_settings_are_refused_before_any_data_is_made(

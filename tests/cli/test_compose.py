@@ -33,23 +33,9 @@ def test_every_option_of_every_group_composes(group: str) -> None:
         OmegaConf.resolve(composed("train", f"{group}={path.stem}"))
 
 
-@pytest.mark.parametrize(
-    ("command", "arguments"),
-    [
-        ("train", ["level=6"]),
-        ("train", ["resume=null"]),
-        ("train", ["checkpoint=x.ckpt"]),
-        ("evaluate", ["checkpoint="]),
-        ("prepare", ["checkpoint=x.ckpt"]),
-    ],
-)
-def test_a_command_without_a_stored_run_starts_from_the_users_configs(
-    command: str, arguments: list[str]
-) -> None:
-    assert stored_run(command, arguments) is None
-
-
-def test_a_folder_without_the_checkpoint_is_refused(tmp_path: Path) -> None:
+def test_a_command_starts_from_a_stored_run_only_where_there_is_one(tmp_path: Path) -> None:
+    for command, argument in (("train", "resume=null"), ("evaluate", "checkpoint="), ("check", "")):
+        assert stored_run(command, [argument]) is None
     with pytest.raises(DataError, match="the folder of a started run"):
         stored_run("train", [f"resume={tmp_path}"])
     with pytest.raises(DataError, match=r"found a folder; .*checkpoints/best\.ckpt"):

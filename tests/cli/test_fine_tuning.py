@@ -168,20 +168,3 @@ def test_fine_tuning_leaves_a_run_of_its_own(
 def test_a_factor_needs_something_to_start_from(rooms: str, run: Run) -> None:
     with pytest.raises(SystemExit, match=r"backbone_lr_factor: found 0\.5; .*without init_from="):
         run("train", *SETTINGS, rooms, "optimizer.backbone_lr_factor=0.5")
-
-
-def test_class_names_are_compared_with_the_scores(
-    tmp_path: Path, rooms: str, run_folder: Path, run: Run
-) -> None:
-    """Of a file whose names are those of the data, or others."""
-    content = torch.load(run_folder / "checkpoints" / "best.ckpt", weights_only=True)
-    names = content["class_names"]
-    for number, changed in enumerate((names, names[:4])):
-        head = content["state_dict"]["network.head.weight"]
-        scores = torch.cat([head, head[:1]]) if number == 0 else head
-        tensors = content["state_dict"] | {"network.head.weight": scores}
-        path = tmp_path / f"{number}.ckpt"
-        torch.save(content | {"class_names": changed, "state_dict": tensors}, path)
-        found = rf"{number}\.ckpt: found {len(scores)} scores in head\.weight .*"
-        with pytest.raises(SystemExit, match=f"{found} expected {len(changed) - 1}, one for each"):
-            run("train", *SETTINGS, rooms, f"init_from={path}")

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import math
 import signal
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,30 +16,9 @@ from tangent_train.geometry import rotation_about
 from tangent_train.inference.judge import NetworkJudge
 from tangent_train.inference.predictor import Predictor
 from tangent_train.inference.views import InputImage
-from tests.cli.tiny_runs import Run
+from tests.cli.tiny_runs import Predict, predicted
 from tests.inference.trained import PERSPECTIVE, TANGENT, sphere, write_checkpoint
 from tests.rendering.drawn_room import draw_room
-
-Predict = Callable[..., dict[str, Any]]
-
-
-@pytest.fixture
-def predict(tmp_path: Path, run: Run) -> Predict:
-    """Runs the command on ``in`` into ``out``; returns the entries of the images by name."""
-    checkpoint = write_checkpoint(tmp_path / "model.ckpt")
-
-    def typed(**settings: Any) -> dict[str, Any]:
-        given = {"checkpoint": checkpoint, "input": tmp_path / "in", "output": tmp_path / "out"}
-        given |= settings
-        run("predict", *(f"{name}={value}" for name, value in given.items()))
-        return _entries(Path(given["output"]))
-
-    return typed
-
-
-def _entries(folder: Path) -> dict[str, Any]:
-    images = json.loads((folder / "summary.json").read_text())["images"]
-    return {entry["name"]: entry for entry in images}
 
 
 def _write(path: Path, rgb: NDArray[np.uint8]) -> Path:
@@ -76,7 +53,7 @@ def test_a_folder_of_panoramas(tmp_path: Path, predict: Predict) -> None:
             picture = cv2.imread(str(output / kind / f"{name}.png"))
             assert picture is not None
             assert picture.shape[1:] == (2 * height, 3)
-    entries = _entries(output)
+    entries = predicted(output)
     assert len(entries) == 5
     assert "found" in entries["broken"]["error"]
     for remedy in ("16×16", "crop=", "GPano", "projection=perspective"):
@@ -131,7 +108,7 @@ def test_an_interruption_keeps_what_is_done(
         predict()
     signal.signal(signal.SIGINT, before)
     assert stopped.value.code == 128 + number
-    assert _entries(tmp_path / "out").keys() == {"a"}
+    assert predicted(tmp_path / "out").keys() == {"a"}
     first = tmp_path / "out" / "labels" / "a.png"
     assert list(first.parent.iterdir()) == [first]
     printed = capsys.readouterr()

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from datamodules.images.palette import class_colors
 from datamodules.images.videos import read_frames
-from tests.cli.tiny_runs import Run
-from tests.inference.trained import CLASS_NAMES, sphere, write_checkpoint
+from tests.cli.tiny_runs import Predict, predicted
+from tests.inference.trained import CLASS_NAMES, sphere
 
 av: Any = pytest.importorskip("av")
 
@@ -46,33 +46,22 @@ def _decoded(path: Path) -> tuple[NDArray[np.uint8], list[float]]:
     ]
 
 
-def _predict(run: Run, tmp_path: Path, **settings: Any) -> None:
-    checkpoint = tmp_path / "model.ckpt"
-    if not checkpoint.exists():
-        write_checkpoint(checkpoint)
-    given = {"checkpoint": checkpoint, "input": "in", "output": "out", "report": 0, **settings}
-    run("predict", *(f"{name}={value}" for name, value in given.items()))
-
-
 def _labels(folder: Path) -> dict[str, NDArray[np.uint8]]:
     paths = sorted(folder.rglob("*.png"))
     found = {path.stem: cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in paths}
     return {name: labels for name, labels in found.items() if labels is not None}
 
 
-def _entries(folder: Path) -> dict[str, Any]:
-    images = json.loads((folder / "summary.json").read_text())["images"]
-    return {entry["name"]: entry for entry in images}
-
-
-def test_frames_get_the_labels_of_images_and_pictures_are_a_video(tmp_path: Path, run: Run) -> None:
+def test_frames_get_the_labels_of_images_and_pictures_are_a_video(
+    tmp_path: Path, predict: Predict
+) -> None:
     """Beside a folder of images that has the video's name."""
     video = _write_video(tmp_path / "in" / "walk.mp4")
     frames, times = _decoded(video)
     (tmp_path / "in" / "walk").mkdir()
     for number, rgb in enumerate(frames):
         cv2.imwrite(str(tmp_path / "in" / "walk" / f"{number:06d}.png"), rgb[..., ::-1])
-    _predict(run, tmp_path)
+    predict()
     of_images = _labels(tmp_path / "out" / "labels" / "walk")
     of_frames = _labels(tmp_path / "out" / "labels" / "walk.mp4")
     assert sorted(of_frames) == [f"{number:06d}" for number in range(len(TIMES))]
@@ -86,14 +75,14 @@ def test_frames_get_the_labels_of_images_and_pictures_are_a_video(tmp_path: Path
         assert made.shape == frames.shape
         assert made_times == pytest.approx(times)
         assert np.abs(made - expected).mean() < 8  # compressed, with colours at half resolution
-    entries = _entries(tmp_path / "out")
+    entries = predicted(tmp_path / "out")
     assert len(entries) == 2 * len(TIMES)
     assert entries["walk.mp4/000003"]["classes"] == entries["walk/000003"]["classes"]
 
 
 def test_an_interrupted_video_is_resumed(
     tmp_path: Path,
-    run: Run,
+    predict: Predict,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -107,26 +96,29 @@ def test_an_interrupted_video_is_resumed(
 
     monkeypatch.setattr("tangent_train.cli.predict_inputs.read_frames", interrupted)
     with pytest.raises(SystemExit) as stopped:
-        _predict(run, tmp_path, input=video)
+        predict(input=video)
     assert stopped.value.code == 130
-    assert "4 of 7 frames are done. resume=true" in capsys.readouterr().out
-    assert len(_entries(tmp_path / "out")) == 4
+    assert "4 of 7 images are done. resume=true" in capsys.readouterr().out
+    assert len(predicted(tmp_path / "out")) == 4
     assert not (tmp_path / "out" / "overlay").exists()
     monkeypatch.setattr("tangent_train.cli.predict_inputs.read_frames", read_frames)
     before = (tmp_path / "out" / "labels" / "walk" / "000003.png").stat().st_mtime_ns
-    _predict(run, tmp_path, input=video, resume="true")
+    predict(input=video, resume="true")
     assert (tmp_path / "out" / "labels" / "walk" / "000003.png").stat().st_mtime_ns == before
-    assert [entry["frame"] for entry in _entries(tmp_path / "out").values()] == list(range(7))
+    assert [entry["frame"] for entry in predicted(tmp_path / "out").values()] == list(range(7))
     assert len(_decoded(tmp_path / "out" / "overlay" / "walk.mp4")[0]) == len(TIMES)
-    _predict(run, tmp_path, input=video, resume="true")
-    _predict(run, tmp_path, input=video, output="again")
+    predict(input=video, resume="true")
+    predict(input=video, output="again")
     first, second = (_labels(tmp_path / name / "labels") for name in ("out", "again"))
     assert first.keys() == second.keys()
     assert all((first[name] == second[name]).all() for name in first)
 
 
 def test_videos_that_cannot_be_used(
-    tmp_path: Path, run: Run, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    predict: Predict,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Each is named once, and the others are labelled."""
     folder = tmp_path / "in"
@@ -141,7 +133,7 @@ def test_videos_that_cannot_be_used(
         output.mux(stream.encode(sound))
         output.mux(stream.encode(None))
     with pytest.raises(SystemExit, match="4 of 11 images could not be used"):
-        _predict(run, tmp_path, write="[labels]")
+        predict(write="[labels]")
     said = " ".join(capsys.readouterr().out.split())
     for name, message in (
         ("broken", "cannot be decoded"),
@@ -150,16 +142,16 @@ def test_videos_that_cannot_be_used(
         ("sound", "no video stream"),
     ):
         assert said.count(f"{name}.mp4: found") == 1
-        assert message in _entries(tmp_path / "out")[name]["error"]
+        assert message in predicted(tmp_path / "out")[name]["error"]
     with pytest.raises(SystemExit, match="write: found color of a video without labels"):
-        _predict(run, tmp_path, write="[color]", output="other")
+        predict(write="[color]", output="other")
     monkeypatch.setitem(__import__("sys").modules, "av", None)
     with pytest.raises(SystemExit, match="1 of 1 images"):
-        _predict(run, tmp_path, input=good, output="other")
+        predict(input=good, output="other")
     assert "pip install 'tangent-train[video]'" in " ".join(capsys.readouterr().out.split())
 
 
-def test_a_shard_has_whole_videos(tmp_path: Path, run: Run) -> None:
+def test_a_shard_has_whole_videos(tmp_path: Path, predict: Predict) -> None:
     for name in ("a", "c"):
         _write_video(tmp_path / "in" / f"{name}.mp4")
     cv2.imwrite(str(tmp_path / "in" / "b.png"), sphere(32))
@@ -167,7 +159,7 @@ def test_a_shard_has_whole_videos(tmp_path: Path, run: Run) -> None:
     settings = {"blend": "nearest", "write": "[labels,color]", "mask": -45}
     for output, shard in (("whole", "null"), ("out", "2/2"), ("out", "1/2")):
         try:
-            _predict(run, tmp_path, **settings, output=output, shard=shard)
+            predict(**settings, output=output, shard=shard)
         except SystemExit as ended:
             assert "1 of " in str(ended.code)  # noqa: PT017 - the shard of the broken one
     out, whole = tmp_path / "out", tmp_path / "whole"

@@ -13,30 +13,28 @@ from PIL import Image
 
 from datamodules.images.pixel_files import write_pixels
 from tangent_train.inference.images import read_panorama
-from tests.cli.tiny_runs import Run
+from tests.cli.tiny_runs import Predict
 from tests.datamodules.data_files import contents
-from tests.inference.trained import sphere, write_checkpoint
+from tests.inference.trained import sphere
 
-Predict = Callable[..., str]
+Told = Callable[..., str]
 NAMES = ("a", "b/a", "b/b", "c", "d", "e", "f")
 
 
 @pytest.fixture
-def predict(tmp_path: Path, run: Run, capsys: pytest.CaptureFixture[str]) -> Predict:
+def told(tmp_path: Path, predict: Predict, capsys: pytest.CaptureFixture[str]) -> Told:
     """Runs the command on seven panoramas, the fifth of which is broken; returns what it says."""
     for number, name in enumerate(NAMES):
         write_pixels(tmp_path / "in" / f"{name}.png", np.roll(sphere(16), number, 1))
     (tmp_path / "in" / "d.png").write_bytes(b"broken")
-    checkpoint = write_checkpoint(tmp_path / "model.ckpt")
-    given = {"checkpoint": checkpoint, "input": "in", "write": "[labels]", "blend": "nearest"}
+    given = {"write": "[labels]", "blend": "nearest"}
 
     def typed(output: str, *shard: int, **settings: Any) -> str:
         if shard:
             settings["shard"] = "{}/{}".format(*shard)
-        told = {**given, "output": output, **settings}
         capsys.readouterr()
         try:
-            run("predict", *(f"{name}={value}" for name, value in told.items()))
+            predict(**given | {"output": output} | settings)
         except SystemExit as ended:
             return capsys.readouterr().out + str(ended.code)
         return capsys.readouterr().out
@@ -50,13 +48,11 @@ def results(folder: str) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("count", [3, 9])
-def test_shards_give_what_one_command_gives(count: int, predict: Predict) -> None:
-    assert "1 of 7 images could not be used" in predict("whole", report=3)
-    broken = [
-        "could not be used" in predict("out", n, count, report=3) for n in range(2, count + 1)
-    ]
+def test_shards_give_what_one_command_gives(count: int, told: Told) -> None:
+    assert "1 of 7 images could not be used" in told("whole", report=3)
+    broken = ["could not be used" in told("out", n, count, report=3) for n in range(2, count + 1)]
     assert not (Path("out") / "summary.json").exists()
-    assert f"{-(-7 // count)} image" in predict("out", 1, count, report=3)
+    assert f"{-(-7 // count)} image" in told("out", 1, count, report=3)
     assert broken.count(True) == (count > 1)
     assert results("out") == results("whole")
     of_shards = [json.loads(text) for text in contents(Path("out/shards")).values()]
@@ -67,8 +63,8 @@ def test_shards_give_what_one_command_gives(count: int, predict: Predict) -> Non
     assert max(lengths) - min(lengths) <= 1
 
 
-def test_an_interrupted_shard_resumes(predict: Predict, monkeypatch: pytest.MonkeyPatch) -> None:
-    predict("whole")
+def test_an_interrupted_shard_resumes(told: Told, monkeypatch: pytest.MonkeyPatch) -> None:
+    told("whole")
 
     def interrupted(path: Path, *args: Any) -> Any:
         if path.name == "e.png":
@@ -76,27 +72,27 @@ def test_an_interrupted_shard_resumes(predict: Predict, monkeypatch: pytest.Monk
         return read_panorama(path, *args)
 
     monkeypatch.setattr("tangent_train.cli.predict.read_panorama", interrupted)
-    assert "resume=true continues" in predict("out", 2, 2)
+    assert "resume=true continues" in told("out", 2, 2)
     monkeypatch.setattr("tangent_train.cli.predict.read_panorama", read_panorama)
     before = {path: path.stat().st_mtime_ns for path in Path("out").rglob("*.png")}
     assert {path.stem for path in before} == {"a", "c"}
-    assert "1 of 2 in all" in predict("out", 1, 2, resume="true")
-    assert "shard: found 2/2, which has out/shards/2-of-2.json" in predict("out", 2, 2)
-    assert "3 images, 2 done already" in predict("out", 2, 2, resume="true")
+    assert "1 of 2 in all" in told("out", 1, 2, resume="true")
+    assert "shard: found 2/2, which has out/shards/2-of-2.json" in told("out", 2, 2)
+    assert "3 images, 2 done already" in told("out", 2, 2, resume="true")
     assert {path: path.stat().st_mtime_ns for path in before} == before
     assert results("out") == results("whole")
-    predict("out", 2, 2, resume="true")  # as a scheduler may start it again
+    told("out", 2, 2, resume="true")  # as a scheduler may start it again
     assert results("out") == results("whole")
 
 
 @pytest.mark.parametrize("shard", ["17/16", "0/16", "3", "-1/2", "a/b", "1/2/3"])
-def test_there_is_no_such_shard(shard: str, predict: Predict) -> None:
-    assert f"shard: found {shard}; expected 1/16 to 16/16" in predict("out", shard=shard)
+def test_there_is_no_such_shard(shard: str, told: Told) -> None:
+    assert f"shard: found {shard}; expected 1/16 to 16/16" in told("out", shard=shard)
     assert not Path("out").exists()
 
 
-def test_shards_that_do_not_belong_together_are_refused(predict: Predict) -> None:
-    predict("out", 1, 3)
+def test_shards_that_do_not_belong_together_are_refused(told: Told) -> None:
+    told("out", 1, 3)
     kept = contents(Path("out"))
     changes: dict[str, dict[str, Any]] = {
         "found shards=4 than those of out/shards/1-of-3.json (3)": {"shard": "2/4"},
@@ -105,26 +101,26 @@ def test_shards_that_do_not_belong_together_are_refused(predict: Predict) -> Non
         "found images of other names than those of": {"input": "in/b"},
     }
     for said, settings in changes.items():
-        assert said in predict("out", **({"shard": "2/3"} | settings))
-        assert "expected a folder without earlier results" in predict("out")
+        assert said in told("out", **({"shard": "2/3"} | settings))
+        assert "expected a folder without earlier results" in told("out")
         assert contents(Path("out")) == kept
-    assert "resume: found rotations=2" in predict("out", 1, 3, rotations=2, resume="true")
+    assert "resume: found rotations=2" in told("out", 1, 3, rotations=2, resume="true")
     assert contents(Path("out")) == kept
-    predict("whole")
-    assert "expected a folder without earlier results" in predict("whole", 1, 2)
+    told("whole")
+    assert "expected a folder without earlier results" in told("whole", 1, 2)
 
 
-def test_masked_pixels_are_unknown_and_have_no_share(predict: Predict) -> None:
+def test_masked_pixels_are_unknown_and_have_no_share(told: Told) -> None:
     """Of whole panoramas and of a part; with a file for all and one for each."""
     for output, mask in {"half": -30, "file": "mask.png", "folder": "masks"}.items():
-        predict("plain", overwrite="true")
+        told("plain", overwrite="true")
         counts = np.ones((16, 32), bool)
         counts[11:] = False  # the centres of rows 10 and 11 are at −28° and −39°
         if output != "half":
             counts[:, 29:], counts[:, :2] = False, False
         for name in ("mask", *(f"masks/{name}" for name in NAMES)):
             write_pixels(Path(f"{name}.png"), counts.repeat(2, 0).repeat(2, 1).astype(np.uint8))
-        predict(output, mask=mask)
+        told(output, mask=mask)
         entries = json.loads(Path(output, "summary.json").read_text())["images"]
         for entry in entries:
             if "error" in entry:

@@ -128,7 +128,7 @@ def test_stages_of_a_network_that_was_trained_again_are_refused(runs: PretendedR
         run_transfer(*SHORT)
     network.unlink()  # to save space: what was found stays found
     run_transfer(*SHORT)
-    with pytest.raises(REFUSED, match=r"seed_0/P: found no checkpoints/best\.ckpt; "):
+    with pytest.raises(REFUSED, match=r"P/checkpoints/best\.ckpt: found no such file; "):
         run_transfer("compare=[erp]", "fine_tuning.epochs=[]")
 
 
@@ -190,28 +190,11 @@ def test_a_given_network_is_not_trained(runs: PretendedRuns, tmp_path: Path) -> 
 
 def test_the_level_of_the_photos() -> None:
     """f' = 128 / (2 tan 22.5°) = 154.5 pixels; at level 8, b = 1, p = 1.10715 / 128."""
-    photos = {"_target_": "tangent_train.rendering.PerspectiveRepresentation", "level": 8}
-    tangent = {
-        "_target_": "tangent_train.rendering.TangentRepresentation",
-        "base_level": 1,
-        "level": 8,
-    }
-    config = OmegaConf.create(
-        {"level": 8, "photos": {"representation": photos}, "representation": tangent}
-    )
-    expected = 8 + np.log2(128 / (2 * np.tan(np.pi / 8)) * 1.1071487 / 128)
-    assert transfer.trained_level(config) == pytest.approx(expected, abs=1e-6)
-    assert expected == pytest.approx(8.418, abs=1e-3)
-    # A crop with the focal length of tangent images is as fine as they are.
-    config.photos.representation.dim = 128
-    config.photos.representation.fov_deg = float(np.degrees(2 * np.arctan(1.1071487 / 2)))
-    assert transfer.trained_level(config) == pytest.approx(8, abs=1e-6)
-    config.representation = {
-        "_target_": "tangent_train.rendering.EquirectRepresentation",
-        "level": 8,
-        "erp_height": 512,
-    }
-    focal = 128 / 1.1071487
-    assert transfer.trained_level(config) == pytest.approx(
-        8 + np.log2(focal * np.pi / 512), abs=1e-6
-    )
+    package, focal = "tangent_train.rendering", 64 / np.tan(np.pi / 8)
+    photos = {"_target_": f"{package}.PerspectiveRepresentation", "level": 8}
+    tangent = {"_target_": f"{package}.TangentRepresentation", "level": 8, "base_level": 1}
+    erp = {"_target_": f"{package}.EquirectRepresentation", "level": 8, "erp_height": 500}
+    for seen, pitch in ((tangent, 1.1071487 / 128), (erp, np.pi / 500)):
+        settings = {"level": 8, "photos": {"representation": photos}, "representation": seen}
+        level = transfer.trained_level(OmegaConf.create(settings))
+        assert level == pytest.approx(8 + np.log2(focal * pitch), abs=1e-6)

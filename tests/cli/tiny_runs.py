@@ -12,10 +12,22 @@ import pytest
 
 from tangent_train.cli import main
 
-__all__ = ["SETTINGS", "SMALL_ROOMS", "Run", "results", "run_command", "run_in"]
+__all__ = [
+    "SETTINGS",
+    "SMALL_ROOMS",
+    "Predict",
+    "Run",
+    "predicted",
+    "results",
+    "run_command",
+    "run_in",
+]
 
 Run = Callable[..., None]
 """Runs a command with arguments."""
+
+Predict = Callable[..., dict[str, Any]]
+"""Runs ``tangent-predict`` with settings; gives the entries of its summary by name."""
 
 _ROOMS = {"1": 2, "2": 2, "3": 1, "4": 1, "5a": 1, "5b": 1, "6": 1}
 SMALL_ROOMS = (
@@ -55,3 +67,10 @@ def results(folder: Path) -> dict[str, Any]:
     content: dict[str, Any] = json.loads((folder / "results.json").read_text())
     content.pop("checkpoint", None)
     return content
+
+
+def predicted(folder: Path) -> dict[str, Any]:
+    """The entries of a ``summary.json`` by name; none if there is none."""
+    path = folder / "summary.json"
+    images = json.loads(path.read_text())["images"] if path.exists() else []
+    return {entry["name"]: entry for entry in images}

@@ -4,26 +4,63 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import onnx
 import pytest
+import torch
 import yaml  # type: ignore[import-untyped]
 from safetensors.torch import load_file, save_file
 
 from tangent_train.checkpoints.content import read_settings
 from tangent_train.checkpoints.trained import METADATA_KEY, load_trained, start_in
+from tangent_train.cli.build import build
 from tangent_train.cli.keypoints import earlier_results
+from tangent_train.cli.stored import StoredRun, stored_run
+from tangent_train.errors import DataError, SettingError
+from tangent_train.registry import make
 from tangent_train.rendering.camera_files import read_cameras
 from tangent_train.results.record import load_record
 from tests.cli.tiny_runs import run_command
-from tests.security.attacks import json_attacks, places, replaced, sampled
-from tests.security.checkpoints import attack_checkpoints, nothing_happens
+from tests.security.attacks import attacks, json_attacks, places, replaced, sampled
+from tests.security.honest import composed
+from tests.security.watch import watched
+
+
+def _nothing_happens(use: Callable[[Path], Any], path: Path, forbidden: Path, what: object) -> None:
+    """Use a file: it is taken for what it is, or refused in one line that names it."""
+    with watched(forbidden) as happened, suppress(DataError, SettingError):
+        use(path)
+    assert not happened, (what, happened)
+    assert [path.name for path in forbidden.iterdir()] == ["config.json"], what
 
 
 def test_in_a_checkpoint(content: dict[str, Any], forbidden: Path) -> None:
-    attack_checkpoints(content, forbidden)
+    """Every attack, and an attack at every place."""
+    honest, path = forbidden.parent / "honest.ckpt", forbidden.parent / "x.ckpt"
+    torch.save(content, honest)
+    stored = stored_run("evaluate", [f"checkpoint={honest}", "data.root=rooms"])
+    assert isinstance(stored, StoredRun)
+    said = composed(stored.arguments)
+
+    def evaluated(path: Path) -> None:
+        stored = stored_run("evaluate", [f"checkpoint={path}", "data.root=rooms"])
+        assert isinstance(stored, StoredRun)
+        settings, source = stored.settings(said)
+        build(settings, source)
+        make(settings["trainer"], "trainer", source, logger=False)
+
+    lighter = content | {"optimizer_states": [], "loops": {}}
+    all_places = [("config", *place) for place in places(content["config"])]
+    all_places += [(name,) for name in ("config", "class_names", "inputs", "kind", "state_dict")]
+    all_places += [("normalization",), ("normalization", "mean")]
+    for place, value in sampled(list(attacks(forbidden)), all_places):
+        torch.save(replaced(lighter, place, value), path)
+        for use in (load_trained, evaluated, start_in):
+            _nothing_happens(use, path, forbidden, (place, value))
 
 
 def test_in_the_metadata_of_an_exported_network(run: Path, forbidden: Path) -> None:
@@ -39,8 +76,8 @@ def test_in_the_metadata_of_an_exported_network(run: Path, forbidden: Path) -> N
         onnx.helper.set_model_props(model, {METADATA_KEY: text})
         onnx.save(model, other)
         for path in (one, other):
-            nothing_happens(load_trained, path, forbidden, (place, value))
-        nothing_happens(start_in, one, forbidden, (place, value))
+            _nothing_happens(load_trained, path, forbidden, (place, value))
+        _nothing_happens(start_in, one, forbidden, (place, value))
 
 
 def test_in_the_settings_of_a_run(run: Path, forbidden: Path) -> None:
@@ -49,7 +86,7 @@ def test_in_the_settings_of_a_run(run: Path, forbidden: Path) -> None:
     settings = read_settings(run / "config.yaml")
     for place, value in sampled(list(json_attacks(forbidden)), list(places(settings))):
         (folder / "config.yaml").write_text(yaml.safe_dump(replaced(settings, place, value)))
-        nothing_happens(load_record, folder, forbidden, (place, value))
+        _nothing_happens(load_record, folder, forbidden, (place, value))
 
 
 def test_in_lists_of_cameras_and_results_of_keypoints(
@@ -69,4 +106,4 @@ def test_in_lists_of_cameras_and_results_of_keypoints(
     ):
         for place, value in sampled(list(json_attacks(forbidden)), list(places(honest))):
             path.write_text(json.dumps(replaced(honest, place, value)))
-            nothing_happens(use, path, forbidden, (path, place, value))
+            _nothing_happens(use, path, forbidden, (path, place, value))

@@ -226,17 +226,9 @@ def test_ones_own_network_is_trusted_by_its_name(content: dict[str, Any], tmp_pa
         load_trained(path, [OWN])
 
 
-def _targets(settings: Any) -> set[str]:
-    inner = settings.values() if isinstance(settings, dict) else settings
-    if not isinstance(settings, dict | list):
-        return set()
-    named = {settings["_target_"]} if isinstance(settings, dict) and "_target_" in settings else []
-    return set(named).union(*map(_targets, inner))
-
-
 def test_files_may_name_all_that_the_configs_name() -> None:
     for path in sorted(config_folder().rglob("*.yaml")):
-        for target in _targets(yaml.safe_load(path.read_text())):
+        for target in re.findall(r"^ *_target_: (\S+)", path.read_text(), re.MULTILINE):
             if not target.endswith("Pairs"):  # of tangent-keypoints, which leaves no checkpoint
                 assert registry._find(target) is not None, (path, target)
 

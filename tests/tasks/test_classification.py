@@ -1,28 +1,15 @@
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from tests.tasks.shapes import Gradients, Shapes, SmallNetwork, quiet_trainer, shape_task
+from tests.tasks.shapes import Gradients, Shapes, quiet_trainer, shape_task
 
 
-def _gradients(
-    count: int = 4, batch_size: int = 4, trainer: dict[str, Any] | None = None, **settings: Any
-) -> tuple[list[Tensor], Tensor]:
-    gradients = Gradients()
-    used = {"max_steps": 1} | (trainer or {})
-    quiet_trainer(limit_val_batches=0, callbacks=[gradients], **used).fit(
-        shape_task(label_smoothing=0.1, **settings), datamodule=Shapes(count, batch_size)
-    )
-    return gradients.found, gradients.loss
-
-
-def expected_gradients(count: int, smoothing: float = 0.1) -> tuple[list[Tensor], Tensor]:
+def _expected(count: int, smoothing: float = 0.1) -> tuple[list[Tensor], Tensor]:
     """In float64, of the mean cross-entropy written out."""
     network = shape_task().network.double()
     shapes = Shapes(count).shapes
@@ -35,30 +22,23 @@ def expected_gradients(count: int, smoothing: float = 0.1) -> tuple[list[Tensor]
     return list(torch.autograd.grad(loss, list(network.parameters()))), loss.detach()
 
 
-def assert_close(found: list[Tensor], expected: list[Tensor], tolerance: float = 1e-5) -> None:
-    for one, other in zip(found, expected, strict=True):
-        assert float((one.double() - other.double()).norm() / other.double().norm()) < tolerance
-
-
-@pytest.mark.parametrize("images_per_chunk", [None, 1, 12, 1000])
-def test_chunks_give_the_gradient_of_the_whole_batch(images_per_chunk: int | None) -> None:
-    found, loss = _gradients(images_per_chunk=images_per_chunk)
-    expected, expected_loss = expected_gradients(4)
-    assert_close(found, expected)
-    assert float(loss) == pytest.approx(float(expected_loss), rel=1e-5)
-
-
-@pytest.mark.parametrize(("images_per_chunk", "shapes"), [(None, [4]), (1, [1] * 4), (15, [3, 1])])
-def test_chunks_are_whole_shapes(images_per_chunk: int | None, shapes: list[int]) -> None:
-    class Counting(SmallNetwork):
-        def forward(self, images: Tensor) -> Tensor:
-            seen.append(len(images))
-            return super().forward(images)
-
+@pytest.mark.parametrize(
+    ("images_per_chunk", "chunks"), [(None, [4]), (1, [1] * 4), (15, [3, 1]), (1000, [4])]
+)
+def test_chunks_of_whole_shapes_give_the_gradient_of_the_batch(
+    images_per_chunk: int | None, chunks: list[int]
+) -> None:
     seen: list[int] = []
-    task = shape_task(Counting(), images_per_chunk=images_per_chunk)
-    quiet_trainer(max_steps=1, limit_val_batches=0).fit(task, datamodule=Shapes(4, 4))
-    assert seen == shapes
+    task = shape_task(images_per_chunk=images_per_chunk, label_smoothing=0.1)
+    task.network.register_forward_pre_hook(lambda _, images: seen.append(len(images[0])))
+    gradients = Gradients()
+    trainer = quiet_trainer(max_steps=1, limit_val_batches=0, callbacks=[gradients])
+    trainer.fit(task, datamodule=Shapes(4, 4))
+    assert seen == chunks
+    expected, loss = _expected(4)
+    for one, other in zip(gradients.found, expected, strict=True):
+        assert float((one.double() - other).norm() / other.norm()) < 1e-5
+    assert float(gradients.loss) == pytest.approx(float(loss), rel=1e-5)
 
 
 class Oracle(nn.Module):

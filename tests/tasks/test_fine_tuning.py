@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 from torch.optim import SGD, Adam
-from torch.optim.lr_scheduler import CosineAnnealingLR, CyclicLR, OneCycleLR, StepLR
+from torch.optim.lr_scheduler import CyclicLR, LinearLR, OneCycleLR, StepLR
 
 from tangent_train.errors import SettingError
 from tests.tasks.shapes import Shapes, quiet_trainer, shape_task
@@ -89,16 +89,23 @@ def test_what_was_loaded_takes_smaller_steps() -> None:
 
 
 @pytest.mark.parametrize(
-    "scheduler",
+    ("scheduler", "steps", "last"),
     [
-        None,
-        partial(StepLR, step_size=1, gamma=0.5),
-        partial(CosineAnnealingLR, T_max=3),
-        partial(OneCycleLR, max_lr=0.1),
-        partial(CyclicLR, base_lr=0.01, max_lr=0.1, step_size_up=1, cycle_momentum=False),
+        (None, 9, 0.1),
+        (partial(StepLR, step_size=1, gamma=0.5), 3, 0.025),
+        (partial(LinearLR, start_factor=1.0, end_factor=0.5, total_iters=1), 6, 0.05),
+        (partial(OneCycleLR, max_lr=0.1), 1, 4e-7),
+        (
+            partial(CyclicLR, base_lr=0.01, max_lr=0.1, step_size_up=1, cycle_momentum=False),
+            6,
+            0.01,
+        ),
     ],
 )
-def test_schedules_move_both_rates(scheduler: Any) -> None:
+def test_schedules_move_both_rates_by_epoch_or_over_the_whole_training(
+    scheduler: Any, steps: int, last: float
+) -> None:
+    """For so many steps the last rate holds."""
     seen: dict[float, list[list[float]]] = {1: [], 0.1: []}
 
     class Watch(lightning.Callback):
@@ -113,6 +120,8 @@ def test_schedules_move_both_rates(scheduler: Any) -> None:
             task, datamodule=Shapes()
         )
     assert len(seen[1]) == 9
+    assert [rates == seen[1][-1] for rates in seen[1]].count(True) == steps
+    assert seen[1][-1] == [pytest.approx(last, rel=0.1)]
     for (whole,), rates in zip(seen[1], seen[0.1], strict=True):
         assert rates == pytest.approx([0.1 * whole, whole])
 

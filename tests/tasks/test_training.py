@@ -14,7 +14,7 @@ import torch
 from lightning.pytorch.strategies import DDPStrategy
 from torch import Tensor, nn
 from torch.distributed.algorithms.ddp_comm_hooks import default_hooks
-from torch.optim.lr_scheduler import LinearLR, OneCycleLR, StepLR
+from torch.nn.functional import cross_entropy
 from torch.utils.data import DataLoader
 
 from tangent_train.rendering import TangentRepresentation
@@ -68,45 +68,55 @@ def _task(images_per_chunk: int | None = None, **settings: Any) -> SegmentationT
 
 
 def _gradients(
-    images_per_chunk: int | None, trainer: dict[str, Any], **settings: Any
+    images_per_chunk: int | None, batch_size: int = 3, trainer: Any = None, **settings: Any
 ) -> tuple[list[Tensor], Tensor]:
+    """Of one step over the three spheres, and the loss of its last batch."""
     gradients = Gradients()
-    # Accumulated: two steps, of two panoramas and of the third one.
-    batch_size = 1 if "accumulate_grad_batches" in trainer else 3
-    callbacks = {"callbacks": [gradients, *trainer.get("callbacks", [])]}
-    quiet_trainer(limit_val_batches=0, **trainer | callbacks).fit(
+    given = {"max_epochs": 1, "accumulate_grad_batches": 3 // batch_size} | (trainer or {})
+    callbacks = {"callbacks": [gradients, *given.get("callbacks", [])]}
+    quiet_trainer(limit_val_batches=0, **given | callbacks).fit(
         _task(images_per_chunk, **settings), datamodule=Data(batch_size)
     )
     return gradients.found, gradients.loss
 
 
-@pytest.mark.parametrize("size", [1, 7, 59, 1000])
-@pytest.mark.parametrize(
-    "trainer",
-    [
-        {"max_steps": 1},
-        {"max_steps": 3, "gradient_clip_val": 0.01},
-        {"max_epochs": 1, "accumulate_grad_batches": 2},
-    ],
-    ids=["plain", "clipped", "accumulated"],
-)
-def test_chunks_give_the_gradient_of_the_whole_batch(size: int, trainer: dict[str, Any]) -> None:
-    whole, loss = _gradients(None, trainer)
-    chunked, chunked_loss = _gradients(size, trainer)
-    for expected, found in zip(whole, chunked, strict=True):
-        assert float((found - expected).norm() / expected.norm()) < 1e-5
-    torch.testing.assert_close(chunked_loss, loss, rtol=1e-5, atol=0)
-    if "gradient_clip_val" in trainer:
-        norm = torch.cat([found.flatten() for found in chunked]).norm()
-        assert float(norm) == pytest.approx(0.01, rel=1e-3), "clipped once, as a whole"
+def _expected(batch_size: int) -> tuple[list[Tensor], Tensor]:
+    """Torch's weighted mean over the labelled pixels of each batch, and the mean over batches."""
+    network, losses = _network(), []
+    for batch in Data(batch_size).train_dataloader():
+        labels = batch.labels.flatten(0, 1).long()
+        known = labels > 0
+        scores = network(batch.images.flatten(0, 1)).movedim(1, -1)[known]
+        weights = torch.tensor([1.0, 3.0, 0.2])
+        loss = cross_entropy(scores, labels[known] - 1, weights, label_smoothing=0.1)
+        losses.append(loss if known.any() else torch.zeros(()))
+    gradients = torch.autograd.grad(torch.stack(losses).mean(), list(network.parameters()))
+    return list(gradients), losses[-1].detach()
+
+
+@pytest.mark.parametrize("size", [None, 1, 7, 59, 1000])
+@pytest.mark.parametrize("batch_size", [3, 1], ids=["plain", "accumulated"])
+def test_chunks_give_the_gradient_of_the_whole_batch(size: int | None, batch_size: int) -> None:
+    found, loss = _gradients(size, batch_size)
+    expected, expected_loss = _expected(batch_size)
+    for one, other in zip(found, expected, strict=True):
+        assert float((one - other).norm() / other.norm()) < 1e-5
+    torch.testing.assert_close(loss, expected_loss, rtol=1e-5, atol=0)
+
+
+def test_gradients_are_clipped_once_as_a_whole() -> None:
+    found, _ = _gradients(7, trainer={"gradient_clip_val": 0.01})
+    expected, _ = _expected(3)
+    flat, whole = (torch.cat([part.flatten() for part in parts]) for parts in (found, expected))
+    torch.testing.assert_close(flat, 0.01 * whole / whole.norm(), rtol=1e-3, atol=1e-6)
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:torch")
 def test_faster_arithmetic_works_in_chunks_and_names_stay() -> None:
     fast: dict[str, Any] = {"channels_last": True, "compile": {"backend": "aot_eager"}}
     assert _task(**fast).state_dict().keys() == _task().state_dict().keys()
-    exact, _ = _gradients(None, {"max_steps": 1})
-    found, _ = _gradients(8, {"max_steps": 1, "precision": "bf16-mixed"}, **fast)
+    exact, _ = _expected(3)
+    found, _ = _gradients(8, trainer={"precision": "bf16-mixed"}, **fast)
     for one, other in zip(found, exact, strict=True):
         assert float((one - other).norm() / other.norm()) < 3e-2
 
@@ -141,74 +151,32 @@ def same_environment() -> Iterator[None]:
 def test_processes_exchange_gradients_once_after_the_last_chunk() -> None:
     exchanges = Exchanges()
     strategy = DDPStrategy(process_group_backend="gloo")
-    trainer = {"max_steps": 1, "devices": 1, "strategy": strategy, "callbacks": [exchanges]}
-    expected, _ = _gradients(None, {"max_steps": 1})
-    found, _ = _gradients(7, trainer)
+    trainer = {"devices": 1, "strategy": strategy, "callbacks": [exchanges]}
+    found, _ = _gradients(7, trainer=trainer)
     assert exchanges.count == 1
-    torch.testing.assert_close(found, expected)
+    torch.testing.assert_close(found, _expected(3)[0])
 
 
-class _Together:
-    """The strategy of one of several processes, of which the others' norms are known."""
-
-    def __init__(self, norms: list[Tensor]) -> None:
-        self._mean = torch.stack(norms).mean(dim=0)
-        self._asked = 0
-
-    def reduce(self, value: Tensor, reduce_op: str) -> Tensor:
-        assert reduce_op == "mean"
-        self._asked += 1
-        return self._mean if self._asked == 1 else value  # then the loss, which is only shown
-
-    def backward(self, loss: Tensor, _: None) -> None:
-        loss.backward()  # type: ignore[no-untyped-call]
-
-
-@pytest.mark.parametrize("chunk", [None, 7])
-def test_the_mean_of_processes_gradients_is_that_of_their_batches_together(
-    chunk: int | None,
-) -> None:
+def test_the_mean_of_processes_gradients_is_that_of_their_batches_together() -> None:
     """Though one has many more labelled pixels than the other."""
-    generator = torch.Generator().manual_seed(0)
-    images = torch.randn(2, 20, 2, 16, 16, generator=generator)
-    labels = torch.randint(0, 4, (2, 20, 16, 16), generator=generator).to(torch.uint8)
-    labels[0, :, 1:] = 0
-    task: Any = _task(chunk)
+    (batch,) = Data(3).train_dataloader()
+    task: Any = _task(7)
     task.class_weights.copy_(torch.tensor([1.0, 3.0, 0.2]))
     task.log = lambda *_, **__: None
 
-    def gradient(part: slice, norms: list[Tensor]) -> Tensor:
-        optimizer = torch.optim.SGD(task.parameters())
-        task._trainer = SimpleNamespace(
-            accumulate_grad_batches=1, optimizers=[optimizer], strategy=_Together(norms)
+    def gradient(part: slice, norm: Tensor) -> Tensor:
+        means = {"mean": iter((norm, torch.zeros(())))}  # that of the loss is only shown
+        strategy = SimpleNamespace(
+            reduce=lambda _, reduce_op: next(means[reduce_op]),
+            backward=lambda loss, _: loss.backward(),
         )
-        task.training_step(Sample(images[part], labels[part]), 0).backward()
+        optimizers = [torch.optim.SGD(task.parameters())]
+        task._trainer = SimpleNamespace(
+            accumulate_grad_batches=1, optimizers=optimizers, strategy=strategy
+        )
+        task.training_step(Sample(batch.images[part], batch.labels[part]), 0).backward()
         return torch.cat([p.grad.flatten() for p in task.network.parameters()])
 
-    norms = [task.loss_norm(part) for part in labels]
-    of_each = [gradient(slice(k, k + 1), norms) for k in (0, 1)]
-    together = gradient(slice(0, 2), [task.loss_norm(labels.flatten(0, 1))])
-    torch.testing.assert_close(sum(of_each) / 2, together, rtol=1e-4, atol=1e-6)
-
-
-@pytest.mark.parametrize("scheduler", [StepLR, LinearLR, OneCycleLR])
-def test_schedulers_step_by_epoch_or_over_the_whole_training(scheduler: Any) -> None:
-    settings = {
-        StepLR: {"step_size": 1, "gamma": 0.5},
-        LinearLR: {"start_factor": 1.0, "end_factor": 0.5, "total_iters": 1},
-        OneCycleLR: {"max_lr": 0.1},
-    }
-    seen: list[float] = []
-
-    class Watch(lightning.Callback):
-        def on_train_batch_start(self, trainer: Any, *_: Any) -> None:
-            seen.append(trainer.optimizers[0].param_groups[0]["lr"])
-
-    task = _task(scheduler=partial(scheduler, **settings[scheduler]))
-    trainer = quiet_trainer(max_epochs=2, limit_val_batches=0, callbacks=[Watch()])
-    trainer.fit(task, datamodule=Data(1))
-    if scheduler is OneCycleLR:
-        assert len(set(seen)) == 6, "stepped every step"
-        assert seen[-1] < 1e-5, "ends at the end of training"
-    else:
-        assert seen == pytest.approx([0.1] * 3 + [0.05] * 3)
+    norm = task.loss_norm(batch.labels.flatten(0, 1))
+    of_each = gradient(slice(0, 1), norm / 2) + gradient(slice(1, 3), norm / 2)
+    torch.testing.assert_close(of_each / 2, gradient(slice(0, 3), norm), rtol=1e-4, atol=1e-6)

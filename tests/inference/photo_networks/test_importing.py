@@ -162,12 +162,16 @@ def test_tangent_images_have_the_angular_resolution_of_the_photos(
         (("normalization=null",), "normalization: found none; expected imagenet, unit, symmetric"),
         (("nothing=[sky]",), "nothing: found sky; expected of background, dark"),
         (("nothing=[background,dark,green,bright]",), "nothing: found all classes"),
-        (("output=net.onnx",), "which exists; expected a new file"),
+        (("output=net.onnx",), "which exists; expected nothing there yet"),
         (("output=ours.ckpt", "file=absent.onnx"), r"output: found ours\.ckpt; expected .*\.onnx"),
         (("file=null",), "file: found none; expected an ONNX file"),
         (
             ("network=timm", "model=vit", "output=net.ckpt"),
             "found timm, which has no networks for segmentation",
+        ),
+        (
+            ("network=torchvision", "model=resnet50", "output=net.ckpt"),
+            "model: found resnet50; expected deeplabv3",
         ),
         (
             (

@@ -7,20 +7,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.cli.tiny_runs import SMALL_ROOMS, results, run_command
+from tests.cli.tiny_runs import SMALL_ROOMS, Run, results
 
 DATA = [text for text in SMALL_ROOMS if text.startswith(("data.", "trainer."))]
 
 
 @pytest.mark.parametrize("suffix", ["safetensors", "onnx"])
 def test_an_export_has_the_figures_of_its_run(
-    suffix: str, rooms: str, run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    suffix: str, rooms: str, run_folder: Path, tmp_path: Path, run: Run
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     checkpoint = f"checkpoint={run_folder / 'checkpoints' / 'best.ckpt'}"
-    run_command(monkeypatch, "export", checkpoint, f"output=network.{suffix}")
+    run("export", checkpoint, f"output=network.{suffix}")
     arguments = [f"checkpoint=network.{suffix}", "data=synthrooms", rooms, *DATA]
-    run_command(monkeypatch, "evaluate", *arguments, "hydra.run.dir=exported")
+    run("evaluate", *arguments, "hydra.run.dir=exported")
     found, expected = results(tmp_path / "exported"), results(run_folder)
     assert found["images"] == expected["images"]
     differing = np.abs(np.subtract(found["confusion"], expected["confusion"])).sum()

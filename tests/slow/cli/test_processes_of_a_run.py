@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from tests.cli.test_commands import CUT_SHORT
-from tests.cli.tiny_runs import SETTINGS, results, run_command
+from tests.cli.tiny_runs import SETTINGS, Run, results
 from tests.running import run_python
 
 # No batch statistics.
@@ -34,16 +34,15 @@ def _names_in_report(run: Path) -> list[str]:
 
 
 def test_two_processes_make_the_steps_and_figures_of_one(
-    rooms: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    rooms: str, tmp_path: Path, run: Run
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     (tmp_path / "own" / "network").mkdir(parents=True)
     (tmp_path / "own" / "network" / "plain.yaml").write_text(PLAIN)
     settings = [text for text in SETTINGS if not text.startswith("network.")]
     common = ["--config-dir", str(tmp_path / "own"), *settings, rooms, "network=plain"]
     common += ["trainer.max_steps=3", "optimizer=adam", "data.validation_fraction=0.4", "panels=2"]
     one = ["data.panoramas_per_step=2", "hydra.run.dir=one"]
-    run_command(monkeypatch, "train", *common, *one)
+    run("train", *common, *one)
     devices = ["trainer.accelerator=cpu", "trainer.devices=2"]
     two = [*common, "trainer=ddp", *devices, "trainer.max_steps=3"]
     two += ["data.panoramas_per_step=1", "task.images_per_chunk=2"]
@@ -65,7 +64,7 @@ def test_two_processes_make_the_steps_and_figures_of_one(
     _train(tmp_path, *resumed)
     assert results(tmp_path / "cut") == results(tmp_path / "two")
     checkpoint = f"checkpoint={tmp_path / 'one' / 'checkpoints' / 'last.ckpt'}"
-    run_command(monkeypatch, "evaluate", checkpoint, rooms, "hydra.run.dir=again")
+    run("evaluate", checkpoint, rooms, "hydra.run.dir=again")
     ddp = ["trainer=ddp", *devices, "hydra.run.dir=evaluated"]
     evaluate = ("-m", "tangent_train.cli.main", "evaluate", checkpoint, rooms, *ddp)
     assert run_python(tmp_path, *evaluate).returncode == 0

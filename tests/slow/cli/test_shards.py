@@ -72,13 +72,3 @@ def test_one_of_them_is_killed_and_resumed(settings: list[str]) -> None:
     for path in Path("out").rglob(".partial*"):  # of the killed one
         path.unlink()
     assert _results("out") == _results("whole")
-
-
-def test_they_run_through_the_launchers_of_sweeps(
-    settings: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("hydra._internal.utils.is_under_debugger", lambda: False)
-    shards = ("-m", "launcher=local", "shard=1/2,2/2", "hydra.sweep.dir=jobs")
-    run_command(monkeypatch, "predict", *shards, *settings, "output=out")
-    assert _results("out") == _results("whole")
-    assert len(list(Path("jobs", ".submitit").glob("[0-9]*"))) == 2

@@ -8,9 +8,13 @@ import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-from tests.cli.tiny_runs import SETTINGS, run_command
+from datamodules.images.pixel_files import write_pixels
+from tests.cli.tiny_runs import SETTINGS, Run
+from tests.datamodules.data_files import contents
+from tests.inference.trained import sphere, write_checkpoint
 
 # Optuna 2.10, all that hydra-optuna-sweeper works with, is written for an old one.
 OLD_SQLALCHEMY = pytest.mark.filterwarnings("ignore:Deprecated API features detected")
@@ -44,36 +48,34 @@ def _runs(folder: Path) -> list[str]:
 
 
 def test_jobs_of_a_grid_are_runs_of_their_own_on_any_number_of_devices(
-    settings: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    settings: tuple[str, ...], tmp_path: Path, run: Run
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     # A folder named as one of this project's packages must not be imported in its place.
     (tmp_path / "models").mkdir()
     (tmp_path / "models" / "__init__.py").write_text("raise ImportError('the wrong models')\n")
     grid = ("-m", "trainer=ddp", "trainer.devices=1,2", "hydra.sweep.dir=a sweep")
-    run_command(monkeypatch, "train", *grid, *settings)
+    run("train", *grid, *settings)
     runs = [tmp_path / "a sweep" / number for number in "01"]
     assert _runs(tmp_path / "a sweep") == ["0", "1"]
     assert {path.name for path in tmp_path.iterdir()} == {"a sweep", "models"}, "run folders"
     (first,), (second,) = map(_writers, runs)
     assert len({os.getpid(), first, second}) == 3
-    for run, devices in zip(runs, (1, 2), strict=True):
-        assert f"\n  devices: {devices}\n" in (run / "config.yaml").read_text()
-        assert _json(run / "results.json")["images"] == 2
+    for folder, devices in zip(runs, (1, 2), strict=True):
+        assert f"\n  devices: {devices}\n" in (folder / "config.yaml").read_text()
+        assert _json(folder / "results.json")["images"] == 2
     checkpoint = f"checkpoint={runs[0] / 'checkpoints' / 'last.ckpt'}"
     rotated = ("data.test_rotation=null,so3", "hydra.sweep.dir=rotated")
-    run_command(monkeypatch, "evaluate", "-m", checkpoint, settings[-1], *rotated)
+    run("evaluate", "-m", checkpoint, settings[-1], *rotated)
     figures = [_json(tmp_path / "rotated" / n / "results.json")["confusion"] for n in "01"]
     assert figures[0] == _json(runs[0] / "results.json")["confusion"] != figures[1]
 
 
 @OLD_SQLALCHEMY
 def test_optuna_compares_runs_of_submitit_by_their_validation(
-    settings: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    settings: tuple[str, ...], tmp_path: Path, run: Run
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     study = ("hydra.sweeper.n_trials=2", "hydra.sweeper.n_jobs=2", "hydra.sweep.dir=study")
-    run_command(monkeypatch, "train", "-m", "sweep=optuna", "launcher=local", *study, *settings)
+    run("train", "-m", "sweep=optuna", "launcher=local", *study, *settings)
     runs = [tmp_path / "study" / number for number in "01"]
     assert _runs(tmp_path / "study") == ["0", "1"]
     (first,), (second,) = map(_writers, runs)
@@ -93,11 +95,10 @@ def test_optuna_compares_runs_of_submitit_by_their_validation(
 
 
 def test_failing_jobs_are_shown_and_do_not_stop_the_others(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    tmp_path: Path, run: Run, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as stopped:
-        run_command(monkeypatch, "train", "-m", "data.fold=4,5", "hydra.sweep.dir=sweep", *SETTINGS)
+        run("train", "-m", "data.fold=4,5", "hydra.sweep.dir=sweep", *SETTINGS)
     error = capfd.readouterr().err
     assert error.count("tangent-train: data.fold: found 4") == 1
     assert error.count("tangent-train: data.fold: found 5") == 1
@@ -107,11 +108,22 @@ def test_failing_jobs_are_shown_and_do_not_stop_the_others(
 
 @OLD_SQLALCHEMY
 def test_a_search_without_a_validation_split_is_refused(
-    settings: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    settings: tuple[str, ...], tmp_path: Path, run: Run
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     message = r"^tangent-train: data\.validation_fraction: found no validation split"
     without = (*settings, "data.validation_fraction=0")
     with pytest.raises(SystemExit, match=message):
-        run_command(monkeypatch, "train", "-m", "sweep=optuna", *without)
+        run("train", "-m", "sweep=optuna", *without)
     assert not list(tmp_path.rglob("checkpoints"))
+
+
+def test_shards_of_predictions_are_jobs(tmp_path: Path, run: Run) -> None:
+    for number in range(5):
+        write_pixels(tmp_path / "in" / f"{number}.png", np.roll(sphere(32), number, 1))
+    settings = (f"checkpoint={write_checkpoint(tmp_path / 'model.ckpt')}", "input=in", "report=2")
+    run("predict", *settings, "output=whole")
+    shards = ("-m", "launcher=local", "shard=1/2,2/2", "hydra.sweep.dir=jobs")
+    run("predict", *shards, *settings, "output=out")
+    found = {n: b for n, b in contents(Path("out")).items() if not n.startswith("shards/")}
+    assert found == contents(Path("whole"))
+    assert len(list(Path("jobs", ".submitit").glob("[0-9]*"))) == 2

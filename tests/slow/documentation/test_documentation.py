@@ -63,13 +63,3 @@ def _check_exists(words: list[str]) -> None:
         wanted = re.fullmatch(rf"(?:{project['name']}|\.)(?:\[([a-z,]+)\])?", words[-1])
         assert wanted, f"{words} is not this project, perhaps with extras"
         assert set((wanted[1] or "dev").split(",")) <= set(project["optional-dependencies"])
-
-
-def test_all_commands_are_found() -> None:
-    """In blocks of other languages they would not be."""
-    commands = sum(bool(words_of(line)[1]) for block in BLOCKS for line in block.commands)
-    written = sum(
-        len(re.findall(r"^(?:\w+=\S+ )?(?:\$ )?tangent-\w+ ", path.read_text(), re.MULTILINE))
-        for path in (ROOT / "README.md", *(ROOT / "docs").glob("**/*.md"))
-    )
-    assert commands >= written > 0
