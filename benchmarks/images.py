@@ -23,8 +23,6 @@ from tangent_train.geometry import (
 )
 from tangent_train.rendering import equirect_to_tangent
 
-__all__ = ["images"]
-
 BARE = "bare cv2.remap, maps ready-made"
 ALL = "equirect_to_tangent"
 SOME = "equirect_to_tangent, 4 images"

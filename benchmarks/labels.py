@@ -17,8 +17,6 @@ from tangent_train.rendering import (
     tangent_to_labels,
 )
 
-__all__ = ["NUM_CLASSES", "growth", "labels", "random_scores"]
-
 NUM_CLASSES = 13
 PLAIN = "grid_sample of a mosaic, argmax"
 OURS = "tangent_to_labels"

@@ -23,19 +23,6 @@ from typing import Any, NamedTuple
 
 import torch
 
-__all__ = [
-    "DEVICE",
-    "FAILURES",
-    "Goal",
-    "Row",
-    "Table",
-    "Way",
-    "added_mib",
-    "attempted",
-    "measure",
-    "peak_mib",
-]
-
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 """Of the measurements that are meant for a GPU."""
 

@@ -15,8 +15,6 @@ from pathlib import Path
 
 from benchmarks.measuring import Goal, Table, Way, measure
 
-__all__ = ["start"]
-
 _COMMAND = "import sys; from tangent_train.cli.main import train; sys.argv = {!r}; train()"
 _FIRST_STEP = """
 import os, tangent_train.tasks.base as base

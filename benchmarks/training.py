@@ -30,8 +30,6 @@ from tangent_train.callbacks.checkpoints import LastCheckpoint
 from tangent_train.cli.build import build
 from tangent_train.cli.compose import config_folder
 
-__all__ = ["built", "evaluation", "loader", "quiet", "step"]
-
 OURS = "tangent-train"
 _WARM_UP = 3
 

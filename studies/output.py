@@ -11,8 +11,6 @@ from matplotlib.figure import Figure
 from tangent_train.files import csv_text, write_text
 from tangent_train.results.tables import Table
 
-__all__ = ["COLORS", "Row", "save"]
-
 Row = dict[str, Any]
 """A line of a table: values by column name."""
 

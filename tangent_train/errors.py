@@ -6,9 +6,6 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-__all__ = ["DataError", "SettingError", "counted", "of_extra", "printable"]
-
-
 _LONGEST = 400  # characters of what was found: a file may hold anything
 _CONTROL = re.compile(r"[^\n\t -~\xa0-\U0010ffff]")
 """Characters that terminals take for commands."""

@@ -17,19 +17,6 @@ from typing import IO, Any
 
 from tangent_train.errors import DataError, SettingError
 
-__all__ = [
-    "NoRoomError",
-    "atomic_path",
-    "csv_text",
-    "load_plain",
-    "no_room",
-    "parse_json",
-    "read_json",
-    "reserve",
-    "write_bytes",
-    "write_text",
-]
-
 _PREFIX = ".partial-"
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _PROBE = bytes(1 << 16)

@@ -14,8 +14,6 @@ from typing import Any
 from tangent_train.registry import Weights, import_named
 from tangent_train.setting_rules import from_file
 
-__all__ = ["find"]
-
 _SIMPLE: Any = int | float | bool | str | None | list[int | float | bool | str | None]
 
 _BY_SIGNATURE = {

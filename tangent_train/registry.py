@@ -26,18 +26,6 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 
 from tangent_train.errors import DataError, SettingError, printable
 
-__all__ = [
-    "SettingsFile",
-    "Text",
-    "Weights",
-    "check_fields",
-    "check_plain",
-    "import_named",
-    "make",
-    "maker_of",
-    "registered",
-]
-
 _HOMES = ("datamodules", "models", "tangent_train.rendering", "tangent_train.tasks")
 """Packages whose public names files may give, where they are registered."""
 

@@ -9,15 +9,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any, Literal
 
-__all__ = [
-    "OF_THIS_MACHINE",
-    "Purpose",
-    "differing_settings",
-    "flat_settings",
-    "from_file",
-    "may_differ",
-]
-
 Purpose = Literal["resume", "report", "transfer", "evaluation"]
 """A run and itself when it is resumed; runs of one group of a report (folds and seeds); a stage of
 a transfer and one that can stand in for it, if it trains, and if it only evaluates a network."""

@@ -8,8 +8,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["decoded"]
-
 
 def decoded(content: bytes | None) -> NDArray[np.uint8]:
     """``(H, W, 3)`` RGB or ``(H, W)`` grey pixels of an encoded image, without transparency."""

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-__all__ = ["TRUST", "write_dropout"]
-
 TRUST = "trust=dropping.Dropping"
 """The setting with which a run of it is resumed."""
 

@@ -13,8 +13,6 @@ from omegaconf import DictConfig, OmegaConf
 
 from tangent_train.cli.compose import config_folder
 
-__all__ = ["ROOT", "composed", "composed_settings", "run_python"]
-
 ROOT = Path(__file__).resolve().parents[1]
 
 

@@ -22,8 +22,6 @@ from tangent_train.rendering import (
 )
 from tangent_train.tasks import SegmentationTask
 
-__all__ = ["correct"]
-
 _LEAST = 1e-12
 """Written for 0, of which there is no multiple."""
 

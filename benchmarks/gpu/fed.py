@@ -24,8 +24,6 @@ from datamodules.core.samples import TrainingSample
 from tangent_train.callbacks.progress import ProgressBar
 from tangent_train.rendering import equirect_to_tangent
 
-__all__ = ["fed"]
-
 _ON_GPU = DEVICE.type == "cuda"
 _WARM, _TIMED, _PROFILED = (8, 30, 10) if _ON_GPU else (1, 2, 1)
 

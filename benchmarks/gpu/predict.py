@@ -27,8 +27,6 @@ from tangent_train.inference.views import InputImage, PanoramaViews
 from tangent_train.registry import make
 from tangent_train.rendering import equirect_to_tangent, tangent_to_labels
 
-__all__ = ["predict"]
-
 
 def predict(quick: bool) -> Iterator[Table]:
     """2048×1024 and 4096×2048, in bf16, then 200 frames by ``tangent-predict``."""

@@ -18,8 +18,6 @@ from models import FCNResNet, HuggingFaceNetwork, UNet
 from tangent_train.rendering import TangentRepresentation
 from tangent_train.tasks import SegmentationTask
 
-__all__ = ["PEAK_FLOPS", "step"]
-
 PEAK_FLOPS = 989e12
 """Dense bf16 operations a second of an H100 or H200 SXM (NVIDIA's data sheets)."""
 

@@ -9,8 +9,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-__all__ = ["ClassWeights", "class_weights"]
-
 ClassWeights = Literal["log", "sqrt", "effective", "none"]
 """Class weighting of the loss; see `class_weights`."""
 

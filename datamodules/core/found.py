@@ -18,8 +18,6 @@ from datamodules.core.store import Store
 from tangent_train.errors import DataError, SettingError
 from tangent_train.threads import in_threads
 
-__all__ = ["SAMPLED", "SPLITS", "Found", "Split", "draw_groups"]
-
 Split = Literal["train", "val", "test"]
 """A part of a data set."""
 

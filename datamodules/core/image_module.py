@@ -50,8 +50,6 @@ from tangent_train.errors import DataError, SettingError
 from tangent_train.geometry import shift_range
 from tangent_train.threads import in_threads
 
-__all__ = ["ImageDataModule", "PanoramaDataModule", "PhotoDataModule", "Split", "Upright"]
-
 
 @dataclass(kw_only=True, eq=False, repr=False)
 class ImageDataModule(SplitDataModule[ImageFiles]):

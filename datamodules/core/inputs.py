@@ -13,19 +13,6 @@ from torch import Tensor
 from datamodules.core.panoramas import STEPS_PER_M
 from tangent_train.errors import SettingError
 
-__all__ = [
-    "INPUTS",
-    "MAX_DEPTH_M",
-    "RGBD_NORMALIZATION",
-    "RGB_NORMALIZATION",
-    "Input",
-    "Normalization",
-    "channel_names",
-    "normalize",
-    "normalize_channels",
-    "ordered_inputs",
-]
-
 Input = Literal["rgb", "depth", "elevation"]
 """Inputs of a network, in channel order, see `channel_names`.
 

@@ -13,16 +13,6 @@ from torch.utils.data import DataLoader, Dataset, Sampler
 
 from tangent_train.errors import DataError, SettingError
 
-__all__ = [
-    "EpochSampler",
-    "Seed",
-    "at_least",
-    "explained",
-    "make_loader",
-    "sample_rng",
-    "this_process",
-]
-
 Seed = int | tuple[int, int]
 """A seed, 0 or more, or one with a stream; (seed, 0) is the same as the seed alone."""
 

@@ -11,8 +11,6 @@ from typing import Any
 from tangent_train.errors import DataError
 from tangent_train.files import parse_json, write_text
 
-__all__ = ["claim_folder"]
-
 
 def claim_folder(
     root: Path, manifest: str, generator: str, version: int, settings: Mapping[str, Any]

@@ -19,15 +19,6 @@ from datamodules.images.png import check_panorama_size
 from tangent_train.errors import DataError, SettingError
 from tangent_train.geometry import PanoramaPose
 
-__all__ = [
-    "ImagePairs",
-    "PairedPanorama",
-    "PanoramaPair",
-    "PanoramaPairs",
-    "PublishedPair",
-    "paired_shape",
-]
-
 
 class PairedPanorama(NamedTuple):
     """One panorama of a pair.

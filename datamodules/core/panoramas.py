@@ -25,21 +25,6 @@ if TYPE_CHECKING:
     )
     from tangent_train.rendering.representations.views import Representation, Sampler
 
-__all__ = [
-    "STEPS_PER_M",
-    "Panorama",
-    "Photo",
-    "Turn",
-    "Unknown",
-    "distance_from_z_depth",
-    "mask_black",
-    "meters_to_steps",
-    "ray_lengths",
-    "resize_area",
-    "resize_depth",
-    "resize_nearest",
-    "steps_to_meters",
-]
 
 _Pixel = TypeVar("_Pixel", bound=np.generic)
 

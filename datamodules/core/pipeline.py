@@ -23,18 +23,6 @@ from tangent_train.rendering import rotate_equirect
 from tangent_train.rendering.upright.gravity import estimate_up
 from tangent_train.threads import in_threads
 
-__all__ = [
-    "EstimatedUp",
-    "Item",
-    "PanoramaJudge",
-    "PosedUp",
-    "Reading",
-    "RotatedPanoramas",
-    "SplitItems",
-    "Transform",
-    "masked",
-]
-
 
 class Item(Protocol):
     """The source of one image or shape."""

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
     from datamodules.core.pipeline import Item
 
-__all__ = ["Problem", "Problems"]
 
 _ERROR_NUMBER = re.compile(r"\[Errno \d+\] ")
 

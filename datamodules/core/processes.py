@@ -14,8 +14,6 @@ from typing import Any, TypeVar
 
 import cv2
 
-__all__ = ["in_processes"]
-
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _Result = TypeVar("_Result")
 

@@ -17,8 +17,6 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-__all__ = ["PlainLines", "progress_bar", "show_progress"]
-
 _EVERY_S = 60.0
 
 

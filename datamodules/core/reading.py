@@ -23,15 +23,6 @@ from datamodules.core.problems import Problems
 from datamodules.images.png import check_panorama_size, check_png, read_color_png
 from tangent_train.errors import DataError
 
-__all__ = [
-    "ImageFiles",
-    "ImageReader",
-    "PanoramaReading",
-    "PhotoReading",
-    "PngReader",
-    "check_headers",
-]
-
 
 class ImageFiles(NamedTuple):
     """The files of one panorama or photo.

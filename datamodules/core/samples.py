@@ -22,17 +22,6 @@ from tangent_train.geometry import equirect_elevations
 from tangent_train.rendering.representations.views import Views
 from tangent_train.rendering.upright.gravity import upright_rotation
 
-__all__ = [
-    "EvaluationImages",
-    "EvaluationSample",
-    "Inputs",
-    "TrainingImages",
-    "TrainingSample",
-    "jitter_colors",
-    "render_inputs",
-    "world_rays",
-]
-
 Inputs = Sequence[Tensor]
 """RGB, perhaps depth and elevation as they were rendered, see `TrainingSample`."""
 

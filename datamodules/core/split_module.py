@@ -25,8 +25,6 @@ from datamodules.core.problems import Problems
 from tangent_train.errors import DataError, SettingError
 from tangent_train.threads import in_threads
 
-__all__ = ["SPLITS", "Found", "Kind", "Split", "SplitDataModule"]
-
 Kind = Literal["segmentation", "classification"]
 """Kind of labels: classes of pixels, or of whole shapes."""
 

@@ -22,8 +22,6 @@ from numpy.typing import NDArray
 from tangent_train.errors import DataError
 from tangent_train.files import atomic_path, parse_json
 
-__all__ = ["Store"]
-
 _REMEDY = (
     "Run tangent-prepare with the same settings (data.store=… and all of data and representation): "
     "it makes what is missing, broken or out of date, and nothing else."

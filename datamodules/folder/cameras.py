@@ -21,8 +21,6 @@ from tangent_train.errors import DataError
 from tangent_train.files import read_json
 from tangent_train.geometry import camera_matrix_from_fov, is_camera_matrix
 
-__all__ = ["FolderCameras", "read_cameras"]
-
 _MOST_FOV_DEG = 170  # more in a K that is given in other units, as shares of the photo's width
 _LEAST_FOCAL = 0.5 / math.tan(math.radians(_MOST_FOV_DEG) / 2)
 _KEYS = ("fx", "fy", "cx", "cy")

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from tangent_train.errors import DataError, counted
 from tangent_train.files import read_json
 
-__all__ = ["UNKNOWN_NAME", "FolderClasses", "read_classes"]
-
 UNKNOWN_NAME = "unknown"
 """Name of label 0, pixels without a class."""
 

@@ -31,8 +31,6 @@ from datamodules.folder.splits import FolderSplits
 from tangent_train.errors import DataError
 from tangent_train.registry import registered
 
-__all__ = ["FolderPanoramas", "FolderPhotos", "LabelledFolder"]
-
 _TRIED = 4
 
 

@@ -27,8 +27,6 @@ from datamodules.images.pixel_files import (
 from datamodules.images.png import PngHeader, read_png_header
 from tangent_train.errors import DataError, SettingError
 
-__all__ = ["FolderReader", "class_masks", "list_images", "note_ignored", "read_codes"]
-
 # What label images may be. In grey of 1 to 4 bits the numbers may be meant, or the steps from black
 # to white that they stand for: better asked than guessed. 16 bits beside alpha are not decoded.
 _VALUES = ("8-bit grey", "16-bit grey", "8-bit grey with alpha", "palette")

@@ -13,8 +13,6 @@ from datamodules.core.problems import Problems
 from datamodules.core.reading import ImageFiles
 from tangent_train.errors import DataError, counted
 
-__all__ = ["FolderSplits"]
-
 
 @dataclass(frozen=True)
 class FolderSplits:

@@ -21,8 +21,6 @@ from tangent_train.geometry import TangentGrid
 from tangent_train.rendering import Interpolation, equirect_to_tangent
 from tangent_train.rendering.camera_files import RIG_FILE, write_rig
 
-__all__ = ["ColmapProject", "flat_names"]
-
 
 def flat_names(paths: Sequence[Path]) -> list[str]:
     """Names of `short_names` without folders.

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from datamodules.images.png import check_pixels
 from tangent_train.errors import DataError, of_extra
 
-__all__ = ["read_exr", "read_exr_size"]
-
 _PREFERRED = ("Z", "Y", "V", "R")
 _CONVERT = "Save the depth alone, or convert it to a float TIFF or .npy file."
 

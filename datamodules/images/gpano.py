@@ -20,8 +20,6 @@ from datamodules.core.panoramas import resize_nearest
 from tangent_train.errors import DataError, SettingError
 from tangent_train.rendering.upright.gravity import up_from_pose
 
-__all__ = ["PanoramaArea", "area_of", "area_of_crop", "up_of", "whole_area"]
-
 _Pixel = TypeVar("_Pixel", bound=np.generic)
 
 _NAMESPACE = b"http://ns.google.com/photos/1.0/panorama/"

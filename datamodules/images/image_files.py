@@ -13,14 +13,6 @@ from tangent_train.errors import DataError
 
 Noted = Callable[..., AbstractContextManager[None]]
 
-__all__ = [
-    "DEPTH_SUFFIXES",
-    "IMAGE_SUFFIXES",
-    "find_depth",
-    "image_paths",
-    "short_names",
-    "walk_files",
-]
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
 """Suffixes of images, in lower case."""

@@ -13,8 +13,6 @@ from datamodules.images.gpano import PanoramaArea, whole_area
 from datamodules.images.pixel_files import LOSSY_SUFFIXES, read_image_size, read_pixels
 from tangent_train.errors import DataError, SettingError
 
-__all__ = ["Mask", "Masks"]
-
 Mask = float | Path | None
 """What of panoramas does not count: what is below a latitude, −90 to 0 degrees; the black pixels of
 a file, for all panoramas, or of the PNG files of a folder, which has one for each; or nothing."""

@@ -8,8 +8,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["class_colors"]
-
 _STEPS = 12  # values of each channel to choose from
 _LIGHTNESS = (35, 90)  # L*: black is the unknown class, white the page
 _SEEN = np.array(

@@ -23,22 +23,6 @@ from datamodules.images.png import MOST_PIXELS, check_pixels, decode, read_png_h
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import atomic_path, reserve, write_bytes
 
-__all__ = [
-    "LOSSY_SUFFIXES",
-    "PIXEL_SUFFIXES",
-    "READABLE_SUFFIXES",
-    "array_file",
-    "check_writable",
-    "is_grey",
-    "photo_fov_deg",
-    "read_array",
-    "read_depth_m",
-    "read_image_size",
-    "read_pixels",
-    "read_rgb",
-    "write_pixels",
-]
-
 _WRITABLE = {
     ".png": ("uint8", "uint16"),
     ".jpg": ("uint8",),

@@ -14,19 +14,6 @@ from numpy.typing import NDArray
 
 from tangent_train.errors import DataError, SettingError
 
-__all__ = [
-    "MOST_PIXELS",
-    "PngHeader",
-    "check_panorama_size",
-    "check_pixels",
-    "check_png",
-    "decode",
-    "read_color_png",
-    "read_depth_png",
-    "read_png",
-    "read_png_header",
-]
-
 MOST_PIXELS = 32768 * 16384
 """Pixels of an image, at most: a file of a few kilobytes can claim more than memory holds."""
 

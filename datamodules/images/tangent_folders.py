@@ -29,16 +29,6 @@ from tangent_train.rendering.camera_files import (
 )
 from tangent_train.threads import in_threads
 
-__all__ = [
-    "face_name",
-    "panorama_area",
-    "read_panorama",
-    "replaced_folder",
-    "shrink_to_level",
-    "write_each",
-    "write_tangent_folder",
-]
-
 _RESIZABLE = (np.uint8, np.uint16, np.float32, np.float64)
 
 

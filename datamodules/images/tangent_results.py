@@ -26,8 +26,6 @@ from tangent_train.rendering import Blend, tangent_to_equirect
 from tangent_train.rendering.camera_files import CameraFile
 from tangent_train.threads import in_threads
 
-__all__ = ["Kind", "TangentResults", "result_files"]
-
 Kind = Literal["color", "labels", "depth", "features"]
 """Meaning of pixels: colours and features are interpolated, labels and depth never."""
 

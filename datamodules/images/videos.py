@@ -17,8 +17,6 @@ from tangent_train.errors import DataError, of_extra
 from tangent_train.files import atomic_path
 from tangent_train.threads import in_threads
 
-__all__ = ["VIDEO_SUFFIXES", "read_frames", "read_video_size", "write_video"]
-
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
 """Suffixes of videos, in lower case."""
 

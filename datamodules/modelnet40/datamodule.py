@@ -34,8 +34,6 @@ from datamodules.modelnet40.shape_samples import (
 from tangent_train.errors import DataError
 from tangent_train.registry import registered
 
-__all__ = ["ModelNet40"]
-
 _PER_PROCESS = 40
 
 

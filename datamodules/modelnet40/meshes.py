@@ -33,8 +33,6 @@ from trimesh.exchange.off import load_off
 from tangent_train.errors import DataError
 from tangent_train.geometry import equirect_directions
 
-__all__ = ["CHANNELS", "RADIUS", "clean_mesh", "mesh_spheres", "read_off"]
-
 CHANNELS = 6
 """Three channels of the mesh, then three of its convex hull."""
 

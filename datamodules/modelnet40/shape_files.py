@@ -19,8 +19,6 @@ from typing import Literal, NamedTuple
 
 from tangent_train.errors import DataError
 
-__all__ = ["MODELNET40", "ShapeFile", "find_shapes"]
-
 _GET_IT = (
     "Get ModelNet40.zip from https://modelnet.cs.princeton.edu and name the unpacked folder in "
     "data.root. Or choose data=synthshapes, which needs no download."

@@ -22,16 +22,6 @@ from tangent_train.geometry import random_rotation, rotation_about
 
 _Shapes = SplitItems[ShapeFile, Any]
 
-__all__ = [
-    "SPHERE_NORMALIZATION",
-    "STEPS",
-    "ShapeSample",
-    "ShapeViews",
-    "Spheres",
-    "TestRotation",
-    "make_spheres",
-    "normalize_spheres",
-]
 
 SPHERE_NORMALIZATION = Normalization(
     mean=(0.7139, 0.6936, 0.5851, 0.5336, 0.7626, 0.5651),

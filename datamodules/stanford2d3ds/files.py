@@ -12,14 +12,6 @@ from tangent_train.errors import DataError
 if TYPE_CHECKING:  # slow, and SynthRooms needs the names alone
     from datamodules.core.reading import ImageFiles
 
-__all__ = [
-    "AREAS",
-    "FOLDS",
-    "GET_IT",
-    "FileName",
-    "PictureFiles",
-    "list_pictures",
-]
 
 AREAS: tuple[str, ...] = ("1", "2", "3", "4", "5a", "5b", "6")
 """All areas; 5a and 5b are parts of one floor and share rooms."""

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from tangent_train.errors import DataError, counted
 from tangent_train.files import read_json
 
-__all__ = ["CLASSES", "UNKNOWN", "LabelTable"]
-
 CLASSES: tuple[str, ...] = (
     "beam",
     "board",

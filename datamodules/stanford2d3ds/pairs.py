@@ -37,8 +37,6 @@ from tangent_train.errors import DataError, SettingError
 from tangent_train.files import parse_json
 from tangent_train.geometry import PanoramaPose
 
-__all__ = ["StanfordPairs", "published_pairs", "read_panorama_pose"]
-
 _MOST = 1e6  # metres and radians
 _KEYS = {"camera_rt_matrix": (3, 4), "camera_original_rotation": (3,), "camera_location": (3,)}
 

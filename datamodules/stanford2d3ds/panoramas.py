@@ -43,8 +43,6 @@ from datamodules.stanford2d3ds.reader import StanfordReader
 from tangent_train.errors import DataError
 from tangent_train.registry import registered
 
-__all__ = ["Stanford2D3DS", "Stanford2D3DSPerspective", "StanfordAreas"]
-
 
 @dataclass(kw_only=True, eq=False, repr=False)
 class StanfordAreas(ImageDataModule):

@@ -17,8 +17,6 @@ from tangent_train.errors import DataError
 from tangent_train.files import parse_json
 from tangent_train.geometry import is_camera_matrix
 
-__all__ = ["StanfordReader", "read_camera_matrix", "read_depth"]
-
 _FORMATS = {"rgb": (8, ("RGB", "RGBA")), "labels": (8, ("RGB", "RGBA")), "depth": (16, ("grey",))}
 _CENTERS_FROM_CORNERS = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
 _MISSING_DEPTH = 65535

@@ -29,19 +29,6 @@ from numpy.typing import NDArray
 from datamodules.core.reading import ImageFiles
 from tangent_train.errors import DataError, SettingError
 
-__all__ = [
-    "FRAMES",
-    "GET_IT",
-    "VIEWS",
-    "choose_frames",
-    "list_frames",
-    "list_panoramas",
-    "panorama_files",
-    "read_camera",
-    "sequence_folder",
-    "view_files",
-]
-
 VIEWS: tuple[str, ...] = ("F", "R", "B", "L")
 """Front, right, back, left: each rotated by 90° to the right of the previous one."""
 

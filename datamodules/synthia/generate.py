@@ -54,8 +54,6 @@ from tangent_train.geometry import (
 )
 from tangent_train.threads import in_threads
 
-__all__ = ["HEIGHT", "MANIFEST", "ViewStitcher", "make_panoramas"]
-
 HEIGHT = 2096
 """Rows of the published panoramas."""
 

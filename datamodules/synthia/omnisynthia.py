@@ -48,8 +48,6 @@ from datamodules.synthia.reader import (
 from tangent_train.errors import DataError
 from tangent_train.registry import registered
 
-__all__ = ["OmniSynthia", "SynthiaPerspective", "divide"]
-
 SEQUENCES: tuple[str, ...] = ("01", "02", "04", "05", "06")
 """The sequences there are; OmniSYNTHIA has their summers."""
 

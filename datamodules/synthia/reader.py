@@ -17,17 +17,6 @@ from datamodules.images.png import read_png
 from datamodules.synthia.files import read_camera
 from tangent_train.errors import DataError
 
-__all__ = [
-    "CLASSES",
-    "INVALID",
-    "NORMALIZATIONS",
-    "PANORAMA_FORMATS",
-    "VIEW_FORMATS",
-    "SynthiaReader",
-    "read_first_channel",
-    "read_ids",
-]
-
 CLASSES: tuple[str, ...] = (
     "sky",
     "building",

@@ -31,18 +31,6 @@ from tangent_train.geometry import (
     rotation_about,
 )
 
-__all__ = [
-    "CAMERA_FROM_SPHERE",
-    "PanoramaView",
-    "PerspectiveView",
-    "Pose",
-    "View",
-    "ViewKind",
-    "draw_view",
-    "euler_angles",
-    "euler_rotation",
-]
-
 ViewKind = Literal["stanford", "uniform"]
 """Viewing directions of photos, see `RoomSettings.views`."""
 

@@ -14,13 +14,6 @@ from datamodules.synthrooms.layout import Frame
 from datamodules.synthrooms.materials import Pattern
 from datamodules.synthrooms.room import UNKNOWN, Item, Light, Room
 
-__all__ = [
-    "add_desk_things",
-    "add_floor_clutter",
-    "add_lamp",
-    "add_wall_clutter",
-]
-
 _UNLABELLED = 0.12
 
 

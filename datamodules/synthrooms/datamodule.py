@@ -17,8 +17,6 @@ from datamodules.synthrooms.generate import RoomSettings, generate_rooms
 from tangent_train.errors import SettingError
 from tangent_train.registry import registered
 
-__all__ = ["SynthRooms", "SynthRoomsPairs", "SynthRoomsPerspective"]
-
 
 @dataclass(kw_only=True, eq=False, repr=False)
 class SynthRoomsAreas(StanfordAreas):

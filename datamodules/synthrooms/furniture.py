@@ -13,15 +13,6 @@ from datamodules.synthrooms.layout import Frame, NoPlaceError, Rectangle
 from datamodules.synthrooms.materials import Material, Pattern
 from datamodules.synthrooms.room import Item, Room
 
-__all__ = [
-    "add_board",
-    "add_bookcase",
-    "add_chair",
-    "add_desk",
-    "add_sofa",
-    "add_table",
-]
-
 
 def add_chair(room: Room) -> None:
     """Add a chair in the open with a random heading."""

@@ -31,8 +31,6 @@ from datamodules.synthrooms.writer import (
 from tangent_train.errors import SettingError
 from tangent_train.files import write_bytes, write_text
 
-__all__ = ["MANIFEST", "RoomPlan", "RoomSettings", "generate_rooms", "make_room", "plan_rooms"]
-
 MANIFEST = "synthrooms.json"
 """File that marks a folder as SynthRooms and holds its settings."""
 

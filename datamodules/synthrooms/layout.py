@@ -11,8 +11,6 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-__all__ = ["FloorPlan", "Frame", "NoPlaceError", "Rectangle", "Wall", "Zone"]
-
 Zone = Literal["low", "high", "full"]
 """Part of a wall's height that an item occupies: up to about a metre, above it, or all of it."""
 

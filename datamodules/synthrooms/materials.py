@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float32]
 
-__all__ = ["Material", "Palette", "Pattern", "albedo", "material_table"]
-
 
 class Pattern(IntEnum):
     """Procedural textures; the last four belong to one kind of object."""

@@ -15,7 +15,6 @@ from datamodules.synthrooms.room import Light, Room
 
 Floats = NDArray[np.float32]
 
-__all__ = ["Hits", "RayScene", "even_directions"]
 
 _LIFT = 1e-3  # metres off the surface where secondary rays begin
 _REACH = 0.8  # metres within which surfaces occlude ambient light

@@ -16,7 +16,6 @@ from datamodules.synthrooms.raycast import Hits, RayScene, even_directions
 
 Floats = NDArray[np.float32]
 
-__all__ = ["MISSING", "Camera", "Holes", "Picture", "draw_camera", "draw_holes", "render"]
 
 MISSING = -1
 """Item number of pixels without a scan."""

@@ -15,8 +15,6 @@ from trimesh import creation
 from datamodules.synthrooms.layout import FloorPlan, Frame
 from datamodules.synthrooms.materials import Material, Palette
 
-__all__ = ["UNKNOWN", "Item", "Light", "Part", "Room"]
-
 UNKNOWN = "<UNK>"
 """Class of unlabelled items."""
 

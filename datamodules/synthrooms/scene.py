@@ -13,8 +13,6 @@ from datamodules.synthrooms.layout import FloorPlan, NoPlaceError
 from datamodules.synthrooms.materials import Palette
 from datamodules.synthrooms.room import Room
 
-__all__ = ["ROOM_TYPES", "draw_room_type", "furnish", "shell"]
-
 _HEIGHTS = (2.5, 3.3)
 _L_SHAPED = 0.35
 

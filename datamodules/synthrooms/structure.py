@@ -12,16 +12,6 @@ from datamodules.synthrooms.layout import Frame, Rectangle, Zone
 from datamodules.synthrooms.materials import Material, Pattern
 from datamodules.synthrooms.room import Item, Light, Room
 
-__all__ = [
-    "add_beams",
-    "add_ceiling",
-    "add_column",
-    "add_door",
-    "add_floor",
-    "add_walls",
-    "add_window",
-]
-
 _THICK = 0.1
 
 

@@ -21,18 +21,6 @@ from datamodules.synthrooms.camera import PanoramaView, Pose, View, euler_angles
 from datamodules.synthrooms.render import MISSING, Picture
 from datamodules.synthrooms.room import UNKNOWN
 
-__all__ = [
-    "INSTANCES",
-    "PANORAMA",
-    "SUFFIXES",
-    "RoomPlan",
-    "camera_identifier",
-    "encode_picture",
-    "label_indices",
-    "label_strings",
-    "pose_record",
-]
-
 PANORAMA = "equirectangular"
 """Frame of panoramas in file names and poses."""
 

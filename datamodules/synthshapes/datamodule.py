@@ -10,8 +10,6 @@ from datamodules.modelnet40.datamodule import ModelNet40
 from datamodules.synthshapes.generate import CLASSES, ShapeSettings, generate_shapes
 from tangent_train.registry import registered
 
-__all__ = ["SynthShapes"]
-
 
 @registered
 @dataclass(kw_only=True, eq=False, repr=False)

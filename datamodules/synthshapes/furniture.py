@@ -7,8 +7,6 @@ import math
 from datamodules.synthshapes.parts import Parts
 from tangent_train.geometry import rotation_about
 
-__all__ = ["bench", "chair", "lamp", "stool", "table"]
-
 
 def chair(parts: Parts) -> None:
     """A seat with a back: on legs, a pedestal or solid; perhaps with arms."""

@@ -20,8 +20,6 @@ from tangent_train.errors import SettingError
 from tangent_train.files import write_text
 from tangent_train.geometry import rotation_about
 
-__all__ = ["CLASSES", "MANIFEST", "ShapeSettings", "generate_shapes", "make_shape", "plan_shapes"]
-
 MANIFEST = "synthshapes.json"
 """File that marks a folder as SynthShapes and holds its settings."""
 

@@ -15,8 +15,6 @@ from trimesh.geometry import align_vectors
 
 Point = Sequence[float]
 
-__all__ = ["Parts"]
-
 
 class Parts:
     """A shape under construction.

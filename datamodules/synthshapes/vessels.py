@@ -11,8 +11,6 @@ from scipy.interpolate import PchipInterpolator
 from datamodules.synthshapes.parts import Parts, Point
 from tangent_train.geometry import rotation_about
 
-__all__ = ["airplane", "bottle", "bowl", "cup", "vase"]
-
 
 def bottle(parts: Parts) -> None:
     """A body with a neck, some with a cap or a handle, some without a clear shoulder."""

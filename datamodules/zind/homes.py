@@ -25,8 +25,6 @@ from tangent_train.files import read_json
 from tangent_train.geometry import PanoramaPose, rotation_about
 from tangent_train.registry import Text, check_fields
 
-__all__ = ["HomePanorama", "list_panoramas"]
-
 _GET_IT = (
     "Get the sample tour from https://github.com/zillow/zind or request the whole set there, and "
     "point data.root at the folder that holds the homes (sample_tour)."

@@ -20,8 +20,6 @@ from numpy.typing import NDArray
 
 from tangent_train.geometry import equirect_latitudes, equirect_to_lonlat
 
-__all__ = ["CLASSES", "DOOR", "OPENING", "WINDOW", "Fixture", "Layout"]
-
 CLASSES: tuple[str, ...] = ("ceiling", "floor", "wall", "door", "window")
 """The classes as labels 1 to 5; 0 is unknown."""
 

@@ -16,8 +16,6 @@ from datamodules.images.pixel_files import read_rgb
 from datamodules.zind.homes import HomePanorama, list_panoramas
 from tangent_train.errors import DataError
 
-__all__ = ["ZindPairs"]
-
 
 class ZindPairs(PanoramaPairs):
     """Any two panoramas of a complete room whose cameras are inside.

@@ -54,8 +54,6 @@ from tangent_train.errors import DataError
 from tangent_train.files import read_json
 from tangent_train.registry import Text, check_fields, registered
 
-__all__ = ["Zind", "ZindReader"]
-
 Doors = Literal["class", "ignore"]
 """Whether doors are a class or unknown."""
 

@@ -21,14 +21,6 @@ from torch import Tensor
 from tangent_train.errors import SettingError
 from tangent_train.files import atomic_path
 
-__all__ = [
-    "AtomicCheckpointIO",
-    "BestCheckpoint",
-    "CheckpointContents",
-    "LastCheckpoint",
-    "averaged_weights",
-]
-
 
 class AtomicCheckpointIO(TorchCheckpointIO):
     """Write beside the old checkpoint and rename.

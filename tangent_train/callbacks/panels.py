@@ -19,8 +19,6 @@ from tangent_train.results.html import EncodedImage, encode_image
 from tangent_train.results.pictures import prediction_panel, shown_arrays
 from tangent_train.results.tables import percent
 
-__all__ = ["PredictionPanels", "evenly_spread"]
-
 _PANORAMA_DIMENSIONS = 2
 
 

@@ -12,8 +12,6 @@ from rich import get_console
 
 from datamodules.core.progress import PlainLines
 
-__all__ = ["ProgressBar"]
-
 
 class ProgressBar(RichProgressBar):
     """Lightning's bar with rate and time left, without the logger's version.

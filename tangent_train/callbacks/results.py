@@ -21,8 +21,6 @@ from tangent_train.results.evaluation import (
 from tangent_train.results.html import write_report
 from tangent_train.results.record import Record
 
-__all__ = ["evaluated", "pictures", "write_evaluation"]
-
 
 def pictures(kind: str, folder: Path, settings: Mapping[str, Any]) -> list[Callback]:
     """Callbacks that draw the predictions on the validation and test splits.

@@ -16,8 +16,6 @@ from tangent_train.metrics.classification import classification_scores
 from tangent_train.metrics.segmentation import segmentation_scores
 from tangent_train.results.pictures import prediction_panel, shown_arrays
 
-__all__ = ["ClassScores", "ValidationPictures"]
-
 _MOST_ROWS = 256
 """Larger images are shown smaller: an event file holds the pictures of all validations."""
 

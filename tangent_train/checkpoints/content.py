@@ -12,15 +12,6 @@ from tangent_train.errors import DataError
 from tangent_train.files import load_plain, write_text
 from tangent_train.registry import Text, check_fields, check_plain
 
-__all__ = [
-    "GROUPS",
-    "INPUTS",
-    "NORMALIZATION",
-    "read_checkpoint",
-    "read_settings",
-    "write_settings",
-]
-
 INPUTS = list[Literal["rgb", "depth", "elevation"]]
 """Inputs of a network, see `datamodules.core.inputs.Input`, which is slow to import."""
 

@@ -13,8 +13,6 @@ from torch.nn import functional
 
 from tangent_train.errors import SettingError
 
-__all__ = ["Groups", "Scores", "size_multiple_of"]
-
 _CERTAIN = 20.0
 """Score of a pixel's class where the network gives nothing but labels."""
 

@@ -23,16 +23,6 @@ from tangent_train.errors import DataError, SettingError
 from tangent_train.files import parse_json
 from tangent_train.registry import SettingsFile, Text, check_fields, check_plain, make
 
-__all__ = [
-    "METADATA_KEY",
-    "Start",
-    "TrainedNetwork",
-    "completed_settings",
-    "load_trained",
-    "metadata_json",
-    "start_in",
-]
-
 METADATA_KEY = "tangent_train"
 """Names the JSON text: in an ONNX file's ``metadata_props``, in safetensors' ``__metadata__``."""
 

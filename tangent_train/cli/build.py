@@ -18,8 +18,6 @@ from tangent_train.inference.class_maps import Unmapped, load_class_map, map_cla
 from tangent_train.inference.views import check_size
 from tangent_train.registry import SettingsFile, make, maker_of
 
-__all__ = ["Settings", "build", "build_data", "build_trained", "check_fits", "shown"]
-
 _RGB = 3
 
 Settings = Mapping[str, Any]

@@ -16,8 +16,6 @@ from tangent_train.cli.say import say
 from tangent_train.errors import counted
 from tangent_train.registry import make
 
-__all__ = ["check"]
-
 
 def check(settings: Mapping[str, Any]) -> None:
     """Read the whole data set of a run; exit with status 1 if there are problems.

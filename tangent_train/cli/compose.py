@@ -7,8 +7,6 @@ from pathlib import Path
 
 from hydra.core.override_parser.types import Quote, QuotedString
 
-__all__ = ["config_folder", "quote_path", "quoted"]
-
 _PATHS = (
     *("back", "cameras", "checkpoint", "class_map", "classes", "depth", "figure", "file"),
     *("init_from", "input", "left", "mask", "model", "output", "resume", "right", "weights"),

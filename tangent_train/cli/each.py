@@ -14,8 +14,6 @@ from datamodules.core.progress import progress_bar
 from tangent_train.errors import DataError, SettingError
 from tangent_train.threads import in_threads
 
-__all__ = ["Job", "Shard", "each"]
-
 _THREADS = min(4, os.cpu_count() or 1)
 """Images that are read ahead, and that are written meanwhile, at most: all are in memory."""
 

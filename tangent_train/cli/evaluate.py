@@ -34,8 +34,6 @@ from tangent_train.registry import SettingsFile, make
 from tangent_train.results.evaluation import headline, result_tables
 from tangent_train.results.record import Record
 
-__all__ = ["Run", "evaluate", "machine_faults"]
-
 # lightning 2.6 asks torch's tree library in a way torch ≥ 2.13 deprecates: nothing to do about it.
 warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)`", FutureWarning)
 

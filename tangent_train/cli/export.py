@@ -15,8 +15,6 @@ from tangent_train.cli.settings import check_new, typed
 from tangent_train.inference.export import export_network
 from tangent_train.inference.predictor import sees_rays
 
-__all__ = ["export"]
-
 
 @dataclass(frozen=True)
 class Settings:

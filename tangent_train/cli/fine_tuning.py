@@ -20,8 +20,6 @@ from tangent_train.cli.settings import Trust, typed
 from tangent_train.errors import DataError, printable
 from tangent_train.registry import SettingsFile, make
 
-__all__ = ["begin_from", "load_start"]
-
 _TYPED = re.compile(r"[+~]*network[.@=]")
 _RGB = 3
 

@@ -6,8 +6,6 @@ import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-__all__ = ["OWN", "annotate"]
-
 OWN = "== Its own settings =="
 """In a help template: the settings of the command's own file follow, without its groups."""
 

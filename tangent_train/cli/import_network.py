@@ -20,7 +20,6 @@ from tangent_train.errors import SettingError
 if TYPE_CHECKING:
     from tangent_train.inference.photo_networks import Imported, PhotoNetwork
 
-__all__ = ["import_network"]
 
 _LIBRARIES = ("torchvision", "huggingface", "smp", "onnx")
 """Each a file of `tangent_train.inference.photo_networks` with a function `load`."""

@@ -24,8 +24,6 @@ from tangent_train.registry import make, maker_of
 from tangent_train.results.keypoints.compare import AS_GIVEN, Comparer, Comparison, Row, Ways
 from tangent_train.results.keypoints.report import KeypointReport, matches_png
 
-__all__ = ["earlier_results", "file_name", "keypoints"]
-
 _OF_IMAGES = ("left", "right", "input", "pairing")
 
 

@@ -25,20 +25,6 @@ if TYPE_CHECKING:
 
     from omegaconf import DictConfig
 
-__all__ = [
-    "check",
-    "evaluate",
-    "export",
-    "import_network",
-    "keypoints",
-    "predict",
-    "prepare",
-    "render",
-    "report",
-    "train",
-    "transfer",
-]
-
 
 def _main(command: str) -> None:
     """Compose the config ``<command>.yaml`` with the command line and hand it to the command."""

@@ -37,8 +37,6 @@ from tangent_train.results.predictions import (
     class_shares,
 )
 
-__all__ = ["predict"]
-
 _DECISIVE = (
     "checkpoint", "class_map", "unmapped", "depth_scale", "projection", "crop", "fov", "level",
     "levels", "base_level", "blend", "rotations", "upright", "max_tilt_deg", "mask",

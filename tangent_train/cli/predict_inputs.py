@@ -12,8 +12,6 @@ from tangent_train.cli.each import Job, Shard
 from tangent_train.errors import DataError, SettingError
 from tangent_train.results.predictions import Entry, frame_name
 
-__all__ = ["Inputs", "is_video"]
-
 
 def is_video(path: Path) -> bool:
     """Whether a file is a video, by its suffix."""

@@ -14,8 +14,6 @@ from tangent_train.errors import SettingError
 from tangent_train.files import parse_json, write_text
 from tangent_train.results.predictions import Entry
 
-__all__ = ["PredictionShard"]
-
 
 @dataclass(frozen=True)
 class PredictionShard:

@@ -7,8 +7,6 @@ from tangent_train.cli.each import Shard
 from tangent_train.cli.say import say
 from tangent_train.registry import make
 
-__all__ = ["prepare"]
-
 
 def prepare(settings: Settings) -> None:
     """Generate or check the data set.

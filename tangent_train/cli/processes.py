@@ -13,8 +13,6 @@ from typing import NoReturn
 
 from tangent_train.cli.compose import quoted
 
-__all__ = ["SigtermError", "command_line", "ended_by_sigterm", "run_process"]
-
 _PATIENCE_S = 30.0  # for a last checkpoint
 
 

@@ -47,8 +47,6 @@ from tangent_train.rendering.camera_files import (
 )
 from tangent_train.rendering.figure import tangent_figure
 
-__all__ = ["render"]
-
 _Work = Callable[[Job, Callable[[float], object]], Path]
 
 

@@ -8,8 +8,6 @@ from pathlib import Path
 
 from tangent_train.cli.say import say
 
-__all__ = ["report"]
-
 
 def report(arguments: Sequence[str]) -> None:
     """Read runs, print the table, write ``report.md``, ``.csv``, ``.json`` and ``.png``.

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from rich.console import Console
 
-__all__ = ["say"]
-
 
 def say(text: str, *, error: bool = False) -> None:
     """Print text as it is: without markup, highlights, and breaks at the width of the terminal.

@@ -12,8 +12,6 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 
 from tangent_train.errors import SettingError
 
-__all__ = ["Trust", "check_new", "typed"]
-
 _Settings = TypeVar("_Settings")
 
 _SAID = {

@@ -20,8 +20,6 @@ from tangent_train.errors import DataError, SettingError
 from tangent_train.registry import SettingsFile, Text, check_fields
 from tangent_train.setting_rules import OF_THIS_MACHINE, flat_settings, from_file
 
-__all__ = ["GROUPS", "StoredNetwork", "StoredRun", "run_settings", "stored_run"]
-
 _SECTIONS = ("data", "representation", "network", "task", "optimizer", "scheduler", "trainer")
 GROUPS = ("experiment", *_SECTIONS)
 """Config groups whose chosen options a checkpoint keeps, as ``choices``."""

@@ -19,8 +19,6 @@ from tangent_train.cli.processes import command_line, run_process
 from tangent_train.errors import SettingError
 from tangent_train.files import parse_json
 
-__all__ = ["OBJECTIVE_FILE", "in_sweep", "run_job"]
-
 OBJECTIVE_FILE = "validation.json"
 """In a run's folder: the figure of its best epoch on the validation split."""
 

@@ -28,8 +28,6 @@ from tangent_train.files import atomic_path, write_text
 from tangent_train.registry import SettingsFile
 from tangent_train.setting_rules import differing_settings, from_file
 
-__all__ = ["train"]
-
 
 def train(settings: Settings, source: SettingsFile | None = None) -> float | None:
     """Train, then evaluate the best epoch of the validation split (else the last) on the test fold.

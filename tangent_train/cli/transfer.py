@@ -29,8 +29,6 @@ from tangent_train.cli.transfer_stages import (
 from tangent_train.cli.transfer_views import views_of
 from tangent_train.errors import DataError, SettingError
 
-__all__ = ["trained_level", "transfer"]
-
 _MOST_SHOWN = 3
 _OF_TRAINING = ("ema", "fine_tuning", "network", "optimizer", "scheduler")
 

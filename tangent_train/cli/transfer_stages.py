@@ -34,8 +34,6 @@ from tangent_train.errors import DataError, SettingError
 from tangent_train.files import parse_json, write_text
 from tangent_train.setting_rules import differing_settings
 
-__all__ = ["Stage", "State", "plan", "run_stage", "stage_command", "stage_state"]
-
 State = Literal["new", "begun", "finished"]
 """Progress of a stage. One that only evaluates is either new or finished."""
 

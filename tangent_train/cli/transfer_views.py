@@ -18,8 +18,6 @@ from tangent_train.checkpoints.trained import TrainedNetwork
 from tangent_train.errors import SettingError
 from tangent_train.inference.views import panorama_settings
 
-__all__ = ["conditions_of", "numbers", "views_of"]
-
 _NAME = re.compile(r"\w[\w.+-]*")
 """It becomes part of a folder's name."""
 

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from tangent_train.keypoints.two_view import TwoView
     from tangent_train.rendering import RigFile
 
-__all__ = ["add_pair", "panorama_poses"]
 
 _SIFT = 128
 

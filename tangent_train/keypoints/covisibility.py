@@ -20,8 +20,6 @@ from tangent_train.geometry import (
 from tangent_train.keypoints.spherical import angles_between
 from tangent_train.rendering.taps import bilinear_equirect_taps
 
-__all__ = ["DepthView", "MatchTruth", "correct_matches", "fov_overlap", "visible_from"]
-
 _TOLERANCE, _TOLERANCE_M = 0.03, 0.03
 """Occlusion tolerance behind a surface: share of the distance, and metres."""
 

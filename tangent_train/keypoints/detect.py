@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
     from tangent_train.geometry import CubeGrid, PinholeGrid, TangentGrid
 
-__all__ = ["Detections", "Detector", "detect_on_equirect", "detect_on_tangent_images"]
 
 _cv2: Any = cv2  # its types lack the detectors
 

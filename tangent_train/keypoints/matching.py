@@ -7,8 +7,6 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["match"]
-
 _ROWS = 512
 """Rows of the block of distances that is held."""
 

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 
 from tangent_train.keypoints.spherical import angles_between
 
-__all__ = ["Motion", "is_by_chance", "motion_errors", "prefers_rotation"]
-
 _SHIFTS = 16
 _PRECISION_RAD = math.radians(0.01)
 """Below the precision of any keypoint."""

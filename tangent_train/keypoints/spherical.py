@@ -11,8 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from tangent_train.geometry import lonlat_to_equirect, xyz_to_lonlat
 
-__all__ = ["SphericalKeypoints", "angles_between", "equirect_jacobian", "local_to_sphere"]
-
 
 @dataclass(frozen=True, eq=False)
 class SphericalKeypoints:

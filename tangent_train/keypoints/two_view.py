@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
     from tangent_train.geometry import PanoramaPose
 
-__all__ = ["TwoView", "colmap", "estimate_two_view", "rigid_matrix"]
 
 _CAMERA_FROM_PANORAMA = np.array([[0, 1.0, 0], [0, 0, -1.0], [1.0, 0, 0]])
 """From `tangent_train.geometry`'s axes to COLMAP's; it mirrors."""

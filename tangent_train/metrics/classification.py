@@ -8,8 +8,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from torchmetrics.classification import MulticlassConfusionMatrix
 
-__all__ = ["ClassCounts", "ClassificationScores", "classification_scores"]
-
 
 class ClassificationScores(NamedTuple):
     """Scores of one confusion matrix.

@@ -15,18 +15,6 @@ from torchmetrics.utilities import dim_zero_cat
 from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_latitudes, equirect_solid_angles
 
-__all__ = [
-    "BAND_EDGES_DEG",
-    "UNKNOWN",
-    "AbsentClass",
-    "ConfusionMatrices",
-    "ConfusionMatrix",
-    "Interval",
-    "SegmentationScores",
-    "bootstrap_intervals",
-    "segmentation_scores",
-]
-
 AbsentClass = Literal["skip", "zero"]
 """Whether a class without labelled pixels is left out of a mean or counts as 0."""
 

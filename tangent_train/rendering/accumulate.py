@@ -21,8 +21,6 @@ from tangent_train.rendering import kernels
 from tangent_train.rendering.compiled import over_rows
 from tangent_train.rendering.tables import sight_of
 
-__all__ = ["NO_OWNERS", "add_to_panorama", "label_panorama", "without_blocks", "zero_sums"]
-
 _NO_TOTAL: NDArray[np.float32] = np.empty((0, 0, 0, 0), np.float32)
 _NO_LABELS: NDArray[np.uint8] = np.empty((0, 0), np.uint8)
 

@@ -30,8 +30,6 @@ from tangent_train.rendering.sampling import map_dtype
 from tangent_train.rendering.tables import image_table, owners, tensors_on
 from tangent_train.rendering.taps import Taps, image_taps, nearest_image_index, sample
 
-__all__ = ["Blend", "tangent_to_equirect", "tangent_to_labels"]
-
 Blend = Literal["nearest", "feather"]
 
 _BAND = 2**20

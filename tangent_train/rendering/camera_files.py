@@ -22,18 +22,6 @@ from tangent_train.files import parse_json, write_text
 from tangent_train.geometry import FLIP_Y, PanoramaPose, TangentGrid, checked_rotation
 from tangent_train.registry import Text, check_fields
 
-__all__ = [
-    "CAMERAS_FILE",
-    "RIG_FILE",
-    "CameraFile",
-    "RigFile",
-    "read_cameras",
-    "read_rig",
-    "write_cameras",
-    "write_poses",
-    "write_rig",
-]
-
 CAMERAS_FILE = "cameras.json"
 """The name of the file in a folder of tangent images."""
 

@@ -18,8 +18,6 @@ from typing import Any, TypeVar
 import torch
 from numba import njit
 
-__all__ = ["njit_exact", "njit_fast", "over_rows"]
-
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 _SMALLEST_SHARE = 2**15

@@ -15,8 +15,6 @@ from tangent_train.geometry import (
 )
 from tangent_train.rendering.forward import equirect_to_tangent
 
-__all__ = ["tangent_figure"]
-
 _Image = NDArray[np.uint8]
 
 _WIDTH = 1600

@@ -22,8 +22,6 @@ from numpy.typing import NDArray
 
 from tangent_train.rendering.compiled import njit_exact, njit_fast
 
-__all__ = ["LANES", "Sight", "add_images", "best_classes", "label_images", "seen_table"]
-
 LANES = 8
 """Classes of a block."""
 

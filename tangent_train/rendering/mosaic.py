@@ -35,8 +35,6 @@ if TYPE_CHECKING:
     from tangent_train.rendering.backward import Blend
     from tangent_train.rendering.representations.perspective import PhotoCrops
 
-__all__ = ["ScoreMosaic"]
-
 
 class ScoreMosaic:
     """Scores of K classes at every pixel of a panorama or photo.

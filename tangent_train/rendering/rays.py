@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 
 from tangent_train.rendering.compiled import njit_exact
 
-__all__ = ["Rays", "equirect_positions", "find_owners", "plane_rays", "sphere_rays"]
-
 Array = NDArray[Any]
 Rays = tuple[Array, Array]
 """``(2, W)`` factors of the columns and ``(H, 2)`` factors of the rows, float64."""

@@ -19,18 +19,6 @@ from tangent_train.rendering.compiled import over_rows
 from tangent_train.rendering.rays import find_owners, sphere_rays
 from tangent_train.rendering.sampling import EquirectMap, pinhole_equirect_map
 
-__all__ = [
-    "TABLES",
-    "ImageTable",
-    "TableCache",
-    "forward_map",
-    "image_table",
-    "owners",
-    "set_table_cache_limit",
-    "sight_of",
-    "tensors_on",
-]
-
 Value = TypeVar("Value", bound=tuple[Any, ...])
 
 

@@ -14,8 +14,6 @@ from matplotlib.text import Text
 from tangent_train.results.record import SCORES
 from tangent_train.results.rows import Row, Statistic
 
-__all__ = ["grid_png", "report_png"]
-
 _COLORS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#999999")
 """Okabe and Ito's colours, which people with colour blindness can tell apart."""
 

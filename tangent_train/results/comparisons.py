@@ -21,8 +21,6 @@ from tangent_train.results.record import Record
 from tangent_train.results.report import Cell, Report
 from tangent_train.results.rows import Row, check_alike, group_runs
 
-__all__ = ["levels_report", "published", "runs_report", "transfer_report"]
-
 _MEANS = {
     "segmentation": {"accuracy": "macc", "iou": "miou"},
     "classification": {"accuracy": "accuracy"},

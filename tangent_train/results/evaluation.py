@@ -23,16 +23,6 @@ from tangent_train.metrics.segmentation import (
 from tangent_train.results.record import RESULTS_FILE, SCORES, Record, with_solid_angle
 from tangent_train.results.tables import Table, percent
 
-__all__ = [
-    "classification_record",
-    "confusion_table",
-    "headline",
-    "largest_loss",
-    "result_tables",
-    "segmentation_record",
-    "write_results",
-]
-
 _HEADINGS = {
     "images": "images",
     "share": "pixels %",

@@ -12,14 +12,6 @@ from numpy.typing import NDArray
 from datamodules.images.palette import class_colors
 from tangent_train.metrics.segmentation import UNKNOWN
 
-__all__ = [
-    "colorize",
-    "mixed_picture",
-    "overlay_picture",
-    "prediction_panel",
-    "shown_arrays",
-]
-
 _Image = NDArray[np.uint8]
 _MARGIN = 8
 _LEAST_ROWS = 256

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from tangent_train.inference.views import InputImage
     from tangent_train.rendering.mosaic import ScoreMosaic
 
-__all__ = ["Entry", "Kind", "PredictionFolder", "class_shares", "frame_name"]
 
 _ROWS_AT_ONCE = 64
 _SUMMARY = "summary.json"

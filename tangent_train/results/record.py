@@ -18,19 +18,6 @@ from tangent_train.metrics.segmentation import AbsentClass, Interval
 from tangent_train.registry import Text, check_fields
 from tangent_train.setting_rules import flat_settings
 
-__all__ = [
-    "RESULTS_FILE",
-    "SCORES",
-    "Band",
-    "Kind",
-    "Record",
-    "Scores",
-    "find_runs",
-    "load_record",
-    "unfinished_runs",
-    "with_solid_angle",
-]
-
 RESULTS_FILE = "results.json"
 
 Kind = Literal["segmentation", "classification"]

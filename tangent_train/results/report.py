@@ -16,8 +16,6 @@ from tangent_train.results.record import SCORES, Band
 from tangent_train.results.rows import Row, Statistic
 from tangent_train.results.tables import Table, percent
 
-__all__ = ["Cell", "Report"]
-
 Cell = tuple[str, str]
 """View and condition: row and column of the first table."""
 

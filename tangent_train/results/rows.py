@@ -20,8 +20,6 @@ from tangent_train.metrics.segmentation import Interval
 from tangent_train.results.record import RESULTS_FILE, Band, Record
 from tangent_train.setting_rules import may_differ
 
-__all__ = ["Row", "Statistic", "average", "check_alike", "group_runs"]
-
 
 class Statistic(NamedTuple):
     """A score over folds and seeds, a share of 1.

@@ -10,8 +10,6 @@ from rich import table as rich_table
 from rich.console import Console
 from rich.markup import escape
 
-__all__ = ["Table", "markdown_line", "percent"]
-
 _WIDEST = 10_000
 """Characters: no table is wider."""
 

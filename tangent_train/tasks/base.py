@@ -19,8 +19,6 @@ from tangent_train.errors import SettingError
 from tangent_train.tasks.divergence import check_weights, refuse_loss
 from tangent_train.tasks.fine_tuning import freeze, groups_of, rates_of
 
-__all__ = ["Part", "Task"]
-
 Part = tuple[tuple[Tensor, ...], Tensor]
 """Inputs of the network and their labels."""
 

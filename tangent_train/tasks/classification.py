@@ -14,8 +14,6 @@ from tangent_train.metrics.classification import ClassCounts, classification_sco
 from tangent_train.registry import registered
 from tangent_train.tasks.base import Task
 
-__all__ = ["ClassificationTask"]
-
 
 @registered
 class ClassificationTask(Task):

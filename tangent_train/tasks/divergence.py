@@ -9,8 +9,6 @@ from torch import Tensor
 
 from tangent_train.errors import SettingError
 
-__all__ = ["check_weights", "refuse_loss"]
-
 _NAMED = 5
 
 

@@ -9,8 +9,6 @@ from torch import Tensor, nn
 
 from tangent_train.errors import SettingError
 
-__all__ = ["freeze", "groups_of", "rates_of"]
-
 _RATES = ("max_lr", "base_lr")
 """Arguments of schedulers that replace the learning rate of the optimizer."""
 

@@ -7,8 +7,6 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 from torch.nn import functional
 
-__all__ = ["auxiliary_sum", "cross_entropy_norm", "cross_entropy_sum"]
-
 
 def cross_entropy_sum(
     scores: Float[Tensor, "images classes height width"],

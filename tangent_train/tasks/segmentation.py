@@ -19,8 +19,6 @@ from tangent_train.rendering import Assembler, EquirectRepresentation
 from tangent_train.tasks.base import Part, Task
 from tangent_train.tasks.losses import auxiliary_sum, cross_entropy_norm, cross_entropy_sum
 
-__all__ = ["SegmentationTask"]
-
 
 @registered
 class SegmentationTask(Task):

@@ -15,8 +15,6 @@ from tangent_train.inference.photo_networks import (
 from tangent_train.registry import make
 from tests.tasks.small_networks import with_statistics
 
-__all__ = ["UNET", "write_imported"]
-
 UNET = {"_target_": "models.UNet", "in_channels": 3, "num_classes": 21, "widths": [4, 8, 12]}
 
 

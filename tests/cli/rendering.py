@@ -14,8 +14,6 @@ from tangent_train.cli.compose import config_folder
 from tangent_train.cli.render import render
 from tangent_train.geometry import equirect_directions
 
-__all__ = ["Refused", "render_with", "smooth"]
-
 Refused = Callable[..., str]
 """Messages of a rendering that is refused, or of which some panoramas fail."""
 

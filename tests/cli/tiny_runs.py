@@ -12,17 +12,6 @@ import pytest
 
 from tangent_train.cli import main
 
-__all__ = [
-    "SETTINGS",
-    "SMALL_ROOMS",
-    "Predict",
-    "Run",
-    "predicted",
-    "results",
-    "run_command",
-    "run_in",
-]
-
 Run = Callable[..., None]
 """Runs a command with arguments."""
 

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from datamodules.core.found import Split
 from datamodules.core.split_module import SplitDataModule
 
-__all__ = ["contents", "gpano_xmp", "names_of", "read_png", "write_png"]
-
 
 def write_png(path: Path, image: NDArray[Any]) -> None:
     """Write an image in OpenCV's order of colours."""

@@ -7,8 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["hit_distances"]
-
 
 def hit_distances(origins: Any, rays: NDArray[np.float64], triangles: Any) -> NDArray[np.float64]:
     """Distances ``(n, m)`` at which n rays meet m triangles (Möller and Trumbore), or infinity."""

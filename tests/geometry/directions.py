@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["angle_deg", "random_directions", "unit"]
-
 
 def unit(vectors: ArrayLike) -> NDArray[np.float64]:
     """Vectors of length 1."""

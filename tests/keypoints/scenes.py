@@ -11,8 +11,6 @@ from tangent_train.geometry import FLIP_Y, PanoramaPose, random_rotation
 from tangent_train.keypoints import SphericalKeypoints
 from tests.geometry.directions import unit
 
-__all__ = ["Scene", "keypoints_at", "rotation_angle_deg", "two_views"]
-
 
 class Scene(NamedTuple):
     """Matches and the truth about them; the first `wrong` ones are wrong."""

@@ -7,8 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["draw_room"]
-
 _LOW = np.array([-3.1, -2.2, -1.5])
 _HIGH = np.array([2.4, 3.6, 1.2])
 _GRAY = np.array([[150, 120], [170, 95], [80, 225]])  # of the lower and upper side of each axis

@@ -12,8 +12,6 @@ import torch
 
 from tests.security.watch import CANARY
 
-__all__ = ["attacks", "json_attacks", "places", "replaced", "sampled"]
-
 _NAMES = (
     f"{CANARY}.fire",
     "os.mkdir",

@@ -13,8 +13,6 @@ from tangent_train.registry import SettingsFile
 from tests.cli import tiny_runs
 from tests.running import composed_settings
 
-__all__ = ["SECRET", "SETTINGS", "composed", "settled", "with_config"]
-
 SECRET = "sesame-open"
 SETTINGS = (
     *tiny_runs.SETTINGS,

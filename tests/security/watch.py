@@ -8,8 +8,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-__all__ = ["CANARY", "watched"]
-
 CANARY = "attack_canary"
 """A module that only attacks name; it does not exist, and asking for it is seen."""
 

@@ -12,8 +12,6 @@ from tangent_train.geometry import equirect_directions, equirect_solid_angles
 from tangent_train.rendering.upright.line_segments import LineSegments
 from tangent_train.rendering.upright.manhattan import followed_axes, segment_weights
 
-__all__ = ["cues", "up_probabilities"]
-
 _SMALL = (32, 64)
 _BELT = 0.5
 _CAP = 0.85

@@ -14,8 +14,6 @@ from tangent_train.rendering.upright.cues import up_probabilities
 from tangent_train.rendering.upright.line_segments import LineSegments, find_line_segments
 from tangent_train.rendering.upright.manhattan import ManhattanFrame, find_manhattan_frames
 
-__all__ = ["Judge", "estimate_up", "up_from_pose", "upright_rotation"]
-
 Judge = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 """Maps directions ``(n, 3)`` to log-likelihoods ``(n,)`` of being up, up to a constant."""
 

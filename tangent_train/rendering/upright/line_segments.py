@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from tangent_train.geometry import CubeGrid
 from tangent_train.rendering.forward import equirect_to_tangent
 
-__all__ = ["LineSegments", "find_line_segments"]
-
 _MOST_ROWS = 512
 _LEAST_SIDE = 128  # of a face: LSD looks for rows of pixels
 _SHORTEST_RAD = np.radians(3)

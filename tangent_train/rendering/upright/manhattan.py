@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from tangent_train.geometry import icosphere, rotation_about
 from tangent_train.rendering.upright.line_segments import LineSegments
 
-__all__ = ["ManhattanFrame", "find_manhattan_frames", "followed_axes", "segment_weights"]
-
 _Float = TypeVar("_Float", bound=np.floating)
 
 _SEARCH_TOLERANCE = np.sin(np.radians(4))

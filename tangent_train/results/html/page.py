@@ -20,8 +20,6 @@ from tangent_train.files import atomic_path
 from tangent_train.geometry import equirect_solid_angles
 from tangent_train.results.tables import Table
 
-__all__ = ["BUDGET_BYTES", "MOST_PIXELS", "EncodedImage", "encode_image", "write_report"]
-
 BUDGET_BYTES = 8_000_000
 """Of the HTML file, for one image with its label maps."""
 

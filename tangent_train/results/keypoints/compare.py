@@ -41,19 +41,6 @@ if TYPE_CHECKING:
 
     from datamodules.core.panorama_pairs import PairedPanorama, PanoramaPair
 
-__all__ = [
-    "AS_GIVEN",
-    "AUC_DEG",
-    "CUBE",
-    "ROTATED",
-    "SHRUNK",
-    "Comparer",
-    "Comparison",
-    "MatchedPair",
-    "Row",
-    "Ways",
-    "shrunk_rows",
-]
 
 Row = dict[str, Any]
 """Figures of one pair, condition and representation, see `Comparer.compare`."""

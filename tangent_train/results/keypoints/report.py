@@ -25,7 +25,6 @@ from tangent_train.results.tables import Table, percent
 if TYPE_CHECKING:
     from datamodules.core.panorama_pairs import PublishedPair
 
-__all__ = ["KeypointReport", "matches_png", "with_splits"]
 
 _CONDITIONS = {AS_GIVEN: "As they are", ROTATED: "Right panorama randomly rotated"}
 _SCORES = {"PMR %": "pmr", "MS %": "ms", "P %": "p"}

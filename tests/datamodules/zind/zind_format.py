@@ -16,8 +16,6 @@ from PIL import Image
 from tangent_train.geometry import equirect_directions
 from tests.datamodules.rays import hit_distances
 
-__all__ = ["KINDS", "Camera", "Room", "brute_force_labels", "write_home", "write_homes"]
-
 KINDS = {"doors": 4, "windows": 5, "openings": 0}
 """Fixtures and their labels; 1 is ceiling, 2 floor, 3 wall."""
 

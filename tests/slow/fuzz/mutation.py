@@ -9,8 +9,6 @@ import zlib
 from random import Random
 from typing import Any
 
-__all__ = ["mutate", "png_chunk", "sealed_png"]
-
 _MOST_BYTES = 1 << 20
 _NUMBER = re.compile(rb"-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
 _NUMBERS = b"0|-0|-1|1.5|1e400|1e308|nan|inf|1_0||0x10|2147483648|65536|true|1 2".split(b"|")

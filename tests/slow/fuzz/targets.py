@@ -41,8 +41,6 @@ from tangent_train.rendering.camera_files import (
 from tests.datamodules.data_files import gpano_xmp
 from tests.datamodules.zind.zind_format import SQUARE, Camera, write_home
 
-__all__ = ["TARGETS"]
-
 _SHAPE = (8, 16)
 _RNG = np.random.default_rng(0)
 _RGB: NDArray[np.uint8] = _RNG.integers(0, 256, (*_SHAPE, 3), np.uint8)
