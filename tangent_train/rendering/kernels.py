@@ -185,7 +185,7 @@ def _feather(side: tuple[int, int], u: Array, v: Array, weight: Array) -> int:
     for p in range(len(weight)):
         a, b = (u[p] + 0.5) * per_column - 1, (v[p] + 0.5) * per_row - 1
         weight[p] = math.sqrt(max(1 - a * a, 0.0) * max(1 - b * b, 0.0))
-        outside += weight[p] <= 0
+        outside += 0 if weight[p] > 0 else 1
     return outside
 
 
