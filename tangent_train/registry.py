@@ -37,6 +37,7 @@ __all__ = [
     "make",
     "maker_of",
     "registered",
+    "unregistered",
 ]
 
 _HOMES = ("datamodules", "models", "tangent_train.rendering", "tangent_train.tasks")
@@ -187,6 +188,20 @@ def check_registered(target: str, place: str) -> None:
         expected="a registered class: the run could not be evaluated",
         remedy=(first if home == package else first + named).rstrip(),
     )
+
+
+def unregistered(settings: Any) -> tuple[str, ...]:
+    """What a section of a config names that a file may not name, and sections in it likewise.
+
+    Args:
+        settings: The section, whose names are known to be right.
+    """
+    if not isinstance(settings, Mapping):
+        return ()
+    target = settings.get("_target_")
+    own = (target,) if target is not None and _find(target) is None else ()
+    inner = [name for value in settings.values() for name in unregistered(value)]
+    return tuple(dict.fromkeys((*own, *inner)))
 
 
 def check_fields(

@@ -11,7 +11,7 @@ from hydra import compose
 from hydra.core.override_parser.types import Quote, QuotedString
 from omegaconf import OmegaConf
 
-__all__ = ["compose_option", "config_folder", "quote_path", "quoted"]
+__all__ = ["compose_option", "config_folder", "named", "quote_path", "quoted"]
 
 _PATHS = (
     *("back", "cameras", "checkpoint", "class_map", "classes", "depth", "figure", "file"),
@@ -30,6 +30,18 @@ def config_folder(command: str = "") -> Path:
     packaged = package / "configs"
     folder = packaged if packaged.is_dir() else package.parent / "configs"
     return folder / command if (folder / command).is_dir() else folder
+
+
+def named(argument: str, setting: str) -> str:
+    """Keep a setting with the name of a config group a setting, where `--config-dir` has the group.
+
+    Hydra never takes a mapping for the choice of an option.
+
+    >>> named("network=unet", "network"), named("level=7", "network")
+    ('network={name:unet}', 'level=7')
+    """
+    name, _, value = argument.partition("=")
+    return f"{name}={{name:{value}}}" if name == setting and value else argument
 
 
 def quote_path(argument: str) -> str:

@@ -23,6 +23,7 @@ from tangent_train.errors import SettingError
 from tangent_train.files import atomic_path
 from tangent_train.geometry import vertex_resolution
 from tangent_train.inference.photo_networks.network import PhotoNetwork
+from tangent_train.registry import unregistered
 
 __all__ = ["Imported", "View", "import_network", "view_of"]
 
@@ -93,7 +94,7 @@ def import_network(
             _write_onnx(network, temporary, names, groups, view)
         else:
             _write_checkpoint(network, temporary, names, groups, view)
-        trained = load_trained(temporary)
+        trained = load_trained(temporary, unregistered(network.settings))  # it was made from them
         if network.image_size != (view.dim, view.dim):  # else it was tried
             _use(trained, view, network.image_size)
     source = None if trained.source is None else replace(trained.source, path=path)
