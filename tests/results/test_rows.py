@@ -96,6 +96,20 @@ def test_networks_from_elsewhere_make_other_groups() -> None:
     ]
 
 
+def test_other_representations_are_said_by_their_class() -> None:
+    tangent = {"_target_": "a.TangentRepresentation", "blend": "feather"}
+    erp = {"_target_": "a.EquirectRepresentation", "rows": 512, "base_level": None}
+    records = [
+        made_record([0.1, 0.2, 0.3], **{f"representation__{name}": v for name, v in own.items()})
+        for own in (tangent | {"base_level": 0}, tangent | {"base_level": 1}, erp)
+    ]
+    assert [row.label for row in group_runs(records)] == [
+        "mine (representation=TangentRepresentation, representation.base_level=0)",
+        "mine (representation=TangentRepresentation, representation.base_level=1)",
+        "mine (representation=EquirectRepresentation)",
+    ]
+
+
 def test_runs_with_other_classes_are_refused() -> None:
     records = [
         made_record([0.1, 0.2, 0.3]),
