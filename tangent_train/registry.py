@@ -152,6 +152,20 @@ def import_named(target: Any, place: str) -> Any:
         ) from error
 
 
+def unregistered(settings: Any) -> tuple[str, ...]:
+    """What a section of a config names that a file may not name, and sections in it likewise.
+
+    Args:
+        settings: The section, whose names are known to be right.
+    """
+    if not isinstance(settings, Mapping):
+        return ()
+    target = settings.get("_target_")
+    own = (target,) if target is not None and _find(target) is None else ()
+    inner = [name for value in settings.values() for name in unregistered(value)]
+    return tuple(dict.fromkeys((*own, *inner)))
+
+
 def check_fields(
     path: Path, content: Any, kinds: Mapping[str, Any], expected: str, where: str = ""
 ) -> dict[str, Any]:

@@ -26,6 +26,18 @@ def config_folder(command: str = "") -> Path:
     return folder / command if (folder / command).is_dir() else folder
 
 
+def named(argument: str, setting: str) -> str:
+    """Keep a setting with the name of a config group a setting, where `--config-dir` has the group.
+
+    Hydra never takes a mapping for the choice of an option.
+
+    >>> named("network=unet", "network"), named("level=7", "network")
+    ('network={name:unet}', 'level=7')
+    """
+    name, _, value = argument.partition("=")
+    return f"{name}={{name:{value}}}" if name == setting and value else argument
+
+
 def quote_path(argument: str) -> str:
     """Quote an override of a file or folder, so that Hydra takes its value literally.
 

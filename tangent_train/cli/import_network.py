@@ -55,7 +55,7 @@ def import_network(config: Mapping[str, Any]) -> None:
     """
     from tangent_train.inference import photo_networks
 
-    settings = typed(Settings, config)
+    settings = typed(Settings, {**config, "network": (config["network"] or {}).get("name")})
     output = settings.output
     suffix = ".onnx" if settings.network == "onnx" else ".ckpt"
     if output.suffix.lower() != suffix:
@@ -137,6 +137,9 @@ def _understood(path: Path, imported: Imported, settings: Settings) -> str:
         f"{20 * 4**view.base_level} tangent images (base level {view.base_level}) of "
         f"{view.dim}×{view.dim}",
     ]
+    own = imported.trained.source.trust if imported.trained.source is not None else ()
+    if own:
+        lines.append(f"of your own: every command that reads it needs trust=[{','.join(own)}]")
     if imported.nothing:
         said = "are written as unknown" if settings.nothing_wins else "never win"
         lines.insert(2, f"{', '.join(imported.nothing)}: mean nothing, {said}")

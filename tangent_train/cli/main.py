@@ -33,7 +33,7 @@ def _main(command: str) -> None:
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 
-    from tangent_train.cli.compose import config_folder, quote_path
+    from tangent_train.cli.compose import config_folder, named, quote_path
     from tangent_train.cli.help import annotate
     from tangent_train.cli.processes import ended_by_sigterm
     from tangent_train.cli.stored import stored_run
@@ -52,6 +52,8 @@ def _main(command: str) -> None:
 
         if stored is not None:
             arguments = stored.arguments
+        if command == "import":
+            arguments = [named(argument, "network") for argument in arguments]
         sys.argv[1:] = map(quote_path, arguments)
         try:
             folder = config_folder(command)

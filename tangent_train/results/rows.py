@@ -211,10 +211,26 @@ def _labels(firsts: Sequence[Record]) -> list[str]:
         own = _identity(record)
         others = [o for o in map(_identity, firsts) if o.get("name") == own.get("name")]
         differing = [
-            f"{setting}={own.get(setting)}"
+            _in_short(setting, own.get(setting))
             for setting in sorted({key for other in others for key in other})
-            if any(other.get(setting) != own.get(setting) for other in others)
+            if any(_differs(setting, other, own) for other in others)
         ]
         text = ", ".join(differing[:3]) + (", …" if len(differing) > 3 else "")
         labels.append(str(own.get("name") or record.folder.name) + (f" ({text})" if text else ""))
     return labels
+
+
+def _differs(setting: str, other: Mapping[str, Any], own: Mapping[str, Any]) -> bool:
+    """Whether a setting differs, and not only because its section is of another class."""
+    classes = [
+        name
+        for name in own
+        if name.endswith("._target_") and setting.startswith(name.removesuffix("_target_"))
+    ]
+    alike = all(other.get(name) == own[name] for name in classes if name != setting)
+    return alike and other.get(setting) != own.get(setting)
+
+
+def _in_short(setting: str, value: Any) -> str:
+    section = setting.removesuffix("._target_")
+    return f"{section}={value if section == setting else str(value).rpartition('.')[2]}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -93,6 +94,20 @@ def test_networks_from_elsewhere_make_other_groups() -> None:
     assert [(row.label, len(row.records)) for row in group_runs(records)] == [
         ("mine (checkpoint=one.onnx)", 2),
         ("mine (checkpoint=two.onnx)", 2),
+    ]
+
+
+def test_other_representations_are_said_by_their_class() -> None:
+    tangent: dict[str, Any] = {"_target_": "a.TangentRepresentation", "blend": "feather"}
+    erp: dict[str, Any] = {"_target_": "a.EquirectRepresentation", "rows": 512, "base_level": None}
+    records = [
+        made_record([0.1, 0.2, 0.3], **{f"representation__{name}": v for name, v in own.items()})
+        for own in (tangent | {"base_level": 0}, tangent | {"base_level": 1}, erp)
+    ]
+    assert [row.label for row in group_runs(records)] == [
+        "mine (representation=TangentRepresentation, representation.base_level=0)",
+        "mine (representation=TangentRepresentation, representation.base_level=1)",
+        "mine (representation=EquirectRepresentation)",
     ]
 
 

@@ -23,7 +23,7 @@ from tangent_train.errors import SettingError
 from tangent_train.files import atomic_path
 from tangent_train.geometry import vertex_resolution
 from tangent_train.inference.photo_networks.network import PhotoNetwork
-from tangent_train.registry import SettingsFile
+from tangent_train.registry import unregistered
 
 _TANGENT = "tangent_train.rendering.TangentRepresentation"
 _LEVELS = (5, 13)
@@ -91,9 +91,10 @@ def import_network(
             _write_onnx(network, temporary, names, groups, view)
         else:
             _write_checkpoint(network, temporary, names, groups, view)
-        trained = load_trained(temporary)
+        trained = load_trained(temporary, unregistered(network.settings))  # it was made from them
         _use(trained, view, network.image_size)
-    return Imported(replace(trained, source=SettingsFile(path)), tuple(nothing), view)
+    source = None if trained.source is None else replace(trained.source, path=path)
+    return Imported(replace(trained, source=source), tuple(nothing), view)
 
 
 def view_of(

@@ -17,11 +17,13 @@ from torchvision import models as torchvision_models
 from models import UNet
 from tangent_train.checkpoints.trained import load_trained
 from tangent_train.cli import main
+from tangent_train.errors import DataError
 from tangent_train.geometry import TangentGrid, camera_matrix_from_fov
 from tangent_train.inference.photo_networks.importing import View, view_of
 from tangent_train.inference.predictor import Predictor
 from tangent_train.inference.views import InputImage, PanoramaViews
 from tests.models.onnx_files import write_linear
+from tests.tasks.small_networks import with_statistics
 
 NAMES = ["background", "dark", "green", "bright"]
 WEIGHT = np.array([[0, 0, 0], [-1, -1, -1], [-1, 2, -1], [1, 1, 1]], np.float32)
@@ -105,6 +107,25 @@ def test_a_network_of_a_config_and_its_export_compute_the_same(
         again = load_trained(here / "again.safetensors")
         assert again.class_names == trained.class_names
         torch.testing.assert_close(again.network(images), expected)
+
+
+def test_a_network_of_ones_own_is_imported(
+    here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (here / "own" / "network").mkdir(parents=True)
+    (here / "own" / "network" / "mine.yaml").write_text(
+        "_target_: tests.tasks.small_networks.with_statistics\nnetwork:\n  _target_: models.UNet\n"
+        "  in_channels: null\n  num_classes: null\n  widths: [4, 8]\n"
+    )
+    network = with_statistics(UNet(3, 4, (4, 8)))
+    torch.save(network.state_dict(), here / "state.pt")
+    given = ("weights=state.pt", "classes=classes.json", "normalization=unit", "output=net.ckpt")
+    _run("import", monkeypatch, "--config-dir", "own", "network=mine", *given)
+    own = "tests.tasks.small_networks.with_statistics"
+    assert f"trust=[{own}]" in capsys.readouterr().out
+    assert load_trained(here / "net.ckpt", [own]).class_names == ("unknown", *NAMES)
+    with pytest.raises(DataError, match=f"trust={own}"):
+        load_trained(here / "net.ckpt")
 
 
 @pytest.mark.parametrize(
