@@ -101,14 +101,14 @@ def _bands(rows: slice, images: int) -> Iterator[tuple[slice, slice]]:
 
 
 def zero_sums(shape: tuple[int, int], channels: int) -> NDArray[np.float32]:
-    """Sums in blocks of eight channels, 0; beyond 2 GiB in a temporary file without a name.
+    """Sums in blocks of 16 channels, 0; beyond 2 GiB in a temporary file without a name.
 
     Args:
         shape: ``(H, W)``.
         channels: K.
 
     Returns:
-        ``(H, K / 8, W, 8)``, see `kernels` and `without_blocks`.
+        ``(H, K / 16, W, 16)``, see `kernels` and `without_blocks`.
 
     Raises:
         SettingError: They do not fit on the disk (of the folder TMPDIR).

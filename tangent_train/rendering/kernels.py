@@ -4,8 +4,8 @@ A *canvas* is what images are put together on: a panorama, or a photo made of cr
 look along `rays.Rays`. An image sees a ray at its pixel (u, v) where ``(u, v, 1)`` is proportional
 to its ``(3, 3)`` matrix times the ray, if the third number is positive.
 
-Scores are interpolated eight classes at a time. Arrays of *blocks* are ``(h, B, w, 8)``: for every
-row, the scores of the first eight classes at all its pixels, then those of the next eight.
+Scores are interpolated 16 classes at a time. Arrays of *blocks* are ``(h, B, w, 16)``: for every
+row, the scores of the first 16 classes at all its pixels, then those of the next 16.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from tangent_train.rendering.compiled import njit_exact, njit_fast
 
-LANES = 8
+LANES = 16
 """Classes of a block."""
 
 _TILE = 64
@@ -114,19 +114,19 @@ def _address(context: Any, builder: Any, kind: Any, array: Any, index: Any, targ
 
 
 @intrinsic  # type: ignore[untyped-decorator]
-def _add_eight(typing: Any, sums: Any, at: Any, scores: Any, places: Any, weights: Any) -> Any:
-    """Add four weighted runs of eight numbers to a run of sums; numba's loops do it one by one."""
+def _add_block(typing: Any, sums: Any, at: Any, scores: Any, places: Any, weights: Any) -> Any:
+    """Add four weighted runs of 16 numbers to a run of sums; numba's loops do it one by one."""
 
     def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        eight = ir.VectorType(ir.FloatType(), LANES)
+        block = ir.VectorType(ir.FloatType(), LANES)
         everywhere = ir.VectorType(ir.IntType(32), LANES)([0] * LANES)
         sums, at, scores, places, weights = arguments
-        target = _address(context, builder, signature.args[0], sums, at, eight)
+        target = _address(context, builder, signature.args[0], sums, at, block)
         total = builder.load(target, align=4)
         for n in range(4):
             place, weight = (builder.extract_value(part, n) for part in (places, weights))
-            source = _address(context, builder, signature.args[2], scores, place, eight)
-            one = builder.insert_element(eight(ir.Undefined), weight, ir.IntType(32)(0))
+            source = _address(context, builder, signature.args[2], scores, place, block)
+            one = builder.insert_element(block(ir.Undefined), weight, ir.IntType(32)(0))
             factors = builder.shuffle_vector(one, one, everywhere)
             product = builder.fmul(builder.load(source, align=4), factors, flags=("contract",))
             total = builder.fadd(total, product, flags=("contract",))
@@ -134,6 +134,41 @@ def _add_eight(typing: Any, sums: Any, at: Any, scores: Any, places: Any, weight
         return context.get_dummy_value()
 
     return types.void(sums, at, scores, places, weights), build
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def _transpose(
+    typing: Any, lines: Any, at: Any, stride: Any, factors: Any, first: Any, pixels: Any, to: Any
+) -> Any:
+    """Write 16 pixels of 16 classes that come from 16 lines, one per class, times factors.
+
+    Interleaving the first with the second half of the rows of a square, log2 16 times, transposes
+    it.
+    """
+
+    def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        block = ir.VectorType(ir.FloatType(), LANES)
+
+        def place(array: int, start: int, step: Any, times: int) -> Any:
+            index = builder.add(arguments[start], builder.mul(step, step.type(times)))
+            kind = signature.args[array]
+            return _address(context, builder, kind, arguments[array], index, block)
+
+        _, _, stride, *_, to = arguments
+        factor = builder.load(place(3, 4, stride, 0), align=4)
+        rows = [builder.load(place(0, 1, stride, k), align=4) for k in range(LANES)]
+        rows = [builder.fmul(row, factor) for row in rows]
+        half = LANES // 2
+        masks = [[h + n // 2 + n % 2 * LANES for n in range(LANES)] for h in (0, half)]
+        orders = [ir.VectorType(ir.IntType(32), LANES)(mask) for mask in masks]
+        for _ in range(LANES.bit_length() - 1):
+            pairs = zip(rows[:half], rows[half:], strict=True)
+            rows = [builder.shuffle_vector(*pair, order) for pair in pairs for order in orders]
+        for k, row in enumerate(rows):
+            builder.store(row, place(5, 6, to.type(LANES), k), align=4)
+        return context.get_dummy_value()
+
+    return types.void(lines, at, stride, factors, first, pixels, to), build
 
 
 @intrinsic  # type: ignore[untyped-decorator]
@@ -333,6 +368,33 @@ def _split(n: int, side: tuple[int, int], room: _Room) -> tuple[int, int, int, i
 
 
 @njit_fast
+def _needed(n: int, corner: tuple[int, int], high: int, room: _Room) -> Array:
+    """What n pixels need of a part of an image: much less than all of it where that is tilted.
+
+    Args:
+        n: How many pixels.
+        corner: Row and column of the part in the image.
+        high: Rows of the part.
+        room: Their columns and rows.
+
+    Returns:
+        ``(high, 2)`` first column of each row, from the corner, and how many columns.
+    """
+    spans = np.zeros((high, 2), np.int64)
+    spans[:, 0] = np.iinfo(np.int32).max
+    for p in range(n):
+        span, column = spans[room.row[p] - corner[0]], room.column[p] - corner[1]
+        span[0], span[1] = min(span[0], column), max(span[1], column + 2)
+    for y in range(high - 1, 0, -1):  # a pixel needs its row and the next one
+        spans[y, 0] = min(spans[y, 0], spans[y - 1, 0])
+        spans[y, 1] = max(spans[y, 1], spans[y - 1, 1])
+    for y in range(high):
+        spans[y, 0] = min(spans[y, 0], spans[y, 1])
+        spans[y, 1] -= spans[y, 0]
+    return spans
+
+
+@njit_fast
 def _weigh(n: int, step: tuple[int, int], room: _Room, taps: _Taps) -> None:
     """Write the taps of n pixels.
 
@@ -366,26 +428,26 @@ def _exp(x: np.float32) -> np.float32:
 
 
 @njit_fast
-def _softmax_lines(lines: Array, highest: Array, factor: Array) -> None:
-    """Softmax of ``(K, n)`` scores over the first axis, in place, but for a factor.
+def _softmax_lines(
+    lines: Array, num_classes: int, count: int, highest: Array, factor: Array
+) -> None:
+    """Softmax over the classes, in place, but for a factor.
 
     Args:
-        lines: The scores, changed; NaN gets a probability of 0.
-        highest: Room for n numbers.
-        factor: ``(n,)`` factors that make the sums 1, written.
+        lines: ``(K or more, n or more)`` scores, changed; NaN gets a probability of 0.
+        num_classes: K.
+        count: Number of pixels n.
+        highest: Their highest scores.
+        factor: Factors that make the sums 1, written.
     """
-    highest[:], factor[:] = -np.inf, 0
-    count = np.uint64(lines.shape[1])
-    for k in range(len(lines)):
+    pixels = np.uint64(count)
+    factor[:count] = 0
+    for k in range(num_classes):
         line = lines[k]
-        for x in range(count):
-            highest[x] = line[x] if line[x] > highest[x] else highest[x]
-    for k in range(len(lines)):
-        line = lines[k]
-        for x in range(count):
+        for x in range(pixels):
             line[x] = _exp(line[x] - highest[x])
             factor[x] += line[x]
-    for x in range(count):
+    for x in range(pixels):
         factor[x] = _ONE / factor[x] if factor[x] > 0 else _ZERO
 
 
@@ -399,35 +461,41 @@ def _fetch_row(scores: Array, first: int, size: int, width: int) -> None:
 
 
 @njit_fast
-def _copy_patch(scores: Array, left: int, top: int, softmax: bool, patch: Array) -> None:
+def _copy_patch(
+    scores: Array, left: int, top: int, spans: Array, softmax: bool, patch: Array
+) -> None:
     """Copy a part of the ``(K, h, w)`` scores of an image to blocks.
 
     Args:
         scores: Of the image.
         left: First column of the part.
         top: First row of the part.
+        spans: What of it is copied, see `_needed`.
         softmax: Whether to copy probabilities.
-        patch: ``(height, B, width, 8)``, written.
+        patch: ``(height, B, width, 16)``, written, and perhaps a block of what follows it.
     """
     num_classes, image_height, image_width = scores.shape
     height, blocks, width, _ = patch.shape
-    count = np.uint64(width)
-    lines = np.zeros((LANES * blocks, width), np.float32)
-    highest, factor = np.ones(width, np.float32), np.ones(width, np.float32)
+    stride = -(-width // LANES) * LANES
+    lines, flat = np.zeros((LANES * blocks, stride), np.float32), patch.reshape(-1)
+    highest, factor = np.empty(width, np.float32), np.ones(stride, np.float32)
     for y in range(height):
-        ahead = (top + y + 1) * image_width + left
-        _fetch_row(scores, ahead, image_height * image_width, width)
+        first, wide = spans[y]
+        ahead = (top + y + 1) * image_width + left + first
+        _fetch_row(scores, ahead, image_height * image_width, wide)
+        highest[:wide] = -np.inf
         for k in range(num_classes):
             line, there = lines[k], scores[k, top + y]
-            for x in range(count):
-                line[x] = there[np.uint64(left) + x]
+            for x in range(np.uint64(wide)):
+                score = there[np.uint64(left + first) + x]
+                line[x] = score
+                highest[x] = score if score > highest[x] else highest[x]
         if softmax:
-            _softmax_lines(lines[:num_classes], highest, factor)
+            _softmax_lines(lines, num_classes, wide, highest, factor)
         for b in range(blocks):
-            block, pixels = lines[LANES * b : LANES * (b + 1)], patch[y, b]
-            for x in range(count):
-                for k in range(np.uint64(LANES)):
-                    pixels[x, k] = block[k, x] * factor[x]
+            pixel, line = LANES * ((y * blocks + b) * width + first), LANES * stride * b
+            for x in range(0, wide, LANES):
+                _transpose(lines.reshape(-1), line + x, stride, factor, x, flat, pixel + LANES * x)
 
 
 @njit_fast
@@ -435,10 +503,10 @@ def _add_patch(patch: Array, taps: _Taps, pixel: Array, sums: Array) -> None:
     """Add weighted bilinear samples of a patch to sums.
 
     Args:
-        patch: ``(height, B, width, 8)`` scores of a part of an image.
+        patch: ``(height, B, width, 16)`` scores of a part of an image.
         taps: Of pixels.
         pixel: ``(n,)`` where their sums are in the first block.
-        sums: ``(h, B, w, 8)``, changed.
+        sums: ``(h, B, w, 16)``, changed.
     """
     scores, flat = patch.reshape(-1), sums.reshape(-1)
     blocks, width = patch.shape[1], patch.shape[2]
@@ -448,7 +516,7 @@ def _add_patch(patch: Array, taps: _Taps, pixel: Array, sums: Array) -> None:
             a = LANES * (np.int64(taps.first[p]) + b * width)
             places = a, a + right, a + below, a + below + right
             weights = taps.a[p], taps.b[p], taps.c[p], taps.d[p]
-            _add_eight(flat, LANES * (pixel[p] + b * sums.shape[2]), scores, places, weights)
+            _add_block(flat, LANES * (pixel[p] + b * sums.shape[2]), scores, places, weights)
 
 
 @njit_fast
@@ -462,18 +530,21 @@ def _add_probabilities(
         covered: Whether an image is among those that were added.
         owner: ``(H, W)``.
         num_classes: K.
-        sums: ``(height, B, width, 8)`` scores of the tile.
-        total: ``(H, B, W, 8)``, changed.
+        sums: ``(height, B, width, 16)`` scores of the tile.
+        total: ``(H, B, W, 16)``, changed.
     """
     top, bottom, left = tile[0], tile[1], tile[2]
     blocks, width = sums.shape[1], sums.shape[2]
-    lines = np.empty((LANES * blocks, width), np.float32)
+    lines = np.zeros((LANES * blocks, width), np.float32)
     highest, factor = np.empty(width, np.float32), np.empty(width, np.float32)
     for i in range(top, bottom):
-        for b in range(blocks):
-            for k in range(LANES):
-                lines[LANES * b + k] = sums[i - top, b, :, k]
-        _softmax_lines(lines[:num_classes], highest, factor)
+        highest[:] = -np.inf
+        for k in range(num_classes):
+            line, of_class = lines[k], sums[i - top, k // LANES, :, k % LANES]
+            for x in range(width):
+                line[x] = of_class[x]
+                highest[x] = line[x] if line[x] > highest[x] else highest[x]
+        _softmax_lines(lines, num_classes, width, highest, factor)
         for x in range(width):
             if not covered[owner[i, left + x]]:
                 factor[x] = 0
@@ -502,7 +573,7 @@ def _write_classes(blocks: Array, num_classes: int, least: float, labels: Array)
     """Write classes of the largest sums of the pixels of a row: of equal ones the first, never NaN.
 
     Args:
-        blocks: ``(B, w, 8)`` sums.
+        blocks: ``(B, w, 16)`` sums.
         num_classes: K.
         least: Share of the sum of all classes that the largest must have, else the class is K.
         labels: ``(w,)``, written.
@@ -538,7 +609,7 @@ def _add_to_tile(
         room: Room for the tile's pixels.
         taps: Likewise.
         patch: Room for a part of an image.
-        sums: ``(h, B, w, 8)``, changed.
+        sums: ``(h, B, w, 16)``, changed.
 
     Returns:
         Perhaps more room for a part of an image.
@@ -557,9 +628,9 @@ def _add_to_tile(
             continue
         top, left, high, wide = _split(n, side, room)
         _weigh(n, (blocks * wide, -top * blocks * wide - left), room, taps)
-        patch = _enough(patch, high * blocks * wide * LANES)
+        patch = _enough(patch, (high * blocks * wide + LANES) * LANES)
         part = _part(patch, (high, blocks, wide, LANES))
-        _copy_patch(scores[m], left, top, softmax, part)
+        _copy_patch(scores[m], left, top, _needed(n, (top, left), high, room), softmax, part)
         _add_patch(part, taps, room.pixel[:n], sums)
     return patch
 
@@ -579,7 +650,7 @@ def add_images(
         sight: Geometry of these images and the canvas.
         softmax: Whether to add probabilities: those of owners are of the interpolated scores,
             feathered ones are interpolated.
-        total: ``(H, B, W, 8)`` sums, changed. Empty where only labels are wanted, for which all
+        total: ``(H, B, W, 16)`` sums, changed. Empty where only labels are wanted, for which all
             images of a pixel have to come at once.
         labels: ``(H, W)`` classes of the largest sums, written where `total` is empty.
     """
