@@ -137,13 +137,10 @@ def _with(row: int, column: int, value: object) -> list[list[Any]]:
     "value",
     [
         "70",
-        K[:2],
         [[70, 0, 30], [0, 72], [0, 0, 1]],
         _with(0, 0, -70),
         _with(0, 1, 2),
-        _with(0, 0, float("nan")),
         _with(0, 0, 10**400),
-        {"fx": 70, "fy": 72, "cx": 30},
         {"fx": 70, "fy": 72, "cx": 30, "cy": 20, "k1": 0.1},
     ],
 )
@@ -162,7 +159,6 @@ def test_cameras_that_are_none(two: Path, value: Any) -> None:
         (_with(1, 2, 47.6), "fx = 70, fy = 72, cx = 30.5, cy = 47.6"),
         (_with(0, 0, 2.7), "fx = 2.7, fy = 72, cx = 30.5, cy = 20"),
         (_with(1, 1, 2.0), "fx = 70, fy = 2, cx = 30.5, cy = 20"),
-        ([[1.1, 0, 0.5], [0, 1.5, 0.5], [0, 0, 1]], "fx = 1.1, fy = 1.5, cx = 0.5, cy = 0.5"),
     ],
 )
 def test_cameras_of_another_size(two: Path, value: Any, found: str) -> None:
