@@ -4,17 +4,18 @@ import hashlib
 import multiprocessing
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 import torch
-from lightning import LightningModule, Trainer
+from lightning.pytorch.plugins import HalfPrecision
 
 from datamodules.core.class_weights import class_weights
 from datamodules.core.loading import EpochSampler, sample_rng
-from datamodules.core.samples import EvaluationSample, TrainingSample
+from datamodules.core.samples import TrainingSample
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 from tangent_train.errors import SettingError
 from tangent_train.rendering import TangentRepresentation
@@ -105,26 +106,14 @@ def test_processes_share_the_panoramas(
     assert len(steps) == 1
 
 
-class _Precision(LightningModule):
-    """Keeps the types of the images that it is given."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.seen: set[torch.dtype] = set()
-
-    def test_step(self, batch: EvaluationSample[torch.Tensor], batch_idx: int) -> None:
-        self.seen.add(batch.images.dtype)
-
-
-@pytest.mark.filterwarnings("ignore:.*does not have many workers")
-@pytest.mark.filterwarnings("ignore:GPU available but not used")
-def test_images_have_the_precision_of_the_run(make_module: MakeModule, tmp_path: Path) -> None:
-    task = _Precision()
-    trainer = Trainer(
-        precision="bf16-true", accelerator="cpu", default_root_dir=tmp_path, logger=False
-    )
-    trainer.test(task, datamodule=make_module(), verbose=False)
-    assert task.seen == {torch.bfloat16}
+def test_images_have_the_precision_of_the_run(
+    make_module: MakeModule, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module = make_module()
+    batch = next(iter(module.test_dataloader()))
+    run = SimpleNamespace(precision_plugin=HalfPrecision("bf16-true"))
+    monkeypatch.setattr(module, "trainer", run)
+    assert module.on_after_batch_transfer(batch, 0).images.dtype == torch.bfloat16
 
 
 COUNTS = np.array([4_000_000, 1_000_000, 900_000, 50_000, 0, 300])

@@ -77,10 +77,9 @@ def test_the_nearest_camera_counts(tmp_path: Path) -> None:
     write_classes(tmp_path)
     for seed, name in enumerate(("a/b/one", "a/b/two", "a/three", "four", "five")):
         write_photo(tmp_path, f"{name}.png", seed, (48, 72), film_mm=30)
-    cameras = {"a/b/one": 80, "a/b/": 90, "./a": 100}
-    write_cameras(
-        tmp_path, {name: {"fx": f, "fy": f + 1, "cx": 9, "cy": 8} for name, f in cameras.items()}
-    )
+    focal = {"a/b/one": 80, "a/b/": 90, "./a": 100}
+    cameras = {name: {"fx": f, "fy": f + 1, "cx": 9, "cy": 8} for name, f in focal.items()}
+    write_cameras(tmp_path, cameras)
     (tmp_path / "train.txt").write_text("five")
 
     def focal_lengths(**settings: Any) -> list[float]:
@@ -93,11 +92,8 @@ def test_the_nearest_camera_counts(tmp_path: Path) -> None:
 
     assert focal_lengths() == pytest.approx([80, 90, 100, 72 * 30 / 36])
     assert focal_lengths(fov=60) == pytest.approx([80, 90, 100, 36 / math.tan(math.pi / 6)])
-    for everything in ("", "."):
-        same = dict.fromkeys(("fx", "fy"), 110) | {"cx": 0, "cy": 0}
-        own = {n: {"fx": f, "fy": f + 1, "cx": 9, "cy": 8} for n, f in cameras.items()}
-        write_cameras(tmp_path, own | {everything: same})
-        assert focal_lengths(fov=60) == [80, 90, 100, 110]
+    write_cameras(tmp_path, cameras | {"": {"fx": 110, "fy": 110, "cx": 0, "cy": 0}})
+    assert focal_lengths(fov=60) == [80, 90, 100, 110]
 
 
 def test_a_camera_is_that_of_the_photo_as_displayed(tmp_path: Path) -> None:
@@ -137,9 +133,11 @@ def _with(row: int, column: int, value: object) -> list[list[Any]]:
     "value",
     [
         "70",
+        K[:2],
         [[70, 0, 30], [0, 72], [0, 0, 1]],
         _with(0, 0, -70),
         _with(0, 1, 2),
+        _with(0, 0, float("nan")),
         _with(0, 0, 10**400),
         {"fx": 70, "fy": 72, "cx": 30, "cy": 20, "k1": 0.1},
     ],
