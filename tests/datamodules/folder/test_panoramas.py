@@ -9,7 +9,6 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from datamodules.core.found import Split
 from datamodules.core.inputs import RGBD_NORMALIZATION, Normalization
 from datamodules.folder.labelled import FolderPanoramas
 from tangent_train.errors import DataError, SettingError
@@ -25,14 +24,12 @@ from tests.datamodules.folder.folder_format import (
 # Pixels
 
 
-@pytest.mark.parametrize("split", ["train", "test"])
-def test_pixels_are_those_of_the_files(root: Path, erp: Any, split: Split) -> None:
+def test_pixels_are_those_of_the_files(root: Path, erp: Any) -> None:
     module = FolderPanoramas(root, erp, inputs=["rgb", "depth"], depth_units_per_m=2000)
-    source = module.source(split)
+    source = module.source("train")
     classes = np.zeros(256, np.uint8)
     classes[list(CLASS_OF_STORED)] = list(CLASS_OF_STORED.values())
     assert module.class_names == ("unknown", *NAMES)
-    assert len(source) >= 1
     for index in range(len(source)):
         name = source.name(index)
         panorama = source.read(index)

@@ -44,10 +44,10 @@ def _found(root: Path, **settings: Any) -> list[tuple[str, str, str]]:
 
 @pytest.fixture
 def two(tmp_path: Path) -> Path:
-    """Two photos of 48×64 without EXIF data, one of them for test."""
+    """Two photos of 48×64 without a focal length (0 is unknown), one of them for test."""
     write_classes(tmp_path)
     write_photo(tmp_path, "hall/a.png", 0, film_mm=None)
-    write_photo(tmp_path, "hall/b.png", 1, film_mm=None)
+    write_photo(tmp_path, "hall/b.png", 1, film_mm=0)
     (tmp_path / "test.txt").write_text("hall/a")
     return tmp_path
 
@@ -100,8 +100,10 @@ def test_a_camera_is_that_of_the_photo_as_displayed(tmp_path: Path) -> None:
     write_classes(tmp_path)
     write_photo(tmp_path, "a.jpg", 0, (60, 40), film_mm=36, orientation=6)
     write_photo(tmp_path, "b.jpg", 0)
-    # Film upright is 24 mm wide.
+    # Film upright is 24 mm wide; other shapes have its diagonal.
     assert _only(tmp_path, "a").camera_matrix[0, 0] == pytest.approx(40 * 36 / 24)
+    focal = _only(tmp_path, "b").camera_matrix[0, 0]
+    assert focal / 80 == pytest.approx(24 / math.hypot(36, 24))
     write_cameras(tmp_path, {"a": [[80, 0, 5], [0, 80, 55], [0, 0, 1]]})
     assert _only(tmp_path, "a").camera_matrix.tolist() == [[80, 0, 5], [0, 80, 55], [0, 0, 1]]
     write_cameras(tmp_path, {"a": [[80, 0, 55], [0, 80, 5], [0, 0, 1]]})

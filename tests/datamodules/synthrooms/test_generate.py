@@ -37,13 +37,6 @@ def test_rooms_have_as_many_cameras_as_wanted_and_are_the_same_rooms() -> None:
         assert other.cameras[: len(one.cameras)] == one.cameras
 
 
-def test_rooms_come_in_the_order_of_the_areas() -> None:
-    settings = RoomSettings(rooms={"area_5b": 0, "1": 2})
-    assert list(settings.rooms.items()) == [("1", 2), ("5b", 0)]
-    assert settings.areas == ["1"]
-    assert sum(RoomSettings().rooms.values()) == 232
-
-
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
