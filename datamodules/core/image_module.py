@@ -117,7 +117,7 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
 
     def training_samples(self) -> TrainingImages:
         """Samples `TrainingSample`."""
-        source, seed = self.source("train"), self.drawn_from
+        source, seed = self.source("train"), (self.seed, self.stream)
         return TrainingImages(source, self.representation, seed, self.inputs, self.color_jitter)
 
     def evaluation_samples(self, split: Split) -> EvaluationImages:
