@@ -26,11 +26,11 @@ from datamodules.core.panoramas import Panorama, Photo, Turn
 from datamodules.core.pipeline import (
     EstimatedUp,
     PanoramaJudge,
-    PosedUp,
     RotatedPanoramas,
     SplitItems,
     Transform,
     masked,
+    posed,
 )
 from datamodules.core.problems import Problems
 from datamodules.core.progress import show_progress
@@ -117,7 +117,7 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
 
     def training_samples(self) -> TrainingImages:
         """Samples `TrainingSample`."""
-        source, seed = self.source("train"), self.drawn_from
+        source, seed = self.source("train"), (self.seed, self.stream)
         return TrainingImages(source, self.representation, seed, self.inputs, self.color_jitter)
 
     def evaluation_samples(self, split: Split) -> EvaluationImages:
@@ -211,7 +211,7 @@ class PanoramaDataModule(ImageDataModule):
         if self.mask is not None:
             transforms.append(partial(masked, self._masks))
         if self.upright is not None:
-            transforms.append(PosedUp())
+            transforms.append(posed)
         if split == "test" and self.test_rotation is not None:
             known = self.upright == "pose"
             transforms.append(RotatedPanoramas(self.test_rotation, self.seed, known=known))

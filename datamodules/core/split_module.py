@@ -362,11 +362,6 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
         return int(getattr(self, self._per_step))
 
     @property
-    def drawn_from(self) -> tuple[int, int]:
-        """Seed and stream."""
-        return self.seed, self.stream
-
-    @property
     def _per_step(self) -> str:
         return f"{self.noun}_per_step"
 
@@ -458,7 +453,8 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
                 f"out of each epoch: {world_size} processes take as many each.",
                 category=UserWarning,
             )
-        sampler = EpochSampler(count, self.drawn_from, shuffle, rank, world_size, start)
+        seed = self.seed, self.stream
+        sampler = EpochSampler(count, seed, shuffle, rank, world_size, start)
         return make_loader(dataset, sampler, batch_size, self.num_workers, self.seed)
 
 

@@ -108,8 +108,8 @@ class ModelNet40(SplitDataModule[ShapeFile]):
 
     def training_samples(self) -> ShapeViews:
         """Samples `ShapeSample`: random views, drawn and rotated as the representation says."""
-        source, labels = self.source("train"), self._labels
-        return ShapeViews(source, labels, self.representation, self.drawn_from, random=True)
+        source, seed = self.source("train"), (self.seed, self.stream)
+        return ShapeViews(source, self._labels, self.representation, seed, random=True)
 
     def evaluation_samples(self, split: Split) -> ShapeViews:
         """Samples `ShapeSample` of all views; those of the test split are rotated if set."""

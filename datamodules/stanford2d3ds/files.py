@@ -26,20 +26,17 @@ GET_IT = (
 """Remedy if the data set is missing."""
 
 _NAME = re.compile(
-    r"camera_([0-9a-f]{32})_([A-Za-z]+)_(\d+)_frame_(equirectangular|\d+)"
-    r"_domain_([a-z]+(?:_[a-z]+)*)(\.\w+)"
+    r"camera_([0-9a-f]{32})_([A-Za-z]+)_(\d+)_frame_(equirectangular|\d+)_domain_rgb\.png"
 )
 
 
 class FileName(NamedTuple):
-    """The parts of a file's name; panoramas have the frame `equirectangular`."""
+    """The parts of the name of an image; panoramas have the frame `equirectangular`."""
 
     camera: str
     room: str
     room_number: int
     frame: str
-    domain: str
-    suffix: str
 
     @classmethod
     def parse(cls, name: str) -> FileName:
@@ -49,10 +46,10 @@ class FileName(NamedTuple):
             name: The name without folders.
 
         Raises:
-            DataError: It is not a file name of the data set.
+            DataError: It is not the name of an image of the data set.
 
         >>> FileName.parse(f"camera_{'0f' * 16}_office_7_frame_3_domain_rgb.png")[1:]
-        ('office', 7, '3', 'rgb', '.png')
+        ('office', 7, '3')
         """
         match = _NAME.fullmatch(name)
         if match is None:
@@ -60,17 +57,11 @@ class FileName(NamedTuple):
                 name,
                 found="an unknown file name",
                 expected="camera_<32 hex>_<room>_<n>_frame_<equirectangular or number>"
-                "_domain_<kind>.<ending>",
+                "_domain_rgb.png",
                 remedy="Move files that are not of the data set elsewhere.",
             )
-        camera, room, number, frame, domain, suffix = match.groups()
-        return cls(camera, room, int(number), frame, domain, suffix)
-
-    def __str__(self) -> str:
-        return (
-            f"camera_{self.camera}_{self.room}_{self.room_number}"
-            f"_frame_{self.frame}_domain_{self.domain}{self.suffix}"
-        )
+        camera, room, number, frame = match.groups()
+        return cls(camera, room, int(number), frame)
 
 
 class PictureFiles(NamedTuple):
@@ -78,7 +69,7 @@ class PictureFiles(NamedTuple):
 
     Attributes:
         area: One of `AREAS`.
-        name: Of its colours.
+        name: Its name.
         image: Its files, named ``area_3/office_2/<32 hex>``; of photos with the frame.
         pose: Its camera and pose.
     """
@@ -127,8 +118,8 @@ def list_pictures(
         with problems.noted(str(rgb), rgb):
             name = FileName.parse(rgb.name)
             semantic, depth, pose = (
-                folder / domain / str(name._replace(domain=domain, suffix=suffix))
-                for domain, suffix in (("semantic", ".png"), ("depth", ".png"), ("pose", ".json"))
+                folder / kind.partition(".")[0] / (rgb.name.removesuffix("rgb.png") + kind)
+                for kind in ("semantic.png", "depth.png", "pose.json")
             )
             image = ImageFiles(
                 f"area_{area}/{name.room}_{name.room_number}/{name.camera}", rgb, semantic

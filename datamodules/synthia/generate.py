@@ -71,6 +71,9 @@ class ViewStitcher:
         camera_matrix: ``(3, 3)`` K of all views, integer pixel centres, without skew.
         size: Rows and columns of all views.
         height: Rows of the panorama, which is twice as wide.
+
+    Attributes:
+        camera_matrix: As given.
     """
 
     def __init__(
@@ -90,34 +93,21 @@ class ViewStitcher:
             "bilinear": cv2.convertMaps(map_x, map_y, cv2.CV_16SC2),
             "nearest": cv2.convertMaps(map_x, map_y, cv2.CV_16SC2, nninterpolation=True),
         }
-        self._camera_matrix = camera_matrix
+        self.camera_matrix = camera_matrix
 
-    def rgb(self, views: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
-        """Panorama ``(H, W, 3)`` of colour images in the order of `VIEWS`, bilinear; else black."""
-        return self._stitch(views, "bilinear", 0)
-
-    def labels(self, views: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
-        """Panorama ``(H, W)`` of labels, nearest; `INVALID` outside the views."""
-        return self._stitch(views, "nearest", INVALID)
-
-    def depth(self, views: Sequence[NDArray[np.uint16]]) -> NDArray[np.uint16]:
-        """Panorama ``(H, W)`` of distances from the centre, nearest; 0 where there is none.
-
-        Args:
-            views: Depth along the optical axes.
-
-        Returns:
-            In the same unit, rounded, at most 65535.
-        """
-        far = [distance_from_z_depth(view, self._camera_matrix) for view in views]
-        return self._stitch(far, "nearest", 0)
-
-    def _stitch(
+    def stitch(
         self,
         views: Sequence[NDArray[Any]],
         interpolation: Literal["bilinear", "nearest"],
-        elsewhere: int,
+        elsewhere: int = 0,
     ) -> NDArray[Any]:
+        """Panorama ``(H, W[, C])`` of images in the order of `VIEWS`.
+
+        Args:
+            views: The images.
+            interpolation: Of colours; labels and distances are not to be mixed.
+            elsewhere: Value outside the views.
+        """
         return cv2.remap(
             np.concatenate(views),
             *self._tables[interpolation],
@@ -243,10 +233,12 @@ def _make(
     stitcher: ViewStitcher, views: Sequence[ImageFiles], target: ImageFiles, problems: Problems
 ) -> None:
     with problems.noted(target.name):
-        rgb = stitcher.rgb([read_color_png(view.rgb) for view in views])
+        depth = [read_first_channel(view.parts["depth"]) for view in views]
+        far = [distance_from_z_depth(one, stitcher.camera_matrix) for one in depth]
+        rgb = stitcher.stitch([read_color_png(view.rgb) for view in views], "bilinear")
         parts = {
-            "depth": stitcher.depth([read_first_channel(view.parts["depth"]) for view in views]),
-            "labels": stitcher.labels([read_ids(view.labels) for view in views]),
+            "depth": stitcher.stitch(far, "nearest"),
+            "labels": stitcher.stitch([read_ids(v.labels) for v in views], "nearest", INVALID),
             # The last one: panoramas are those that have this file.
             "rgb": cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR),
         }

@@ -38,7 +38,7 @@ class SegmentationTask(Task):
         class_names: K + 1 names of the labels, the unknown class first.
         *arguments: Optimizer and scheduler, see `Task`.
         class_weights: Weights of the loss: a name that the data module knows (``none``, ``log``,
-            ``sqrt``, ``effective``) or K numbers.
+            ``sqrt``) or K numbers.
         auxiliary_weight: Weight of the loss of the scores under ``"aux"``.
         images_per_forward: Images per forward pass in evaluation, which bounds memory.
         absent_class: Treatment of classes absent from the ground truth in the means.

@@ -100,8 +100,7 @@ def test_a_mask_is_a_latitude_in_a_file_and_a_path_of_ones_own(
     assert (mask, source.owns("data.mask")) == ("pole.png", False)
     with pytest.raises(SettingError, match=r"data\.mask: found none.*had data\.mask='pole\.png'"):
         masked("pole.png")
-    mask, source = masked("/theirs/pole.png", "data.mask=pole.png")
-    assert (mask, source.owns("data.mask")) == ("pole.png", False)
+
     settings, source = settled(with_config(content, tmp_path))
     settings["data"] |= {"mask": "pole.png"}
     with pytest.raises(DataError, match=r"data\.mask='pole\.png'; expected .*float"):

@@ -32,13 +32,6 @@ def test_the_pairs_of_a_folder(folder: Path) -> None:
     assert every.names == ["a – b", "a – e", "b – e"]
 
 
-def test_namesakes_are_told_apart(tmp_path: Path) -> None:
-    for name in ("one/room.png", "two/room.png"):
-        _write(tmp_path / name, 0)
-    pattern = str(tmp_path / "*" / "room.png")
-    assert ImagePairs(input=pattern).names == ["one/room – two/room"]
-
-
 @pytest.mark.parametrize(
     ("settings", "message"),
     [

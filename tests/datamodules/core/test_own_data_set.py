@@ -82,9 +82,7 @@ def test_the_first_class_is_the_unknown_one(
 ) -> None:
     _write(tmp_path, 2)
     data = _toy(tmp_path)
-    monkeypatch.delattr(Toy, "class_names")
-    if names:
-        monkeypatch.setattr(Toy, "class_names", names, raising=False)
+    monkeypatch.setattr(Toy, "class_names", names)
     with pytest.raises(SettingError, match=f"class_names of Toy: found {found}; expected unknown"):
         data.prepare_data()
 

@@ -58,23 +58,13 @@ def _nearest_valid(depth: NDArray[np.uint16], shape: tuple[int, int]) -> NDArray
 
 
 @pytest.mark.parametrize("shape", [(12, 24), (4, 8), (3, 6), (5, 10)])
-def test_depth_is_that_of_a_near_valid_pixel(shape: tuple[int, int]) -> None:
+def test_depth_is_that_of_the_nearest_valid_pixel(shape: tuple[int, int]) -> None:
     rng = np.random.default_rng(3)
     depth = rng.integers(1, 2000, (12, 24), np.uint16)
     depth[rng.random(depth.shape) < 0.7] = 0
     small, reference = resize_depth(depth, shape), _nearest_valid(depth, shape)
     assert small.dtype == np.uint16
-    np.testing.assert_array_equal(small == 0, reference == 0)
-    valid = resize_nearest(depth, shape) > 0
-    np.testing.assert_array_equal(small[valid], reference[valid])
-    assert set(small.ravel().tolist()) <= set(depth.ravel().tolist())
-
-
-def test_depth_takes_the_nearest_of_the_valid_ones() -> None:
-    depth = np.zeros((5, 10), np.uint16)
-    depth[0, 0], depth[2, 1], depth[4, 4] = 10, 20, 30
-    depth[4, 9] = 40
-    assert resize_depth(depth, (1, 2)).tolist() == [[20, 40]]
+    np.testing.assert_array_equal(small, reference)
 
 
 # --- masks -------------------------------------------------------------------------------------

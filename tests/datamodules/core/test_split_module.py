@@ -4,17 +4,18 @@ import hashlib
 import multiprocessing
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 import torch
-from lightning import LightningModule, Trainer
+from lightning.pytorch.plugins import HalfPrecision
 
 from datamodules.core.class_weights import class_weights
 from datamodules.core.loading import EpochSampler, sample_rng
-from datamodules.core.samples import EvaluationSample, TrainingSample
+from datamodules.core.samples import TrainingSample
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 from tangent_train.errors import SettingError
 from tangent_train.rendering import TangentRepresentation
@@ -74,7 +75,9 @@ def test_workers_start_after_opencv_has_used_threads(make_module: MakeModule) ->
     assert not stuck
 
 
-def test_rotated_panoramas_are_seen_upright_where_up_is_known(make_module: MakeModule) -> None:
+def test_rotated_panoramas_are_seen_upright_where_up_is_known(
+    make_module: MakeModule, monkeypatch: pytest.MonkeyPatch
+) -> None:
     rotated, known = make_module(test_rotation=30), make_module(test_rotation=30, upright="pose")
     panorama, aware = rotated.source("test").read(0), known.source("test").read(0)
     np.testing.assert_array_equal(panorama.rgb, aware.rgb)
@@ -87,6 +90,12 @@ def test_rotated_panoramas_are_seen_upright_where_up_is_known(make_module: MakeM
     np.testing.assert_allclose(rotation @ [0, 0, 1], aware.up, atol=1e-12)
     for split in ("train", "val"):
         assert known.source(split).read(0).up is None
+    tagged = np.array([0.6, 0, 0.8])
+    monkeypatch.setattr("datamodules.core.pipeline.tagged_up", lambda path: tagged)
+    np.testing.assert_array_equal(known.source("train").read(0).up, tagged)
+    turned = known.source("test").read(0).up
+    assert turned is not None
+    assert aware.up @ turned == pytest.approx(0.8)
 
 
 def test_processes_share_the_panoramas(
@@ -105,44 +114,29 @@ def test_processes_share_the_panoramas(
     assert len(steps) == 1
 
 
-class _Precision(LightningModule):
-    """Keeps the types of the images that it is given."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.seen: set[torch.dtype] = set()
-
-    def test_step(self, batch: EvaluationSample[torch.Tensor], batch_idx: int) -> None:
-        self.seen.add(batch.images.dtype)
-
-
-@pytest.mark.filterwarnings("ignore:.*does not have many workers")
-@pytest.mark.filterwarnings("ignore:GPU available but not used")
-def test_images_have_the_precision_of_the_run(make_module: MakeModule, tmp_path: Path) -> None:
-    task = _Precision()
-    trainer = Trainer(
-        precision="bf16-true", accelerator="cpu", default_root_dir=tmp_path, logger=False
-    )
-    trainer.test(task, datamodule=make_module(), verbose=False)
-    assert task.seen == {torch.bfloat16}
+def test_images_have_the_precision_of_the_run(
+    make_module: MakeModule, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module = make_module()
+    batch = next(iter(module.test_dataloader()))
+    run = SimpleNamespace(precision_plugin=HalfPrecision("bf16-true"))
+    monkeypatch.setattr(module, "trainer", run)
+    assert module.on_after_batch_transfer(batch, 0).images.dtype == torch.bfloat16
 
 
 COUNTS = np.array([4_000_000, 1_000_000, 900_000, 50_000, 0, 300])
 
 
-def test_effective_weights_are_those_of_cui_for_the_mean_count() -> None:
-    seen = COUNTS > 0
-    counts = COUNTS[seen].astype(np.float64)
-    beta = 1 - 1 / counts.mean()
-    expected = (1 - beta) / (1 - beta**counts)
-    weights = class_weights(COUNTS, "effective")
-    found = weights[torch.from_numpy(seen)].numpy()
-    np.testing.assert_allclose(found, expected / expected.mean(), rtol=1e-5)
-    assert weights[4] == 0
-    assert weights.dtype == torch.float32
+def test_weights_are_those_of_the_formulas() -> None:
+    shares = COUNTS[COUNTS > 0] / 5_950_300
+    root = shares**-0.5
+    for kind, expected in (("log", 1 / np.log(1.02 + shares)), ("sqrt", root / root.mean())):
+        weights = class_weights(COUNTS, kind)  # type: ignore[arg-type]
+        np.testing.assert_allclose(weights, np.insert(expected, 4, 0), rtol=1e-6)
+        assert weights.dtype == torch.float32
 
 
-@pytest.mark.parametrize("kind", ["log", "sqrt", "effective", "none"])
+@pytest.mark.parametrize("kind", ["log", "sqrt", "none"])
 def test_only_the_shares_count_and_weights_are_finite(kind: str) -> None:
     once = class_weights(COUNTS, kind)  # type: ignore[arg-type]
     torch.testing.assert_close(once, class_weights(COUNTS * 1000, kind))  # type: ignore[arg-type]

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import json
 import os
 from collections import namedtuple
 from collections.abc import Callable
@@ -80,16 +79,6 @@ def test_what_is_written_is_mapped(source: Path, store: Path) -> None:
         assert not found[name].flags.owndata
         np.testing.assert_array_equal(found[name], array)
         np.testing.assert_array_equal(record[name], array, err_msg="NumPy reads it alone")
-    line = (store / "room" / "küche 1.npy").read_bytes().rpartition(b"\n")[2]
-    assert json.loads(line) == {
-        "rgb": f"image.png (3 bytes of {source.stat().st_mtime_ns} ns)",
-    }
-
-
-def _flip(path: Path) -> None:
-    content = bytearray(path.read_bytes())
-    content[0] ^= 1
-    path.write_bytes(content)
 
 
 def _objects(path: Path) -> None:
@@ -100,12 +89,9 @@ def _objects(path: Path) -> None:
     "damage",
     [
         lambda path: path.unlink(),
-        lambda path: path.write_bytes(b""),
         lambda path: path.write_bytes(path.read_bytes()[:-5]),
-        lambda path: path.write_bytes(path.read_bytes().rpartition(b"\n")[0]),
         lambda path: path.write_bytes(path.read_bytes().rpartition(b"\n")[0] + b"\n[]"),
         lambda path: np.save(path, np.zeros(3)),
-        _flip,
         _objects,
     ],
 )
@@ -121,18 +107,13 @@ def test_damage_is_found_on_opening(
         one.read("a", {"rgb": source})
 
 
-@pytest.mark.parametrize("change", ["time", "size", "name"])
-def test_a_changed_source_is_noticed(source: Path, store: Path, change: str) -> None:
+@pytest.mark.parametrize(("size", "seconds"), [(3, -1), (4, 0)])
+def test_a_changed_source_is_noticed(source: Path, store: Path, size: int, seconds: int) -> None:
     one = Store(store)
     one.make("a", {"rgb": source}, lambda: {"rgb": np.arange(5)})
     time = source.stat().st_mtime_ns
-    if change == "time":  # older, as by cp -p
-        os.utime(source, ns=(0, time - 10**9))
-    elif change == "size":
-        source.write_bytes(b"abcd")
-        os.utime(source, ns=(0, time))
-    else:
-        source = source.rename(source.with_name("other.png"))
+    source.write_bytes(b"x" * size)
+    os.utime(source, ns=(0, time + seconds * 10**9))  # also older, as by cp -p
     with pytest.raises(DataError, match=r"found rgb made from image\.png \(3 bytes"):
         one.read("a", {"rgb": source})
 
@@ -162,20 +143,12 @@ def test_samples_and_class_weights_are_those_without_a_store(
     assert torch.equal(prepared.class_weights("log"), plain.class_weights("log"))
 
 
-def test_parts_make_the_whole_store_and_each_makes_only_what_is_missing_of_it(
-    make_module: MakeModule, store: Path, tmp_path: Path
-) -> None:
+def test_parts_make_the_whole_store(make_module: MakeModule, store: Path, tmp_path: Path) -> None:
     make_module().prepare_data()
     other = tmp_path / "in parts"
     parts = [Shard(number, 3).part for number in (1, 2, 3)]
     assert [make_module(store=other).prepare_part(part) for part in parts] == [3, 3, 2]
     assert contents(other) == contents(store)
-    before = _times(other)
-    lost = sorted(before)[:2]
-    for path in lost:
-        path.unlink()
-    made = [_made(other, before) for part in parts if make_module(store=other).prepare_part(part)]
-    assert made[-1] == set(lost)
     with pytest.raises(SettingError, match=r"data\.store: found none, with shard="):
         make_module(store=None).prepare_part(parts[0])
 

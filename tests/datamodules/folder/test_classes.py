@@ -29,18 +29,6 @@ def test_forms_of_classes(tmp_path: Path) -> None:
     assert colors.decode(stored[None]).tolist() == [[1, 2, 1, 0]]
 
 
-def test_colors_are_compared_exactly_with_a_slow_reading(tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    table = rng.choice(1 << 24, 255, replace=False)
-    content = {f"c{place}": f"#{code:06x}" for place, code in enumerate(table)}
-    classes = read_classes(_write_json(tmp_path, json.dumps(content)))
-    codes = np.concatenate([table, table + 1, table - 1, rng.integers(0, 1 << 24, 1000)])
-    codes = codes.clip(0, (1 << 24) - 1)
-    stored = np.stack([codes >> 16, codes >> 8 & 255, codes & 255], -1).astype(np.uint8)[None]
-    places = {int(code): place + 1 for place, code in enumerate(table)}
-    assert classes.decode(stored)[0].tolist() == [places.get(int(code), 0) for code in codes]
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [

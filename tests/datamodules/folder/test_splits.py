@@ -23,28 +23,20 @@ def _together(names: dict[str, list[str]]) -> list[str]:
     return sorted(found)
 
 
-def test_whole_scenes_are_drawn(root: Path, erp: Any) -> None:
-    chosen: dict[str, str] = {}
-    for split, names in _all_names(FolderPanoramas(root, erp)).items():
-        for name in names:
-            assert chosen.setdefault(name.partition("/")[0], split) == split
-    splits = list(chosen.values())
-    assert len(chosen) == 6
-    assert (splits.count("test"), splits.count("val"), splits.count("train")) == (1, 1, 4)
-
-
-def test_shares_and_seeds_of_the_drawing(tmp_path: Path, erp: Any) -> None:
-    root = write_data_set(tmp_path, scenes=20, each=1, height=16)
+def test_whole_scenes_are_drawn_by_share_and_seed(tmp_path: Path, erp: Any) -> None:
+    root = write_data_set(tmp_path, scenes=20, each=2, height=16)
     names = _all_names(FolderPanoramas(root, erp, seed=5))
-    assert [len(names[split]) for split in SPLITS] == [14, 2, 4]
-    assert len(_together(names)) == 20
+    scenes = {split: {name.partition("/")[0] for name in names[split]} for split in SPLITS}
+    assert [len(scenes[split]) for split in SPLITS] == [14, 2, 4]
+    assert [len(names[split]) for split in SPLITS] == [28, 4, 8]
+    assert len(_together(names)) == 40
     assert _all_names(FolderPanoramas(root, erp, seed=6)) == names, "not the run's seed"
     other = _all_names(FolderPanoramas(root, erp, split_seed=1))
     assert other["test"] != names["test"]
     assert other["val"] != names["val"]
     settings: dict[str, Any] = {"test_fraction": 0.5, "validation_fraction": 0}
     half = _all_names(FolderPanoramas(root, erp, **settings))
-    assert [len(half[split]) for split in SPLITS] == [10, 0, 10]
+    assert [len(half[split]) for split in SPLITS] == [20, 0, 20]
     assert FolderPanoramas(root, erp, **settings).val_dataloader() == []
 
 

@@ -16,7 +16,7 @@ from datamodules.images.masks import Masks
 from datamodules.images.pixel_files import write_pixels
 from tangent_train.errors import DataError, SettingError
 from tangent_train.geometry import equirect_directions
-from tangent_train.rendering import EquirectRepresentation
+from tangent_train.rendering import EquirectRepresentation, rotate_equirect
 from tests.datamodules.data_files import names_of
 from tests.datamodules.folder.folder_format import CLASS_OF_STORED, write_data_set
 
@@ -53,14 +53,10 @@ def test_every_panorama_has_its_own(tmp_path: Path) -> None:
     for seed, name in enumerate(("a", "kitchen/a")):
         write_pixels(tmp_path / f"{name}.png", spotted(32, seed))
     masks = Masks(tmp_path)
-    for _ in range(2):
-        for seed, name in enumerate(("a", "kitchen/a")):
-            masks.check(name)
-            found = masks.read(name, WHOLE)
-            np.testing.assert_array_equal(found, np.where(spotted(32, seed), 255, 0))
-    for use in (masks.check, lambda name: masks.read(name, WHOLE)):
-        with pytest.raises(DataError, match=r"b\.png: found no such file; expected a mask as PNG"):
-            use("b")
+    for seed, name in enumerate(("a", "kitchen/a")):
+        masks.check(name)
+        found = masks.read(name, WHOLE)
+        np.testing.assert_array_equal(found, np.where(spotted(32, seed), 255, 0))
     write_pixels(tmp_path / "square.png", np.ones((20, 20), np.uint8))
     for use in (masks.check, lambda name: masks.read(name, WHOLE)):
         with pytest.raises(DataError, match=r"square\.png: found 20×20.*twice as wide as high"):
@@ -110,7 +106,6 @@ def test_files_that_are_no_masks(tmp_path: Path) -> None:
 # --- data.mask ------------------------------------------------------------------------------------
 
 
-SHAPE = (32, 64)
 ERP: Any = EquirectRepresentation(level=4)
 BELOW = 90 - (np.arange(32) + 0.5) * 180 / 32 < -30
 """Rows."""
@@ -158,17 +153,9 @@ def test_the_mask_rotates_with_the_panorama(root: Path, tmp_path: Path) -> None:
     settings: Any = {"test_rotation": "so3", "seed": 3}
     masked = FolderPanoramas(root, ERP, mask=tmp_path / "mask.png", **settings)
     for index, name in enumerate(names_of(masked, "test")):
-        expected = np.where(patches[1::2, 1::2], stored_labels(root, name), 0)
-        # The output direction d shows the input at Rᵀd.
-        rotation = RotatedPanoramas("so3", 3).rotation(index)
-        x, y, z = np.moveaxis(equirect_directions(SHAPE) @ rotation, -1, 0)
-        rows = (0.5 - np.arcsin(np.clip(z, -1, 1)) / np.pi) * 32
-        columns = (np.arctan2(y, x) / np.pi + 1) * 32
-        expected = expected[rows.astype(int).clip(0, 31), columns.astype(int) % 64]
-        clear = np.minimum(abs(rows - rows.round()), abs(columns - columns.round())) > 1e-6
-        found = masked.source("test").read(index).labels
-        np.testing.assert_array_equal(found[clear], expected[clear])
-        assert clear.mean() > 0.99
+        labels = np.where(patches[1::2, 1::2], stored_labels(root, name), 0).astype(np.uint8)
+        expected = rotate_equirect(labels, RotatedPanoramas("so3", 3).rotation(index), "nearest")
+        np.testing.assert_array_equal(masked.source("test").read(index).labels, expected)
 
 
 def test_missing_masks_are_listed_before_training(root: Path, tmp_path: Path) -> None:

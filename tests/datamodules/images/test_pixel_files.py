@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Any
 
@@ -73,7 +72,6 @@ def test_what_is_written_is_read(
     [
         (".bmp", np.uint8, 3, r"\.bmp files: found"),
         (".png", np.float32, 1, r"float32 pixels of 1 channel; expected .*\.tif.*\.npy"),
-        (".jpg", np.uint16, 3, r"uint16 pixels of 3 channels; expected .*\.png"),
         (".png", np.uint8, 2, r"expected .*\.npy"),
     ],
 )
@@ -125,15 +123,11 @@ def test_grey_palette_and_transparency(tmp_path: Path) -> None:
         np.testing.assert_array_equal(read_rgb(tmp_path / f"{name}.png"), pixels, err_msg=name)
 
 
-def _save_oriented(path: Path, orientation: int) -> None:
-    exif = Image.Exif()
-    exif[ExifTags.Base.Orientation] = orientation
-    Image.fromarray(_smooth(24, 41)).save(path, exif=exif, lossless=True)
-
-
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_jpeg_gives_the_upright_pixels_of_another_decoder(tmp_path: Path, orientation: int) -> None:
-    _save_oriented(tmp_path / "image.jpg", orientation)
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = orientation
+    Image.fromarray(_smooth(24, 41)).save(tmp_path / "image.jpg", exif=exif)
     expected = cv2.imread(str(tmp_path / "image.jpg"))
     assert expected is not None
     np.testing.assert_array_equal(read_rgb(tmp_path / "image.jpg"), expected[..., ::-1])
@@ -154,30 +148,6 @@ def test_files_that_are_no_images(tmp_path: Path, read: Any) -> None:
     ]:
         with pytest.raises(DataError, match=rf"{name}: found .*{found}"):
             read(tmp_path / name)
-
-
-# Field of view
-
-
-def _photo(path: Path, size: tuple[int, int], film_mm: Any, orientation: int = 1) -> Path:
-    exif = Image.Exif()
-    exif[ExifTags.Base.Orientation] = orientation
-    exif[ExifTags.IFD.Exif] = {ExifTags.Base.FocalLengthIn35mmFilm: film_mm}
-    Image.new("RGB", size).save(path, exif=exif)
-    return path
-
-
-def test_field_of_view_of_other_shapes_has_the_diagonal_of_film(tmp_path: Path) -> None:
-    fov_deg = photo_fov_deg(_photo(tmp_path / "a.jpg", (400, 300), 26))
-    assert fov_deg is not None
-    across = 2 * math.tan(math.radians(fov_deg) / 2)
-    assert across * 5 / 4 == pytest.approx(math.hypot(36, 24) / 26)
-
-
-def test_no_field_of_view(tmp_path: Path) -> None:
-    assert photo_fov_deg(_photo(tmp_path / "a.jpg", (360, 240), 0)) is None, "unknown"
-    Image.new("RGB", (4, 8)).save(tmp_path / "b.png")
-    assert photo_fov_deg(tmp_path / "b.png") is None
 
 
 # Depth

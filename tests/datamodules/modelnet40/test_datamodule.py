@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
@@ -15,7 +16,6 @@ from datamodules.modelnet40.meshes import CHANNELS, clean_mesh, mesh_spheres, re
 from datamodules.modelnet40.shape_files import MODELNET40, find_shapes
 from datamodules.modelnet40.shape_samples import (
     STEPS,
-    ShapeSample,
     ShapeViews,
 )
 from tangent_train.errors import DataError
@@ -42,13 +42,9 @@ def test_both_layouts(tmp_path: Path, layout: Literal["by class", "by split"]) -
     _touch(root / "modelnet40_train/._chair_0001.off" if layout == "by split" else root / ".x.off")
     _touch(root / ("modelnet40_test/list.txt" if layout == "by split" else "chair/train/a.txt"))
     found = find_shapes(root)
-    counted = {
-        label: tuple(sum(s.label == label and s.part == p for s in found) for p in PARTS)
-        for label in COUNTS
-    }
-    assert counted == COUNTS
-    assert len(found) == sum(map(sum, COUNTS.values()))
-    assert len({shape.name for shape in found}) == len(found)
+    counted = Counter((shape.label, shape.part) for shape in found)
+    expected = {(c, p): n for c, both in COUNTS.items() for p, n in zip(PARTS, both, strict=True)}
+    assert counted == expected
     for shape in found:
         assert shape.path == root / f"{shape.name}.off"
     assert found == sorted(found, key=lambda shape: (shape.part, shape.name))
@@ -125,14 +121,10 @@ def test_batches(make_module: MakeModule) -> None:
     assert [len(batch.label) for batch in batches] == [4, 4, 4, 3]
     assert batches[0].images.shape == (4, 20, 8, 8, CHANNELS)
     assert batches[0].images.dtype == torch.int16
-    batch = module.on_after_batch_transfer(batches[0], 0)
-    assert isinstance(batch, ShapeSample)
-    assert (batch.images.shape, batch.images.dtype) == ((4, 20, 6, 8, 8), torch.float32)
-    assert (batch.label.dtype, batch.index.dtype) == (torch.int64, torch.int64)
-    seen = sorted(int(index) for batch in batches for index in batch.index)
-    assert seen == list(range(TRAINING))
-    labels = {int(i): int(c) for batch in batches for i, c in zip(batch.index, batch.label)}  # noqa: B905
-    assert [labels[i] for i in range(TRAINING)] == _labels(module, "train")
+    images = module.on_after_batch_transfer(batches[0], 0).images
+    assert (images.shape, images.dtype) == ((4, 20, 6, 8, 8), torch.float32)
+    pairs = torch.cat([torch.stack([batch.index, batch.label], 1) for batch in batches])
+    assert sorted(map(tuple, pairs.tolist())) == list(enumerate(_labels(module, "train")))
 
 
 def test_views_are_those_of_the_float_spheres(make_module: MakeModule, root: Path) -> None:

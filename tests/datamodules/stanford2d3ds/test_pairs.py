@@ -49,8 +49,6 @@ def test_the_table_is_the_papers() -> None:
     assert pairs[25][1:5] == ("easy", "ee20957_hallway_6", "eaba8c8_hallway_6", 1.0)
     assert pairs[59].scores["L2"] == (0.29, 0.16, 0.54)
     assert pairs[1].scores["ERP"] == (0.27, 0.07, 0.27)
-    smallest_easy = min(pair.fov_overlap for pair in pairs if pair.split == "easy")
-    assert smallest_easy == max(pair.fov_overlap for pair in pairs if pair.split == "hard") == 0.86
 
 
 # Files are found by the beginnings of their names.
@@ -68,7 +66,6 @@ def test_all_pairs_are_found(area: Path) -> None:
     assert pair.left.distance_m is not None
     assert np.isnan(pair.left.distance_m[0]).all()
     assert (pair.left.distance_m[1:] == 2).all()
-    assert pair.left.pose is not None
 
 
 def test_missing_and_ambiguous_names_are_told_at_once(area: Path, tmp_path: Path) -> None:

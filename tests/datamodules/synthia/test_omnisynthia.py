@@ -10,7 +10,7 @@ from datamodules.core.found import SPLITS
 from datamodules.synthia.omnisynthia import OmniSynthia, SynthiaPerspective
 from tangent_train.errors import DataError
 from tangent_train.rendering import EquirectRepresentation, PerspectiveRepresentation
-from tests.datamodules.data_files import names_of, read_png, write_png
+from tests.datamodules.data_files import names_of, read_png
 from tests.datamodules.synthia import synthia_format as synthia
 
 SEQUENCES: dict[str, Any] = {"train_sequences": ["01"], "test_sequences": ["04"]}
@@ -22,12 +22,6 @@ FRAMES = {"01": 5, "02": 3, "04": 2, "05": 2, "06": 4}
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Panoramas as published; not to be changed."""
     return synthia.write_panoramas(tmp_path_factory.mktemp("omnisynthia"), FRAMES)
-
-
-@pytest.fixture
-def broken_root(tmp_path: Path) -> Path:
-    """Panoramas of two sequences, to be damaged."""
-    return synthia.write_panoramas(tmp_path / "data", {"01": 2, "04": 2})
 
 
 def two(root: Path, erp: Any, **settings: Any) -> OmniSynthia:
@@ -130,17 +124,3 @@ def test_panoramas_are_made_from_views(tmp_path: Path, erp: Any) -> None:
     two(root, erp, panorama_height=64, frames=2).make_files()
     with pytest.raises(DataError, match="found height=64"):
         two(root, erp, frames=2).make_files()
-
-
-# --- what cannot be used -------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("part", "dtype"), [("GT/LABELS_Correct", np.uint16), ("Depth", np.uint8)])
-def test_another_bit_depth_is_found_before_training(
-    broken_root: Path, erp: Any, part: str, dtype: Any
-) -> None:
-    place = f"pano/{part}/000001.png"
-    path = synthia.sequence(broken_root, "04") / place  # training would never notice
-    write_png(path, np.zeros((32, 64), dtype))
-    with pytest.raises(DataError, match=f"{place}: found .*-bit grey; expected"):
-        two(broken_root, erp, inputs=("rgb", "depth")).setup("fit")

@@ -3,15 +3,12 @@ from __future__ import annotations
 import math
 from collections import Counter
 from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
-from datamodules import SynthRoomsPerspective
-from datamodules.core.found import SPLITS
 from datamodules.synthrooms.camera import PanoramaView, PerspectiveView, Pose, euler_rotation
 from datamodules.synthrooms.generate import RoomSettings, plan_rooms
 from datamodules.synthrooms.layout import FloorPlan, NoPlaceError, Rectangle
@@ -29,9 +26,6 @@ from datamodules.synthrooms.writer import (
     pose_record,
 )
 from tangent_train.errors import SettingError
-from tangent_train.rendering import PerspectiveRepresentation
-from tests.datamodules.conftest import TINY_ROOMS
-from tests.datamodules.data_files import names_of
 
 
 def test_rooms_have_as_many_cameras_as_wanted_and_are_the_same_rooms() -> None:
@@ -41,24 +35,6 @@ def test_rooms_have_as_many_cameras_as_wanted_and_are_the_same_rooms() -> None:
         assert (one.name, one.area) == (other.name, other.area)
         assert len(other.cameras) == max(2, len(one.cameras))
         assert other.cameras[: len(one.cameras)] == one.cameras
-
-
-def test_views_are_read_like_photos_of_the_real_set(tiny_rooms: Path) -> None:
-    crops = PerspectiveRepresentation(level=5, fov_deg=20)
-    module = SynthRoomsPerspective(tiny_rooms, crops, rooms=vars(TINY_ROOMS))
-    module.prepare_data()
-    names = [name for split in SPLITS for name in names_of(module, split)]
-    assert len(set(names)) == len(names) == sum(len(p.cameras) for p in plan_rooms(TINY_ROOMS))
-    photo = module.source("test").read(0)
-    assert photo.rgb.shape == (8, 8, 3)
-    assert photo.labels.max() > 0
-
-
-def test_rooms_come_in_the_order_of_the_areas() -> None:
-    settings = RoomSettings(rooms={"area_5b": 0, "1": 2})
-    assert list(settings.rooms.items()) == [("1", 2), ("5b", 0)]
-    assert settings.areas == ["1"]
-    assert sum(RoomSettings().rooms.values()) == 232
 
 
 @pytest.mark.parametrize(
@@ -119,27 +95,22 @@ def test_everything_stands_inside(rooms: list[Room]) -> None:
 
 
 def test_every_class_covers_enough_pixels_in_enough_rooms(rooms: list[Room]) -> None:
-    names = list(INSTANCES)
-    pixels, present = np.zeros(len(names)), np.zeros(len(names))
-    total, unknown, missing = 0, 0, 0
+    pixels, present = Counter[str](), Counter[str]()
+    missing = 0
     for room in rooms:
-        limits = Counter(room.items)
-        assert all(limits[name] <= limit for name, limit in INSTANCES.items())
         scene = RayScene(room)
         holes = draw_holes(room.rng, scene)
         camera = draw_camera(room.rng, scene, room.plan, [])
         view = PanoramaView(Pose.looking(camera.location, camera.heading), 32)
         items = render(scene, view, camera, holes, 1, room.rng).items
         seen = Counter(room.items[k] for k in items[items != MISSING])
-        counts = np.array([seen[name] for name in names])
-        pixels, present = pixels + counts, present + (counts > 0)
-        total += items.size
-        unknown += seen[UNKNOWN]
+        pixels += seen
+        present.update(seen.keys())
         missing += int((items == MISSING).sum())
-    shares = dict(zip(names, pixels / total, strict=True))
-    assert min(shares.values()) > 0.01, shares
-    assert (present / len(rooms)).min() > 0.45
-    assert unknown > 0
+    total = missing + pixels.total()
+    assert min(pixels[name] / total for name in INSTANCES) > 0.01, pixels
+    assert min(present[name] / len(rooms) for name in INSTANCES) > 0.45, present
+    assert pixels[UNKNOWN] > 0
     assert 0.02 < missing / total < 0.15
 
 

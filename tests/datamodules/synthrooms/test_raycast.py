@@ -153,22 +153,6 @@ def test_euler_angles_give_their_rotation_back(seed: int) -> None:
     np.testing.assert_allclose(euler_rotation(euler_angles(rotation)), rotation, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("heading", "pitch", "forward"),
-    [
-        (0.0, 0.0, [1, 0, 0]),
-        (math.pi / 2, 0.0, [0, 1, 0]),
-        (0.0, math.pi / 2, [0, 0, 1]),
-    ],
-)
-def test_heading_and_pitch(heading: float, pitch: float, forward: list[float]) -> None:
-    pose = Pose.looking(PLACE, heading, pitch)
-    np.testing.assert_allclose(pose.world_from_camera[:, 2], forward, atol=1e-12)
-    np.testing.assert_allclose(pose.rt_matrix @ [*PLACE, 1], 0, atol=1e-12)
-    ahead = pose.rt_matrix @ [*(PLACE + 2 * np.array(forward)), 1]
-    np.testing.assert_allclose(ahead, [0, 0, 2], atol=1e-12)
-
-
 def test_panorama_rays_are_the_sphere_mirrored_and_turned_by_the_heading() -> None:
     view = PanoramaView(Pose.looking(PLACE, heading=0.7), 16)
     expected = equirect_directions((16, 32)) @ (rotation_about((0, 0, 1), 0.7) @ FLIP_Y).T

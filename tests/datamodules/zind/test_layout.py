@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from datamodules.zind.layout import CLASSES, DOOR, OPENING, WINDOW, Fixture, Layout
 from tangent_train.geometry import equirect_directions
@@ -96,25 +95,3 @@ def test_fixtures_a_little_off_their_wall_are_on_it() -> None:
     shifted = Room(SQUARE.vertices, {"windows": [((-1, 1.52), (0.5, 1.49), (-0.4, 0.4))]})
     near, exact = (_layout(Camera("").layout(r), 0.6).labels((64, 128)) for r in (shifted, SQUARE))
     assert (near == 5).sum() == pytest.approx((exact == 5).sum(), rel=0.05)
-
-
-def test_distances_are_those_of_the_planes() -> None:
-    shape = (45, 90)
-    room, camera = VIEWS["concave"]
-    layout = _layout(camera.layout(room), 0.6)
-    labels, distances = layout.labels(shape), layout.distances(shape)
-    x, y, z = np.moveaxis(equirect_directions(shape) * distances[..., None], -1, 0)
-    assert np.isnan(distances[np.isin(labels, (0, 4, 5))]).all()
-    np.testing.assert_allclose(z[labels == 1], 0.6)
-    np.testing.assert_allclose(z[labels == 2], -1)
-    walls = np.stack([-y, x], axis=-1)[labels == 3]
-    np.testing.assert_allclose(_off_polygon(walls, np.array(layout.vertices)), 0, atol=1e-9)
-
-
-def _off_polygon(points: NDArray[Any], vertices: NDArray[Any]) -> NDArray[Any]:
-    """Distance of points to the nearest side of a polygon."""
-    ends = np.roll(vertices, -1, axis=0) - vertices
-    away = points[:, None] - vertices
-    place = np.clip((away * ends).sum(-1) / (ends**2).sum(-1), 0, 1)
-    off: NDArray[Any] = np.linalg.norm(away - place[..., None] * ends, axis=-1).min(axis=1)
-    return off
