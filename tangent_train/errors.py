@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 _LONGEST = 400  # characters of what was found: a file may hold anything
 _CONTROL = re.compile(r"[^\n\t -~\xa0-\U0010ffff]")
@@ -60,3 +62,26 @@ class SettingError(_ExplainedError):
 
 class DataError(_ExplainedError):
     """A file or folder that cannot be used."""
+
+
+@contextmanager
+def of_extra(extra: str, subject: object, remedy: str = "") -> Iterator[None]:
+    """A block that imports packages of an extra of tangent-train.
+
+    Args:
+        extra: Its name.
+        subject: What needs them.
+        remedy: Another remedy.
+
+    Raises:
+        SettingError: One is not installed.
+    """
+    try:
+        yield
+    except ImportError as error:
+        raise SettingError(
+            subject,
+            found=f"a missing package ({error})",
+            expected=f"the packages of the extra {extra}",
+            remedy=f"Run: pip install 'tangent-train[{extra}]'. {remedy}".rstrip(),
+        ) from error

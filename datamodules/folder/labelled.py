@@ -6,7 +6,7 @@ On disk::
       classes.json                  see `read_classes`
       images/[scene/]…/name.jpg     or .png, .tif, .webp
       labels/[scene/]…/name.png     values or colours of the classes, at the size of the image
-      depth/[scene/]…/name.png      or .tif, .npy, if depth is an input, see `read_depth_m`
+      depth/[scene/]…/name.png      or .tif, .npy, .exr, if depth is an input, see `read_depth_m`
       train.txt val.txt test.txt    if wanted, names one per line, see `FolderSplits`
 """
 

@@ -17,7 +17,7 @@ Noted = Callable[..., AbstractContextManager[None]]
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
 """Suffixes of images, in lower case."""
 
-DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".npy")
+DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".npy", ".exr")
 """Suffixes of depth maps."""
 
 

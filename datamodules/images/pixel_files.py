@@ -18,6 +18,7 @@ from numpy.lib.format import open_memmap
 from numpy.typing import DTypeLike, NDArray
 from PIL import ExifTags, Image, ImageOps
 
+from datamodules.images.exr import read_exr, read_exr_size
 from datamodules.images.png import MOST_PIXELS, check_pixels, decode, read_png_header
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import atomic_path, reserve, write_bytes
@@ -33,7 +34,10 @@ _WRITABLE = {
 """Pixel types by suffix; ``.npy`` holds any."""
 
 PIXEL_SUFFIXES = (*_WRITABLE, ".npy")
-"""Suffixes that `write_pixels` and `read_pixels` take, in lower case."""
+"""Suffixes that `write_pixels` takes, in lower case."""
+
+READABLE_SUFFIXES = (*PIXEL_SUFFIXES, ".exr")
+"""Suffixes that `read_pixels` takes."""
 
 LOSSY_SUFFIXES = (".jpg", ".jpeg", ".webp")
 """Formats that change pixels a little: not for labels and depth."""
@@ -84,7 +88,10 @@ def read_image_size(path: Path) -> tuple[int, int]:
     Raises:
         DataError: It cannot be read, or is not an image.
     """
-    if path.suffix.lower() == ".npy":
+    suffix = path.suffix.lower()
+    if suffix == ".exr":
+        return read_exr_size(path)
+    if suffix == ".npy":
         height, width = read_array(path).shape[:2]
         return height, width
     with _opened(path) as image:
@@ -109,7 +116,7 @@ def read_pixels(path: Path, *, indices: bool) -> NDArray[Any]:
     """Read an image or an array as stored; alpha is dropped, the EXIF orientation applied.
 
     Args:
-        path: JPEG, PNG, TIFF, WebP or ``.npy``.
+        path: JPEG, PNG, TIFF, WebP, OpenEXR (one channel of it) or ``.npy``.
         indices: Of an image with a palette (or of 1 bit), whether to give indices or colours.
 
     Returns:
@@ -119,8 +126,11 @@ def read_pixels(path: Path, *, indices: bool) -> NDArray[Any]:
     Raises:
         DataError: The file cannot be read or is broken, or its array is not an image.
     """
-    if path.suffix.lower() == ".npy":
+    suffix = path.suffix.lower()
+    if suffix == ".npy":
         return read_array(path)
+    if suffix == ".exr":
+        return read_exr(path)
     with _opened(path) as image:
         tiles = str(getattr(image, "tile", ""))  # how pixels are stored: "RGB;16B"
         if image.mode in ("RGB", "RGBA", "LA") and ";16" in tiles:
@@ -171,8 +181,8 @@ def read_depth_m(path: Path, units_per_m: float) -> NDArray[np.float32]:
     """Read a depth map.
 
     Args:
-        path: PNG, TIFF or array of integers, which are units; or TIFF or array of floats, which
-            are metres.
+        path: PNG, TIFF or array of integers, which are units; or TIFF, array or OpenEXR image of
+            floats, which are metres.
         units_per_m: Units in a metre, 1000 for millimetres.
 
     Returns:
@@ -190,7 +200,7 @@ def read_depth_m(path: Path, units_per_m: float) -> NDArray[np.float32]:
         raise DataError(
             path,
             found=f"{stored.dtype} of shape {stored.shape}",
-            expected="depth: 16-bit grey PNG or TIFF, 32-bit float TIFF or .npy",
+            expected="depth: 16-bit grey PNG or TIFF, 32-bit float TIFF, .npy or .exr",
         )
     depth = stored.astype(np.float32)
     if stored.dtype.kind != "f":

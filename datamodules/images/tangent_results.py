@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from datamodules.core.panoramas import ray_lengths
 from datamodules.images.pixel_files import (
     LOSSY_SUFFIXES,
-    PIXEL_SUFFIXES,
+    READABLE_SUFFIXES,
     array_file,
     check_writable,
     read_pixels,
@@ -62,7 +62,7 @@ def result_files(folder: Path, cameras: CameraFile) -> list[Path]:
         )
     there: dict[str, list[Path]] = {}
     for file in sorted(folder.iterdir()):
-        if file.suffix.lower() in PIXEL_SUFFIXES:
+        if file.suffix.lower() in READABLE_SUFFIXES:
             there.setdefault(file.stem, []).append(file)
     stems = [Path(name).stem for _, name in sorted(zip(cameras.faces, cameras.files, strict=True))]
     wrong = [stem for stem in stems if len(there.get(stem, [])) != 1]

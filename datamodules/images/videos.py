@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.images.png import check_pixels
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError, of_extra
 from tangent_train.files import atomic_path
 from tangent_train.threads import in_threads
 
@@ -29,15 +29,8 @@ _BT709 = 1  # of the matrix, primaries and transfer: what players assume of larg
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
     """A container and its first video stream; errors in the block name the file."""
-    try:
+    with of_extra("video", path):
         import av
-    except ImportError as error:
-        raise SettingError(
-            path,
-            found=f"a missing package ({error})",
-            expected="the packages of the extra video",
-            remedy="Run: pip install 'tangent-train[video]'.",
-        ) from error
     try:
         with av.open(str(path)) as container:
             if not container.streams.video:

@@ -60,9 +60,9 @@ def test_no_images(tmp_path: Path, pattern: str, found: str) -> None:
 
 
 def test_depth_is_found_by_the_name_of_the_image(tmp_path: Path) -> None:
-    _touch(tmp_path / "a" / "x.png", tmp_path / "a" / "y_depth.npy", tmp_path / "a" / "z.txt")
+    _touch(tmp_path / "a" / "x.png", tmp_path / "a" / "y_depth.exr", tmp_path / "a" / "z.txt")
     assert find_depth(tmp_path, "a/x", "") == tmp_path / "a" / "x.png"
-    assert find_depth(tmp_path, "a/y", "") == tmp_path / "a" / "y_depth.npy"
+    assert find_depth(tmp_path, "a/y", "") == tmp_path / "a" / "y_depth.exr"
     with pytest.raises(DataError, match=r"a.z: found no such file; .*_depth.* Remedy"):
         find_depth(tmp_path, "a/z", "Remedy")
     _touch(tmp_path / "a" / "x_depth.npy")

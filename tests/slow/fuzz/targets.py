@@ -12,6 +12,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import OpenEXR
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -237,11 +238,15 @@ def _pixel_seeds() -> list[bytes]:
     ]
     seeds += [_image(_DEPTH.astype(np.float32), "tiff")]
     seeds += [cv2.imencode(s, np.dstack([_DEPTH] * 3))[1].tobytes() for s in (".png", ".tiff")]
-    return seeds
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "a.exr"
+        header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.PIZ_COMPRESSION}
+        OpenEXR.File(header, {"Z": _DEPTH.astype(np.float32)}).write(str(path))
+        return [*seeds, path.read_bytes()]
 
 
 def _read_image(path: Path) -> None:
-    suffix = {b"\x93": ".npy", b"P": ".npy"}.get(path.read_bytes()[:1], ".png")
+    suffix = {b"\x93": ".npy", b"P": ".npy", b"\x76": ".exr"}.get(path.read_bytes()[:1], ".png")
     path = path.replace(path.with_suffix(suffix))
     for indices in (True, False):
         pixels = read_pixels(path, indices=indices)
