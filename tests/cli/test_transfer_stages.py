@@ -177,14 +177,11 @@ def test_data_without_folds() -> None:
 @pytest.mark.parametrize(
     ("setting", "value"),
     [
-        ("fine_tuning.epochs", 3),
         ("fine_tuning.epochs", [0]),
-        ("fine_tuning.epochs", [1, 1]),
-        ("folds", [1.5]),
-        ("seeds", [-1]),
+        ("folds", [1, 1]),
+        ("seeds", 3),
         ("compare", "erp"),
         ("compare", ["erp", "erp"]),
-        ("compare", [{"option": "erp"}]),
         ("compare", ["../erp"]),
         ("conditions", []),
         ("conditions", [3]),
