@@ -153,6 +153,7 @@ def test_a_class_map_of_a_run(rooms: str, run_folder: Path, tmp_path: Path, run:
     [
         ({"data": None}, r"data: found none, and .*photo\.ckpt has no settings of a run.*data="),
         ({"class_map": None}, r"found class names .*'beam'.*; expected .*'dark'.*class_map="),
+        ({"class_map": {"classes": {"floor": ["pink"]}}}, "found no class of the map in a network"),
         ({"network": "network.widths=[4]"}, r"network\.widths: found .*the network is in"),
         ({"inputs": "data.inputs=[rgb,depth]"}, "found inputs|normalization"),
         ({"unmapped": "unmapped=often"}, "unmapped: found often; expected unknown or never"),
@@ -165,7 +166,7 @@ def test_what_cannot_be_evaluated_is_refused(
 ) -> None:
     given = {"checkpoint": network, "data": rooms, "class_map": MAP} | changes
     if given["class_map"]:
-        given["class_map"] = _written(tmp_path / "map.json", MAP)
+        given["class_map"] = _written(tmp_path / "map.json", given["class_map"])
     arguments = [*filter(None, given.values()), *(ROOMS if given["data"] == rooms else [])]
     with pytest.raises(SystemExit, match=message):
         run("evaluate", *arguments)
