@@ -83,7 +83,7 @@ def test_what_a_map_leaves_is_missed_or_never_wins(
 @pytest.mark.parametrize(
     ("typed", "kind", "expected"),
     [
-        (["representation=erp", "level=3"], "EquirectRepresentation", {"level": 3}),
+        (["representation=erp"], "EquirectRepresentation", {"level": 4}),
         (["level=3"], "TangentRepresentation", {"level": 3, "base_level": 0}),
         (
             ["representation.blend=feather", "representation.base_level=1"],
