@@ -191,9 +191,7 @@ def _model(project: Path, poses: dict[str, PanoramaPose]) -> Any:
     return model
 
 
-@pytest.mark.parametrize("binary", [True, False])
 def test_poses_come_back(
-    binary: bool,
     project: Path,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
@@ -205,7 +203,7 @@ def test_poses_come_back(
     }
     model = _model(project, poses)
     (project / "sparse" / "0").mkdir(parents=True)
-    (model.write_binary if binary else model.write_text)(project / "sparse" / "0")
+    model.write(project / "sparse" / "0")
     monkeypatch.chdir(project / "sparse")  # the project is two folders up of the model
     render_with(poses="0", output=tmp_path / "poses.json")
     assert "poses of 2 of 2 panoramas" in capsys.readouterr().out
