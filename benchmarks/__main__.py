@@ -21,7 +21,6 @@ from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict
 from importlib import import_module
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -33,11 +32,9 @@ from tangent_train.results.tables import Table as TextTable
 MEASURED = {
     "images": "benchmarks.images",
     "labels": "benchmarks.labels",
-    "growth": "benchmarks.labels",
     "loader": "benchmarks.training",
     "step": "benchmarks.training",
     "evaluation": "benchmarks.training",
-    "start": "benchmarks.start",
 }
 """Modules of the rows; each has a function of the same name."""
 
@@ -90,7 +87,9 @@ def run(modules: Mapping[str, str], output: Path, *, quick: bool) -> Path:
     """
     start = time.perf_counter()
     tables: list[Table] = []
-    content = machine() | {"quick": quick, "failures": FAILURES}
+    content: dict[str, Any] = {"quick": quick, "failures": FAILURES}
+    content["cores"] = len(os.sched_getaffinity(0))
+    content["environment"] = get_pretty_env_info().splitlines()  # type: ignore[no-untyped-call]
     output.mkdir(parents=True, exist_ok=True)
     path = output / "results.json"
     for name, module in modules.items():
@@ -102,21 +101,8 @@ def run(modules: Mapping[str, str], output: Path, *, quick: bool) -> Path:
                 content["tables"] = [asdict(table) for table in tables]
                 content["quotients"] = quotients(tables)
                 path.write_text(json.dumps(content, indent=1, ensure_ascii=False), "utf-8")
-    goals = [goal for table in tables for goal in table.goals]
-    met = sum(goal.met for goal in goals)
-    print(f"{met} of {len(goals)} goals met, in {time.perf_counter() - start:.0f} s")
     print(f"Results are in {path}.")
     return path
-
-
-def machine() -> dict[str, Any]:
-    """What figures depend on."""
-    libraries = ("numpy", "opencv-python-headless", "numba", "lightning")
-    return {
-        "cores": len(os.sched_getaffinity(0)),
-        "versions": {library: version(library) for library in libraries},
-        "environment": get_pretty_env_info().splitlines(),  # type: ignore[no-untyped-call]
-    }
 
 
 def show(table: Table) -> None:
@@ -168,8 +154,6 @@ def compare(content: Mapping[str, Any]) -> None:
             verdict = "new"
         elif now["low"] > then["high"] and now["median"] > _NOISE * then["median"]:
             verdict, slower = "slower", slower + 1
-        elif now["high"] < then["low"] and now["median"] * _NOISE < then["median"]:
-            verdict = "faster"
         print(f"{verdict:7} {name}")
     if slower:
         sys.exit(f"{slower} of {len(content['quotients'])} have become slower.")

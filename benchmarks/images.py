@@ -10,7 +10,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from benchmarks.measuring import Goal, Table, Way, measure
@@ -87,15 +86,14 @@ def _rivals(panorama: NDArray[Any], grid: TangentGrid) -> dict[str, Render]:
 
     Their conventions, in ours (centres of pixels are integers, yaw to the right, pitch up):
 
-    * **py360convert**, **pytorch360convert**: the field of view spans the centres of the outermost
-      pixels. The first keeps the positions of its last views: it is given room for all of them.
+    * **py360convert**: the field of view spans the centres of the outermost pixels. It keeps the
+      positions of its last views, and is given room for all of them.
     * **pyequilib**: the principal point is half the side, so one pixel less than ours is rendered;
       its panorama begins one row and one column further, so it gets a rolled one.
     """
     os.environ.setdefault("PY360CONVERT_CACHE_SIZE", "1024")  # read when it is imported
     import py360convert
     from equilib import Equi2Pers
-    from pytorch360convert import e2p
 
     poses = xyz_to_lonlat(grid.centers_xyz)
     degrees = np.degrees(poses).tolist()
@@ -103,7 +101,6 @@ def _rivals(panorama: NDArray[Any], grid: TangentGrid) -> dict[str, Render]:
     fov_deg = math.degrees(2 * math.atan(side / 2 * grid.pitch))
     view = Equi2Pers(height=side, width=side, fov_x=fov_deg, z_down=True)
     rolled = np.ascontiguousarray(np.roll(panorama, (1, 1), axis=(0, 1)).transpose(2, 0, 1))
-    floats = torch.from_numpy(panorama).float()
 
     def pyequilib(face: int) -> NDArray[Any]:
         yaw, pitch = poses[face]
@@ -113,9 +110,6 @@ def _rivals(panorama: NDArray[Any], grid: TangentGrid) -> dict[str, Render]:
     return {
         "py360convert": lambda face: py360convert.e2p(panorama, fov_deg, *degrees[face], size),
         "pyequilib": pyequilib,
-        "pytorch360convert": lambda face: e2p(
-            floats, fov_deg, *degrees[face], size, channels_first=False
-        ).numpy(),
     }
 
 

@@ -1,8 +1,8 @@
-"""Rendering labels, compared with `grid_sample` and `argmax`; growth with the level."""
+"""Rendering labels, compared with `grid_sample` and `argmax`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from functools import partial
 
 import numpy as np
@@ -11,11 +11,7 @@ from torch.nn import functional
 
 from benchmarks.measuring import Goal, Row, Table, Way, added_mib, measure
 from tangent_train.geometry import TangentGrid, equirect_directions, equirect_shape
-from tangent_train.rendering import (
-    equirect_to_tangent,
-    set_table_cache_limit,
-    tangent_to_labels,
-)
+from tangent_train.rendering import tangent_to_labels
 
 NUM_CLASSES = 13
 PLAIN = "grid_sample of a mosaic, argmax"
@@ -23,7 +19,7 @@ OURS = "tangent_to_labels"
 
 
 def labels(quick: bool) -> Iterator[Table]:
-    """Time, memory, and the first call."""
+    """Time and memory."""
     level = 6 if quick else 10
     grid, shape = TangentGrid(1, level), equirect_shape(level)
     scores = random_scores(grid)
@@ -33,18 +29,12 @@ def labels(quick: bool) -> Iterator[Table]:
     if agree < 0.995:
         raise RuntimeError(f"{PLAIN} gives other labels: {agree:.1%} agree")
 
-    def first() -> None:
-        set_table_cache_limit(0)
-        tangent_to_labels(array, grid, shape)
-        set_table_cache_limit(512 * 2**20)
-
     noise = random_scores(grid, apart=1).numpy()
     ways = [
         Way(PLAIN, plain),
         Way(OURS, lambda: tangent_to_labels(array, grid, shape), ours=True),
         Way(f"{OURS}, white noise", lambda: tangent_to_labels(noise, grid, shape), True, rounds=3),
         Way(f"{OURS}, feather", lambda: tangent_to_labels(array, grid, shape, "feather"), True),
-        Way(f"{OURS}, first call", first, ours=True, rounds=3),
     ]
     table = Table("labels: time", measure(ways, 2 if quick else 7))
     table.goals = [Goal("as fast as grid_sample", 1 / table.ratio(OURS), 15, True)]
@@ -52,10 +42,10 @@ def labels(quick: bool) -> Iterator[Table]:
     yield _memory(level, scores.nbytes / 2**20)
 
 
-def random_scores(grid: TangentGrid, classes: int = NUM_CLASSES, apart: int = 32) -> torch.Tensor:
+def random_scores(grid: TangentGrid, apart: int = 32) -> torch.Tensor:
     """Scores of all images, float32: normal numbers some pixels apart, interpolated."""
     side = max(2, grid.dim // apart)
-    size = (grid.num_images, classes, side, side)
+    size = (grid.num_images, NUM_CLASSES, side, side)
     scores = torch.randn(size, generator=torch.Generator().manual_seed(0))
     return functional.interpolate(scores, (grid.dim, grid.dim), mode="bilinear")
 
@@ -86,36 +76,7 @@ def _memory(level: int, scores_mib: float) -> Table:
     return table
 
 
-def _labels_of(level: int, classes: int = NUM_CLASSES) -> Callable[[], object]:
+def _labels_of(level: int) -> Callable[[], object]:
     small, grid = TangentGrid(1, 5), TangentGrid(1, level)
-    tangent_to_labels(random_scores(small, classes), small, equirect_shape(5))  # compiles
-    return partial(tangent_to_labels, random_scores(grid, classes), grid, equirect_shape(level))
-
-
-def _images_of(level: int) -> Callable[[], object]:
-    equirect_to_tangent(np.zeros((64, 128, 3), np.uint8), TangentGrid(1, 5))
-    shape = equirect_shape(level)
-    panorama = np.random.default_rng(0).integers(0, 256, (*shape, 3), np.uint8)
-    return partial(equirect_to_tangent, panorama, TangentGrid(1, level))
-
-
-def growth(quick: bool) -> Iterator[Table]:
-    """Time and memory over levels, which should be linear in pixels."""
-    levels = (5, 6, 7) if quick else (7, 8, 9, 10, 11)
-    for what, work in (("to images", _images_of), ("to labels", partial(_labels_of, classes=4))):
-        names = [f"level {level}, b = 1" for level in levels]
-        set_table_cache_limit(2**31)  # the tables of level 11 need more than the default
-        ways = [Way(n, work(level), ours=True) for n, level in zip(names, levels, strict=True)]
-        rows = measure(ways, 2 if quick else 5)
-        set_table_cache_limit(512 * 2**20)
-        yield _linear(f"growth: time {what} over levels", rows, levels, "s")
-        memory = [added_mib(work, level) for level in levels]
-        rows = [Row(n, [mib], ours=True) for n, mib in zip(names, memory, strict=True)]
-        yield _linear(f"growth: memory {what} over levels", rows, levels, "MiB")
-
-
-def _linear(name: str, rows: list[Row], levels: Sequence[int], unit: str) -> Table:
-    """The slope of a line through the logarithms of pixels and medians is at most 1.15."""
-    medians = np.log([row.median for row in rows])
-    slope = float(np.polyfit(np.array(levels) * np.log(4), medians, 1)[0])
-    return Table(name, rows, unit, [Goal("grows with pixels to the power", slope, 1.15)])
+    tangent_to_labels(random_scores(small), small, equirect_shape(5))  # compiles
+    return partial(tangent_to_labels, random_scores(grid), grid, equirect_shape(level))

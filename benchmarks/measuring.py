@@ -120,7 +120,8 @@ def measure(ways: Sequence[Way], rounds: int) -> list[Row]:
         start = time.perf_counter()
         for _ in range(repeats):
             way.run()
-        _synchronize()
+        if DEVICE.type == "cuda":
+            torch.cuda.synchronize()
         return (time.perf_counter() - start) / repeats
 
     warm = [min(seconds(way, 1), seconds(way, 1)) for way in ways]
@@ -131,12 +132,6 @@ def measure(ways: Sequence[Way], rounds: int) -> list[Row]:
             if number < ways[k].rounds:
                 rows[k].values.append(seconds(ways[k], repeats[k]) * ways[k].scale)
     return rows
-
-
-def _synchronize() -> None:
-    """Wait until a GPU, if there is one, has done its work."""
-    if DEVICE.type == "cuda":
-        torch.cuda.synchronize()
 
 
 def added_mib(function: Callable[..., Callable[[], object]], *arguments: Any) -> float:

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import redirect_stdout
 from typing import Any
 
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
-
-from datamodules.core.problems import Problem
 from tangent_train.cli.say import say
 from tangent_train.errors import counted
 from tangent_train.registry import make
+from tangent_train.results.tables import Table
 
 
 def check(settings: Mapping[str, Any]) -> None:
@@ -28,30 +24,20 @@ def check(settings: Mapping[str, Any]) -> None:
     """
     representation = make(settings["representation"], "representation")
     data = make(settings["data"], "data", representation=representation)
-    console = Console(highlight=False)
+    terminal = sys.stdout.isatty()
     with redirect_stdout(sys.stderr):  # progress is none of the problems that are listed
         problems, count = data.check()
     listed = problems.listed()
     read = f"{counted(count, data.noun)} of {_printable(str(data.root))} checked"
-    if listed and console.is_terminal:
-        console.print(_table(listed))
-    for problem in () if console.is_terminal else listed:
-        sys.stdout.write("\t".join(map(_printable, problem[:3])) + "\n")
+    rows = [[*map(_printable, problem[:3])] for problem in listed]
+    if rows and terminal:
+        Table("", ("file", "finding", "remedy"), rows, text_columns=range(3), lines=True).print()
+    for row in () if terminal else rows:
+        sys.stdout.write("\t".join(row) + "\n")
     found = counted(len(listed), "problems") if listed else "Nothing is wrong"
-    say(f"{found}; {read}.", error=bool(listed) and not console.is_terminal)
+    say(f"{found}; {read}.", error=bool(listed) and not terminal)
     if listed:
         sys.exit(1)
-
-
-def _table(problems: Sequence[Problem]) -> Table:
-    table = Table(show_lines=True)
-    # Folded, never cut: a path is of use as a whole.
-    table.add_column("file", overflow="fold", ratio=4)
-    table.add_column("finding", overflow="fold", ratio=3)
-    table.add_column("remedy", overflow="fold", ratio=3)
-    for problem in problems:
-        table.add_row(*(Text(_printable(cell)) for cell in problem[:3]))
-    return table
 
 
 def _printable(text: str) -> str:

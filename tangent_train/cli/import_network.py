@@ -73,8 +73,7 @@ def import_network(config: Mapping[str, Any]) -> None:
             nothing_wins=settings.nothing_wins,
         )
     say(_understood(output, imported, settings))
-    indoors = _indoors(imported.view.level, network.image_size, settings)
-    for remark in (*indoors, *network.remarks):
+    for remark in network.remarks:
         say(remark)
 
 
@@ -91,33 +90,12 @@ def _load(settings: Settings, normalization: Any) -> PhotoNetwork:
             normalization=normalization,
         )
         return network
-    if name == "timm":
-        raise SettingError(
-            "network",
-            found="timm, which has no networks for segmentation",
-            expected=f"{', '.join(_LIBRARIES)}, or an option of configs/network",
-            remedy="Networks on its encoders (encoder_name=tu-…) are those of network=smp.",
-        )
     from tangent_train.inference.photo_networks import of_config
 
     search = f"hydra.searchpath=[file://{config_folder()}]"
     config: Any = compose("import", [f"+network@section={name}", search])
     section: Any = OmegaConf.to_container(config.section)
     return of_config.load(section, settings.weights, settings.classes, normalization)
-
-
-def _indoors(level: int, image_size: tuple[int, int], settings: Settings) -> list[str]:
-    """Levels below the one derived, unless one was given."""
-    from tangent_train.inference.photo_networks.importing import view_of
-
-    if settings.level is not None:
-        return []
-    view = view_of(image_size, settings.fov, level - 1, settings.base_level)
-    levels = f"levels=[{view.level - 1},{view.level}] base_level={view.base_level}"
-    return [
-        f"indoors, try {levels} in tangent-predict: images that show more of a room, the best "
-        "of those tried on real ones (docs/photo_networks.md)"
-    ]
 
 
 def _understood(path: Path, imported: Imported, settings: Settings) -> str:

@@ -59,12 +59,10 @@ class Inputs:
             check_size(job.path, (rows, columns))
             return count
 
-        names = short_names(paths)
-        folders = {parent.casefold() for name in names for parent in _parents(name)}
         files = {
             # A folder of images may have the name of a video, whose frames get a folder too.
-            name + path.suffix if is_video(path) and name.casefold() in folders else name: path
-            for name, path in zip(names, paths, strict=True)
+            name + path.suffix if is_video(path) and path.with_suffix("").is_dir() else name: path
+            for name, path in zip(short_names(paths), paths, strict=True)
         }
         videos = {name: Job(name, path) for name, path in files.items() if is_video(path)}
         return cls(files, {name: job.then(frames) for name, job in videos.items()})
@@ -121,8 +119,3 @@ class Inputs:
                     yield Job(name, video.path, frame)
         except DataError as error:
             yield Job(frame_name(video.item, number + 1), video.path, error=str(error))
-
-
-def _parents(name: str) -> list[str]:
-    parts = name.split("/")
-    return ["/".join(parts[:end]) for end in range(1, len(parts))]

@@ -35,7 +35,7 @@ from tangent_train.cli.each import Job, each
 from tangent_train.cli.say import say
 from tangent_train.cli.settings import check_new, typed
 from tangent_train.errors import DataError, SettingError, counted
-from tangent_train.geometry import TangentGrid, nearest_level, random_rotation, rotation_about
+from tangent_train.geometry import TangentGrid, nearest_level, rotation_about
 from tangent_train.keypoints.colmap import panorama_poses
 from tangent_train.rendering.camera_files import (
     CAMERAS_FILE,
@@ -61,8 +61,7 @@ class Settings:
     level: int | None
     dim: int | None
     faces: tuple[int, ...] | None
-    rotation: Literal["so3"] | tuple[float, float, float] | None
-    seed: int
+    rotation: tuple[float, float, float] | None
     format: str
     interpolation: Literal["bilinear", "nearest"]
     colmap: bool
@@ -243,8 +242,6 @@ def _rotation(settings: Settings) -> NDArray[np.float64] | None:
     """The rotation in the frame of directions: x forward, y to the right, z up."""
     if settings.rotation is None:
         return None
-    if settings.rotation == "so3":
-        return random_rotation(np.random.default_rng(settings.seed))
     yaw, pitch, roll = np.radians(settings.rotation)
     # y is to the right here: a positive rotation about it looks down.
     return (

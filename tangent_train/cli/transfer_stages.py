@@ -24,7 +24,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from filelock import FileLock, Timeout
 from omegaconf import DictConfig, OmegaConf
 
 from tangent_train.checkpoints.content import read_settings
@@ -229,9 +228,9 @@ def stage_state(stage: Stage) -> State:
             expected="the settings of this command",
             remedy=_REMEDY,
         )
-    weights = stage.weights
+    weights, known = stage.weights, parse_json(record.read_bytes())["weights"]
     # A network that was trained again is another one; one that is gone is not missed.
-    if weights and weights.is_file() and _weights_in(record) != _digest(weights, stage.config):
+    if weights and weights.is_file() and known != _digest(weights, stage.config):
         raise SettingError(
             stage.folder,
             found=f"stage {stage.name} of another network, or with another class map",
@@ -253,7 +252,6 @@ def run_stage(stage: Stage, state: State) -> int:
 
     Raises:
         DataError: The checkpoint it starts from is missing.
-        SettingError: Another command is running it.
     """
     config, digest = dict(stage.config), None
     if state == "begun":
@@ -269,21 +267,10 @@ def run_stage(stage: Stage, state: State) -> int:
         config["init_from" if stage.command == "train" else "checkpoint"] = str(stage.weights)
         digest = _digest(stage.weights, config)
     stage.folder.mkdir(parents=True, exist_ok=True)
-    try:
-        with FileLock(stage.folder / ".lock", blocking=False):
-            if state == "new":
-                write_text(stage.folder / "stage.json", json.dumps({"weights": digest}) + "\n")
-            write_text(
-                stage.folder / "stage.yaml", OmegaConf.to_yaml(OmegaConf.create(_HEAD | config))
-            )
-            status = run_process(stage_command(stage))
-    except Timeout as error:
-        raise SettingError(
-            stage.folder,
-            found=f"another tangent-transfer that runs stage {stage.name}",
-            expected="none",
-            remedy="Wait for it; other seeds and folds can run beside it.",
-        ) from error
+    if state == "new":
+        write_text(stage.folder / "stage.json", json.dumps({"weights": digest}) + "\n")
+    write_text(stage.folder / "stage.yaml", OmegaConf.to_yaml(OmegaConf.create(_HEAD | config)))
+    status = run_process(stage_command(stage))
     return status if status >= 0 else 128 - status
 
 
@@ -291,15 +278,6 @@ def stage_command(stage: Stage) -> list[str]:
     """The command line of the stage's run."""
     config = (f"--config-dir={stage.folder}", "--config-name=stage")
     return command_line(stage.command, config, stage.folder)
-
-
-def _weights_in(record: Path) -> Any:
-    try:
-        return dict(parse_json(record.read_bytes())).get("weights")
-    except (TypeError, ValueError) as error:
-        raise DataError(
-            record, found=error, expected="what tangent-transfer wrote", remedy=_REMEDY
-        ) from error
 
 
 def _digest(weights: Path, config: Mapping[str, Any]) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from rich import table as rich_table
 from rich.console import Console
@@ -26,6 +27,7 @@ class Table:
         text_columns: Columns that are aligned to the left; the others hold numbers.
         shades: For every row a number from 0 to 1 for each cell after the first: a heat map in
             HTML.
+        lines: Whether the terminal shows lines between the rows.
     """
 
     title: str
@@ -34,6 +36,7 @@ class Table:
     note: str = ""
     text_columns: Sequence[int] = (0,)
     shades: Sequence[Sequence[float]] | None = None
+    lines: bool = False
 
     def markdown(self) -> str:
         """The table as Markdown, below a heading."""
@@ -48,9 +51,12 @@ class Table:
         console = Console(highlight=False)
         if not console.is_terminal:
             console.width = _WIDEST
-        table = rich_table.Table(title=escape(self.title), caption=escape(self.note) or None)
+        title, note = escape(self.title) or None, escape(self.note) or None
+        table = rich_table.Table(title=title, caption=note, show_lines=self.lines)
         for k, name in enumerate(self.header):
-            table.add_column(escape(name), justify="left" if k in self.text_columns else "right")
+            justify: Any = "left" if k in self.text_columns else "right"
+            # Folded, never cut: a path is of use as a whole.
+            table.add_column(escape(name), justify=justify, overflow="fold")
         for row in self.rows:
             table.add_row(*map(escape, row))
         console.print(table)

@@ -8,10 +8,7 @@ from typing import Any
 import torch
 
 from datamodules.core.inputs import Normalization
-from tangent_train.inference.photo_networks import (
-    PhotoNetwork,
-    import_network,
-)
+from tangent_train.inference.photo_networks import PhotoNetwork, import_network
 from tangent_train.registry import make
 from tests.tasks.small_networks import with_statistics
 

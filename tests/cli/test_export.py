@@ -48,7 +48,6 @@ def test_the_suffix_says_the_format(
     ("arguments", "message"),
     [
         ([], "checkpoint: found none; expected a file"),
-        (["checkpoint={}"], "output: found none"),
         (["checkpoint={}", "output=x.pt"], r"output: found x\.pt; .* \.onnx or \.safetensors\.$"),
         (["checkpoint={}", "output=x.onnx", "image_size=32"], "image_size: found 32; expected"),
         (

@@ -42,7 +42,6 @@ def _begun(monkeypatch: pytest.MonkeyPatch, path: Path, *overrides: str) -> tupl
 @pytest.mark.parametrize(
     ("overrides", "widths"),
     [
-        ([], [4, 8, 12]),
         (["experiment=rooms/demo"], [4, 8, 12]),
         (["network=unet_small"], [16, 32, 64, 128, 256]),
         (["network.widths=[4,4]"], [4, 4]),
@@ -117,8 +116,6 @@ def test_files_that_do_not_describe_their_network_change_nothing(
     assert settings["network"]["widths"] == [16, 32, 64, 128, 256, 256]
     assert "normalization" not in settings["data"]
     assert source is None
-    with pytest.raises(DataError, match=r"net\.onnx: found an ONNX file, .*exported from"):
-        _begun(monkeypatch, tmp_path / "net.onnx")
 
 
 def test_classes_of_files_are_called_only_where_they_are_known(
@@ -134,9 +131,6 @@ def test_classes_of_files_are_called_only_where_they_are_known(
         monkeypatch, tmp_path / "odd.ckpt", "trust=[torch.nn.Flatten]", "data.inputs=[rgb]"
     )
     with pytest.raises(SettingError, match=r"scores of the network: found \(1, "):
-        build(*begun)
-    begun = _begun(monkeypatch, tmp_path / "odd.ckpt", "trust=[torch.nn.Flatten]")
-    with pytest.raises(SettingError, match=r"of Flatten: found none; .*data\.inputs=\[rgb\]"):
         build(*begun)
 
 
@@ -163,8 +157,3 @@ def test_fine_tuning_leaves_a_run_of_its_own(
     run("evaluate", f"checkpoint={checkpoint}", rooms, "hydra.run.dir=again")
     assert results(tmp_path / "again") == results(tmp_path / "tuned")
     assert read_settings(tmp_path / "again" / "config.yaml")["choices"] == choices
-
-
-def test_a_factor_needs_something_to_start_from(rooms: str, run: Run) -> None:
-    with pytest.raises(SystemExit, match=r"backbone_lr_factor: found 0\.5; .*without init_from="):
-        run("train", *SETTINGS, rooms, "optimizer.backbone_lr_factor=0.5")

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from datamodules.images.palette import class_colors
 from datamodules.images.videos import read_frames
 from tests.cli.tiny_runs import Predict, predicted
+from tests.datamodules.data_files import read_png
 from tests.inference.trained import CLASS_NAMES, sphere
 
 av: Any = pytest.importorskip("av")
@@ -47,9 +48,7 @@ def _decoded(path: Path) -> tuple[NDArray[np.uint8], list[float]]:
 
 
 def _labels(folder: Path) -> dict[str, NDArray[np.uint8]]:
-    paths = sorted(folder.rglob("*.png"))
-    found = {path.stem: cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in paths}
-    return {name: labels for name, labels in found.items() if labels is not None}
+    return {path.stem: read_png(path) for path in sorted(folder.rglob("*.png"))}
 
 
 def test_frames_get_the_labels_of_images_and_pictures_are_a_video(

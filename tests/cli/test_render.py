@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from datamodules.images.pixel_files import read_pixels, write_pixels
 from tangent_train.geometry import TangentGrid, equirect_directions
@@ -33,14 +32,6 @@ def room(tmp_path: Path) -> Path:
 def rendered(room: Path, tmp_path: Path) -> Path:
     render_with(input=room, output=tmp_path / "tan", base_level=0)
     return tmp_path / "tan" / "room"
-
-
-def _results(folder: Path, array: NDArray[Any], suffix: str = ".npy") -> Path:
-    """The same result for all 20 images."""
-    folder.mkdir(exist_ok=True)
-    for face in range(20):
-        write_pixels(folder / f"face_{face:03}{suffix}", array)
-    return folder
 
 
 # There and back.
@@ -130,19 +121,17 @@ def test_labels_are_never_mixed(tmp_path: Path, refused: Refused) -> None:
     assert set(np.unique(expected)) == {3, 90, 200}
 
 
-def _z_depth(dim: int, radius: float) -> NDArray[np.float64]:
-    """``(d, d)`` depth along the axis of a sphere around the camera, by similar triangles."""
+@pytest.mark.parametrize("dim", [32, 20])
+def test_z_depth_of_floats_becomes_distance(rendered: Path, tmp_path: Path, dim: int) -> None:
+    """Depth along the axis of a sphere around the camera, by similar triangles."""
     grid = TangentGrid(0, 5)
     line = ((np.arange(dim) + 0.5) / dim - 0.5) * grid.dim * grid.pitch
     x, y = np.meshgrid(line, line)
-    return np.asarray(radius / np.sqrt(x**2 + y**2 + 1))
-
-
-@pytest.mark.parametrize("dim", [32, 20])
-def test_z_depth_of_floats_becomes_distance(rendered: Path, tmp_path: Path, dim: int) -> None:
-    depth = _z_depth(dim, 2.5).astype(np.float32)
+    depth = (2.5 / np.sqrt(x**2 + y**2 + 1)).astype(np.float32)
     depth[: dim // 2] = 0
-    folder, output = _results(tmp_path / "depth", depth, ".tif"), tmp_path / "back.tif"
+    folder, output = tmp_path / "depth", tmp_path / "back.tif"
+    for face in range(20):
+        write_pixels(folder / f"face_{face:03}.tif", depth)
     render_with(back=folder, cameras=rendered / "cameras.json", output=output, z_depth=True)
     distance = _read(output)
     measured = distance > 0
@@ -184,8 +173,6 @@ def test_features_of_another_resolution(
 @pytest.mark.parametrize(
     ("rotation", "forward", "right"),
     [
-        ([90, 0, 0], (0, 1, 0), (-1, 0, 0)),  # to the right
-        ([0, 90, 0], (0, 0, 1), (0, 1, 0)),  # up
         ([0, 0, 90], (1, 0, 0), (0, 0, -1)),  # clockwise: right goes down
         ([90, 90, 0], (0, 0, 1), (-1, 0, 0)),  # pitched before yawed
     ],
@@ -291,7 +278,6 @@ def test_settings_that_cannot_work(
             {},
             r"face_003\.png: found 16×16×3 of uint8; expected squares, all alike: 32×32",
         ),
-        ({"face_000.png": (32, 30, 3)}, {}, "found 32×30×3 of uint8; expected squares"),
         ({}, {"kind": "labels"}, "expected labels.*Say what they are with kind=.*one channel"),
         ({}, {"z_depth": True}, "z_depth: found true for color"),
         ({}, {"output": "folder"}, r"expected a name ending in \.png"),

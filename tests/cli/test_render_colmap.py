@@ -14,9 +14,9 @@ from PIL import Image
 from datamodules.images.pixel_files import read_pixels, write_pixels
 from tangent_train.geometry import FLIP_Y, PanoramaPose, TangentGrid, random_rotation
 from tangent_train.keypoints.colmap import panorama_poses
-from tangent_train.rendering import equirect_to_tangent, read_rig
+from tangent_train.rendering import read_rig
 from tests.cli.rendering import Refused, render_with, smooth
-from tests.datamodules.data_files import contents
+from tests.datamodules.data_files import contents, gpano_xmp
 from tests.geometry.directions import angle_deg, random_directions
 
 pycolmap = pytest.importorskip("pycolmap")
@@ -121,20 +121,6 @@ def test_sizes_differ_and_one_is_broken(panoramas: Path, tmp_path: Path, refused
 # Masks.
 
 
-def test_one_mask_for_all(panoramas: Path, tmp_path: Path) -> None:
-    mask = np.random.default_rng(0).integers(0, 2, (16, 32), np.uint8).repeat(4, 0).repeat(4, 1)
-    write_pixels(tmp_path / "mask.png", mask * 200)
-    settings = {"input": panoramas, "base_level": 0, "colmap": True, "format": "jpg"}
-    render_with(output=tmp_path / "one", mask=tmp_path / "mask.png", **settings)
-    grid = TangentGrid(0, 5)
-    expected = equirect_to_tangent(mask, grid, interpolation="nearest")
-    for name in FRAMES:
-        for face in range(20):
-            image = f"face_{face:03}/{Path(name).stem}.jpg"
-            written = read_pixels(tmp_path / "one" / "masks" / f"{image}.png", indices=True)
-            np.testing.assert_array_equal(written, expected[face] * 255)
-
-
 def test_masks_by_name_and_classes_to_ignore(
     panoramas: Path, tmp_path: Path, refused: Refused
 ) -> None:
@@ -164,9 +150,8 @@ def test_masks_by_name_and_classes_to_ignore(
 def test_what_a_partial_panorama_does_not_show_is_ignored(tmp_path: Path) -> None:
     tags = {"FullPanoWidth": 128, "FullPanoHeight": 64, "CroppedAreaLeft": 0, "CroppedAreaTop": 16}
     tags |= {"CroppedAreaImageWidth": 128, "CroppedAreaImageHeight": 32}
-    attributes = " ".join(f'GPano:{name}Pixels="{value}"' for name, value in tags.items())
-    xmp = f'<x xmlns:GPano="http://ns.google.com/photos/1.0/panorama/" {attributes}/>'
-    Image.fromarray(smooth()[16:48]).save(tmp_path / "part.jpg", xmp=xmp.encode())
+    xmp = gpano_xmp({f"{name}Pixels": value for name, value in tags.items()})
+    Image.fromarray(smooth()[16:48]).save(tmp_path / "part.jpg", xmp=xmp)
     write_pixels(tmp_path / "white.png", np.full((32, 128), 255, np.uint8))
     settings = {"input": tmp_path / "part.jpg", "base_level": 0, "colmap": True}
     render_with(output=tmp_path / "out", **settings)
@@ -206,9 +191,7 @@ def _model(project: Path, poses: dict[str, PanoramaPose]) -> Any:
     return model
 
 
-@pytest.mark.parametrize("binary", [True, False])
 def test_poses_come_back(
-    binary: bool,
     project: Path,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
@@ -220,7 +203,7 @@ def test_poses_come_back(
     }
     model = _model(project, poses)
     (project / "sparse" / "0").mkdir(parents=True)
-    (model.write_binary if binary else model.write_text)(project / "sparse" / "0")
+    model.write(project / "sparse" / "0")
     monkeypatch.chdir(project / "sparse")  # the project is two folders up of the model
     render_with(poses="0", output=tmp_path / "poses.json")
     assert "poses of 2 of 2 panoramas" in capsys.readouterr().out

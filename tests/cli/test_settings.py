@@ -41,8 +41,6 @@ def test_values_are_converted() -> None:
         ({"choice": "c"}, "choice: found c; expected a or b or null"),
         ({"share": float("nan")}, "share: found nan; expected a number"),
         ({"count": True}, "count: found True; expected a whole number or null"),
-        ({"count": 1.5}, "count: found 1.5"),
-        ({"names": [1]}, "names: found"),
         ({"pair": [1, 2, 3]}, "pair: found"),
         ({"flag": "no"}, "flag: found no; expected true or false"),
     ],

@@ -47,9 +47,7 @@ def _run(command: str, monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None
 OF_ONNX = ("network=onnx", "file=net.onnx", "classes=classes.json", "normalization=unit")
 
 
-def test_an_imported_file_is_imported_again(
-    here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_imported_file_is_imported_again(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its description is replaced."""
     given = onnx.load("net.onnx")
     helper.set_model_props(given, {"author": "somebody"})
@@ -57,7 +55,6 @@ def test_an_imported_file_is_imported_again(
     _run("import", monkeypatch, *OF_ONNX, "level=7", "output=ours.onnx")
     again = ("file=ours.onnx", "level=6", "base_level=1", "output=again.onnx")
     _run("import", monkeypatch, *OF_ONNX, *again)
-    assert "indoors" not in capsys.readouterr().out.partition("again.onnx")[2]
     assert load_trained(here / "again.onnx").level == 6
     properties = [entry.key for entry in onnx.load("again.onnx").metadata_props]
     assert sorted(properties) == ["author", "tangent_train"]
@@ -73,7 +70,6 @@ def test_an_onnx_file_labels_panoramas(
     said = capsys.readouterr().out
     assert "3 classes: dark, green, bright\n" in said
     assert f"background: mean nothing, {'are written as unknown' if wins else 'never win'}" in said
-    assert "indoors, try levels=[3,4] base_level=0 in tangent-predict" in said
     trained = load_trained(here / "ours.onnx")
     assert trained.class_names == ("unknown", "dark", "green", "bright")
     assert (trained.fixed_size, trained.level) == ((32, 32), 5)
@@ -186,10 +182,6 @@ def test_tangent_images_have_the_angular_resolution_of_the_photos(
         (("output=net.onnx",), "which exists; expected nothing there yet"),
         (("output=ours.ckpt", "file=absent.onnx"), r"output: found ours\.ckpt; expected .*\.onnx"),
         (("file=null",), "file: found none; expected an ONNX file"),
-        (
-            ("network=timm", "model=vit", "output=net.ckpt"),
-            "found timm, which has no networks for segmentation",
-        ),
         (
             ("network=torchvision", "model=resnet50", "output=net.ckpt"),
             "model: found resnet50; expected deeplabv3",

@@ -15,8 +15,8 @@ import pytest
 
 from datamodules.images.pixel_files import write_pixels
 from tangent_train.cli.processes import command_line
+from tests.cli.test_shards import results
 from tests.cli.tiny_runs import run_command
-from tests.datamodules.data_files import contents
 from tests.inference.trained import sphere, write_checkpoint
 
 ROOT = Path(__file__).parents[3]
@@ -39,10 +39,6 @@ def _started(*arguments: str) -> subprocess.Popen[bytes]:
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     line = command_line("predict", arguments, Path())
     return subprocess.Popen(line, env=environment)
-
-
-def _results(folder: str) -> dict[str, bytes]:
-    return {name: b for name, b in contents(Path(folder)).items() if not name.startswith("shards/")}
 
 
 def _images(shard: str) -> list[Any]:
@@ -71,4 +67,4 @@ def test_one_of_them_is_killed_and_resumed(settings: list[str]) -> None:
     ]
     for path in Path("out").rglob(".partial*"):  # of the killed one
         path.unlink()
-    assert _results("out") == _results("whole")
+    assert results("out") == results("whole")

@@ -8,13 +8,9 @@ import re
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
-from datamodules.images.pixel_files import write_pixels
 from tests.cli.tiny_runs import SETTINGS, Run
-from tests.datamodules.data_files import contents
-from tests.inference.trained import sphere, write_checkpoint
 
 # Optuna 2.10, all that hydra-optuna-sweeper works with, is written for an old one.
 OLD_SQLALCHEMY = pytest.mark.filterwarnings("ignore:Deprecated API features detected")
@@ -115,15 +111,3 @@ def test_a_search_without_a_validation_split_is_refused(
     with pytest.raises(SystemExit, match=message):
         run("train", "-m", "sweep=optuna", *without)
     assert not list(tmp_path.rglob("checkpoints"))
-
-
-def test_shards_of_predictions_are_jobs(tmp_path: Path, run: Run) -> None:
-    for number in range(5):
-        write_pixels(tmp_path / "in" / f"{number}.png", np.roll(sphere(32), number, 1))
-    settings = (f"checkpoint={write_checkpoint(tmp_path / 'model.ckpt')}", "input=in", "report=2")
-    run("predict", *settings, "output=whole")
-    shards = ("-m", "launcher=local", "shard=1/2,2/2", "hydra.sweep.dir=jobs")
-    run("predict", *shards, *settings, "output=out")
-    found = {n: b for n, b in contents(Path("out")).items() if not n.startswith("shards/")}
-    assert found == contents(Path("whole"))
-    assert len(list(Path("jobs", ".submitit").glob("[0-9]*"))) == 2

@@ -74,7 +74,6 @@ CONFIGS = {
 """Programs that get the settings above, and their config."""
 
 _FENCE = re.compile(r"^( *)```+(\w*)\n(.*?)^\1```+$", re.MULTILINE | re.DOTALL)
-_SPAN = re.compile(r"(?<!`)`((?:tangent-|python |pip |make )[^`\n]* [^`\n]+|make \w+)`(?!`)")
 _FILE = re.compile(r"^# (\S+\.\w+)\n")
 _OPEN = re.compile(r"…|<[^<>]*>")
 
@@ -108,8 +107,6 @@ def blocks(name: str, text: str) -> Iterator[Block]:
             yield Block(place, [line.removeprefix("$ ") for line in lines], files=files)
         elif language == "python" and not _FILE.match(body):
             yield Block(place, python=body, files=files)
-    for span in _SPAN.finditer(_FENCE.sub(lambda m: "\n" * m[0].count("\n"), text)):
-        yield Block(f"{name}: {span[1]}", [span[1]], files=files)
 
 
 def words_of(line: str) -> tuple[dict[str, str], list[str]]:

@@ -9,28 +9,19 @@ from typing import Any
 import cv2
 import numpy as np
 
-from datamodules import (
-    FolderPanoramas,
-    ModelNet40,
-    Stanford2D3DS,
-    SynthiaPerspective,
-)
+from datamodules import FolderPanoramas, ModelNet40, Stanford2D3DS
 from datamodules.core.found import SPLITS
 from datamodules.core.split_module import SplitDataModule
-from tangent_train.rendering import EquirectRepresentation, PerspectiveRepresentation
+from tangent_train.rendering import EquirectRepresentation
 from tests.conftest import FabricateStanford
 from tests.datamodules.folder.folder_format import write_data_set
 from tests.datamodules.modelnet40.shapes_format import write_tree
-from tests.datamodules.synthia.synthia_format import write_views
 
 NAME = "Küche 1 [b] 部屋 ∕ a,b=c"
 ERP = EquirectRepresentation(level=3)
-CROPS = PerspectiveRepresentation(level=5)
 BOTH: Any = ("rgb", "depth")
-SEQUENCES = {"01": 4, "02": 3, "04": 2}
-_OF_SYNTHIA: dict[str, Any] = {"train_sequences": ("01", "02"), "test_sequences": ("04",)}
 
-KINDS = ("folder", "stanford", "synthia photos", "shapes")
+KINDS = ("folder", "stanford", "shapes")
 
 
 def write(kind: str, root: Path, fabricate: FabricateStanford) -> Path:
@@ -39,8 +30,6 @@ def write(kind: str, root: Path, fabricate: FabricateStanford) -> Path:
         return write_data_set(root, depth=True)
     if kind == "shapes":
         return write_tree(root)
-    if kind == "synthia photos":
-        return write_views(root, SEQUENCES)
     return fabricate(root)
 
 
@@ -49,9 +38,6 @@ def module(kind: str, root: Path, **settings: Any) -> SplitDataModule[Any]:
     make: dict[str, Callable[..., SplitDataModule[Any]]] = {
         "folder": lambda **more: FolderPanoramas(root, ERP, inputs=BOTH, **more),
         "stanford": lambda **more: Stanford2D3DS(root, ERP, inputs=BOTH, **more),
-        "synthia photos": lambda **more: SynthiaPerspective(
-            root, CROPS, inputs=BOTH, **_OF_SYNTHIA, **more
-        ),
         "shapes": lambda **more: ModelNet40(root, ERP, **more),
     }
     return make[kind](**settings)
@@ -62,7 +48,6 @@ def colors(kind: str, root: Path) -> list[Path]:
     pattern = {
         "folder": "images/**/*.*",
         "stanford": "area_*/pano/rgb/*.png",
-        "synthia photos": "*/RGB/**/*.png",
         "shapes": "**/*.off",
     }
     return sorted(root.glob(pattern[kind]))
@@ -78,12 +63,8 @@ def partner(kind: str, path: Path, part: str) -> Path:
     """
     if kind == "folder":
         return path.parents[2] / part / path.parent.name / f"{path.stem}.png"
-    if kind == "stanford":
-        domain = "semantic" if part == "labels" else part
-        return path.parents[1] / domain / path.name.replace("domain_rgb", f"domain_{domain}")
-    folder = {"depth": "Depth", "labels": "GT/LABELS"}[part]
-    place = path.parts.index("RGB")
-    return path.__class__(*path.parts[:place]) / folder / path.__class__(*path.parts[place + 1 :])
+    domain = "semantic" if part == "labels" else part
+    return path.parents[1] / domain / path.name.replace("domain_rgb", f"domain_{domain}")
 
 
 def names(data: SplitDataModule[Any]) -> dict[str, list[str]]:

@@ -56,7 +56,6 @@ _FAULTS = [
     ("stanford", "labels", _past_the_table, r"instance 521 in 1 pixel; expected 0 to 520"),
     ("stanford", "rgb", sets.link_to_itself, _LOOP),
     ("stanford", "rgb", _other_shape, "expected twice as wide"),
-    ("synthia photos", "labels", sets.corrupt, _BROKEN),
     ("folder", "labels", sets.corrupt, _NO_IMAGE),
     ("folder", "depth", sets.to_8_bits, "uint8 of shape"),
     ("folder", "labels", sets.smaller, "16×32 pixels; expected 32"),

@@ -49,7 +49,7 @@ def root(tmp_path: Path) -> Path:
 # --- left out -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", ["folder", "stanford", "synthia photos", "shapes"])
+@pytest.mark.parametrize("kind", sets.KINDS)
 def test_broken_files_are_refused_or_left_out_and_counted(
     kind: str, root: Path, fabricate_stanford: FabricateStanford, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -21,19 +21,12 @@ from tests.datamodules.data_files import contents
 
 PROCESSES = 3
 PANORAMAS = 14
-ROOMS = RoomSettings(rooms={"area_1": 2, "area_5a": 1}, height=32)
 
 
 @pytest.fixture(scope="module")
 def processes() -> ForkServerContext:
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(
-        [
-            "datamodules.stanford2d3ds.panoramas",
-            "datamodules.synthrooms.generate",
-            "tangent_train.rendering",
-        ]
-    )
+    context.set_forkserver_preload(["datamodules.stanford2d3ds.panoramas"])
     return context
 
 

@@ -5,12 +5,10 @@ from __future__ import annotations
 import json
 import shutil
 from dataclasses import replace
-from functools import partial
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import cv2
-import lightning
 import numpy as np
 import pytest
 import torch
@@ -41,48 +39,19 @@ def _without_labels(path: Path) -> None:
     assert cv2.imwrite(str(path), np.zeros_like(image))
 
 
-class Steps(lightning.Callback):
-    """Keeps the loss, the labelled pixels and the weights of every step."""
-
-    def __init__(self) -> None:
-        self.losses: list[float] = []
-        self.labelled: list[int] = []
-        self.weights: list[torch.Tensor] = []
-
-    def on_train_batch_end(
-        self, trainer: Any, pl_module: Any, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
-        self.losses.append(float(trainer.callback_metrics["train/loss"]))
-        self.labelled.append(int((batch.labels > 0).sum()))
-        self.weights.append(pl_module.network.layer.weight.detach().clone())
-
-
 @WITHOUT_VALIDATION
-@pytest.mark.parametrize(("settings", "half"), [({}, False), ({"images_per_chunk": 7}, True)])
-def test_a_batch_without_labels_changes_nothing(
-    root: Path, tmp_path: Path, settings: dict[str, Any], half: bool
-) -> None:
+@pytest.mark.parametrize("half", [False, True])
+def test_a_batch_without_labels_changes_nothing(root: Path, tmp_path: Path, half: bool) -> None:
     _, *unknown = _label_files(root, "[12346]")
     for path in unknown:
         _without_labels(path)
     plugins = [MixedPrecision("16-mixed", "cpu", torch.amp.GradScaler("cpu"))] if half else []
-    steps = Steps()
-    trainer = run_trainer(tmp_path / "run", max_epochs=1, plugins=plugins, callbacks=[steps])
+    trainer = run_trainer(tmp_path / "run", max_epochs=1, plugins=plugins)
     network = Faulty()
-    weights = [network.layer.weight.detach().clone()]
-    task = small_task(network, optimizer=partial(torch.optim.SGD, lr=0.01), **settings)
-    trainer.fit(task, datamodule=small_data(root, validation_fraction=0))
-    weights += steps.weights
-    assert len(steps.losses) == 9
-    assert sum(count > 0 for count in steps.labelled) == 1
-    for step, (loss, labelled) in enumerate(zip(steps.losses, steps.labelled, strict=True)):
-        same = torch.equal(weights[step], weights[step + 1])
-        if labelled:
-            assert loss > 0
-            assert not same
-        else:
-            assert loss == 0
-            assert same
+    trainer.fit(small_task(network), datamodule=small_data(root, validation_fraction=0))
+    weights = [*network.weights, network.layer.weight.detach()]
+    changed = [not torch.equal(before, after) for before, after in pairwise(weights)]
+    assert (len(changed), sum(changed)) == (9, 1)
 
 
 @pytest.mark.parametrize("absent", ["skip", "zero"])

@@ -18,7 +18,6 @@ from PIL import Image
 
 from datamodules.core.problems import Problems
 from datamodules.core.reading import ImageFiles
-from datamodules.core.store import Store
 from datamodules.folder.cameras import read_cameras as read_photo_cameras
 from datamodules.folder.classes import read_classes
 from datamodules.images.gpano import area_of, up_of
@@ -34,9 +33,7 @@ from tangent_train.geometry import TangentGrid, rotation_about
 from tangent_train.rendering.camera_files import (
     CameraFile,
     read_cameras,
-    read_rig,
     write_cameras,
-    write_rig,
 )
 from tests.datamodules.data_files import gpano_xmp
 from tests.datamodules.zind.zind_format import SQUARE, Camera, write_home
@@ -133,20 +130,6 @@ def _read_camera_list(path: Path) -> None:
     cameras = read_cameras(path)
     assert len(cameras.faces) == len(cameras.files)
     assert cameras.grid.directions(cameras.faces[:1]).shape[1:] == (cameras.grid.dim,) * 2 + (3,)
-
-
-def _rig_seeds() -> list[bytes]:
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "rig_config.json"
-        write_rig(path, TangentGrid(0, 4), {"face_003/": 3, "face_007/": 7}, {"a.png": "a.jpg"})
-        return [path.read_bytes()]
-
-
-def _read_rig(path: Path) -> None:
-    rig = read_rig(path)
-    for matrix in rig.world_from_camera.values():
-        np.testing.assert_allclose(matrix @ matrix.T, np.eye(3), atol=1e-5)
-    assert len(rig.images) == len(rig.world_from_camera) * len(rig.panoramas)
 
 
 def _photo_camera_seeds() -> list[bytes]:
@@ -258,26 +241,10 @@ def _read_image(path: Path) -> None:
         assert 0 <= depth.min() <= depth.max() <= 1e4
 
 
-def _store_seeds() -> list[bytes]:
-    with TemporaryDirectory() as folder:
-        store, source = Store(Path(folder)), Path(folder) / "a.png"
-        source.touch()
-        store.make("a", {"rgb": source}, lambda: {"rgb": _RGB, "depth": _DEPTH})
-        return [store.path("a").read_bytes()]
-
-
-def _read_store(path: Path) -> None:
-    path.replace(path.with_suffix(".npy"))
-    for array in Store(path.parent).read(path.stem, {}).values():
-        assert array.dtype.kind != "O"
-        array.tobytes()  # every pixel can be looked at
-
-
 TARGETS: dict[str, tuple[Callable[[], list[bytes]], Callable[[Path], None]]] = {
     "label_table": (_table_seeds, _read_table),
     "classes": (_class_seeds, _read_class_list),
     "cameras": (_camera_seeds, _read_camera_list),
-    "rig": (_rig_seeds, _read_rig),
     "photo_cameras": (_photo_camera_seeds, _read_photo_cameras),
     "pose": (_pose_seeds, _read_pose),
     "off": (_off_seeds, _read_mesh),
@@ -285,6 +252,5 @@ TARGETS: dict[str, tuple[Callable[[], list[bytes]], Callable[[Path], None]]] = {
     "label_image": (_label_image_seeds, _read_label_image),
     "gpano": (_gpano_seeds, _read_gpano),
     "pixels": (_pixel_seeds, _read_image),
-    "store": (_store_seeds, _read_store),
 }
 """By name: valid files, and a reader that asserts what comes out."""
