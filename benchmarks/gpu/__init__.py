@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+__all__ = ["segformer"]
+
 
 def segformer(quick: bool) -> dict[str, Any]:
     """The config of SegFormer-B0, or of a smaller one."""

@@ -19,7 +19,10 @@ from torch.profiler import ProfilerActivity, profile
 
 from benchmarks.measuring import DEVICE, Goal, Row, Table, attempted
 from benchmarks.training import built, quiet
+from datamodules.core.inputs import normalize
+from datamodules.core.samples import TrainingSample
 from tangent_train.callbacks.progress import ProgressBar
+from tangent_train.rendering import equirect_to_tangent
 
 _ON_GPU = DEVICE.type == "cuda"
 _WARM, _TIMED, _PROFILED = (8, 30, 10) if _ON_GPU else (1, 2, 1)
@@ -43,6 +46,8 @@ def fed(quick: bool) -> Iterator[Table]:
         fits = {"the step alone": partial(_fit, task, train_dataloaders=repeat(batch))}
         for workers in (0,) if quick else [n for n in (2, 4, 8, 12, 15) if n < cores]:
             fits[f"{workers} workers"] = partial(_fit, task, datamodule=data, workers=workers)
+        rendered = partial(_fit, task, train_dataloaders=_rendered(data, 4 if quick else 16))
+        fits["rendered on the GPU, whole panoramas in pinned memory"] = rendered
         found = {}
         for name, fit in fits.items():
             with attempted(name):
@@ -113,3 +118,25 @@ def _union_s(profiler: Any) -> float:
     start, end = np.array(sorted((e.time_range.start, e.time_range.end) for e in events)).T
     until = np.maximum.accumulate(np.append(0, end[:-1]))
     return float(np.maximum(0, end - np.maximum(start, until)).sum()) / 1e6
+
+
+def _rendered(data: Any, count: int) -> Iterator[Any]:
+    """Batches that are rendered on the device from panoramas in pinned memory."""
+    grid, panoramas = data.representation.grid, []
+    for k in range(count):
+        image = data.source("train").read(k)
+        parts = map(torch.tensor, (image.rgb, image.depth.clip(max=2048), image.labels))
+        panoramas.append([part.pin_memory() if _ON_GPU else part for part in parts])
+    while True:
+        sets = []
+        for k in torch.randint(count, (4,)).tolist():
+            rgb, depth, labels = (part.to(DEVICE, non_blocking=True) for part in panoramas[k])
+            faces = torch.randperm(grid.num_images)[:4].numpy()
+            images = equirect_to_tangent(rgb.movedim(-1, 0).float(), grid, faces)
+            exact = torch.stack([depth.to(torch.int16), labels.to(torch.int16)])
+            steps, truth = equirect_to_tangent(exact, grid, faces, "nearest").unbind(1)
+            sets.append((images.movedim(1, -1), steps, truth.byte()))
+        rgb, depth, labels = (torch.stack(part) for part in zip(*sets, strict=True))
+        inputs = normalize((rgb, depth), data.normalization, ("rgb", "depth"))
+        rays = torch.empty(4, 0, 3, 3, device=DEVICE)
+        yield TrainingSample(inputs, labels, rays, torch.arange(4))  # type: ignore[arg-type]

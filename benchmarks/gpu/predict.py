@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from tangent_train.inference.photo_networks import PhotoNetwork, import_network
 from tangent_train.inference.predictor import Predictor, view_scores
 from tangent_train.inference.views import InputImage, PanoramaViews
 from tangent_train.registry import make
+from tangent_train.rendering import equirect_to_tangent, tangent_to_labels
 
 
 def predict(quick: bool) -> Iterator[Table]:
@@ -61,7 +62,7 @@ def _imported(settings: dict[str, Any], level: int, path: Path) -> TrainedNetwor
 
 
 def _rows(trained: TrainedNetwork, level: int, rounds: int) -> list[Row]:
-    """The network alone, and `Predictor` as it is."""
+    """The network alone, `Predictor` as it is, and everything on the device."""
     shape, grid = equirect_shape(level), TangentGrid(1, level)
     image = InputImage(np.random.default_rng(0).integers(0, 256, (*shape, 3), np.uint8))
     predictors = {
@@ -73,19 +74,24 @@ def _rows(trained: TrainedNetwork, level: int, rounds: int) -> list[Row]:
     random = torch.randn(count, 3, grid.dim, grid.dim, device=DEVICE)
     random = random.contiguous(memory_format=torch.channels_last)
 
-    def views(part: slice) -> torch.Tensor:
-        return random[: part.stop - part.start]
+    def scores(views: Callable[[slice], torch.Tensor]) -> list[torch.Tensor]:
+        parts = view_scores(trained.network, views, grid.num_images, per_forward)
+        return [part for _, part in parts]
 
-    def scores() -> list[Any]:
-        return list(view_scores(trained.network, views, grid.num_images, per_forward))
+    def on_device() -> None:
+        panorama = torch.from_numpy(image.rgb).to(DEVICE).movedim(-1, 0) / 255
+        faces = np.arange(grid.num_images)
+        found = scores(lambda part: equirect_to_tangent(panorama, grid, faces[part]))
+        tangent_to_labels(torch.cat(found), grid, shape).byte().cpu()
 
     def labelled(predictor: Predictor) -> None:
         trained.labels(predictor.predict(image).labels())
 
     ways = [
-        Way("the network", scores),
+        Way("the network", lambda: scores(lambda part: random[: part.stop - part.start])),
         Way("Predictor, feather", partial(labelled, predictors["feather"]), ours=True),
         Way("Predictor, nearest", partial(labelled, predictors["nearest"]), ours=True),
+        Way("rendered and labelled on the device, nearest", on_device),
     ]
     with torch.autocast(DEVICE.type, torch.bfloat16, enabled=DEVICE.type == "cuda"):
         return measure(ways, rounds)

@@ -17,7 +17,7 @@ from tangent_train.cli.build import Settings
 from tangent_train.cli.evaluate import Run
 from tangent_train.cli.say import say
 from tangent_train.cli.settings import Trust, typed
-from tangent_train.errors import printable
+from tangent_train.errors import DataError, printable
 from tangent_train.registry import SettingsFile, make
 
 _TYPED = re.compile(r"[+~]*network[.@=]")
@@ -39,7 +39,17 @@ def begin_from(path: Path, settings: Settings) -> tuple[Settings, SettingsFile |
 
     Returns:
         Settings of the run, and the source of those that the file gave, if any.
+
+    Raises:
+        DataError: It is an ONNX file.
     """
+    if path.suffix.lower() == ".onnx":
+        raise DataError(
+            path,
+            found="an ONNX file, whose tensors cannot be trained",
+            expected="a checkpoint, a state dict or a .safetensors file",
+            remedy="Give the checkpoint that it was exported from.",
+        )
     start, hydra = start_in(path), HydraConfig.get()
     if start is None or "network" not in hydra.runtime.choices:
         return settings, None

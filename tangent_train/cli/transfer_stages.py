@@ -24,6 +24,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+from filelock import FileLock, Timeout
 from omegaconf import DictConfig, OmegaConf
 
 from tangent_train.checkpoints.content import read_settings
@@ -252,6 +253,7 @@ def run_stage(stage: Stage, state: State) -> int:
 
     Raises:
         DataError: The checkpoint it starts from is missing.
+        SettingError: Another command is running it.
     """
     config, digest = dict(stage.config), None
     if state == "begun":
@@ -267,10 +269,21 @@ def run_stage(stage: Stage, state: State) -> int:
         config["init_from" if stage.command == "train" else "checkpoint"] = str(stage.weights)
         digest = _digest(stage.weights, config)
     stage.folder.mkdir(parents=True, exist_ok=True)
-    if state == "new":
-        write_text(stage.folder / "stage.json", json.dumps({"weights": digest}) + "\n")
-    write_text(stage.folder / "stage.yaml", OmegaConf.to_yaml(OmegaConf.create(_HEAD | config)))
-    status = run_process(stage_command(stage))
+    try:
+        with FileLock(stage.folder / ".lock", blocking=False):
+            if state == "new":
+                write_text(stage.folder / "stage.json", json.dumps({"weights": digest}) + "\n")
+            write_text(
+                stage.folder / "stage.yaml", OmegaConf.to_yaml(OmegaConf.create(_HEAD | config))
+            )
+            status = run_process(stage_command(stage))
+    except Timeout as error:
+        raise SettingError(
+            stage.folder,
+            found=f"another tangent-transfer that runs stage {stage.name}",
+            expected="none",
+            remedy="Wait for it; other seeds and folds can run beside it.",
+        ) from error
     return status if status >= 0 else 128 - status
 
 

@@ -116,6 +116,8 @@ def test_files_that_do_not_describe_their_network_change_nothing(
     assert settings["network"]["widths"] == [16, 32, 64, 128, 256, 256]
     assert "normalization" not in settings["data"]
     assert source is None
+    with pytest.raises(DataError, match=r"net\.onnx: found an ONNX file, .*exported from"):
+        _begun(monkeypatch, tmp_path / "net.onnx")
 
 
 def test_classes_of_files_are_called_only_where_they_are_known(
