@@ -21,19 +21,8 @@ from tangent_train.geometry import (
     xyz_to_lonlat,
 )
 from tests.geometry.directions import random_directions
-from tests.rendering.reference import ReferenceGrid, to_xyz
 
 ROTATION = rotation_about((1, 2, -3), 1.1)
-
-
-@pytest.mark.parametrize(("base_level", "level", "dim"), [(0, 5, None), (1, 5, 13), (2, 5, 20)])
-def test_directions_follow_the_textbook_formulas(
-    base_level: int, level: int, dim: int | None
-) -> None:
-    grid = TangentGrid(base_level, level, dim)
-    reference = ReferenceGrid(base_level, level, grid.dim)
-    expected = [to_xyz(reference.lonlat(face)) for face in reference.order(grid.centers_xyz)]
-    np.testing.assert_allclose(grid.directions(), expected, atol=1e-13)
 
 
 @pytest.mark.parametrize("rotation", [None, ROTATION])

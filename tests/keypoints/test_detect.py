@@ -46,20 +46,6 @@ def test_orb_finds_the_same_in_an_image_and_upside_down() -> None:
         assert np.median(tree.query(found.points_xy[found.sizes == size])[0]) < 1e-3
 
 
-@pytest.mark.parametrize("name", ["sift", "orb"])
-def test_arrays_fit_together(name: str) -> None:
-    image = np.random.default_rng(0).integers(0, 256, (120, 150), np.uint8)
-    detector = Detector(name)
-    kind, width = ("float32", 128) if detector.norm == "l2" else ("uint8", 32)
-    blank, tiny = np.full((90, 60), 128, np.uint8), np.zeros((1, 1), np.uint8)
-    for number, view in enumerate((image[:, ::-1], blank, tiny)):  # not contiguous
-        found = detector.detect(view)
-        n = len(found.responses)
-        assert [v.shape for v in found] == [(n, 2), (n,), (n,), (n,), (n, width)]
-        assert found.descriptors.dtype == kind
-        assert (n > 10) == (number == 0)
-
-
 # The panorama.
 
 

@@ -75,15 +75,6 @@ def test_it_computes_its_formula() -> None:
     torch.testing.assert_close(exact, expected, rtol=1e-6, atol=1e-6)
 
 
-def test_an_image_alone_learns_nothing() -> None:
-    mixer, (tokens, directions) = _mixer(), _inputs(images=1)
-    learned = mixer(tokens.requires_grad_(), directions)
-    assert not learned.any()
-    leaves = [tokens, *mixer.parameters()]
-    for gradient in torch.autograd.grad((learned * torch.randn_like(learned)).sum(), leaves):
-        assert not gradient.any(), "and nothing is learned from it"
-
-
 def test_it_starts_from_nothing_and_every_parameter_learns() -> None:
     mixer, (tokens, directions) = SphereAttention(12, heads=3, width=6), _inputs()
     assert not mixer(tokens, directions).any()

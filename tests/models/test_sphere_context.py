@@ -224,18 +224,6 @@ def test_scores_and_gradients_on_a_gpu_are_those_of_the_cpu() -> None:
         torch.testing.assert_close((scores, found), expected, check_device=False)
 
 
-@GPU
-@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
-def test_half_precision(dtype: torch.dtype) -> None:
-    context = small_context().cuda().eval()
-    images, rays = torch.randn(4, 3, 16, 16).cuda(), sphere_rays(4).cuda()
-    with torch.no_grad():
-        expected = context(images, rays)
-        with torch.autocast("cuda", dtype):
-            for found in (context(images, rays), context(images, rays, 3)):
-                torch.testing.assert_close(found.float(), expected, rtol=0.1, atol=0.1)
-
-
 def test_only_one_chunk_is_kept_for_the_gradient() -> None:
     context, images, rays = small_context().train(), torch.randn(16, 3, 32, 32), sphere_rays(16)
 

@@ -86,16 +86,6 @@ def test_the_page_refers_to_nothing_outside_and_forbids_it(nasty_page: str) -> N
     assert policy.startswith("default-src 'none'; img-src data: blob:;")
 
 
-def test_tables_align_columns_and_shade_heat_maps() -> None:
-    text = Table("t", ("class", "a"), [("wall", "61.2"), ("floor", "–")]).html()
-    assert '<th scope="col"><span>class' in text
-    assert '<th class="number" scope="col"><span>a' in text
-    assert text.count('<td class="number">') == 2
-    heat = Table("t", ("", "a", "b"), [("x", "25", "90")], shades=[[0.25, 0.9]]).html()
-    assert '<td style="--share:0.250">25</td>' in heat
-    assert '<td class="strong" style="--share:0.900">90</td>' in heat
-
-
 def test_printed_tables_and_markdown_take_any_text_in_full_width(
     capsys: pytest.CaptureFixture[str],
 ) -> None:

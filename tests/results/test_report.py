@@ -122,19 +122,6 @@ def test_all_files_hold_the_same_scores(tmp_path: Path) -> None:
     assert "| mine | 2 | 0 | /runs/2_0 |" in text
 
 
-def test_inputs_and_representations_have_their_names() -> None:
-    other = {"representation__base_level": None}
-    erp = {"representation___target_": "r.EquirectRepresentation"}
-    for settings, names in (
-        ({"data__inputs": ["rgb"]}, ("RGB", "0")),
-        ({"data__inputs": ["rgb", "depth", "elevation"]}, ("RGB-D + elevation", "0")),
-        (other, ("RGB-D", "tangent images")),
-        (other | erp, ("RGB-D", "ERP")),
-    ):
-        (row,) = _runs_report(made_record([0.5] * 3, **settings)).rows
-        assert (row.facts["input"], row.facts["b"]) == names
-
-
 def test_the_papers_rows_stand_beside_the_same_data_and_resolution() -> None:
     report = _runs_report(made_record([0.5] * 13, REAL))
     cells = _cells(report)
