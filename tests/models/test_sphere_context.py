@@ -222,23 +222,3 @@ def test_scores_and_gradients_on_a_gpu_are_those_of_the_cpu() -> None:
         expected = _gradients(context, images, rays, size)
         scores, found = _gradients(copy.deepcopy(context).cuda(), images.cuda(), rays.cuda(), size)
         torch.testing.assert_close((scores, found), expected, check_device=False)
-
-
-def test_only_one_chunk_is_kept_for_the_gradient() -> None:
-    context, images, rays = small_context().train(), torch.randn(16, 3, 32, 32), sphere_rays(16)
-
-    def kept_bytes(size: int | None) -> int:
-        """Of tensors that the graph holds between the forward and the backward pass."""
-        storages: dict[int, int] = {}
-
-        def pack(tensor: Tensor) -> Tensor:
-            storage = tensor.untyped_storage()
-            storages[storage.data_ptr()] = storage.nbytes()
-            return tensor
-
-        with torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor):
-            scores = context(images, rays, size)
-        assert scores.requires_grad
-        return sum(storages.values())
-
-    assert kept_bytes(4) < 0.1 * kept_bytes(None)

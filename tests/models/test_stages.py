@@ -12,6 +12,14 @@ from tangent_train.errors import SettingError
 from tests.models.sphere_networks import STAGE, small_unet
 
 
+class _Looking(nn.Sequential):
+    """Cannot run where there are no values."""
+
+    def forward(self, images: Tensor) -> Tensor:
+        result: Tensor = super().forward(images)  # type: ignore[no-untyped-call]
+        return result * 2 if bool(images.sum() > 1) else result
+
+
 class _Twice(nn.Module):
     """Runs one stage twice; the other gives two tensors."""
 
@@ -27,10 +35,18 @@ class _Twice(nn.Module):
         return features
 
 
-def test_channels_are_found_by_running_a_copy() -> None:
-    network = UNet(4, 14)
+@pytest.mark.parametrize(
+    ("network", "stage", "in_channels", "channels"),
+    [
+        (UNet(4, 14), "downs.4", 4, 256),
+        (_Looking(nn.Conv2d(3, 6, 1), nn.Conv2d(6, 2, 1)), "0", 3, 6),
+    ],
+)
+def test_channels_are_found_by_running_a_copy(
+    network: nn.Module, stage: str, in_channels: int, channels: int
+) -> None:
     before = {name: tensor.clone() for name, tensor in network.state_dict().items()}
-    assert stage_channels(network, "downs.4", 4) == 256
+    assert stage_channels(network, stage, in_channels) == channels
     assert network.training
     assert not any(module._forward_hooks for module in network.modules())
     torch.testing.assert_close(network.state_dict(), before, rtol=0, atol=0)

@@ -75,10 +75,6 @@ def test_a_single_run_is_shown_with_its_interval_over_images(tmp_path: Path) -> 
     explained = "95 % bootstrap interval over its images"
     assert explained in report.tables()[0].note
     assert explained not in _runs_report(*several).tables()[0].note
-    with_bar, without = (
-        decoded(report_png("", [Row("", (run(found),))])) for found in (intervals, {})
-    )
-    assert (with_bar != without).any()
     ends_of = {
         (figure["row"], figure["fold"]): (figure["low"], figure["high"])
         for figure in report.figures()
@@ -109,12 +105,6 @@ def test_all_files_hold_the_same_scores(tmp_path: Path) -> None:
         assert {k: v for k, v in row.items() if v} == {
             k: str(v) for k, v in figure.items() if v is not None
         }
-    scopes = [
-        r for r in rows if r["row"] == "mine" and r["score"] == "miou" and r["class"] == "mean"
-    ]
-    assert [(r["fold"], r["south"], r["mean"]) for r in scopes if r["fold"] == "mean"] == [
-        ("mean", "", "0.25"), ("mean", "45.0", "0.6"), ("mean", "-90.0", "0.2"),
-    ]  # fmt: skip
     text = (tmp_path / "x.md").read_text()
     assert text.startswith("# Report\n")
     assert r"| a\|b [red] | 10.0 | 40.0 | – |" in text

@@ -71,6 +71,22 @@ class SmallNetwork(nn.Module):
         return scores
 
 
+class WithStatistics(nn.Module):
+    """A small network with batch normalization."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        self.encoder = nn.Sequential(nn.Conv2d(3, 8, 3, stride=2), nn.BatchNorm2d(8), nn.ReLU())
+        self.neck = nn.Sequential(nn.Conv2d(8, 8, 1), nn.BatchNorm2d(8), nn.ReLU())
+        self.head = nn.Linear(8, 3)
+
+    def forward(self, images: Tensor) -> Tensor:
+        features = self.neck(self.encoder(images.flatten(0, 1))).mean(dim=(2, 3))
+        scores: Tensor = self.head(features.unflatten(0, images.shape[:2]).mean(dim=1))
+        return scores
+
+
 def shape_task(
     network: nn.Module | None = None, names: Sequence[str] = NAMES, **settings: Any
 ) -> ClassificationTask:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from functools import partial
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import lightning
@@ -155,28 +154,3 @@ def test_processes_exchange_gradients_once_after_the_last_chunk() -> None:
     found, _ = _gradients(7, trainer=trainer)
     assert exchanges.count == 1
     torch.testing.assert_close(found, _expected(3)[0])
-
-
-def test_the_mean_of_processes_gradients_is_that_of_their_batches_together() -> None:
-    """Though one has many more labelled pixels than the other."""
-    (batch,) = Data(3).train_dataloader()
-    task: Any = _task(7)
-    task.class_weights.copy_(torch.tensor([1.0, 3.0, 0.2]))
-    task.log = lambda *_, **__: None
-
-    def gradient(part: slice, norm: Tensor) -> Tensor:
-        means = {"mean": iter((norm, torch.zeros(())))}  # that of the loss is only shown
-        strategy = SimpleNamespace(
-            reduce=lambda _, reduce_op: next(means[reduce_op]),
-            backward=lambda loss, _: loss.backward(),
-        )
-        optimizers = [torch.optim.SGD(task.parameters())]
-        task._trainer = SimpleNamespace(
-            accumulate_grad_batches=1, optimizers=optimizers, strategy=strategy
-        )
-        task.training_step(Sample(batch.images[part], batch.labels[part]), 0).backward()
-        return torch.cat([p.grad.flatten() for p in task.network.parameters()])
-
-    norm = task.loss_norm(batch.labels.flatten(0, 1))
-    of_each = gradient(slice(0, 1), norm / 2) + gradient(slice(1, 3), norm / 2)
-    torch.testing.assert_close(of_each / 2, gradient(slice(0, 3), norm), rtol=1e-4, atol=1e-6)

@@ -151,19 +151,6 @@ def test_a_judge_chooses_among_the_axes_of_the_best_frame(
         np.testing.assert_array_equal(estimate_up(room, 180, judge), wanted)
 
 
-def test_what_is_hopeless_or_the_only_one_is_not_judged(monkeypatch: pytest.MonkeyPatch) -> None:
-    def judge(ups: NDArray[np.float64]) -> NDArray[np.float64]:
-        raise AssertionError(ups)
-
-    turn = _tilted(3, 200, 180)
-    assert angle_deg(_up(draw_room((128, 256), turn), 60, judge), turn[:, 2]) < 0.5
-    estimate_up(_without_structure()["black"], 180, judge)
-    certain = np.array([0.001, 0.001, 0.996, 0.001, 0.001, 0])
-    place = "tangent_train.rendering.upright.gravity.up_probabilities"
-    monkeypatch.setattr(place, lambda *_: certain)
-    assert estimate_up(draw_room((128, 256), turn), 180, judge) is not None
-
-
 def test_upside_down() -> None:
     turn = rotation_about((1, 0, 0), math.pi)
     room = draw_room((128, 256), turn)
