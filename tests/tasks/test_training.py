@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import lightning
 import pytest
@@ -16,14 +16,10 @@ from torch.distributed.algorithms.ddp_comm_hooks import default_hooks
 from torch.nn.functional import cross_entropy
 from torch.utils.data import DataLoader
 
+from datamodules.core.samples import TrainingSample
 from tangent_train.rendering import TangentRepresentation
 from tangent_train.tasks import SegmentationTask
 from tests.tasks.shapes import Gradients, quiet_trainer
-
-
-class Sample(NamedTuple):
-    images: Tensor
-    labels: Tensor
 
 
 class Data(lightning.LightningDataModule):
@@ -39,7 +35,10 @@ class Data(lightning.LightningDataModule):
         labels = torch.randint(0, 4, (3, 20, 16, 16), generator=generator).to(torch.uint8)
         labels[:, :7, 1:] = 0
         labels[1] = 0
-        samples: Any = [Sample(*pair) for pair in zip(images, labels, strict=True)]
+        samples: Any = [
+            TrainingSample(*pair, torch.zeros(20, 3, 3), 0)
+            for pair in zip(images, labels, strict=True)
+        ]
         return DataLoader(samples, self.batch_size)
 
 
