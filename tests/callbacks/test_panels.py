@@ -48,7 +48,7 @@ def test_the_panoramas_of_the_panels_are_kept_for_the_report(tmp_path: Path) -> 
         assert image.sphere
         assert np.abs(decoded(image.input).astype(int) - 20 * k).max() <= 1
         assert np.all(decoded(image.truth) == 1)
-        prediction = decoded(image.prediction)
-        assert prediction[0, 0] == 2
-        assert np.count_nonzero(prediction == 1) == 127
+        shown = decoded(image.prediction)
+        assert shown[0, 0] == 2
+        assert np.count_nonzero(shown == 1) == 127
         assert image.note == f"mIoU {100 * 127 / 128:.1f}\u00a0%", "the floor is not in the truth"
