@@ -17,15 +17,11 @@ from tangent_train.geometry import random_rotation
 from tests.models.sphere_networks import awake, sphere_rays
 
 
-def _inputs(
-    images: int = 5, spheres: int = 2, channels: int = 12, size: tuple[int, int] = (2, 3)
-) -> tuple[Tensor, Tensor]:
-    """Tokens, and directions that differ from sphere to sphere."""
-    rays = torch.cat([sphere_rays(images).roll(shift, 1) for shift in range(spheres)])
-    if spheres > 1:
-        turn = torch.tensor(random_rotation(np.random.default_rng(1)), dtype=torch.float32)
-        rays = torch.cat([rays[:1], turn @ rays[1:]])
-    return torch.randn(spheres, images, channels, *size), token_directions(rays, *size)
+def _inputs() -> tuple[Tensor, Tensor]:
+    """Tokens of two spheres of five images, and directions that differ from sphere to sphere."""
+    turn = torch.tensor(random_rotation(np.random.default_rng(1)), dtype=torch.float32)
+    rays = torch.cat([sphere_rays(5), turn @ sphere_rays(5).roll(1, 1)])
+    return torch.randn(2, 5, 12, 2, 3), token_directions(rays, 2, 3)
 
 
 def _mixer() -> SphereAttention:

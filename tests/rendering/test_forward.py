@@ -12,12 +12,10 @@ from numpy.typing import NDArray
 from tangent_train.errors import SettingError
 from tangent_train.geometry import (
     TangentGrid,
-    random_rotation,
 )
 from tangent_train.rendering import equirect_to_tangent, sampling
 
 Array = NDArray[Any]
-TURNED = TangentGrid(0, 5, rotation=random_rotation(np.random.default_rng(1)))
 
 
 def _random(shape: tuple[int, ...], dtype: Any = np.float64) -> Array:
@@ -136,13 +134,3 @@ def test_errors(image: Any, arguments: dict[str, Any], message: str) -> None:
 )
 def test_tiny_panoramas_are_no_wrong_layouts(image: Any) -> None:
     assert len(equirect_to_tangent(image, TangentGrid(0, 4))) == 20
-
-
-@pytest.mark.parametrize("channels", [1, 6])
-def test_small_images_together_are_those_rendered_one_by_one(channels: int) -> None:
-    image = _random((32, 64, channels), np.uint8)
-    for grid in (TangentGrid(2, 4), TURNED):
-        together = equirect_to_tangent(image, grid)
-        for face in range(0, grid.num_images, 7):
-            alone = equirect_to_tangent(image, grid, [face])[0]
-            np.testing.assert_array_equal(together[face], alone)
