@@ -61,7 +61,7 @@ def trained(
     """Two epochs of panoramas."""
     folder = tmp_path_factory.mktemp("trained")
     # Validation: 3 panoramas of 2 rooms.
-    split = {"validation_fraction": 0.35, "seed": 3}
+    split: Any = {"validation_fraction": 0.35, "seed": 3}
     data = Stanford2D3DS(stanford_root, TANGENT, panoramas_per_step=2, **split)
     torch.manual_seed(0)
     sgd = partial(torch.optim.SGD, lr=0.1)
