@@ -51,11 +51,6 @@ def _trained(names: Sequence[str], groups: Groups | None = None) -> TrainedNetwo
     return trained_network(TANGENT, network=network, class_names=("unknown", *names), groups=groups)
 
 
-def _written(path: Path, content: Any) -> str:
-    path.write_text(content if isinstance(content, str) else json.dumps(content))
-    return str(path)
-
-
 @pytest.mark.parametrize("name", SHIPPED)
 def test_a_map_names_published_classes(name: str) -> None:
     source, count, targets = SHIPPED[name]
@@ -160,7 +155,7 @@ def test_a_map_of_a_map() -> None:
 def test_unusable_files(content: Any, message: str, tmp_path: Path) -> None:
     path = tmp_path / "map.json"
     if content is not None:
-        _written(path, content)
+        path.write_text(content if isinstance(content, str) else json.dumps(content))
     with pytest.raises(DataError, match=message) as caught:
         load_class_map(str(path))
     assert caught.value.subject == path

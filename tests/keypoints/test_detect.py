@@ -88,6 +88,7 @@ def test_a_blank_panorama_has_none_and_colour_is_grey(name: str, tangent: bool) 
         return detect_on_equirect(image, Detector(name))
 
     assert len(detect(np.full((101, 77, 3), 90, np.uint8))) == 0
+    assert len(Detector(name).detect(np.zeros((1, 1), np.uint8)).points_xy) == 0
     image = texture((101, 177))  # odd sizes
     gray, color = detect(image), detect(np.repeat(image[..., None], 3, axis=2))
     assert len(gray) > 30
