@@ -20,7 +20,6 @@ from tangent_train.geometry import (
     rotation_about,
     xyz_to_lonlat,
 )
-from tests.geometry.directions import random_directions
 
 ROTATION = rotation_about((1, 2, -3), 1.1)
 
@@ -116,16 +115,3 @@ def test_least_dim_covers_the_voronoi_cells_exactly(base_level: int, finer: int)
         TangentGrid(base_level, level, least - 1)
     assert TangentGrid(base_level, level, least).half_extent >= voronoi_extent(base_level)
     assert TangentGrid.least_dim(base_level, level) == least
-
-
-@pytest.mark.parametrize("rotation", [None, rotation_about((1, 1, 0), 2.0)])
-def test_owner_has_the_nearest_centre(rotation: NDArray[np.float64] | None) -> None:
-    grid = TangentGrid(1, 5, rotation=rotation)
-    directions = random_directions(600)
-    angles = np.arccos(np.clip(directions @ grid.centers_xyz.T, -1, 1))
-    expected = angles.argmin(axis=1)
-    np.testing.assert_array_equal(grid.owners(directions), expected)
-    # Vectors of any length and shape.
-    np.testing.assert_array_equal(
-        grid.owners(3 * directions.reshape(20, 30, 3)), expected.reshape(20, 30)
-    )

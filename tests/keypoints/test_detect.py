@@ -23,7 +23,7 @@ from tangent_train.keypoints.detect import (
 )
 from tangent_train.keypoints.spherical import SphericalKeypoints
 from tests.geometry.directions import angle_deg, unit
-from tests.keypoints.textures import Agreement, blobs, rotated, texture
+from tests.keypoints.textures import Agreement, blob, rotated, texture
 
 LEVEL, SHAPE = 7, (256, 512)
 ROTATION = random_rotation(np.random.default_rng(1))
@@ -68,7 +68,7 @@ def test_a_panorama_has_no_seam() -> None:
 def test_a_blob_is_found_once_wherever_it_is(lon_deg: float, lat_deg: float) -> None:
     center = lonlat_to_xyz(np.deg2rad([lon_deg, lat_deg]))
     sigma = np.deg2rad(1.2 if lat_deg > 0 else 2.5)
-    found = detect_on_equirect(blobs(SHAPE, center[None], sigma), Detector())
+    found = detect_on_equirect(blob(SHAPE, center, sigma), Detector())
     found = found.select(angle_deg(found.directions_xyz, center) < 5)
     assert len(np.unique(found.directions_xyz.round(4), axis=0)) == 1
     # OpenCV's default is off by a quarter of a pixel of 0.7°.
