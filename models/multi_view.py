@@ -29,7 +29,7 @@ class MultiView(nn.Module):
 
     def __init__(self, network: nn.Module, in_channels: int, num_classes: int) -> None:
         super().__init__()
-        if first_convolution(network)[1].in_channels != in_channels:
+        if first_convolution(network).in_channels != in_channels:
             widen_stem(network, in_channels)
         _fit_head(network, num_classes)
         self.network = network

@@ -32,7 +32,7 @@ def widen_stem(network: nn.Module, in_channels: int) -> nn.Module:
     """
     if in_channels < _RGB:
         raise SettingError("network.in_channels", found=in_channels, expected="3 or more")
-    _, stem = first_convolution(network)
+    stem = first_convolution(network)
     if stem.in_channels != _RGB or stem.groups != 1:
         raise _unfit(network, stem)
     if in_channels > _RGB:
@@ -42,15 +42,15 @@ def widen_stem(network: nn.Module, in_channels: int) -> nn.Module:
     return network
 
 
-def first_convolution(network: nn.Module) -> tuple[str, nn.Conv2d]:
-    """The first convolution of a network, in the order of definition, and its name.
+def first_convolution(network: nn.Module) -> nn.Conv2d:
+    """The first convolution of a network, in the order of definition.
 
     Raises:
         SettingError: There is none.
     """
-    for name, module in network.named_modules():
+    for module in network.modules():
         if isinstance(module, nn.Conv2d):
-            return name, module
+            return module
     raise _unfit(network, "none")
 
 

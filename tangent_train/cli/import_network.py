@@ -18,7 +18,8 @@ from tangent_train.cli.settings import check_new, typed
 from tangent_train.errors import SettingError
 
 if TYPE_CHECKING:
-    from tangent_train.inference.photo_networks import Imported, PhotoNetwork
+    from tangent_train.checkpoints.trained import TrainedNetwork
+    from tangent_train.inference.photo_networks import PhotoNetwork
 
 
 _LIBRARIES = ("torchvision", "huggingface", "smp", "onnx")
@@ -63,7 +64,7 @@ def import_network(config: Mapping[str, Any]) -> None:
     check_new(settings, output)
     with get_console().status(f"Writing {output.name} …"):
         network = _load(settings, config["normalization"])
-        imported = photo_networks.import_network(
+        trained = photo_networks.import_network(
             network,
             output,
             fov_deg=settings.fov,
@@ -72,7 +73,7 @@ def import_network(config: Mapping[str, Any]) -> None:
             nothing=settings.nothing,
             nothing_wins=settings.nothing_wins,
         )
-    say(_understood(output, imported, settings))
+    say(_understood(output, trained, settings))
     for remark in network.remarks:
         say(remark)
 
@@ -98,9 +99,9 @@ def _load(settings: Settings, normalization: Any) -> PhotoNetwork:
     return of_config.load(section, settings.weights, settings.classes, normalization)
 
 
-def _understood(path: Path, imported: Imported, settings: Settings) -> str:
+def _understood(path: Path, trained: TrainedNetwork, settings: Settings) -> str:
     """Description of an imported network."""
-    trained, view = imported.trained, imported.view
+    base_level, dim = trained.representation["base_level"], trained.representation["dim"]
     names = trained.class_names[1:]
     mean, std = trained.normalization.mean, trained.normalization.std
     numbers = [" ".join(f"{value:.4g}" for value in values) for values in (mean, std)]
@@ -111,14 +112,13 @@ def _understood(path: Path, imported: Imported, settings: Settings) -> str:
         f"{len(names)} classes: {', '.join(names)}",
         f"normalization of images from 0 to 1: mean {numbers[0]}, std {numbers[1]}",
         f"image size: {size}{multiple}",
-        f"photos of {settings.fov:g}° → panoramas of level {view.level} as "
-        f"{20 * 4**view.base_level} tangent images (base level {view.base_level}) of "
-        f"{view.dim}×{view.dim}",
+        f"photos of {settings.fov:g}° → panoramas of level {trained.level} as "
+        f"{20 * 4**base_level} tangent images (base level {base_level}) of {dim}×{dim}",
     ]
-    own = imported.trained.source.trust if imported.trained.source is not None else ()
+    own = trained.source.trust if trained.source is not None else ()
     if own:
         lines.append(f"of your own: every command that reads it needs trust=[{','.join(own)}]")
-    if imported.nothing:
+    if settings.nothing:
         said = "are written as unknown" if settings.nothing_wins else "never win"
-        lines.insert(2, f"{', '.join(imported.nothing)}: mean nothing, {said}")
+        lines.insert(2, f"{', '.join(settings.nothing)}: mean nothing, {said}")
     return "\n".join(lines)

@@ -95,29 +95,24 @@ def _titled(image: _Image, title: str) -> _Image:
     return np.concatenate([_text(strip, title, (2, 16)), image])
 
 
-def overlay_picture(
-    rgb: _Image, labels: NDArray[np.integer], class_names: Sequence[str], opacity: float = 0.5
-) -> _Image:
+def overlay_picture(rgb: _Image, labels: NDArray[np.integer], class_names: Sequence[str]) -> _Image:
     """A picture overlaid with its labels, above a legend of its classes.
 
     Args:
         rgb: ``(H, W, 3)``.
         labels: ``(H, W)`` class indices; unknown pixels (0) show the picture.
         class_names: K + 1 names, the unknown class first.
-        opacity: Of the labels, 0 to 1.
 
     Returns:
         RGB image of the same width, a little higher; the legend grows with the width.
     """
-    mixed = mixed_picture(rgb, labels, len(class_names), opacity)
+    mixed = mixed_picture(rgb, labels, len(class_names))
     scale = max(1, round(rgb.shape[1] / _LEGEND_WIDTH))
     seen = np.setdiff1d(np.unique(labels), [UNKNOWN])
     return np.concatenate([mixed, _legend(rgb.shape[1], seen, class_names, scale)])
 
 
-def mixed_picture(
-    rgb: _Image, labels: NDArray[np.integer], num_classes: int, opacity: float = 0.5
-) -> _Image:
+def mixed_picture(rgb: _Image, labels: NDArray[np.integer], num_classes: int) -> _Image:
     """The lightness of a picture overlaid with its labels, of the same size.
 
     Without the picture's colours, which would change those of the classes; these are pure where a
@@ -127,11 +122,10 @@ def mixed_picture(
         rgb: ``(H, W, 3)``.
         labels: ``(H, W)`` class indices; unknown pixels (0) show the picture.
         num_classes: K + 1.
-        opacity: Of the labels, 0 to 1.
     """
     light = cv2.cvtColor(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB)
     colors = colorize(labels, num_classes)
-    mixed = cv2.addWeighted(light, 1 - opacity, colors, opacity, 0)
+    mixed = cv2.addWeighted(light, 0.5, colors, 0.5, 0)
     for axis in (0, 1):
         begins = np.diff(labels, axis=axis, prepend=labels.take([0], axis)) != 0
         mixed[begins] = colors[begins]

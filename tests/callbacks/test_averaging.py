@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 from lightning.pytorch.callbacks import Callback
-from torch import Tensor, nn
+from torch import Tensor
 
 from tangent_train.callbacks.checkpoints import (
     AtomicCheckpointIO,
@@ -18,25 +18,10 @@ from tangent_train.callbacks.checkpoints import (
     LastCheckpoint,
     averaged_weights,
 )
-from tests.tasks.shapes import Shapes, quiet_trainer, shape_task
+from tests.tasks.shapes import Shapes, WithStatistics, quiet_trainer, shape_task
 
 DECAY = 0.3  # from the fourth step on: (1 + t) / (10 + t) is less before
 STEPS = 4
-
-
-class WithStatistics(nn.Module):
-    """Batch statistics, and dropout that draws from torch's generator at every step."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        torch.manual_seed(0)
-        self.layers = nn.Sequential(
-            nn.Conv2d(3, 4, 3), nn.BatchNorm2d(4), nn.Dropout(0.3), nn.Conv2d(4, 3, 1)
-        )
-
-    def forward(self, images: Tensor) -> Tensor:
-        scores: Tensor = self.layers(images.flatten(0, 1)).mean(dim=(2, 3))
-        return scores.view(*images.shape[:2], 3).mean(dim=1)
 
 
 class Reference(Callback):

@@ -13,11 +13,11 @@ from tangent_train.callbacks.panels import PredictionPanels
 from tests.decoded import decoded
 
 NAMES = ("unknown", "wall", "floor")
-SHAPE, CROPS = (8, 16), (3, 4, 5)
+SHAPE = (8, 16)
 
 
 class _Source:
-    """Ten images; photos are cut into crops, whose pixels hold the number of the crop."""
+    """Ten panoramas."""
 
     def __len__(self) -> int:
         return 10
@@ -26,30 +26,21 @@ class _Source:
         return f"area/room {index}"
 
     def read(self, index: int) -> Any:
-        rgb = np.full((*SHAPE, 3), 20 * index, np.uint8)
-        crops = np.arange(3, dtype=np.uint8)[:, None, None, None] * np.ones((*CROPS, 3), np.uint8)
-        whole = SimpleNamespace(render=lambda image, interpolation: 60 * crops)
-        sampler = SimpleNamespace(whole=lambda: whole)
-        return SimpleNamespace(rgb=rgb, sampler=lambda representation: sampler)
+        return SimpleNamespace(rgb=np.full((*SHAPE, 3), 20 * index, np.uint8))
 
 
-def _tested(folder: Path, count: int, *shape: int) -> PredictionPanels:
-    """The callback after all ten images, two a batch; the first labelled pixel is wrong."""
-    panels = PredictionPanels(folder, count)
+def test_the_panoramas_of_the_panels_are_kept_for_the_report(tmp_path: Path) -> None:
+    """After all ten, two a batch; the first labelled pixel is wrong."""
+    panels = PredictionPanels(tmp_path, 4)
     trainer: Any = SimpleNamespace(datamodule=SimpleNamespace(source=lambda split: _Source()))
     task: Any = SimpleNamespace(class_names=NAMES, representation=None)
     for first in range(0, 10, 2):
-        target = torch.ones((2, *shape), dtype=torch.uint8)
+        target = torch.ones((2, *SHAPE), dtype=torch.uint8)
         prediction = target.clone().long()
         prediction.flatten(1)[:, 0] = 2
         batch = SimpleNamespace(index=torch.tensor([first, first + 1]), target=target)
         panels.on_test_batch_end(trainer, task, prediction, batch, first // 2)
     panels.on_test_end(trainer, task)
-    return panels
-
-
-def test_the_panoramas_of_the_panels_are_kept_for_the_report(tmp_path: Path) -> None:
-    panels = _tested(tmp_path, 4, *SHAPE)
     chosen = (0, 3, 6, 9)
     assert [image.name for image in panels.images] == [f"area/room {k}" for k in chosen]
     assert {path.stem for path in tmp_path.iterdir()} == {f"area_room {k}" for k in chosen}
@@ -57,7 +48,7 @@ def test_the_panoramas_of_the_panels_are_kept_for_the_report(tmp_path: Path) -> 
         assert image.sphere
         assert np.abs(decoded(image.input).astype(int) - 20 * k).max() <= 1
         assert np.all(decoded(image.truth) == 1)
-        prediction = decoded(image.prediction)
-        assert prediction[0, 0] == 2
-        assert np.count_nonzero(prediction == 1) == 127
+        shown = decoded(image.prediction)
+        assert shown[0, 0] == 2
+        assert np.count_nonzero(shown == 1) == 127
         assert image.note == f"mIoU {100 * 127 / 128:.1f}\u00a0%", "the floor is not in the truth"

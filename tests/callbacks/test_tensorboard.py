@@ -27,17 +27,6 @@ TANGENT = TangentRepresentation(base_level=0, level=4, faces_per_panorama=5)
 STEPS = 3  # of an epoch: 6 panoramas, 2 at a time
 
 
-def _task(representation: Any, class_names: tuple[str, ...]) -> SegmentationTask:
-    torch.manual_seed(0)
-    optimizer = partial(torch.optim.SGD, lr=0.1)
-    return SegmentationTask(nn.Conv2d(4, 13, 1), representation, class_names, optimizer)
-
-
-def _panoramas(root: Path) -> Stanford2D3DS:
-    # Validation: 3 panoramas of 2 rooms.
-    return Stanford2D3DS(root, TANGENT, panoramas_per_step=2, validation_fraction=0.35, seed=3)
-
-
 def _fit(folder: Path, data: Any, task: Any, count: int = 2) -> None:
     trainer = quiet_trainer(
         max_epochs=2,
@@ -71,8 +60,12 @@ def trained(
 ) -> tuple[Path, SegmentationTask, Stanford2D3DS]:
     """Two epochs of panoramas."""
     folder = tmp_path_factory.mktemp("trained")
-    data = _panoramas(stanford_root)
-    task = _task(TANGENT, data.class_names)
+    # Validation: 3 panoramas of 2 rooms.
+    split: Any = {"validation_fraction": 0.35, "seed": 3}
+    data = Stanford2D3DS(stanford_root, TANGENT, panoramas_per_step=2, **split)
+    torch.manual_seed(0)
+    sgd = partial(torch.optim.SGD, lr=0.1)
+    task = SegmentationTask(nn.Conv2d(4, 13, 1), TANGENT, data.class_names, sgd)
     _fit(folder, data, task)
     return folder, task, data
 

@@ -190,10 +190,6 @@ def test_other_images_are_refused(image: Any, message: str, network: Network) ->
 def test_impossible_settings_are_refused(tmp_path: Path, network: Network) -> None:
     with pytest.raises(SettingError, match="None: the network sees rgb"):
         network.labels(_RGB, depth=np.zeros((16, 32)))
-    with pytest.raises(SettingError, match="fov_deg: found 180"):
-        network.scores(_RGB, fov=180)
-    with pytest.raises(DataError, match=r"missing\.ckpt"):
-        tt.load(tmp_path / "missing.ckpt")
     with pytest.raises(SettingError, match="class_map: found night"):
         tt.load(tmp_path / "net.ckpt", class_map="night")
     with pytest.raises(SettingError, match="unmapped: found '0'"):

@@ -65,17 +65,19 @@ def _blocks(height: int, width: int) -> NDArray[np.uint8]:
 
 
 @pytest.mark.parametrize(
-    ("representation", "blend", "channels"),
+    ("representation", "blend", "channels", "rotations"),
     [
-        (TANGENT, "nearest", 4),
-        (TANGENT | {"blend": "feather"}, "feather", 3),
-        (TANGENT | {"crop_multiple": 2}, "nearest", 3),
-        (ERP, "feather", 3),  # there is nothing to blend
-        (CUBE, "feather", 4),  # its faces do not overlap
+        (TANGENT, "nearest", 4, 1),
+        (TANGENT | {"blend": "feather"}, "feather", 3, 1),
+        (TANGENT | {"crop_multiple": 2}, "nearest", 3, 1),
+        (ERP, "feather", 3, 1),  # there is nothing to blend
+        (CUBE, "feather", 4, 1),  # its faces do not overlap
+        (TANGENT | {"average_rotations": 3}, "nearest", 4, 3),
+        (ERP | {"average_rotations": 3}, "nearest", 4, 3),
     ],
 )
 def test_labels_are_those_of_an_evaluation(
-    stanford_root: Path, representation: dict[str, Any], blend: str, channels: int
+    stanford_root: Path, representation: dict[str, Any], blend: str, channels: int, rotations: int
 ) -> None:
     trained = trained_network(representation, channels)
     made = make(representation, "representation")
@@ -83,25 +85,13 @@ def test_labels_are_those_of_an_evaluation(
     task = SegmentationTask(trained.network, made, trained.class_names, SGD)
     batch = next(iter(data.test_dataloader()))
     batch = data.on_after_batch_transfer(batch, 0)
-    expected = task.predict_labels(batch.images[0], tuple(batch.target[0].shape)).numpy()
-    image = data.source("test").read(int(batch.index[0]))
-    labels = _labels(trained, InputImage(image.rgb, image.depth), 7, blend=blend)
+    images, rays, turns = batch.images[0], batch.rays[0], batch.rotations[0]
+    expected = task.predict_labels(images, tuple(batch.target[0].shape), rays, turns).numpy()
+    read = data.source("test").read(int(batch.index[0]))
+    image = InputImage(read.rgb, read.depth)
+    labels = _labels(trained, image, 7, blend=blend, rotations=rotations)
     assert len(np.unique(expected)) == 3
     np.testing.assert_array_equal(labels + 1, expected)
-
-
-def test_equirectangular_images_are_averaged_over_rotations() -> None:
-    """As the network's own probabilities, shifted back, add up."""
-    trained, rgb = trained_network(ERP), _blocks(32, 64)
-    labels = _labels(trained, InputImage(rgb), rotations=3)
-    total = torch.zeros(3, 32, 64)
-    for shift in (0, 21, 43):
-        turned = torch.from_numpy(np.roll(rgb, -shift, axis=1).copy())[None]
-        images = normalize([turned], trained.normalization, trained.inputs)
-        with torch.no_grad():
-            total += trained.network(images)[0].softmax(dim=0).roll(shift, -1)
-    np.testing.assert_array_equal(labels, total.argmax(dim=0).numpy())
-    assert (labels != _labels(trained, InputImage(rgb))).any(), "at the seam"
 
 
 @pytest.mark.parametrize("per_forward", [7, 1000])
@@ -168,24 +158,6 @@ def test_a_larger_panorama_is_shrunk_without_aliasing() -> None:
     trained = trained_network(TANGENT)
     expected = _labels(trained, InputImage(np.full_like(rgb, 128)))
     np.testing.assert_array_equal(_labels(trained, InputImage(rgb)), expected)
-
-
-def test_probabilities_of_several_rotations_are_averaged(monkeypatch: pytest.MonkeyPatch) -> None:
-    trained, image = trained_network(TANGENT), InputImage(sphere(32))
-    views = PanoramaViews(trained, blend="nearest", rotations=3)
-    scores = Predictor(trained, views).predict(image)
-    probabilities = scores.probabilities(slice(None))
-    np.testing.assert_allclose(probabilities.sum(axis=-1), 1, atol=1e-5)
-    alone, sets = [], views(image)
-    for k, views_of_turn in enumerate(sets):
-        angle = np.radians(72 / 3 * k)
-        expected = TangentGrid(0, 4, rotation=rotation_about((0, 0, 1), angle) if k else None)
-        grid = views_of_turn.views(slice(0, 20)).grid
-        np.testing.assert_allclose(grid.centers_xyz, expected.centers_xyz, atol=1e-12)
-        monkeypatch.setattr(PanoramaViews, "__call__", lambda *_, only=views_of_turn: [only])
-        single = Predictor(trained, views).predict(image, probabilities=True)
-        alone.append(single.probabilities(slice(None)))
-    np.testing.assert_allclose(probabilities, np.mean(alone, axis=0), atol=1e-5)
 
 
 def test_unsure_is_unknown_of_networks_that_know_nothing_too() -> None:

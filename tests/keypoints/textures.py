@@ -38,16 +38,13 @@ def volume_texture(
     return _as_bytes(127 + 75 * grey)
 
 
-def blobs(
-    shape: tuple[int, int], centers_xyz: NDArray[np.float64], sigma_rad: float
+def blob(
+    shape: tuple[int, int], center_xyz: NDArray[np.float64], sigma_rad: float
 ) -> NDArray[np.uint8]:
-    """Bright Gaussian blobs on grey: 60 + Σ 150 exp(−angle² / 2σ²)."""
-    directions = equirect_directions(shape)
-    grey = np.full(shape, 60.0)
-    for center in centers_xyz:
-        chord = ((directions - center) ** 2).sum(axis=-1)
-        grey += 150 * np.exp(-((2 * np.arcsin(np.sqrt(chord) / 2)) ** 2) / (2 * sigma_rad**2))
-    return _as_bytes(grey)
+    """A bright Gaussian blob on grey: 60 + 150 exp(−angle² / 2σ²)."""
+    chord = ((equirect_directions(shape) - center_xyz) ** 2).sum(axis=-1)
+    angle = 2 * np.arcsin(np.sqrt(chord) / 2)
+    return _as_bytes(60 + 150 * np.exp(-(angle**2) / (2 * sigma_rad**2)))
 
 
 def _as_bytes(grey: NDArray[np.float64]) -> NDArray[np.uint8]:

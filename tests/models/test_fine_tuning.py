@@ -75,10 +75,6 @@ def test_depth_starts_at_zero_and_other_classes_untrained(tmp_path: Path) -> Non
     for module in (rgb, network):
         module.eval()
     assert torch.equal(rgb[:3](image[:, :3]), network[:3](image))  # type: ignore[index]
-    text = str(origins)
-    assert "untrained: 2\n  3.weight: (21, 4, 1, 1) in the file, (5, 4, 1, 1) here\n" in text
-    assert "loaded: 8 tensors, 71.0% of" in text
-    assert "not used: 1\n  aux.weight" in text
 
 
 @pytest.mark.parametrize(

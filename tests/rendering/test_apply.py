@@ -147,13 +147,6 @@ def test_other_results_are_refused(function: Function, message: str) -> None:
         apply(function, _ARRAY, TangentGrid(0, 4), images_per_call=10)
 
 
-def test_other_results_of_tensors_are_refused() -> None:
-    panorama = torch.zeros(3, 8, 16)
-    for function in (lambda x: x[1:], lambda x: x.movedim(1, -1), lambda x: x.numpy()):
-        with pytest.raises(SettingError, match=r"Tensor of numbers \(20\[, K\], 16, 16\)"):
-            apply(function, panorama, TangentGrid(0, 4))
-
-
 @pytest.mark.parametrize(
     ("panorama", "settings", "message"),
     [

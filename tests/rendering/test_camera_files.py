@@ -40,8 +40,10 @@ def _world_panorama(height: int) -> NDArray[np.float64]:
 
 @pytest.mark.parametrize("grid", GRIDS)
 def test_pixels_are_where_the_file_says(grid: TangentGrid, tmp_path: Path) -> None:
-    write_cameras(tmp_path / "cameras.json", _cameras(grid))
-    content = json.loads((tmp_path / "cameras.json").read_text())
+    path, cameras = tmp_path / "new folder" / "cameras.json", _cameras(grid)
+    write_cameras(path, cameras)
+    assert read_cameras(path) == cameras
+    content = json.loads(path.read_text())
     seen = equirect_to_tangent(_world_panorama(500), grid, FACES)
     matrix = np.array(content["camera"]["matrix"])
     assert content["camera"]["width"] == content["camera"]["height"] == grid.dim
@@ -53,15 +55,6 @@ def test_pixels_are_where_the_file_says(grid: TangentGrid, tmp_path: Path) -> No
         for row, column in ((0, 0), (3, 11), (grid.dim - 1, 2)):
             ray = rotation @ np.linalg.inv(matrix) @ (column, row, 1)
             np.testing.assert_allclose(shown[row, column], ray / np.linalg.norm(ray), atol=5e-4)
-
-
-@pytest.mark.parametrize("grid", GRIDS)
-def test_what_is_written_is_read(grid: TangentGrid, tmp_path: Path) -> None:
-    cameras = _cameras(grid)
-    write_cameras(tmp_path / "new folder" / "cameras.json", cameras)
-    again = read_cameras(tmp_path / "new folder" / "cameras.json")
-    assert again == cameras
-    assert again.grid.dim == grid.dim
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,6 @@ import torch
 from tangent_train.errors import SettingError
 from tangent_train.geometry import CubeGrid, equirect_directions
 from tangent_train.rendering import (
-    equirect_to_tangent,
     tangent_to_equirect,
     tangent_to_labels,
 )
@@ -36,17 +35,6 @@ def test_up_to_the_edge_a_pixel_takes_the_values_of_its_owner_alone(
     coordinates = np.stack([x, y, -x, -y, z, -z])
     owned = np.take_along_axis(coordinates, owner[None], axis=0)[0]
     np.testing.assert_allclose(owned, coordinates.max(axis=0), atol=1e-12)
-
-
-def test_the_pole_is_in_the_middle_of_the_up_face() -> None:
-    rows = np.repeat(np.arange(64, dtype=np.float32)[:, None], 128, axis=1)
-    up, down = equirect_to_tangent(rows, CubeGrid(5), [4, 5])
-    for face, pole in ((up, 0.0), (63 - down, 0.0)):
-        assert face[2, 2] == pole
-        for turned in (face.T, face[::-1], face[:, ::-1]):
-            np.testing.assert_allclose(turned, face, atol=1e-3)
-        # A pixel two fifths from the middle: atan 0.4 below the pole.
-        assert face[2, 3] == pytest.approx(np.degrees(np.arctan(0.4)) / 180 * 64 - 0.5, abs=1e-3)
 
 
 @pytest.mark.parametrize("render", [tangent_to_equirect, tangent_to_labels])

@@ -122,8 +122,7 @@ def test_forward_in_torch(case: Case, interpolation: Interpolation) -> None:
 def test_forward_of_labels_is_the_nearest_label(case: Case, dtype: type[np.integer]) -> None:
     pair = pair_of(case)
     labels = (noise(*case.shape) * np.iinfo(dtype).max).astype(dtype)
-    lonlat = np.stack([pair.theirs.lonlat(face) for face in pair.order])
-    certain = certain_nearest(lonlat, case.shape, margin=1e-4)
+    certain = certain_pixels(pair, case, "nearest")
     expected = pair.theirs.forward(labels[..., None].astype(np.float64), "nearest")[pair.order]
     result = equirect_to_tangent(labels, pair.ours, interpolation="nearest")
     assert result.dtype == dtype

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import pytest
 
@@ -47,8 +46,8 @@ def test_a_class_absent_from_a_fold_is_left_out_there(three_folds: list[Record])
     assert row.of_fold(3).score("iou", "sofa") == Statistic(None, None, None, 0)
 
 
-@pytest.fixture
-def transfer() -> Row:
+@pytest.mark.parametrize("name", ["miou", "miou_solid_angle"])
+def test_what_is_kept_is_the_ratio_of_the_means_over_what_both_have(name: str) -> None:
     """Panoramas compared with photos, two folds of two seeds."""
     photos = {(2, 0): 0.8, (1, 0): 0.4, (1, 1): 0.6, (2, 1): 0.8, (3, 0): 0.1}
     sphere = {(1, 1): 0.5, (1, 0): 0.3, (2, 1): 0.7, (2, 0): 0.9, (3, 1): 0.9}
@@ -56,13 +55,7 @@ def transfer() -> Row:
         tuple(made_record([v] * 3, data__fold=f, seed=s) for (f, s), v in values.items())
         for values in (photos, sphere)
     )
-    return Row("S", after, partner=Row("P", tuple(map(without_solid_angle, before))))
-
-
-@pytest.mark.parametrize("name", ["miou", "miou_solid_angle"])
-def test_what_is_kept_is_the_ratio_of_the_means_over_what_both_have(
-    transfer: Row, name: str
-) -> None:
+    transfer = Row("S", after, partner=Row("P", tuple(map(without_solid_angle, before))))
     kept = transfer.kept(name)
     # Folds 1 and 2: 0.4 and 0.8 of 0.5 and 0.8; fold 3 has other seeds.
     assert kept.mean == pytest.approx(0.6 / 0.65)
@@ -94,20 +87,6 @@ def test_networks_from_elsewhere_make_other_groups() -> None:
     assert [(row.label, len(row.records)) for row in group_runs(records)] == [
         ("mine (checkpoint=one.onnx)", 2),
         ("mine (checkpoint=two.onnx)", 2),
-    ]
-
-
-def test_other_representations_are_said_by_their_class() -> None:
-    tangent: dict[str, Any] = {"_target_": "a.TangentRepresentation", "blend": "feather"}
-    erp: dict[str, Any] = {"_target_": "a.EquirectRepresentation", "rows": 512, "base_level": None}
-    records = [
-        made_record([0.1, 0.2, 0.3], **{f"representation__{name}": v for name, v in own.items()})
-        for own in (tangent | {"base_level": 0}, tangent | {"base_level": 1}, erp)
-    ]
-    assert [row.label for row in group_runs(records)] == [
-        "mine (representation=TangentRepresentation, representation.base_level=0)",
-        "mine (representation=TangentRepresentation, representation.base_level=1)",
-        "mine (representation=EquirectRepresentation)",
     ]
 
 

@@ -24,42 +24,38 @@ class Tied(nn.Module):
         return {"out": self.head(self.second(self.first(images)).relu())}
 
 
-class OneSize(nn.Conv2d):
+class _Plain(nn.Conv2d):
+    def __init__(self, channels: int = 4, classes: int = 4) -> None:
+        super().__init__(channels, classes, 1)
+
+
+class OneSize(_Plain):
     """Something learned for every pixel."""
 
     def __init__(self, channels: int = 4, classes: int = 4) -> None:
-        super().__init__(channels, classes, 1)
+        super().__init__(channels, classes)
         self.places = nn.Parameter(torch.randn(classes, 24, 40))
 
     def forward(self, images: Tensor) -> Tensor:
         return super().forward(images) + self.places
 
 
-class TwoSizes(nn.Conv2d):
+class TwoSizes(_Plain):
     """Another computation for wide images: a trace knows only one of them."""
-
-    def __init__(self) -> None:
-        super().__init__(4, 4, 1)
 
     def forward(self, images: Tensor) -> Tensor:
         return super().forward(images) * (2 if images.shape[-1] > 35 else 1)
 
 
-class Tracing(nn.Conv2d):
+class Tracing(_Plain):
     """Another computation while it is traced."""
-
-    def __init__(self) -> None:
-        super().__init__(4, 4, 1)
 
     def forward(self, images: Tensor) -> Tensor:
         return super().forward(images) * (2 if torch.compiler.is_compiling() else 1)
 
 
-class Looking(nn.Conv2d):
+class Looking(_Plain):
     """Another computation for other values: no exporter knows both."""
-
-    def __init__(self, channels: int = 4, classes: int = 4) -> None:
-        super().__init__(channels, classes, 1)
 
     def forward(self, images: Tensor) -> Tensor:
         return super().forward(images) * (2 if bool(images.sum() > 0) else 1)

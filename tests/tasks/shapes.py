@@ -4,26 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import lightning
 import torch
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
+from datamodules.modelnet40.shape_samples import ShapeSample
 from tangent_train.rendering import TangentRepresentation
 from tangent_train.tasks import ClassificationTask
 
 NAMES = ("bottle", "chair", "mug")
 TANGENT = TangentRepresentation(base_level=0, level=4)
-
-
-class Shape(NamedTuple):
-    """As the data module of shapes gives them."""
-
-    images: Tensor
-    label: Tensor
-    index: int  # type: ignore[assignment]  # nobody needs tuple.index
 
 
 class Shapes(lightning.LightningDataModule):
@@ -39,11 +32,11 @@ class Shapes(lightning.LightningDataModule):
     def __init__(self, count: int = 9, batch_size: int = 3) -> None:
         super().__init__()
         generator = torch.Generator().manual_seed(0)
-        self.shapes: list[Shape] = []
+        self.shapes: list[ShapeSample] = []
         for index in range(count):
             images = 0.3 * torch.randn(5, 3, 16, 16, generator=generator)
             images[index % 5, index % 3] += 2
-            self.shapes.append(Shape(images, torch.tensor(index % 3), index))
+            self.shapes.append(ShapeSample(images, torch.tensor(index % 3), torch.tensor(index)))
         self.batch_size = batch_size
 
     def train_dataloader(self) -> DataLoader[Any]:
@@ -68,6 +61,22 @@ class SmallNetwork(nn.Module):
     def forward(self, images: Tensor) -> Tensor:
         features = self.features(images.flatten(0, 1)).unflatten(0, images.shape[:2])
         scores: Tensor = self.head(features.mean(dim=(1, 3, 4)))
+        return scores
+
+
+class WithStatistics(nn.Module):
+    """A small network with batch normalization."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        self.encoder = nn.Sequential(nn.Conv2d(3, 8, 3, stride=2), nn.BatchNorm2d(8), nn.ReLU())
+        self.neck = nn.Sequential(nn.Conv2d(8, 8, 1), nn.BatchNorm2d(8), nn.ReLU())
+        self.head = nn.Linear(8, 3)
+
+    def forward(self, images: Tensor) -> Tensor:
+        features = self.neck(self.encoder(images.flatten(0, 1))).mean(dim=(2, 3))
+        scores: Tensor = self.head(features.unflatten(0, images.shape[:2]).mean(dim=1))
         return scores
 
 

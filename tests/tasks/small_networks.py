@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from datamodules.core.inputs import Input, Normalization
+from datamodules.core.inputs import Normalization
 from tangent_train.checkpoints.scores import Scores, size_multiple_of
 from tangent_train.checkpoints.trained import TrainedNetwork, completed_settings
 from tangent_train.cli.build import build
@@ -31,30 +31,18 @@ def with_statistics(network: nn.Module, seed: int = 0) -> nn.Module:
     return network
 
 
-def _targets(settings: Mapping[str, Any]) -> set[str]:
-    inner = [value for value in settings.values() if isinstance(value, Mapping)]
-    return {str(settings["_target_"])}.union(*map(_targets, inner))
-
-
 def small_trained(
-    settings: Mapping[str, Any] = UNET,
-    network: nn.Module | None = None,
-    image_size: tuple[int, int] = (32, 32),
-    channels: int = 4,
+    settings: Mapping[str, Any] = UNET, image_size: tuple[int, int] = (32, 32)
 ) -> TrainedNetwork:
-    """As it comes out of a checkpoint, with random numbers; `network` instead of the settings'."""
+    """As it comes out of a checkpoint, with random numbers."""
     torch.manual_seed(1)
-    inner = with_statistics(network or make(settings, "network"))
-    scores = Scores(inner, len(NAMES) - 1).eval()
-    multiple = size_multiple_of(scores, channels)
-    depth: tuple[Input, ...] = ("rgb", "depth")
+    scores = Scores(with_statistics(make(settings, "network")), len(NAMES) - 1).eval()
+    multiple = size_multiple_of(scores, 4)
     return TrainedNetwork(
         network=scores,
         class_names=NAMES,
-        inputs=depth[: channels - 2],
-        normalization=Normalization(
-            [0.5, 0.4, 0.3, 1.1][:channels], [0.2, 0.25, 0.3, 0.8][:channels]
-        ),
+        inputs=("rgb", "depth"),
+        normalization=Normalization([0.5, 0.4, 0.3, 1.1], [0.2, 0.25, 0.3, 0.8]),
         level=5,
         representation={
             "_target_": "tangent_train.rendering.TangentRepresentation",
@@ -65,7 +53,7 @@ def small_trained(
         size_multiple=multiple or 1,
         fixed_size=None if multiple else image_size,
         settings=settings,
-        source=SettingsFile(Path("x.ckpt"), trust=_targets(settings)),
+        source=SettingsFile(Path("x.ckpt"), trust={settings["_target_"]}),
     )
 
 

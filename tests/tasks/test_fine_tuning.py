@@ -8,31 +8,15 @@ from typing import Any
 import lightning
 import pytest
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.optim import SGD, Adam
 from torch.optim.lr_scheduler import CyclicLR, LinearLR, OneCycleLR, StepLR
 
 from tangent_train.errors import SettingError
-from tests.tasks.shapes import Shapes, quiet_trainer, shape_task
+from tests.tasks.shapes import Shapes, WithStatistics, quiet_trainer, shape_task
 
 pytestmark = pytest.mark.filterwarnings("ignore:Found .* in eval mode")
 FRESH = frozenset({"head.weight", "head.bias"})
-
-
-class WithStatistics(nn.Module):
-    """A small network with batch normalization."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        torch.manual_seed(0)
-        self.encoder = nn.Sequential(nn.Conv2d(3, 8, 3, stride=2), nn.BatchNorm2d(8), nn.ReLU())
-        self.neck = nn.Sequential(nn.Conv2d(8, 8, 1), nn.BatchNorm2d(8), nn.ReLU())
-        self.head = nn.Linear(8, 3)
-
-    def forward(self, images: Tensor) -> Tensor:
-        features = self.neck(self.encoder(images.flatten(0, 1))).mean(dim=(2, 3))
-        scores: Tensor = self.head(features.unflatten(0, images.shape[:2]).mean(dim=1))
-        return scores
 
 
 def _tensors(task: Any) -> dict[str, Tensor]:

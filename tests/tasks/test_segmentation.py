@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import lightning
 import numpy as np
@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.utils.data import DataLoader
 
+from datamodules.core.samples import EvaluationSample, TrainingSample
 from tangent_train.errors import SettingError
 from tangent_train.rendering import TangentRepresentation
 from tangent_train.tasks import SegmentationTask
@@ -23,19 +24,6 @@ pytestmark = pytest.mark.filterwarnings("ignore:You defined a `validation_step`:
 NAMES = ("unknown", "a", "b")
 WEIGHTS = torch.tensor([1.0, 3.0])
 TANGENT = TangentRepresentation(base_level=0, level=4)
-
-
-class Training(NamedTuple):
-    images: Tensor
-    labels: Tensor
-    rays: Tensor
-
-
-class Evaluation(NamedTuple):
-    images: Tensor
-    target: Tensor
-    rays: Tensor
-    rotations: Tensor
 
 
 class Data(lightning.LightningDataModule):
@@ -55,8 +43,8 @@ class Data(lightning.LightningDataModule):
             tensor = torch.from_numpy(images).permute(0, 3, 1, 2).contiguous()
             labels = torch.from_numpy(whole.render(truth, "nearest"))
             where = torch.tensor(whole.rays()), torch.tensor(whole.rotations())
-            self.train.append(Training(tensor, labels, where[0]))
-            self.test.append(Evaluation(tensor, torch.from_numpy(truth), *where))
+            self.train.append(TrainingSample(tensor, labels, where[0], 0))
+            self.test.append(EvaluationSample(tensor, torch.from_numpy(truth), *where, 0))
 
     def train_dataloader(self) -> DataLoader[Any]:
         return DataLoader(self.train, batch_size=2)  # type: ignore[arg-type]
@@ -179,7 +167,7 @@ def test_such_a_network_is_told_where_its_images_look_and_divides_them_itself() 
     target[16:] = 2
     views = task.representation.whole()
     where = torch.tensor(views.rays()), torch.tensor(views.rotations())
-    samples: Any = [Evaluation(torch.zeros(40, 2, 16, 16), target, *where)]
+    samples: Any = [EvaluationSample(torch.zeros(40, 2, 16, 16), target, *where, 0)]
     quiet_trainer().test(task, DataLoader(samples), verbose=False)
     assert network.told == [((1, 20, 3, 3), 7)] * 2, "of every rotation"
     pixels = task.matrices.pixels

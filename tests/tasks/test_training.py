@@ -5,8 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from functools import partial
-from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any
 
 import lightning
 import pytest
@@ -17,14 +16,10 @@ from torch.distributed.algorithms.ddp_comm_hooks import default_hooks
 from torch.nn.functional import cross_entropy
 from torch.utils.data import DataLoader
 
+from datamodules.core.samples import TrainingSample
 from tangent_train.rendering import TangentRepresentation
 from tangent_train.tasks import SegmentationTask
 from tests.tasks.shapes import Gradients, quiet_trainer
-
-
-class Sample(NamedTuple):
-    images: Tensor
-    labels: Tensor
 
 
 class Data(lightning.LightningDataModule):
@@ -40,7 +35,10 @@ class Data(lightning.LightningDataModule):
         labels = torch.randint(0, 4, (3, 20, 16, 16), generator=generator).to(torch.uint8)
         labels[:, :7, 1:] = 0
         labels[1] = 0
-        samples: Any = [Sample(*pair) for pair in zip(images, labels, strict=True)]
+        samples: Any = [
+            TrainingSample(*pair, torch.zeros(20, 3, 3), 0)
+            for pair in zip(images, labels, strict=True)
+        ]
         return DataLoader(samples, self.batch_size)
 
 
@@ -155,28 +153,3 @@ def test_processes_exchange_gradients_once_after_the_last_chunk() -> None:
     found, _ = _gradients(7, trainer=trainer)
     assert exchanges.count == 1
     torch.testing.assert_close(found, _expected(3)[0])
-
-
-def test_the_mean_of_processes_gradients_is_that_of_their_batches_together() -> None:
-    """Though one has many more labelled pixels than the other."""
-    (batch,) = Data(3).train_dataloader()
-    task: Any = _task(7)
-    task.class_weights.copy_(torch.tensor([1.0, 3.0, 0.2]))
-    task.log = lambda *_, **__: None
-
-    def gradient(part: slice, norm: Tensor) -> Tensor:
-        means = {"mean": iter((norm, torch.zeros(())))}  # that of the loss is only shown
-        strategy = SimpleNamespace(
-            reduce=lambda _, reduce_op: next(means[reduce_op]),
-            backward=lambda loss, _: loss.backward(),
-        )
-        optimizers = [torch.optim.SGD(task.parameters())]
-        task._trainer = SimpleNamespace(
-            accumulate_grad_batches=1, optimizers=optimizers, strategy=strategy
-        )
-        task.training_step(Sample(batch.images[part], batch.labels[part]), 0).backward()
-        return torch.cat([p.grad.flatten() for p in task.network.parameters()])
-
-    norm = task.loss_norm(batch.labels.flatten(0, 1))
-    of_each = gradient(slice(0, 1), norm / 2) + gradient(slice(1, 3), norm / 2)
-    torch.testing.assert_close(of_each / 2, gradient(slice(0, 3), norm), rtol=1e-4, atol=1e-6)

@@ -44,21 +44,6 @@ class View:
     dim: int
 
 
-@dataclass(frozen=True)
-class Imported:
-    """A network as its file gives it back.
-
-    Attributes:
-        trained: The network.
-        nothing: Names of the scores that mean nothing.
-        view: Its tangent images.
-    """
-
-    trained: TrainedNetwork
-    nothing: tuple[str, ...]
-    view: View
-
-
 def import_network(
     network: PhotoNetwork,
     path: Path,
@@ -68,7 +53,7 @@ def import_network(
     base_level: int | None = None,
     nothing: Collection[str] = (),
     nothing_wins: bool = True,
-) -> Imported:
+) -> TrainedNetwork:
     """Write a photo network as a checkpoint, read it again and label one image with it.
 
     Args:
@@ -79,6 +64,9 @@ def import_network(
         base_level: Base level b of the tangent images; None for the size of those photos.
         nothing: Names of scores that mean nothing, such as a background.
         nothing_wins: Whether these may win, which is then written as unknown (label 0).
+
+    Returns:
+        The network as its file gives it back.
 
     Raises:
         SettingError: A setting is impossible, or the names do not fit the scores.
@@ -94,7 +82,7 @@ def import_network(
         trained = load_trained(temporary, unregistered(network.settings))  # it was made from them
         _use(trained, view, network.image_size)
     source = None if trained.source is None else replace(trained.source, path=path)
-    return Imported(replace(trained, source=source), tuple(nothing), view)
+    return replace(trained, source=source)
 
 
 def view_of(
@@ -105,7 +93,7 @@ def view_of(
 ) -> View:
     """The tangent images that look most like the photos a network was trained on.
 
-    Level s has the focal length nearest to theirs, ``2^s / R_v(−1)`` pixels (DESIGN, section 3);
+    Level s has the focal length nearest to theirs, ``2^s / R_v(−1)`` pixels;
     base level b the largest images that are not larger than theirs. Their side is that of the
     photos' shorter one: what is beyond the default side overlaps with other images.
 

@@ -141,7 +141,7 @@ def imported(folder: Path, **settings: Any) -> TrainedNetwork:
     """The same network, as its checkpoint gives it back."""
     given: dict[str, Any] = {"classes": None, "normalization": None} | settings
     network = huggingface.load(model=str(folder), **given)
-    return import_network(network, folder / "imported.ckpt").trained
+    return import_network(network, folder / "imported.ckpt")
 
 
 @torch.no_grad()

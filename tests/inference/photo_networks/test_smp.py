@@ -49,7 +49,7 @@ def test_its_own_scores(folder: Path, tmp_path: Path) -> None:
     own = segmentation_models_pytorch.from_pretrained(str(folder)).eval()
     preprocess = encoders.get_preprocessing_fn("tu-mobilenetv3_small_050.lamb_in1k")
     pixels = torch.from_numpy(preprocess(photo())).permute(2, 0, 1)[None].float()
-    trained = import_network(_load(folder), tmp_path / "net.ckpt").trained
+    trained = import_network(_load(folder), tmp_path / "net.ckpt")
     scores = imported_scores(trained)
     torch.testing.assert_close(scores.softmax(dim=0), own(pixels)[0], rtol=0, atol=1e-4)
     assert trained.class_names == ("unknown", *NAMES)
