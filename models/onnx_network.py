@@ -60,6 +60,8 @@ class OnnxNetwork(nn.Module):
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = torch.get_num_threads()
         options.log_severity_level = _ERRORS_ONLY
+        # Threads that wait for work by spinning take the cores from what is done with the scores.
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         usable = {"CPUExecutionProvider"}
         usable |= {"CUDAExecutionProvider"} if torch.cuda.is_available() else set()
         providers = [name for name in onnxruntime.get_available_providers() if name in usable]

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import inspect
 import math
+import weakref
+from collections import deque
+from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +21,8 @@ from tangent_train.rendering.mosaic import ScoreMosaic
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
+    import numpy as np
+    from numpy.typing import NDArray
     from torch import Tensor, nn
 
     from datamodules.core.inputs import Input, Normalization
@@ -136,6 +141,7 @@ class Predictor:
             self._network = partial(network, images_per_chunk=self._per_forward)
         self._trained, self._view_sets = trained, view_sets
         self._min_confidence = min_confidence
+        self._spare: deque[NDArray[np.float32]] = deque(maxlen=1)
 
     def predict(
         self,
@@ -157,13 +163,19 @@ class Predictor:
         """
         sets = self._view_sets(image)
         height, width = image.rgb.shape[:2]
+        spare = None
+        with suppress(IndexError):
+            spare = self._spare.pop()
         mosaic = ScoreMosaic(
             (height, width),
             self._trained.network.num_scores,
             self._view_sets.blend,
             averaged=probabilities or len(sets) > 1,
             min_confidence=self._min_confidence,
+            spare=spare,
         )
+        # The next image gets the memory of this one once nobody has its mosaic any more.
+        weakref.finalize(mosaic, self._spare.append, mosaic.sums).atexit = False
         for views in sets:
 
             def images(part: slice, views: Any = views) -> Tensor:

@@ -100,12 +100,15 @@ def _bands(rows: slice, images: int) -> Iterator[tuple[slice, slice]]:
         yield slice(start, stop), slice(start - rows.start, stop - rows.start)
 
 
-def zero_sums(shape: tuple[int, int], channels: int) -> NDArray[np.float32]:
+def zero_sums(
+    shape: tuple[int, int], channels: int, spare: NDArray[np.float32] | None = None
+) -> NDArray[np.float32]:
     """Sums in blocks of 16 channels, 0; beyond 2 GiB in a temporary file without a name.
 
     Args:
         shape: ``(H, W)``.
         channels: K.
+        spare: Sums that nobody uses any more; clearing them is faster than new memory.
 
     Returns:
         ``(H, K / 16, W, 16)``, see `kernels` and `without_blocks`.
@@ -116,7 +119,10 @@ def zero_sums(shape: tuple[int, int], channels: int) -> NDArray[np.float32]:
     whole = (shape[0], -(-channels // kernels.LANES), shape[1], kernels.LANES)
     nbytes = math.prod(whole) * 4
     if nbytes <= _IN_MEMORY_BYTES:
-        return np.zeros(whole, np.float32)
+        if spare is None or spare.shape != whole:
+            return np.zeros(whole, np.float32)
+        spare[:] = 0
+        return spare
     # The file has no name: it is gone with the array, whatever happens.
     with tempfile.TemporaryFile() as file:
         try:  # now: of a full disk the system says nothing later, it ends the process

@@ -50,6 +50,12 @@ class ScoreMosaic:
             pixel, beyond 2 GiB in a temporary file (of the folder TMPDIR).
         min_confidence: Probability from which the best class is certain, see `labels`; above 0,
             sums are kept.
+        spare: `sums` of a mosaic that nobody uses any more, to take its memory.
+
+    Attributes:
+        shape: As given.
+        blend: As given.
+        sums: Of probabilities, from `zero_sums`; empty where they are not kept.
 
     Raises:
         SettingError: The temporary file for the sums does not fit on the disk.
@@ -63,6 +69,7 @@ class ScoreMosaic:
         *,
         averaged: bool = False,
         min_confidence: float = 0.0,
+        spare: NDArray[np.float32] | None = None,
     ) -> None:
         self.shape = shape
         self.blend = blend
@@ -70,7 +77,7 @@ class ScoreMosaic:
         averaged = averaged or blend == "feather" or min_confidence > 0
         self._num_classes = num_classes
         self._min_confidence = min_confidence
-        self._total = zero_sums(shape if averaged else (0, 0), num_classes)
+        self.sums = zero_sums(shape if averaged else (0, 0), num_classes, spare)
         self._owned: tuple[object, NDArray[np.integer]] = None, NO_OWNERS
 
     def add(self, scores: Tensor, grid: PinholeGrid, faces: NDArray[np.int64]) -> None:
@@ -87,9 +94,9 @@ class ScoreMosaic:
         check_blend(self.blend, grid)
         owner = self._owners(grid, lambda: owners(grid, self.shape))
         images = _on_cpu(scores), grid, faces
-        if len(self._total):
+        if len(self.sums):
             everywhere = self.shape, slice(0, self.shape[0])
-            add_to_panorama(*images, *everywhere, owner, self._total, softmax=True)
+            add_to_panorama(*images, *everywhere, owner, self.sums, softmax=True)
         else:
             label_panorama(*images, owner, self._labels)
 
@@ -118,23 +125,23 @@ class ScoreMosaic:
         rays = plane_rays(self.shape)
         owner = self._owners(crops, lambda: crops.owners(self.shape))
         sight = kernels.Sight(which, views, spans, *rays, owner)
-        if len(self._total):
-            arguments = (prepared, sight, True, self._total, self._labels)
+        if len(self.sums):
+            arguments = (prepared, sight, True, self.sums, self._labels)
             over_rows(kernels.add_images, height, width, *arguments)
         else:
             over_rows(kernels.label_images, height, width, prepared, sight, self._labels)
 
     def labels(self) -> NDArray[np.unsignedinteger]:
         """``(H, W)`` places of the best classes, of equal ones the first; K where unsure."""
-        if len(self._total):
+        if len(self.sums):
             least = self._min_confidence
-            arguments = (self._total, self._num_classes, least, self._labels)
+            arguments = (self.sums, self._num_classes, least, self._labels)
             over_rows(kernels.best_classes, *self.shape, *arguments)
         return self._labels
 
     def probabilities(self, rows: slice | NDArray[np.intp]) -> NDArray[np.float32]:
         """``(h, W, K)`` probabilities of some rows, which add up to 1; only where averaged."""
-        total = without_blocks(self._total[rows], self._num_classes)
+        total = without_blocks(self.sums[rows], self._num_classes)
         return total / np.maximum(total.sum(axis=-1, keepdims=True), np.float32(1e-37))
 
     def _owners(

@@ -116,7 +116,7 @@ def test_every_pixel_has_one_owner_even_where_images_are_equally_near() -> None:
     result = ScoreMosaic(shape, 3, "nearest", averaged=True)
     for face in range(6):
         result.add(ones[[face]], grid, np.array([face]))
-    np.testing.assert_allclose(result._total.sum(axis=-1), 1, atol=1e-6)
+    np.testing.assert_allclose(result.sums.sum(axis=-1), 1, atol=1e-6)
 
 
 def test_large_sums_live_in_a_file_and_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -125,7 +125,7 @@ def test_large_sums_live_in_a_file_and_are_the_same(monkeypatch: pytest.MonkeyPa
     expected = _added(ScoreMosaic(shape, 7, "feather"), scores, grid).probabilities(slice(None))
     monkeypatch.setattr(accumulate, "_IN_MEMORY_BYTES", 0)
     result = _added(ScoreMosaic(shape, 7, "feather"), scores, grid)
-    assert isinstance(result._total, np.memmap)
+    assert isinstance(result.sums, np.memmap)
     np.testing.assert_array_equal(result.probabilities(slice(None)), expected)
 
 
