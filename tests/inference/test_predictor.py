@@ -61,6 +61,24 @@ def _blocks(height: int, width: int) -> NDArray[np.uint8]:
     return blocks.repeat(6, axis=0).repeat(6, axis=1)[:height, :width]
 
 
+def test_images_share_memory_only_one_after_the_other() -> None:
+    trained, (bright, dark) = (
+        trained_network(TANGENT),
+        (_blocks(32, 64), _blocks(32, 64)[::-1].copy()),
+    )
+    predictor = Predictor(trained, PanoramaViews(trained, blend="feather"))
+    first = predictor.predict(InputImage(bright))
+    expected = first.probabilities(slice(None))
+    second = predictor.predict(InputImage(dark))
+    np.testing.assert_array_equal(first.probabilities(slice(None)), expected)
+    assert (second.probabilities(slice(None)) != expected).any()
+    address = second.sums.ctypes.data
+    del second
+    third = predictor.predict(InputImage(bright))
+    assert third.sums.ctypes.data == address
+    np.testing.assert_array_equal(third.probabilities(slice(None)), expected)
+
+
 # Panoramas.
 
 
