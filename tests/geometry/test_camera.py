@@ -1,4 +1,8 @@
-"""Perspective cameras (the paper's supplement, section 2.1): closed forms, and OpenCV."""
+"""Perspective cameras against the equations of the paper's supplement, section 2.1.
+
+The paper counts pixels from the corner of the image (c' = W'/2); ours are counted from the centre
+of the first pixel, so that ``c_paper = c + ½``.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +11,9 @@ import math
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry import (
@@ -18,6 +25,45 @@ from tangent_train.geometry import (
 
 SIZE = (480, 760)  # height, width: not square, mistake 5 of the released code swaps them
 K = np.array([[560.0, 0, 370.25], [0, 520.0, 244.0], [0, 0, 1]])
+CORNER = np.array([[1.0, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
+"""From pixels counted from centres to pixels counted from corners."""
+
+
+def paper_shift_range(
+    matrix: NDArray[np.float64], size: tuple[int, int], fov_deg: float, dim: int
+) -> NDArray[np.float64]:
+    """Least and greatest (δx, δy), the supplement's last formula, in its own pixels."""
+    (f_x, _, c_x), (_, f_y, c_y), _ = CORNER @ matrix
+    height, width = size
+    focal = dim / (2 * math.tan(math.radians(fov_deg) / 2))
+    center = dim / 2
+    return np.array([
+        [f_x / focal * center - c_x, f_y / focal * center - c_y],
+        [width - c_x - f_x / focal * (dim - center), height - c_y - f_y / focal * (dim - center)],
+    ])  # fmt: skip
+
+
+@given(
+    focal=st.tuples(st.floats(300, 900), st.floats(300, 900)),
+    size=st.tuples(st.integers(400, 800), st.integers(400, 800)),
+    off_center=st.tuples(st.floats(-20, 20), st.floats(-20, 20)),
+    fov_deg=st.floats(5, 24),
+    dim=st.integers(8, 256),
+)
+def test_shift_range_is_the_papers(
+    focal: tuple[float, float],
+    size: tuple[int, int],
+    off_center: tuple[float, float],
+    fov_deg: float,
+    dim: int,
+) -> None:
+    height, width = size
+    matrix = np.array([
+        [focal[0], 0, width / 2 + off_center[0]], [0, focal[1], height / 2 + off_center[1]],
+        [0, 0, 1],
+    ])  # fmt: skip
+    expected = paper_shift_range(matrix, size, fov_deg, dim)
+    np.testing.assert_allclose(shift_range(matrix, size, fov_deg), expected, atol=1e-9)
 
 
 @pytest.mark.parametrize("size", [(128, 128), (96, 160), (120, 64)])

@@ -10,6 +10,7 @@ from tangent_train.errors import SettingError
 from tangent_train.geometry import (
     FLIP_Y,
     PanoramaPose,
+    lonlat_to_xyz,
     random_rotation,
     rotation_about,
     xyz_to_lonlat,
@@ -32,6 +33,20 @@ def test_a_panorama_in_a_right_handed_room() -> None:
     direction, distance = pose.seen((3 + np.sqrt(3), 4 - 1, 1.5))
     np.testing.assert_allclose(np.degrees(xyz_to_lonlat(direction)), (120, 0), atol=1e-12)
     assert distance == pytest.approx(2)
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_points_appear_where_they_came_from(mirrored: bool) -> None:
+    pose = posed(1, mirrored)
+    rng = np.random.default_rng(2)
+    # With both poles and both sides of the seam among them.
+    special = np.radians(np.array([[0, 90], [0, -90], [180, 0], [-180, 10], [179.9, 3]]))
+    some = rng.uniform((-np.pi, -np.pi / 2), (np.pi, np.pi / 2), (40, 2))
+    directions = lonlat_to_xyz(np.concatenate([special, some])).reshape(9, 5, 3)
+    distance_m = rng.uniform(0.1, 9, (9, 5))
+    back, back_m = pose.seen(pose.points_m(directions, distance_m))
+    np.testing.assert_allclose(back, directions, atol=1e-12)
+    np.testing.assert_allclose(back_m, distance_m, atol=1e-12)
 
 
 @pytest.mark.parametrize("mirrored", [False, True])

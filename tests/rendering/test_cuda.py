@@ -7,9 +7,11 @@ import pytest
 import torch
 
 from tangent_train.geometry import TangentGrid, equirect_shape
+from tangent_train.metrics import ConfusionMatrix
 from tangent_train.rendering import (
     Blend,
     Interpolation,
+    apply,
     equirect_to_tangent,
     tangent_to_equirect,
     tangent_to_labels,
@@ -57,3 +59,21 @@ def test_labels_of_any_precision(blend: Blend, classes: int, dtype: torch.dtype)
     on_gpu = tangent_to_labels(scores.cuda(), GRID, SHAPE, blend).cpu()
     least = 0.9999 if dtype == torch.float32 else 0.98  # what is rounded ties more often
     assert (on_gpu == expected).double().mean() > least
+
+
+@pytest.mark.parametrize("blend", ["nearest", "feather"])
+def test_functions_of_images(blend: Blend) -> None:
+    panorama = _random(3, *SHAPE)
+    expected = apply(torch.sin, panorama, GRID, blend)
+    on_gpu = apply(torch.sin, panorama.cuda(), GRID, blend)
+    assert on_gpu.is_cuda
+    torch.testing.assert_close(on_gpu.cpu(), expected)
+
+
+def test_confusion_matrices() -> None:
+    prediction, truth = (_random(2, *SHAPE).abs() * 2).long().clamp(max=4)
+    on_cpu, on_gpu = ConfusionMatrix(5), ConfusionMatrix(5).cuda()
+    on_cpu.update(prediction, truth)
+    on_gpu.update(prediction.cuda(), truth.cuda())
+    np.testing.assert_array_equal(on_gpu.compute().bands, on_cpu.compute().bands)
+    np.testing.assert_allclose(on_gpu.compute().solid_angle, on_cpu.compute().solid_angle)

@@ -12,10 +12,14 @@ from numpy.typing import NDArray
 from tangent_train.errors import SettingError
 from tangent_train.geometry import (
     TangentGrid,
+    equirect_shape,
+    random_rotation,
+    xyz_to_lonlat,
 )
 from tangent_train.rendering import equirect_to_tangent, sampling
 
 Array = NDArray[Any]
+TURNED = TangentGrid(0, 5, rotation=random_rotation(np.random.default_rng(1)))
 
 
 def _random(shape: tuple[int, ...], dtype: Any = np.float64) -> Array:
@@ -54,6 +58,23 @@ def test_nearest_wraps_at_the_seam(monkeypatch: pytest.MonkeyPatch, remap: int) 
     np.testing.assert_array_equal(found, [[31, 0, 127, 96]])
 
 
+@pytest.mark.parametrize("base_level", [0, 1])
+def test_labels_at_the_seam_are_never_unknown(base_level: int) -> None:
+    """They were, in the released code."""
+    grid = TangentGrid(base_level, base_level + 4)
+    height, width = equirect_shape(grid.level)
+    labels = np.full((height, width), 3, np.uint8)  # 0 would be unknown
+    labels[:, 0], labels[:, -1] = 1, 2
+    images = equirect_to_tangent(labels, grid, interpolation="nearest")
+    assert images.min() > 0
+    # The seam runs through images, its first column to the right of its last.
+    lon = xyz_to_lonlat(grid.directions())[..., 0]
+    step = 2 * np.pi / width
+    np.testing.assert_array_equal(images == 1, lon < -np.pi + step)
+    np.testing.assert_array_equal(images == 2, lon >= np.pi - step)
+    assert (images == 1).any(axis=(1, 2)).sum() >= 4
+
+
 def test_rows_beyond_a_pole_reflect_with_a_half_turn() -> None:
     # Looking straight up at the north pole of a 4-column panorama: half-way between the first row
     # and its reflection.
@@ -78,6 +99,14 @@ def test_panoramas_too_large_for_opencv(
     monkeypatch.setattr("cv2.remap", None)
     found = equirect_to_tangent(image, grid, interpolation=interpolation)
     np.testing.assert_allclose(found, expected, atol=1 if dtype == np.uint8 else 1e-5)
+
+
+def test_only_the_asked_faces_in_their_order() -> None:
+    image, grid = _random((64, 128), np.uint8), TangentGrid(0, 5)
+    whole = equirect_to_tangent(image, grid)
+    np.testing.assert_array_equal(equirect_to_tangent(image, grid, [7, 2, 2]), whole[[7, 2, 2]])
+    assert equirect_to_tangent(image, grid, []).shape == (0, 32, 32)
+    assert equirect_to_tangent(torch.rand(2, 3, 8, 16), grid, []).shape == (2, 0, 3, 32, 32)
 
 
 def test_views_of_memory_and_read_only_arrays() -> None:
@@ -134,3 +163,13 @@ def test_errors(image: Any, arguments: dict[str, Any], message: str) -> None:
 )
 def test_tiny_panoramas_are_no_wrong_layouts(image: Any) -> None:
     assert len(equirect_to_tangent(image, TangentGrid(0, 4))) == 20
+
+
+@pytest.mark.parametrize("channels", [1, 6])
+def test_small_images_together_are_those_rendered_one_by_one(channels: int) -> None:
+    image = _random((32, 64, channels), np.uint8)
+    for grid in (TangentGrid(2, 4), TURNED):
+        together = equirect_to_tangent(image, grid)
+        for face in range(0, grid.num_images, 7):
+            alone = equirect_to_tangent(image, grid, [face])[0]
+            np.testing.assert_array_equal(together[face], alone)

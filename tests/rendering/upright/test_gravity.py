@@ -91,6 +91,14 @@ def test_frames_of_exact_segments(counts: tuple[int, int, int]) -> None:
     assert frame.significance > 3
 
 
+@pytest.mark.parametrize("count", [4, 200])
+def test_random_segments_are_not_significant(count: int) -> None:
+    for seed in range(5):
+        normals, middles = unit(np.random.default_rng(seed).normal(size=(2, count, 3)))
+        segments = LineSegments(normals, middles, np.linspace(0.1, 0.6, count))
+        assert find_manhattan_frames(segments)[0].significance < 1.8
+
+
 _UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -149,6 +157,19 @@ def test_a_judge_chooses_among_the_axes_of_the_best_frame(
     assert (axes @ axes.T - np.eye(6) < 0.01).all()
     for wanted in axes:
         np.testing.assert_array_equal(estimate_up(room, 180, judge), wanted)
+
+
+def test_what_is_hopeless_or_the_only_one_is_not_judged(monkeypatch: pytest.MonkeyPatch) -> None:
+    def judge(ups: NDArray[np.float64]) -> NDArray[np.float64]:
+        raise AssertionError(ups)
+
+    turn = _tilted(3, 200, 180)
+    assert angle_deg(_up(draw_room((128, 256), turn), 60, judge), turn[:, 2]) < 0.5
+    estimate_up(_without_structure()["black"], 180, judge)
+    certain = np.array([0.001, 0.001, 0.996, 0.001, 0.001, 0])
+    place = "tangent_train.rendering.upright.gravity.up_probabilities"
+    monkeypatch.setattr(place, lambda *_: certain)
+    assert estimate_up(draw_room((128, 256), turn), 180, judge) is not None
 
 
 def test_upside_down() -> None:
