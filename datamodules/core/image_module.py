@@ -26,11 +26,11 @@ from datamodules.core.panoramas import Panorama, Photo, Turn
 from datamodules.core.pipeline import (
     EstimatedUp,
     PanoramaJudge,
+    PosedUp,
     RotatedPanoramas,
     SplitItems,
     Transform,
     masked,
-    posed,
 )
 from datamodules.core.problems import Problems
 from datamodules.core.progress import show_progress
@@ -211,7 +211,7 @@ class PanoramaDataModule(ImageDataModule):
         if self.mask is not None:
             transforms.append(partial(masked, self._masks))
         if self.upright is not None:
-            transforms.append(posed)
+            transforms.append(PosedUp())
         if split == "test" and self.test_rotation is not None:
             known = self.upright == "pose"
             transforms.append(RotatedPanoramas(self.test_rotation, self.seed, known=known))

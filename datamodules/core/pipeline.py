@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any, Generic, Literal, Protocol, TypeVar
 
@@ -159,14 +159,17 @@ def masked(masks: Masks, panorama: Panorama, index: int, files: ImageFiles) -> P
     return panorama._replace(labels=panorama.labels & counts)
 
 
-tagged_up = lru_cache(maxsize=None)(up_of)
-"""As `up_of`, but every file is read once: with a store it is not needed for anything else."""
+class PosedUp:
+    """Panoramas with the up direction of their GPano tags; None without tags."""
 
+    def __init__(self) -> None:
+        self._ups: dict[int, NDArray[np.float64] | None] = {}
 
-def posed(panorama: Panorama, index: int, files: ImageFiles) -> Panorama:
-    """The panorama with the up direction of its GPano tags, if there are any; a `Transform`."""
-    del index
-    return panorama._replace(up=tagged_up(files.rgb))
+    def __call__(self, panorama: Panorama, index: int, files: ImageFiles) -> Panorama:
+        """The panorama with `up`."""
+        if index not in self._ups:
+            self._ups[index] = up_of(files.rgb)
+        return panorama._replace(up=self._ups[index])
 
 
 class EstimatedUp:

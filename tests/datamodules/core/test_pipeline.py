@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from datamodules.core.panoramas import Panorama
 from datamodules.core.pipeline import (
     EstimatedUp,
+    PosedUp,
     RotatedPanoramas,
     SplitItems,
 )
@@ -43,6 +44,7 @@ def test_tilt_is_exact_and_yaw_random(tilt: float) -> None:
 def test_rotations_are_those_of_seed_and_index() -> None:
     first, again, other = (RotatedPanoramas("so3", seed) for seed in (1, 1, 2))
     np.testing.assert_array_equal(first.rotation(0), again.rotation(0))
+    assert not np.allclose(first.rotation(0), first.rotation(1))
     assert not np.allclose(first.rotation(0), other.rotation(0))
 
 
@@ -66,6 +68,21 @@ def test_image_depth_labels_and_up_rotate_together(
     assert (unknown.depth, unknown.up) == (None, None)
 
 
+def test_files_are_asked_once_where_up_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+
+    def up_of(path: Path) -> NDArray[np.float64] | None:
+        asked.append(str(path))
+        return UP if str(path) == "1" else None
+
+    monkeypatch.setattr("datamodules.core.pipeline.up_of", up_of)
+    posed = PosedUp()
+    for _ in range(2):
+        assert posed(_heights(), 0, FILES[0]).up is None
+        np.testing.assert_array_equal(posed(_heights(), 1, FILES[1]).up, UP)
+    assert asked == ["0", "1"]
+
+
 @pytest.mark.parametrize("found", [None, UP])
 def test_only_what_nothing_says_is_estimated_and_only_once(
     monkeypatch: pytest.MonkeyPatch, found: NDArray[np.float64] | None
@@ -85,15 +102,23 @@ def test_only_what_nothing_says_is_estimated_and_only_once(
     assert asked == [50]
 
 
-def test_a_judge_stays_in_its_process(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_judge_sees_the_panorama_and_stays_in_its_process(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def judge(panorama: Panorama, ups: NDArray[np.float64]) -> NDArray[np.float64]:
+        np.testing.assert_array_equal(panorama.rgb, _heights().rgb)
+        return -ups[:, 0]
+
     def estimate(rgb: NDArray[np.uint8], max_tilt_deg: float, judge: Any) -> Any:
-        return UP if judge is None else -UP
+        up = np.array([-1.0, 0, 0])
+        assert judge is None or judge(np.eye(3)).argmax() != 0
+        return up if judge is not None else UP
 
     monkeypatch.setattr("datamodules.core.pipeline.estimate_up", estimate)
-    upright = EstimatedUp(180, lambda panorama, ups: -ups[:, 0])
-    np.testing.assert_array_equal(upright(_heights(), 0, FILES[0]).up, -UP)
+    upright = EstimatedUp(180, judge)
+    judged = upright(_heights(), 0, FILES[0]).up
     sent = pickle.loads(pickle.dumps(upright))  # as to a worker
-    np.testing.assert_array_equal(sent(_heights(), 0, FILES[0]).up, -UP)
+    np.testing.assert_array_equal(sent(_heights(), 0, FILES[0]).up, judged)
     np.testing.assert_array_equal(sent(_heights(), 1, FILES[1]).up, UP)
 
 
