@@ -10,6 +10,7 @@ from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 
 from datamodules.core.inputs import normalize
@@ -21,7 +22,6 @@ from tangent_train.rendering.mosaic import ScoreMosaic
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    import numpy as np
     from numpy.typing import NDArray
     from torch import Tensor, nn
 
@@ -163,19 +163,7 @@ class Predictor:
         """
         sets = self._view_sets(image)
         height, width = image.rgb.shape[:2]
-        spare = None
-        with suppress(IndexError):
-            spare = self._spare.pop()
-        mosaic = ScoreMosaic(
-            (height, width),
-            self._trained.network.num_scores,
-            self._view_sets.blend,
-            averaged=probabilities or len(sets) > 1,
-            min_confidence=self._min_confidence,
-            spare=spare,
-        )
-        # The next image gets the memory of this one once nobody has its mosaic any more.
-        weakref.finalize(mosaic, self._spare.append, mosaic.sums).atexit = False
+        mosaic = self._mosaic((height, width), averaged=probabilities or len(sets) > 1)
         for views in sets:
 
             def images(part: slice, views: Any = views) -> Tensor:
@@ -190,4 +178,21 @@ class Predictor:
             ):
                 views.add(mosaic, scores, part)
                 progress((part.stop - part.start) / views.count / len(sets))
+        return mosaic
+
+    def _mosaic(self, shape: tuple[int, int], *, averaged: bool) -> ScoreMosaic:
+        """A mosaic; it takes the memory of the one before, once nobody has that any more."""
+        spare = None
+        with suppress(IndexError):
+            spare = self._spare.pop()
+        mosaic = ScoreMosaic(
+            shape,
+            self._trained.network.num_scores,
+            self._view_sets.blend,
+            averaged=averaged,
+            min_confidence=self._min_confidence,
+            spare=spare,
+        )
+        if not isinstance(mosaic.sums, np.memmap):  # room on a disk is given back at once
+            weakref.finalize(mosaic, self._spare.append, mosaic.sums).atexit = False
         return mosaic

@@ -477,7 +477,8 @@ def _copy_patch(
     num_classes, image_height, image_width = scores.shape
     height, blocks, width, _ = patch.shape
     stride = -(-width // LANES) * LANES
-    lines, flat = np.zeros((LANES * blocks, stride), np.float32), patch.reshape(-1)
+    lines = np.zeros((LANES * blocks, stride), np.float32)
+    from_lines, to_pixels = lines.reshape(-1), patch.reshape(-1)
     highest, factor = np.empty(width, np.float32), np.ones(stride, np.float32)
     for y in range(height):
         first, wide = spans[y]
@@ -493,9 +494,9 @@ def _copy_patch(
         if softmax:
             _softmax_lines(lines, num_classes, wide, highest, factor)
         for b in range(blocks):
-            pixel, line = LANES * ((y * blocks + b) * width + first), LANES * stride * b
+            at, to = LANES * stride * b, LANES * ((y * blocks + b) * width + first)
             for x in range(0, wide, LANES):
-                _transpose(lines.reshape(-1), line + x, stride, factor, x, flat, pixel + LANES * x)
+                _transpose(from_lines, at + x, stride, factor, x, to_pixels, to + LANES * x)
 
 
 @njit_fast

@@ -47,7 +47,7 @@ class ScoreMosaic:
             images that see it.
         averaged: Whether to keep sums of probabilities: always with ``feather``; with ``nearest``
             for more than one grid, or when the probabilities are wanted. They take 4 K bytes a
-            pixel, beyond 2 GiB in a temporary file (of the folder TMPDIR).
+            pixel, K rounded up to 16s, beyond 2 GiB in a temporary file (of the folder TMPDIR).
         min_confidence: Probability from which the best class is certain, see `labels`; above 0,
             sums are kept.
         spare: `sums` of a mosaic that nobody uses any more, to take its memory.

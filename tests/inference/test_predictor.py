@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+import weakref
 from pathlib import Path
 from typing import Any
 
@@ -77,6 +78,24 @@ def test_images_share_memory_only_one_after_the_other() -> None:
     third = predictor.predict(InputImage(bright))
     assert third.sums.ctypes.data == address
     np.testing.assert_array_equal(third.probabilities(slice(None)), expected)
+
+
+@pytest.mark.parametrize("in_memory", [True, False])
+def test_memory_of_another_size_or_on_a_disk_is_given_back(
+    in_memory: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not in_memory:
+        monkeypatch.setattr("tangent_train.rendering.accumulate._IN_MEMORY_BYTES", 0)
+    trained = trained_network(TANGENT)
+    predictor = Predictor(trained, PanoramaViews(trained, blend="feather"))
+    first = predictor.predict(InputImage(_blocks(64, 128)))
+    kept = weakref.ref(first.sums)
+    del first
+    assert (kept() is not None) == in_memory
+    during = []
+    predictor.predict(InputImage(_blocks(32, 64)), lambda _: during.append(kept()))
+    assert during
+    assert set(map(type, during)) == {type(None)}
 
 
 # Panoramas.
