@@ -10,6 +10,7 @@ from torchmetrics.utilities import dim_zero_cat
 
 from tangent_train.errors import SettingError
 from tangent_train.metrics.segmentation import (
+    BAND_EDGES_DEG,
     ConfusionMatrix,
     bootstrap_intervals,
     segmentation_scores,
@@ -57,6 +58,11 @@ def test_absent_classes(absent: str, mean: float) -> None:
     assert segmentation_scores(confusion, absent).miou == pytest.approx(mean)  # type: ignore[arg-type]
 
 
+def test_a_mean_over_one_class_is_that_of_the_class() -> None:
+    scores = segmentation_scores([[0, 0, 0], [0, 3, 1], [0, 0, 0]])
+    assert (scores.miou, scores.macc) == (0.75, 0.75)
+
+
 def test_nothing_labelled() -> None:
     empty = np.zeros((4, 4))
     scores = segmentation_scores(empty)
@@ -97,6 +103,7 @@ def test_latitude_bands_go_from_north_to_south() -> None:
     bands = metric.compute().bands
     for k, band in enumerate(bands):
         assert band[k + 1, k + 1] == band.sum() == 30 * 4
+    assert BAND_EDGES_DEG[:: len(bands)] == (90, -90)
 
 
 def test_large_counts_stay_exact() -> None:
@@ -188,6 +195,7 @@ def test_intervals_are_the_same_in_any_order() -> None:
 def test_draws_without_labels_are_left_out() -> None:
     _, of_images = _random_images(1)
     with_one = bootstrap_intervals(np.concatenate([of_images, np.zeros_like(of_images)]))
+    assert {*with_one} == {"miou", "macc"}
     assert with_one == bootstrap_intervals(of_images.repeat(2, axis=0))
 
 
