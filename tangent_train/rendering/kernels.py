@@ -138,9 +138,10 @@ def _add_block(typing: Any, sums: Any, at: Any, scores: Any, places: Any, weight
 
 @intrinsic  # type: ignore[untyped-decorator]
 def _transpose(
-    typing: Any, lines: Any, at: Any, stride: Any, factors: Any, first: Any, pixels: Any, to: Any
-) -> Any:
-    """Write 16 pixels of 16 classes that come from 16 lines, one per class, times factors.
+    typing: Any, rows: Any, at: Any, stride: Any, factors: Any, first: Any,
+    columns: Any, to: Any, step: Any,
+) -> Any:  # fmt: skip
+    """Write the columns of 16 rows of 16 numbers, which are multiplied by factors.
 
     Interleaving the first with the second half of the rows of a square, log2 16 times, transposes
     it.
@@ -154,7 +155,7 @@ def _transpose(
             kind = signature.args[array]
             return _address(context, builder, kind, arguments[array], index, block)
 
-        _, _, stride, *_, to = arguments
+        _, _, stride, *_, step = arguments
         factor = builder.load(place(3, 4, stride, 0), align=4)
         rows = [builder.load(place(0, 1, stride, k), align=4) for k in range(LANES)]
         rows = [builder.fmul(row, factor) for row in rows]
@@ -165,10 +166,10 @@ def _transpose(
             pairs = zip(rows[:half], rows[half:], strict=True)
             rows = [builder.shuffle_vector(*pair, order) for pair in pairs for order in orders]
         for k, row in enumerate(rows):
-            builder.store(row, place(5, 6, to.type(LANES), k), align=4)
+            builder.store(row, place(5, 6, step, k), align=4)
         return context.get_dummy_value()
 
-    return types.void(lines, at, stride, factors, first, pixels, to), build
+    return types.void(rows, at, stride, factors, first, columns, to, step), build
 
 
 @intrinsic  # type: ignore[untyped-decorator]
@@ -488,15 +489,32 @@ def _copy_patch(
         for k in range(num_classes):
             line, there = lines[k], scores[k, top + y]
             for x in range(np.uint64(wide)):
-                score = there[np.uint64(left + first) + x]
-                line[x] = score
-                highest[x] = score if score > highest[x] else highest[x]
+                line[x] = there[np.uint64(left + first) + x]
+            if softmax:
+                for x in range(np.uint64(wide)):
+                    highest[x] = line[x] if line[x] > highest[x] else highest[x]
         if softmax:
             _softmax_lines(lines, num_classes, wide, highest, factor)
         for b in range(blocks):
             at, to = LANES * stride * b, LANES * ((y * blocks + b) * width + first)
             for x in range(0, wide, LANES):
-                _transpose(from_lines, at + x, stride, factor, x, to_pixels, to + LANES * x)
+                _transpose(from_lines, at + x, stride, factor, x, to_pixels, to + LANES * x, LANES)
+
+
+@njit_fast
+def _to_lines(blocks: Array, lines: Array) -> None:
+    """Write ``(B, w, 16)`` numbers of a row as ``(16 B, w or more)`` lines, one per class."""
+    width, stride = blocks.shape[1], lines.shape[1]
+    whole, rest = width - width % LANES, LANES * (width % LANES)
+    last, factor = np.zeros(LANES * LANES, np.float32), np.ones(LANES, np.float32)
+    to = lines.reshape(-1)
+    for b in range(len(blocks)):
+        pixels, first = blocks[b].reshape(-1), LANES * stride * b
+        for x in range(0, whole, LANES):
+            _transpose(pixels, LANES * x, LANES, factor, 0, to, first + x, stride)
+        if rest:
+            last[:rest] = pixels[LANES * whole :]
+            _transpose(last, 0, LANES, factor, 0, to, first + whole, stride)
 
 
 @njit_fast
@@ -536,14 +554,14 @@ def _add_probabilities(
     """
     top, bottom, left = tile[0], tile[1], tile[2]
     blocks, width = sums.shape[1], sums.shape[2]
-    lines = np.zeros((LANES * blocks, width), np.float32)
+    lines = np.empty((LANES * blocks, -(-width // LANES) * LANES), np.float32)
     highest, factor = np.empty(width, np.float32), np.empty(width, np.float32)
     for i in range(top, bottom):
+        _to_lines(sums[i - top], lines)
         highest[:] = -np.inf
         for k in range(num_classes):
-            line, of_class = lines[k], sums[i - top, k // LANES, :, k % LANES]
+            line = lines[k]
             for x in range(width):
-                line[x] = of_class[x]
                 highest[x] = line[x] if line[x] > highest[x] else highest[x]
         _softmax_lines(lines, num_classes, width, highest, factor)
         for x in range(width):
@@ -581,15 +599,16 @@ def _write_classes(blocks: Array, num_classes: int, least: float, labels: Array)
     """
     width = len(labels)
     highest, best = np.full(width, -np.inf, np.float32), np.zeros(width, np.int32)
+    lines = np.empty((LANES * len(blocks), -(-width // LANES) * LANES), np.float32)
+    _to_lines(blocks, lines)
     for k in range(num_classes):
-        sums, label = blocks[k // LANES].reshape(-1)[k % LANES :], np.int32(k)
+        line, label = lines[k], np.int32(k)
         for x in range(np.uint64(width)):
-            score = sums[np.uint64(LANES) * x]
-            better = score > highest[x]
+            better = line[x] > highest[x]
             best[x] = label if better else best[x]
-            highest[x] = score if better else highest[x]
+            highest[x] = line[x] if better else highest[x]
     for x in range(width):
-        unsure = least > 0 and highest[x] < least * blocks[:, x].sum()
+        unsure = least > 0 and highest[x] < least * lines[:, x].sum()
         labels[x] = num_classes if unsure else best[x]
 
 
