@@ -33,7 +33,6 @@ _RUN = {
     "panels": int,
     "tensorboard_images": int,
     "checkpoint_every_n_steps": int | None,
-    "ema": float | None,
 }
 """Settings outside of the sections."""
 

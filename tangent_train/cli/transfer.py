@@ -30,7 +30,7 @@ from tangent_train.cli.transfer_views import views_of
 from tangent_train.errors import DataError, SettingError
 
 _MOST_SHOWN = 3
-_OF_TRAINING = ("ema", "fine_tuning", "network", "optimizer", "scheduler")
+_OF_TRAINING = ("fine_tuning", "network", "optimizer", "scheduler")
 
 
 def transfer(config: DictConfig) -> None:

@@ -18,7 +18,6 @@ TUNED = (
     "task.frozen=[stem,downs.0]",
     "optimizer.backbone_lr_factor=0.1",
     "data.inputs=[rgb]",
-    "ema=0.9",
     "init_from=net.ckpt",
 )
 
