@@ -9,7 +9,6 @@ import sys
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +28,6 @@ from tangent_train.cli.transfer_stages import (
 from tangent_train.cli.transfer_views import views_of
 from tangent_train.errors import DataError, SettingError
 
-_MOST_SHOWN = 3
 _OF_TRAINING = ("fine_tuning", "network", "optimizer", "scheduler")
 
 
@@ -104,7 +102,7 @@ def _check_given(path: Path, given: Mapping[str, Any], stages: Sequence[Stage]) 
 
 def _check_data(stages: Sequence[Stage], trained: TrainedNetwork | None) -> None:
     """Build the data and networks of all stages: errors come before hours of training."""
-    from tangent_train.cli.build import build, build_trained
+    from tangent_train.cli.build import build, build_trained, check_fits, shown
 
     first: Any = None
     built: dict[Any, tuple[Stage, Any]] = {}
@@ -119,53 +117,13 @@ def _check_data(stages: Sequence[Stage], trained: TrainedNetwork | None) -> None
             settings = {**stage.config, "checkpoint": str(stage.weights)}
             data = (build_trained(settings, trained) if trained else build(settings))[0]
             first = first or data
-            _check_alike(first, data)
+            check_fits(data, shown(first), f"the network of stage {stages[0].name}")
             # Files are the same for all rotations, and for all views of as many rows.
             built.setdefault((stage.name[0], getattr(data, "erp_height", 0)), (stage, data))
     for stage, data in built.values():  # after all settings: this makes files
         with _named(stage):
             data.make_files()
             data.setup()
-    _tell_shared_scenes(list(built.values()))
-
-
-def _check_alike(first: Any, own: Any) -> None:
-    """Refuse data that a network of the first stage cannot take, or would take for another."""
-    for number, (before, now) in enumerate(zip_longest(first.class_names, own.class_names)):
-        if before != now:
-            raise SettingError(
-                "data",
-                found=f"{now or 'nothing'} as class {number} in {own.classes_from}",
-                expected=f"{before or 'nothing'}, as in {first.classes_from}",
-                remedy="Photos and panoramas have the same classes in the same order.",
-            )
-    for name in ("inputs", "normalization"):
-        before, now = getattr(first, name), getattr(own, name)
-        if before != now:
-            raise SettingError(
-                f"data.{name}", found=now, expected=f"{before}, as in the stages before"
-            )
-
-
-def _tell_shared_scenes(built: Sequence[tuple[Stage, Any]]) -> None:
-    """Say which scenes P is trained on and S tested: only their names are known to be the same."""
-    trained, tested = (
-        {
-            item.name.partition("/")[0]
-            for stage, data in built
-            if stage.name[0] == kind
-            for item in data.found().of(splits)
-        }
-        for kind, splits in (("P", ("train", "val")), ("S", ("test",)))
-    )
-    shared = sorted(trained & tested)
-    if shared:
-        more = f" and {len(shared) - _MOST_SHOWN} others" if len(shared) > _MOST_SHOWN else ""
-        say(
-            f"Note: P is trained on photos, and S tested on panoramas, of "
-            f"{', '.join(shared[:_MOST_SHOWN])}{more}. If they show the same places, hold them out "
-            "of both, for example in test.txt."
-        )
 
 
 @contextmanager
