@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 import shlex
 import sys
@@ -164,7 +163,7 @@ def _report(
             key = stage.config["level"] if study else stage.name
             found[key].append(load_record(stage.folder))
     if study:
-        level = trained_level(config) if trained is None else trained.level
+        level = config.level if trained is None else trained.level
         name, report = "angular_resolution", levels_report(found, level)
     else:
         cells = {s.name: (s.view or "S", s.condition) for s in stages if s.condition}
@@ -174,25 +173,3 @@ def _report(
     for note in report.all_notes():
         say(f"- {note}")
     say(f"Tables and a chart: {folder / name}.md, .csv, .json, .png")
-
-
-def trained_level(config: DictConfig) -> float:
-    """The level at which the panoramas' images have the focal length of the photos' crops.
-
-    That of a crop is ``f' = W' / (2 tan(Ω'/2))`` pixels (paper, supplement, "Camera
-    normalization"), that of a tangent image 1/p: every level doubles it. The paper's 45° and 128
-    pixels for level 8 are as fine as level 8.42 at b = 1.
-
-    Args:
-        config: The composed ``transfer.yaml``.
-    """
-    from tangent_train.geometry import camera_matrix_from_fov
-    from tangent_train.registry import make
-
-    settings: Any = OmegaConf.to_container(config, resolve=True)
-    photos = make(settings["photos"]["representation"], "photos.representation")
-    panoramas = make(settings["representation"], "representation")
-    focal = camera_matrix_from_fov(photos.fov_deg, photos.image_size)[0, 0]
-    grid = getattr(panoramas, "grid", None)
-    pitch = math.pi / panoramas.erp_height if grid is None else grid.pitch
-    return float(config.level + math.log2(focal * pitch))

@@ -73,26 +73,13 @@ def test_the_network_is_the_file_s_unless_one_is_typed(
 
 
 def test_depth_is_added_to_a_network_for_photos(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    imported: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    settings, _ = _begun(monkeypatch, write_imported(tmp_path / "own.ckpt"))
+    settings, _ = _begun(monkeypatch, imported)
     assert settings["network"] == UNET | {"in_channels": None, "num_classes": None}
     mean, std = RGBD_NORMALIZATION.mean[3], RGBD_NORMALIZATION.std[3]
     expected = {"mean": [*IMAGENET["mean"], mean], "std": [*IMAGENET["std"], std]}
     assert settings["data"]["normalization"] == expected
-    other = {
-        "_target_": "torchvision.models.segmentation.lraspp_mobilenet_v3_large",
-        "num_classes": 21,
-        "weights": None,
-        "weights_backbone": None,
-    }
-    path = write_imported(tmp_path / "other.ckpt", other)
-    settings, source = _begun(monkeypatch, path)
-    assert settings["network"]["network"] == other | {"num_classes": None}
-    _, task = build(settings, source)
-    assert task(torch.zeros(1, 4, 32, 32)).shape == (1, 13, 32, 32)
-    settings, _ = _begun(monkeypatch, path, "data.inputs=[rgb]")
-    assert settings["network"] == other | {"num_classes": None}
 
 
 def test_a_network_that_holds_the_file_s_is_kept(
