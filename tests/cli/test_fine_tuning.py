@@ -130,13 +130,18 @@ def test_fine_tuning_leaves_a_run_of_its_own(
     path = write_imported(tmp_path / "net.ckpt", UNET | {"num_classes": 13}, 13)
     typed = [text for text in SETTINGS if "network" not in text]
     tuned = ["data.inputs=[rgb]", "trainer.max_epochs=1", "task.frozen=[stem,downs]"]
-    slower = ["optimizer.backbone_lr_factor=0.1", "hydra.run.dir=tuned", f"init_from={path}"]
-    run("train", *typed, rooms, *tuned, *slower)
+    slower = ["optimizer.backbone_lr_factor=0.1", "scheduler=constant", f"init_from={path}"]
+    run("train", *typed, rooms, *tuned, *slower, "hydra.run.dir=tuned")
     assert "  head (2 tensors): of other classes in the file\n" in capsys.readouterr().out
+    before = torch.load(path, weights_only=True)["state_dict"]
     path.unlink()
+    run("train", "resume=tuned", rooms, "trainer.max_epochs=2")
     checkpoint = tmp_path / "tuned" / "checkpoints" / "best.ckpt"
     content = torch.load(checkpoint, weights_only=True)
     assert content["fresh"] == ["head.bias", "head.weight"]
+    for name, tensor in before.items():
+        frozen = name.startswith(("network.stem.", "network.downs."))
+        assert not frozen or torch.equal(tensor, content["state_dict"][name])
     choices = content["config"]["choices"]
     assert "network" not in choices, "it is of no option"
     assert choices["experiment"] == "rooms/demo"
