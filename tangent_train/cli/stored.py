@@ -29,7 +29,6 @@ _RUN = {
     "seed": int,
     "level": int,
     "panels": int,
-    "tensorboard_images": int,
     "checkpoint_every_n_steps": int | None,
 }
 """Settings outside of the sections."""
