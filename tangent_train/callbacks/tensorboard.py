@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback
-from lightning.pytorch.loggers import TensorBoardLogger
 
 from tangent_train.metrics.classification import classification_scores
 from tangent_train.metrics.segmentation import segmentation_scores
@@ -17,7 +16,7 @@ class ClassScores(Callback):
     """Log per-class scores to TensorBoard after every validation.
 
     ``val_iou/<class>``, of shapes ``val_accuracy/<class>``, of the classes that occur, at the same
-    steps as ``val/miou``. Only the first process writes, and only with a TensorBoard logger.
+    steps as ``val/miou``. Only the first process writes.
     """
 
     def on_validation_end(  # noqa: D102 - a hook of Lightning; the scores are there now
@@ -25,11 +24,8 @@ class ClassScores(Callback):
     ) -> None:
         if trainer.sanity_checking or not trainer.is_global_zero:
             return
-        found = (x.experiment for x in trainer.loggers if isinstance(x, TensorBoardLogger))
-        writer = next(found, None)
-        if writer is None:
-            return
         task: Any = pl_module
+        writer = task.logger.experiment
         segmentation = task.kind == "segmentation"
         if segmentation:
             name = "val_iou"

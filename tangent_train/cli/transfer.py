@@ -26,6 +26,7 @@ from tangent_train.cli.transfer_stages import (
 )
 from tangent_train.cli.transfer_views import views_of
 from tangent_train.errors import DataError, SettingError
+from tangent_train.registry import check_fields
 
 _OF_TRAINING = ("fine_tuning", "network", "optimizer", "scheduler")
 
@@ -86,12 +87,9 @@ def _of_network(config: DictConfig) -> tuple[DictConfig, TrainedNetwork]:
 
 def _check_given(path: Path, given: Mapping[str, Any], stages: Sequence[Stage]) -> None:
     """Refuse a checkpoint that has seen the test rooms of another fold."""
-    from tangent_train.registry import check_fields
-
-    expected = "the settings of a run"
-    data = check_fields(path, given, {"data": dict}, expected)["data"]
-    fold = check_fields(path, data, {"fold": int | None}, expected, "data")["fold"]
-    if fold is not None and {stage.fold for stage in stages} != {fold}:
+    data = check_fields(path, given, {"data": dict}, "the settings of a run")["data"]
+    fold = data.get("fold")
+    if fold is not None and any(stage.fold != fold for stage in stages):
         raise SettingError(
             f"checkpoint={path}",
             found=f"a network for testing on fold {fold}, of the others it has seen the rooms",
