@@ -17,16 +17,33 @@ from tangent_train.cli.build import build
 from tangent_train.cli.fine_tuning import begin_from
 from tangent_train.errors import DataError, SettingError
 from tangent_train.inference.export import export_network
-from tests.cli.imported import UNET, write_imported
+from tangent_train.inference.photo_networks import PhotoNetwork, import_network
+from tangent_train.registry import make
 from tests.cli.tiny_runs import SETTINGS, Run, results
 from tests.running import composed, composed_settings
+from tests.tasks.small_networks import with_statistics
 
 IMAGENET = {"mean": [0.485, 0.456, 0.406], "std": [0.229, 0.224, 0.225]}
 
 
+UNET = {"_target_": "models.UNet", "in_channels": 3, "num_classes": 21, "widths": [4, 8, 12]}
+
+
+def _write_imported(path: Path, classes: int) -> Path:
+    """Write a network with random numbers as `tangent-import` does."""
+    torch.manual_seed(3)
+    settings = UNET | {"num_classes": classes}
+    network = with_statistics(make(settings, "network"))
+    names = [f"thing {number}" for number in range(classes)]
+    normalization = Normalization.of("imagenet", 3)
+    photo = PhotoNetwork(network, settings, names, normalization, (64, 64))
+    import_network(photo, path, level=6)
+    return path
+
+
 @pytest.fixture
 def imported(tmp_path: Path) -> Path:
-    return write_imported(tmp_path / "net.ckpt")
+    return _write_imported(tmp_path / "net.ckpt", 21)
 
 
 def _begun(monkeypatch: pytest.MonkeyPatch, path: Path, *overrides: str) -> tuple[Any, Any]:
@@ -127,7 +144,7 @@ def test_fine_tuning_leaves_a_run_of_its_own(
     tmp_path: Path, rooms: str, run: Run, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Here with the data's number of classes, but of other names."""
-    path = write_imported(tmp_path / "net.ckpt", UNET | {"num_classes": 13}, 13)
+    path = _write_imported(tmp_path / "net.ckpt", 13)
     typed = [text for text in SETTINGS if "network" not in text]
     tuned = ["data.inputs=[rgb]", "trainer.max_epochs=1", "task.frozen=[stem,downs]"]
     slower = ["optimizer.backbone_lr_factor=0.1", "scheduler=constant", f"init_from={path}"]
