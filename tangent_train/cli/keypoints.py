@@ -112,7 +112,7 @@ def earlier_results(output: Path, settings: Mapping[str, Any]) -> dict[str, list
     path, expected = output / "results.json", "results of tangent-keypoints"
     if not path.exists():
         return {}
-    kinds = {"settings": dict, "rows": list[dict]}
+    kinds = {"settings": dict, "rows": list[dict]}  # type: ignore[type-arg]
     content = check_fields(path, read_json(path, expected), kinds, expected)
     done: dict[str, list[Row]] = {}
     for row in content["rows"]:

@@ -95,6 +95,10 @@ def _network(**settings: Any) -> dict[str, Any]:
             r"network\._target_: no_such\.Net, .*PYTHON",
         ),
         (
+            {"network": {"_target_": "torch.nn.Convolution"}},
+            r"network\._target_: torch\.nn\.Convolution, .*Correct the name",
+        ),
+        (
             {"network": _network(wide=3)},
             r"network\.wide=3; expected one of its set",
         ),
@@ -111,7 +115,7 @@ def test_what_cannot_be_loaded_says_why(
     content["config"] |= changed
     torch.save(content, path)
     with pytest.raises(DataError, match=rf"(?s)^{re.escape(str(path))}: found {message}"):
-        load_trained(path, ["no_such.Net"])
+        load_trained(path, ["no_such.Net", "torch.nn.Convolution"])
 
 
 @pytest.mark.parametrize(

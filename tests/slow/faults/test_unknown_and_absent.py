@@ -6,6 +6,7 @@ import json
 import shutil
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -56,7 +57,7 @@ def test_a_batch_without_labels_changes_nothing(root: Path, tmp_path: Path, half
 @pytest.mark.parametrize("absent", ["skip", "zero"])
 @pytest.mark.parametrize("how_many", [1, 5])
 def test_panoramas_without_a_labelled_pixel(
-    root: Path, tmp_path: Path, how_many: int, absent: str
+    root: Path, tmp_path: Path, how_many: int, absent: Any
 ) -> None:
     for path in _label_files(root, "5[ab]")[:how_many]:
         _without_labels(path)
