@@ -11,7 +11,6 @@ This module imports nothing heavy: networks and data sets import it.
 
 from __future__ import annotations
 
-import builtins
 import inspect
 import re
 import sys
@@ -21,7 +20,7 @@ from functools import partial
 from importlib import import_module
 from pathlib import Path
 from pkgutil import resolve_name
-from types import NoneType, SimpleNamespace, UnionType
+from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from tangent_train.errors import DataError, SettingError, printable
@@ -282,45 +281,22 @@ def _find(target: str) -> tuple[Any, Mapping[str, Any]] | None:
     return libraries.find(module, name)
 
 
-class _Names(dict[str, Any]):
-    """Names in the annotations of a function; those only type checkers know are of objects."""
-
-    def __init__(self, names: Mapping[str, Any]) -> None:
-        known = {"Callable": Callable, "Mapping": Mapping, "Path": Path, "Sequence": Sequence}
-        super().__init__(known | dict(names))
-
-    def __missing__(self, name: str) -> Any:
-        return getattr(builtins, name, _Object)
-
-
 def _kinds(made: Any) -> dict[str, Any]:
     """By the name of an argument what a file may give for it; also those handed on to bases."""
-    if is_dataclass(made):
-        return _kinds_of_fields(made)
+    if is_dataclass(made):  # each field by the names of the module that declares it
+        hints = get_type_hints(made)
+        return {one.name: _kind(hints[one.name]) for one in fields(made) if one.init}
     kinds: dict[str, Any] = {}
     for base in inspect.getmro(made) if inspect.isclass(made) else (made,):
         function = vars(base).get("__init__") if inspect.isclass(base) else base
         if function is None:
             continue
-        hints = get_type_hints(function, localns=_Names(inspect.unwrap(function).__globals__))
+        hints = get_type_hints(function)
         arguments = inspect.signature(function).parameters.values()
         of_base = {a.name: _kind(hints[a.name]) for a in arguments if a.name in hints}
         kinds = {**{n: k for n, k in of_base.items() if n != "settings"}, **kinds}
         if not any(a.kind is a.VAR_KEYWORD for a in arguments):
             break
-    return kinds
-
-
-def _kinds_of_fields(made: Any) -> dict[str, Any]:
-    """The same of a dataclass: each field by the annotation in the class that declares it."""
-    given = {one.name for one in fields(made) if one.init}
-    kinds: dict[str, Any] = {}
-    for base in reversed(inspect.getmro(made)):
-        own = SimpleNamespace(
-            __annotations__={n: h for n, h in inspect.get_annotations(base).items() if n in given}
-        )
-        hints = get_type_hints(own, localns=_Names(vars(sys.modules[base.__module__])))
-        kinds |= {name: _kind(hint) for name, hint in hints.items()}
     return kinds
 
 

@@ -10,13 +10,8 @@ from tangent_train.setting_rules import Purpose, differing_settings, from_file, 
 @pytest.mark.parametrize(
     ("name", "purposes"),
     [
-        ("data.root", {"resume", "report", "transfer", "evaluation"}),
-        ("task.channels_last", {"resume", "report", "transfer", "evaluation"}),
         ("task.compile.mode", {"resume", "report", "transfer", "evaluation"}),
         ("seed", {"report"}),
-        ("data.fold", {"report"}),
-        ("data.inputs", set()),
-        ("network.widths", set()),
         ("trainer.max_epochs", {"resume", "evaluation"}),
         ("trainer.precision", set()),
         ("optimizer.lr", {"evaluation"}),
@@ -43,9 +38,3 @@ def test_a_mask_may_lie_elsewhere_when_a_run_is_resumed() -> None:
     assert differing_settings(other, path, "report") == [("data.mask", "/b.png", "a.png")]
     assert differing_settings(path, latitude, "resume") == [("data.mask", "a.png", -60)]
     assert [from_file("data.mask", mask) for mask in (-60, None, "a.png")] == [True, True, False]
-
-
-def test_files_do_not_decide_about_this_machine() -> None:
-    own = ("data.root", "data.store", "task.compile.options", "trainer.devices", "trainer.plugins")
-    assert not any(map(from_file, own))
-    assert all(map(from_file, ("data.fold", "trainer.max_epochs", "network.root", "task.compiled")))

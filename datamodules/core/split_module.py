@@ -352,11 +352,6 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
         return self.source(split).name(index)
 
     @property
-    def classes_from(self) -> Path:
-        """The file or folder that says which classes there are, for messages."""
-        return self.root
-
-    @property
     def per_step(self) -> int:
         """Images or shapes per training step and process."""
         return int(getattr(self, self._per_step))

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,13 +63,8 @@ class LabelledFolder(ImageDataModule):
         self.require("test_fraction", 0 < self.test_fraction < 1, "above 0 to below 1")
         self.require("split_seed", self.split_seed >= 0, "0 or more")
         # Now, not with the files: the network is made for as many classes.
-        self._classes = read_classes(self.classes_from)
+        self._classes = read_classes(self.root / "classes.json")
         self.class_names = (UNKNOWN_NAME, *self._classes.names)
-
-    @property
-    def classes_from(self) -> Path:
-        """``classes.json``."""
-        return self.root / "classes.json"
 
     def find_images(self, problems: Problems) -> tuple[FolderReader, dict[Split, list[ImageFiles]]]:
         """See `ImageDataModule`."""

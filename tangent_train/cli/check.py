@@ -28,8 +28,9 @@ def check(settings: Mapping[str, Any]) -> None:
     with redirect_stdout(sys.stderr):  # progress is none of the problems that are listed
         problems, count = data.check()
     listed = problems.listed()
-    read = f"{counted(count, data.noun)} of {_printable(str(data.root))} checked"
-    rows = [[*map(_printable, problem[:3])] for problem in listed]
+    # Names of files may hold line ends, terminal escapes and invalid bytes.
+    read = f"{counted(count, data.noun)} of {repr(str(data.root))[1:-1]} checked"
+    rows = [[repr(text)[1:-1] for text in problem[:3]] for problem in listed]
     if rows and terminal:
         Table("", ("file", "finding", "remedy"), rows, text_columns=range(3), lines=True).print()
     for row in () if terminal else rows:
@@ -38,13 +39,3 @@ def check(settings: Mapping[str, Any]) -> None:
     say(f"{found}; {read}.", error=bool(listed) and not terminal)
     if listed:
         sys.exit(1)
-
-
-def _printable(text: str) -> str:
-    r"""Escape file names, which may hold line ends, terminal escapes and invalid bytes.
-
-    >>> print(_printable("küche 1\n\x1b[2J\udcff.png"))
-    küche 1\n\x1b[2J\udcff.png
-    """
-    escaped = (c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
-    return "".join(escaped)

@@ -14,20 +14,15 @@ _PATHS = (
 """Settings that name files or folders."""
 
 
-def config_folder(command: str = "") -> Path:
-    """The Hydra tree: the copy inside the wheel first, the checkout's second.
-
-    Args:
-        command: One that has a folder of its own there, as its settings have names of groups.
-    """
+def config_folder() -> Path:
+    """The Hydra tree: the copy inside the wheel first, the checkout's second."""
     package = Path(__file__).resolve().parents[1]
     packaged = package / "configs"
-    folder = packaged if packaged.is_dir() else package.parent / "configs"
-    return folder / command if (folder / command).is_dir() else folder
+    return packaged if packaged.is_dir() else package.parent / "configs"
 
 
 def named(argument: str, setting: str) -> str:
-    """Keep a setting with the name of a config group a setting, where `--config-dir` has the group.
+    """Keep a setting with the name of a config group a setting.
 
     Hydra never takes a mapping for the choice of an option.
 

@@ -19,8 +19,9 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from datamodules.core.loading import explained
 from tangent_train.callbacks.checkpoints import AtomicCheckpointIO, CheckpointContents
+from tangent_train.callbacks.panels import PredictionPanels
 from tangent_train.callbacks.progress import ProgressBar
-from tangent_train.callbacks.results import evaluated, pictures, write_evaluation
+from tangent_train.callbacks.tensorboard import ClassScores
 from tangent_train.checkpoints.content import read_checkpoint, write_settings
 from tangent_train.checkpoints.scores import Scores, size_multiple_of
 from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
@@ -31,7 +32,15 @@ from tangent_train.errors import SettingError
 from tangent_train.files import no_room
 from tangent_train.inference.judge import NetworkJudge
 from tangent_train.registry import SettingsFile, make
-from tangent_train.results.evaluation import headline, result_tables
+from tangent_train.results.evaluation import (
+    classification_record,
+    confusion_table,
+    headline,
+    result_tables,
+    segmentation_record,
+    write_results,
+)
+from tangent_train.results.html import write_report
 from tangent_train.results.record import Record
 
 # lightning 2.6 asks torch's tree library in a way torch ≥ 2.13 deprecates: nothing to do about it.
@@ -118,7 +127,9 @@ class Run:
     def trainer(self, callbacks: Sequence[Callback]) -> lightning.Trainer:
         """The trainer of the config, with callbacks besides those of every run."""
         contents = {"kind": self.task.kind, "config": self.settings, **shown(self.data)}
-        common = [CheckpointContents(contents), ProgressBar()]
+        common = [CheckpointContents(contents), ProgressBar(), ClassScores()]
+        if self.task.kind == "segmentation":
+            common.append(PredictionPanels(self.folder / "panels", self.settings["panels"]))
         section = self.settings["trainer"]
         # Devices found, advertisements, what the settings say anyway.
         logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
@@ -130,7 +141,7 @@ class Run:
             # A run shorter than that is validated at its end.
             check_val_every_n_epoch=min(every, epochs) if every and (epochs or -1) > 0 else every,
             default_root_dir=str(self.folder),
-            callbacks=[*callbacks, *common, *pictures(self.task.kind, self.folder, self.settings)],
+            callbacks=[*callbacks, *common],
             logger=TensorBoardLogger(self.folder, name="", version="tensorboard"),
             plugins=[AtomicCheckpointIO()],
             # The data module's samplers count every image once on any number of processes.
@@ -150,11 +161,16 @@ class Run:
         if getattr(self.data, "upright", None) == "auto":
             self.data.judge = self._judge(trainer.strategy.root_device)
         trainer.test(self.task, datamodule=self.data, verbose=False)
-        record = evaluated(self.task, self.data.noun)
+        task, noun = self.task, self.data.noun
+        if task.kind == "classification":
+            record = classification_record(task.matrices, task.class_names, noun)
+        else:
+            names, absent = task.class_names, task.absent_class
+            record = segmentation_record(task.matrices, names, absent, noun)
         total = len(self.data.source("test"))
         if record.images != total:
-            raise RuntimeError(f"{record.images} of {total} test {self.data.noun} were counted")
-        self._report(record, checkpoint)
+            raise RuntimeError(f"{record.images} of {total} test {noun} were counted")
+        self._report(record, checkpoint, trainer.callbacks)  # type: ignore[attr-defined]
 
     def _judge(self, device: torch.device) -> NetworkJudge:
         """The network as what says which way is up in the test panoramas."""
@@ -176,11 +192,20 @@ class Run:
             ) from error
 
     @rank_zero_only
-    def _report(self, record: Record, checkpoint: Path) -> None:
+    def _report(self, record: Record, checkpoint: Path, callbacks: Sequence[Callback]) -> None:
         own = checkpoint.is_relative_to(self.folder)  # so that a run tells the same wherever it is
         name = str(checkpoint.relative_to(self.folder) if own else checkpoint)
         record = replace(record, checkpoint=name, class_map=self.settings.get("class_map"))
-        write_evaluation(self.task, record, self.folder, self.notes)
+        notes = [f"Checkpoint: {name}", *self.notes]
+        write_results(record, self.folder, notes)
+        write_report(
+            self.folder / "report.html",
+            f"Evaluation of {checkpoint.name}",
+            tables=[*result_tables(record), confusion_table(record)],
+            images=[i for c in callbacks if isinstance(c, PredictionPanels) for i in c.images],
+            class_names=self.task.class_names,
+            notes=[headline(record), *notes],
+        )
         for line in (*self.notes, headline(record)):
             say(line)
         result_tables(record)[0].print()

@@ -59,7 +59,7 @@ def begin_from(path: Path, settings: Settings) -> tuple[Settings, SettingsFile |
     if any(map(_TYPED.match, hydra.overrides.task)) or _wraps(network, target):
         told.append(f"Network of the config: {network['_target_']}")
     else:
-        changed["network"] = _of_channels(start, changed["data"])
+        changed["network"] = start.settings
         source = SettingsFile(path, typed(Trust, settings).trust, settings.keys() - {"network"})
         told.append(f"Network of {path}: {target} (another: network=…)")
     normalization = _normalization(start, changed["data"])
@@ -106,21 +106,6 @@ def _wraps(section: Mapping[str, Any], target: Any) -> bool:
     """Whether a network of this class is inside another one, as their settings say."""
     inner = [value for value in section.values() if isinstance(value, Mapping)]
     return any(value.get("_target_") == target or _wraps(value, target) for value in inner)
-
-
-def _of_channels(start: Start, data: Mapping[str, Any]) -> dict[str, Any]:
-    """The file's network, widened if it only takes RGB and the data have more channels."""
-    channels = len(channel_names(data.get("inputs") or ()))
-    if channels <= _RGB or start.inputs is None or _has(start.settings, "in_channels"):
-        return start.settings
-    return {"_target_": "models.widen_stem", "in_channels": None, "network": start.settings}
-
-
-def _has(section: Any, name: str) -> bool:
-    """Whether a network, or one inside it, has a setting."""
-    if not isinstance(section, Mapping) or "_target_" not in section:
-        return False
-    return name in section or any(_has(value, name) for value in section.values())
 
 
 def _normalization(start: Start, data: Mapping[str, Any]) -> dict[str, list[float]] | None:

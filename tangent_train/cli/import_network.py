@@ -12,7 +12,6 @@ from hydra import compose
 from omegaconf import OmegaConf
 from rich import get_console
 
-from tangent_train.cli.compose import config_folder
 from tangent_train.cli.say import say
 from tangent_train.cli.settings import check_new, typed
 from tangent_train.errors import SettingError
@@ -28,7 +27,7 @@ _LIBRARIES = ("torchvision", "huggingface", "smp", "onnx")
 
 @dataclass(frozen=True)
 class Settings:
-    """See ``configs/import/import.yaml``; `normalization` may also be a mapping."""
+    """See ``configs/import.yaml``; `normalization` may also be a mapping."""
 
     network: str
     model: str | None
@@ -93,8 +92,7 @@ def _load(settings: Settings, normalization: Any) -> PhotoNetwork:
         return network
     from tangent_train.inference.photo_networks import of_config
 
-    search = f"hydra.searchpath=[file://{config_folder()}]"
-    config: Any = compose("import", [f"+network@section={name}", search])
+    config: Any = compose("import", [f"+network@section={name}"])
     section: Any = OmegaConf.to_container(config.section)
     return of_config.load(section, settings.weights, settings.classes, normalization)
 

@@ -17,10 +17,10 @@ from datamodules.images.pixel_files import read_image_size
 from tangent_train.cli.say import say
 from tangent_train.cli.settings import typed
 from tangent_train.errors import DataError, SettingError
-from tangent_train.files import parse_json, write_bytes
+from tangent_train.files import read_json, write_bytes
 from tangent_train.keypoints.colmap import add_pair
 from tangent_train.keypoints.two_view import colmap
-from tangent_train.registry import make, maker_of
+from tangent_train.registry import check_fields, make, maker_of
 from tangent_train.results.keypoints.compare import AS_GIVEN, Comparer, Comparison, Row, Ways
 from tangent_train.results.keypoints.report import KeypointReport, matches_png
 
@@ -106,20 +106,18 @@ def earlier_results(output: Path, settings: Mapping[str, Any]) -> dict[str, list
     """Scores of the finished pairs, by name.
 
     Raises:
-        SettingError: The folder holds something else, or results of other settings.
+        DataError: Its ``results.json`` is something else.
+        SettingError: They are of other settings.
     """
-    if not output.exists() or not any(output.iterdir()):
+    path, expected = output / "results.json", "results of tangent-keypoints"
+    if not path.exists():
         return {}
+    kinds = {"settings": dict, "rows": list[dict]}  # type: ignore[type-arg]
+    content = check_fields(path, read_json(path, expected), kinds, expected)
     done: dict[str, list[Row]] = {}
-    try:
-        content = parse_json((output / "results.json").read_bytes())
-        before = dict(content["settings"])
-        for row in content["rows"]:
-            done.setdefault(row["pair"], []).append(row)
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise SettingError(
-            "output", found=f"{output} with other files", expected="a new or empty folder"
-        ) from error
+    for row in content["rows"]:
+        done.setdefault(str(row.get("pair")), []).append(row)
+    before = content["settings"]
     for name, value in settings.items():
         if before.get(name) != value:
             raise SettingError(

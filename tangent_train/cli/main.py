@@ -56,7 +56,7 @@ def _main(command: str) -> None:
             arguments = [named(argument, "network") for argument in arguments]
         sys.argv[1:] = map(quote_path, arguments)
         try:
-            folder = config_folder(command)
+            folder = config_folder()
             os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises what it would print
             run = hydra.main(version_base="1.3", config_path=str(folder), config_name=command)(job)
             if {"--help", "-h"}.intersection(arguments):

@@ -96,7 +96,10 @@ def predict(config: Mapping[str, Any]) -> None:
     inputs, shard = _inputs(settings), Shard.of(settings.shard)
     original, trained = _networks(settings)
     folder = PredictionFolder(settings.output, trained.class_names, settings.write)
-    label = _Labeller(settings, original, trained, folder, inputs.spread(settings.report))
+    names = inputs.names()
+    spread = np.linspace(0, len(names) - 1, min(settings.report, len(names))).round()
+    shown = [names[int(number)] for number in spread]
+    label = _Labeller(settings, original, trained, folder, shown)
     if shard is None:
         done = _label(settings, decisive, inputs, label, folder)
         _finish(settings, inputs, label, folder, done)
@@ -127,7 +130,8 @@ def _label(
     earlier = folder.earlier(decisive, summary) if settings.resume else {}
     if not (settings.overwrite or earlier or (part is not None and part.folder.exists())):
         folder.check()
-    entries = [entry for entry in earlier.values() if inputs.has(entry)]
+    names = dict.fromkeys(inputs.names())
+    entries = [entry for name, entry in earlier.items() if name in names]
     if part is not None:
         part.begin(entries, resume=settings.resume, overwrite=settings.overwrite)
 
@@ -137,7 +141,7 @@ def _label(
         elif any("classes" in e for e in entries):  # else nothing is in the way of another try
             folder.write_summary(decisive, entries)
 
-    count = inputs.count()
+    count = len(names)
     say(f"{counted(count, 'images')}, {len(entries)} done already.")
     missing = count - len(entries)
     steps = label, label.read, label.write

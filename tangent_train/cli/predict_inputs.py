@@ -10,7 +10,7 @@ from datamodules.images.image_files import IMAGE_SUFFIXES, image_paths, short_na
 from datamodules.images.videos import VIDEO_SUFFIXES, read_frames, read_video_size
 from tangent_train.cli.each import Job, Shard
 from tangent_train.errors import DataError, SettingError
-from tangent_train.results.predictions import Entry, frame_name
+from tangent_train.results.predictions import frame_name
 
 
 def is_video(path: Path) -> bool:
@@ -73,30 +73,14 @@ class Inputs:
         files = {name: self.files[name] for name in names}
         return Inputs(files, {name: job for name, job in self.videos.items() if name in files})
 
-    def spread(self, count: int) -> list[str]:
-        """Names of some images and frames, spread over all."""
-        total = self.count()
-        count = min(count, total)
-        chosen = {-(-number * total // count) for number in range(count)}
-        return [name for number, name in enumerate(self._names()) if number in chosen]
-
-    def _names(self) -> Iterator[str]:
+    def names(self) -> list[str]:
+        """Names of all images and frames; a video that cannot be read is one."""
+        names = []
         for name in self.files:
             video = self.videos.get(name)
-            if video is None or video.error:
-                yield name
-            else:
-                yield from (frame_name(name, number) for number in range(video.value))
-
-    def count(self) -> int:
-        """Number of images and frames; a video that cannot be read counts as one."""
-        frames = sum(1 if job.error else job.value for job in self.videos.values())
-        return len(self.files) - len(self.videos) + frames
-
-    def has(self, entry: Entry) -> bool:
-        """Whether an entry of an earlier summary is of one of these."""
-        name: str = entry["name"]
-        return (name.rpartition("/")[0] if "frame" in entry else name) in self.files
+            count = video.value or 0 if video else 0
+            names += [frame_name(name, number) for number in range(count)] or [name]
+        return names
 
     def missing(self, done: Container[str]) -> Iterator[Job]:
         """Images, and frames with what gives their pixels, that are not done yet."""

@@ -7,7 +7,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from tangent_train.cli.each import Shard
 from tangent_train.errors import SettingError
@@ -64,8 +64,17 @@ class PredictionShard:
             if unlike and not overwrite:
                 if not known:
                     self.path.unlink()
-                self._refuse(path, unlike[0], content.get(unlike[0]))
-            elif "shards" in unlike:  # the others are replaced one by one
+                name = unlike[0]
+                own, others = f"{name}={self._common[name]}", f" ({content.get(name)})"
+                if name == "names":
+                    own, others = "images of other names", ""
+                raise SettingError(
+                    "shard",
+                    found=f"{own} than those of {path}{others}",
+                    expected="the same images and settings for all shards of a folder",
+                    remedy="Give another output, or overwrite=true.",
+                )
+            if "shards" in unlike:  # the others are replaced one by one
                 path.unlink(missing_ok=True)
 
     def save(self, entries: Sequence[Entry], *, done: bool = False) -> None:
@@ -98,16 +107,6 @@ class PredictionShard:
 
     def _path(self, number: int) -> Path:
         return self.folder / f"{number}-of-{self.shard.count}.json"
-
-    def _refuse(self, path: Path, name: str, value: object) -> NoReturn:
-        own = {"names": "images of other names"}.get(name, f"{name}={self._common[name]}")
-        others = "" if name == "names" else f" ({value})"
-        raise SettingError(
-            "shard",
-            found=f"{own} than those of {path}{others}",
-            expected="the same images and settings for all shards of a folder",
-            remedy="Give another output, or overwrite=true.",
-        )
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -7,7 +7,6 @@ for what is typed and what concerns this machine, and never reach Hydra.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,16 +23,13 @@ _SECTIONS = ("data", "representation", "network", "task", "optimizer", "schedule
 GROUPS = ("experiment", *_SECTIONS)
 """Config groups whose chosen options a checkpoint keeps, as ``choices``."""
 
-_OPTION = re.compile(r"\w+(/\w+)*", re.ASCII)
 _RUN = {
     "choices": dict[str, Text] | None,
     "name": Text,
     "seed": int,
     "level": int,
     "panels": int,
-    "tensorboard_images": int,
     "checkpoint_every_n_steps": int | None,
-    "ema": float | None,
 }
 """Settings outside of the sections."""
 
@@ -281,10 +277,9 @@ def _check_evaluation(path: Path, own: set[str], *, of_run: bool) -> None:
 
 
 def _is_own(group: str, option: str) -> bool:
-    """Whether it is an option of this program's configs: a name, and no path."""
-    if group not in GROUPS or not _OPTION.fullmatch(option):
-        return False
-    return (config_folder() / group / f"{option}.yaml").is_file()
+    """Whether it is an option of this program's configs."""
+    folder = config_folder() / group
+    return group in GROUPS and folder / f"{option}.yaml" in folder.rglob("*.yaml")
 
 
 def _lay(settings: dict[str, Any], said: Any, place: Sequence[str]) -> None:

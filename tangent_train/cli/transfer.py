@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import math
 import re
 import shlex
 import sys
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -28,9 +26,9 @@ from tangent_train.cli.transfer_stages import (
 )
 from tangent_train.cli.transfer_views import views_of
 from tangent_train.errors import DataError, SettingError
+from tangent_train.registry import check_fields
 
-_MOST_SHOWN = 3
-_OF_TRAINING = ("ema", "fine_tuning", "network", "optimizer", "scheduler")
+_OF_TRAINING = ("fine_tuning", "network", "optimizer", "scheduler")
 
 
 def transfer(config: DictConfig) -> None:
@@ -89,12 +87,9 @@ def _of_network(config: DictConfig) -> tuple[DictConfig, TrainedNetwork]:
 
 def _check_given(path: Path, given: Mapping[str, Any], stages: Sequence[Stage]) -> None:
     """Refuse a checkpoint that has seen the test rooms of another fold."""
-    from tangent_train.registry import check_fields
-
-    expected = "the settings of a run"
-    data = check_fields(path, given, {"data": dict}, expected)["data"]
-    fold = check_fields(path, data, {"fold": int | None}, expected, "data")["fold"]
-    if fold is not None and {stage.fold for stage in stages} != {fold}:
+    data = check_fields(path, given, {"data": dict}, "the settings of a run")["data"]
+    fold = data.get("fold")
+    if fold is not None and any(stage.fold != fold for stage in stages):
         raise SettingError(
             f"checkpoint={path}",
             found=f"a network for testing on fold {fold}, of the others it has seen the rooms",
@@ -104,7 +99,7 @@ def _check_given(path: Path, given: Mapping[str, Any], stages: Sequence[Stage]) 
 
 def _check_data(stages: Sequence[Stage], trained: TrainedNetwork | None) -> None:
     """Build the data and networks of all stages: errors come before hours of training."""
-    from tangent_train.cli.build import build, build_trained
+    from tangent_train.cli.build import build, build_trained, check_fits, shown
 
     first: Any = None
     built: dict[Any, tuple[Stage, Any]] = {}
@@ -119,53 +114,13 @@ def _check_data(stages: Sequence[Stage], trained: TrainedNetwork | None) -> None
             settings = {**stage.config, "checkpoint": str(stage.weights)}
             data = (build_trained(settings, trained) if trained else build(settings))[0]
             first = first or data
-            _check_alike(first, data)
+            check_fits(data, shown(first), f"the network of stage {stages[0].name}")
             # Files are the same for all rotations, and for all views of as many rows.
             built.setdefault((stage.name[0], getattr(data, "erp_height", 0)), (stage, data))
     for stage, data in built.values():  # after all settings: this makes files
         with _named(stage):
             data.make_files()
             data.setup()
-    _tell_shared_scenes(list(built.values()))
-
-
-def _check_alike(first: Any, own: Any) -> None:
-    """Refuse data that a network of the first stage cannot take, or would take for another."""
-    for number, (before, now) in enumerate(zip_longest(first.class_names, own.class_names)):
-        if before != now:
-            raise SettingError(
-                "data",
-                found=f"{now or 'nothing'} as class {number} in {own.classes_from}",
-                expected=f"{before or 'nothing'}, as in {first.classes_from}",
-                remedy="Photos and panoramas have the same classes in the same order.",
-            )
-    for name in ("inputs", "normalization"):
-        before, now = getattr(first, name), getattr(own, name)
-        if before != now:
-            raise SettingError(
-                f"data.{name}", found=now, expected=f"{before}, as in the stages before"
-            )
-
-
-def _tell_shared_scenes(built: Sequence[tuple[Stage, Any]]) -> None:
-    """Say which scenes P is trained on and S tested: only their names are known to be the same."""
-    trained, tested = (
-        {
-            item.name.partition("/")[0]
-            for stage, data in built
-            if stage.name[0] == kind
-            for item in data.found().of(splits)
-        }
-        for kind, splits in (("P", ("train", "val")), ("S", ("test",)))
-    )
-    shared = sorted(trained & tested)
-    if shared:
-        more = f" and {len(shared) - _MOST_SHOWN} others" if len(shared) > _MOST_SHOWN else ""
-        say(
-            f"Note: P is trained on photos, and S tested on panoramas, of "
-            f"{', '.join(shared[:_MOST_SHOWN])}{more}. If they show the same places, hold them out "
-            "of both, for example in test.txt."
-        )
 
 
 @contextmanager
@@ -206,7 +161,7 @@ def _report(
             key = stage.config["level"] if study else stage.name
             found[key].append(load_record(stage.folder))
     if study:
-        level = trained_level(config) if trained is None else trained.level
+        level = config.level if trained is None else trained.level
         name, report = "angular_resolution", levels_report(found, level)
     else:
         cells = {s.name: (s.view or "S", s.condition) for s in stages if s.condition}
@@ -216,25 +171,3 @@ def _report(
     for note in report.all_notes():
         say(f"- {note}")
     say(f"Tables and a chart: {folder / name}.md, .csv, .json, .png")
-
-
-def trained_level(config: DictConfig) -> float:
-    """The level at which the panoramas' images have the focal length of the photos' crops.
-
-    That of a crop is ``f' = W' / (2 tan(Ω'/2))`` pixels (paper, supplement, "Camera
-    normalization"), that of a tangent image 1/p: every level doubles it. The paper's 45° and 128
-    pixels for level 8 are as fine as level 8.42 at b = 1.
-
-    Args:
-        config: The composed ``transfer.yaml``.
-    """
-    from tangent_train.geometry import camera_matrix_from_fov
-    from tangent_train.registry import make
-
-    settings: Any = OmegaConf.to_container(config, resolve=True)
-    photos = make(settings["photos"]["representation"], "photos.representation")
-    panoramas = make(settings["representation"], "representation")
-    focal = camera_matrix_from_fov(photos.fov_deg, photos.image_size)[0, 0]
-    grid = getattr(panoramas, "grid", None)
-    pitch = math.pi / panoramas.erp_height if grid is None else grid.pitch
-    return float(config.level + math.log2(focal * pitch))

@@ -16,18 +16,6 @@ def _python(code: str) -> list[str]:
     return [sys.executable, "-c", f"import os, signal, sys, time\n{code}"]
 
 
-def test_the_status_and_variables_of_a_process() -> None:
-    code = "sys.exit(3 if os.environ['PYTHONSAFEPATH'] and os.environ.get('X') == 'y' else 4)"
-    assert processes.run_process(_python(code), {"X": "y"}) == 3
-    code = "sys.exit(3 if 'PATH' not in os.environ else 4)"
-    assert processes.run_process(_python(code), {"PATH": None}) == 3
-
-
-def test_a_folder_reaches_hydra_as_it_is(tmp_path: Path) -> None:
-    line = processes.command_line("train", ["a=1"], tmp_path / "it's ${here}")
-    assert line[-1] == rf"hydra.run.dir='{tmp_path}/it\'s \${{here}}'"
-
-
 def test_sigterm_reaches_the_job_which_may_finish_its_checkpoint(tmp_path: Path) -> None:
     mark = tmp_path / "saved"
     code = (

@@ -15,7 +15,6 @@ from datamodules.images.pixel_files import read_pixels, write_pixels
 from tangent_train.geometry import TangentGrid, equirect_directions
 from tangent_train.rendering import equirect_to_tangent, read_cameras, tangent_to_equirect
 from tests.cli.rendering import Refused, render_with, smooth
-from tests.cli.tiny_runs import Run
 from tests.datamodules.data_files import contents
 
 _read = partial(read_pixels, indices=True)
@@ -58,17 +57,6 @@ def test_colours_come_back(
     again = _read(output)
     assert np.abs(again / np.iinfo(dtype).max - image / np.iinfo(dtype).max).max() <= 4 / 255
     np.testing.assert_array_equal(again, tangent_to_equirect(expected, grid, (64, 128), blend))
-
-
-def test_the_command_line_takes_any_path(
-    tmp_path: Path, run: Run, capsys: pytest.CaptureFixture[str]
-) -> None:
-    write_pixels(tmp_path / "my (rooms)" / "a=b,c.png", smooth(32))
-    run("render", "input=my (rooms)/a=b,c.png", "output=out [1]", "base_level=0")
-    run("render", "back=out [1]/a=b,c", "output=back, again.png", "height=20")
-    assert _read(tmp_path / "back, again.png").shape == (20, 40, 3)
-    assert "Written: back, again.png" in capsys.readouterr().out
-    assert not list(tmp_path.glob("outputs")), "Hydra leaves nothing behind"
 
 
 def test_a_folder_of_panoramas_and_back(tmp_path: Path, refused: Refused) -> None:

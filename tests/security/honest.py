@@ -19,7 +19,6 @@ SETTINGS = (
     "data.inputs=[rgb]",
     "trainer.max_epochs=1",
     "panels=0",
-    "tensorboard_images=0",
 )
 
 

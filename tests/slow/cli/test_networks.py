@@ -61,28 +61,3 @@ def test_every_kind_of_network_can_be_exported_for_images_of_any_size(
     for count, size in ((1, (64, 96)), (5, (32 + step, 64))):
         images = some_images(trained, count, size)
         assert_same(again.network(images).detach(), scores_of(trained, images))
-
-
-class Recorder(torch.nn.Conv2d):
-    """A network that remembers its settings."""
-
-    def __init__(self, in_channels: int, classes: int, **settings: Any) -> None:
-        super().__init__(in_channels, classes, 1)
-        self.settings = settings
-
-
-@pytest.mark.parametrize("source", [{}, {"checkpoint": "x"}, {"resume": "x"}])
-def test_published_weights_are_left_out_where_a_checkpoint_has_others(
-    source: dict[str, str],
-) -> None:
-    settings = _composed() | source
-    target = f"{__name__}.Recorder"
-    settings["network"] = {
-        "_target_": target,
-        "in_channels": None,
-        "classes": None,
-        "weights": "coco",
-    }
-    _, task = build(settings)
-    assert task.network.in_channels == 4
-    assert task.network.settings == {"weights": None if source else "coco"}

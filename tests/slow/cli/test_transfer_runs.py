@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import shutil
 from pathlib import Path
 
@@ -70,32 +69,17 @@ _SETTINGS = (
 )
 
 
-def test_classes_scenes_and_cameras_are_compared_before_training(
-    tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_classes_and_cameras_are_compared_before_training(tmp_path: Path, run: Run) -> None:
     rooms = write_data_set(tmp_path / "my_rooms", scenes=5)
     photos = write_photos(tmp_path / "my_photos", scenes=5)
     classes = (rooms / "classes.json").read_text()
-    for given, told in (
-        ({"wall": 1, "window": 255, "floor": 2}, ("window as class 2", "floor")),
-        ({"wall": 1, "floor": 2}, ("nothing as class 3", "window")),
-    ):
-        write_classes(rooms, given)
-        message = "stage S: data: found {} in my_rooms/classes.json; expected {}, as in my_photos/"
-        with pytest.raises(SystemExit, match=re.escape(message.format(*told))):
-            run("transfer", *_SETTINGS)
+    write_classes(rooms, {"wall": 1, "window": 255, "floor": 2})
+    message = r"stage S: data, .* stage P: found class names .*'window', 'floor'.*; expected .*"
+    with pytest.raises(SystemExit, match=message):
+        run("transfer", *_SETTINGS)
     assert not Path("runs/transfer/transfer/seed_0").exists()
 
     (rooms / "classes.json").write_text(classes)
-    (rooms / "test.txt").write_text("scene_3/view.0\n")
-    (photos / "train.txt").write_text("scene_3/view.0\nscene_4/view.0\n")
-    (photos / "val.txt").write_text("scene_2/view.0\n")
-    monkeypatch.setattr("tangent_train.cli.transfer.run_stage", lambda *_: 3)
-    with pytest.raises(SystemExit) as ended:
-        run("transfer", *_SETTINGS)
-    assert ended.value.code == 3
-    note = "Note: P is trained on photos, and S tested on panoramas, of scene_3. If they show the"
-    assert note in capsys.readouterr().out
     write_photo(photos, "scene_1/new.png", 1, film_mm=None)
     message = r"stage P, in photos: my_photos/images/scene_1/new\.png: found no K in cameras\.json"
     with pytest.raises(SystemExit, match=message):

@@ -6,14 +6,10 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
 from lightning.pytorch.trainer.states import TrainerFn
 
 from datamodules.core import found as found_module
-from datamodules.core.found import Found, Split
-from datamodules.core.problems import Problems
-from datamodules.core.reading import ImageFiles
 from datamodules.core.split_module import SplitDataModule
 from tangent_train.errors import DataError
 from tests.cli.tiny_runs import run_command
@@ -131,29 +127,6 @@ def test_training_begins_with_a_look_at_some_images_of_all_splits(
     assert all(str(path) in text for path in broken), "all of these are looked at"
     assert "tangent-check" in text
     assert "data.skip_broken=true" in text
-
-
-def test_the_look_is_short_and_goes_everywhere(monkeypatch: pytest.MonkeyPatch) -> None:
-    lengths: dict[Split, int] = {"train": 1000, "val": 100, "test": 400}
-    items = {
-        split: [ImageFiles(f"{split} {k}", Path(), Path()) for k in range(count)]
-        for split, count in lengths.items()
-    }
-
-    def _seen(seed: int) -> list[str]:
-        seen: list[str] = []
-        found = Found("images", items, lambda files: seen.append(files.name))
-        found.read_some(seed, Problems())
-        return seen
-
-    first = _seen(seed=0)
-    assert len(first) == len(set(first)) == found_module.SAMPLED
-    counts = [sum(name.startswith(split) for name in first) for split in lengths]
-    assert np.abs(np.array(counts) - np.array([1000, 100, 400]) * 32 / 1500).max() <= 1
-    assert set(_seen(seed=1)) != set(first), "other runs look at others"
-    assert set(_seen(seed=0)) == set(first)
-    monkeypatch.setattr(found_module, "_SECONDS", -1)
-    assert 0 < len(_seen(seed=0)) < found_module.SAMPLED, "images may be large, and disks slow"
 
 
 # --- the commands -------------------------------------------------------------------------------
