@@ -16,7 +16,7 @@ a transfer and one that can stand in for it, if it trains, and if it only evalua
 _ALWAYS = "resume report transfer evaluation"
 _RULES = (
     # Where files are, how a run is watched, how fast it is: no result depends on these.
-    (_ALWAYS, "checkpoint checkpoint_every_n_steps choices panels resume trust"),
+    (_ALWAYS, "checkpoint checkpoint_every_n_steps choices panels resume tensorboard_images trust"),
     (_ALWAYS, "data.in_memory data.label_table data.num_workers data.root data.store"),
     (_ALWAYS, "task.channels_last task.compile task.images_per_forward"),
     (_ALWAYS, "trainer.accelerator trainer.enable_model_summary trainer.enable_progress_bar"),

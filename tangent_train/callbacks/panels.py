@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback
+from numpy.typing import NDArray
 
 from datamodules.core.loading import at_least
 from tangent_train.files import write_bytes
@@ -19,6 +20,11 @@ from tangent_train.results.pictures import prediction_panel, shown_arrays
 from tangent_train.results.tables import percent
 
 _PANORAMA_DIMENSIONS = 2
+
+
+def evenly_spread(count: int, total: int) -> NDArray[np.float64]:
+    """At most `count` of the numbers from 0 to ``total - 1``, the first and the last among them."""
+    return np.linspace(0, total - 1, min(count, total)).round()
 
 
 class PredictionPanels(Callback):
@@ -52,7 +58,7 @@ class PredictionPanels(Callback):
         dataloader_idx: int = 0,
     ) -> None:
         source: Any = trainer.datamodule.source("test")  # type: ignore[attr-defined]
-        chosen = np.linspace(0, len(source) - 1, min(self.count, len(source))).round()
+        chosen = evenly_spread(self.count, len(source))
         for index, prediction, target in zip(
             batch.index.tolist(), outputs, batch.target, strict=True
         ):

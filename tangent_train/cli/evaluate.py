@@ -21,7 +21,7 @@ from datamodules.core.loading import explained
 from tangent_train.callbacks.checkpoints import AtomicCheckpointIO, CheckpointContents
 from tangent_train.callbacks.panels import PredictionPanels
 from tangent_train.callbacks.progress import ProgressBar
-from tangent_train.callbacks.tensorboard import ClassScores
+from tangent_train.callbacks.tensorboard import ClassScores, ValidationPictures
 from tangent_train.checkpoints.content import read_checkpoint, write_settings
 from tangent_train.checkpoints.scores import Scores, size_multiple_of
 from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
@@ -130,6 +130,7 @@ class Run:
         common = [CheckpointContents(contents), ProgressBar(), ClassScores()]
         if self.task.kind == "segmentation":
             common.append(PredictionPanels(self.folder / "panels", self.settings["panels"]))
+            common.append(ValidationPictures(self.settings["tensorboard_images"]))
         section = self.settings["trainer"]
         # Devices found, advertisements, what the settings say anyway.
         logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)

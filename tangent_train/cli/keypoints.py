@@ -107,10 +107,13 @@ def earlier_results(output: Path, settings: Mapping[str, Any]) -> dict[str, list
 
     Raises:
         DataError: Its ``results.json`` is something else.
-        SettingError: They are of other settings.
+        SettingError: They are of other settings, or there are other files only.
     """
     path, expected = output / "results.json", "results of tangent-keypoints"
     if not path.exists():
+        if output.exists() and any(output.iterdir()):
+            found = f"{output} with other files"
+            raise SettingError("output", found=found, expected="a new or empty folder")
         return {}
     kinds = {"settings": dict, "rows": list[dict]}  # type: ignore[type-arg]
     content = check_fields(path, read_json(path, expected), kinds, expected)

@@ -29,7 +29,9 @@ _RUN = {
     "seed": int,
     "level": int,
     "panels": int,
+    "tensorboard_images": int,
     "checkpoint_every_n_steps": int | None,
+    "ema": float | None,
 }
 """Settings outside of the sections."""
 

@@ -17,7 +17,7 @@ from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.callbacks import LearningRateMonitor
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
-from tangent_train.callbacks.checkpoints import BestCheckpoint, LastCheckpoint
+from tangent_train.callbacks.checkpoints import BestCheckpoint, LastCheckpoint, averaged_weights
 from tangent_train.checkpoints.content import read_checkpoint
 from tangent_train.cli.build import Settings
 from tangent_train.cli.evaluate import Run, machine_faults
@@ -59,6 +59,9 @@ def train(settings: Settings, source: SettingsFile | None = None) -> float | Non
     last = LastCheckpoint(checkpoints, settings["checkpoint_every_n_steps"], _typed_local())
     best = BestCheckpoint(checkpoints, run.task.monitor)
     trainer = run.trainer([last, LearningRateMonitor(), best])
+    if settings["ema"] is not None:  # first: the last step is in the average that is saved
+        average = averaged_weights(settings["ema"], trainer.strategy.root_device)
+        trainer.callbacks.insert(0, average)  # type: ignore[attr-defined]
     with machine_faults(run.folder, run.data):
         _fit(run, trainer, resumed, last)
         # First: an error in the test must not cost a sweep its figure.

@@ -28,7 +28,7 @@ from tangent_train.cli.transfer_views import views_of
 from tangent_train.errors import DataError, SettingError
 from tangent_train.registry import check_fields
 
-_OF_TRAINING = ("fine_tuning", "network", "optimizer", "scheduler")
+_OF_TRAINING = ("ema", "fine_tuning", "network", "optimizer", "scheduler")
 
 
 def transfer(config: DictConfig) -> None:

@@ -16,20 +16,22 @@ from tensorboard.backend.event_processing.event_accumulator import (  # type: ig
 from torch import nn
 
 from datamodules import Stanford2D3DS
-from tangent_train.callbacks.tensorboard import ClassScores
+from tangent_train.callbacks.tensorboard import ClassScores, ValidationPictures
 from tangent_train.rendering import TangentRepresentation
+from tangent_train.results.pictures import prediction_panel
 from tangent_train.tasks import SegmentationTask
+from tests.decoded import decoded
 from tests.tasks.shapes import Shapes, quiet_trainer, shape_task
 
 TANGENT = TangentRepresentation(base_level=0, level=4, faces_per_panorama=5)
 STEPS = 3  # of an epoch: 6 panoramas, 2 at a time
 
 
-def _fit(folder: Path, data: Any, task: Any) -> None:
+def _fit(folder: Path, data: Any, task: Any, count: int = 2) -> None:
     trainer = quiet_trainer(
         max_epochs=2,
         logger=TensorBoardLogger(folder, name="", version="tensorboard"),
-        callbacks=[ClassScores()],
+        callbacks=[ValidationPictures(count), ClassScores()],
         num_sanity_val_steps=1,
         log_every_n_steps=1,
         default_root_dir=folder,
@@ -38,29 +40,72 @@ def _fit(folder: Path, data: Any, task: Any) -> None:
 
 
 def _events(folder: Path) -> EventAccumulator:
-    events = EventAccumulator(str(folder / "tensorboard"))
+    events = EventAccumulator(str(folder / "tensorboard"), size_guidance={"images": 0})
     events.Reload()
     return events
 
 
 def _steps(events: EventAccumulator, tag: str) -> list[int]:
-    return [event.step for event in events.Scalars(tag)]
+    kind = events.Images if tag in events.Tags()["images"] else events.Scalars
+    return [event.step for event in kind(tag)]
 
 
-def test_figures_of_every_class_are_those_of_numpy(stanford_root: Path, tmp_path: Path) -> None:
+def _tags(events: EventAccumulator, kind: str, group: str) -> list[str]:
+    return sorted(tag for tag in events.Tags()[kind] if tag.startswith(group))
+
+
+@pytest.fixture(scope="module")
+def trained(
+    stanford_root: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, SegmentationTask, Stanford2D3DS]:
+    """Two epochs of panoramas."""
+    folder = tmp_path_factory.mktemp("trained")
     # Validation: 3 panoramas of 2 rooms.
     split: Any = {"validation_fraction": 0.35, "seed": 3}
     data = Stanford2D3DS(stanford_root, TANGENT, panoramas_per_step=2, **split)
     torch.manual_seed(0)
     sgd = partial(torch.optim.SGD, lr=0.1)
     task = SegmentationTask(nn.Conv2d(4, 13, 1), TANGENT, data.class_names, sgd)
-    _fit(tmp_path, data, task)
-    events = _events(tmp_path)
+    _fit(folder, data, task)
+    return folder, task, data
+
+
+def test_the_same_images_are_shown_after_every_validation(
+    trained: tuple[Path, SegmentationTask, Stanford2D3DS],
+) -> None:
+    folder, task, data = trained
+    events, source = _events(folder), data.source("val")
+    assert len(source) == 3
+    chosen = {f"val_images/{source.name(k).replace('/', '_')}": k for k in (0, 2)}
+    assert _tags(events, "images", "val_images/") == sorted(chosen), "first and last of 3"
+    for tag, index in chosen.items():
+        assert _steps(events, tag) == _steps(events, "val/miou") == [STEPS - 1, 2 * STEPS - 1]
+        panorama = source.read(index)
+        views = TANGENT.whole()
+        rgb = torch.from_numpy(views.render(panorama.rgb, "bilinear")).movedim(-1, 1) / 255
+        assert panorama.depth is not None
+        steps = views.render(panorama.depth, "nearest").astype(np.float32) / 512
+        depth = torch.from_numpy(steps).clamp(max=4)
+        values = torch.cat([rgb, depth[:, None]], dim=1)
+        normalization: Any = data.normalization
+        mean, std = (torch.tensor(v) for v in (normalization.mean, normalization.std))
+        with torch.no_grad():
+            scores = task.network((values - mean[:, None, None]) / std[:, None, None])
+        labels = TANGENT.to_labels(scores, (32, 64)).numpy() + 1
+        expected = prediction_panel(panorama.rgb, panorama.labels, labels, data.class_names)
+        shown = decoded(events.Images(tag)[-1].encoded_image_string)
+        np.testing.assert_array_equal(shown, expected)
+
+
+def test_figures_of_every_class_are_those_of_numpy(
+    trained: tuple[Path, SegmentationTask, Stanford2D3DS],
+) -> None:
+    folder, task, data = trained
+    events = _events(folder)
     matrix = task.matrices.pixels
     present = [k for k in range(1, 14) if matrix[k].sum()]
     named = {f"val_iou/{data.class_names[k]}": k for k in present}
-    tags = [tag for tag in events.Tags()["scalars"] if tag.startswith("val_iou/")]
-    assert sorted(tags) == sorted(named)
+    assert _tags(events, "scalars", "val_iou/") == sorted(named)
     assert named, "no class to compare"
     for tag, k in named.items():
         union = matrix[k].sum() + matrix[1:, k].sum() - matrix[k, k]
@@ -72,7 +117,7 @@ def test_figures_of_every_class_are_those_of_numpy(stanford_root: Path, tmp_path
 
 def test_shapes_have_accuracies_and_no_unknown_class(tmp_path: Path) -> None:
     task: Any = shape_task()
-    _fit(tmp_path, Shapes(), task)
+    _fit(tmp_path, Shapes(), task, count=0)
     events = _events(tmp_path)
     assert _steps(events, f"val_accuracy/{task.class_names[0]}") == [2, 5]
     mean = np.mean([events.Scalars(f"val_accuracy/{n}")[-1].value for n in task.class_names])
