@@ -20,7 +20,8 @@ from datamodules.core.panoramas import (
     resize_depth,
 )
 from datamodules.core.problems import Problems
-from datamodules.images.png import check_panorama_size, check_png, read_color_png
+from datamodules.images.pixel_files import read_rgb
+from datamodules.images.png import check_panorama_size, check_png
 from tangent_train.errors import DataError
 
 
@@ -114,7 +115,7 @@ class PngReader(ImageReader):
 
     def rgb(self, files: ImageFiles) -> NDArray[np.uint8]:
         """Colours; alpha is dropped."""
-        return read_color_png(files.rgb)
+        return read_rgb(files.rgb)
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Reading and writing the user's own images: colours, depth, labels, arrays.
+"""Reading and writing images: colours, depth, labels, arrays.
 
 Pillow opens and identifies every image; OpenCV writes, and decodes the 16-bit colours that Pillow
 would cut to 8 bits.
@@ -19,7 +19,7 @@ from numpy.typing import DTypeLike, NDArray
 from PIL import ExifTags, Image, ImageOps
 
 from datamodules.images.exr import read_exr, read_exr_size
-from datamodules.images.png import MOST_PIXELS, check_pixels, decode, read_png_header
+from datamodules.images.png import MOST_PIXELS, check_pixels, read_png_header
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import atomic_path, reserve, write_bytes
 
@@ -148,7 +148,10 @@ def read_pixels(path: Path, *, indices: bool) -> NDArray[Any]:
 
 
 def _decode_16_bit(path: Path, *, grey: bool) -> NDArray[Any]:
-    pixels = decode(path, cv2.IMREAD_UNCHANGED)
+    # From memory: `cv2.imread` knows no paths beyond the system's code page.
+    pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+    if pixels is None:
+        raise ValueError("broken pixels")
     return np.ascontiguousarray(pixels[..., 0] if grey else pixels[..., 2::-1])
 
 

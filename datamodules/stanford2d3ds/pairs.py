@@ -29,7 +29,7 @@ from datamodules.core.panorama_pairs import (
 )
 from datamodules.core.panoramas import resize_area, resize_depth, steps_to_meters
 from datamodules.core.problems import Problems
-from datamodules.images.png import read_color_png
+from datamodules.images.pixel_files import read_rgb
 from datamodules.stanford2d3ds.files import AREAS, GET_IT, PictureFiles, list_pictures
 from datamodules.stanford2d3ds.reader import read_depth
 from datamodules.synthrooms.camera import CAMERA_FROM_SPHERE, euler_rotation
@@ -157,7 +157,7 @@ class StanfordPairs(PanoramaPairs):
     def panorama(self, files: PictureFiles) -> PairedPanorama:
         """See `PanoramaPairs`."""
         image = files.image
-        rgb = read_color_png(image.rgb)
+        rgb = read_rgb(image.rgb)
         shape = paired_shape(image.rgb, rgb, self._height)
         steps = resize_depth(read_depth(image.parts["depth"]), shape)
         distance_m = np.where(steps == 0, np.float32(np.nan), steps_to_meters(steps))

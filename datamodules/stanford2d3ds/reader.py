@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from datamodules.core.panoramas import Unknown, mask_black, resize_nearest
 from datamodules.core.reading import ImageFiles, PngReader
-from datamodules.images.png import read_color_png, read_depth_png
+from datamodules.images.pixel_files import read_pixels, read_rgb
 from datamodules.stanford2d3ds.label_table import LabelTable
 from tangent_train.errors import DataError
 from tangent_train.files import parse_json
@@ -44,7 +44,7 @@ class StanfordReader(PngReader):
 
     def labels(self, files: ImageFiles, shape: tuple[int, int] | None = None) -> NDArray[np.uint8]:
         """Classes by the class table, 0 where black pixels are masked."""
-        colors = read_color_png(files.labels)
+        colors = read_rgb(files.labels)
         shape = shape or (colors.shape[0], colors.shape[1])
         labels = self.table.decode(resize_nearest(colors, shape), files.labels)
         if self.unknown == "labels":
@@ -66,7 +66,7 @@ def read_depth(path: Path) -> NDArray[np.uint16]:
     Raises:
         DataError: The file is broken.
     """
-    steps = read_depth_png(path)
+    steps = read_pixels(path, indices=True)
     steps[steps == _MISSING_DEPTH] = 0
     return steps
 

@@ -24,7 +24,7 @@ from datamodules.core.panoramas import distance_from_z_depth
 from datamodules.core.problems import Problems
 from datamodules.core.progress import show_progress
 from datamodules.core.reading import ImageFiles, check_headers
-from datamodules.images.png import read_color_png
+from datamodules.images.pixel_files import read_rgb
 from datamodules.synthia.files import (
     FRAMES,
     GET_IT,
@@ -235,7 +235,7 @@ def _make(
     with problems.noted(target.name):
         depth = [read_first_channel(view.parts["depth"]) for view in views]
         far = [distance_from_z_depth(one, stitcher.camera_matrix) for one in depth]
-        rgb = stitcher.stitch([read_color_png(view.rgb) for view in views], "bilinear")
+        rgb = stitcher.stitch([read_rgb(view.rgb) for view in views], "bilinear")
         parts = {
             "depth": stitcher.stitch(far, "nearest"),
             "labels": stitcher.stitch([read_ids(v.labels) for v in views], "nearest", INVALID),

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from datamodules.core.inputs import RGBD_NORMALIZATION, Normalization
 from datamodules.core.panoramas import meters_to_steps, resize_nearest
 from datamodules.core.reading import ImageFiles, PngReader
-from datamodules.images.png import read_png
+from datamodules.images.pixel_files import read_pixels
 from datamodules.synthia.files import read_camera
 from tangent_train.errors import DataError
 
@@ -102,9 +102,8 @@ def read_first_channel(path: Path) -> NDArray[Any]:
     Raises:
         DataError: The file is broken.
     """
-    image = read_png(path, cv2.IMREAD_UNCHANGED)
-    # OpenCV's order is blue, green, red, and perhaps alpha.
-    return image if image.ndim == 2 else cv2.extractChannel(image, 2)
+    image = read_pixels(path, indices=True)
+    return image if image.ndim == 2 else image[..., 0]
 
 
 def read_ids(path: Path) -> NDArray[np.uint8]:

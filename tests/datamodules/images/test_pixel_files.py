@@ -24,8 +24,6 @@ from datamodules.images.png import (
     PngHeader,
     check_panorama_size,
     check_png,
-    read_color_png,
-    read_depth_png,
     read_png_header,
 )
 from tangent_train.errors import DataError, SettingError
@@ -201,9 +199,6 @@ def test_what_is_no_depth(tmp_path: Path) -> None:
 # --- PNG files of data sets -----------------------------------------------------------------------
 
 
-READERS = [read_png_header, read_color_png, read_depth_png]
-
-
 def _written(folder: Path, image: np.ndarray[Any, Any]) -> Path:
     write_png(folder / "image.png", image)
     return folder / "image.png"
@@ -225,16 +220,15 @@ def test_header(tmp_path: Path, shape: tuple[int, ...], dtype: Any, bits: int, c
         check_png(path, 8, ("palette",))
 
 
-@pytest.mark.parametrize("read", READERS)
 @pytest.mark.parametrize("missing", [slice(-20, None), slice(-1, None), slice(1000, 3000)])
-def test_truncated_files_are_named(tmp_path: Path, missing: slice, read: Any) -> None:
+def test_truncated_files_are_named(tmp_path: Path, missing: slice) -> None:
     noise = np.random.default_rng(0).integers(0, 256, (64, 128, 3), np.uint8)
     path = _written(tmp_path, noise)
     content = bytearray(path.read_bytes())
     del content[missing]
     path.write_bytes(content)
     with pytest.raises(DataError, match=r"image\.png: found .* truncated"):
-        read(path)
+        read_png_header(path)
 
 
 def test_size_of_panoramas(tmp_path: Path) -> None:

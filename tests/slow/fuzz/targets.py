@@ -21,8 +21,8 @@ from datamodules.core.reading import ImageFiles
 from datamodules.folder.cameras import read_cameras as read_photo_cameras
 from datamodules.folder.classes import read_classes
 from datamodules.images.gpano import area_of, up_of
-from datamodules.images.pixel_files import read_depth_m, read_pixels
-from datamodules.images.png import check_png, read_color_png, read_depth_png
+from datamodules.images.pixel_files import read_depth_m, read_pixels, read_rgb
+from datamodules.images.png import check_png
 from datamodules.modelnet40.meshes import read_off
 from datamodules.stanford2d3ds.label_table import CLASSES, LabelTable
 from datamodules.stanford2d3ds.pairs import read_panorama_pose
@@ -181,10 +181,10 @@ def _read_label_image(path: Path) -> None:
         is_depth = file.read(25)[24:] == b"\x10"
     if is_depth:
         header = check_png(path, 16, ("grey",))
-        assert read_depth_png(path).shape == header[:2]
+        assert read_pixels(path, indices=True).shape == header[:2]
         return
     header = check_png(path, 8, ("RGB", "RGBA"))
-    labels = LabelTable(np.arange(14, dtype=np.uint8)).decode(read_color_png(path))
+    labels = LabelTable(np.arange(14, dtype=np.uint8)).decode(read_rgb(path))
     assert labels.shape == header[:2]
     assert labels.max() <= len(CLASSES)
 
