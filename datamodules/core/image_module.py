@@ -22,7 +22,16 @@ from datamodules.core.inputs import (
     normalize,
     ordered_inputs,
 )
-from datamodules.core.panoramas import Panorama, Photo, Turn
+from datamodules.core.panoramas import (
+    ImageFiles,
+    ImageReader,
+    Panorama,
+    PanoramaReading,
+    Photo,
+    PhotoReading,
+    Turn,
+    check_headers,
+)
 from datamodules.core.pipeline import (
     EstimatedUp,
     PanoramaJudge,
@@ -34,13 +43,6 @@ from datamodules.core.pipeline import (
 )
 from datamodules.core.problems import Problems
 from datamodules.core.progress import show_progress
-from datamodules.core.reading import (
-    ImageFiles,
-    ImageReader,
-    PanoramaReading,
-    PhotoReading,
-    check_headers,
-)
 from datamodules.core.samples import EvaluationImages, TrainingImages
 from datamodules.core.split_module import SplitDataModule
 from datamodules.core.store import Store

@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.core.loading import sample_rng
-from datamodules.core.panoramas import Panorama
+from datamodules.core.panoramas import ImageFiles, Panorama
 from datamodules.core.problems import Problems
-from datamodules.core.reading import ImageFiles
 from datamodules.core.store import Store
 from datamodules.images.gpano import up_of, whole_area
 from datamodules.images.masks import Masks

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from datamodules.core.found import Split
 from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
 from datamodules.core.inputs import Input
+from datamodules.core.panoramas import ImageFiles
 from datamodules.core.problems import Problems
-from datamodules.core.reading import ImageFiles
 from datamodules.folder.cameras import FolderCameras, read_cameras
 from datamodules.folder.classes import UNKNOWN_NAME, read_classes
 from datamodules.folder.reader import FolderReader, list_images, note_ignored, read_codes

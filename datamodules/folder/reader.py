@@ -11,9 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.core.panoramas import meters_to_steps, resize_nearest
+from datamodules.core.panoramas import ImageFiles, ImageReader, meters_to_steps, resize_nearest
 from datamodules.core.problems import Problems
-from datamodules.core.reading import ImageFiles, ImageReader
 from datamodules.folder.classes import FolderClasses, read_classes
 from datamodules.images.image_files import IMAGE_SUFFIXES, find_depth, image_paths, walk_files
 from datamodules.images.masks import Masks

@@ -34,9 +34,8 @@ from typing import ClassVar, Literal
 
 from datamodules.core.found import Split, draw_groups
 from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
-from datamodules.core.panoramas import Unknown
+from datamodules.core.panoramas import ImageFiles, Unknown
 from datamodules.core.problems import Problems
-from datamodules.core.reading import ImageFiles
 from datamodules.stanford2d3ds.files import AREAS, FOLDS, GET_IT, list_pictures
 from datamodules.stanford2d3ds.label_table import CLASSES, LabelTable
 from datamodules.stanford2d3ds.reader import StanfordReader

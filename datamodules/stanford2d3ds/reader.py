@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.core.panoramas import Unknown, mask_black, resize_nearest
-from datamodules.core.reading import ImageFiles, PngReader
+from datamodules.core.panoramas import ImageFiles, PngReader, Unknown, mask_black, resize_nearest
 from datamodules.images.pixel_files import read_pixels, read_rgb
 from datamodules.stanford2d3ds.label_table import LabelTable
 from tangent_train.errors import DataError

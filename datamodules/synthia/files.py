@@ -26,7 +26,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.core.reading import ImageFiles
+from datamodules.core.panoramas import ImageFiles
 from tangent_train.errors import DataError, SettingError
 
 VIEWS: tuple[str, ...] = ("F", "R", "B", "L")

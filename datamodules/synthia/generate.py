@@ -20,10 +20,9 @@ from numpy.typing import NDArray
 
 from datamodules.core.loading import at_least
 from datamodules.core.made_folders import claim_folder
-from datamodules.core.panoramas import distance_from_z_depth
+from datamodules.core.panoramas import ImageFiles, check_headers, distance_from_z_depth
 from datamodules.core.problems import Problems
 from datamodules.core.progress import show_progress
-from datamodules.core.reading import ImageFiles, check_headers
 from datamodules.images.pixel_files import read_rgb
 from datamodules.synthia.files import (
     FRAMES,

@@ -23,8 +23,8 @@ from typing import ClassVar
 from datamodules.core.found import Found, Split
 from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
 from datamodules.core.inputs import Input
+from datamodules.core.panoramas import ImageFiles
 from datamodules.core.problems import Problems
-from datamodules.core.reading import ImageFiles
 from datamodules.synthia.files import (
     FRAMES,
     GET_IT,

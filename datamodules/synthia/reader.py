@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.core.inputs import RGBD_NORMALIZATION, Normalization
-from datamodules.core.panoramas import meters_to_steps, resize_nearest
-from datamodules.core.reading import ImageFiles, PngReader
+from datamodules.core.panoramas import ImageFiles, PngReader, meters_to_steps, resize_nearest
 from datamodules.images.pixel_files import read_pixels
 from datamodules.synthia.files import read_camera
 from tangent_train.errors import DataError

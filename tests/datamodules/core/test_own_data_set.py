@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from datamodules.core.found import Split
 from datamodules.core.image_module import PanoramaDataModule
+from datamodules.core.panoramas import ImageFiles, PngReader
 from datamodules.core.problems import Problems
-from datamodules.core.reading import ImageFiles, PngReader
 from datamodules.images.pixel_files import read_pixels
 from tangent_train.errors import DataError, SettingError
 from tangent_train.rendering import EquirectRepresentation

@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from datamodules.core.panoramas import Panorama
+from datamodules.core.panoramas import ImageFiles, Panorama
 from datamodules.core.pipeline import (
     EstimatedUp,
     PosedUp,
     RotatedPanoramas,
     SplitItems,
 )
-from datamodules.core.reading import ImageFiles
 from tangent_train.errors import DataError
 from tangent_train.geometry import equirect_directions
 

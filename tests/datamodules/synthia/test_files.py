@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from datamodules.core.reading import ImageFiles
+from datamodules.core.panoramas import ImageFiles
 from datamodules.synthia.files import choose_frames, read_camera
 from datamodules.synthia.omnisynthia import divide
 from datamodules.synthia.reader import CLASSES, VIEW_FORMATS, SynthiaReader

@@ -12,8 +12,8 @@ from lightning.pytorch.trainer.states import TrainerFn
 
 from datamodules.core import found as found_module
 from datamodules.core.found import Found, Split
+from datamodules.core.panoramas import ImageFiles
 from datamodules.core.problems import Problems
-from datamodules.core.reading import ImageFiles
 from datamodules.core.split_module import SplitDataModule
 from tangent_train.errors import DataError
 from tests.cli.tiny_runs import run_command

@@ -16,8 +16,8 @@ import OpenEXR
 from numpy.typing import NDArray
 from PIL import Image
 
+from datamodules.core.panoramas import ImageFiles
 from datamodules.core.problems import Problems
-from datamodules.core.reading import ImageFiles
 from datamodules.folder.cameras import read_cameras as read_photo_cameras
 from datamodules.folder.classes import read_classes
 from datamodules.images.gpano import area_of, up_of
