@@ -14,7 +14,7 @@ from tangent_train.files import NoRoomError
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from datamodules.core.pipeline import Item
+    from datamodules.core.found import Item
 
 
 _ERROR_NUMBER = re.compile(r"\[Errno \d+\] ")

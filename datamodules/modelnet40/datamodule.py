@@ -14,8 +14,7 @@ from typing import Any, ClassVar
 
 from torch import Tensor
 
-from datamodules.core.found import Found, Split, draw_groups
-from datamodules.core.pipeline import SplitItems
+from datamodules.core.found import Found, Split, SplitItems, draw_groups
 from datamodules.core.problems import Problems
 from datamodules.core.processes import in_processes
 from datamodules.core.split_module import Kind, SplitDataModule
@@ -104,7 +103,7 @@ class ModelNet40(SplitDataModule[ShapeFile]):
 
     def pipeline(self, found: Found[ShapeFile], split: Split) -> SplitItems[ShapeFile, Spheres]:
         """The spheres in the store."""
-        return SplitItems(found.splits[split], found.read, Spheres, found.store)
+        return SplitItems(found, split, Spheres)
 
     def training_samples(self) -> ShapeViews:
         """Samples `ShapeSample`: random views, drawn and rotated as the representation says."""

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from datamodules.core.found import SplitItems
 from datamodules.core.inputs import Normalization, normalize_channels
 from datamodules.core.loading import Seed, sample_rng
-from datamodules.core.pipeline import SplitItems
 from datamodules.modelnet40.meshes import clean_mesh, mesh_spheres, read_off
 from datamodules.modelnet40.shape_files import ShapeFile
 from tangent_train.geometry import random_rotation, rotation_about

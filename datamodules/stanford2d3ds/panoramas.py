@@ -1,6 +1,6 @@
 """Stanford2D3DS (Armeni et al. 2017): six areas of three buildings, 1,413 panoramas, 70,496 photos.
 
-Features: 2048×4096 RGB, depth and 13 semantic classes (`label_table.CLASSES`), captured with a
+Features: 2048×4096 RGB, depth and 13 semantic classes (`reader.CLASSES`), captured with a
 Matterport camera; all panoramas are upright. Three folds of its authors, by area.
 
 On disk, as released::
@@ -37,8 +37,7 @@ from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, P
 from datamodules.core.panoramas import ImageFiles, Unknown
 from datamodules.core.problems import Problems
 from datamodules.stanford2d3ds.files import AREAS, FOLDS, GET_IT, list_pictures
-from datamodules.stanford2d3ds.label_table import CLASSES, LabelTable
-from datamodules.stanford2d3ds.reader import StanfordReader
+from datamodules.stanford2d3ds.reader import CLASSES, LabelTable, StanfordReader
 from tangent_train.errors import DataError
 from tangent_train.registry import registered
 

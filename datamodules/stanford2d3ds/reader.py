@@ -1,4 +1,4 @@
-"""Decoder of the files of Stanford2D3DS."""
+"""Decoder of the files of Stanford2D3DS, and its class table."""
 
 from __future__ import annotations
 
@@ -11,14 +11,107 @@ from numpy.typing import NDArray
 
 from datamodules.core.panoramas import ImageFiles, PngReader, Unknown, mask_black, resize_nearest
 from datamodules.images.pixel_files import read_pixels, read_rgb
-from datamodules.stanford2d3ds.label_table import LabelTable
-from tangent_train.errors import DataError
-from tangent_train.files import parse_json
+from tangent_train.errors import DataError, counted
+from tangent_train.files import parse_json, read_json
 from tangent_train.geometry import is_camera_matrix
+
+CLASSES: tuple[str, ...] = (
+    "beam",
+    "board",
+    "bookcase",
+    "ceiling",
+    "chair",
+    "clutter",
+    "column",
+    "door",
+    "floor",
+    "sofa",
+    "table",
+    "wall",
+    "window",
+)
+"""The 13 classes; the label of a class is its place here plus one."""
+
+_MISSING = 0x0D0D0D
+
+UNKNOWN = 0
+"""The label of pixels without a class: ignored in training and evaluation."""
 
 _FORMATS = {"rgb": (8, ("RGB", "RGBA")), "labels": (8, ("RGB", "RGBA")), "depth": (16, ("grey",))}
 _CENTERS_FROM_CORNERS = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
 _MISSING_DEPTH = 65535
+
+
+@dataclass(frozen=True, eq=False)
+class LabelTable:
+    """Class of every instance of the data set.
+
+    A pixel of a `semantic` image holds the index of an instance as the colour
+    R · 65536 + G · 256 + B. Missing labels are #0D0D0D = 855309, past the end of the table.
+    (Without R they would be instance 3341, clutter.)
+
+    Attributes:
+        class_ids: ``(entries,)`` uint8, 1 to 13 in the order of `CLASSES`, or `UNKNOWN`.
+    """
+
+    class_ids: NDArray[np.uint8]
+
+    @classmethod
+    def from_json(cls, path: Path) -> LabelTable:
+        """Read `semantic_labels.json`, a list of names ``class_instance_room_number_area``.
+
+        Args:
+            path: The file.
+
+        Raises:
+            DataError: It cannot be read or is no such list.
+        """
+        expected = f"a JSON list of names that begin with {', '.join(CLASSES)} or <UNK>"
+        remedy = "Copy semantic_labels.json of the Stanford2D3DS release."
+        names = read_json(path, expected, remedy)
+        if not isinstance(names, list) or not names:
+            raise DataError(path, found=type(names).__name__, expected=expected, remedy=remedy)
+        ids = {"<UNK>": UNKNOWN} | {name: i for i, name in enumerate(CLASSES, start=1)}
+        classes = [str(name).partition("_")[0] for name in names]
+        strange = sorted(set(classes) - set(ids))
+        if strange:
+            raise DataError(path, found=f"class {strange[0]!r}", expected=expected, remedy=remedy)
+        return cls(np.array([ids[name] for name in classes], np.uint8))
+
+    def decode(self, colors: NDArray[np.uint8], path: object = "labels") -> NDArray[np.uint8]:
+        """Labels of a `semantic` image.
+
+        Args:
+            colors: ``(H, W, 3)`` uint8 in RGB order.
+            path: Their file, for messages.
+
+        Returns:
+            ``(H, W)`` uint8 labels.
+
+        Raises:
+            DataError: There are instances past the end of the table, other than the mark of missing
+                labels.
+
+        >>> table = LabelTable(np.array([0, 1, 12], np.uint8))
+        >>> table.decode(np.array([[[0, 0, 2], [13, 13, 13]]], np.uint8)).tolist()
+        [[12, 0]]
+        """
+        red, green, blue = np.moveaxis(colors.astype(np.int32), -1, 0)
+        index = (red << 16) | (green << 8) | blue
+        end = len(self.class_ids)
+        past = index >= end
+        strange = past & (index != _MISSING)
+        if strange.any():
+            count = int(np.count_nonzero(strange))
+            raise DataError(
+                path,
+                found=f"instance {index[strange].min()} in {counted(count, 'pixels')}",
+                expected=f"0 to {end - 1}, the entries of the class table, or #{_MISSING:06X} "
+                "where labels are missing",
+                remedy="Use the file and semantic_labels.json of one release.",
+            )
+        index[past] = 0
+        return np.where(past, np.uint8(UNKNOWN), self.class_ids[index])
 
 
 @dataclass(frozen=True)

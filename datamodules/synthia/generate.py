@@ -24,24 +24,22 @@ from datamodules.core.panoramas import ImageFiles, check_headers, distance_from_
 from datamodules.core.problems import Problems
 from datamodules.core.progress import show_progress
 from datamodules.images.pixel_files import read_rgb
-from datamodules.synthia.files import (
+from datamodules.synthia.reader import (
     FRAMES,
     GET_IT,
+    INVALID,
+    PANORAMA_FORMATS,
+    VIEW_FORMATS,
     VIEWS,
+    SynthiaReader,
     choose_frames,
     list_frames,
     panorama_files,
     read_camera,
-    sequence_folder,
-    view_files,
-)
-from datamodules.synthia.reader import (
-    INVALID,
-    PANORAMA_FORMATS,
-    VIEW_FORMATS,
-    SynthiaReader,
     read_first_channel,
     read_ids,
+    sequence_folder,
+    view_files,
 )
 from tangent_train.errors import DataError
 from tangent_train.files import write_bytes

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from datamodules.core.found import Found, SplitItems
 from datamodules.core.panoramas import ImageFiles, Panorama
 from datamodules.core.pipeline import (
     EstimatedUp,
     PosedUp,
     RotatedPanoramas,
-    SplitItems,
 )
 from tangent_train.errors import DataError
 from tangent_train.geometry import equirect_directions
@@ -133,7 +133,7 @@ def test_what_is_remembered_is_read_once_and_what_is_broken_is_listed() -> None:
     def double(panorama: Panorama, index: int, files: Any) -> Panorama:
         return panorama._replace(labels=panorama.labels * 0 + index)
 
-    items = SplitItems(FILES, decode, Panorama, transforms=[double])
+    items = SplitItems(Found("panoramas", {"test": FILES}, decode), "test", Panorama, [double])
     items.remember("data")
     for index in (0, 1):
         np.testing.assert_array_equal(items.read(index).rgb, _heights().rgb)
@@ -142,4 +142,4 @@ def test_what_is_remembered_is_read_once_and_what_is_broken_is_listed() -> None:
     assert sorted(read) == ["0", "1"]
     broken = [file._replace(name="broken", rgb=Path(f"b{file.name}")) for file in FILES]
     with pytest.raises(DataError, match=r"data: found 2 problems(.|\n)*b0(.|\n)*b1"):
-        SplitItems(broken, decode, Panorama).remember("data")
+        SplitItems(Found("panoramas", {"test": broken}, decode), "test", Panorama).remember("data")
