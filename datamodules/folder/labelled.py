@@ -90,7 +90,8 @@ class LabelledFolder(ImageDataModule):
     def check(self) -> tuple[Problems, int]:
         """See `SplitDataModule`; files that training would pass over are named too."""
         problems, count = super().check()
-        note_ignored(self.root, problems)
+        with problems.noted():
+            note_ignored(self.root, problems)
         return problems, count
 
     def make_reader(self, images: Sequence[ImageFiles], problems: Problems) -> FolderReader:

@@ -17,7 +17,6 @@ from datamodules.folder.classes import FolderClasses, read_classes
 from datamodules.images.image_files import IMAGE_SUFFIXES, find_depth, image_paths, walk_files
 from datamodules.images.masks import Masks
 from datamodules.images.pixel_files import (
-    is_grey,
     read_depth_m,
     read_image_size,
     read_pixels,
@@ -92,7 +91,7 @@ def list_images(root: Path, problems: Problems, *, with_depth: bool) -> list[Ima
             expected = "a data set: images/, labels/ and classes.json, see docs/own_data.md"
             raise DataError(folder, found="no such folder", expected=expected)
     found: dict[str, ImageFiles] = {}
-    for rgb in image_paths(root / "images", problems.noted):
+    for rgb in image_paths(root / "images"):
         name = _name(root / "images", rgb)
         depth = None
         with problems.noted(name):
@@ -111,7 +110,7 @@ def list_images(root: Path, problems: Problems, *, with_depth: bool) -> list[Ima
 
 
 def note_ignored(root: Path, problems: Problems) -> None:
-    """Note files that training passes over, and grey images among coloured ones.
+    """Note files that training passes over.
 
     Args:
         root: Folder with ``images/`` and ``labels/``, there or not.
@@ -119,18 +118,13 @@ def note_ignored(root: Path, problems: Problems) -> None:
     """
     files = list(walk_files(root / "images"))
     names = {_name(root / "images", path) for path in files}
-    images = [path for path in files if path.suffix.lower() in IMAGE_SUFFIXES]
     noted = [
         (path, "labels of no image", "Name it as its image, or remove it.")
         for path in walk_files(root / "labels")
         if _name(root / "labels", path) not in names
     ]
-    others = set(files) - set(images)
+    others = [path for path in files if path.suffix.lower() not in IMAGE_SUFFIXES]
     noted += [(path, "no image", "Convert it; of a video, extract frames.") for path in others]
-    grey = [path for path in images if is_grey(path)]
-    if len(grey) < len(images):
-        told = "grey, others are coloured", "Label images belong in labels/."
-        noted += [(path, *told) for path in grey]
     expected = f"images ({', '.join(IMAGE_SUFFIXES)}) and labels (.png) of the same names"
     for path, found, remedy in noted:
         problems.add(DataError(path, found=found, expected=expected, remedy=remedy), str(path))

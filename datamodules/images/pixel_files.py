@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -66,7 +66,7 @@ def _opened(path: Path) -> Iterator[Image.Image]:
     except Exception as error:
         raise DataError(
             path,
-            found=f"no image that can be decoded ({error})",
+            found=f"no image that can be decoded ({getattr(error, 'strerror', None) or error})",
             expected="a whole JPEG, PNG, TIFF or WebP image",
             remedy="Copy or export the file again.",
         ) from error
@@ -96,13 +96,6 @@ def read_image_size(path: Path) -> tuple[int, int]:
         return height, width
     with _opened(path) as image:
         return _upright_size(image)
-
-
-def is_grey(path: Path) -> bool:
-    """Whether an image has a single channel of colour; not of one that cannot be read."""
-    with suppress(DataError), _opened(path) as image:
-        return image.mode in (*_SINGLE_CHANNEL, "LA")
-    return False
 
 
 def _upright_size(image: Image.Image) -> tuple[int, int]:

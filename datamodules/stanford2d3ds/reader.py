@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +42,7 @@ UNKNOWN = 0
 _FORMATS = {"rgb": (8, ("RGB", "RGBA")), "labels": (8, ("RGB", "RGBA")), "depth": (16, ("grey",))}
 _CENTERS_FROM_CORNERS = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
 _MISSING_DEPTH = 65535
+_MOST = 1e6  # metres, radians, pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,14 +178,39 @@ def read_camera_matrix(path: Path) -> NDArray[np.float64]:
     Raises:
         DataError: The file is missing or broken, or holds no such matrix.
     """
-    expected = "a pose file with a camera_k_matrix of 3×3 numbers, without skew"
-    try:
-        matrix = np.array(parse_json(path.read_bytes())["camera_k_matrix"], np.float64)
-    except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:
-        found = f"{type(error).__name__}: {error}"
-        raise DataError(
-            path, found=found, expected=expected, remedy="Copy or extract the file again."
-        ) from error
+    (matrix,) = read_pose_numbers(path, {"camera_k_matrix": (3, 3)})
     if not is_camera_matrix(matrix):
+        expected = "a camera_k_matrix without skew"
         raise DataError(path, found=matrix.tolist(), expected=expected)
     return _CENTERS_FROM_CORNERS @ matrix
+
+
+def read_pose_numbers(path: Path, keys: Mapping[str, tuple[int, ...]]) -> list[NDArray[np.float64]]:
+    """Numbers in a pose file.
+
+    Args:
+        path: ``camera_…_domain_pose.json``.
+        keys: What to read, with its shape.
+
+    Raises:
+        DataError: It cannot be read, or lacks one of them.
+    """
+    try:
+        record = parse_json(path.read_bytes())
+        return [_numbers(record[key], shape) for key, shape in keys.items()]
+    except (OSError, ValueError, TypeError, KeyError, OverflowError) as error:
+        raise DataError(
+            path,
+            found=f"{type(error).__name__}: {error}",
+            expected=f"a pose as JSON, with {', '.join(keys)}",
+            remedy="Copy or extract the file again.",
+        ) from error
+
+
+def _numbers(value: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    numbers = np.array(value, np.float64)
+    # Some releases have a fourth row 0 0 0 1.
+    numbers = numbers[:3] if numbers.shape == (4, 4) else numbers
+    if numbers.shape != shape or not np.abs(numbers).max() <= _MOST:
+        raise ValueError(f"{value}, not {'×'.join(map(str, shape))} numbers")
+    return numbers

@@ -18,7 +18,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.core.loading import at_least
 from datamodules.core.made_folders import claim_folder
 from datamodules.core.panoramas import ImageFiles, check_headers, distance_from_z_depth
 from datamodules.core.problems import Problems
@@ -41,7 +40,7 @@ from datamodules.synthia.reader import (
     sequence_folder,
     view_files,
 )
-from tangent_train.errors import DataError
+from tangent_train.errors import DataError, at_least
 from tangent_train.files import write_bytes
 from tangent_train.geometry import (
     equirect_latitudes,

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from datamodules.core.inputs import RGBD_NORMALIZATION, Normalization
 from datamodules.core.panoramas import ImageFiles, PngReader, meters_to_steps, resize_nearest
 from datamodules.images.pixel_files import read_pixels
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError, at_least
 
 VIEWS: tuple[str, ...] = ("F", "R", "B", "L")
 """Front, right, back, left: each rotated by 90° to the right of the previous one."""
@@ -171,8 +171,7 @@ def choose_frames(frames: Sequence[str], count: int = FRAMES) -> list[str]:
     >>> len(choose_frames([str(i) for i in range(1250)]))
     417
     """
-    if count < 1:
-        raise SettingError("data.frames", found=count, expected="1 or more")
+    at_least("data.frames", count, 1)
     step = math.floor(len(frames) / count + 0.5) if len(frames) > count else 1
     return list(frames[::step])
 
