@@ -17,14 +17,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from datamodules.core.found import Split
 from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
 from datamodules.core.inputs import Input
 from datamodules.core.panoramas import ImageFiles
 from datamodules.core.problems import Problems
-from datamodules.folder.cameras import FolderCameras, read_cameras
+from datamodules.folder.cameras import read_cameras
 from datamodules.folder.classes import UNKNOWN_NAME, read_classes
 from datamodules.folder.reader import FolderReader, list_images, note_ignored, read_codes
 from datamodules.folder.splits import FolderSplits
@@ -138,22 +137,6 @@ class FolderPanoramas(LabelledFolder, PanoramaDataModule):
     """
 
 
-@dataclass(frozen=True)
-class _PhotoReader(FolderReader):
-    """Reads a user's own photos."""
-
-    cameras: FolderCameras
-
-    @property
-    def settings(self) -> dict[str, str]:
-        """The cameras in short too: they are stored with the photos."""
-        return {**super().settings, "cameras": self.cameras.fingerprint}
-
-    def camera(self, files: ImageFiles) -> NDArray[np.float64]:
-        """The camera matrix, by ``cameras.json``, the field of view or the EXIF data."""
-        return self.cameras.matrix(files)
-
-
 @registered
 @dataclass(kw_only=True, eq=False, repr=False)
 class FolderPhotos(LabelledFolder, PhotoDataModule):
@@ -179,4 +162,4 @@ class FolderPhotos(LabelledFolder, PhotoDataModule):
         """See `LabelledFolder`."""
         cameras = read_cameras(self.root / "cameras.json", self.fov)
         cameras.check_names(images, problems)
-        return _PhotoReader(self._classes, self.depth_units_per_m, cameras)
+        return FolderReader(self._classes, self.depth_units_per_m, cameras)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from datamodules.core.panoramas import ImageFiles, ImageReader, meters_to_steps, resize_nearest
 from datamodules.core.problems import Problems
+from datamodules.folder.cameras import FolderCameras
 from datamodules.folder.classes import FolderClasses, read_classes
 from datamodules.images.image_files import IMAGE_SUFFIXES, find_depth, image_paths, walk_files
 from datamodules.images.masks import Masks
@@ -38,16 +39,19 @@ class FolderReader(ImageReader):
     Attributes:
         classes: Meaning of their labels.
         depth_units_per_m: Units in a metre of depth files of whole numbers.
+        cameras: Of photos.
     """
 
     classes: FolderClasses
     depth_units_per_m: float
+    cameras: FolderCameras | None = None
 
     @property
     def settings(self) -> dict[str, str]:
-        """The classes in short and the units."""
+        """The classes in short, the units and, as they are stored with photos, the cameras."""
         units = f"{self.depth_units_per_m:g}"
-        return {"classes": self.classes.fingerprint, "depth units per metre": units}
+        settings = {"classes": self.classes.fingerprint, "depth units per metre": units}
+        return settings | ({"cameras": self.cameras.fingerprint} if self.cameras else {})
 
     def size(self, part: str, path: Path) -> tuple[int, int]:
         """See `ImageReader`, as all others."""
@@ -71,6 +75,10 @@ class FolderReader(ImageReader):
     def depth(self, files: ImageFiles) -> NDArray[np.uint16]:
         """Depth in steps of 1/512 m."""
         return meters_to_steps(read_depth_m(files.parts["depth"], self.depth_units_per_m))
+
+    def camera(self, files: ImageFiles) -> NDArray[np.float64]:
+        """The camera matrix, by ``cameras.json``, the field of view or the EXIF data."""
+        return self.cameras.matrix(files) if self.cameras else super().camera(files)
 
 
 def list_images(root: Path, problems: Problems, *, with_depth: bool) -> list[ImageFiles]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -79,7 +79,7 @@ class ShapeViews(Dataset[ShapeSample]):
 
     Attributes:
         source: The shapes.
-        labels: Of the classes, by name.
+        class_names: Of the labels, in their order.
         representation: Representation of the images.
         seed: Of the run, 0 or more.
         random: Whether views are drawn for every epoch and index; else all are taken.
@@ -87,7 +87,7 @@ class ShapeViews(Dataset[ShapeSample]):
     """
 
     source: _Shapes
-    labels: Mapping[str, int]
+    class_names: Sequence[str]
     representation: Any
     seed: Seed
     random: bool = False
@@ -103,7 +103,7 @@ class ShapeViews(Dataset[ShapeSample]):
         # Torch hardly knows uint16; all values are below 2 · STEPS = 2¹⁵.
         return ShapeSample(
             torch.from_numpy(np.require(images, requirements="W").view(np.int16)),
-            torch.tensor(self.labels[self.source.items[index].label]),
+            torch.tensor(self.class_names.index(self.source.items[index].label)),
             torch.tensor(index),
         )
 
