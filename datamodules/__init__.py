@@ -28,23 +28,19 @@ if TYPE_CHECKING:
     from datamodules.zind.pairs import ZindPairs as ZindPairs
     from datamodules.zind.panoramas import Zind as Zind
 
-_MODULES = {
-    "FolderPanoramas": "datamodules.folder.labelled",
-    "FolderPhotos": "datamodules.folder.labelled",
-    "ImagePairs": "datamodules.core.panorama_pairs",
-    "ModelNet40": "datamodules.modelnet40.datamodule",
-    "OmniSynthia": "datamodules.synthia.omnisynthia",
-    "Stanford2D3DS": "datamodules.stanford2d3ds.panoramas",
-    "Stanford2D3DSPerspective": "datamodules.stanford2d3ds.panoramas",
-    "StanfordPairs": "datamodules.stanford2d3ds.pairs",
-    "SynthRooms": "datamodules.synthrooms.datamodule",
-    "SynthRoomsPairs": "datamodules.synthrooms.datamodule",
-    "SynthRoomsPerspective": "datamodules.synthrooms.datamodule",
-    "SynthShapes": "datamodules.synthshapes.datamodule",
-    "SynthiaPerspective": "datamodules.synthia.omnisynthia",
-    "Zind": "datamodules.zind.panoramas",
-    "ZindPairs": "datamodules.zind.pairs",
+_CLASSES = {
+    "core.panorama_pairs": ("ImagePairs",),
+    "folder.labelled": ("FolderPanoramas", "FolderPhotos"),
+    "modelnet40.datamodule": ("ModelNet40",),
+    "stanford2d3ds.pairs": ("StanfordPairs",),
+    "stanford2d3ds.panoramas": ("Stanford2D3DS", "Stanford2D3DSPerspective"),
+    "synthia.omnisynthia": ("OmniSynthia", "SynthiaPerspective"),
+    "synthrooms.datamodule": ("SynthRooms", "SynthRoomsPairs", "SynthRoomsPerspective"),
+    "synthshapes.datamodule": ("SynthShapes",),
+    "zind.pairs": ("ZindPairs",),
+    "zind.panoramas": ("Zind",),
 }
+_MODULES = {name: f"{__name__}.{file}" for file, names in _CLASSES.items() for name in names}
 
 __all__ = list(_MODULES)
 

@@ -43,13 +43,15 @@ class _ExplainedError(ValueError):
     def __init__(
         self, subject: object, *, found: object = None, expected: object = None, remedy: str = ""
     ) -> None:
-        message = str(subject)
+        message = finding = str(subject)
         if found is not None:
             # Of an OSError without its number and the path, which is the subject.
             shown = getattr(found, "strerror", None) or str(found)
             shown = shown if len(shown) <= _LONGEST else shown[:_LONGEST] + "…"
-            message = f"{subject}: found {shown}; expected {expected}. {remedy}".rstrip()
+            finding = f"{shown}; expected {expected}"
+            message = f"{subject}: found {finding}. {remedy}".rstrip()
         super().__init__(printable(message))
+        self.finding = printable(finding)
         self.subject = subject
         self.found = found
         self.expected = expected
@@ -62,6 +64,17 @@ class SettingError(_ExplainedError):
 
 class DataError(_ExplainedError):
     """A file or folder that cannot be used."""
+
+
+def at_least(name: str, value: object, least: int) -> int:
+    """A setting that has to be an integer of `least` or more.
+
+    Raises:
+        SettingError: It is something else.
+    """
+    if type(value) is not int or value < least:
+        raise SettingError(name, found=value, expected=f"an integer of {least} or more")
+    return value
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Literal
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from datamodules.core.found import Found, Split
+from datamodules.core.found import Found, Split, SplitItems, Transform
 from datamodules.core.inputs import (
     RGB_NORMALIZATION,
     RGBD_NORMALIZATION,
@@ -22,25 +22,25 @@ from datamodules.core.inputs import (
     normalize,
     ordered_inputs,
 )
-from datamodules.core.panoramas import Panorama, Photo, Turn
+from datamodules.core.panoramas import (
+    ImageFiles,
+    ImageReader,
+    Panorama,
+    PanoramaReading,
+    Photo,
+    PhotoReading,
+    Turn,
+    check_headers,
+)
 from datamodules.core.pipeline import (
     EstimatedUp,
     PanoramaJudge,
     PosedUp,
     RotatedPanoramas,
-    SplitItems,
-    Transform,
     masked,
 )
 from datamodules.core.problems import Problems
 from datamodules.core.progress import show_progress
-from datamodules.core.reading import (
-    ImageFiles,
-    ImageReader,
-    PanoramaReading,
-    PhotoReading,
-    check_headers,
-)
 from datamodules.core.samples import EvaluationImages, TrainingImages
 from datamodules.core.split_module import SplitDataModule
 from datamodules.core.store import Store
@@ -218,7 +218,7 @@ class PanoramaDataModule(ImageDataModule):
         if self.upright == "auto":
             judge = self.judge if split == "test" else None
             transforms.append(EstimatedUp(self.max_tilt_deg, judge))
-        return SplitItems(found.splits[split], found.read, Panorama, found.store, transforms)
+        return SplitItems(found, split, Panorama, transforms)
 
     def test_dataloader(self) -> DataLoader[Any]:
         """Batches for the test; what is to be judged is estimated first, in this process."""
@@ -267,7 +267,7 @@ class PhotoDataModule(ImageDataModule):
 
     def pipeline(self, found: Found[ImageFiles], split: Split) -> SplitItems[ImageFiles, Photo]:
         """Photos from files or store."""
-        return SplitItems(found.splits[split], found.read, Photo, found.store)
+        return SplitItems(found, split, Photo)
 
     def check_image(self, files: ImageFiles, reader: ImageReader, problems: Problems) -> None:
         """See `ImageDataModule`; crops must fit into the photo, too."""

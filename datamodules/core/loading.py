@@ -178,14 +178,3 @@ def _opencv_without_threads(_worker: int) -> None:
     # The workers are the parallelism; threads inside them would only fight over the cores. Not 1:
     # that waits for threads which the parent had and the forked worker does not.
     cv2.setNumThreads(0)
-
-
-def at_least(name: str, value: int, least: int) -> int:
-    """A setting that has to be `least` or more.
-
-    Raises:
-        SettingError: It is less.
-    """
-    if value < least:
-        raise SettingError(name, found=value, expected=f"{least} or more")
-    return value

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from contextlib import contextmanager
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
@@ -14,10 +13,7 @@ from tangent_train.files import NoRoomError
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from datamodules.core.pipeline import Item
-
-
-_ERROR_NUMBER = re.compile(r"\[Errno \d+\] ")
+    from datamodules.core.found import Item
 
 
 _Item = TypeVar("_Item", bound="Item")
@@ -75,7 +71,10 @@ class Problems:
     ) -> None:
         """Note an error, see `noted`."""
         where = error.subject if file is None or isinstance(error.subject, PurePath) else file
-        self._noted.append(Problem(str(where), _finding(error, where), error.remedy, item, error))
+        finding = error.finding
+        if error.found is not None and where is not error.subject:
+            finding = f"{error.subject}: {finding}"
+        self._noted.append(Problem(str(where), finding, error.remedy, item, error))
 
     def add_all(self, others: Problems) -> None:
         """Add the problems of another check."""
@@ -120,11 +119,3 @@ class Problems:
         lines = [f"{root}: found {len(listed)} problems; expected none."]
         lines += [f"  {problem.error}" for problem in listed]
         raise DataError("\n".join([*lines, remedy]).rstrip())
-
-
-def _finding(error: DataError | SettingError, where: object) -> str:
-    """Message of an error without its file and remedy, which have columns of their own."""
-    text = str(error).removesuffix(error.remedy).rstrip(". ")
-    text = text.removeprefix(str(where)).lstrip(",: ").removeprefix("found ")
-    text = text.replace(f": '{where}'", "").replace(f" of {where}", "")
-    return _ERROR_NUMBER.sub("", text)

@@ -14,10 +14,10 @@ from torch import Tensor
 from torch.utils.data import Dataset
 from torchvision.transforms.v2 import functional
 
+from datamodules.core.found import SplitItems
 from datamodules.core.inputs import MAX_DEPTH_M, Input
 from datamodules.core.loading import Seed, sample_rng
 from datamodules.core.panoramas import STEPS_PER_M
-from datamodules.core.pipeline import SplitItems
 from tangent_train.geometry import equirect_elevations
 from tangent_train.rendering.representations.views import Views
 from tangent_train.rendering.upright.gravity import upright_rotation

@@ -17,10 +17,9 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from datamodules.core.class_weights import ClassWeights, class_weights
-from datamodules.core.found import SPLITS, Found, Split
+from datamodules.core.found import SPLITS, Found, Item, Split, SplitItems
 from datamodules.core.inputs import Normalization
 from datamodules.core.loading import EpochSampler, make_loader, this_process
-from datamodules.core.pipeline import Item, SplitItems
 from datamodules.core.problems import Problems
 from tangent_train.errors import DataError, SettingError
 from tangent_train.threads import in_threads

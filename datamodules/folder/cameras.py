@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from datamodules.core.panoramas import ImageFiles
 from datamodules.core.problems import Problems
-from datamodules.core.reading import ImageFiles
 from datamodules.images.pixel_files import photo_fov_deg, read_image_size
 from tangent_train.errors import DataError
 from tangent_train.files import read_json

@@ -16,14 +16,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from datamodules.core.found import Split
 from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
 from datamodules.core.inputs import Input
+from datamodules.core.panoramas import ImageFiles
 from datamodules.core.problems import Problems
-from datamodules.core.reading import ImageFiles
-from datamodules.folder.cameras import FolderCameras, read_cameras
+from datamodules.folder.cameras import read_cameras
 from datamodules.folder.classes import UNKNOWN_NAME, read_classes
 from datamodules.folder.reader import FolderReader, list_images, note_ignored, read_codes
 from datamodules.folder.splits import FolderSplits
@@ -84,7 +83,8 @@ class LabelledFolder(ImageDataModule):
     def check(self) -> tuple[Problems, int]:
         """See `SplitDataModule`; files that training would pass over are named too."""
         problems, count = super().check()
-        note_ignored(self.root, problems)
+        with problems.noted():
+            note_ignored(self.root, problems)
         return problems, count
 
     def make_reader(self, images: Sequence[ImageFiles], problems: Problems) -> FolderReader:
@@ -131,22 +131,6 @@ class FolderPanoramas(LabelledFolder, PanoramaDataModule):
     """
 
 
-@dataclass(frozen=True)
-class _PhotoReader(FolderReader):
-    """Reads a user's own photos."""
-
-    cameras: FolderCameras
-
-    @property
-    def settings(self) -> dict[str, str]:
-        """The cameras in short too: they are stored with the photos."""
-        return {**super().settings, "cameras": self.cameras.fingerprint}
-
-    def camera(self, files: ImageFiles) -> NDArray[np.float64]:
-        """The camera matrix, by ``cameras.json``, the field of view or the EXIF data."""
-        return self.cameras.matrix(files)
-
-
 @registered
 @dataclass(kw_only=True, eq=False, repr=False)
 class FolderPhotos(LabelledFolder, PhotoDataModule):
@@ -172,4 +156,4 @@ class FolderPhotos(LabelledFolder, PhotoDataModule):
         """See `LabelledFolder`."""
         cameras = read_cameras(self.root / "cameras.json", self.fov)
         cameras.check_names(images, problems)
-        return _PhotoReader(self._classes, self.depth_units_per_m, cameras)
+        return FolderReader(self._classes, self.depth_units_per_m, cameras)

@@ -11,14 +11,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.core.panoramas import meters_to_steps, resize_nearest
+from datamodules.core.panoramas import ImageFiles, ImageReader, meters_to_steps, resize_nearest
 from datamodules.core.problems import Problems
-from datamodules.core.reading import ImageFiles, ImageReader
+from datamodules.folder.cameras import FolderCameras
 from datamodules.folder.classes import FolderClasses, read_classes
 from datamodules.images.image_files import IMAGE_SUFFIXES, find_depth, image_paths, walk_files
 from datamodules.images.masks import Masks
 from datamodules.images.pixel_files import (
-    is_grey,
     read_depth_m,
     read_image_size,
     read_pixels,
@@ -40,16 +39,19 @@ class FolderReader(ImageReader):
     Attributes:
         classes: Meaning of their labels.
         depth_units_per_m: Units in a metre of depth files of whole numbers.
+        cameras: Of photos.
     """
 
     classes: FolderClasses
     depth_units_per_m: float
+    cameras: FolderCameras | None = None
 
     @property
     def settings(self) -> dict[str, str]:
-        """The classes in short and the units."""
+        """The classes in short, the units and, as they are stored with photos, the cameras."""
         units = f"{self.depth_units_per_m:g}"
-        return {"classes": self.classes.fingerprint, "depth units per metre": units}
+        settings = {"classes": self.classes.fingerprint, "depth units per metre": units}
+        return settings | ({"cameras": self.cameras.fingerprint} if self.cameras else {})
 
     def size(self, part: str, path: Path) -> tuple[int, int]:
         """See `ImageReader`, as all others."""
@@ -74,6 +76,10 @@ class FolderReader(ImageReader):
         """Depth in steps of 1/512 m."""
         return meters_to_steps(read_depth_m(files.parts["depth"], self.depth_units_per_m))
 
+    def camera(self, files: ImageFiles) -> NDArray[np.float64]:
+        """The camera matrix, by ``cameras.json``, the field of view or the EXIF data."""
+        return self.cameras.matrix(files) if self.cameras else super().camera(files)
+
 
 def list_images(root: Path, problems: Problems, *, with_depth: bool) -> list[ImageFiles]:
     """All images of a data set, in the order of their names.
@@ -93,7 +99,7 @@ def list_images(root: Path, problems: Problems, *, with_depth: bool) -> list[Ima
             expected = "a data set: images/, labels/ and classes.json, see docs/own_data.md"
             raise DataError(folder, found="no such folder", expected=expected)
     found: dict[str, ImageFiles] = {}
-    for rgb in image_paths(root / "images", problems.noted):
+    for rgb in image_paths(root / "images"):
         name = _name(root / "images", rgb)
         depth = None
         with problems.noted(name):
@@ -112,7 +118,7 @@ def list_images(root: Path, problems: Problems, *, with_depth: bool) -> list[Ima
 
 
 def note_ignored(root: Path, problems: Problems) -> None:
-    """Note files that training passes over, and grey images among coloured ones.
+    """Note files that training passes over.
 
     Args:
         root: Folder with ``images/`` and ``labels/``, there or not.
@@ -120,18 +126,13 @@ def note_ignored(root: Path, problems: Problems) -> None:
     """
     files = list(walk_files(root / "images"))
     names = {_name(root / "images", path) for path in files}
-    images = [path for path in files if path.suffix.lower() in IMAGE_SUFFIXES]
     noted = [
         (path, "labels of no image", "Name it as its image, or remove it.")
         for path in walk_files(root / "labels")
         if _name(root / "labels", path) not in names
     ]
-    others = set(files) - set(images)
+    others = [path for path in files if path.suffix.lower() not in IMAGE_SUFFIXES]
     noted += [(path, "no image", "Convert it; of a video, extract frames.") for path in others]
-    grey = [path for path in images if is_grey(path)]
-    if len(grey) < len(images):
-        told = "grey, others are coloured", "Label images belong in labels/."
-        noted += [(path, *told) for path in grey]
     expected = f"images ({', '.join(IMAGE_SUFFIXES)}) and labels (.png) of the same names"
     for path, found, remedy in noted:
         problems.add(DataError(path, found=found, expected=expected, remedy=remedy), str(path))

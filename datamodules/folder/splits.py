@@ -9,8 +9,8 @@ from pathlib import Path
 from lightning.pytorch.utilities import rank_zero_warn
 
 from datamodules.core.found import SPLITS, Split, draw_groups
+from datamodules.core.panoramas import ImageFiles
 from datamodules.core.problems import Problems
-from datamodules.core.reading import ImageFiles
 from tangent_train.errors import DataError, counted
 
 

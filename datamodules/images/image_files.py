@@ -5,14 +5,10 @@ from __future__ import annotations
 import glob
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from tangent_train.errors import DataError
-
-Noted = Callable[..., AbstractContextManager[None]]
-
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
 """Suffixes of images, in lower case."""
@@ -21,15 +17,12 @@ DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".npy", ".exr")
 """Suffixes of depth maps."""
 
 
-def image_paths(
-    pattern: str | Path, noted: Noted | None = None, suffixes: Sequence[str] = IMAGE_SUFFIXES
-) -> list[Path]:
+def image_paths(pattern: str | Path, suffixes: Sequence[str] = IMAGE_SUFFIXES) -> list[Path]:
     """The images that a setting names.
 
     Args:
         pattern: A file; a folder, searched recursively; or a glob pattern, with ``**`` for folders
             of any depth. ``~`` is the home folder.
-        noted: Reports folders that cannot be opened, see `Problems.noted`.
         suffixes: Of images, in lower case.
 
     Returns:
@@ -37,7 +30,7 @@ def image_paths(
         case, that are not hidden.
 
     Raises:
-        DataError: There are none.
+        DataError: There are none, or a folder cannot be opened.
     """
     path = Path(pattern)
     # The shell leaves the ~ of "input=~/holiday" alone.
@@ -45,7 +38,7 @@ def image_paths(
     if path.is_file():
         return [path]
     if path.is_dir():
-        found = list(walk_files(path, noted))
+        found = list(walk_files(path))
     else:
         found = [Path(name) for name in glob.glob(str(path), recursive=True)]  # noqa: PTH207
     images = sorted({file for file in found if file.suffix.lower() in suffixes})
@@ -61,25 +54,28 @@ def image_paths(
     return images
 
 
-def walk_files(folder: Path, noted: Noted | None = None) -> Iterator[Path]:
+def walk_files(folder: Path) -> Iterator[Path]:
     """Files of a folder and its subfolders, linked ones included, each folder once.
 
     Args:
         folder: There or not; hidden files and folders are left out.
-        noted: See `image_paths`.
+
+    Raises:
+        DataError: A folder cannot be opened.
     """
     seen = set()
-
-    def closed(error: OSError) -> None:
-        if noted is not None:
-            with noted(None, Path(error.filename)):
-                raise error
-
-    for parent, folders, names in os.walk(folder, followlinks=True, onerror=closed):
+    if not folder.is_dir():
+        return
+    for parent, folders, names in os.walk(folder, followlinks=True, onerror=_refuse):
         real = os.path.realpath(parent)
         folders[:] = [] if real in seen else [name for name in folders if name[0] != "."]
         yield from (Path(parent, name) for name in names if real not in seen and name[0] != ".")
         seen.add(real)
+
+
+def _refuse(error: OSError) -> None:
+    expected = "a folder that can be opened"
+    raise DataError(error.filename, found=error, expected=expected) from error
 
 
 def find_depth(folder: Path, name: str, remedy: str) -> Path:

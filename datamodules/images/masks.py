@@ -68,7 +68,7 @@ class Masks:
             DataError: It is missing, or not twice as wide as high.
         """
         path = self._checked(self._path / f"{name}.png")
-        _whole(path, read_image_size(path))
+        whole_area(path, read_image_size(path))
 
     def read(self, name: str, area: PanoramaArea) -> NDArray[np.uint8]:
         """Where a panorama counts: 255, elsewhere and where it shows nothing 0.
@@ -95,7 +95,9 @@ class Masks:
         rows = area.full_shape[0]
         counts[90 - (np.arange(rows) + 0.5) * 180 / rows < self._lowest_deg] = 0
         if own is not None:
-            place = area if own.shape == area.image_shape else _whole(path, own.shape)
+            rows, columns = own.shape
+            fits = (rows, columns) == area.image_shape
+            place = area if fits else whole_area(path, (rows, columns))
             counts[~resize_nearest(place.place(own), area.full_shape)] = 0
         if not self.of_each:
             self._kept = area, counts
@@ -114,11 +116,3 @@ class Masks:
                 "of each panorama",
             )
         return path
-
-
-def _whole(path: Path, size: tuple[int, ...]) -> PanoramaArea:
-    try:
-        return whole_area(path, (size[0], size[1]))
-    except DataError as error:
-        expected = "the size of the panorama, or the whole sphere, twice as wide as high"
-        raise DataError(path, found=error.found, expected=expected) from error

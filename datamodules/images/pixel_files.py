@@ -1,4 +1,4 @@
-"""Reading and writing the user's own images: colours, depth, labels, arrays.
+"""Reading and writing images: colours, depth, labels, arrays.
 
 Pillow opens and identifies every image; OpenCV writes, and decodes the 16-bit colours that Pillow
 would cut to 8 bits.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from numpy.typing import DTypeLike, NDArray
 from PIL import ExifTags, Image, ImageOps
 
 from datamodules.images.exr import read_exr, read_exr_size
-from datamodules.images.png import MOST_PIXELS, check_pixels, decode, read_png_header
+from datamodules.images.png import MOST_PIXELS, check_pixels, read_png_header
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import atomic_path, reserve, write_bytes
 
@@ -66,7 +66,7 @@ def _opened(path: Path) -> Iterator[Image.Image]:
     except Exception as error:
         raise DataError(
             path,
-            found=f"no image that can be decoded ({error})",
+            found=f"no image that can be decoded ({getattr(error, 'strerror', None) or error})",
             expected="a whole JPEG, PNG, TIFF or WebP image",
             remedy="Copy or export the file again.",
         ) from error
@@ -96,13 +96,6 @@ def read_image_size(path: Path) -> tuple[int, int]:
         return height, width
     with _opened(path) as image:
         return _upright_size(image)
-
-
-def is_grey(path: Path) -> bool:
-    """Whether an image has a single channel of colour; not of one that cannot be read."""
-    with suppress(DataError), _opened(path) as image:
-        return image.mode in (*_SINGLE_CHANNEL, "LA")
-    return False
 
 
 def _upright_size(image: Image.Image) -> tuple[int, int]:
@@ -148,7 +141,10 @@ def read_pixels(path: Path, *, indices: bool) -> NDArray[Any]:
 
 
 def _decode_16_bit(path: Path, *, grey: bool) -> NDArray[Any]:
-    pixels = decode(path, cv2.IMREAD_UNCHANGED)
+    # From memory: `cv2.imread` knows no paths beyond the system's code page.
+    pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+    if pixels is None:
+        raise ValueError("broken pixels")
     return np.ascontiguousarray(pixels[..., 0] if grey else pixels[..., 2::-1])
 
 

@@ -1,4 +1,4 @@
-"""PNG files of data sets: checked by their headers, decoded by OpenCV."""
+"""PNG files by their headers, and the sizes that images may have."""
 
 from __future__ import annotations
 
@@ -6,11 +6,7 @@ import os
 import struct
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
-
-import cv2
-import numpy as np
-from numpy.typing import NDArray
+from typing import BinaryIO, NamedTuple
 
 from tangent_train.errors import DataError, SettingError
 
@@ -70,7 +66,7 @@ def read_png_header(path: Path) -> PngHeader:
 
 
 def _has_all_chunks(file: BinaryIO) -> bool:
-    # OpenCV allocates the bytes that a chunk claims, up to 2 GB, before it reads them.
+    # Decoders allocate the bytes that a chunk claims, up to 2 GB, before they read them.
     size = file.seek(0, os.SEEK_END)
     position, name = len(_SIGNATURE), b""
     while name != b"IEND":
@@ -132,51 +128,3 @@ def check_panorama_size(path: Path, size: tuple[int, int], erp_height: int) -> N
             expected=f"at most the {height} rows of {path}",
             remedy="Choose a lower level, or larger panoramas.",
         )
-
-
-def read_color_png(path: Path) -> NDArray[np.uint8]:
-    """Decode 8-bit colours, ``(H, W, 3)`` in RGB order; alpha is dropped.
-
-    Raises:
-        DataError: The file is broken.
-    """
-    return cv2.cvtColor(read_png(path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
-
-
-def read_depth_png(path: Path) -> NDArray[np.uint16]:
-    """Decode 16-bit grey values, ``(H, W)``.
-
-    Raises:
-        DataError: The file is broken.
-    """
-    return read_png(path, cv2.IMREAD_ANYDEPTH)
-
-
-def read_png(path: Path, flags: int) -> NDArray[Any]:
-    """Decode a PNG file with OpenCV: channels in BGR order.
-
-    Args:
-        path: The file.
-        flags: Of `cv2.imdecode`.
-
-    Raises:
-        DataError: The file is broken, or too large to be decoded.
-    """
-    read_png_header(path)
-    return decode(path, flags)
-
-
-def decode(path: Path, flags: int) -> NDArray[Any]:
-    """Decode an image file whose size was checked with OpenCV: channels in BGR order.
-
-    Raises:
-        DataError: The file is broken.
-    """
-    try:
-        # From memory: `cv2.imread` knows no paths beyond the system's code page.
-        image = cv2.imdecode(np.fromfile(path, np.uint8), flags)
-    except (OSError, cv2.error) as error:
-        raise DataError(path, found=error, expected="an image", remedy=_REMEDY) from error
-    if image is None:
-        raise DataError(path, found="a broken image", expected="one that decodes", remedy=_REMEDY)
-    return image

@@ -14,8 +14,7 @@ from typing import Any, ClassVar
 
 from torch import Tensor
 
-from datamodules.core.found import Found, Split, draw_groups
-from datamodules.core.pipeline import SplitItems
+from datamodules.core.found import Found, Split, SplitItems, draw_groups
 from datamodules.core.problems import Problems
 from datamodules.core.processes import in_processes
 from datamodules.core.split_module import Kind, SplitDataModule
@@ -104,17 +103,18 @@ class ModelNet40(SplitDataModule[ShapeFile]):
 
     def pipeline(self, found: Found[ShapeFile], split: Split) -> SplitItems[ShapeFile, Spheres]:
         """The spheres in the store."""
-        return SplitItems(found.splits[split], found.read, Spheres, found.store)
+        return SplitItems(found, split, Spheres)
 
     def training_samples(self) -> ShapeViews:
         """Samples `ShapeSample`: random views, drawn and rotated as the representation says."""
         source, seed = self.source("train"), (self.seed, self.stream)
-        return ShapeViews(source, self._labels, self.representation, seed, random=True)
+        return ShapeViews(source, self.class_names, self.representation, seed, random=True)
 
     def evaluation_samples(self, split: Split) -> ShapeViews:
         """Samples `ShapeSample` of all views; those of the test split are rotated if set."""
         source, rotation = self.source(split), self.test_rotation if split == "test" else None
-        return ShapeViews(source, self._labels, self.representation, self.seed, rotation=rotation)
+        views = self.class_names, self.representation, self.seed
+        return ShapeViews(source, *views, rotation=rotation)
 
     @property
     def in_channels(self) -> int:
@@ -125,10 +125,6 @@ class ModelNet40(SplitDataModule[ShapeFile]):
         """The views of a `ShapeSample`, ``(B, N, 6, h, w)`` float32."""
         normalization: Any = self.normalization
         return normalize_spheres(batch.images, normalization)
-
-    @property
-    def _labels(self) -> dict[str, int]:
-        return {name: label for label, name in enumerate(self.class_names)}
 
     def evaluation_size(self) -> int:
         """Shapes per evaluation batch: as many as in training."""

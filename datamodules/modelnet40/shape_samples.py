@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from datamodules.core.found import SplitItems
 from datamodules.core.inputs import Normalization, normalize_channels
 from datamodules.core.loading import Seed, sample_rng
-from datamodules.core.pipeline import SplitItems
 from datamodules.modelnet40.meshes import clean_mesh, mesh_spheres, read_off
 from datamodules.modelnet40.shape_files import ShapeFile
 from tangent_train.geometry import random_rotation, rotation_about
@@ -79,7 +79,7 @@ class ShapeViews(Dataset[ShapeSample]):
 
     Attributes:
         source: The shapes.
-        labels: Of the classes, by name.
+        class_names: Of the labels, in their order.
         representation: Representation of the images.
         seed: Of the run, 0 or more.
         random: Whether views are drawn for every epoch and index; else all are taken.
@@ -87,7 +87,7 @@ class ShapeViews(Dataset[ShapeSample]):
     """
 
     source: _Shapes
-    labels: Mapping[str, int]
+    class_names: Sequence[str]
     representation: Any
     seed: Seed
     random: bool = False
@@ -103,7 +103,7 @@ class ShapeViews(Dataset[ShapeSample]):
         # Torch hardly knows uint16; all values are below 2 · STEPS = 2¹⁵.
         return ShapeSample(
             torch.from_numpy(np.require(images, requirements="W").view(np.int16)),
-            torch.tensor(self.labels[self.source.items[index].label]),
+            torch.tensor(self.class_names.index(self.source.items[index].label)),
             torch.tensor(index),
         )
 

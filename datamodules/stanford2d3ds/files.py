@@ -10,7 +10,7 @@ from datamodules.core.problems import Problems
 from tangent_train.errors import DataError
 
 if TYPE_CHECKING:  # slow, and SynthRooms needs the names alone
-    from datamodules.core.reading import ImageFiles
+    from datamodules.core.panoramas import ImageFiles
 
 
 AREAS: tuple[str, ...] = ("1", "2", "3", "4", "5a", "5b", "6")
@@ -101,7 +101,7 @@ def list_pictures(
         with_depth: Whether depth is wanted.
         problems: That there are none, or other files, is added.
     """
-    from datamodules.core.reading import ImageFiles
+    from datamodules.core.panoramas import ImageFiles
 
     folder = root / f"area_{area}" / group
     found = []

@@ -16,10 +16,9 @@ from collections.abc import Iterable, Sequence
 from functools import cached_property
 from itertools import combinations
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from datamodules.core.panorama_pairs import (
     PairedPanorama,
@@ -29,15 +28,13 @@ from datamodules.core.panorama_pairs import (
 )
 from datamodules.core.panoramas import resize_area, resize_depth, steps_to_meters
 from datamodules.core.problems import Problems
-from datamodules.images.png import read_color_png
+from datamodules.images.pixel_files import read_rgb
 from datamodules.stanford2d3ds.files import AREAS, GET_IT, PictureFiles, list_pictures
-from datamodules.stanford2d3ds.reader import read_depth
+from datamodules.stanford2d3ds.reader import read_depth, read_pose_numbers
 from datamodules.synthrooms.camera import CAMERA_FROM_SPHERE, euler_rotation
 from tangent_train.errors import DataError, SettingError
-from tangent_train.files import parse_json
 from tangent_train.geometry import PanoramaPose
 
-_MOST = 1e6  # metres and radians
 _KEYS = {"camera_rt_matrix": (3, 4), "camera_original_rotation": (3,), "camera_location": (3,)}
 
 
@@ -50,29 +47,14 @@ def read_panorama_pose(path: Path) -> PanoramaPose:
     Raises:
         DataError: It cannot be read, or holds no pose.
     """
+    rt, angles, location = read_pose_numbers(path, _KEYS)
+    if np.abs(angles).max() > 2 * math.pi:
+        angles = np.radians(angles)
+    original = euler_rotation(angles)
     try:
-        record = parse_json(path.read_bytes())
-        rt, angles, location = (_numbers(record[key], shape) for key, shape in _KEYS.items())
-        if np.abs(angles).max() > 2 * math.pi:
-            angles = np.radians(angles)
-        original = euler_rotation(angles)
         return PanoramaPose(original @ rt[:, :3] @ original @ CAMERA_FROM_SPHERE, location)
-    except (OSError, ValueError, TypeError, KeyError, OverflowError, FloatingPointError) as error:
-        raise DataError(
-            path,
-            found=f"{type(error).__name__}: {error}",
-            expected=f"a pose as JSON, with {', '.join(_KEYS)}",
-            remedy="Copy or extract the file again.",
-        ) from error
-
-
-def _numbers(value: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    numbers = np.array(value, np.float64)
-    # Some releases have a fourth row 0 0 0 1.
-    numbers = numbers[:3] if numbers.shape == (4, 4) else numbers
-    if numbers.shape != shape or not np.abs(numbers).max() <= _MOST:
-        raise ValueError(f"{value}, not {'×'.join(map(str, shape))} numbers")
-    return numbers
+    except SettingError as error:
+        raise DataError(path, found=error.found, expected="a rotation") from error
 
 
 _REPRESENTATIONS = ("ERP", "L0", "L1", "L2")
@@ -157,7 +139,7 @@ class StanfordPairs(PanoramaPairs):
     def panorama(self, files: PictureFiles) -> PairedPanorama:
         """See `PanoramaPairs`."""
         image = files.image
-        rgb = read_color_png(image.rgb)
+        rgb = read_rgb(image.rgb)
         shape = paired_shape(image.rgb, rgb, self._height)
         steps = resize_depth(read_depth(image.parts["depth"]), shape)
         distance_m = np.where(steps == 0, np.float32(np.nan), steps_to_meters(steps))

@@ -1,6 +1,6 @@
 """Stanford2D3DS (Armeni et al. 2017): six areas of three buildings, 1,413 panoramas, 70,496 photos.
 
-Features: 2048×4096 RGB, depth and 13 semantic classes (`label_table.CLASSES`), captured with a
+Features: 2048×4096 RGB, depth and 13 semantic classes (`reader.CLASSES`), captured with a
 Matterport camera; all panoramas are upright. Three folds of its authors, by area.
 
 On disk, as released::
@@ -34,12 +34,10 @@ from typing import ClassVar, Literal
 
 from datamodules.core.found import Split, draw_groups
 from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
-from datamodules.core.panoramas import Unknown
+from datamodules.core.panoramas import ImageFiles, Unknown
 from datamodules.core.problems import Problems
-from datamodules.core.reading import ImageFiles
 from datamodules.stanford2d3ds.files import AREAS, FOLDS, GET_IT, list_pictures
-from datamodules.stanford2d3ds.label_table import CLASSES, LabelTable
-from datamodules.stanford2d3ds.reader import StanfordReader
+from datamodules.stanford2d3ds.reader import CLASSES, LabelTable, StanfordReader
 from tangent_train.errors import DataError
 from tangent_train.registry import registered
 

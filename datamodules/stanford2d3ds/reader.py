@@ -1,25 +1,120 @@
-"""Decoder of the files of Stanford2D3DS."""
+"""Decoder of the files of Stanford2D3DS, and its class table."""
 
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.core.panoramas import Unknown, mask_black, resize_nearest
-from datamodules.core.reading import ImageFiles, PngReader
-from datamodules.images.png import read_color_png, read_depth_png
-from datamodules.stanford2d3ds.label_table import LabelTable
-from tangent_train.errors import DataError
-from tangent_train.files import parse_json
+from datamodules.core.panoramas import ImageFiles, PngReader, Unknown, mask_black, resize_nearest
+from datamodules.images.pixel_files import read_pixels, read_rgb
+from tangent_train.errors import DataError, counted
+from tangent_train.files import parse_json, read_json
 from tangent_train.geometry import is_camera_matrix
+
+CLASSES: tuple[str, ...] = (
+    "beam",
+    "board",
+    "bookcase",
+    "ceiling",
+    "chair",
+    "clutter",
+    "column",
+    "door",
+    "floor",
+    "sofa",
+    "table",
+    "wall",
+    "window",
+)
+"""The 13 classes; the label of a class is its place here plus one."""
+
+_MISSING = 0x0D0D0D
+
+UNKNOWN = 0
+"""The label of pixels without a class: ignored in training and evaluation."""
 
 _FORMATS = {"rgb": (8, ("RGB", "RGBA")), "labels": (8, ("RGB", "RGBA")), "depth": (16, ("grey",))}
 _CENTERS_FROM_CORNERS = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
 _MISSING_DEPTH = 65535
+_MOST = 1e6  # metres, radians, pixels
+
+
+@dataclass(frozen=True, eq=False)
+class LabelTable:
+    """Class of every instance of the data set.
+
+    A pixel of a `semantic` image holds the index of an instance as the colour
+    R · 65536 + G · 256 + B. Missing labels are #0D0D0D = 855309, past the end of the table.
+    (Without R they would be instance 3341, clutter.)
+
+    Attributes:
+        class_ids: ``(entries,)`` uint8, 1 to 13 in the order of `CLASSES`, or `UNKNOWN`.
+    """
+
+    class_ids: NDArray[np.uint8]
+
+    @classmethod
+    def from_json(cls, path: Path) -> LabelTable:
+        """Read `semantic_labels.json`, a list of names ``class_instance_room_number_area``.
+
+        Args:
+            path: The file.
+
+        Raises:
+            DataError: It cannot be read or is no such list.
+        """
+        expected = f"a JSON list of names that begin with {', '.join(CLASSES)} or <UNK>"
+        remedy = "Copy semantic_labels.json of the Stanford2D3DS release."
+        names = read_json(path, expected, remedy)
+        if not isinstance(names, list) or not names:
+            raise DataError(path, found=type(names).__name__, expected=expected, remedy=remedy)
+        ids = {"<UNK>": UNKNOWN} | {name: i for i, name in enumerate(CLASSES, start=1)}
+        classes = [str(name).partition("_")[0] for name in names]
+        strange = sorted(set(classes) - set(ids))
+        if strange:
+            raise DataError(path, found=f"class {strange[0]!r}", expected=expected, remedy=remedy)
+        return cls(np.array([ids[name] for name in classes], np.uint8))
+
+    def decode(self, colors: NDArray[np.uint8], path: object = "labels") -> NDArray[np.uint8]:
+        """Labels of a `semantic` image.
+
+        Args:
+            colors: ``(H, W, 3)`` uint8 in RGB order.
+            path: Their file, for messages.
+
+        Returns:
+            ``(H, W)`` uint8 labels.
+
+        Raises:
+            DataError: There are instances past the end of the table, other than the mark of missing
+                labels.
+
+        >>> table = LabelTable(np.array([0, 1, 12], np.uint8))
+        >>> table.decode(np.array([[[0, 0, 2], [13, 13, 13]]], np.uint8)).tolist()
+        [[12, 0]]
+        """
+        red, green, blue = np.moveaxis(colors.astype(np.int32), -1, 0)
+        index = (red << 16) | (green << 8) | blue
+        end = len(self.class_ids)
+        past = index >= end
+        strange = past & (index != _MISSING)
+        if strange.any():
+            count = int(np.count_nonzero(strange))
+            raise DataError(
+                path,
+                found=f"instance {index[strange].min()} in {counted(count, 'pixels')}",
+                expected=f"0 to {end - 1}, the entries of the class table, or #{_MISSING:06X} "
+                "where labels are missing",
+                remedy="Use the file and semantic_labels.json of one release.",
+            )
+        index[past] = 0
+        return np.where(past, np.uint8(UNKNOWN), self.class_ids[index])
 
 
 @dataclass(frozen=True)
@@ -44,7 +139,7 @@ class StanfordReader(PngReader):
 
     def labels(self, files: ImageFiles, shape: tuple[int, int] | None = None) -> NDArray[np.uint8]:
         """Classes by the class table, 0 where black pixels are masked."""
-        colors = read_color_png(files.labels)
+        colors = read_rgb(files.labels)
         shape = shape or (colors.shape[0], colors.shape[1])
         labels = self.table.decode(resize_nearest(colors, shape), files.labels)
         if self.unknown == "labels":
@@ -66,7 +161,7 @@ def read_depth(path: Path) -> NDArray[np.uint16]:
     Raises:
         DataError: The file is broken.
     """
-    steps = read_depth_png(path)
+    steps = read_pixels(path, indices=True)
     steps[steps == _MISSING_DEPTH] = 0
     return steps
 
@@ -83,14 +178,39 @@ def read_camera_matrix(path: Path) -> NDArray[np.float64]:
     Raises:
         DataError: The file is missing or broken, or holds no such matrix.
     """
-    expected = "a pose file with a camera_k_matrix of 3×3 numbers, without skew"
-    try:
-        matrix = np.array(parse_json(path.read_bytes())["camera_k_matrix"], np.float64)
-    except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:
-        found = f"{type(error).__name__}: {error}"
-        raise DataError(
-            path, found=found, expected=expected, remedy="Copy or extract the file again."
-        ) from error
+    (matrix,) = read_pose_numbers(path, {"camera_k_matrix": (3, 3)})
     if not is_camera_matrix(matrix):
+        expected = "a camera_k_matrix without skew"
         raise DataError(path, found=matrix.tolist(), expected=expected)
     return _CENTERS_FROM_CORNERS @ matrix
+
+
+def read_pose_numbers(path: Path, keys: Mapping[str, tuple[int, ...]]) -> list[NDArray[np.float64]]:
+    """Numbers in a pose file.
+
+    Args:
+        path: ``camera_…_domain_pose.json``.
+        keys: What to read, with its shape.
+
+    Raises:
+        DataError: It cannot be read, or lacks one of them.
+    """
+    try:
+        record = parse_json(path.read_bytes())
+        return [_numbers(record[key], shape) for key, shape in keys.items()]
+    except (OSError, ValueError, TypeError, KeyError, OverflowError) as error:
+        raise DataError(
+            path,
+            found=f"{type(error).__name__}: {error}",
+            expected=f"a pose as JSON, with {', '.join(keys)}",
+            remedy="Copy or extract the file again.",
+        ) from error
+
+
+def _numbers(value: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    numbers = np.array(value, np.float64)
+    # Some releases have a fourth row 0 0 0 1.
+    numbers = numbers[:3] if numbers.shape == (4, 4) else numbers
+    if numbers.shape != shape or not np.abs(numbers).max() <= _MOST:
+        raise ValueError(f"{value}, not {'×'.join(map(str, shape))} numbers")
+    return numbers

@@ -18,33 +18,29 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.core.loading import at_least
 from datamodules.core.made_folders import claim_folder
-from datamodules.core.panoramas import distance_from_z_depth
+from datamodules.core.panoramas import ImageFiles, check_headers, distance_from_z_depth
 from datamodules.core.problems import Problems
 from datamodules.core.progress import show_progress
-from datamodules.core.reading import ImageFiles, check_headers
-from datamodules.images.png import read_color_png
-from datamodules.synthia.files import (
+from datamodules.images.pixel_files import read_rgb
+from datamodules.synthia.reader import (
     FRAMES,
     GET_IT,
+    INVALID,
+    PANORAMA_FORMATS,
+    VIEW_FORMATS,
     VIEWS,
+    SynthiaReader,
     choose_frames,
     list_frames,
     panorama_files,
     read_camera,
+    read_first_channel,
+    read_ids,
     sequence_folder,
     view_files,
 )
-from datamodules.synthia.reader import (
-    INVALID,
-    PANORAMA_FORMATS,
-    VIEW_FORMATS,
-    SynthiaReader,
-    read_first_channel,
-    read_ids,
-)
-from tangent_train.errors import DataError
+from tangent_train.errors import DataError, at_least
 from tangent_train.files import write_bytes
 from tangent_train.geometry import (
     equirect_latitudes,
@@ -235,7 +231,7 @@ def _make(
     with problems.noted(target.name):
         depth = [read_first_channel(view.parts["depth"]) for view in views]
         far = [distance_from_z_depth(one, stitcher.camera_matrix) for one in depth]
-        rgb = stitcher.stitch([read_color_png(view.rgb) for view in views], "bilinear")
+        rgb = stitcher.stitch([read_rgb(view.rgb) for view in views], "bilinear")
         parts = {
             "depth": stitcher.stitch(far, "nearest"),
             "labels": stitcher.stitch([read_ids(v.labels) for v in views], "nearest", INVALID),

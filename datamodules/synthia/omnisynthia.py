@@ -3,7 +3,7 @@
 Features: 2096×4192 RGB, depth and 13 semantic classes (`reader.CLASSES`). The panoramas combine
 four cameras: a band around the horizon, black and unknown above and below. Missing panoramas are
 generated from the four views of SYNTHIA's sequences 01, 02, 04, 05 and 06 SUMMER, which are
-photos too. `files` has the tree on disk.
+photos too. `reader` has the tree on disk.
 
 Licence: SYNTHIA is free for research: http://synthia-dataset.net.
 
@@ -23,27 +23,25 @@ from typing import ClassVar
 from datamodules.core.found import Found, Split
 from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
 from datamodules.core.inputs import Input
+from datamodules.core.panoramas import ImageFiles
 from datamodules.core.problems import Problems
-from datamodules.core.reading import ImageFiles
-from datamodules.synthia.files import (
+from datamodules.synthia.generate import HEIGHT, make_panoramas
+from datamodules.synthia.reader import (
+    CLASSES,
     FRAMES,
     GET_IT,
+    NORMALIZATIONS,
+    PANORAMA_FORMATS,
+    VIEW_FORMATS,
     VIEWS,
+    Formats,
+    SynthiaReader,
     choose_frames,
     list_frames,
     list_panoramas,
     panorama_files,
     sequence_folder,
     view_files,
-)
-from datamodules.synthia.generate import HEIGHT, make_panoramas
-from datamodules.synthia.reader import (
-    CLASSES,
-    NORMALIZATIONS,
-    PANORAMA_FORMATS,
-    VIEW_FORMATS,
-    Formats,
-    SynthiaReader,
 )
 from tangent_train.errors import DataError
 from tangent_train.registry import registered

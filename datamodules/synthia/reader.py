@@ -1,7 +1,26 @@
-"""Decoder of the files of SYNTHIA and OmniSYNTHIA: labels, depth, cameras."""
+"""The files of SYNTHIA's video sequences and of OmniSYNTHIA: names, cameras, labels, depth.
+
+On disk, as released (`0X` is 01, 02, 04, 05 or 06)::
+
+    root/SYNTHIA-SEQS-0X-SUMMER/
+      RGB/Stereo_Left/Omni_F/000000.png        760×1280, 8 bit; Omni_R, Omni_B, Omni_L likewise
+      GT/LABELS/Stereo_Left/Omni_F/000000.png  16-bit RGB: R is the class, the others the instance
+      Depth/Stereo_Left/Omni_F/000000.png      16 bit, z-depth in cm, in every channel there is
+      CameraParams/intrinsics.txt              focal length, centre x and y, baseline
+      pano/                                    OmniSYNTHIA: 2096×4192
+        RGB/000000.png                         8 bit, black outside the views
+        GT/LABELS_Correct/000000.png           8 bit, 255 outside the views
+        Depth/000000.png                       16 bit, cm
+
+The four views of a frame are upright and share their centre: F faces forward, and R, B and L are
+each rotated by a further 90° to the right.
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,11 +30,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.core.inputs import RGBD_NORMALIZATION, Normalization
-from datamodules.core.panoramas import meters_to_steps, resize_nearest
-from datamodules.core.reading import ImageFiles, PngReader
-from datamodules.images.png import read_png
-from datamodules.synthia.files import read_camera
-from tangent_train.errors import DataError
+from datamodules.core.panoramas import ImageFiles, PngReader, meters_to_steps, resize_nearest
+from datamodules.images.pixel_files import read_pixels
+from tangent_train.errors import DataError, at_least
+
+VIEWS: tuple[str, ...] = ("F", "R", "B", "L")
+"""Front, right, back, left: each rotated by 90° to the right of the previous one."""
+
+GET_IT = (
+    "Get SYNTHIA-SEQS-01, -02, -04, -05 and -06 SUMMER from http://synthia-dataset.net and point "
+    "data.root at the folder that holds them."
+)
+"""Remedy if the data set is missing."""
+
+FRAMES = 500
+"""About as many frames of each sequence became panoramas of OmniSYNTHIA."""
+
+_SIZE = (760, 1280)
+_CAMERA = (532.740352, 640.0, 380.0)  # of views of that size, centre from pixel corners
+_NAME = "[0-9]" * 6 + ".png"
 
 CLASSES: tuple[str, ...] = (
     "sky",
@@ -71,6 +104,115 @@ _LABELS = np.zeros(256, np.uint8)
 _LABELS[: _LAST_ID + 1] = [*range(13), 0, 0, 13]
 
 
+def sequence_folder(root: Path, sequence: str) -> Path:
+    """Folder of a sequence.
+
+    Raises:
+        DataError: The data set is missing.
+
+    >>> from pathlib import Path
+    >>> sequence_folder(Path("."), "01").name
+    'SYNTHIA-SEQS-01-SUMMER'
+    """
+    if not root.is_dir():
+        raise DataError(root, found="no such folder", expected="the data set", remedy=GET_IT)
+    return root / f"SYNTHIA-SEQS-{sequence}-SUMMER"
+
+
+def view_files(root: Path, sequence: str, frame: str, view: str, *, with_depth: bool) -> ImageFiles:
+    """Files of one of `VIEWS` of a frame; `frame` is as ``000000``."""
+    folder = sequence_folder(root, sequence)
+    place = f"Stereo_Left/Omni_{view}/{frame}.png"
+    camera = _camera_file(folder)
+    return ImageFiles(
+        f"sequence_{sequence}/{frame}/{view}",
+        folder / "RGB" / place,
+        folder / "GT" / "LABELS" / place,
+        folder / "Depth" / place if with_depth else None,
+        camera if camera.exists() else None,
+    )
+
+
+def panorama_files(root: Path, sequence: str, frame: str, *, with_depth: bool) -> ImageFiles:
+    """Files of one panorama; `frame` is as ``000000``."""
+    pano, name = sequence_folder(root, sequence) / "pano", f"{frame}.png"
+    return ImageFiles(
+        f"sequence_{sequence}/{frame}",
+        pano / "RGB" / name,
+        pano / "GT" / "LABELS_Correct" / name,
+        pano / "Depth" / name if with_depth else None,
+    )
+
+
+def list_frames(folder: Path) -> list[str]:
+    """Frames of which a view has a colour image, as ``000000``, in order; none is no error."""
+    return _names(*(folder / "RGB" / "Stereo_Left" / f"Omni_{view}" for view in VIEWS))
+
+
+def list_panoramas(folder: Path) -> list[str]:
+    """Frames that have the colour image of a panorama, in order; none is no error."""
+    return _names(folder / "pano" / "RGB")
+
+
+def _names(*folders: Path) -> list[str]:
+    # Of a folder that is missing or closed there is none.
+    return sorted({path.stem for folder in folders for path in folder.glob(_NAME)})
+
+
+def choose_frames(frames: Sequence[str], count: int = FRAMES) -> list[str]:
+    """The frames that become panoramas: all, or every n-th from the first, about `count`.
+
+    As OmniSYNTHIA's authors chose them (Zhang et al. 2019): n is the number of frames divided by
+    `count`, rounded, halves up.
+
+    Raises:
+        SettingError: `count` is less than 1.
+
+    >>> len(choose_frames([str(i) for i in range(1250)]))
+    417
+    """
+    at_least("data.frames", count, 1)
+    step = math.floor(len(frames) / count + 0.5) if len(frames) > count else 1
+    return list(frames[::step])
+
+
+def read_camera(folder: Path, size: tuple[int, int]) -> NDArray[np.float64]:
+    """Camera matrix of all views of a sequence.
+
+    From ``CameraParams/intrinsics.txt``: the focal length, x and y of the centre, and perhaps the
+    baseline. Without that file, the one camera of the release.
+
+    Args:
+        folder: Of the sequence.
+        size: Rows and columns of the views.
+
+    Returns:
+        ``(3, 3)`` K for integer pixel centres; the file counts from pixel corners.
+
+    Raises:
+        DataError: The file holds something else, or is missing and the views have another size.
+    """
+    path = _camera_file(folder)
+    text = path.read_text(encoding="utf-8", errors="replace") if path.exists() else ""
+    numbers = list(_CAMERA) if size == _SIZE and not path.exists() else []
+    with suppress(ValueError):
+        numbers = [float(number) for number in text.replace(",", " ").split()] or numbers
+    focal, x, y = numbers[:3] if len(numbers) in (3, 4) else (0.0, 0.0, 0.0)
+    if not (0 < focal < math.inf and 0 < x < size[1] and 0 < y < size[0]):
+        raise DataError(
+            path,
+            found=repr(text[:80]) if path.exists() else "no such file",
+            expected="focal length, centre x and y, and perhaps the baseline, in pixels of "
+            f"views of {size[0]}×{size[1]}; only of {_SIZE[0]}×{_SIZE[1]} is it known without",
+            remedy="Extract the file again.",
+        )
+    return np.array([[focal, 0, x - 0.5], [0, focal, y - 0.5], [0, 0, 1]])
+
+
+def _camera_file(folder: Path) -> Path:
+    return folder / "CameraParams" / "intrinsics.txt"
+
+
 @dataclass(frozen=True)
 class SynthiaReader(PngReader):
     """Views and panoramas alike.
@@ -102,9 +244,8 @@ def read_first_channel(path: Path) -> NDArray[Any]:
     Raises:
         DataError: The file is broken.
     """
-    image = read_png(path, cv2.IMREAD_UNCHANGED)
-    # OpenCV's order is blue, green, red, and perhaps alpha.
-    return image if image.ndim == 2 else cv2.extractChannel(image, 2)
+    image = read_pixels(path, indices=True)
+    return image if image.ndim == 2 else image[..., 0]
 
 
 def read_ids(path: Path) -> NDArray[np.uint8]:

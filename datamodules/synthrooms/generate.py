@@ -28,7 +28,7 @@ from datamodules.synthrooms.writer import (
     label_strings,
     pose_record,
 )
-from tangent_train.errors import SettingError
+from tangent_train.errors import SettingError, at_least
 from tangent_train.files import write_bytes, write_text
 
 MANIFEST = "synthrooms.json"
@@ -86,9 +86,7 @@ class RoomSettings:
         numbers = {f"rooms[{area}]": count for area, count in rooms.items()}
         names = ("seed", "views_per_camera", *_LEAST)
         for name, value in {**numbers, **{name: getattr(self, name) for name in names}}.items():
-            least = _LEAST.get(name, 0)
-            if type(value) is not int or value < least:
-                raise SettingError(name, found=value, expected=f"an integer of {least} or more")
+            at_least(name, value, _LEAST.get(name, 0))
 
     @property
     def areas(self) -> list[str]:

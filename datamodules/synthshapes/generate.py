@@ -16,7 +16,7 @@ from datamodules.core.processes import in_processes
 from datamodules.core.progress import show_progress
 from datamodules.synthshapes import furniture, vessels
 from datamodules.synthshapes.parts import Parts
-from tangent_train.errors import SettingError
+from tangent_train.errors import at_least
 from tangent_train.files import write_text
 from tangent_train.geometry import rotation_about
 
@@ -60,11 +60,9 @@ class ShapeSettings:
     test: int = 30
 
     def __post_init__(self) -> None:
-        for name, value in asdict(self).items():
-            least = 0 if name == "seed" else 1
-            if type(value) is not int or value < least:
-                expected = f"an integer of {least} or more"
-                raise SettingError(f"data.shapes.{name}", found=repr(value), expected=expected)
+        at_least("data.shapes.seed", self.seed, 0)
+        at_least("data.shapes.train", self.train, 1)
+        at_least("data.shapes.test", self.test, 1)
 
 
 def plan_shapes(settings: ShapeSettings) -> dict[str, tuple[str, int]]:

@@ -45,8 +45,8 @@ from numpy.typing import NDArray
 from datamodules.core.found import SPLITS, Split, draw_groups
 from datamodules.core.image_module import PanoramaDataModule
 from datamodules.core.inputs import Input
+from datamodules.core.panoramas import ImageFiles, ImageReader
 from datamodules.core.problems import Problems
-from datamodules.core.reading import ImageFiles, ImageReader
 from datamodules.images.pixel_files import read_image_size, read_rgb
 from datamodules.zind.homes import HomePanorama, list_panoramas
 from datamodules.zind.layout import CLASSES, DOOR, Layout

@@ -12,7 +12,7 @@ from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback
 from numpy.typing import NDArray
 
-from datamodules.core.loading import at_least
+from tangent_train.errors import at_least
 from tangent_train.files import write_bytes
 from tangent_train.metrics.segmentation import segmentation_scores
 from tangent_train.results.html import EncodedImage, encode_image

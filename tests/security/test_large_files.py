@@ -18,7 +18,6 @@ from datamodules.images.pixel_files import (
     read_pixels,
     read_rgb,
 )
-from datamodules.images.png import read_color_png, read_depth_png
 from tangent_train.errors import DataError
 from tests.slow.fuzz.mutation import sealed_png
 
@@ -52,7 +51,7 @@ def no_decoder(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("no_decoder")
 @pytest.mark.parametrize("size", [(32769, 16384), (2**31 - 1, 2**31 - 1)])
-@pytest.mark.parametrize("read", [read_color_png, read_depth_png, _pixels, _depth, read_rgb])
+@pytest.mark.parametrize("read", [_pixels, _depth, read_rgb])
 def test_images_are_measured_before_they_are_decoded(
     read: Read, size: tuple[int, int], tmp_path: Path
 ) -> None:
@@ -64,13 +63,12 @@ def test_images_are_measured_before_they_are_decoded(
 
 
 @pytest.mark.usefixtures("no_decoder")
-@pytest.mark.parametrize("read", [read_color_png, _pixels])
-def test_chunks_that_claim_gigabytes_are_not_decoded(read: Read, tmp_path: Path) -> None:
+def test_chunks_that_claim_gigabytes_are_not_decoded(tmp_path: Path) -> None:
     path = _png(tmp_path / "a.png", 16, 8)
     whole = path.read_bytes()
     path.write_bytes(whole[:33] + struct.pack(">I", 3_000_000_000) + whole[37:])
     with pytest.raises(DataError, match=r"a\.png: found .* truncated"):
-        read(path)
+        _pixels(path)
 
 
 def test_the_largest_panoramas_are_allowed(tmp_path: Path) -> None:

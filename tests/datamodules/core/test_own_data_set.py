@@ -12,13 +12,12 @@ from numpy.typing import NDArray
 
 from datamodules.core.found import Split
 from datamodules.core.image_module import PanoramaDataModule
+from datamodules.core.panoramas import ImageFiles, PngReader
 from datamodules.core.problems import Problems
-from datamodules.core.reading import ImageFiles, PngReader
-from datamodules.images.png import read_png
+from datamodules.images.pixel_files import read_pixels
 from tangent_train.errors import DataError, SettingError
 from tangent_train.rendering import EquirectRepresentation
-from tests.datamodules.data_files import read_png as read_as_stored
-from tests.datamodules.data_files import write_png
+from tests.datamodules.data_files import read_png, write_png
 
 FORMATS = {"rgb": (8, ("RGB",)), "labels": (8, ("grey",))}
 
@@ -27,7 +26,7 @@ class ToyReader(PngReader):
     formats = FORMATS
 
     def labels(self, files: ImageFiles, shape: tuple[int, int] | None = None) -> NDArray[np.uint8]:
-        labels: NDArray[np.uint8] = read_png(files.labels, cv2.IMREAD_UNCHANGED)
+        labels: NDArray[np.uint8] = read_pixels(files.labels, indices=True)
         return labels if shape is None else cv2.resize(labels, shape[::-1], interpolation=0)
 
 
@@ -61,7 +60,7 @@ def test_a_data_set_is_a_reader_and_its_files(tmp_path: Path) -> None:
     data.prepare_data()
     assert len(data.source("train")) == 2
     sample = data.evaluation_samples("test")[0, 0]
-    np.testing.assert_array_equal(sample.target, read_as_stored(tmp_path / "labels" / "c.png"))
+    np.testing.assert_array_equal(sample.target, read_png(tmp_path / "labels" / "c.png"))
     problems, count = data.check()
     assert not problems.items
     assert count == 3

@@ -10,14 +10,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from datamodules.core.panoramas import Panorama
+from datamodules.core.found import Found, SplitItems
+from datamodules.core.panoramas import ImageFiles, Panorama
 from datamodules.core.pipeline import (
     EstimatedUp,
-    PosedUp,
     RotatedPanoramas,
-    SplitItems,
 )
-from datamodules.core.reading import ImageFiles
 from tangent_train.errors import DataError
 from tangent_train.geometry import equirect_directions
 
@@ -66,21 +64,6 @@ def test_image_depth_labels_and_up_rotate_together(
     np.testing.assert_allclose(found, R @ ((0, 0, 1) if up is None else up), atol=1e-12)
     unknown = RotatedPanoramas(rotation, seed=5)(_heights()._replace(depth=None, up=up), 0)
     assert (unknown.depth, unknown.up) == (None, None)
-
-
-def test_files_are_asked_once_where_up_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[str] = []
-
-    def up_of(path: Path) -> NDArray[np.float64] | None:
-        asked.append(str(path))
-        return UP if str(path) == "1" else None
-
-    monkeypatch.setattr("datamodules.core.pipeline.up_of", up_of)
-    posed = PosedUp()
-    for _ in range(2):
-        assert posed(_heights(), 0, FILES[0]).up is None
-        np.testing.assert_array_equal(posed(_heights(), 1, FILES[1]).up, UP)
-    assert asked == ["0", "1"]
 
 
 @pytest.mark.parametrize("found", [None, UP])
@@ -134,7 +117,7 @@ def test_what_is_remembered_is_read_once_and_what_is_broken_is_listed() -> None:
     def double(panorama: Panorama, index: int, files: Any) -> Panorama:
         return panorama._replace(labels=panorama.labels * 0 + index)
 
-    items = SplitItems(FILES, decode, Panorama, transforms=[double])
+    items = SplitItems(Found("panoramas", {"test": FILES}, decode), "test", Panorama, [double])
     items.remember("data")
     for index in (0, 1):
         np.testing.assert_array_equal(items.read(index).rgb, _heights().rgb)
@@ -143,4 +126,4 @@ def test_what_is_remembered_is_read_once_and_what_is_broken_is_listed() -> None:
     assert sorted(read) == ["0", "1"]
     broken = [file._replace(name="broken", rgb=Path(f"b{file.name}")) for file in FILES]
     with pytest.raises(DataError, match=r"data: found 2 problems(.|\n)*b0(.|\n)*b1"):
-        SplitItems(broken, decode, Panorama).remember("data")
+        SplitItems(Found("panoramas", {"test": broken}, decode), "test", Panorama).remember("data")

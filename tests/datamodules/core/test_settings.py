@@ -31,12 +31,10 @@ CROPS: Any = PerspectiveRepresentation(level=5)
     ("data", "settings", "name"),
     [
         (Stanford2D3DS, {"panoramas_per_step": 0}, "panoramas_per_step"),
-        (Stanford2D3DS, {"seed": -1}, "seed"),
         (Stanford2D3DS, {"normalization": RGB_NORMALIZATION}, "normalization"),
         (Stanford2D3DS, {"color_jitter": 1.1}, "color_jitter"),
         (Stanford2D3DS, {"inputs": "rgb"}, "inputs: found rgb; expected a list"),
         (Stanford2D3DS, {"inputs": ("depth",)}, "inputs"),
-        (Stanford2D3DS, {"inputs": ("rgb", "rgb")}, "inputs"),
         (Stanford2D3DS, {"inputs": ("rgb", "heat")}, "inputs"),
         (Stanford2D3DS, {"upright": "maybe"}, "upright"),
         (Stanford2D3DS, {"max_tilt_deg": 0}, "max_tilt_deg"),

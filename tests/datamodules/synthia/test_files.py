@@ -9,10 +9,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from datamodules.core.reading import ImageFiles
-from datamodules.synthia.files import choose_frames, read_camera
+from datamodules.core.panoramas import ImageFiles
 from datamodules.synthia.omnisynthia import divide
-from datamodules.synthia.reader import CLASSES, VIEW_FORMATS, SynthiaReader
+from datamodules.synthia.reader import (
+    CLASSES,
+    VIEW_FORMATS,
+    SynthiaReader,
+    choose_frames,
+    read_camera,
+)
 from tangent_train.errors import DataError
 from tests.datamodules.data_files import write_png
 

@@ -10,8 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from datamodules.core.problems import Problems
-from datamodules.synthia.files import VIEWS
 from datamodules.synthia.generate import make_panoramas
+from datamodules.synthia.reader import VIEWS
 from tangent_train.geometry import equirect_directions
 from tests.datamodules.data_files import contents, read_png
 from tests.datamodules.synthia import synthia_format as synthia

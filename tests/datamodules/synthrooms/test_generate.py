@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from contextlib import suppress
 from typing import Any
 
 import cv2
@@ -11,7 +10,6 @@ import pytest
 
 from datamodules.synthrooms.camera import PanoramaView, PerspectiveView, Pose, euler_rotation
 from datamodules.synthrooms.generate import RoomSettings, plan_rooms
-from datamodules.synthrooms.layout import FloorPlan, NoPlaceError, Rectangle
 from datamodules.synthrooms.raycast import RayScene
 from datamodules.synthrooms.render import MISSING, Picture, draw_camera, draw_holes, render
 from datamodules.synthrooms.room import UNKNOWN, Room
@@ -51,26 +49,6 @@ def test_rooms_have_as_many_cameras_as_wanted_and_are_the_same_rooms() -> None:
 def test_what_cannot_work_is_named(wrong: dict[str, Any], message: str) -> None:
     with pytest.raises(SettingError, match=message):
         RoomSettings(**wrong)
-
-
-@pytest.mark.parametrize("notch", [None, (2.0, 1.5)])
-def test_what_stands_on_the_floor_keeps_apart_and_inside(
-    notch: tuple[float, float] | None,
-) -> None:
-    rng = np.random.default_rng(0)
-    plan = FloorPlan((6.0, 5.0, 2.8), notch)
-    areas = []
-    for _ in range(30):
-        with suppress(NoPlaceError):
-            at_wall = plan.against_wall(rng, 1.2, 0.5, "full")
-            areas.append(Rectangle.around(at_wall, (-0.6, 0.6), (0.01, 0.5)))
-        with suppress(NoPlaceError):
-            free = plan.in_the_open(rng, 0.8, 0.6)
-            areas.append(Rectangle.around(free, (-0.4, 0.4), (-0.3, 0.3)))
-    assert len(areas) > 8
-    for k, area in enumerate(areas):
-        assert plan.contains(area)
-        assert not any(area.meets(other) for other in areas[:k])
 
 
 SEEDS = range(60)

@@ -16,17 +16,15 @@ import OpenEXR
 from numpy.typing import NDArray
 from PIL import Image
 
+from datamodules.core.panoramas import ImageFiles
 from datamodules.core.problems import Problems
-from datamodules.core.reading import ImageFiles
 from datamodules.folder.cameras import read_cameras as read_photo_cameras
 from datamodules.folder.classes import read_classes
 from datamodules.images.gpano import area_of, up_of
 from datamodules.images.pixel_files import read_depth_m, read_pixels
-from datamodules.images.png import check_png, read_color_png, read_depth_png
 from datamodules.modelnet40.meshes import read_off
-from datamodules.stanford2d3ds.label_table import CLASSES, LabelTable
 from datamodules.stanford2d3ds.pairs import read_panorama_pose
-from datamodules.stanford2d3ds.reader import read_camera_matrix
+from datamodules.stanford2d3ds.reader import CLASSES, LabelTable, read_camera_matrix
 from datamodules.zind.homes import list_panoramas
 from tangent_train.errors import DataError
 from tangent_train.geometry import TangentGrid, rotation_about
@@ -170,25 +168,6 @@ def _read_home(path: Path) -> None:
         assert ((distances > 0) & (distances < np.inf) | np.isnan(distances)).all()
 
 
-def _label_image_seeds() -> list[bytes]:
-    indices = np.zeros_like(_RGB)
-    indices[..., 2] = _RGB[..., 2] % 14
-    return [_image(indices), _image(np.dstack([indices, indices[..., :1]])), _image(_DEPTH)]
-
-
-def _read_label_image(path: Path) -> None:
-    with path.open("rb") as file:
-        is_depth = file.read(25)[24:] == b"\x10"
-    if is_depth:
-        header = check_png(path, 16, ("grey",))
-        assert read_depth_png(path).shape == header[:2]
-        return
-    header = check_png(path, 8, ("RGB", "RGBA"))
-    labels = LabelTable(np.arange(14, dtype=np.uint8)).decode(read_color_png(path))
-    assert labels.shape == header[:2]
-    assert labels.max() <= len(CLASSES)
-
-
 def _gpano_seeds() -> list[bytes]:
     tags = {"ProjectionType": "equirectangular", "FullPanoWidthPixels": 360}
     tags |= {"FullPanoHeightPixels": 180, "CroppedAreaImageWidthPixels": 60}
@@ -249,7 +228,6 @@ TARGETS: dict[str, tuple[Callable[[], list[bytes]], Callable[[Path], None]]] = {
     "pose": (_pose_seeds, _read_pose),
     "off": (_off_seeds, _read_mesh),
     "home": (_home_seeds, _read_home),
-    "label_image": (_label_image_seeds, _read_label_image),
     "gpano": (_gpano_seeds, _read_gpano),
     "pixels": (_pixel_seeds, _read_image),
 }
