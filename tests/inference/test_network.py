@@ -175,9 +175,8 @@ _RGB = np.zeros((16, 32, 3), np.uint8)
     [
         (_RGB[:, :31], "found 16×31 pixels; expected the whole sphere.*fov="),
         (_RGB[..., 0], r"ndarray \(16, 32\) of uint8; expected .* array \(H, W, 3\)"),
-        (_RGB.transpose(2, 0, 1), r"transpose\(1, 2, 0\)"),
-        (torch.zeros(16, 32, 3, dtype=torch.uint8), r"tensor \(3, H, W\).*permute\(2, 0, 1\)"),
-        (torch.zeros(3, 16, 32), "found Tensor.*float32.*times 255"),
+        (torch.zeros(16, 32, 3, dtype=torch.uint8), r"found Tensor \(16, 32, 3\).*\(3, H, W\)"),
+        (torch.zeros(3, 16, 32), "found Tensor.*float32; expected RGB of 0 to 255"),
         (_RGB[:0, :0], r"\(0, 0, 3\)"),
         ("room.jpg", "found str"),
     ],

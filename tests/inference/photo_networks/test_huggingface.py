@@ -109,7 +109,7 @@ def test_files_that_are_missing(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"config\.json: found list; expected a JSON object"):
         networks.imported(folder)
     (folder / "config.json").unlink()
-    with pytest.raises(DataError, match=r"config\.json: found no such file"):
+    with pytest.raises(DataError, match=r"config\.json: found No such file"):
         networks.imported(folder)
 
 
