@@ -141,7 +141,6 @@ def test_a_map_of_a_map() -> None:
     ("content", "message"),
     [
         (None, "found No such file"),
-        ("{", "expected a class map"),
         ({"source": 1, "classes": {"wall": ["wall"]}}, "found source=1"),
         ({"classes": {"wall": "wall"}}, "found wall='wall' in classes"),
         ({"classes": {"wall\n": ["wall"]}}, "found names="),

@@ -13,6 +13,7 @@ import onnx
 import onnxruntime
 import pytest
 import torch
+from safetensors import safe_open
 from safetensors.numpy import load_file
 from safetensors.torch import save_file
 
@@ -44,12 +45,9 @@ def files(trained: TrainedNetwork, tmp_path_factory: pytest.TempPathFactory) -> 
 def _metadata(path: Path) -> Any:
     """Read without this package's own code."""
     if path.suffix == ".onnx":
-        text = next(p.value for p in onnx.load(path).metadata_props if p.key == "tangent_train")
-    else:
-        content = path.read_bytes()
-        header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])
-        text = header["__metadata__"]["tangent_train"]
-    return json.loads(text)
+        return json.loads(onnx.load(path).metadata_props[0].value)
+    with safe_open(path, "numpy") as file:
+        return json.loads(file.metadata()["tangent_train"])
 
 
 def test_onnxruntime_computes_what_pytorch_does(
@@ -186,15 +184,11 @@ def test_what_would_compute_something_else_is_refused(
 def test_other_files_are_refused(files: dict[str, Path], tmp_path: Path) -> None:
     path = tmp_path / "net.onnx"
     model = onnx.load(files[".onnx"])
-    text = model.metadata_props[0].value
-    for value, message in (
-        ("{", "no JSON in 'tangent_train' of its metadata"),
-        (text.replace('"inputs"', '"input"'), "no inputs in 'tangent_train'"),
-    ):
-        onnx.helper.set_model_props(model, {"tangent_train": value})
-        onnx.save(model, path)
-        with pytest.raises(DataError, match=f"net.onnx: found .*{message}"):
-            load_trained(path)
+    text = model.metadata_props[0].value.replace('"inputs"', '"input"')
+    onnx.helper.set_model_props(model, {"tangent_train": text})
+    onnx.save(model, path)
+    with pytest.raises(DataError, match=r"net\.onnx: found no inputs in 'tangent_train'"):
+        load_trained(path)
     path = tmp_path / "net.safetensors"
     save_file({"a": torch.zeros(2)}, path)
     with pytest.raises(DataError, match="found no JSON in 'tangent_train' of its metadata"):
