@@ -145,7 +145,7 @@ def test_fine_tuning_leaves_a_run_of_its_own(
     tuned = ["data.inputs=[rgb]", "trainer.max_epochs=1", "task.frozen=[stem,downs]"]
     slower = ["optimizer.backbone_lr_factor=0.1", "hydra.run.dir=tuned", f"init_from={path}"]
     run("train", *typed, rooms, *tuned, *slower)
-    assert "  head (2 tensors): of other classes in the file\n" in capsys.readouterr().out
+    assert "  of other classes in the file: head.weight, head.bias\n" in capsys.readouterr().out
     path.unlink()
     checkpoint = tmp_path / "tuned" / "checkpoints" / "best.ckpt"
     content = torch.load(checkpoint, weights_only=True)

@@ -162,22 +162,16 @@ def test_scores_of_other_classes_are_left_out_though_they_fit(tmp_path: Path) ->
 
 
 def test_every_tensor_that_is_not_loaded_is_named(tmp_path: Path) -> None:
-    """By module where all of one have the same fate."""
-    network = nn.ModuleDict({"encoder": _network(64), "head": nn.Sequential(nn.Linear(2, 2))})
-    found = {f"encoder.{name}": t for name, t in _network(64).state_dict().items()}
-    found["encoder.0.weight"] = torch.ones(4, 64, 5, 5)
-    found["encoder.1.weight"] = torch.ones(7)
-    del found["encoder.3.bias"]
-    found |= {f"aux.{name}": tensor for name, tensor in _network().state_dict().items()}
-    torch.save(found | {"encoder.odd": torch.ones(2)}, tmp_path / "x.pt")
+    network = nn.Sequential(_network(64), nn.Linear(2, 2))
+    found = {f"0.{name}": t for name, t in _network(64).state_dict().items()}
+    found |= {"0.0.weight": torch.ones(4, 64, 5, 5), "0.odd": torch.ones(2)}
+    del found["0.3.bias"]
+    torch.save(found, tmp_path / "x.pt")
     lines = str(initialize(network, tmp_path / "x.pt")).splitlines()
     assert lines[1:] == [
-        "untrained: 5",
-        "  encoder.0.weight: (4, 64, 5, 5) in the file, (4, 64, 3, 3) here",
-        "  encoder.1.weight: (7,) in the file, (4,) here",
-        "  encoder.3.bias: not in the file",
-        "  head (2 tensors): not in the file",
-        "not used: 12",
-        "  aux (11 tensors): not in the network",
-        "  encoder.odd: not in the network",
+        "untrained: 4",
+        "  (4, 64, 5, 5) in the file, (4, 64, 3, 3) here: 0.0.weight",
+        "  not in the file: 0.3.bias, 1.weight, 1.bias",
+        "not used: 1",
+        "  not in the network: 0.odd",
     ]
