@@ -22,6 +22,7 @@ from models.onnx_network import OnnxNetwork
 from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
 from tangent_train.errors import DataError, SettingError
 from tangent_train.inference.export import SUFFIXES, export_network
+from tests.inference.trained import TANGENT
 from tests.tasks.odd_networks import assert_same, own, scores_of, some_images
 from tests.tasks.small_networks import NAMES, UNET, small_trained
 
@@ -78,11 +79,7 @@ def test_everything_known_of_a_network_comes_back(
         "inputs": ["rgb", "depth"],
         "normalization": {"mean": [0.5, 0.4, 0.3, 1.1], "std": [0.2, 0.25, 0.3, 0.8]},
         "level": 5,
-        "representation": {
-            "_target_": "tangent_train.rendering.TangentRepresentation",
-            "base_level": 0,
-            "level": 5,
-        },
+        "representation": TANGENT | {"level": 5},
         "image_size": [32, 32],
         "size_multiple": 4,
         "fixed_size": None,
