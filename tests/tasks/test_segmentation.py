@@ -39,7 +39,8 @@ class Data(lightning.LightningDataModule):
         rng = np.random.default_rng(0)
         coarse = rng.normal(size=(count, 2, 4, 8, 1)).astype(np.float32)
         panoramas = coarse.repeat(8, axis=2).repeat(8, axis=3)
-        self.train, self.test = [], []
+        self.train: Any = []
+        self.test: Any = []
         for signal, other in panoramas:
             truth = np.where(signal > 0, 2, 1).astype(np.uint8)[..., 0]
             truth[:2] = 0
@@ -54,10 +55,10 @@ class Data(lightning.LightningDataModule):
             self.test.append(EvaluationSample(tensor, torch.from_numpy(truth), *where, 0))
 
     def train_dataloader(self) -> DataLoader[Any]:
-        return DataLoader(self.train, self.batch_size)  # type: ignore[arg-type]
+        return DataLoader(self.train, self.batch_size)
 
     def val_dataloader(self) -> DataLoader[Any]:
-        return DataLoader(self.test, batch_size=2)  # type: ignore[arg-type]
+        return DataLoader(self.test, batch_size=2)
 
     test_dataloader = val_dataloader
 
