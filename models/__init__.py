@@ -12,7 +12,6 @@ if TYPE_CHECKING:
     from models.fine_tuning import initialize as initialize
     from models.hexunet import HexUNet as HexUNet
     from models.huggingface import HuggingFaceNetwork as HuggingFaceNetwork
-    from models.multi_view import MultiView as MultiView
     from models.shape_classifier import ShapeClassifier as ShapeClassifier
     from models.sphere_attention import SphereAttention as SphereAttention
     from models.sphere_context import SphereContext as SphereContext
@@ -24,7 +23,6 @@ _FILES = {
     "FCNResNet": "fcn_resnet",
     "HexUNet": "hexunet",
     "HuggingFaceNetwork": "huggingface",
-    "MultiView": "multi_view",
     "ShapeClassifier": "shape_classifier",
     "SphereAttention": "sphere_attention",
     "SphereContext": "sphere_context",

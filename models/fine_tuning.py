@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -34,14 +34,13 @@ class Origins(NamedTuple):
     def __str__(self) -> str:
         """A few lines for the terminal."""
         lines = [f"loaded: {len(self.loaded)} tensors, {self.share:.1%} of the network's numbers"]
-        everything = (*self.loaded, *self.adapted, *self.fresh, *self.unused)
         for kind, reasons in (
             ("adapted", self.adapted),
             ("untrained", self.fresh),
             ("not used", dict.fromkeys(self.unused, "not in the network")),
         ):
             lines += [f"{kind}: {len(reasons)}"] * bool(reasons)
-            lines += _grouped(reasons, everything)
+            lines += _by_reason(reasons)
         return printable("\n".join(lines))
 
 
@@ -164,21 +163,10 @@ def _prefix(names: Iterable[str], ends: Mapping[str, object]) -> str:
     return min(counts, key=lambda prefix: (-counts[prefix], len(prefix)), default="")
 
 
-def _grouped(reasons: Mapping[str, str], everything: Collection[str]) -> list[str]:
-    """A line per tensor, or per module whose tensors all have the same reason."""
-    sizes = Counter(module for name in everything for module in _modules(name))
-    alike = Counter((module, why) for name, why in reasons.items() for module in _modules(name))
-    groups: defaultdict[tuple[str, str], list[str]] = defaultdict(list)
+def _by_reason(reasons: Mapping[str, str]) -> Iterator[str]:
+    """A line per reason, with the names of all its tensors."""
+    names: defaultdict[str, list[str]] = defaultdict(list)
     for name, why in reasons.items():
-        whole = (m for m in _modules(name) if alike[m, why] == sizes[m])
-        groups[next(whole, name), why].append(name)
-    return [
-        f"  {names[0]}: {why}" if len(names) == 1 else f"  {place} ({len(names)} tensors): {why}"
-        for (place, why), names in groups.items()
-    ]
-
-
-def _modules(name: str) -> list[str]:
-    """Names of the modules that a tensor is in, the largest first."""
-    parts = name.split(".")
-    return [".".join(parts[:k]) for k in range(1, len(parts))]
+        names[why].append(name)
+    for why, found in names.items():
+        yield f"  {why}: {', '.join(found)}"

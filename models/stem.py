@@ -32,26 +32,20 @@ def widen_stem(network: nn.Module, in_channels: int) -> nn.Module:
     """
     if in_channels < _RGB:
         raise SettingError("network.in_channels", found=in_channels, expected="3 or more")
-    stem = first_convolution(network)
-    if stem.in_channels != _RGB or stem.groups != 1:
-        raise _unfit(network, stem)
+    convolutions = (module for module in network.modules() if isinstance(module, nn.Conv2d))
+    stem = next(convolutions, None)
+    if stem is None or stem.in_channels != _RGB or stem.groups != 1:
+        raise SettingError(
+            f"first convolution of {type(network).__name__}",
+            found=stem or "none",
+            expected="one that takes the three channels of an RGB image",
+            remedy="Networks that only take those need data.inputs=[rgb].",
+        )
     if in_channels > _RGB:
         places = [*range(_RGB), *[None] * (in_channels - _RGB)]
         stem.weight = nn.Parameter(select_channels(stem.weight.detach(), places))
         stem.in_channels = in_channels
     return network
-
-
-def first_convolution(network: nn.Module) -> nn.Conv2d:
-    """The first convolution of a network, in the order of definition.
-
-    Raises:
-        SettingError: There is none.
-    """
-    for module in network.modules():
-        if isinstance(module, nn.Conv2d):
-            return module
-    raise _unfit(network, "none")
 
 
 def select_channels(weight: Tensor, places: Sequence[int | None]) -> Tensor:
@@ -66,12 +60,3 @@ def select_channels(weight: Tensor, places: Sequence[int | None]) -> Tensor:
     """
     zeros = torch.zeros_like(weight[:, 0])
     return torch.stack([zeros if k is None else weight[:, k] for k in places], dim=1)
-
-
-def _unfit(network: nn.Module, found: object) -> SettingError:
-    return SettingError(
-        f"first convolution of {type(network).__name__}",
-        found=found,
-        expected="one that takes the three channels of an RGB image",
-        remedy="Networks that only take those need data.inputs=[rgb].",
-    )

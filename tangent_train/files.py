@@ -169,18 +169,17 @@ def load_plain(path: Path, expected: str, *, mmap: bool = False) -> Any:
         raise DataError(path, found=found, expected=expected, remedy=remedy) from error
 
 
-def parse_json(text: str | bytes, **options: Any) -> Any:
+def parse_json(text: str | bytes) -> Any:
     """`json.loads`, with a `ValueError` for text that is nested too deeply.
 
     Args:
         text: UTF-8, UTF-16 or UTF-32 where it is bytes.
-        **options: For `json.loads`.
 
     Raises:
         ValueError: It is no JSON.
     """
     try:
-        return json.loads(text, **options)
+        return json.loads(text)
     except RecursionError as error:
         raise ValueError("its brackets are nested too deeply") from error
 

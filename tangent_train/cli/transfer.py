@@ -170,4 +170,4 @@ def _report(
     report.tables()[0].print()
     for note in report.all_notes():
         say(f"- {note}")
-    say(f"Tables and a chart: {folder / name}.md, .csv, .json, .png")
+    say(f"Tables and a chart: {folder / name}.md, .csv, .png")

@@ -16,12 +16,12 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from tangent_train.checkpoints.scores import Scores
 from tangent_train.checkpoints.trained import TrainedNetwork
 from tangent_train.errors import DataError, SettingError
-from tangent_train.files import parse_json
+from tangent_train.files import read_json
 from tangent_train.registry import Text, check_fields
 
 Unmapped = Literal["unknown", "never"]
@@ -97,10 +97,7 @@ def load_class_map(given: str) -> ClassMap:
         raise SettingError(
             "class_map", found=given, expected=f"{', '.join(shipped)}; or a file my_map.json"
         )
-    try:
-        content = parse_json(path.read_text(encoding="utf-8"), object_pairs_hook=_once_each)
-    except (OSError, ValueError) as error:
-        raise DataError(path, found=error, expected=_EXPECTED) from error
+    content = read_json(path, _EXPECTED)
     fields = check_fields(path, content, {"source": Text | None, "classes": dict}, _EXPECTED)
     classes = fields["classes"]
     check_fields(path, {"names": list(classes)}, {"names": list[Text]}, _EXPECTED, "classes")
@@ -176,11 +173,3 @@ def _plain(name: str) -> str:
     """The first synonym of a name, as names are compared."""
     first = name.partition(",")[0].replace("-", " ").replace("_", " ")
     return " ".join(first.casefold().split())
-
-
-def _once_each(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    names = Counter(name for name, _ in pairs)
-    twice = [name for name, count in names.items() if count > 1]
-    if twice:
-        raise ValueError(f"{', '.join(twice)} more than once")
-    return dict(pairs)

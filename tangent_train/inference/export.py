@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import logging
-import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -24,6 +19,7 @@ from tangent_train.checkpoints.trained import (
 )
 from tangent_train.errors import SettingError
 from tangent_train.files import atomic_path
+from tangent_train.inference.quiet import quiet
 
 SUFFIXES = (".onnx", ".safetensors")
 
@@ -135,7 +131,7 @@ def _write_onnx(trained: TrainedNetwork, path: Path, opset: int | None) -> None:
         shape |= {2: step * torch.export.Dim("h"), 3: step * torch.export.Dim("w")}
         least = -(-_LEAST_TRACED // step)
         size = step * max(3, least), step * max(4, least + 1)  # no two dimensions are equal
-    with _quiet_exporter():
+    with quiet():
         program: Any = torch.onnx.export(
             trained.network,
             (_random_images(trained, 2, size),),
@@ -153,20 +149,6 @@ def _write_onnx(trained: TrainedNetwork, path: Path, opset: int | None) -> None:
     written_as = replace(trained, settings=None, groups=groups)  # the graph adds them up
     program.model.metadata_props[METADATA_KEY] = metadata_json(written_as)
     program.save(path, external_data=False)
-
-
-@contextmanager
-def _quiet_exporter() -> Iterator[None]:
-    """Hide the exporter's developer notes: its output is verified anyway."""
-    disabled = logging.root.manager.disable
-    logging.disable()
-    try:
-        silent = io.StringIO()
-        with warnings.catch_warnings(), redirect_stdout(silent), redirect_stderr(silent):
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        logging.disable(disabled)
 
 
 def _write_safetensors(trained: TrainedNetwork, path: Path) -> None:

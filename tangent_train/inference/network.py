@@ -109,10 +109,6 @@ class Network:
         self._panoramas = panoramas
         self._make_photos = photos
 
-    def __repr__(self) -> str:
-        seen = " and ".join(self.trained.inputs)
-        return f"<Network of {len(self.class_names) - 1} classes, sees {seen}>"
-
     def labels(
         self,
         image: Pixels,
@@ -218,17 +214,10 @@ def _rgb(image: Any) -> NDArray[np.uint8]:
     channels = 0 if is_tensor else -1
     if fits and array.shape[channels] == 3 and array.size:
         return np.ascontiguousarray(np.moveaxis(array, channels, -1))
-    remedy = ""
-    if fits and array.shape[-1 - channels] == 3:
-        change = ".permute(2, 0, 1)" if is_tensor else ".transpose(1, 2, 0)"
-        remedy = f"{change} puts its channels where they belong."
-    elif isinstance(array, np.ndarray) and array.dtype.kind == "f":
-        remedy = "Floats of 0 to 1 times 255, rounded, are such numbers."
     raise SettingError(
         "image",
         found=_described(image),
         expected="RGB of 0 to 255: a uint8 tensor (3, H, W) or array (H, W, 3)",
-        remedy=remedy,
     )
 
 

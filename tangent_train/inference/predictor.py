@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from datamodules.core.inputs import Input, Normalization
     from tangent_train.checkpoints.trained import TrainedNetwork
-    from tangent_train.inference.views import InputImage, ViewSets
+    from tangent_train.inference.views import InputImage, PanoramaViews, PhotoViews
 
 _PIXELS_PER_FORWARD = 2**20
 
@@ -98,7 +98,7 @@ class Predictor:
 
     Args:
         trained: The network; it is moved to the device.
-        view_sets: Its views: `PanoramaViews` or `PhotoViews`.
+        view_sets: Its views.
         device: A torch device, or ``auto``: a GPU if there is one.
         images_per_forward: Views per call of the network, which bounds memory; None for 2^20
             pixels' worth. A network with cross-image attention takes all views of a panorama
@@ -115,7 +115,7 @@ class Predictor:
     def __init__(
         self,
         trained: TrainedNetwork,
-        view_sets: ViewSets,
+        view_sets: PanoramaViews | PhotoViews,
         device: str = "cpu",
         images_per_forward: int | None = None,
         min_confidence: float = 0.0,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -82,19 +82,8 @@ class ViewSet:
     rays: NDArray[np.float32] = field(default_factory=lambda: NO_RAYS)
 
 
-class ViewSets(Protocol):
-    """Chooses the views of images of one kind; the scores of several sets are averaged."""
-
-    blend: Blend
-    image_size: tuple[int, int]
-
-    def __call__(self, image: InputImage) -> list[ViewSet]:
-        """The view sets of one image."""
-        ...
-
-
 class PanoramaViews:
-    """Views of panoramas, by default those of training.
+    """Views of panoramas, by default those of training; scores of several sets are averaged.
 
     Networks trained on photos get tangent images of base level 1, at the level that matches the
     angular resolution of their crops.

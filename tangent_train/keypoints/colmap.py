@@ -24,9 +24,6 @@ if TYPE_CHECKING:
     from tangent_train.rendering import RigFile
 
 
-_SIFT = 128
-
-
 def add_pair(
     path: Path,
     names: tuple[str, str],
@@ -41,8 +38,7 @@ def add_pair(
         path: The database; created if it is missing.
         names: Of the left and the right image, relative to COLMAP's image folder.
         shapes: ``(H, W)`` of their files.
-        keypoints: Their keypoints. Only SIFT's descriptors are written: COLMAP has no type for
-            ORB's, and needs none, as there are matches.
+        keypoints: Their keypoints, with SIFT's descriptors.
         matches: ``(m, 2)`` indices of keypoints.
         geometry: The geometry of the m matches.
 
@@ -75,10 +71,9 @@ def _image_id(
     database.write_frame(frame)
     pixels = keypoints.equirect_pixels(shape) + 0.5
     database.write_keypoints(image_id, pixels.astype(np.float32))
-    if keypoints.descriptors.shape[1] == _SIFT:
-        numbers = np.rint(keypoints.descriptors).clip(0, 255).astype(np.uint8)
-        kind = pycolmap.FeatureExtractorType.SIFT
-        database.write_descriptors(image_id, pycolmap.FeatureDescriptors(kind, numbers))
+    numbers = np.rint(keypoints.descriptors).clip(0, 255).astype(np.uint8)
+    kind = pycolmap.FeatureExtractorType.SIFT
+    database.write_descriptors(image_id, pycolmap.FeatureDescriptors(kind, numbers))
     return image_id
 
 

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import cv2
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_to_lonlat, lonlat_to_xyz
 from tangent_train.keypoints.spherical import (
     SphericalKeypoints,
@@ -27,13 +25,6 @@ if TYPE_CHECKING:
 
 
 _cv2: Any = cv2  # its types lack the detectors
-
-_SMALLEST_SIDE = 16
-"""Pixels; ORB's pyramid fails on smaller images."""
-
-_ORB_SCALE = 1.2
-_ORB_KEYPOINTS = 10_000
-"""Most keypoints of a panorama with ORB, which finds far too many corners otherwise."""
 
 _WRAP_SHARE = 8
 """A panorama is continued by W/8 columns: SIFT's descriptors reach 5.3 times a keypoint's size, so
@@ -56,81 +47,38 @@ class Detections(NamedTuple):
         sizes: ``(n,)`` float64 diameters in pixels.
         angles_rad: ``(n,)`` float64 from right towards down.
         responses: ``(n,)`` float32.
-        descriptors: ``(n, D)`` float32 or uint8.
+        descriptors: ``(n, 128)`` float32.
     """
 
     points_xy: NDArray[np.float64]
     sizes: NDArray[np.float64]
     angles_rad: NDArray[np.float64]
     responses: NDArray[np.float32]
-    descriptors: NDArray[np.float32] | NDArray[np.uint8]
+    descriptors: NDArray[np.float32]
 
 
-@dataclass(frozen=True)
-class Detector:
-    """One of OpenCV's detectors with its descriptor, without their known position errors.
+def detect(gray: NDArray[np.uint8]) -> Detections:
+    """Detect and describe SIFT keypoints. Several threads may call it at once.
 
-    * ``sift`` runs with ``enable_precise_upscale``: without it positions are off by ¼ pixel.
-    * ``orb``: positions found in downscaled images are mapped back from edge to edge. OpenCV's
-      are off by up to a pixel and more where sizes are not divisible.
+    OpenCV runs with ``enable_precise_upscale``: without it positions are off by ¼ pixel.
 
     Args:
-        name: ``sift`` or ``orb``.
+        gray: ``(h, w)`` uint8.
 
-    Raises:
-        SettingError: The name is unknown.
+    Returns:
+        All keypoints, in OpenCV's order; none within 1¾ pixels of the borders.
     """
-
-    name: str = "sift"
-
-    def __post_init__(self) -> None:
-        if self.name not in ("sift", "orb"):
-            raise SettingError("detector", found=repr(self.name), expected="sift or orb")
-
-    @property
-    def norm(self) -> Literal["l2", "hamming"]:
-        """Descriptor distance: L2 for float32, Hamming for uint8 bits."""
-        return "l2" if self.name == "sift" else "hamming"
-
-    def detect(self, gray: NDArray[np.uint8]) -> Detections:
-        """Detect and describe keypoints. Several threads may call it at once.
-
-        Args:
-            gray: ``(h, w)`` uint8.
-
-        Returns:
-            All keypoints, in OpenCV's order. SIFT finds none within 1¾ pixels of the borders, ORB
-            none within 31.
-        """
-        if self.name == "sift":
-            engine = _cv2.SIFT_create(enable_precise_upscale=True)
-        else:
-            engine = _cv2.ORB_create(2**24, _ORB_SCALE)  # all; the strongest are chosen later
-        points: Any = ()
-        if min(gray.shape) >= _SMALLEST_SIDE:
-            points, descriptors = engine.detectAndCompute(np.ascontiguousarray(gray), None)
-        if not len(points):
-            kind = np.float32 if self.norm == "l2" else np.uint8
-            descriptors = np.empty((0, engine.descriptorSize()), kind)
-        table = [(*p.pt, p.size, p.angle, p.response, p.octave) for p in points]
-        values = np.array(table, np.float64).reshape(-1, 6)
-        places = values[:, :2]
-        if self.name == "orb":
-            scale = _ORB_SCALE ** values[:, 5:]
-            size = np.array(gray.shape[::-1])
-            places = (places / scale + 0.5) * size / np.rint(size / scale) - 0.5
-        responses = values[:, 4].astype(np.float32)
-        return Detections(places, values[:, 2], np.deg2rad(values[:, 3]), responses, descriptors)
-
-    def strongest(self, keypoints: SphericalKeypoints) -> SphericalKeypoints:
-        """The keypoints of a panorama that are kept: all of SIFT's, the strongest of ORB's."""
-        if self.name == "sift" or len(keypoints) <= _ORB_KEYPOINTS:
-            return keypoints
-        order = np.argsort(-keypoints.responses, kind="stable")
-        return keypoints.select(np.sort(order[:_ORB_KEYPOINTS]))
+    sift = _cv2.SIFT_create(enable_precise_upscale=True)
+    points, descriptors = sift.detectAndCompute(np.ascontiguousarray(gray), None)
+    if not points:
+        descriptors = np.empty((0, sift.descriptorSize()), np.float32)
+    table = [(*p.pt, p.size, p.angle, p.response) for p in points]
+    values = np.array(table, np.float64).reshape(-1, 5)
+    responses = values[:, 4].astype(np.float32)
+    return Detections(values[:, :2], values[:, 2], np.deg2rad(values[:, 3]), responses, descriptors)
 
 
-def detect_on_equirect(image: NDArray[np.uint8], detector: Detector) -> SphericalKeypoints:
+def detect_on_equirect(image: NDArray[np.uint8]) -> SphericalKeypoints:
     """Detect keypoints on a panorama as if it were an ordinary image, but across ±180°.
 
     The image is extended by W/8 columns of its other side, left and right, so that keypoints at
@@ -138,21 +86,20 @@ def detect_on_equirect(image: NDArray[np.uint8], detector: Detector) -> Spherica
 
     Args:
         image: ``(H, W)`` grey or ``(H, W, 3)`` RGB, uint8.
-        detector: The detector.
     """
     gray = _gray(image)
     height, width = gray.shape
     pad = -(-width // _WRAP_SHARE)
-    found = detector.detect(np.pad(gray, ((0, 0), (pad, pad)), mode="wrap"))
+    found = detect(np.pad(gray, ((0, 0), (pad, pad)), mode="wrap"))
     found.points_xy[:, 0] -= pad
     u = found.points_xy[:, 0]
     directions = lonlat_to_xyz(equirect_to_lonlat(found.points_xy, (height, width)))
     keypoints = _on_sphere(found, directions, equirect_jacobian(directions, (height, width)), 0)
-    return detector.strongest(keypoints.select((u >= -0.5) & (u < width - 0.5)))
+    return keypoints.select((u >= -0.5) & (u < width - 0.5))
 
 
 def detect_on_tangent_images(
-    image: NDArray[np.uint8], grid: TangentGrid | CubeGrid, detector: Detector, margin: int = 32
+    image: NDArray[np.uint8], grid: TangentGrid | CubeGrid, margin: int = 32
 ) -> SphericalKeypoints:
     """Detect keypoints on the tangent images of a panorama, or on the faces of a cube.
 
@@ -163,7 +110,6 @@ def detect_on_tangent_images(
     Args:
         image: ``(H, W)`` grey or ``(H, W, 3)`` RGB, uint8.
         grid: The images.
-        detector: The detector.
         margin: Pixels added on every side of the images, at the same pitch: detectors find nothing
             near borders, and large keypoints need space.
 
@@ -174,7 +120,7 @@ def detect_on_tangent_images(
     wide = grid.widened(margin)
 
     def search(face: int) -> SphericalKeypoints:
-        found = detector.detect(equirect_to_tangent(gray, wide, [face])[0])
+        found = detect(equirect_to_tangent(gray, wide, [face])[0])
         plane = (found.points_xy - (wide.dim - 1) / 2) * wide.pitch
         rays = np.column_stack([plane, np.ones(len(plane))])
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
@@ -187,7 +133,7 @@ def detect_on_tangent_images(
     with ThreadPoolExecutor(threads) as pool:
         parts = list(pool.map(search, range(wide.num_images)))
     keypoints = SphericalKeypoints.concatenated(parts)
-    return detector.strongest(keypoints.select(~_repeated(keypoints, wide.pitch)))
+    return keypoints.select(~_repeated(keypoints, wide.pitch))
 
 
 def gnomonic_jacobian(

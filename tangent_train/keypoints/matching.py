@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,9 +10,8 @@ _ROWS = 512
 
 
 def match(
-    left_descriptors: NDArray[np.generic],
-    right_descriptors: NDArray[np.generic],
-    norm: Literal["l2", "hamming"] = "l2",
+    left_descriptors: NDArray[np.float32],
+    right_descriptors: NDArray[np.float32],
     ratio: float = 0.8,
     *,
     mutual: bool = True,
@@ -22,36 +19,27 @@ def match(
     """The unambiguous nearest right descriptor of every left one.
 
     Time grows with n_l · n_r, memory with n_r. Distances are exact for whole numbers up to 255, as
-    SIFT's, and for bits. Of equally near right descriptors the first is the nearest.
+    SIFT's. Of equally near right descriptors the first is the nearest.
 
     Args:
-        left_descriptors: ``(n_l, D)`` numbers, or bytes of bits for ``hamming``.
+        left_descriptors: ``(n_l, D)``.
         right_descriptors: ``(n_r, D)``.
-        norm: ``l2``, the Euclidean distance, or ``hamming``, the number of different bits.
-        ratio: Keep a match whose distance is less than this share of the distance to the second
+        ratio: Keep a match whose Euclidean distance is less than this share of that to the second
             nearest (Lowe 2004; the paper's matches have 0.8). 1 or more: keep all.
         mutual: Keep a match only if the left one is also the nearest to the right one.
 
     Returns:
         ``(m, 2)`` indices of left and right descriptors, by the left ones.
     """
-    left, right = (_numbers(values, norm) for values in (left_descriptors, right_descriptors))
+    left, right = left_descriptors, right_descriptors
     if not (len(left) and len(right)):
         return np.empty((0, 2), np.int64)
     nearest, first, second = _nearest_two(left, right)
-    # Squared Euclidean distances of bits are their Hamming distances.
-    share = ratio if norm == "hamming" else ratio * ratio
-    chosen = np.flatnonzero(first < share * second) if ratio < 1 else np.arange(len(left))
+    chosen = np.flatnonzero(first < ratio**2 * second) if ratio < 1 else np.arange(len(left))
     if mutual and len(chosen):
         back, _, _ = _nearest_two(right[nearest[chosen]], left)
         chosen = chosen[back == chosen]
     return np.stack([chosen, nearest[chosen]], axis=1)
-
-
-def _numbers(descriptors: NDArray[np.generic], norm: str) -> NDArray[np.float32]:
-    if norm == "hamming":
-        descriptors = np.unpackbits(descriptors.view(np.uint8), axis=1)
-    return descriptors.astype(np.float32)
 
 
 def _nearest_two(

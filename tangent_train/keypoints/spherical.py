@@ -23,7 +23,7 @@ class SphericalKeypoints:
         sizes_rad: ``(n,)`` float32, angular diameter of the neighbourhood (``KeyPoint.size``).
         orientations_xyz: ``(n, 3)`` float64 unit vectors, perpendicular to the directions.
         responses: ``(n,)`` float32 strength.
-        descriptors: ``(n, D)`` float32, or uint8 that hold bits.
+        descriptors: ``(n, D)`` float32.
         images: ``(n,)`` int32, the face each was detected in; 0 for a panorama.
     """
 
@@ -31,7 +31,7 @@ class SphericalKeypoints:
     sizes_rad: NDArray[np.float32]
     orientations_xyz: NDArray[np.float64]
     responses: NDArray[np.float32]
-    descriptors: NDArray[np.float32] | NDArray[np.uint8]
+    descriptors: NDArray[np.float32]
     images: NDArray[np.int32]
 
     def _arrays(self) -> tuple[NDArray[Any], ...]:

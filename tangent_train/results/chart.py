@@ -35,10 +35,9 @@ def report_png(title: str, rows: Sequence[Row]) -> bytes:
         A PNG file.
     """
     scores, names = SCORES[rows[0].records[0].kind], rows[0].records[0].class_names
-    worst = scores.worst
     means = [[row.score(name) for name in scores.means] for row in rows]
-    classes = [[row.score(worst, name) for name in names] for row in rows]
-    second = _Panel(f"{scores.per_class[worst]} of each class", names, classes)
+    classes = [[row.score(scores.charted, name) for name in names] for row in rows]
+    second = _Panel(f"{scores.per_class[scores.charted]} of each class", names, classes)
     return _png(rows, _Panel(title, list(scores.means.values()), means), second)
 
 

@@ -133,21 +133,6 @@ def headline(record: Record) -> str:
     return f"{', '.join(means)} over {counted(record.images, record.noun)}".strip() + told
 
 
-def largest_loss(record: Record) -> str:
-    """The class that lowers the mean most, and its confusion; empty without a loss."""
-    score = SCORES[record.kind].worst
-    labelled = [e for e in record.classes if e.get("share", e.get("images")) and e[score] < 1]
-    if not labelled:
-        return ""
-    worst = min(labelled, key=lambda entry: float(entry[score]))
-    name = SCORES[record.kind].per_class[score]
-    text = f"Largest loss: {worst['class']}, {percent(worst[score])} % {name}"
-    if worst["taken_for"] is not None:
-        share = percent(worst["taken_for_share"])
-        text += f"; most often taken for {worst['taken_for']} ({share} % of it)"
-    return f"{text}."
-
-
 def result_tables(record: Record) -> list[Table]:
     """The scores per class, with their means, and per latitude band.
 
@@ -175,7 +160,7 @@ def result_tables(record: Record) -> list[Table]:
     rows.append(["mean", *means])
     texts = [0, *(1 + k for k, name in enumerate(columns) if name == "taken_for")]
     header = ["class", *(headings[name] for name in columns)]
-    tables = [Table("Per class", header, rows, largest_loss(record), texts)]
+    tables = [Table("Per class", header, rows, text_columns=texts)]
     if record.latitude_bands:
         rows = [
             ["{}° … {}°".format(*b["latitude_deg"]), _cell(b["miou"]), _cell(b["macc"])]

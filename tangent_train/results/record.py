@@ -13,7 +13,7 @@ from typing import Any, Literal, NamedTuple
 
 from tangent_train.checkpoints.content import INPUTS, read_settings
 from tangent_train.errors import DataError
-from tangent_train.files import parse_json
+from tangent_train.files import read_json
 from tangent_train.metrics.segmentation import AbsentClass, Interval
 from tangent_train.registry import Text, check_fields
 from tangent_train.setting_rules import flat_settings
@@ -33,14 +33,14 @@ class Scores(NamedTuple):
         per_class: Of one class.
         mean_of: The mean over the classes of each score of one class.
         per_band: Of a latitude band.
-        worst: The score per class that says which class is the worst.
+        charted: The score per class that a chart shows.
     """
 
     means: Mapping[str, str]
     per_class: Mapping[str, str]
     mean_of: Mapping[str, str]
     per_band: Sequence[str]
-    worst: str
+    charted: str
 
 
 def with_solid_angle(
@@ -193,10 +193,7 @@ def load_record(folder: Path) -> Record:
         DataError: A file is missing, or is not what ``tangent-train`` writes.
     """
     path = folder / RESULTS_FILE
-    try:
-        content = parse_json(path.read_bytes())
-    except (OSError, ValueError) as error:
-        raise DataError(path, found=error, expected=_EXPECTED) from error
+    content = read_json(path, _EXPECTED)
     found = check_fields(path, content, _FIELDS, _EXPECTED)
     scores = SCORES[found["kind"]]
     kinds_of: dict[str, dict[str, Any]] = {

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -149,13 +148,12 @@ class Report:
         return [*notes, *self.notes]
 
     def write(self, folder: Path, name: str) -> None:
-        """Write the report as ``.json``, ``.md``, ``.csv`` and ``.png``, each atomically.
+        """Write the report as ``.md``, ``.csv`` and ``.png``, each atomically.
 
         Args:
             folder: Output folder.
             name: Of the files.
         """
-        write_text(folder / f"{name}.json", self._json())
         write_text(folder / f"{name}.md", self._markdown())
         figures = list(self.figures())
         columns = list(dict.fromkeys(key for figure in figures for key in figure))
@@ -200,28 +198,6 @@ class Report:
         ]
         table = Table("Runs", ("", "fold", "seed", "run"), runs, text_columns=(0, 3))
         return "\n".join([f"# {first[3:]}", notes, *others, table.markdown()])
-
-    def _json(self) -> str:
-        rows = [
-            {
-                "row": row.label,
-                **row.facts,
-                "published": row.published,
-                "compared_with": row.partner and row.partner.label,
-                "runs": [
-                    {"folder": str(r.folder), "fold": r.fold, "seed": r.seed, "images": r.images}
-                    for r in row.records
-                ],
-            }
-            for row in self.rows
-        ]
-        content = {
-            "unit": "shares of 1",
-            "rows": rows,
-            "figures": list(self.figures()),
-            "notes": self.all_notes(),
-        }
-        return json.dumps(content, indent=1) + "\n"
 
 
 def _cell(found: Statistic, folds: int) -> str:

@@ -18,7 +18,7 @@ from tangent_train.callbacks.checkpoints import (
     LastCheckpoint,
     averaged_weights,
 )
-from tests.tasks.shapes import Shapes, WithStatistics, quiet_trainer, shape_task
+from tests.tasks.shapes import Shapes, SmallNetwork, quiet_trainer, shape_task
 
 DECAY = 0.3  # from the fourth step on: (1 + t) / (10 + t) is less before
 STEPS = 4
@@ -63,7 +63,9 @@ def test_checkpoints_hold_the_average_and_the_weights_to_go_on_with(
     tmp_path: Path, accumulated: int
 ) -> None:
     reference = Reference()
-    task: Any = shape_task(WithStatistics(), optimizer=partial(torch.optim.Adam, lr=0.03))
+    task: Any = shape_task(
+        SmallNetwork(statistics=True), optimizer=partial(torch.optim.Adam, lr=0.03)
+    )
     average = averaged_weights(DECAY, torch.device("cpu"))
     best = BestCheckpoint(tmp_path, "val/class_accuracy")
     contents = CheckpointContents({"config": {}})

@@ -66,28 +66,21 @@ def write_checkpoint(
     path: Path, representation: dict[str, Any] = TANGENT, channels: int = 3
 ) -> Path:
     """The checkpoint of such a network, as `tangent-train` writes it."""
-    network = color_network(channels)
-    settings = {
-        "_target_": "torch.nn.Conv2d",
-        "in_channels": None,
-        "out_channels": 3,
-        "kernel_size": 3,
-        "padding": 1,
-        "padding_mode": "replicate",
-    }
-    config = {
-        "network": settings,
-        "representation": representation,
-        "level": representation["level"],
-    }
-    normalization = RGB_NORMALIZATION if channels == 3 else RGBD_NORMALIZATION
+    trained = trained_network(representation, channels)
+    normalization, tensors = trained.normalization, trained.network.state_dict()
+    network = {"_target_": "torch.nn.Conv2d", "in_channels": None, "out_channels": 3}
+    network |= {"kernel_size": 3, "padding": 1, "padding_mode": "replicate"}
     content = {
-        "config": config,
+        "config": {
+            "network": network,
+            "representation": representation,
+            "level": representation["level"],
+        },
         "kind": "segmentation",
-        "inputs": ["rgb", "depth"][: channels - 2],
+        "inputs": list(trained.inputs),
         "class_names": list(CLASS_NAMES),
         "normalization": {"mean": list(normalization.mean), "std": list(normalization.std)},
-        "state_dict": {f"network.{name}": value for name, value in network.state_dict().items()},
+        "state_dict": tensors,
     }
     path.parent.mkdir(parents=True, exist_ok=True)
     torch.save(content, path)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -55,17 +55,16 @@ def rotation_angle_deg(first: ArrayLike, second: ArrayLike) -> float:
     return float(np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1))))
 
 
-def keypoints_at(directions_xyz: NDArray[np.float64], *, bits: bool = False) -> SphericalKeypoints:
+def keypoints_at(directions_xyz: NDArray[np.float64]) -> SphericalKeypoints:
     """Keypoints of 2° in these directions, their orientation to the right."""
     n = len(directions_xyz)
     x, y, _ = directions_xyz.T
     right = np.stack([-y, x, 0 * x], axis=-1) / np.maximum(np.hypot(x, y), 1e-9)[:, None]
-    descriptors: Any = np.random.default_rng(n).integers(0, 256, (n, 32 if bits else 128))
     return SphericalKeypoints(
         directions_xyz,
         np.full(n, np.radians(2), np.float32),
         right,
         np.ones(n, np.float32),
-        descriptors.astype(np.uint8 if bits else np.float32),
+        np.random.default_rng(n).integers(0, 256, (n, 128)).astype(np.float32),
         np.zeros(n, np.int32),
     )

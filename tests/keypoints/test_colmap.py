@@ -64,18 +64,16 @@ def test_colmap_reads_what_was_written(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["PANORAMIC", "DEGENERATE"])
-def test_pairs_without_translation_and_bits(tmp_path: Path, kind: str) -> None:
+def test_pairs_without_translation(tmp_path: Path, kind: str) -> None:
     rotated = kind == "PANORAMIC"
     rotation = random_rotation(np.random.default_rng(1)) if rotated else None
     two_view = TwoView(np.full(9, rotated), rotation)
     matches = np.stack([np.arange(9), np.arange(9)], axis=1)
-    both = keypoints_at(random_directions(9), bits=True), keypoints_at(random_directions(9))
+    points = keypoints_at(random_directions(9))
     path = tmp_path / "pair.db"
-    add_pair(path, ("a", "b"), ((50, 100), (60, 120)), both, matches, two_view)
+    add_pair(path, ("a", "b"), ((50, 100), (60, 120)), (points, points), matches, two_view)
     with pycolmap.Database.open(path) as database:
         assert database.num_cameras() == 2
-        assert not database.exists_descriptors(1)
-        assert database.exists_descriptors(2)
         geometry = database.read_two_view_geometry(1, 2)
         assert geometry.config == getattr(pycolmap.TwoViewGeometryConfiguration, kind).value
         assert len(geometry.inlier_matches) == (9 if rotated else 0)

@@ -16,7 +16,7 @@ from tangent_train.geometry import (
     rotation_about,
 )
 from tangent_train.keypoints.detect import (
-    Detector,
+    detect,
     detect_on_equirect,
     detect_on_tangent_images,
     gnomonic_jacobian,
@@ -31,21 +31,6 @@ DOG = 2 ** (1 / 6)
 """The DoG of a Gaussian blob of width s is largest at σ = s / this."""
 
 
-# One image.
-
-
-def test_orb_finds_the_same_in_an_image_and_upside_down() -> None:
-    """As OpenCV maps them back from shrunk images, positions are off by up to 2.6 pixels here."""
-    image = texture((611, 523))  # does not divide by the scales
-    found, turned = (Detector("orb").detect(view) for view in (image, image[::-1, ::-1]))
-    back = np.array([522, 610]) - turned.points_xy
-    scales = np.unique(found.sizes)
-    assert len(scales) == 8
-    for size in scales:
-        tree = cKDTree(back[turned.sizes == size])
-        assert np.median(tree.query(found.points_xy[found.sizes == size])[0]) < 1e-3
-
-
 # The panorama.
 
 
@@ -53,8 +38,8 @@ def test_a_panorama_has_no_seam() -> None:
     """Rolled, it has the same keypoints, rolled: at ±180° as anywhere else."""
     image, columns = texture(SHAPE), 200
     roll = rotation_about([0, 0, 1], columns / SHAPE[1] * 2 * np.pi)
-    left = rotated(detect_on_equirect(image, Detector()), roll)
-    right = detect_on_equirect(np.roll(image, columns, axis=1), Detector())
+    left = rotated(detect_on_equirect(image), roll)
+    right = detect_on_equirect(np.roll(image, columns, axis=1))
     assert len(right) == pytest.approx(len(left), rel=0.01)
     agreement = Agreement(left, right)
     assert agreement.share > 0.99
@@ -68,7 +53,7 @@ def test_a_panorama_has_no_seam() -> None:
 def test_a_blob_is_found_once_wherever_it_is(lon_deg: float, lat_deg: float) -> None:
     center = lonlat_to_xyz(np.deg2rad([lon_deg, lat_deg]))
     sigma = np.deg2rad(1.2 if lat_deg > 0 else 2.5)
-    found = detect_on_equirect(blob(SHAPE, center, sigma), Detector())
+    found = detect_on_equirect(blob(SHAPE, center, sigma))
     found = found.select(angle_deg(found.directions_xyz, center) < 5)
     assert len(np.unique(found.directions_xyz.round(4), axis=0)) == 1
     # OpenCV's default is off by a quarter of a pixel of 0.7°.
@@ -78,19 +63,17 @@ def test_a_blob_is_found_once_wherever_it_is(lon_deg: float, lat_deg: float) -> 
     assert ((columns >= -0.5) & (columns <= SHAPE[1] - 0.5)).all()
 
 
-@pytest.mark.parametrize("name", ["sift", "orb"])
 @pytest.mark.parametrize("tangent", [False, True])
-def test_a_blank_panorama_has_none_and_colour_is_grey(name: str, tangent: bool) -> None:
-    def detect(image: NDArray[np.uint8]) -> SphericalKeypoints:
-        grid = TangentGrid(0, 5, dim=29)
+def test_a_blank_panorama_has_none_and_colour_is_grey(tangent: bool) -> None:
+    def found(image: NDArray[np.uint8]) -> SphericalKeypoints:
         if tangent:
-            return detect_on_tangent_images(image, grid, Detector(name), 21)
-        return detect_on_equirect(image, Detector(name))
+            return detect_on_tangent_images(image, TangentGrid(0, 5, dim=29), 21)
+        return detect_on_equirect(image)
 
-    assert len(detect(np.full((101, 77, 3), 90, np.uint8))) == 0
-    assert len(Detector(name).detect(np.zeros((1, 1), np.uint8)).points_xy) == 0
+    assert len(found(np.full((101, 77, 3), 90, np.uint8))) == 0
+    assert len(detect(np.zeros((1, 1), np.uint8)).points_xy) == 0
     image = texture((101, 177))  # odd sizes
-    gray, color = detect(image), detect(np.repeat(image[..., None], 3, axis=2))
+    gray, color = found(image), found(np.repeat(image[..., None], 3, axis=2))
     assert len(gray) > 30
     np.testing.assert_array_equal(gray.directions_xyz, color.directions_xyz)
     np.testing.assert_array_equal(gray.descriptors, color.descriptors)
@@ -102,7 +85,7 @@ def test_a_blank_panorama_has_none_and_colour_is_grey(name: str, tangent: bool) 
 @lru_cache
 def found_on_texture(base_level: int, *, rotate: bool = False) -> SphericalKeypoints:
     image = texture(SHAPE, ROTATION if rotate else None)
-    return detect_on_tangent_images(image, TangentGrid(base_level, LEVEL), Detector(), 16)
+    return detect_on_tangent_images(image, TangentGrid(base_level, LEVEL), 16)
 
 
 @pytest.mark.parametrize("base_level", [0, 2])

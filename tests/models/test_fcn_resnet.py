@@ -87,7 +87,6 @@ def test_published_weights_come_from_the_cache_or_the_internet(
     ("settings", "message"),
     [
         ({"depth": 34}, r"network\.depth: found 34; expected 50 or 101"),
-        ({"depth": 50, "in_channels": 1}, r"network\.in_channels: found 1"),
         ({"depth": 50, "weights": "voc"}, r"network\.weights: found voc; expected null, coco"),
     ],
 )

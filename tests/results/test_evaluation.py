@@ -16,7 +16,6 @@ from tangent_train.results.evaluation import (
     classification_record,
     confusion_table,
     headline,
-    largest_loss,
     result_tables,
     segmentation_record,
     write_results,
@@ -128,33 +127,9 @@ def test_means_stand_with_their_intervals(tmp_path: Path) -> None:
     assert {name: tuple(ends) for name, ends in read.items()} == record.intervals
 
 
-@pytest.mark.parametrize(
-    ("pixels", "sentence"),
-    [
-        (
-            {(1, 1): 90, (1, 2): 10, (2, 2): 50, (2, 1): 30, (2, 3): 20},
-            "Largest loss: floor, 45.5 % IoU; most often taken for wall (30.0 % of it).",
-        ),
-        ({(1, 1): 5, (0, 3): 9, (2, 1): 5, (2, 2): 90}, "Largest loss: wall, 50.0 % IoU."),
-        ({(1, 1): 5, (3, 3): 1}, ""),
-        ({(0, 1): 7}, ""),
-    ],
-)
-def test_the_largest_loss_is_that_of_a_labelled_class(
-    pixels: dict[tuple[int, int], int], sentence: str
-) -> None:
-    for absent in ("skip", "zero"):
-        record = segmentation_record(_matrices(pixels), NAMES, absent)
-        assert largest_loss(record) == sentence
-        assert result_tables(record)[0].note == sentence
-
-
 def test_shapes_are_counted_per_class_and_over_all(tmp_path: Path) -> None:
     record = classification_record(SHAPE_MATRIX, SHAPES)
     assert record.means == {"accuracy": 13 / 16, "class_accuracy": 0.75}
-    assert largest_loss(record) == (
-        "Largest loss: mug, 25.0 % accuracy; most often taken for bottle (75.0 % of it)."
-    )
     write_results(record, tmp_path)
     text = (tmp_path / "results.md").read_text()
     assert "| mug | 4 | 25.0 | bottle | 75.0 |" in text

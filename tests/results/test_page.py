@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from base64 import b64encode
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -95,23 +94,6 @@ def test_printed_tables_and_markdown_take_any_text_in_full_width(
 
 
 CLASSES = 14
-
-
-@pytest.mark.parametrize("budget", [150_000, 400_000])
-def test_noisy_labels_are_halved_and_the_picture_made_coarser_until_they_fit(budget: int) -> None:
-    rng = np.random.default_rng(0)
-    truth, prediction = rng.integers(0, CLASSES, (2, 512, 1024), np.uint8)
-    rgb = rng.integers(0, 256, (512, 1024, 3), np.uint8)
-    maps = {"prediction": prediction, "truth": truth}
-    image = encode_image("noise", rgb, CLASSES, **maps, budget_bytes=budget)
-    files = (image.input, image.thumbnail, image.truth or b"", image.prediction or b"")
-    assert sum(len(b64encode(file)) for file in files) <= budget
-    labels = decoded(image.truth)
-    factor = 512 // len(labels)
-    assert factor > 1
-    # Nearest: every label is one of those below it, no mixture.
-    blocks = truth.reshape(len(labels), factor, len(labels) * 2, factor)
-    assert np.all((blocks == labels[:, None, :, None]).any(axis=(1, 3)))
 
 
 def test_a_larger_image_is_shrunk_by_area_and_its_labels_to_the_nearest() -> None:

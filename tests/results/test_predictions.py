@@ -61,25 +61,24 @@ def test_pixels_of_photos_count_by_their_solid_angle() -> None:
     assert class_shares(labels, NAMES, image)["down"] == pytest.approx(part, rel=1e-3)
 
 
-def test_the_table_has_the_classes_that_occur() -> None:
-    folder = PredictionFolder(Path(), ("unknown", "sky", "wall", "car"), [])
-    entries: list[Entry] = [
-        {"classes": {"sky": 0.25, "wall": 0.75, "car": 0.0}},
-        {"error": "broken"},
-    ]
-    assert folder.mean_shares(entries).rows == [["wall", "75.0"], ["sky", "25.0"]]
-
-
 def test_the_summary(tmp_path: Path) -> None:
     entries: list[Entry] = [
-        {"file": "a, b.jpg", "name": "a", "rows": 2, "columns": 4, "classes": {"up": 1, "down": 3}},
+        {
+            "file": "a, b.jpg",
+            "name": "a",
+            "rows": 2,
+            "columns": 4,
+            "classes": {"up": 0.25, "down": 0.75},
+        },
         {"file": "=x.jpg", "name": "x", "error": "=x.jpg: found nothing; expected an image."},
     ]
-    PredictionFolder(tmp_path, NAMES, ["labels"]).write_summary({"level": 6}, entries)
+    folder = PredictionFolder(tmp_path, NAMES, ["labels"])
+    folder.write_summary({"level": 6}, entries)
+    assert folder.mean_shares(entries).rows == [["down", "75.0"], ["up", "25.0"]]
     content = json.loads((tmp_path / "summary.json").read_text())
     assert content == {"level": 6, "images": entries}
     assert json.loads((tmp_path / "classes.json").read_text()) == {"up": 1, "down": 2}
     with (tmp_path / "summary.csv").open(newline="") as file:
         first, second = csv.DictReader(file)
-    assert (first["file"], first["up"], first["error"]) == ("a, b.jpg", "1", "")
+    assert (first["file"], first["up"], first["error"]) == ("a, b.jpg", "0.25", "")
     assert (second["file"], second["down"]) == ("'=x.jpg", "")

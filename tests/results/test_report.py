@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
@@ -61,7 +60,7 @@ def test_the_tables_show_means_spreads_and_what_is_missing() -> None:
     ]
 
 
-def test_a_single_run_is_shown_with_its_interval_over_images(tmp_path: Path) -> None:
+def test_a_single_run_is_shown_with_its_interval_over_images() -> None:
     def run(found: dict[str, tuple[float, float]], **settings: Any) -> Record:
         return replace(made_record([0.1, 0.5, 0.5], **settings), intervals=found)
 
@@ -75,33 +74,16 @@ def test_a_single_run_is_shown_with_its_interval_over_images(tmp_path: Path) -> 
     explained = "95 % bootstrap interval over its images"
     assert explained in report.tables()[0].note
     assert explained not in _runs_report(*several).tables()[0].note
-    ends_of = {
-        (figure["row"], figure["fold"]): (figure["low"], figure["high"])
-        for figure in report.figures()
-        if figure["score"] == "miou" and figure["class"] == "mean"
-    }
-    ends, none = (0.25, 0.31), (None, None)
-    assert ends_of == {
-        ("single", 1): ends, ("single", "mean"): ends,
-        ("mine", 1): ends, ("mine", 2): ends, ("mine", "mean"): none,
-    }  # fmt: skip
 
 
 def test_all_files_hold_the_same_scores(tmp_path: Path) -> None:
     records = [made_record([0.1, 0.4, None], bands=(0.6, 0.2), data__fold=fold) for fold in (1, 2)]
-    _runs_report(*records, made_record([0.1, 0.4, None], name="a|b [red]")).write(tmp_path, "x")
-    assert {path.name for path in tmp_path.iterdir()} == {
-        f"x.{s}" for s in ["json", "md", "csv", "png"]
-    }
-    read = json.loads((tmp_path / "x.json").read_text())
-    assert read["unit"] == "shares of 1"
-    (ours,) = (row for row in read["rows"] if row["row"] == "mine")
-    assert [run["fold"] for run in ours["runs"]] == [1, 2]
-    assert ours["runs"][0]["images"] == 5
+    report = _runs_report(*records, made_record([0.1, 0.4, None], name="a|b [red]"))
+    report.write(tmp_path, "x")
+    assert {path.name for path in tmp_path.iterdir()} == {"x.md", "x.csv", "x.png"}
     with (tmp_path / "x.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == len(read["figures"])
-    for row, figure in zip(rows, read["figures"], strict=True):
+    for row, figure in zip(rows, report.figures(), strict=True):
         assert {k: v for k, v in row.items() if v} == {
             k: str(v) for k, v in figure.items() if v is not None
         }

@@ -49,30 +49,14 @@ class Shapes(lightning.LightningDataModule):
 
 
 class SmallNetwork(nn.Module):
-    """Without batch statistics: a gradient does not depend on what is computed together."""
+    """Without batch statistics, a gradient does not depend on what is computed together."""
 
-    def __init__(self, classes: int = 3) -> None:
+    def __init__(self, classes: int = 3, *, statistics: bool = False) -> None:
         super().__init__()
-        self.features = nn.Sequential(
-            nn.Conv2d(3, 8, 3, stride=2, padding=1), nn.GroupNorm(2, 8), nn.ReLU()
-        )
+        norm: Any = nn.BatchNorm2d if statistics else partial(nn.GroupNorm, 2)
+        self.encoder = nn.Sequential(nn.Conv2d(3, 8, 3, stride=2), norm(8), nn.ReLU())
+        self.neck = nn.Sequential(nn.Conv2d(8, 8, 1), norm(8), nn.ReLU())
         self.head = nn.Linear(8, classes)
-
-    def forward(self, images: Tensor) -> Tensor:
-        features = self.features(images.flatten(0, 1)).unflatten(0, images.shape[:2])
-        scores: Tensor = self.head(features.mean(dim=(1, 3, 4)))
-        return scores
-
-
-class WithStatistics(nn.Module):
-    """A small network with batch normalization."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        torch.manual_seed(0)
-        self.encoder = nn.Sequential(nn.Conv2d(3, 8, 3, stride=2), nn.BatchNorm2d(8), nn.ReLU())
-        self.neck = nn.Sequential(nn.Conv2d(8, 8, 1), nn.BatchNorm2d(8), nn.ReLU())
-        self.head = nn.Linear(8, 3)
 
     def forward(self, images: Tensor) -> Tensor:
         features = self.neck(self.encoder(images.flatten(0, 1))).mean(dim=(2, 3))

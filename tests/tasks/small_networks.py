@@ -15,6 +15,7 @@ from tangent_train.checkpoints.trained import TrainedNetwork, completed_settings
 from tangent_train.cli.build import build
 from tangent_train.registry import SettingsFile, make
 from tangent_train.tasks import SegmentationTask
+from tests.inference.trained import TANGENT
 from tests.running import composed_settings
 
 NAMES = ("unknown", "beam", "board", "sofa", "wall")
@@ -44,11 +45,7 @@ def small_trained(
         inputs=("rgb", "depth"),
         normalization=Normalization([0.5, 0.4, 0.3, 1.1], [0.2, 0.25, 0.3, 0.8]),
         level=5,
-        representation={
-            "_target_": "tangent_train.rendering.TangentRepresentation",
-            "base_level": 0,
-            "level": 5,
-        },
+        representation=TANGENT | {"level": 5},
         image_size=image_size,
         size_multiple=multiple or 1,
         fixed_size=None if multiple else image_size,

@@ -14,33 +14,10 @@ from lightning.pytorch.strategies import DDPStrategy
 from torch import Tensor, nn
 from torch.distributed.algorithms.ddp_comm_hooks import default_hooks
 from torch.nn.functional import cross_entropy
-from torch.utils.data import DataLoader
 
-from datamodules.core.samples import TrainingSample
-from tangent_train.rendering import TangentRepresentation
 from tangent_train.tasks import SegmentationTask
 from tests.tasks.shapes import Gradients, quiet_trainer
-
-
-class Data(lightning.LightningDataModule):
-    """Three spheres of 20 images; the first images are almost all unknown."""
-
-    def __init__(self, batch_size: int) -> None:
-        super().__init__()
-        self.batch_size = batch_size
-
-    def train_dataloader(self) -> DataLoader[Any]:
-        generator = torch.Generator().manual_seed(0)
-        images = torch.randn(3, 20, 2, 16, 16, generator=generator)
-        labels = torch.randint(0, 4, (3, 20, 16, 16), generator=generator).to(torch.uint8)
-        labels[:, :7, 1:] = 0
-        labels[1] = 0
-        samples: Any = [
-            TrainingSample(*pair, torch.zeros(20, 3, 3), 0)
-            for pair in zip(images, labels, strict=True)
-        ]
-        return DataLoader(samples, self.batch_size)
-
+from tests.tasks.test_segmentation import NAMES, TANGENT, WEIGHTS, Data
 
 pytestmark = pytest.mark.filterwarnings("ignore:You defined a `validation_step`:UserWarning")
 
@@ -48,17 +25,17 @@ pytestmark = pytest.mark.filterwarnings("ignore:You defined a `validation_step`:
 def _network() -> nn.Module:
     torch.manual_seed(0)
     return nn.Sequential(
-        nn.Conv2d(2, 8, 3, padding=1), nn.ReLU(), nn.GroupNorm(2, 8), nn.Conv2d(8, 3, 3, padding=1)
+        nn.Conv2d(2, 8, 3, padding=1), nn.ReLU(), nn.GroupNorm(2, 8), nn.Conv2d(8, 2, 3, padding=1)
     )
 
 
 def _task(images_per_chunk: int | None = None, **settings: Any) -> SegmentationTask:
     return SegmentationTask(
         _network(),
-        TangentRepresentation(base_level=0, level=4),
-        ("unknown", "a", "b", "c"),
+        TANGENT,
+        NAMES,
         partial(torch.optim.SGD, lr=0.1),
-        class_weights=[1.0, 3.0, 0.2],
+        class_weights=WEIGHTS.tolist(),
         label_smoothing=0.1,
         images_per_chunk=images_per_chunk,
         **settings,
@@ -73,7 +50,7 @@ def _gradients(
     given = {"max_epochs": 1, "accumulate_grad_batches": 3 // batch_size} | (trainer or {})
     callbacks = {"callbacks": [gradients, *given.get("callbacks", [])]}
     quiet_trainer(limit_val_batches=0, **given | callbacks).fit(
-        _task(images_per_chunk, **settings), datamodule=Data(batch_size)
+        _task(images_per_chunk, **settings), datamodule=Data(batch_size=batch_size)
     )
     return gradients.found, gradients.loss
 
@@ -81,12 +58,11 @@ def _gradients(
 def _expected(batch_size: int) -> tuple[list[Tensor], Tensor]:
     """Torch's weighted mean over the labelled pixels of each batch, and the mean over batches."""
     network, losses = _network(), []
-    for batch in Data(batch_size).train_dataloader():
+    for batch in Data(batch_size=batch_size).train_dataloader():
         labels = batch.labels.flatten(0, 1).long()
         known = labels > 0
         scores = network(batch.images.flatten(0, 1)).movedim(1, -1)[known]
-        weights = torch.tensor([1.0, 3.0, 0.2])
-        loss = cross_entropy(scores, labels[known] - 1, weights, label_smoothing=0.1)
+        loss = cross_entropy(scores, labels[known] - 1, WEIGHTS, label_smoothing=0.1)
         losses.append(loss if known.any() else torch.zeros(()))
     gradients = torch.autograd.grad(torch.stack(losses).mean(), list(network.parameters()))
     return list(gradients), losses[-1].detach()

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ from tangent_train.inference.photo_networks.network import (
     class_names_in,
 )
 from tangent_train.inference.photo_networks.saved import json_in, saved_folder, tensors_in
+from tangent_train.inference.quiet import quiet
 from tangent_train.registry import SettingsFile, make
 
 _TASK = "the task is semantic"
@@ -161,7 +161,7 @@ def _task(folder: Path, config: Mapping[str, Any]) -> list[int]:
 def _load_tensors(network: HuggingFaceNetwork, tensors: dict[str, Tensor], folder: Path) -> None:
     """Load weights through transformers, which knows their names in its older versions."""
     inner = network.network
-    with _silence():
+    with quiet():
         loaded, found = type(inner).from_pretrained(
             None,
             config=inner.config,
@@ -180,21 +180,3 @@ def _load_tensors(network: HuggingFaceNetwork, tensors: dict[str, Tensor], folde
             "classes in its id2label",
         )
     inner.load_state_dict(loaded.state_dict())
-
-
-@contextmanager
-def _silence() -> Iterator[None]:
-    """Without transformers' warnings and progress bars."""
-    from transformers import utils
-
-    logging: Any = utils.logging
-    before = logging.get_verbosity()
-    bars = logging.is_progress_bar_enabled()
-    logging.set_verbosity_error()
-    logging.disable_progress_bar()
-    try:
-        yield
-    finally:
-        logging.set_verbosity(before)
-        if bars:
-            logging.enable_progress_bar()

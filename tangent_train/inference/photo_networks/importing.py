@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Mapping
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -27,21 +27,6 @@ from tangent_train.registry import unregistered
 
 _TANGENT = "tangent_train.rendering.TangentRepresentation"
 _LEVELS = (5, 13)
-
-
-@dataclass(frozen=True)
-class View:
-    """Tangent images for a photo network.
-
-    Attributes:
-        level: Level s, their angular resolution.
-        base_level: Base level b.
-        dim: Side in pixels.
-    """
-
-    level: int
-    base_level: int
-    dim: int
 
 
 def import_network(
@@ -72,26 +57,26 @@ def import_network(
         SettingError: A setting is impossible, or the names do not fit the scores.
         NoRoomError: The disk is full.
     """
-    view = view_of(network.image_size, fov_deg, level, base_level)
+    seen = representation_of(network.image_size, fov_deg, level, base_level)
     names, groups = _groups(network.score_names, nothing, nothing_wins)
     with atomic_path(path) as temporary:
         if isinstance(network.network, OnnxNetwork):
-            _write_onnx(network, temporary, names, groups, view)
+            _write_onnx(network, temporary, names, groups, seen)
         else:
-            _write_checkpoint(network, temporary, names, groups, view)
+            _write_checkpoint(network, temporary, names, groups, seen)
         trained = load_trained(temporary, unregistered(network.settings))  # it was made from them
-        _use(trained, view, network.image_size)
+        _use(trained, seen, network.image_size)
     source = None if trained.source is None else replace(trained.source, path=path)
     return replace(trained, source=source)
 
 
-def view_of(
+def representation_of(
     image_size: tuple[int, int],
     fov_deg: float,
     level: int | None = None,
     base_level: int | None = None,
-) -> View:
-    """The tangent images that look most like the photos a network was trained on.
+) -> dict[str, Any]:
+    """Settings of the tangent images that look most like the photos a network was trained on.
 
     Level s has the focal length nearest to theirs, ``2^s / R_v(−1)`` pixels;
     base level b the largest images that are not larger than theirs. Their side is that of the
@@ -115,7 +100,8 @@ def view_of(
     side = min(image_size)
     if base_level is None:
         base_level = max(0, math.ceil(level - math.log2(side)))
-    return View(level, base_level, max(side, 2 ** (level - base_level)))
+    dim = max(side, 2 ** (level - base_level))
+    return {"_target_": _TANGENT, "base_level": base_level, "level": level, "dim": dim}
 
 
 def _groups(
@@ -139,32 +125,31 @@ def _groups(
 
 
 @torch.no_grad()
-def _use(trained: TrainedNetwork, view: View, photos: tuple[int, int]) -> None:
+def _use(trained: TrainedNetwork, seen: Mapping[str, Any], photos: tuple[int, int]) -> None:
     """Label one image as the commands will: names that do not fit the scores are refused."""
     try:
-        trained.network(torch.zeros(1, 3, view.dim, view.dim))
+        trained.network(torch.zeros(1, 3, seen["dim"], seen["dim"]))
     except (RuntimeError, ValueError) as error:
         raise SettingError(
             "level, base_level",
-            found=f"tangent images of {view.dim}×{view.dim}, which the network does not take "
+            found=f"tangent images of {seen['dim']}×{seen['dim']}, which the network does not take "
             f"({str(error).partition(chr(10))[0]})",
             expected=f"its own images, of {'×'.join(map(str, photos))}",
             remedy="Leave base_level null, or make it larger.",
         ) from error
 
 
-def _representation(view: View) -> dict[str, Any]:
-    own = {"base_level": view.base_level, "level": view.level, "dim": view.dim}
-    return {"_target_": _TANGENT, **own}
-
-
 def _write_checkpoint(
-    network: PhotoNetwork, path: Path, names: list[str], groups: Groups | None, view: View
+    network: PhotoNetwork,
+    path: Path,
+    names: list[str],
+    groups: Groups | None,
+    seen: Mapping[str, Any],
 ) -> None:
     config = {
         "network": network.settings,
-        "representation": _representation(view),
-        "level": view.level,
+        "representation": dict(seen),
+        "level": seen["level"],
     }
     mean, std = network.normalization.mean, network.normalization.std
     tensors = network.network.state_dict()
@@ -183,7 +168,11 @@ def _write_checkpoint(
 
 
 def _write_onnx(
-    network: PhotoNetwork, path: Path, names: list[str], groups: Groups | None, view: View
+    network: PhotoNetwork,
+    path: Path,
+    names: list[str],
+    groups: Groups | None,
+    seen: Mapping[str, Any],
 ) -> None:
     import onnx
 
@@ -195,9 +184,9 @@ def _write_onnx(
         class_names=tuple(names),
         inputs=("rgb",),
         normalization=network.normalization,
-        level=view.level,
-        representation=_representation(view),
-        image_size=(view.dim, view.dim),
+        level=seen["level"],
+        representation=seen,
+        image_size=(seen["dim"], seen["dim"]),
         size_multiple=1 if fixed else size_multiple_of(scores, 3) or 1,
         fixed_size=fixed,
         groups=groups,

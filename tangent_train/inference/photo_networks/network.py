@@ -11,7 +11,7 @@ from torch import nn
 
 from datamodules.core.inputs import Normalization
 from tangent_train.errors import DataError, SettingError
-from tangent_train.files import parse_json
+from tangent_train.files import read_json
 
 USUAL_SIZE = (512, 512)
 """Rows and columns of the photos, where nothing says what they were."""
@@ -53,10 +53,7 @@ def class_names_in(path: Path | None) -> tuple[str, ...]:
     expected = 'a JSON list of class names in the order of the scores, ["wall", "floor"]'
     if path is None:
         raise SettingError("classes", found="none", expected=f"a file with {expected}")
-    try:
-        content = parse_json(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise DataError(path, found=f"an unreadable file ({error})", expected=expected) from error
+    content = read_json(path, expected)
     names = content if isinstance(content, list) else []
     if isinstance(content, dict):
         names = [content.get(str(place)) for place in range(len(content))]

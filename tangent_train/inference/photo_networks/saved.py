@@ -11,7 +11,7 @@ from torch import Tensor
 
 from models.pretrained import read_tensors
 from tangent_train.errors import DataError, SettingError
-from tangent_train.files import parse_json
+from tangent_train.files import read_json
 
 _WEIGHTS = "model.safetensors"
 _SHARDS = "model-*-of-*.safetensors"
@@ -55,12 +55,8 @@ def json_in(folder: Path, name: str) -> dict[str, Any]:
     Raises:
         DataError: It is missing or holds something else.
     """
-    path, expected = folder / name, "a JSON object"
-    try:
-        content = parse_json(path.read_bytes())
-    except (OSError, ValueError) as error:
-        found = f"an unreadable file ({error})" if path.exists() else "no such file"
-        raise DataError(path, found=found, expected=f"{expected} of save_pretrained") from error
+    path, expected = folder / name, "a JSON object of save_pretrained"
+    content = read_json(path, expected)
     if not isinstance(content, dict):
         raise DataError(path, found=type(content).__name__, expected=expected)
     return content

@@ -20,9 +20,6 @@ from tangent_train.files import atomic_path
 from tangent_train.geometry import equirect_solid_angles
 from tangent_train.results.tables import Table
 
-BUDGET_BYTES = 8_000_000
-"""Of the HTML file, for one image with its label maps."""
-
 MOST_PIXELS = 4096
 """The longer side of an image in the report."""
 
@@ -73,12 +70,10 @@ def encode_image(
     truth: NDArray[np.integer] | None = None,
     sphere: bool = True,
     note: str = "",
-    budget_bytes: int = BUDGET_BYTES,
 ) -> EncodedImage:
-    """Compress an image to its share of the report.
+    """Compress an image for the report, to a few megabytes at most.
 
-    Sides longer than `MOST_PIXELS` are downsampled, colours by area, labels by nearest neighbour,
-    then halved until they fit.
+    Sides longer than `MOST_PIXELS` are downsampled, colours by area, labels by nearest neighbour.
 
     Args:
         name: Shown beside it.
@@ -88,19 +83,15 @@ def encode_image(
         truth: ``(h, w)`` class indices, 0 unknown; of any size.
         sphere: Whether it is a whole equirectangular panorama.
         note: A line about it.
-        budget_bytes: Of the HTML file, where files are written in base64.
     """
     maps = {"truth": truth, "prediction": prediction}
-    labels = {k: v.astype(np.uint8, copy=False) for k, v in maps.items() if v is not None}
-    thumbnail = _jpeg(rgb, _THUMBNAIL_PIXELS)
-    room, side = budget_bytes * 3 // 4 - len(thumbnail), MOST_PIXELS
-    while True:
-        small = {k: _shrunk(v, side, cv2.INTER_NEAREST_EXACT) for k, v in labels.items()}
-        pngs = {k: cv2.imencode(".png", v, _PNG)[1].tobytes() for k, v in small.items()}
-        jpeg = _jpeg(rgb, side)
-        if len(jpeg) + sum(map(len, pngs.values())) <= room or side == 1:
-            break
-        side //= 2
+    small = {
+        name: _shrunk(labels.astype(np.uint8, copy=False), MOST_PIXELS, cv2.INTER_NEAREST_EXACT)
+        for name, labels in maps.items()
+        if labels is not None
+    }
+    pngs = {name: cv2.imencode(".png", labels, _PNG)[1].tobytes() for name, labels in small.items()}
+    jpeg, thumbnail = _jpeg(rgb, MOST_PIXELS), _jpeg(rgb, _THUMBNAIL_PIXELS)
     height, width = rgb.shape[:2]
     both = pngs.get("prediction"), pngs.get("truth")
     shares = _shares(list(small.values()), class_count, sphere=sphere)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import zlib
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -20,7 +20,6 @@ from tangent_train.geometry import (
     random_rotation,
 )
 from tangent_train.keypoints import (
-    Detector,
     SphericalKeypoints,
     TwoView,
     detect_on_equirect,
@@ -87,7 +86,6 @@ class Ways:
 
     Attributes:
         base_level: Base levels of the tangent images.
-        detector: See `Detector`.
         margin: Pixels added around every tangent image.
         level: Level s; None for the level nearest to the larger panorama.
         ratio: See `match`.
@@ -101,7 +99,6 @@ class Ways:
     """
 
     base_level: tuple[int, ...]
-    detector: Literal["sift", "orb"] = "sift"
     margin: int = 32
     level: int | None = None
     ratio: float = 0.8
@@ -192,21 +189,19 @@ class Comparer:
 
     def _detect(self, rgb: NDArray[np.uint8], level: int) -> dict[str, SphericalKeypoints]:
         """Keypoints of a panorama by representation, in the order of `Ways.representations`."""
-        detector = Detector(self.ways.detector)
-        found = {"ERP": detect_on_equirect(rgb, detector)}
+        found = {"ERP": detect_on_equirect(rgb)}
         grids: dict[str, TangentGrid | CubeGrid] = {}
         if self.ways.controls:
-            found[SHRUNK] = detect_on_equirect(_shrunk(rgb, shrunk_rows(level)), detector)
+            found[SHRUNK] = detect_on_equirect(_shrunk(rgb, shrunk_rows(level)))
             grids[CUBE] = CubeGrid(2**level)
         grids |= {f"L{b}": TangentGrid(b, level) for b in self.ways.base_level}
         for name, grid in grids.items():
-            found[name] = detect_on_tangent_images(rgb, grid, detector, self.ways.margin)
+            found[name] = detect_on_tangent_images(rgb, grid, self.ways.margin)
         return found
 
     def _matched(self, left: SphericalKeypoints, right: SphericalKeypoints) -> MatchedPair:
         ways = self.ways
-        both = left.descriptors, right.descriptors
-        matches = match(*both, Detector(ways.detector).norm, ways.ratio, mutual=ways.mutual)
+        matches = match(left.descriptors, right.descriptors, ways.ratio, mutual=ways.mutual)
         rays = left.directions_xyz[matches[:, 0]], right.directions_xyz[matches[:, 1]]
         geometry = estimate_two_view(*rays, ways.max_error_deg, seed=ways.seed)
         return MatchedPair(left, right, matches, geometry)

@@ -64,7 +64,7 @@ def test_without_depth_all_keypoints_count_and_blank_panoramas_have_no_scores(
     pair: PanoramaPair,
 ) -> None:
     blank = pair.left._replace(rgb=np.full((64, 128, 3), 90, np.uint8), distance_m=None)
-    comparer = Comparer(Ways((0,), "orb", controls=False))
+    comparer = Comparer(Ways((0,), controls=False))
     for other in (pair.right, blank):
         for row in comparer.compare(PanoramaPair("x", None, other, blank)).rows:
             assert (row["fov_overlap"], row["visible_by"]) == (None, "all keypoints")

@@ -2,19 +2,11 @@
 
 from __future__ import annotations
 
-import csv
-import json
-from pathlib import Path
 from typing import Any
 
-import cv2
-import pytest
-
 from datamodules.stanford2d3ds.pairs import published_pairs
-from tangent_train.results.keypoints.compare import AS_GIVEN, ROTATED, SHRUNK, Comparer, Row, Ways
-from tangent_train.results.keypoints.report import KeypointReport, matches_png, with_splits
-from tests.decoded import decoded
-from tests.results.keypoints.ball_room import ball_pair
+from tangent_train.results.keypoints.compare import AS_GIVEN, ROTATED, SHRUNK, Row
+from tangent_train.results.keypoints.report import KeypointReport, with_splits
 
 PUBLISHED = {str(pair.number): pair for pair in published_pairs()}
 ALL = ("ERP", SHRUNK, "L0", "L1", "L2")
@@ -99,24 +91,3 @@ def test_other_data_have_nothing_of_the_papers() -> None:
     assert tables(text)["Right panorama randomly rotated"][1][2] == "40.0"
     bare = [row("a", visible_by="all keypoints")]
     assert "n_L and n_R are all keypoints" in KeypointReport(bare, ("ERP",), {}, {}).markdown()
-
-
-def test_files_hold_every_figure(tmp_path: Path) -> None:
-    rows = of_paper()
-    KeypointReport(rows, ALL, {"seed": 0}, PUBLISHED).write(tmp_path)
-    written = json.loads((tmp_path / "results.json").read_text())
-    assert written == {"settings": {"seed": 0}, "rows": rows}
-    read = list(csv.DictReader((tmp_path / "pairs.csv").read_text().splitlines()))
-    assert len(read) == 60 * 5
-    assert (read[1]["pair"], read[1]["representation"], read[1]["pmr"]) == ("0", "L0", "0.28")
-    assert read[1]["rotation_error_deg"] == ""
-
-
-def test_a_picture_joins_keypoints_across_the_seam() -> None:
-    pytest.importorskip("pycolmap")
-    pair = ball_pair(shape=(64, 128))
-    comparison = Comparer(Ways((0,), controls=False)).compare(pair)
-    picture = decoded(matches_png(comparison, AS_GIVEN))
-    assert picture.shape == (800, 1600, 3)
-    hsv = cv2.cvtColor(picture, cv2.COLOR_RGB2HSV)
-    assert (hsv[..., 1] > 200).sum() > 1000  # coloured lines on grey panoramas

@@ -17,7 +17,7 @@ from tests.tasks.odd_networks import assert_same, scores_of, some_images
 from tests.tasks.small_networks import save_checkpoint
 
 NETWORKS = {path.stem for path in (config_folder() / "network").glob("*.yaml")}
-OF_SHAPES = {"multi_view_resnet18", "shape_classifier", "shape_classifier_16"}
+OF_SHAPES = {"shape_classifier", "shape_classifier_16"}
 ALIKE = {"unet_small", "unet_context", "fcn_resnet_context"}
 """Of the same parts as others."""
 DEPTH = {"fcn_resnet": "network.depth=50", "fcn_resnet_context": "network.network.depth=50"}

@@ -1,0 +1,23 @@
+"""Libraries whose notes are for their developers."""
+
+from __future__ import annotations
+
+import io
+import logging
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Hide what a library logs, warns of and prints: what it returns is verified anyway."""
+    disabled = logging.root.manager.disable
+    logging.disable()
+    try:
+        silent = io.StringIO()
+        with warnings.catch_warnings(), redirect_stdout(silent), redirect_stderr(silent):
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logging.disable(disabled)
