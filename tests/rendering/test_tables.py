@@ -82,7 +82,7 @@ def test_tables_are_computed_once(monkeypatch: pytest.MonkeyPatch) -> None:
         pytest.fail("a table was computed again")
 
     first = render((40, 80))
-    for maker in ("over_rows", "pinhole_equirect_map"):
+    for maker in ("over_rows", "equirect_map"):
         monkeypatch.setattr(tables, maker, computed_again)
     for result, before in zip(render((40, 80)), first, strict=True):
         np.testing.assert_array_equal(result, before)
