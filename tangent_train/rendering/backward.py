@@ -109,30 +109,25 @@ def tangent_to_labels(
     Raises:
         SettingError: The logits, the shape or the blend cannot be used.
     """
-    if isinstance(logits, np.ndarray):
-        return _render_labels(_tensor(logits), grid, shape, blend).numpy()
-    return _render_labels(logits.detach(), grid, shape, blend).long()
-
-
-def _render_labels(
-    logits: Tensor, grid: PinholeGrid, shape: tuple[int, int], blend: Blend
-) -> Tensor:
-    """`tangent_to_labels` in the smallest unsigned integers."""
+    scores = _tensor(logits) if isinstance(logits, np.ndarray) else logits.detach()
     check_blend(blend, grid)
     shape = check_shape(shape)
-    check_images("scores", logits, grid)
-    small = torch.uint8 if logits.shape[-3] <= 256 else torch.uint16
-    stacks = logits.reshape(-1, *logits.shape[-4:])
-    compiled = logits.device.type == "cpu" and logits.dtype != torch.float64
-    result = torch.zeros((len(stacks), *shape), dtype=small, device=logits.device)
-    for stack, labels in zip(stacks, result, strict=True):
+    check_images("scores", scores, grid)
+    small = torch.uint8 if scores.shape[-3] <= 256 else torch.uint16
+    stacks = scores.reshape(-1, *scores.shape[-4:])
+    compiled = scores.device.type == "cpu" and scores.dtype != torch.float64
+    flat = torch.zeros((len(stacks), *shape), dtype=small, device=scores.device)
+    for stack, labels in zip(stacks, flat, strict=True):
         if compiled:
-            scores, faces = stack.float().numpy(), grid.face_indices()
+            arrays, faces = stack.float().numpy(), grid.face_indices()
             owner = owners(grid, shape) if blend == "nearest" else NO_OWNERS
-            label_panorama(scores, grid, faces, owner, labels.numpy())
+            label_panorama(arrays, grid, faces, owner, labels.numpy())
         else:
             _torch_labels(stack, grid, shape, blend, labels.view(-1))
-    return result.reshape(*logits.shape[:-4], *shape)
+    result = flat.reshape(*scores.shape[:-4], *shape)
+    if isinstance(logits, np.ndarray):
+        return result.numpy()
+    return result.long()
 
 
 def _tensor(array: NDArray[np.generic]) -> Tensor:

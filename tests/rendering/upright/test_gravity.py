@@ -14,10 +14,18 @@ from scipy.spatial.transform import Rotation
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_directions, random_rotation, rotation_about
-from tangent_train.rendering.upright.cues import cues, up_probabilities
-from tangent_train.rendering.upright.gravity import estimate_up, up_from_pose, upright_rotation
-from tangent_train.rendering.upright.line_segments import LineSegments, find_line_segments
-from tangent_train.rendering.upright.manhattan import find_manhattan_frames
+from tangent_train.rendering.upright.gravity import (
+    cues,
+    estimate_up,
+    up_from_pose,
+    up_probabilities,
+    upright_rotation,
+)
+from tangent_train.rendering.upright.manhattan import (
+    LineSegments,
+    find_line_segments,
+    find_manhattan_frames,
+)
 from tests.geometry.directions import angle_deg, unit
 from tests.keypoints.textures import texture
 from tests.rendering.drawn_room import draw_room
