@@ -55,6 +55,7 @@ def test_bands_are_parts_of_the_whole(monkeypatch: pytest.MonkeyPatch, blend: An
     def rendered() -> list[torch.Tensor]:
         return [
             tangent_to_equirect(images, grid, shape, blend),
+            tangent_to_equirect(images, grid, shape, interpolation="nearest"),
             tangent_to_labels(images, grid, shape, blend).double(),
             tangent_to_labels(images.float(), grid, shape, blend).double(),
             torch.from_numpy(tangent_to_equirect(arrays, grid, shape, blend)).double(),

@@ -81,6 +81,7 @@ def test_labels_come_from_the_pixel_at_the_centre() -> None:
     off_center=st.tuples(st.floats(-0.2, 0.2), st.floats(-0.2, 0.2)),
     share=st.floats(0.05, 1),
     level=st.integers(4, 9),
+    overlap=st.sampled_from([0.0, 0.25, 0.6]),
     seed=st.integers(0, 100),
 )
 def test_crops_never_leave_the_photo_and_the_grid_counts_every_place_once(
@@ -89,6 +90,7 @@ def test_crops_never_leave_the_photo_and_the_grid_counts_every_place_once(
     off_center: tuple[float, float],
     share: float,
     level: int,
+    overlap: float,
     seed: int,
 ) -> None:
     height, width = size
@@ -101,7 +103,7 @@ def test_crops_never_leave_the_photo_and_the_grid_counts_every_place_once(
         level, 2 * math.degrees(widest) * share * (1 - 1e-9), crops_per_photo=4
     )
     sampler = representation.of_camera(matrix, size)
-    random, grid = sampler.sample(np.random.default_rng(seed)), sampler.whole()
+    random, grid = sampler.sample(np.random.default_rng(seed)), sampler.cover(overlap)
     extent = 2 * np.diag(matrix)[:2] * math.tan(math.radians(representation.fov_deg) / 2)
     for crops in (random, grid):
         assert (crops.boxes >= 0).all()
@@ -111,25 +113,16 @@ def test_crops_never_leave_the_photo_and_the_grid_counts_every_place_once(
     # Together they reach from border to border, and owned pixels add up to the photo's area.
     np.testing.assert_allclose(grid.boxes[:, :2].min(axis=0), 0, atol=0.01)
     np.testing.assert_allclose(grid.boxes[:, 2:].max(axis=0), (width, height), atol=0.01)
-    columns, rows = (len(np.unique(grid.boxes[:, axis].round(6))) for axis in (0, 1))
+    starts = [np.unique(grid.boxes[:, axis].round(6)) for axis in (0, 1)]
+    columns, rows = map(len, starts)
     assert len(grid.boxes) == columns * rows
-    assert (columns - 1) * extent[0] < width, "no more than needed"
-    assert (rows - 1) * extent[1] < height, "no more than needed"
+    for places, side, whole in zip(starts, extent, (width, height), strict=True):
+        step = side * (1 - overlap)
+        assert (np.diff(places) <= step + 1e-5 * side).all(), "as much overlap as wanted"
+        assert (len(places) - 2) * step < whole - side + 1e-5 * side, "no more than needed"
     area = grid.owned().sum() * np.prod(extent / representation.image_size[0])
     slack = 2 * (columns + rows) * max(width, height) * max(extent) / representation.image_size[0]
     assert abs(area - width * height) <= slack
-
-
-@pytest.mark.parametrize("overlap", [0.0, 0.25, 0.6])
-def test_as_few_crops_as_overlap_enough(overlap: float) -> None:
-    crops = PerspectiveRepresentation(8, 30.0, 64).of_camera(K, SIZE).cover(overlap)
-    for axis in (0, 1):
-        starts = np.unique(crops.boxes[:, axis].round(6))
-        side = (crops.boxes[:, axis + 2] - crops.boxes[:, axis]).mean()
-        assert len(starts) > 1
-        assert (np.diff(starts) <= side * (1 - overlap) + 1e-5).all()
-        fewer = (starts[-1] - starts[0]) / (len(starts) - 2) if len(starts) > 2 else np.inf
-        assert fewer > side * (1 - overlap)
 
 
 def test_the_side_follows_from_the_level() -> None:

@@ -180,14 +180,6 @@ def test_what_is_hopeless_or_the_only_one_is_not_judged(monkeypatch: pytest.Monk
     assert estimate_up(draw_room((128, 256), turn), 180, judge) is not None
 
 
-def test_upside_down() -> None:
-    turn = rotation_about((1, 0, 0), math.pi)
-    room = draw_room((128, 256), turn)
-    assert angle_deg(_up(room, 180), -_UP) < 0.5
-    # Not to be considered: the axis that is nearest to upright is that of the floor.
-    assert angle_deg(_up(room), _UP) < 0.5
-
-
 def test_no_direction_beyond_the_largest_tilt() -> None:
     assert estimate_up(draw_room((128, 256), _tilted(20, 0, 45)), max_tilt_deg=5) is None
     with pytest.raises(SettingError, match="max_tilt_deg: found 181"):
