@@ -87,7 +87,7 @@ def test_labels_and_masks_are_copied_from_the_owner(dtype: Any, channels: tuple[
 @pytest.mark.parametrize("blend", ["nearest", "feather"])
 def test_tensors_and_arrays_agree(blend: Blend) -> None:
     grid, panorama = TangentGrid(0, 5), _smooth(32)
-    tensor = torch.from_numpy(panorama).movedim(-1, 0)
+    tensor = torch.from_numpy(panorama).movedim(-1, 0).requires_grad_()
     expected = apply(lambda images: images[..., :2] ** 2, panorama, grid, blend)
     found = apply(lambda images: images[:, :2] ** 2, tensor, grid, blend)
     assert isinstance(found, torch.Tensor)
@@ -106,12 +106,6 @@ def test_labels_of_tensors_keep_their_dtype() -> None:
     assert (masks.dtype, masks.shape) == (torch.bool, (3, 32, 64))
     assert (labels == tensor.argmax(dim=0)).double().mean() > 0.97
     assert (masks == (tensor > 0)).double().mean() > 0.97
-
-
-def test_nothing_is_kept_for_gradients() -> None:
-    network = torch.nn.Conv2d(3, 4, 3, padding=1)
-    result = apply(network, torch.rand(3, 16, 32), TangentGrid(0, 4))
-    assert not result.requires_grad
 
 
 def _other_after_the_first(shapes: list[tuple[int, ...]], dtypes: list[Any]) -> Function:

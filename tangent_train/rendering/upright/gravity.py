@@ -75,11 +75,8 @@ def estimate_up(
             are not hopeless.
 
     Raises:
-        SettingError: The panorama or the tilt cannot be used.
+        SettingError: The tilt is none.
     """
-    if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8:
-        found = f"shape {rgb.shape}, dtype {rgb.dtype}"
-        raise SettingError("panorama", found=found, expected="(H, W, 3) of dtype uint8")
     if not 0 < max_tilt_deg <= 180:
         raise SettingError("max_tilt_deg", found=max_tilt_deg, expected="above 0, at most 180")
     if rgb.shape[0] < _LEAST_ROWS:

@@ -214,18 +214,6 @@ def test_dark_rooms_with_missing_parts() -> None:
     assert angle_deg(_up(room), turn[:, 2]) < 0.5
 
 
-@pytest.mark.parametrize(
-    ("panorama", "found"),
-    [
-        (np.zeros((8, 16), np.uint8), r"shape \(8, 16\)"),
-        (np.zeros((8, 16, 3), np.float32), "dtype float32"),
-    ],
-)
-def test_other_arrays_are_refused(panorama: NDArray[Any], found: str) -> None:
-    with pytest.raises(SettingError, match=f"panorama: found .*{found}"):
-        estimate_up(panorama)
-
-
 # Rotating upright
 
 
