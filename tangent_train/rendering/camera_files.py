@@ -181,6 +181,11 @@ class RigFile:
     world_from_camera: Mapping[str, NDArray[np.float64]]
     panoramas: Mapping[str, str]
 
+    @property
+    def images(self) -> list[str]:
+        """Names of all images, as COLMAP has them."""
+        return [prefix + name for prefix in self.world_from_camera for name in self.panoramas]
+
 
 def write_rig(
     path: Path, grid: TangentGrid, faces: Mapping[str, int], panoramas: Mapping[str, str]
