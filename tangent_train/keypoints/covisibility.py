@@ -18,7 +18,7 @@ from tangent_train.geometry import (
     xyz_to_lonlat,
 )
 from tangent_train.keypoints.spherical import angles_between
-from tangent_train.rendering.taps import bilinear_equirect_taps
+from tangent_train.rendering.sampling import bilinear_equirect_taps
 
 _TOLERANCE, _TOLERANCE_M = 0.03, 0.03
 """Occlusion tolerance behind a surface: share of the distance, and metres."""

@@ -26,9 +26,14 @@ from tangent_train.rendering.checks import (
     check_shape,
 )
 from tangent_train.rendering.forward import Interpolation, Pixels
-from tangent_train.rendering.sampling import map_dtype
+from tangent_train.rendering.sampling import (
+    Taps,
+    image_taps,
+    map_dtype,
+    nearest_image_index,
+    sample,
+)
 from tangent_train.rendering.tables import image_table, owners, tensors_on
-from tangent_train.rendering.taps import Taps, image_taps, nearest_image_index, sample
 
 Blend = Literal["nearest", "feather"]
 
@@ -104,30 +109,25 @@ def tangent_to_labels(
     Raises:
         SettingError: The logits, the shape or the blend cannot be used.
     """
-    if isinstance(logits, np.ndarray):
-        return _render_labels(_tensor(logits), grid, shape, blend).numpy()
-    return _render_labels(logits.detach(), grid, shape, blend).long()
-
-
-def _render_labels(
-    logits: Tensor, grid: PinholeGrid, shape: tuple[int, int], blend: Blend
-) -> Tensor:
-    """`tangent_to_labels` in the smallest unsigned integers."""
+    scores = _tensor(logits) if isinstance(logits, np.ndarray) else logits.detach()
     check_blend(blend, grid)
     shape = check_shape(shape)
-    check_images("scores", logits, grid)
-    small = torch.uint8 if logits.shape[-3] <= 256 else torch.uint16
-    stacks = logits.reshape(-1, *logits.shape[-4:])
-    compiled = logits.device.type == "cpu" and logits.dtype != torch.float64
-    result = torch.zeros((len(stacks), *shape), dtype=small, device=logits.device)
-    for stack, labels in zip(stacks, result, strict=True):
+    check_images("scores", scores, grid)
+    small = torch.uint8 if scores.shape[-3] <= 256 else torch.uint16
+    stacks = scores.reshape(-1, *scores.shape[-4:])
+    compiled = scores.device.type == "cpu" and scores.dtype != torch.float64
+    flat = torch.zeros((len(stacks), *shape), dtype=small, device=scores.device)
+    for stack, labels in zip(stacks, flat, strict=True):
         if compiled:
-            scores, faces = stack.float().numpy(), grid.face_indices()
+            arrays, faces = stack.float().numpy(), grid.face_indices()
             owner = owners(grid, shape) if blend == "nearest" else NO_OWNERS
-            label_panorama(scores, grid, faces, owner, labels.numpy())
+            label_panorama(arrays, grid, faces, owner, labels.numpy())
         else:
             _torch_labels(stack, grid, shape, blend, labels.view(-1))
-    return result.reshape(*logits.shape[:-4], *shape)
+    result = flat.reshape(*scores.shape[:-4], *shape)
+    if isinstance(logits, np.ndarray):
+        return result.numpy()
+    return result.long()
 
 
 def _tensor(array: NDArray[np.generic]) -> Tensor:
@@ -153,7 +153,7 @@ def _from_arrays(
     stack = _tensor(images.astype(np.float64 if exact else np.float32, copy=False))
     stack = stack[:, None] if images.ndim == 3 else stack.movedim(-1, 1)
     if blend == "feather" and not exact:
-        result = _feathered(stack.contiguous().numpy(), grid, shape)
+        result = _feathered(stack.numpy(), grid, shape)
     else:
         result = tangent_to_equirect(stack, grid, shape, blend).movedim(0, -1).numpy()
     if images.dtype.kind in "ui":
@@ -164,27 +164,17 @@ def _from_arrays(
 def _feathered(
     images: NDArray[np.float32], grid: PinholeGrid, shape: tuple[int, int]
 ) -> NDArray[np.float32]:
-    """``(H, W, C)`` average of ``(N, C, d, d)`` images."""
-    channels, ones = images.shape[1], np.ones_like(images[:, :1])
+    """``(H, W, C)`` average of ``(N, C, d, d)`` images; the sum of the weights is that of ones."""
+    channels, step = images.shape[1], max(1, _BAND // shape[1])
+    with_ones = np.ascontiguousarray(np.concatenate([images, np.ones_like(images[:, :1])], axis=1))
     panorama = np.empty((*shape, channels), np.float32)
-    of_weights = _feathered_sums(ones, grid, shape)
-    for (rows, sums), (_, weights) in zip(
-        _feathered_sums(images, grid, shape), of_weights, strict=True
-    ):
-        panorama[rows] = without_blocks(sums, channels) / without_blocks(weights, 1)
-    return panorama
-
-
-def _feathered_sums(
-    images: NDArray[np.float32], grid: PinholeGrid, shape: tuple[int, int]
-) -> Iterator[tuple[slice, NDArray[np.float32]]]:
-    """Bands of rows and their weighted sums of ``(N, C, d, d)`` images, see `zero_sums`."""
-    step = max(1, _BAND // shape[1])
     for start in range(0, shape[0], step):
         rows = slice(start, min(shape[0], start + step))
-        sums = zero_sums((rows.stop - start, shape[1]), images.shape[1])
-        add_to_panorama(images, grid, grid.face_indices(), shape, rows, NO_OWNERS, sums)
-        yield rows, sums
+        sums = zero_sums((rows.stop - start, shape[1]), channels + 1)
+        add_to_panorama(with_ones, grid, grid.face_indices(), shape, rows, NO_OWNERS, sums)
+        total = without_blocks(sums, channels + 1)
+        panorama[rows] = total[..., :channels] / total[..., channels:]
+    return panorama
 
 
 def _bands(

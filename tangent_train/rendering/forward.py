@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -13,15 +13,17 @@ from torch import Tensor
 from tangent_train.geometry import PinholeGrid, checked_rotation
 from tangent_train.geometry.pinhole_grid import Faces
 from tangent_train.rendering.checks import check_panorama
-from tangent_train.rendering.rays import sphere_rays
 from tangent_train.rendering.sampling import (
     EquirectMap,
+    bilinear_equirect_taps,
     equirect_map,
     map_dtype,
+    nearest_equirect_index,
+    sample,
     sample_map,
+    sphere_rays,
 )
 from tangent_train.rendering.tables import forward_map, tensors_on
-from tangent_train.rendering.taps import bilinear_equirect_taps, nearest_equirect_index, sample
 
 Interpolation = Literal["bilinear", "nearest"]
 
@@ -62,15 +64,16 @@ def equirect_to_tangent(
     """
     check_panorama(image, interpolation)
     indices = grid.face_indices(faces)
+    # Of random subsets the tables of single images are kept.
+    together = faces is None or grid.rotation is not None
+    pixels = _CHUNK if isinstance(image, Tensor) else _TOGETHER
+    step = max(1, pixels // max(grid.dim**2, 4 * grid.dim)) if together else 1
     if isinstance(image, Tensor):
-        return _render_tensor(image, grid, indices, interpolation)
+        return _render_tensor(image, grid, indices, step, interpolation)
     image = np.ascontiguousarray(image)
     shape = image.shape[0], image.shape[1]
     out = np.empty((len(indices) * grid.dim, grid.dim, *image.shape[2:]), image.dtype)
     dtype = map_dtype(image.dtype == np.float64, interpolation)
-    # Of random subsets the tables of single images are kept.
-    together = faces is None or grid.rotation is not None
-    step = max(1, _TOGETHER // max(grid.dim**2, 4 * grid.dim)) if together else 1
     for start in range(0, len(indices), step):
         table = forward_map(grid, shape, indices[start : start + step], dtype)
         part = out[start * grid.dim : (start + step) * grid.dim]
@@ -79,42 +82,30 @@ def equirect_to_tangent(
 
 
 def _render_tensor(
-    image: Tensor, grid: PinholeGrid, indices: NDArray[np.int64], interpolation: Interpolation
+    image: Tensor,
+    grid: PinholeGrid,
+    indices: NDArray[np.int64],
+    step: int,
+    interpolation: Interpolation,
 ) -> Tensor:
     *batch, channels, height, width = image.shape
     source = image.reshape(-1, height * width)
     dtype = map_dtype(image.dtype == torch.float64, interpolation)
-    step = max(1, _CHUNK // grid.dim**2)
     chunks = [image.new_empty((*batch, 0, channels, grid.dim, grid.dim))]
     for start in range(0, len(indices), step):
-        u, v = _positions(grid, (height, width), indices[start : start + step], dtype, image.device)
+        faces = tuple(indices[start : start + step].tolist())
+        # On the CPU they share the memory of the map, which is kept already.
+        key = None if image.device.type == "cpu" else ("forward", (height, width), faces, dtype)
+        build = partial(forward_map, grid, (height, width), faces, dtype)
+        u, v = (part.reshape(-1) for part in tensors_on(image.device, grid, key, build)[:2])
         if interpolation == "nearest":
             index = nearest_equirect_index(u, v, (height, width))
             values = source.gather(1, index.expand(len(source), -1))
         else:
             values = sample(source, bilinear_equirect_taps(u, v, (height, width)))
-        images = values.reshape(*batch, channels, -1, grid.dim, grid.dim)
+        images = values.reshape(*batch, channels, len(faces), grid.dim, grid.dim)
         chunks.append(images.movedim(-3, -4))
     return torch.cat(chunks, dim=-4)
-
-
-def _positions(
-    grid: PinholeGrid,
-    shape: tuple[int, int],
-    indices: NDArray[np.int64],
-    dtype: np.dtype[np.floating],
-    device: torch.device,
-) -> tuple[Tensor, Tensor]:
-    """Columns and rows of all pixels of some images, one after the other."""
-
-    def tensors(face: int) -> tuple[Tensor, ...]:
-        # On the CPU they share the memory of the maps, which are kept already.
-        key = None if device.type == "cpu" else ("forward", shape, face, dtype)
-        return tensors_on(device, grid, key, lambda: forward_map(grid, shape, [face], dtype)[:2])
-
-    tables = [tensors(face) for face in indices.tolist()]
-    u, v = (torch.stack(lines).reshape(-1) for lines in zip(*tables, strict=True))
-    return u, v
 
 
 Scalar = TypeVar("Scalar", bound=np.generic)

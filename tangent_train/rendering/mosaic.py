@@ -22,7 +22,7 @@ from tangent_train.rendering.accumulate import (
 )
 from tangent_train.rendering.checks import check_blend
 from tangent_train.rendering.compiled import over_rows
-from tangent_train.rendering.rays import plane_rays
+from tangent_train.rendering.sampling import plane_rays
 from tangent_train.rendering.tables import owners
 
 if TYPE_CHECKING:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Sequence
 from contextlib import suppress
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -15,27 +15,16 @@ from torch import Tensor
 from tangent_train.errors import SettingError
 from tangent_train.geometry import PinholeGrid, equirect_latitudes, xyz_to_lonlat
 from tangent_train.rendering import kernels
-from tangent_train.rendering.compiled import over_rows
-from tangent_train.rendering.rays import find_owners, sphere_rays
-from tangent_train.rendering.sampling import EquirectMap, pinhole_equirect_map
+from tangent_train.rendering.compiled import njit_exact, over_rows
+from tangent_train.rendering.sampling import (
+    Array,
+    EquirectMap,
+    equirect_map,
+    plane_rays,
+    sphere_rays,
+)
 
 Value = TypeVar("Value", bound=tuple[Any, ...])
-
-
-class ImageTable(NamedTuple):
-    """Positions of ERP pixels in the images that see them.
-
-    Attributes:
-        face: ``(R, H, W)`` images, uint8, int16 or int32.
-        u: ``(R, H, W)`` columns in the images.
-        v: ``(R, H, W)`` rows in the images.
-        weight: ``(R, H, W)`` weights that add up to 1.
-    """
-
-    face: NDArray[np.integer]
-    u: NDArray[np.floating]
-    v: NDArray[np.floating]
-    weight: NDArray[np.floating]
 
 
 class TableCache:
@@ -129,7 +118,8 @@ def forward_map(
 
     def build() -> EquirectMap:
         world_from_pixel = grid.world_from_camera[list(chosen)] @ np.linalg.inv(grid.camera_matrix)
-        return pinhole_equirect_map(world_from_pixel, (grid.dim, grid.dim), shape, dtype)
+        rays = plane_rays((grid.dim, grid.dim))
+        return equirect_map(world_from_pixel[..., [0, 2, 1]], rays, shape, dtype)
 
     return _cached(grid, ("forward", shape, chosen, dtype), build)
 
@@ -149,13 +139,59 @@ def owners(grid: PinholeGrid, shape: tuple[int, int]) -> NDArray[np.integer]:
     return _cached(grid, ("owners", shape), build)[0]
 
 
+def _inner_cosine(grid: PinholeGrid) -> float:
+    """Cosine of half the angle between the nearest two centres: nearer to one is the nearest."""
+    centers, around = grid.centers_xyz, grid.neighbors
+    cosines = np.einsum("nkc,nc->nk", centers[around], centers)
+    others = around != np.arange(grid.num_images)[:, None]
+    return float(np.cos(np.arccos(cosines[others].max()) / 2))
+
+
+@njit_exact
+def find_owners(
+    start: int, stop: int, centers: Array, neighbors: Array, inner: float,
+    columns: Array, rows: Array, face: Array,
+) -> None:  # fmt: skip
+    """Find the image with the nearest centre, for the ERP rows ``start:stop``.
+
+    Steps to ever nearer centres, starting from the owner of the previous pixel.
+
+    Args:
+        start: First row.
+        stop: One past the last row.
+        centers: ``(N, 3)`` directions of the images' centres.
+        neighbors: ``(N, k)`` images around every image.
+        inner: Cosine of half the angle between the nearest two centres: a centre nearer than that
+            is the nearest.
+        columns: From `sphere_rays`.
+        rows: From `sphere_rays`.
+        face: ``(H, W)`` owners, written.
+    """
+    own = 0
+    for i in range(start, stop):
+        z = rows[i, 1]
+        for j in range(columns.shape[1]):
+            x, y = rows[i, 0] * columns[0, j], rows[i, 0] * columns[1, j]
+            best = centers[own, 0] * x + centers[own, 1] * y + centers[own, 2] * z
+            while best < inner:
+                nearer = own
+                for other in neighbors[own]:
+                    dot = centers[other, 0] * x + centers[other, 1] * y + centers[other, 2] * z
+                    if dot > best:
+                        best, nearer = dot, other
+                if nearer == own:
+                    break
+                own = nearer
+            face[i, j] = own
+
+
 def image_table(
     grid: PinholeGrid,
     shape: tuple[int, int],
     dtype: np.dtype[np.floating],
     blend: str,
     rows: slice,
-) -> ImageTable:
+) -> tuple[NDArray[Any], ...]:
     """The images that contribute to the ERP pixels of some rows, and the positions in them.
 
     Args:
@@ -165,6 +201,10 @@ def image_table(
         blend: ``nearest``: the owner of every pixel, R = 1. ``feather``: R is the largest number of
             images that see a pixel.
         rows: The rows, without a step.
+
+    Returns:
+        ``(R, rows, W)`` each: images, int16 or int32; columns and rows in them; and weights that
+        add up to 1.
     """
     part = owners(grid, shape)[rows] if blend == "nearest" else np.empty((0, 0), np.uint8)
     sight = sight_of(grid, grid.face_indices(), shape, rows, part)
@@ -182,7 +222,7 @@ def image_table(
     # Pixels that fewer images see take their first one again, with weight 0.
     unused = np.arange(len(face))[:, None, None] >= count
     face, u, v = (np.where(unused, line[:1], line) for line in (face, u, v))
-    return ImageTable(face, u, v, weight / weight.sum(axis=0))
+    return face, u, v, weight / weight.sum(axis=0)
 
 
 def sight_of(
@@ -245,11 +285,3 @@ def tensors_on(
         return tuple(torch.from_numpy(part).to(device) for part in build())
 
     return tensors() if key is None else _cached(grid, ("tensors", device, *key), tensors)
-
-
-def _inner_cosine(grid: PinholeGrid) -> float:
-    """Cosine of half the angle between the nearest two centres: nearer to one is the nearest."""
-    centers, around = grid.centers_xyz, grid.neighbors
-    cosines = np.einsum("nkc,nc->nk", centers[around], centers)
-    others = around != np.arange(grid.num_images)[:, None]
-    return float(np.cos(np.arccos(cosines[others].max()) / 2))

@@ -48,8 +48,14 @@ def test_results_are_those_of_all_images_at_once(
     np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
-def test_images_come_in_order_and_no_more_than_asked_for() -> None:
-    grid, counts, seen = TangentGrid(1, 5), [], []
+@pytest.mark.parametrize(
+    ("grid", "asked", "expected"),
+    [(TangentGrid(1, 5), 32, [32, 32, 16]), (TangentGrid(0, 9), None, [4] * 5)],  # 4 · 512² = 2^20
+)
+def test_images_come_in_order_and_no_more_than_asked_for(
+    grid: TangentGrid, asked: int | None, expected: list[int]
+) -> None:
+    counts, seen = [], []
 
     def noted(images: NDArray[np.uint8]) -> NDArray[np.float32]:
         counts.append(len(images))
@@ -57,20 +63,9 @@ def test_images_come_in_order_and_no_more_than_asked_for() -> None:
         return np.zeros(images.shape[:3], np.float32)
 
     panorama = np.random.default_rng(0).integers(0, 256, (64, 128, 3), np.uint8)
-    apply(noted, panorama, grid, images_per_call=32)
-    assert counts == [32, 32, 16]
+    apply(noted, panorama, grid, images_per_call=asked)
+    assert counts == expected
     np.testing.assert_array_equal(np.concatenate(seen), equirect_to_tangent(panorama, grid))
-
-
-def test_large_images_come_one_at_a_time() -> None:
-    counts = []
-
-    def noted(images: NDArray[np.float32]) -> NDArray[np.float32]:
-        counts.append(len(images))
-        return images[:, :, :, 0]
-
-    apply(noted, _smooth(16), TangentGrid(0, 9))
-    assert counts == [4] * 5  # 4 · 512² = 2^20
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.int64, bool])
@@ -92,7 +87,7 @@ def test_labels_and_masks_are_copied_from_the_owner(dtype: Any, channels: tuple[
 @pytest.mark.parametrize("blend", ["nearest", "feather"])
 def test_tensors_and_arrays_agree(blend: Blend) -> None:
     grid, panorama = TangentGrid(0, 5), _smooth(32)
-    tensor = torch.from_numpy(panorama).movedim(-1, 0)
+    tensor = torch.from_numpy(panorama).movedim(-1, 0).requires_grad_()
     expected = apply(lambda images: images[..., :2] ** 2, panorama, grid, blend)
     found = apply(lambda images: images[:, :2] ** 2, tensor, grid, blend)
     assert isinstance(found, torch.Tensor)
@@ -111,12 +106,6 @@ def test_labels_of_tensors_keep_their_dtype() -> None:
     assert (masks.dtype, masks.shape) == (torch.bool, (3, 32, 64))
     assert (labels == tensor.argmax(dim=0)).double().mean() > 0.97
     assert (masks == (tensor > 0)).double().mean() > 0.97
-
-
-def test_nothing_is_kept_for_gradients() -> None:
-    network = torch.nn.Conv2d(3, 4, 3, padding=1)
-    result = apply(network, torch.rand(3, 16, 32), TangentGrid(0, 4))
-    assert not result.requires_grad
 
 
 def _other_after_the_first(shapes: list[tuple[int, ...]], dtypes: list[Any]) -> Function:

@@ -81,24 +81,20 @@ def test_files_that_cannot_be_right(changes: dict[str, Any], message: str, tmp_p
         read_cameras(path)
 
 
-@pytest.mark.parametrize("content", [None, b"[]", b"\xff\xfe\x00"])
-def test_files_that_are_no_json(content: bytes | None, tmp_path: Path) -> None:
-    if content is not None:
-        (tmp_path / "cameras.json").write_bytes(content)
-    with pytest.raises(DataError, match=r"cameras\.json.*tangent-render"):
-        read_cameras(tmp_path / "cameras.json")
-
-
+@pytest.mark.parametrize("read", [read_cameras, read_rig])
 @pytest.mark.parametrize(
     "content",
     [
-        "[]",
-        '[{"cameras": [{"image_prefix": "a/", "ref_sensor": true}], "panoramas": {}}]',
-        '[{"cameras": [], "panoramas": ["a.png"]}]',
-        '[{"cameras": [{"image_prefix": "a/", "world_from_camera": [1, 2]}], "panoramas": {}}]',
+        None,
+        b"[]",
+        b"\xff\xfe\x00",
+        b'[{"cameras": [{"image_prefix": "a/", "ref_sensor": true}], "panoramas": {}}]',
+        b'[{"cameras": [], "panoramas": ["a.png"]}]',
+        b'[{"cameras": [{"image_prefix": "a/", "world_from_camera": [1, 2]}], "panoramas": {}}]',
     ],
 )
-def test_rigs_of_others(content: str, tmp_path: Path) -> None:
-    (tmp_path / "rig_config.json").write_text(content)
-    with pytest.raises(DataError, match=r"rig_config\.json.*tangent-render"):
-        read_rig(tmp_path / "rig_config.json")
+def test_other_files(read: Any, content: bytes | None, tmp_path: Path) -> None:
+    if content is not None:
+        (tmp_path / "other.json").write_bytes(content)
+    with pytest.raises(DataError, match=r"other\.json.*tangent-render"):
+        read(tmp_path / "other.json")

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
 
-from tangent_train.errors import SettingError
 from tangent_train.geometry import CubeGrid, equirect_directions
 from tangent_train.rendering import (
     tangent_to_equirect,
@@ -35,10 +32,3 @@ def test_up_to_the_edge_a_pixel_takes_the_values_of_its_owner_alone(
     coordinates = np.stack([x, y, -x, -y, z, -z])
     owned = np.take_along_axis(coordinates, owner[None], axis=0)[0]
     np.testing.assert_allclose(owned, coordinates.max(axis=0), atol=1e-12)
-
-
-@pytest.mark.parametrize("render", [tangent_to_equirect, tangent_to_labels])
-def test_faces_cannot_be_feathered(render: Any) -> None:
-    images = np.zeros((6, 16, 16, 16), np.float32)
-    with pytest.raises(SettingError, match="blend: found 'feather'; expected 'nearest' for images"):
-        render(images, CubeGrid(16), (32, 64), "feather")

@@ -55,6 +55,7 @@ def test_bands_are_parts_of_the_whole(monkeypatch: pytest.MonkeyPatch, blend: An
     def rendered() -> list[torch.Tensor]:
         return [
             tangent_to_equirect(images, grid, shape, blend),
+            tangent_to_equirect(images, grid, shape, interpolation="nearest"),
             tangent_to_labels(images, grid, shape, blend).double(),
             tangent_to_labels(images.float(), grid, shape, blend).double(),
             torch.from_numpy(tangent_to_equirect(arrays, grid, shape, blend)).double(),
@@ -82,7 +83,7 @@ def test_tables_are_computed_once(monkeypatch: pytest.MonkeyPatch) -> None:
         pytest.fail("a table was computed again")
 
     first = render((40, 80))
-    for maker in ("over_rows", "pinhole_equirect_map"):
+    for maker in ("over_rows", "equirect_map"):
         monkeypatch.setattr(tables, maker, computed_again)
     for result, before in zip(render((40, 80)), first, strict=True):
         np.testing.assert_array_equal(result, before)

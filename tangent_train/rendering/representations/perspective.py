@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,12 +21,8 @@ from torch import Tensor
 from tangent_train.errors import SettingError
 from tangent_train.geometry import shift_range
 from tangent_train.registry import registered
-from tangent_train.rendering.checks import check_choice
 from tangent_train.rendering.forward import Interpolation
 from tangent_train.rendering.representations.views import Views
-
-Crops = Literal["grid", "center"]
-"""Crops of an evaluation: all over the photo, or one in the middle."""
 
 _PAPER_FOV_DEG = 45.0
 
@@ -139,9 +135,7 @@ class PhotoSampler:
         return self._crops(shifts, mirrored=wanted.mirror and bool(rng.random() < 0.5))
 
     def whole(self) -> PhotoCrops:
-        """The fewest crops that cover the photo, evenly spread; or the one in the middle."""
-        if self.representation.evaluation == "center":
-            return self._crops(np.clip(np.zeros((1, 2)), *self._shifts()))
+        """The fewest crops that cover the photo, evenly spread."""
         return self.cover()
 
     def cover(self, overlap: float = 0.0) -> PhotoCrops:
@@ -179,7 +173,7 @@ class PhotoSampler:
 
 @registered
 class PerspectiveRepresentation:
-    """Crops of photos, all of one camera.
+    """Crops of photos, all of one camera; evaluation covers the photo, each place counted once.
 
     Args:
         level: Level s of the panoramas whose angular resolution the crops have.
@@ -188,8 +182,6 @@ class PerspectiveRepresentation:
             resolution: 2^(s−1) for 45°, 128 at level 8, more for a wider view. Pixels are square.
         crops_per_photo: Crops drawn at random for a training sample.
         mirror: Mirror half of the training samples left to right.
-        evaluation: `grid` covers the photo with crops, each place counted once; `center` takes the
-            crop in the middle.
 
     Attributes:
         image_size: Rows and columns of a crop.
@@ -205,7 +197,6 @@ class PerspectiveRepresentation:
         dim: int | Sequence[int] | None = None,
         crops_per_photo: int = 1,
         mirror: bool = False,
-        evaluation: Crops = "grid",
     ) -> None:
         wider = math.tan(math.radians(fov_deg) / 2) / math.tan(math.radians(_PAPER_FOV_DEG) / 2)
         dim = max(2, round(2 ** (level - 1) * wider)) if dim is None else dim
@@ -215,11 +206,9 @@ class PerspectiveRepresentation:
                 "representation.dim", found=dim, expected="2 or more, or [height, width]"
             )
         self.image_size = sides[0], sides[1]
-        check_choice("representation.evaluation", evaluation, ("grid", "center"))
         self.fov_deg = fov_deg
         self.crops_per_photo = crops_per_photo
         self.mirror = mirror
-        self.evaluation = evaluation
 
     def of_camera(self, camera_matrix: NDArray[np.float64], size: tuple[int, int]) -> PhotoSampler:
         """The sampler of the crops of a photo.

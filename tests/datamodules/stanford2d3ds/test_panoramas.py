@@ -139,7 +139,7 @@ def test_wrong_layout(broken_root: Path, erp: Any) -> None:
 # --- photos ---------------------------------------------------------------------------------------
 
 
-CROPS = PerspectiveRepresentation(level=5, evaluation="grid", crops_per_photo=2)
+CROPS = PerspectiveRepresentation(level=5, crops_per_photo=2)
 
 
 @pytest.fixture(scope="module")

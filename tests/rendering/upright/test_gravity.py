@@ -14,10 +14,18 @@ from scipy.spatial.transform import Rotation
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_directions, random_rotation, rotation_about
-from tangent_train.rendering.upright.cues import cues, up_probabilities
-from tangent_train.rendering.upright.gravity import estimate_up, up_from_pose, upright_rotation
-from tangent_train.rendering.upright.line_segments import LineSegments, find_line_segments
-from tangent_train.rendering.upright.manhattan import find_manhattan_frames
+from tangent_train.rendering.upright.gravity import (
+    cues,
+    estimate_up,
+    up_from_pose,
+    up_probabilities,
+    upright_rotation,
+)
+from tangent_train.rendering.upright.manhattan import (
+    LineSegments,
+    find_line_segments,
+    find_manhattan_frames,
+)
 from tests.geometry.directions import angle_deg, unit
 from tests.keypoints.textures import texture
 from tests.rendering.drawn_room import draw_room
@@ -172,14 +180,6 @@ def test_what_is_hopeless_or_the_only_one_is_not_judged(monkeypatch: pytest.Monk
     assert estimate_up(draw_room((128, 256), turn), 180, judge) is not None
 
 
-def test_upside_down() -> None:
-    turn = rotation_about((1, 0, 0), math.pi)
-    room = draw_room((128, 256), turn)
-    assert angle_deg(_up(room, 180), -_UP) < 0.5
-    # Not to be considered: the axis that is nearest to upright is that of the floor.
-    assert angle_deg(_up(room), _UP) < 0.5
-
-
 def test_no_direction_beyond_the_largest_tilt() -> None:
     assert estimate_up(draw_room((128, 256), _tilted(20, 0, 45)), max_tilt_deg=5) is None
     with pytest.raises(SettingError, match="max_tilt_deg: found 181"):
@@ -212,18 +212,6 @@ def test_dark_rooms_with_missing_parts() -> None:
     room = draw_room((128, 256), turn) // 8
     room[:12], room[-9:], room[:, 30:45] = 0, 0, 0
     assert angle_deg(_up(room), turn[:, 2]) < 0.5
-
-
-@pytest.mark.parametrize(
-    ("panorama", "found"),
-    [
-        (np.zeros((8, 16), np.uint8), r"shape \(8, 16\)"),
-        (np.zeros((8, 16, 3), np.float32), "dtype float32"),
-    ],
-)
-def test_other_arrays_are_refused(panorama: NDArray[Any], found: str) -> None:
-    with pytest.raises(SettingError, match=f"panorama: found .*{found}"):
-        estimate_up(panorama)
 
 
 # Rotating upright
