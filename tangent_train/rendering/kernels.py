@@ -1,7 +1,7 @@
 """Compiled loops that add images to a canvas.
 
 A *canvas* is what images are put together on: a panorama, or a photo made of crops. Its pixels
-look along `rays.Rays`. An image sees a ray at its pixel (u, v) where ``(u, v, 1)`` is proportional
+look along `sampling.Rays`. An image sees a ray at its pixel (u, v) where ``(u, v, 1)`` is proportional
 to its ``(3, 3)`` matrix times the ray, if the third number is positive.
 
 Scores are interpolated 16 classes at a time. Arrays of *blocks* are ``(h, B, w, 16)``: for every
