@@ -1,8 +1,8 @@
 """Compiled loops that add images to a canvas.
 
 A *canvas* is what images are put together on: a panorama, or a photo made of crops. Its pixels
-look along `sampling.Rays`. An image sees a ray at its pixel (u, v) where ``(u, v, 1)`` is proportional
-to its ``(3, 3)`` matrix times the ray, if the third number is positive.
+look along `sampling.Rays`. An image sees a ray at its pixel (u, v) where ``(u, v, 1)`` is
+proportional to its ``(3, 3)`` matrix times the ray, if the third number is positive.
 
 Scores are interpolated 16 classes at a time. Arrays of *blocks* are ``(h, B, w, 16)``: for every
 row, the scores of the first 16 classes at all its pixels, then those of the next 16.

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from tangent_train.errors import SettingError
 from tangent_train.geometry import (
     camera_matrix_from_fov,
+    is_camera_matrix,
     normalize_camera,
     perspective_directions,
     shift_range,
@@ -104,6 +105,20 @@ def test_fov_is_between_the_outer_pixel_edges(fov_deg: float, size: tuple[int, i
 def test_impossible_fields_of_view_are_refused(fov_deg: float) -> None:
     with pytest.raises(SettingError, match=r"fov_deg: found .*; expected more than 0 and less"):
         camera_matrix_from_fov(fov_deg, (4, 4))
+
+
+def test_a_camera_matrix_has_focal_lengths_a_centre_and_nothing_else() -> None:
+    assert is_camera_matrix(K)
+    for place, value in (
+        *(((0, 0), 0), ((1, 1), -520), ((0, 1), 1), ((1, 0), 1), ((2, 0), 1), ((2, 1), 1)),
+        *(((2, 2), 2), ((0, 2), math.nan), ((1, 2), math.inf)),
+    ):
+        other = K.copy()
+        other[place] = value
+        assert not is_camera_matrix(other), place
+    assert not is_camera_matrix(K[:2])
+    assert not is_camera_matrix(K[None])
+    assert not is_camera_matrix(np.eye(4))
 
 
 def test_perspective_directions_hit_their_own_pixel() -> None:

@@ -25,7 +25,8 @@ Shape = tuple[int, int]
 SHAPES = [(1, 1), (2, 4), (50, 100), (63, 126), (7, 9)]
 
 
-def test_negative_level_is_refused() -> None:
+def test_levels_begin_with_two_rows() -> None:
+    assert equirect_shape(0) == (2, 4)
     with pytest.raises(SettingError, match="level: found -1; expected 0 or more"):
         equirect_shape(-1)
 

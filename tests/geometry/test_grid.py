@@ -61,6 +61,14 @@ def test_impossible_levels_are_refused(base_level: int, level: int) -> None:
         TangentGrid(base_level, level)
 
 
+def test_sizes_that_take_for_ever_are_refused() -> None:
+    assert TangentGrid(0, 30).dim == TangentGrid(0, 5, 2**30).dim == 2**30
+    with pytest.raises(SettingError, match="level: found 31; expected at most 30"):
+        TangentGrid(0, 31)
+    with pytest.raises(SettingError, match=f"dim: found {2**30 + 1}; expected at most {2**30}"):
+        TangentGrid(0, 5, 2**30 + 1)
+
+
 def test_grids_are_values() -> None:
     different = [
         TangentGrid(0, 5),
