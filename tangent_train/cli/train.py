@@ -14,10 +14,10 @@ from typing import Any
 import lightning
 from hydra.core.hydra_config import HydraConfig
 from lightning.fabric.utilities.exceptions import MisconfigurationException
-from lightning.pytorch.callbacks import LearningRateMonitor
+from lightning.pytorch.callbacks import EMAWeightAveraging, LearningRateMonitor
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
-from tangent_train.callbacks.checkpoints import BestCheckpoint, LastCheckpoint, averaged_weights
+from tangent_train.callbacks.checkpoints import BestCheckpoint, LastCheckpoint
 from tangent_train.checkpoints.content import read_checkpoint
 from tangent_train.cli.build import Settings
 from tangent_train.cli.evaluate import Run, machine_faults
@@ -60,7 +60,7 @@ def train(settings: Settings, source: SettingsFile | None = None) -> float | Non
     best = BestCheckpoint(checkpoints, run.task.monitor)
     trainer = run.trainer([last, LearningRateMonitor(), best])
     if settings["ema"] is not None:  # first: the last step is in the average that is saved
-        average = averaged_weights(settings["ema"], trainer.strategy.root_device)
+        average = EMAWeightAveraging(trainer.strategy.root_device, decay=settings["ema"])
         trainer.callbacks.insert(0, average)  # type: ignore[attr-defined]
     with machine_faults(run.folder, run.data):
         _fit(run, trainer, resumed, last)

@@ -171,7 +171,6 @@ def test_settings_of_an_evaluation(run_folder: Path, rooms: str, run: Run) -> No
         (["task=classification"], "task: found classification, with panoramas"),
         (["checkpoint_every_n_steps=0"], "checkpoint_every_n_steps: found 0"),
         (["tensorboard_images=-1"], "tensorboard_images: found -1"),
-        (["ema=1"], "ema: found 1"),
         (["panels=-1"], "panels: found -1"),
         (["optimizer.backbone_lr_factor=0.5"], r"lr_factor: found 0\.5; .*without init_from="),
         (["hydra.run.dir=file/run"], "file/run: found not a directory"),
