@@ -83,9 +83,10 @@ def test_the_same_images_are_shown_after_every_validation(
     for tag, index in chosen.items():
         assert _steps(events, tag) == _steps(events, "val/miou") == [STEPS - 1, 2 * STEPS - 1]
         panorama = source.read(index)
+        normalization: Any = data.normalization
         inputs = render_inputs(panorama, TANGENT.whole(), data.inputs)
         with torch.no_grad():
-            scores = task.network(normalize(inputs, data.normalization, data.inputs))
+            scores = task.network(normalize(inputs, normalization, data.inputs))
         labels = TANGENT.to_labels(scores, (32, 64)).numpy() + 1
         expected = prediction_panel(panorama.rgb, panorama.labels, labels, data.class_names)
         shown = decoded(events.Images(tag)[-1].encoded_image_string)
