@@ -16,6 +16,8 @@ from tensorboard.backend.event_processing.event_accumulator import (  # type: ig
 from torch import nn
 
 from datamodules import Stanford2D3DS
+from datamodules.core.inputs import normalize
+from datamodules.core.samples import render_inputs
 from tangent_train.callbacks.tensorboard import ClassScores, ValidationPictures
 from tangent_train.rendering import TangentRepresentation
 from tangent_train.results.pictures import prediction_panel
@@ -81,16 +83,10 @@ def test_the_same_images_are_shown_after_every_validation(
     for tag, index in chosen.items():
         assert _steps(events, tag) == _steps(events, "val/miou") == [STEPS - 1, 2 * STEPS - 1]
         panorama = source.read(index)
-        views = TANGENT.whole()
-        rgb = torch.from_numpy(views.render(panorama.rgb, "bilinear")).movedim(-1, 1) / 255
-        assert panorama.depth is not None
-        steps = views.render(panorama.depth, "nearest").astype(np.float32) / 512
-        depth = torch.from_numpy(steps).clamp(max=4)
-        values = torch.cat([rgb, depth[:, None]], dim=1)
         normalization: Any = data.normalization
-        mean, std = (torch.tensor(v) for v in (normalization.mean, normalization.std))
+        inputs = render_inputs(panorama, TANGENT.whole(), data.inputs)
         with torch.no_grad():
-            scores = task.network((values - mean[:, None, None]) / std[:, None, None])
+            scores = task.network(normalize(inputs, normalization, data.inputs))
         labels = TANGENT.to_labels(scores, (32, 64)).numpy() + 1
         expected = prediction_panel(panorama.rgb, panorama.labels, labels, data.class_names)
         shown = decoded(events.Images(tag)[-1].encoded_image_string)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
@@ -16,16 +15,6 @@ class LabelMaps(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         return images[:, 0].long()
-
-
-def test_probabilities_of_a_group_add_up() -> None:
-    network, images = nn.Conv2d(3, 5, 1), torch.randn(2, 3, 4, 6)
-    groups = [[3], [0, 2], [1]]  # the last score never wins
-    with torch.no_grad():
-        found = Scores(network, 3, groups)(images).softmax(dim=1).numpy()
-        own = np.exp(network(images).double().numpy())
-    sums = np.stack([own[:, group].sum(axis=1) for group in groups], axis=1)
-    np.testing.assert_allclose(found, sums / sums.sum(axis=1, keepdims=True), atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -52,15 +41,10 @@ def test_label_maps_are_certain() -> None:
 def test_larger_images_are_divided(size: tuple[int, int]) -> None:
     """A network of single pixels: dividing changes nothing, and every part has the right size."""
     network, images = nn.Conv2d(3, 2, 1), torch.randn(2, 3, *size)
-    seen = []
+    expected, seen = network(images), []
     network.register_forward_pre_hook(lambda _, given: seen.append(given[0].shape[-2:]))
     with torch.no_grad():
-        torch.testing.assert_close(
-            Scores(network, 2, tile=(4, 6))(images), nn.functional.conv2d(images, *_of(network))
-        )
+        found = Scores(network, 2, tile=(4, 6))(images)
+    torch.testing.assert_close(found, expected.detach())
     assert set(seen) == {(4, 6)}
     assert len(seen) == -(-size[0] // 4) * -(-size[1] // 6)
-
-
-def _of(network: nn.Conv2d) -> tuple[Tensor, Tensor | None]:
-    return network.weight, network.bias

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import json
 import math
 import signal
 from pathlib import Path
@@ -43,11 +45,21 @@ def test_a_folder_of_panoramas(tmp_path: Path, predict: Predict) -> None:
     entries = predicted(output)
     assert len(entries) == 5
     assert "found" in entries["broken"]["error"]
+    with (output / "summary.csv").open(newline="") as file:
+        rows = {Path(row["file"]).name: row for row in csv.DictReader(file)}
+    assert rows["broken.jpg"]["dark"] == ""
+    assert rows["a=b.png"]["dark"] == str(entries["a=b"]["classes"]["dark"])
+    names = json.loads((output / "classes.json").read_text())
+    assert names == {"dark": 1, "green": 2, "bright": 3}
     for remedy in ("16×16", "crop=", "GPano", "projection=perspective"):
         assert remedy in entries["square"]["error"]
     assert sum(entries["a=b"]["classes"].values()) == pytest.approx(1)
     page = (output / "report.html").read_text()
     assert "flat/küche #1" in page
+    shares = [entry["classes"] for entry in entries.values() if "classes" in entry]
+    means = sorted((np.mean([of[name] for of in shares]) for name in names), reverse=True)
+    places = [page.index(f">{100 * mean:.1f}<") for mean in means]
+    assert places == sorted(places), "the largest first"
     assert "http://" not in page.replace("http://www.w3.org", "")
     assert not list(output.rglob(".partial*"))
 

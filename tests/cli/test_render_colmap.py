@@ -1,19 +1,16 @@
-"""Projects for COLMAP, read by COLMAP: rigs, cameras, masks, and the poses that it finds."""
+"""Projects for COLMAP, read by COLMAP: rigs, cameras and masks."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from PIL import Image
 
 from datamodules.images.pixel_files import read_pixels, write_pixels
-from tangent_train.geometry import FLIP_Y, PanoramaPose, TangentGrid, random_rotation
-from tangent_train.keypoints.colmap import panorama_poses
+from tangent_train.geometry import FLIP_Y, TangentGrid
 from tangent_train.rendering import read_rig
 from tests.cli.rendering import Refused, render_with, smooth
 from tests.datamodules.data_files import contents, gpano_xmp
@@ -22,7 +19,7 @@ from tests.geometry.directions import angle_deg, random_directions
 pycolmap = pytest.importorskip("pycolmap")
 pycolmap.logging.minloglevel = 2
 NAMES = ("hall/room.png", "kitchen/room.png")
-FRAMES = {"hall__room.png": NAMES[0], "kitchen__room.png": NAMES[1]}
+FRAMES = ("hall__room.png", "kitchen__room.png")
 
 
 @pytest.fixture
@@ -167,59 +164,6 @@ def test_what_a_partial_panorama_does_not_show_is_ignored(tmp_path: Path) -> Non
 
 
 # Poses.
-
-
-def _model(project: Path, poses: dict[str, PanoramaPose]) -> Any:
-    """What COLMAP's mapper would make of the project, with given poses."""
-    axes = read_rig(project / "rig_config.json").world_from_camera["face_000/"]
-    model = pycolmap.Reconstruction()
-    with _database(project) as database:
-        for camera in database.read_all_cameras():
-            model.add_camera(camera)
-        (rig,) = database.read_all_rigs()
-        model.add_rig(rig)
-        for frame in database.read_all_frames():
-            images = [database.read_image(data.id) for data in frame.data_ids]
-            pose = poses[FRAMES[images[0].name.partition("/")[2]]]
-            rotation = (pose.world_from_panorama @ FLIP_Y @ axes).T
-            shift = -rotation @ pose.location_m
-            frame.rig_from_world = pycolmap.Rigid3d(np.column_stack([rotation, shift]))
-            model.add_frame(frame)
-            for image in images:
-                model.add_image(image)
-            model.register_frame(frame.frame_id)
-    return model
-
-
-def test_poses_come_back(
-    project: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    rng = np.random.default_rng(5)
-    poses = {
-        name: PanoramaPose(random_rotation(rng) @ FLIP_Y, rng.normal(size=3)) for name in NAMES
-    }
-    model = _model(project, poses)
-    (project / "sparse" / "0").mkdir(parents=True)
-    model.write(project / "sparse" / "0")
-    monkeypatch.chdir(project / "sparse")  # the project is two folders up of the model
-    render_with(poses="0", output=tmp_path / "poses.json")
-    assert "poses of 2 of 2 panoramas" in capsys.readouterr().out
-    content = json.loads((tmp_path / "poses.json").read_text())
-    assert [entry["file"] for entry in content["panoramas"]] == list(NAMES)
-    found = panorama_poses(project / "sparse" / "0", read_rig(project / "rig_config.json"))
-    for entry in content["panoramas"]:
-        pose = poses[entry["file"]]
-        np.testing.assert_allclose(entry["location"], pose.location_m, atol=1e-9)
-        # A point left of the panorama's middle: y is to the left there.
-        point = pose.points_m((0.6, -0.8, 0), 2)
-        matrix: NDArray[np.float64] = np.array(entry["world_from_panorama"])
-        assert np.linalg.det(matrix) == pytest.approx(1)
-        np.testing.assert_allclose(entry["location"] + 2 * matrix @ (0.6, 0.8, 0), point, atol=1e-9)
-        seen, distance = found[entry["file"]].seen(point)
-        np.testing.assert_allclose(seen * distance, (1.2, -1.6, 0), atol=1e-9)
 
 
 def test_models_of_something_else(project: Path, tmp_path: Path, refused: Refused) -> None:

@@ -41,7 +41,7 @@ SETTINGS = (
 def run_command(monkeypatch: pytest.MonkeyPatch, command: str, *arguments: str) -> None:
     """Run a command in this process."""
     monkeypatch.setattr(sys, "argv", [f"tangent-{command}", *arguments])
-    getattr(main, command)()
+    getattr(main, command.replace("import", "import_network"))()
 
 
 def run_in(folder: Path, command: str, *arguments: str) -> None:

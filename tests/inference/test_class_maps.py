@@ -140,9 +140,7 @@ def test_a_map_of_a_map() -> None:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (None, "found No such file"),
         ({"source": 1, "classes": {"wall": ["wall"]}}, "found source=1"),
-        ({"classes": {"wall": "wall"}}, "found wall='wall' in classes"),
         ({"classes": {"wall\n": ["wall"]}}, "found names="),
         ({"classes": {"wall": ["a\u001b[2J"]}}, "found wall="),
         ({"classes": {"wall": []}}, "found no source class; expected 1 to"),
@@ -152,8 +150,7 @@ def test_a_map_of_a_map() -> None:
 )
 def test_unusable_files(content: Any, message: str, tmp_path: Path) -> None:
     path = tmp_path / "map.json"
-    if content is not None:
-        path.write_text(content if isinstance(content, str) else json.dumps(content))
+    path.write_text(json.dumps(content))
     with pytest.raises(DataError, match=message) as caught:
         load_class_map(str(path))
     assert caught.value.subject == path

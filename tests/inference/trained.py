@@ -13,6 +13,7 @@ from torch import nn
 from datamodules.core.inputs import RGB_NORMALIZATION, RGBD_NORMALIZATION
 from tangent_train.checkpoints.scores import Scores
 from tangent_train.checkpoints.trained import TrainedNetwork
+from tangent_train.cli.build import shown
 from tangent_train.geometry import equirect_directions
 from tangent_train.registry import make
 
@@ -67,7 +68,6 @@ def write_checkpoint(
 ) -> Path:
     """The checkpoint of such a network, as `tangent-train` writes it."""
     trained = trained_network(representation, channels)
-    normalization, tensors = trained.normalization, trained.network.state_dict()
     network = {"_target_": "torch.nn.Conv2d", "in_channels": None, "out_channels": 3}
     network |= {"kernel_size": 3, "padding": 1, "padding_mode": "replicate"}
     content = {
@@ -77,10 +77,8 @@ def write_checkpoint(
             "level": representation["level"],
         },
         "kind": "segmentation",
-        "inputs": list(trained.inputs),
-        "class_names": list(CLASS_NAMES),
-        "normalization": {"mean": list(normalization.mean), "std": list(normalization.std)},
-        "state_dict": tensors,
+        "state_dict": trained.network.state_dict(),
+        **shown(trained),
     }
     path.parent.mkdir(parents=True, exist_ok=True)
     torch.save(content, path)

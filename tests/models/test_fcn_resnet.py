@@ -14,6 +14,7 @@ from torchvision.models.segmentation import fcn_resnet50
 
 from models import FCNResNet
 from tangent_train.errors import DataError, SettingError
+from tests.tasks.small_networks import with_statistics
 
 LAST = ("classifier.4.weight", "classifier.4.bias")
 State = dict[str, Tensor]
@@ -23,14 +24,8 @@ State = dict[str, Tensor]
 def published() -> nn.Module:
     """As torchvision publishes it: 21 classes, an auxiliary classifier, statistics of some data."""
     torch.manual_seed(0)
-    network: nn.Module = fcn_resnet50(
-        weights=None, weights_backbone=None, num_classes=21, aux_loss=True
-    )
-    for module in network.modules():
-        if isinstance(module, nn.BatchNorm2d):
-            nn.init.uniform_(module.running_mean, -0.1, 0.1)  # type: ignore[arg-type]
-            nn.init.uniform_(module.running_var, 0.9, 1.1)  # type: ignore[arg-type]
-    return network.eval()
+    network = fcn_resnet50(weights=None, weights_backbone=None, num_classes=21, aux_loss=True)
+    return with_statistics(network).eval()
 
 
 def _resnet(published: nn.Module) -> State:

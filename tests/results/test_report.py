@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 from dataclasses import replace
-from pathlib import Path
 from statistics import fmean
 from typing import Any
 
@@ -74,24 +72,6 @@ def test_a_single_run_is_shown_with_its_interval_over_images() -> None:
     explained = "95 % bootstrap interval over its images"
     assert explained in report.tables()[0].note
     assert explained not in _runs_report(*several).tables()[0].note
-
-
-def test_all_files_hold_the_same_scores(tmp_path: Path) -> None:
-    records = [made_record([0.1, 0.4, None], bands=(0.6, 0.2), data__fold=fold) for fold in (1, 2)]
-    report = _runs_report(*records, made_record([0.1, 0.4, None], name="a|b [red]"))
-    report.write(tmp_path, "x")
-    assert {path.name for path in tmp_path.iterdir()} == {"x.md", "x.csv", "x.png"}
-    with (tmp_path / "x.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    for row, figure in zip(rows, report.figures(), strict=True):
-        assert {k: v for k, v in row.items() if v} == {
-            k: str(v) for k, v in figure.items() if v is not None
-        }
-    text = (tmp_path / "x.md").read_text()
-    assert text.startswith("# Report\n")
-    assert r"| a\|b [red] | 10.0 | 40.0 | – |" in text
-    assert "| mine | 60.0 | 20.0 |" in text
-    assert "| mine | 2 | 0 | /runs/2_0 |" in text
 
 
 def test_the_papers_rows_stand_beside_the_same_data_and_resolution() -> None:

@@ -12,10 +12,10 @@ from torch import nn
 from datamodules.core.inputs import Normalization
 from tangent_train.checkpoints.scores import Scores, size_multiple_of
 from tangent_train.checkpoints.trained import TrainedNetwork, completed_settings
-from tangent_train.cli.build import build
+from tangent_train.cli.build import build, shown
 from tangent_train.registry import SettingsFile, make
 from tangent_train.tasks import SegmentationTask
-from tests.inference.trained import TANGENT
+from tests.inference.trained import TANGENT, trained_network
 from tests.running import composed_settings
 
 NAMES = ("unknown", "beam", "board", "sofa", "wall")
@@ -39,13 +39,12 @@ def small_trained(
     torch.manual_seed(1)
     scores = Scores(with_statistics(make(settings, "network")), len(NAMES) - 1).eval()
     multiple = size_multiple_of(scores, 4)
-    return TrainedNetwork(
+    return trained_network(
+        TANGENT | {"level": 5},
+        channels=4,
         network=scores,
         class_names=NAMES,
-        inputs=("rgb", "depth"),
         normalization=Normalization([0.5, 0.4, 0.3, 1.1], [0.2, 0.25, 0.3, 0.8]),
-        level=5,
-        representation=TANGENT | {"level": 5},
         image_size=image_size,
         size_multiple=multiple or 1,
         fixed_size=None if multiple else image_size,
@@ -54,13 +53,12 @@ def small_trained(
     )
 
 
-def save_checkpoint(path: Path, *overrides: str, **changes: Any) -> SegmentationTask:
+def save_checkpoint(path: Path, *overrides: str) -> SegmentationTask:
     """Write what a run of such a config writes (of Lightning's own entries none is needed).
 
     Args:
         path: The file.
         overrides: Of the composed ``train.yaml``.
-        changes: Entries of the file to replace; None leaves one out.
 
     Returns:
         The task in evaluation mode, whose tensors are in the file.
@@ -72,16 +70,7 @@ def save_checkpoint(path: Path, *overrides: str, **changes: Any) -> Segmentation
         settings["network"], data.in_channels, data.num_classes
     )
     with_statistics(task.network)
-    normalization = data.normalization
-    content = {
-        "config": settings,
-        "kind": task.kind,
-        "inputs": list(data.inputs),
-        "class_names": list(data.class_names),
-        "normalization": {"mean": list(normalization.mean), "std": list(normalization.std)},
-        "state_dict": task.state_dict(),
-        **changes,
-    }
-    torch.save({name: value for name, value in content.items() if value is not None}, path)
+    content = {"config": settings, "kind": task.kind, **shown(data)}
+    torch.save(content | {"state_dict": task.state_dict()}, path)
     trained: SegmentationTask = task.eval()
     return trained

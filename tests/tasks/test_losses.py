@@ -29,22 +29,16 @@ def test_sum_over_norm_is_the_weighted_mean(smoothing: float) -> None:
     torch.testing.assert_close(total / norm, expected)
 
 
-def test_half_precision_does_not_overflow() -> None:
-    labels = torch.full((2, 300, 300), 2, dtype=torch.uint8)
-    weights = torch.tensor([1.0, 3.0, 0.5], dtype=torch.float16)
-    norm = cross_entropy_norm(labels, weights)
-    assert float(norm) == 3 * labels.numel()
-    scores = torch.zeros(2, 3, 300, 300, dtype=torch.float16)
-    mean = cross_entropy_sum(scores, labels, weights) / norm
-    assert float(mean) == pytest.approx(math.log(3), rel=1e-5)
-
-
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
-def test_the_norm_is_exact_under_autocast(dtype: torch.dtype) -> None:
+def test_half_precision_neither_overflows_nor_rounds(dtype: torch.dtype) -> None:
     labels = torch.full((2, 300, 301), 2, dtype=torch.uint8)
     weights = torch.tensor([1.0, 3.0, 0.5])
+    scores = torch.zeros(2, 3, 300, 301, dtype=dtype)
     with torch.autocast("cpu", dtype):
-        assert float(cross_entropy_norm(labels, weights)) == 3 * labels.numel()
+        norms = [cross_entropy_norm(labels, given) for given in (weights, weights.to(dtype))]
+        mean = cross_entropy_sum(scores, labels, weights.to(dtype)) / norms[0]
+    assert [float(norm) for norm in norms] == [3 * labels.numel()] * 2
+    assert float(mean) == pytest.approx(math.log(3), rel=1e-5)
 
 
 WEIGHTS = torch.tensor([7.0, 1.0, 0.5, 2.0, 0.0], dtype=torch.float64)

@@ -35,8 +35,8 @@ def _panoramas(folder: Path) -> dict[str, Pose]:
         pose = Pose.looking(place, rng.uniform(-3, 3), *rng.uniform(-0.2, 0.2, 2))
         camera = Camera(place, 0.0, (0.0, 0.0), first.gain, 0.004)
         picture = render(scene, PanoramaView(pose, 512), camera, holes, 1, rng)
-        write_pixels(folder / f"{k}.png", picture.rgb)
-        poses[f"{k}.png"] = pose
+        write_pixels(folder / f"{k}" / "room.png", picture.rgb)
+        poses[f"{k}/room.png"] = pose
     return poses
 
 
@@ -75,7 +75,7 @@ def _reconstruct(project: Path) -> None:
     pycolmap.incremental_mapping(database, project / "images", project / "sparse", options)
 
 
-def test_poses_of_a_room(tmp_path: Path) -> None:
+def test_poses_of_a_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     poses = _panoramas(tmp_path / "in")
     mask = np.full((512, 1024), 255, np.uint8)
     mask[427:] = 0  # below 60°: the tripod
@@ -92,7 +92,8 @@ def test_poses_of_a_room(tmp_path: Path) -> None:
             assert (counts[rows, columns] == 255).all()
             found += len(rows)
         assert found > 10_000
-    render_with(poses=project / "sparse" / "0", output=tmp_path / "poses.json")
+    monkeypatch.chdir(project / "sparse")  # the project is two folders up of the model
+    render_with(poses="0", output=tmp_path / "poses.json")
     entries = json.loads((tmp_path / "poses.json").read_text())["panoramas"]
     assert [entry["file"] for entry in entries] == list(poses)
     # A panorama's pose in the files: x forward, y left, z up; cameras: x right, y down, z forward.
@@ -101,6 +102,7 @@ def test_poses_of_a_room(tmp_path: Path) -> None:
     turned: list[NDArray[np.float64]] = [np.array(e["world_from_panorama"]) for e in entries]
     lengths = []
     for k in (1, 2):
+        assert np.linalg.det(turned[k]) == pytest.approx(1)
         relative, expected = turned[0].T @ turned[k], true[0].T @ true[k]
         assert rotation_angle_deg(relative, expected) < 0.5
         shift = np.subtract(entries[k]["location"], entries[0]["location"]) @ turned[0]

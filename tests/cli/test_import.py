@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,12 +13,12 @@ from torchvision import models as torchvision_models
 
 from models import UNet
 from tangent_train.checkpoints.trained import load_trained
-from tangent_train.cli import main
 from tangent_train.errors import DataError
 from tangent_train.geometry import TangentGrid, camera_matrix_from_fov
 from tangent_train.inference.photo_networks.importing import representation_of
 from tangent_train.inference.predictor import Predictor
 from tangent_train.inference.views import InputImage, PanoramaViews
+from tests.cli.tiny_runs import Run
 from tests.models.onnx_files import write_linear
 from tests.tasks.small_networks import with_statistics
 
@@ -29,17 +28,11 @@ BIAS = np.array([0.1, 1, 0, -1.5], np.float32)
 
 
 @pytest.fixture
-def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The current folder, with a network and the names of its scores."""
-    monkeypatch.chdir(tmp_path)
+def here(tmp_path: Path) -> Path:
+    """The current folder of commands, with a network and the names of its scores."""
     write_linear(tmp_path / "net.onnx", WEIGHT, BIAS, shape=("n", 3, 32, 32))
     (tmp_path / "classes.json").write_text(json.dumps(NAMES))
     return tmp_path
-
-
-def _run(command: str, monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None:
-    monkeypatch.setattr(sys, "argv", [f"tangent-{command}", *arguments])
-    getattr(main, "import_network" if command == "import" else command)()
 
 
 OF_ONNX = ("network=onnx", "file=net.onnx", "classes=classes.json", "normalization=unit")
@@ -47,11 +40,11 @@ OF_ONNX = ("network=onnx", "file=net.onnx", "classes=classes.json", "normalizati
 
 @pytest.mark.parametrize("wins", [True, False])
 def test_an_onnx_file_labels_panoramas(
-    wins: bool, here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    wins: bool, here: Path, run: Run, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Blocks of one colour: the labels are those of every pixel's own scores."""
     nothing = ("nothing=[background]", f"nothing_wins={wins}".lower())
-    _run("import", monkeypatch, *OF_ONNX, *nothing, "fov=90", "output=ours.onnx")
+    run("import", *OF_ONNX, *nothing, "fov=90", "output=ours.onnx")
     said = capsys.readouterr().out
     assert "3 classes: dark, green, bright\n" in said
     assert f"background: mean nothing, {'are written as unknown' if wins else 'never win'}" in said
@@ -69,29 +62,27 @@ def test_an_onnx_file_labels_panoramas(
     assert set(np.unique(expected)) == ({0, 1, 2, 3} if wins else {1, 2, 3})
 
 
-def test_a_network_of_a_config_and_its_export_compute_the_same(
-    here: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_network_of_a_config_and_its_export_compute_the_same(here: Path, run: Run) -> None:
     torch.manual_seed(0)
     network = UNet(3, 4, (16, 32, 64, 128, 256)).eval()
     torch.save(network.state_dict(), here / "state.pt")
     given = ("weights=state.pt", "classes=classes.json", "normalization=imagenet")
     size = ("level=6", "base_level=1", "nothing=[background]")
-    _run("import", monkeypatch, "network=unet_small", *given, *size, "output=net.ckpt")
+    run("import", "network=unet_small", *given, *size, "output=net.ckpt")
     trained = load_trained(here / "net.ckpt")
     assert trained.normalization.mean == (0.485, 0.456, 0.406)
     images = torch.randn(2, 3, 32, 48)
     with torch.no_grad():
         expected = network(images)[:, [1, 2, 3, 0]]
         torch.testing.assert_close(trained.network(images), expected)
-        _run("export", monkeypatch, "checkpoint=net.ckpt", "output=again.safetensors")
+        run("export", "checkpoint=net.ckpt", "output=again.safetensors")
         again = load_trained(here / "again.safetensors")
         assert again.class_names == trained.class_names
         torch.testing.assert_close(again.network(images), expected)
 
 
 def test_a_network_of_ones_own_is_imported(
-    here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    here: Path, run: Run, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (here / "own" / "network").mkdir(parents=True)
     (here / "own" / "network" / "mine.yaml").write_text(
@@ -101,7 +92,7 @@ def test_a_network_of_ones_own_is_imported(
     network = with_statistics(UNet(3, 4, (4, 8)))
     torch.save(network.state_dict(), here / "state.pt")
     given = ("weights=state.pt", "classes=classes.json", "normalization=unit", "output=net.ckpt")
-    _run("import", monkeypatch, "--config-dir", "own", "network=mine", *given)
+    run("import", "--config-dir", "own", "network=mine", *given)
     own = "tests.tasks.small_networks.with_statistics"
     assert f"trust=[{own}]" in capsys.readouterr().out
     assert load_trained(here / "net.ckpt", [own]).class_names == ("unknown", *NAMES)
@@ -110,7 +101,7 @@ def test_a_network_of_ones_own_is_imported(
 
 
 def test_torchvision_gives_the_scores_of_its_own_transform(
-    here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    here: Path, run: Run, capsys: pytest.CaptureFixture[str]
 ) -> None:
     torch.manual_seed(0)
     name = "lraspp_mobilenet_v3_large"
@@ -118,7 +109,7 @@ def test_torchvision_gives_the_scores_of_its_own_transform(
     torch.save(network.state_dict(), here / "state.pt")
     (here / "classes.json").unlink()
     arguments = ("network=torchvision", f"model={name}", "weights=state.pt")
-    _run("import", monkeypatch, *arguments, "output=net.ckpt")
+    run("import", *arguments, "output=net.ckpt")
     weights = torchvision_models.get_model_weights(name)["DEFAULT"]
     assert f"21 classes: {', '.join(weights.meta['categories'])}\n" in capsys.readouterr().out
     trained = load_trained(here / "net.ckpt")
@@ -172,17 +163,17 @@ def test_tangent_images_have_the_angular_resolution_of_the_photos(
     ],
 )
 def test_what_does_not_fit_is_one_clear_message(
-    changes: tuple[str, ...], told: str, here: Path, monkeypatch: pytest.MonkeyPatch
+    changes: tuple[str, ...], told: str, here: Path, run: Run
 ) -> None:
     (here / "three.json").write_text(json.dumps(NAMES[1:]))
     (here / "holes.json").write_text(json.dumps({"0": "wall", "2": "floor"}))
     before = set(here.iterdir())
     with pytest.raises(SystemExit, match=told):
-        _run("import", monkeypatch, *OF_ONNX, "output=ours.onnx", *changes)
+        run("import", *OF_ONNX, "output=ours.onnx", *changes)
     assert set(here.iterdir()) == before
 
 
-def test_classes_may_be_given_by_place(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_classes_may_be_given_by_place(here: Path, run: Run) -> None:
     (here / "classes.json").write_text(json.dumps({"3": "d", "0": "a", "1": "b", "2": "c"}))
-    _run("import", monkeypatch, *OF_ONNX, "output=ours.onnx")
+    run("import", *OF_ONNX, "output=ours.onnx")
     assert load_trained(here / "ours.onnx").class_names == ("unknown", "a", "b", "c", "d")
