@@ -1,4 +1,4 @@
-"""Every option of the config tree, composed once; where a command starts from a checkpoint."""
+"""Every config of the tree, composed once; where a command starts from a checkpoint."""
 
 from __future__ import annotations
 
@@ -12,7 +12,19 @@ from tangent_train.cli.stored import stored_run
 from tangent_train.errors import DataError
 from tests.running import composed
 
+EXPERIMENTS = sorted(
+    path.relative_to(config_folder() / "experiment").with_suffix("").as_posix()
+    for path in (config_folder() / "experiment").rglob("*.yaml")
+)
 GROUPS = ("representation", "optimizer", "scheduler", "network", "data", "trainer", "task")
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+def test_every_experiment_composes(experiment: str) -> None:
+    command = "transfer" if Path(experiment).name.startswith("transfer") else "train"
+    config = composed(command, f"experiment={experiment}")
+    OmegaConf.resolve(config)
+    assert config.name in (experiment, experiment.removeprefix("rooms/"))
 
 
 @pytest.mark.parametrize("group", GROUPS)
