@@ -20,7 +20,7 @@ from tangent_train.rendering import (
     PerspectiveRepresentation,
     TangentRepresentation,
 )
-from tests.conftest import FabricateStanford
+from tests.conftest import fabricate
 from tests.datamodules.data_files import names_of, read_png
 
 
@@ -37,10 +37,10 @@ def test_what_is_past_the_end_of_the_table_is_missing_or_a_mistake() -> None:
 
 
 @pytest.fixture
-def broken_root(fabricate_stanford: FabricateStanford, tmp_path: Path) -> Path:
+def broken_root(tmp_path: Path) -> Path:
     """A data set to be damaged, one panorama per area."""
     rooms = {"1": ("office_1", "office_2")} | dict.fromkeys(AREAS[1:], ("office_1",))
-    return fabricate_stanford(tmp_path / "data", rooms, height=16)
+    return fabricate(tmp_path / "data", rooms, height=16)
 
 
 # --- names -------------------------------------------------------------------------------------
@@ -143,10 +143,8 @@ CROPS = PerspectiveRepresentation(level=5, crops_per_photo=2)
 
 
 @pytest.fixture(scope="module")
-def photo_root(
-    tmp_path_factory: pytest.TempPathFactory, fabricate_stanford: FabricateStanford
-) -> Path:
-    return fabricate_stanford(tmp_path_factory.mktemp("photos"), photos=2)
+def photo_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return fabricate(tmp_path_factory.mktemp("photos"), photos=2)
 
 
 # --- reading -----------------------------------------------------------------------------------
@@ -215,10 +213,8 @@ def test_samples_of_photos(photo_root: Path) -> None:
 # --- what cannot work --------------------------------------------------------------------------
 
 
-def test_a_photo_that_sees_less_than_a_crop_or_has_no_pose_is_named(
-    fabricate_stanford: FabricateStanford, tmp_path: Path
-) -> None:
-    broken_root = fabricate_stanford(tmp_path, photos=1)
+def test_a_photo_that_sees_less_than_a_crop_or_has_no_pose_is_named(tmp_path: Path) -> None:
+    broken_root = fabricate(tmp_path, photos=1)
     module = Stanford2D3DSPerspective(broken_root, PerspectiveRepresentation(5, fov_deg=70))
     next(broken_root.glob("area_5a/data/pose/*.json")).unlink()
     with pytest.raises(DataError, match=r"pose\.json: found .*No such file"):
