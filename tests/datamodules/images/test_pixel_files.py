@@ -20,10 +20,7 @@ from datamodules.images.pixel_files import (
     read_rgb,
     write_pixels,
 )
-from datamodules.images.png import (
-    check_panorama_size,
-    read_png_header,
-)
+from datamodules.images.png import read_png_header
 from tangent_train.errors import DataError, SettingError
 from tests.datamodules.data_files import write_png
 
@@ -207,11 +204,3 @@ def test_truncated_files_are_named(tmp_path: Path, missing: slice) -> None:
     path.write_bytes(content)
     with pytest.raises(DataError, match=r"image\.png: found .* truncated"):
         read_png_header(path)
-
-
-def test_size_of_panoramas(tmp_path: Path) -> None:
-    check_panorama_size(tmp_path, (64, 128), 64)
-    with pytest.raises(DataError, match="found 64×127 pixels; expected twice as wide as high"):
-        check_panorama_size(tmp_path, (64, 127), 64)
-    with pytest.raises(SettingError, match="at most the 64 rows"):
-        check_panorama_size(tmp_path, (64, 128), 65)
