@@ -59,13 +59,7 @@ _SETTINGS = (
     "level=4",
     "network=unet_small",
     "network.widths=[4,8]",
-    "data.num_workers=0",
-    "photos.data.num_workers=0",
-    "trainer.max_epochs=1",
-    "trainer.accelerator=cpu",
     "compare=[]",
-    "fine_tuning.epochs=[1]",
-    "panels=0",
 )
 
 
