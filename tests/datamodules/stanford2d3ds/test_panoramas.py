@@ -36,13 +36,6 @@ def test_what_is_past_the_end_of_the_table_is_missing_or_a_mistake() -> None:
         table.decode(_colors([0x0D0D0D, 9815, 9816, 0xFFFFFF]))
 
 
-@pytest.fixture
-def broken_root(tmp_path: Path) -> Path:
-    """A data set to be damaged, one panorama per area."""
-    rooms = {"1": ("office_1", "office_2")} | dict.fromkeys(AREAS[1:], ("office_1",))
-    return fabricate(tmp_path / "data", rooms, height=16)
-
-
 # --- names -------------------------------------------------------------------------------------
 
 
@@ -125,7 +118,8 @@ def test_masks_are_applied_on_reading(stanford_root: Path, erp: Any) -> None:
 # --- what cannot be used -----------------------------------------------------------------------
 
 
-def test_wrong_layout(broken_root: Path, erp: Any) -> None:
+def test_wrong_layout(tmp_path: Path, erp: Any) -> None:
+    broken_root = fabricate(tmp_path / "data", dict.fromkeys(AREAS, ("office_1",)), height=16)
     with pytest.raises(DataError, match="no area_1, area_2"):
         Stanford2D3DS(broken_root / "area_1", erp).setup()
     (broken_root / "area_5b").rename(broken_root / "spare")

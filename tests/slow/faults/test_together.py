@@ -5,11 +5,9 @@ from __future__ import annotations
 import multiprocessing
 import zlib
 from concurrent.futures import ProcessPoolExecutor
-from multiprocessing.context import ForkServerContext
 from pathlib import Path
 from typing import Any
 
-import pytest
 import torch
 
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
@@ -17,13 +15,6 @@ from tangent_train.rendering import TangentRepresentation
 
 PROCESSES = 3
 PANORAMAS = 14
-
-
-@pytest.fixture(scope="module")
-def processes() -> ForkServerContext:
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["datamodules.stanford2d3ds.panoramas"])
-    return context
 
 
 def _data(root: Path, store: Path | None) -> Stanford2D3DS:
@@ -50,8 +41,10 @@ def _prepare_and_read(root: Path, store: Path, barrier: Any) -> tuple[int, int]:
 
 
 def test_runs_that_prepare_the_same_store_at_once_see_the_same(
-    stanford_root: Path, tmp_path: Path, processes: ForkServerContext
+    stanford_root: Path, tmp_path: Path
 ) -> None:
+    processes = multiprocessing.get_context("forkserver")
+    processes.set_forkserver_preload(["datamodules.stanford2d3ds.panoramas"])
     store = tmp_path / "store"
     with processes.Manager() as manager, ProcessPoolExecutor(PROCESSES, processes) as pool:
         barrier = manager.Barrier(PROCESSES)
