@@ -40,7 +40,7 @@ def scripts(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def _run(folder: Path, program: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [program, *arguments]
+    command: list[str | Path] = [program, *arguments]
     return subprocess.run(command, check=False, cwd=folder, capture_output=True, text=True)
 
 

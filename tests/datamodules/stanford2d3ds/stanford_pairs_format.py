@@ -6,7 +6,10 @@ import hashlib
 import shutil
 from pathlib import Path
 
+import numpy as np
+
 from datamodules.stanford2d3ds.pairs import published_pairs
+from tests.datamodules.data_files import read_png, write_png
 
 
 def write_paper_pairs(root: Path, rooms: Path) -> Path:
@@ -14,7 +17,7 @@ def write_paper_pairs(root: Path, rooms: Path) -> Path:
 
     Args:
         root: Where ``area_1`` comes to be.
-        rooms: Synthetic rooms in the same format, whose panoramas they are.
+        rooms: Synthetic rooms in the same format, whose depth and poses they have.
 
     Returns:
         The same folder.
@@ -28,14 +31,14 @@ def write_paper_pairs(root: Path, rooms: Path) -> Path:
 
 
 def write_panorama(root: Path, camera: str, room: str, rooms: Path, number: int = 0) -> None:
-    """One panorama.
+    """One panorama of one grey: nothing in it is found in another one, which takes long.
 
     Args:
         root: Where ``area_1`` comes to be.
         camera: 32 hexadecimal digits.
         room: As ``office_3``.
         rooms: Synthetic rooms in the same format.
-        number: Which of their panoramas it is; they are taken in turn.
+        number: Grey, and which of their panoramas it has depth and pose of; they take turns.
     """
     for kind in ("rgb", "depth", "pose"):
         panoramas = sorted(rooms.glob(f"area_1/pano/{kind}/*"))
@@ -43,4 +46,7 @@ def write_panorama(root: Path, camera: str, room: str, rooms: Path, number: int 
         name = f"camera_{camera}_{room}_frame_equirectangular_domain_{kind}{panorama.suffix}"
         path = root / "area_1" / "pano" / kind / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(panorama, path)
+        if kind == "rgb":
+            write_png(path, np.full_like(read_png(panorama), number))
+        else:
+            shutil.copyfile(panorama, path)
