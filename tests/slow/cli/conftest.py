@@ -19,7 +19,7 @@ padding: 1
 
 @pytest.fixture
 def plain(tmp_path: Path) -> tuple[str, ...]:
-    """Settings that choose a network of one convolution, in a folder of configs."""
+    """Arguments that choose a network of one convolution, to be the first ones."""
     (tmp_path / "own" / "network").mkdir(parents=True)
     (tmp_path / "own" / "network" / "plain.yaml").write_text(_PLAIN)
     return ("--config-dir=own", "network=plain")

@@ -28,7 +28,7 @@ def test_two_processes_make_the_steps_and_figures_of_one(
     rooms: str, tmp_path: Path, run: Run, plain: tuple[str, ...]
 ) -> None:
     settings = [text for text in SETTINGS if not text.startswith("network.")]
-    common = [*settings, rooms, *plain]
+    common = [*plain, *settings, rooms]
     common += ["trainer.max_steps=3", "optimizer=adam", "data.validation_fraction=0.4", "panels=2"]
     one = ["data.panoramas_per_step=2", "hydra.run.dir=one"]
     run("train", *common, *one)

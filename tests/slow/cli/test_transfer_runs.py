@@ -18,7 +18,7 @@ from tests.datamodules.folder.photo_format import write_photo, write_photos
 def test_real_runs_from_photos_to_panoramas(
     tmp_path: Path, run: Run, plain: tuple[str, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    network = (*SETTINGS, *plain, "compare=[]", "trainer.max_epochs=2")
+    network = (*plain, *SETTINGS, "compare=[]", "trainer.max_epochs=2")
     run("transfer", *network)
     stages = ["P", "S", "P-FT-1", "S-FT-1"]
     found = {name: json.loads((OF_SEED_0 / name / "results.json").read_text()) for name in stages}
