@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,10 +30,6 @@ ROOMS = {
     "5b": ("hallway_2", "office_3"),
     "6": ("office_1",),
 }
-
-
-FabricateStanford = Callable[..., Path]
-"""Writes a small data set; returns its root. See `fabricate`."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -98,12 +94,6 @@ def _panorama(rng: np.random.Generator, height: int, *, alpha: bool) -> dict[str
     else:
         bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
     return {"rgb": bgr, "semantic": color[..., ::-1], "depth": depth}
-
-
-@pytest.fixture(scope="session")
-def fabricate_stanford() -> FabricateStanford:
-    """Writes a small data set in the format of Stanford2D3DS."""
-    return fabricate
 
 
 @pytest.fixture(scope="session")

@@ -12,6 +12,17 @@ from numpy.typing import NDArray
 from datamodules.core.found import Split
 from datamodules.core.split_module import SplitDataModule
 
+GPANO_TAGS = {
+    "ProjectionType": "equirectangular",
+    "FullPanoWidthPixels": "360",
+    "FullPanoHeightPixels": "180",
+    "CroppedAreaImageWidthPixels": "60",
+    "CroppedAreaImageHeightPixels": "40",
+    "CroppedAreaLeftPixels": "100",
+    "CroppedAreaTopPixels": "30",
+}
+"""40×60 pixels of a panorama of 180×360."""
+
 
 def write_png(path: Path, image: NDArray[Any]) -> None:
     """Write an image in OpenCV's order of colours."""

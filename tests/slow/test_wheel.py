@@ -39,9 +39,9 @@ def scripts(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return environment / "bin"
 
 
-@pytest.fixture
-def clean(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("PYTHONPATH", raising=False)
+def _run(folder: Path, program: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    command: list[str | Path] = [program, *arguments]
+    return subprocess.run(command, check=False, cwd=folder, capture_output=True, text=True)
 
 
 def test_the_wheel_holds_the_packages_and_the_configs(wheel: Path) -> None:
@@ -58,17 +58,13 @@ def test_the_wheel_holds_the_packages_and_the_configs(wheel: Path) -> None:
     assert not [name for name in names if name.startswith(("tests", "benchmarks", "data/"))]
 
 
-@pytest.mark.usefixtures("clean")
-def test_the_commands_answer_from_another_folder(scripts: Path, tmp_path: Path) -> None:
+def test_the_commands_answer_from_another_folder(
+    scripts: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("PYTHONPATH", raising=False)
     commands = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
     for command in commands:
-        done = subprocess.run(
-            [scripts / command, "--help"],
-            check=False,
-            cwd=tmp_path,
-            capture_output=True,
-            text=True,
-        )
+        done = _run(tmp_path, scripts / command, "--help")
         assert done.returncode == 0, done.stderr
         assert command in done.stdout
     assert not list(tmp_path.iterdir())
@@ -81,8 +77,7 @@ def test_packages_of_the_same_names_on_the_path_hide_nothing(
         (tmp_path / name).mkdir()
         (tmp_path / name / "__init__.py").write_text("raise RuntimeError")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    command = [str(scripts / "tangent-check"), "data=folder", "data.root=nowhere"]
-    done = subprocess.run(command, check=False, cwd=tmp_path, capture_output=True, text=True)
+    done = _run(tmp_path, scripts / "tangent-check", "data=folder", "data.root=nowhere")
     assert done.returncode == 1
     *notes, refusal = done.stderr.splitlines()
     for name, note in zip(("datamodules", "models"), notes, strict=True):

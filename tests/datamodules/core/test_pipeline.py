@@ -12,10 +12,7 @@ from numpy.typing import NDArray
 
 from datamodules.core.found import Found, SplitItems
 from datamodules.core.panoramas import ImageFiles, Panorama
-from datamodules.core.pipeline import (
-    EstimatedUp,
-    RotatedPanoramas,
-)
+from datamodules.core.pipeline import EstimatedUp, PosedUp, RotatedPanoramas
 from tangent_train.errors import DataError
 from tangent_train.geometry import equirect_directions
 
@@ -64,6 +61,21 @@ def test_image_depth_labels_and_up_rotate_together(
     np.testing.assert_allclose(found, R @ ((0, 0, 1) if up is None else up), atol=1e-12)
     unknown = RotatedPanoramas(rotation, seed=5)(_heights()._replace(depth=None, up=up), 0)
     assert (unknown.depth, unknown.up) == (None, None)
+
+
+def test_files_are_asked_once_where_up_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+
+    def up_of(path: Path) -> NDArray[np.float64] | None:
+        asked.append(str(path))
+        return UP if str(path) == "1" else None
+
+    monkeypatch.setattr("datamodules.core.pipeline.up_of", up_of)
+    posed = PosedUp()
+    for _ in range(2):
+        assert posed(_heights(), 0, FILES[0]).up is None
+        np.testing.assert_array_equal(posed(_heights(), 1, FILES[1]).up, UP)
+    assert asked == ["0", "1"]
 
 
 @pytest.mark.parametrize("found", [None, UP])

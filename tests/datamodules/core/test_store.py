@@ -15,7 +15,7 @@ from datamodules.core.store import Store
 from tangent_train.cli.each import Shard
 from tangent_train.errors import DataError, SettingError
 from tangent_train.rendering import EquirectRepresentation
-from tests.conftest import FabricateStanford
+from tests.conftest import fabricate
 from tests.datamodules.data_files import contents
 
 MakeModule = Callable[..., Stanford2D3DS]
@@ -24,12 +24,12 @@ PANORAMAS = 8
 
 
 @pytest.fixture
-def root(fabricate_stanford: FabricateStanford, tmp_path: Path) -> Path:
+def root(tmp_path: Path) -> Path:
     """A data set of eight panoramas, one or two of every area."""
     rooms = {"1": ("office_1", "office_2")} | dict.fromkeys(
         ("2", "3", "4", "5a", "5b", "6"), ("office_1",)
     )
-    return fabricate_stanford(tmp_path / "data", rooms, photos=1)
+    return fabricate(tmp_path / "data", rooms, photos=1)
 
 
 @pytest.fixture

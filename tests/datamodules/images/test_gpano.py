@@ -13,17 +13,7 @@ from datamodules.images.gpano import PanoramaArea, area_of, area_of_crop, up_of,
 from tangent_train.errors import DataError, SettingError
 from tangent_train.geometry import equirect_to_lonlat
 from tangent_train.rendering.upright.gravity import up_from_pose
-from tests.datamodules.data_files import gpano_xmp
-
-_TAGS = {
-    "ProjectionType": "equirectangular",
-    "FullPanoWidthPixels": "360",
-    "FullPanoHeightPixels": "180",
-    "CroppedAreaImageWidthPixels": "60",
-    "CroppedAreaImageHeightPixels": "40",
-    "CroppedAreaLeftPixels": "100",
-    "CroppedAreaTopPixels": "30",
-}
+from tests.datamodules.data_files import GPANO_TAGS, gpano_xmp
 
 
 def _save(
@@ -48,14 +38,14 @@ _AREA = PanoramaArea((180, 360), (30, 70), (100, 160), (40, 60))
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif", ".webp"])
 @pytest.mark.parametrize("elements", [False, True])
 def test_tags_of_all_formats(tmp_path: Path, suffix: str, elements: bool) -> None:
-    path = _save(tmp_path / f"image{suffix}", _TAGS, elements=elements)
+    path = _save(tmp_path / f"image{suffix}", GPANO_TAGS, elements=elements)
     assert area_of(path, (40, 60)) == _AREA
 
 
 def test_images_that_say_nothing(tmp_path: Path) -> None:
     Image.new("RGB", (60, 40)).save(tmp_path / "none.jpg")
-    incomplete = {k: v for k, v in _TAGS.items() if k != "CroppedAreaTopPixels"}
-    other = _save(tmp_path / "other.jpg", _TAGS)
+    incomplete = {k: v for k, v in GPANO_TAGS.items() if k != "CroppedAreaTopPixels"}
+    other = _save(tmp_path / "other.jpg", GPANO_TAGS)
     other.write_bytes(other.read_bytes().replace(b"photos/1.0/panorama", b"photos/1.0/image"))
     for path in (tmp_path / "none.jpg", _save(tmp_path / "incomplete.jpg", incomplete), other):
         assert area_of(path, (30, 60)) == whole_area(path, (30, 60)), path.name
@@ -66,7 +56,7 @@ def test_images_that_say_nothing(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("size", [(20, 30), (80, 120), (27, 40), (33, 50)])
 def test_resized_images_show_the_same(tmp_path: Path, size: tuple[int, int]) -> None:
-    path = _save(tmp_path / "image.jpg", _TAGS, size)
+    path = _save(tmp_path / "image.jpg", GPANO_TAGS, size)
     area = area_of(path, size)
     assert area is not None
     assert area.image_shape == size
@@ -99,22 +89,12 @@ def _angles_deg(area: PanoramaArea, corner_xy: tuple[int, int]) -> NDArray[np.fl
 def test_tags_that_cannot_be_are_refused(
     tmp_path: Path, changes: dict[str, str], size: tuple[int, int], found: str
 ) -> None:
-    path = _save(tmp_path / "image.jpg", _TAGS | changes)
+    path = _save(tmp_path / "image.jpg", GPANO_TAGS | changes)
     with pytest.raises(DataError, match=rf"image\.jpg: found .*{found}"):
         area_of(path, size)
 
 
 # Placing and cutting
-
-
-def _reference_place(image: NDArray[Any], area: PanoramaArea) -> NDArray[Any]:
-    """Pixel by pixel."""
-    height, width = area.full_shape
-    whole = np.zeros((height, width, *image.shape[2:]), image.dtype)
-    for row in range(image.shape[0]):
-        for column in range(image.shape[1]):
-            whole[area.rows[0] + row, (area.columns[0] + column) % width] = image[row, column]
-    return whole
 
 
 @pytest.mark.parametrize(
@@ -132,7 +112,10 @@ def test_place_and_cut(area: PanoramaArea, channels: tuple[int, ...], dtype: Any
     image = np.random.default_rng(0).integers(1, 250, shape).astype(dtype)
     placed = area.place(image)
     assert placed.dtype == image.dtype
-    np.testing.assert_array_equal(placed, _reference_place(image, area))
+    whole = np.zeros((8, 16, *channels))
+    for column in range(image.shape[1]):
+        whole[slice(*area.rows), (area.columns[0] + column) % 16] = image[:, column]
+    np.testing.assert_array_equal(placed, whole)
     np.testing.assert_array_equal(area.cut(placed), image)
 
 

@@ -22,14 +22,6 @@ RAYS = equirect_directions(SHAPE)
 POINTS = "0 0 0\n1 0 0\n1 1 0\n0 1 0.5\n"
 
 
-def _box(center: tuple[float, float, float], size: tuple[float, float, float]) -> Trimesh:
-    return creation.box(size).apply_translation(center)
-
-
-def _ball(subdivisions: int, radii: tuple[float, float, float] = (1, 1, 1)) -> Trimesh:
-    return creation.icosphere(subdivisions).apply_scale(radii)
-
-
 def _mesh(vertices: Any, faces: Any) -> Trimesh:
     return Trimesh(np.array(vertices, np.float64), np.array(faces), process=False)
 
@@ -82,7 +74,8 @@ def test_broken_files_are_named(tmp_path: Path, content: str) -> None:
 
 
 def test_a_cube() -> None:
-    spheres = mesh_spheres(clean_mesh(_box((7, -3, 20), (5, 5, 5))), SHAPE)
+    box = creation.box((5, 5, 5)).apply_translation((7, -3, 20))
+    spheres = mesh_spheres(clean_mesh(box), SHAPE)
     half = RADIUS / math.sqrt(3)
     along = np.abs(RAYS).max(axis=-1)  # the share of the ray along the normal of the face it hits
     two, one = np.sort(np.abs(RAYS), axis=-1)[..., 1:].transpose(2, 0, 1)
@@ -126,7 +119,7 @@ def test_no_ray_slips_through_a_closed_mesh(shape: tuple[int, int]) -> None:
         [[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]],
         [[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]],
     )
-    for made in (octahedron, _ball(3), _box((0, 0, 0), (1, 2, 3))):
+    for made in (octahedron, creation.icosphere(3), creation.box((1, 2, 3))):
         spheres = mesh_spheres(clean_mesh(made), shape)
         assert spheres.shape == (*shape, 6)
         assert spheres[..., [1, 4]].min() > 0.1

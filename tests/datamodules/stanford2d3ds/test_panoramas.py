@@ -20,7 +20,7 @@ from tangent_train.rendering import (
     PerspectiveRepresentation,
     TangentRepresentation,
 )
-from tests.conftest import FabricateStanford
+from tests.conftest import fabricate
 from tests.datamodules.data_files import names_of, read_png
 
 
@@ -34,13 +34,6 @@ def test_what_is_past_the_end_of_the_table_is_missing_or_a_mistake() -> None:
     assert table.decode(_colors([0x0D0D0D, 9815])).tolist() == [[0, 6]]
     with pytest.raises(DataError, match="found instance 9816 in 2 pixels; expected 0 to 9815"):
         table.decode(_colors([0x0D0D0D, 9815, 9816, 0xFFFFFF]))
-
-
-@pytest.fixture
-def broken_root(fabricate_stanford: FabricateStanford, tmp_path: Path) -> Path:
-    """A data set to be damaged, one panorama per area."""
-    rooms = {"1": ("office_1", "office_2")} | dict.fromkeys(AREAS[1:], ("office_1",))
-    return fabricate_stanford(tmp_path / "data", rooms, height=16)
 
 
 # --- names -------------------------------------------------------------------------------------
@@ -125,7 +118,8 @@ def test_masks_are_applied_on_reading(stanford_root: Path, erp: Any) -> None:
 # --- what cannot be used -----------------------------------------------------------------------
 
 
-def test_wrong_layout(broken_root: Path, erp: Any) -> None:
+def test_wrong_layout(tmp_path: Path, erp: Any) -> None:
+    broken_root = fabricate(tmp_path / "data", dict.fromkeys(AREAS, ("office_1",)), height=16)
     with pytest.raises(DataError, match="no area_1, area_2"):
         Stanford2D3DS(broken_root / "area_1", erp).setup()
     (broken_root / "area_5b").rename(broken_root / "spare")
@@ -143,10 +137,8 @@ CROPS = PerspectiveRepresentation(level=5, crops_per_photo=2)
 
 
 @pytest.fixture(scope="module")
-def photo_root(
-    tmp_path_factory: pytest.TempPathFactory, fabricate_stanford: FabricateStanford
-) -> Path:
-    return fabricate_stanford(tmp_path_factory.mktemp("photos"), photos=2)
+def photo_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return fabricate(tmp_path_factory.mktemp("photos"), photos=2)
 
 
 # --- reading -----------------------------------------------------------------------------------
@@ -215,10 +207,8 @@ def test_samples_of_photos(photo_root: Path) -> None:
 # --- what cannot work --------------------------------------------------------------------------
 
 
-def test_a_photo_that_sees_less_than_a_crop_or_has_no_pose_is_named(
-    fabricate_stanford: FabricateStanford, tmp_path: Path
-) -> None:
-    broken_root = fabricate_stanford(tmp_path, photos=1)
+def test_a_photo_that_sees_less_than_a_crop_or_has_no_pose_is_named(tmp_path: Path) -> None:
+    broken_root = fabricate(tmp_path, photos=1)
     module = Stanford2D3DSPerspective(broken_root, PerspectiveRepresentation(5, fov_deg=70))
     next(broken_root.glob("area_5a/data/pose/*.json")).unlink()
     with pytest.raises(DataError, match=r"pose\.json: found .*No such file"):

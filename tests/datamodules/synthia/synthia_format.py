@@ -15,7 +15,7 @@ from tests.datamodules.data_files import write_png
 SIZE = (38, 64)  # the real 760×1280 by 20
 FOCAL, CENTER_X, CENTER_Y = 532.740352 / 20, 32.0, 19.0
 HEIGHT = 104
-IDS = np.array([1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 15, 0])
+IDS = np.arange(16)
 # Forward and right of each view: x to the front, y to the right, z up.
 LOOKS = {
     "F": ((1, 0, 0), (0, 1, 0)),

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from datamodules.core.found import SPLITS
 from datamodules.synthia.omnisynthia import OmniSynthia, SynthiaPerspective
@@ -28,6 +29,11 @@ def two(root: Path, erp: Any, **settings: Any) -> OmniSynthia:
     return OmniSynthia(root, erp, **{**SEQUENCES, **settings})
 
 
+def classes_of(ids: NDArray[Any]) -> NDArray[Any]:
+    """Of twelve ids and traffic lights; the others are unknown."""
+    return np.where(ids == 15, 13, np.where(ids > 12, 0, ids))
+
+
 # --- splits --------------------------------------------------------------------------------------
 
 
@@ -46,6 +52,8 @@ def test_splits(root: Path, erp: Any) -> None:
     assert len(splits["train"]) == 14 - 4
     assert len({name for split in splits.values() for name in split}) == sum(FRAMES.values())
     assert not list(root.rglob("*.json"))
+    assert len(names_of(OmniSynthia(root, erp, validation_fraction=0.99), "train")) == 4
+    assert not names_of(OmniSynthia(root, erp, validation_fraction=0), "val")
 
 
 # --- reading -------------------------------------------------------------------------------------
@@ -58,7 +66,7 @@ def test_reads_what_was_written(root: Path) -> None:
     pano = synthia.sequence(root, "04") / "pano"
     ids = read_png(pano / "GT" / "LABELS_Correct" / "000001.png")
     assert {15, 255} <= set(np.unique(ids).tolist())
-    expected = np.where(ids == 15, 13, np.where(ids == 255, 0, ids))
+    expected = classes_of(ids)
     np.testing.assert_array_equal(panorama.labels, expected)
     np.testing.assert_array_equal(source.labels(1), expected)
     rgb = read_png(pano / "RGB" / "000001.png")[..., ::-1]
@@ -91,7 +99,7 @@ def test_photos_are_what_was_written(root: Path) -> None:
             rays = synthia.view_rays(view)
             np.testing.assert_allclose(photo.rgb, synthia.rgb_of(rays), atol=0.5001)
             ids = synthia.labels_of(rays, frame)
-            np.testing.assert_array_equal(photo.labels, np.where(ids == 15, 13, ids))
+            np.testing.assert_array_equal(photo.labels, classes_of(ids))
             meters = (500 + 10 * rays[..., 2]) / 100 * np.linalg.norm(rays, axis=-1)
             meters[:2, :3] = 0
             assert photo.depth is not None

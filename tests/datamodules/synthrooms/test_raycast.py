@@ -33,11 +33,15 @@ NO_HOLES = Holes(np.zeros((0, 3)), np.zeros(0))
 
 
 def empty_room() -> Room:
+    """A lamp under the ceiling, which can be seen by its light only."""
     rng = np.random.default_rng(0)
     room = shell(rng, FloorPlan((5.0, 4.0, 3.0)))
     room.parts[:] = [
         part for part in room.parts if len(part.triangles) and _is_slab(part.triangles)
     ]
+    down = np.array([0, 0, -1.0])
+    sides = np.array([[0.2, 0, 0], [0, 0.2, 0]])
+    room.lights.append(Light(np.array([2.5, 2.0, 2.9]), sides, down, 2.0))
     return room
 
 
@@ -46,50 +50,29 @@ def _is_slab(triangles: NDArray[Any]) -> bool:
     return bool(np.isclose(np.ptp(triangles, axis=(0, 1)).min(), 0.1))
 
 
-def lit_room() -> Room:
-    """A lamp under the ceiling."""
-    room = empty_room()
-    down = np.array([0, 0, -1.0])
-    sides = np.array([[0.2, 0, 0], [0, 0.2, 0]])
-    room.lights.append(Light(np.array([2.5, 2.0, 2.9]), sides, down, 2.0))
-    return room
-
-
 def take(
-    room: Room, view: PanoramaView | PerspectiveView, holes: Holes = NO_HOLES, **camera: object
+    view: PanoramaView, holes: Holes = NO_HOLES, caps: tuple[float, float] = (0.0, 0.0)
 ) -> Picture:
-    settings: dict[str, object] = {
-        "location": HERE,
-        "heading": 0.0,
-        "caps": (0.0, 0.0),
-        "gain": np.full(3, 3.0, np.float32),
-        "noise": 0.0,
-    }
-    sensor = Camera(**{**settings, **camera})  # type: ignore[arg-type]
-    return render(RayScene(room), view, sensor, holes, 2, np.random.default_rng(0))
-
-
-def wall_distance(rays: NDArray[Any]) -> NDArray[Any]:
-    """Distance from `HERE` to the walls of the box along `rays`, in closed form."""
-    with np.errstate(divide="ignore"):
-        along = np.where(rays > 0, (SIZE - HERE) / rays, -HERE / rays)
-    return along.min(axis=-1)
+    camera = Camera(HERE, 0.0, caps, np.full(3, 3.0, np.float32), 0.0)
+    return render(RayScene(empty_room()), view, camera, holes, 2, np.random.default_rng(0))
 
 
 def test_distances_in_an_empty_box_are_those_of_its_planes() -> None:
     view = PanoramaView(Pose.looking(HERE, heading=0.7), 64)
     rays = view.rays().astype(np.float64)
-    depth = take(empty_room(), view).depth_m
+    with np.errstate(divide="ignore"):
+        expected = np.where(rays > 0, (SIZE - HERE) / rays, -HERE / rays).min(axis=-1)
+    depth = take(view).depth_m
     seen = ~np.isnan(depth)
     assert seen.mean() > 0.99
-    np.testing.assert_allclose(depth[seen], wall_distance(rays)[seen], atol=1e-4)
+    np.testing.assert_allclose(depth[seen], expected[seen], atol=1e-4)
 
 
 def test_what_was_not_scanned_has_neither_label_nor_depth_but_a_colour() -> None:
     view = PanoramaView(Pose.looking(HERE, 0.0), 64)
-    whole = take(lit_room(), view)
+    whole = take(view)
     wall = HERE + np.array([3.5, 0, 0])
-    holed = take(lit_room(), view, Holes(wall[None], np.array([0.5])))
+    holed = take(view, Holes(wall[None], np.array([0.5])))
     # The ball meets the wall in a disc; its ragged radius is between 0.43 and 0.56 m.
     points = HERE + view.rays() * np.nan_to_num(whole.depth_m)[..., None]
     away = np.linalg.norm(points - wall, axis=-1)
@@ -101,7 +84,7 @@ def test_what_was_not_scanned_has_neither_label_nor_depth_but_a_colour() -> None
 
 @pytest.mark.parametrize(("caps", "rows"), [((0.4, 0.0), [0]), ((0.0, 0.4), [-1]), ((0, 0), [])])
 def test_caps_are_black_and_missing(caps: tuple[float, float], rows: list[int]) -> None:
-    picture = take(lit_room(), PanoramaView(Pose.looking(HERE, 0), 32), caps=caps)
+    picture = take(PanoramaView(Pose.looking(HERE, 0), 32), caps=caps)
     black = (picture.rgb == 0).all(axis=(1, 2))
     missing = (picture.items == MISSING).all(axis=1) & np.isnan(picture.depth_m).all(axis=1)
     for row in (0, -1):

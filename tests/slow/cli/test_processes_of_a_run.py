@@ -12,15 +12,6 @@ from tests.cli.test_commands import CUT_SHORT
 from tests.cli.tiny_runs import SETTINGS, Run, results
 from tests.running import run_python
 
-# No batch statistics.
-PLAIN = """
-_target_: torch.nn.Conv2d
-in_channels: 4
-out_channels: 13
-kernel_size: 3
-padding: 1
-"""
-
 
 def _train(folder: Path, *arguments: str, status: int = 0, program: str = "-m") -> str:
     command = ["-m", "tangent_train.cli.main", "train"] if program == "-m" else [program]
@@ -34,12 +25,10 @@ def _names_in_report(run: Path) -> list[str]:
 
 
 def test_two_processes_make_the_steps_and_figures_of_one(
-    rooms: str, tmp_path: Path, run: Run
+    rooms: str, tmp_path: Path, run: Run, plain: tuple[str, ...]
 ) -> None:
-    (tmp_path / "own" / "network").mkdir(parents=True)
-    (tmp_path / "own" / "network" / "plain.yaml").write_text(PLAIN)
     settings = [text for text in SETTINGS if not text.startswith("network.")]
-    common = ["--config-dir", str(tmp_path / "own"), *settings, rooms, "network=plain"]
+    common = [*plain, *settings, rooms]
     common += ["trainer.max_steps=3", "optimizer=adam", "data.validation_fraction=0.4", "panels=2"]
     one = ["data.panoramas_per_step=2", "hydra.run.dir=one"]
     run("train", *common, *one)

@@ -6,11 +6,10 @@ import json
 import os
 import re
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from tests.cli.tiny_runs import SETTINGS, Run
+from tests.cli.tiny_runs import SETTINGS, Run, results
 
 # Optuna 2.10, all that hydra-optuna-sweeper works with, is written for an old one.
 OLD_SQLALCHEMY = pytest.mark.filterwarnings("ignore:Deprecated API features detected")
@@ -26,11 +25,6 @@ def _no_debugger(monkeypatch: pytest.MonkeyPatch) -> None:
 def settings(rooms: str) -> tuple[str, ...]:
     """Of a run of one epoch."""
     return (*SETTINGS, "data.validation_fraction=0.4", "trainer.max_epochs=1", "panels=0", rooms)
-
-
-def _json(path: Path) -> dict[str, Any]:
-    content: dict[str, Any] = json.loads(path.read_text())
-    return content
 
 
 def _writers(run: Path) -> set[int]:
@@ -58,12 +52,12 @@ def test_jobs_of_a_grid_are_runs_of_their_own_on_any_number_of_devices(
     assert len({os.getpid(), first, second}) == 3
     for folder, devices in zip(runs, (1, 2), strict=True):
         assert f"\n  devices: {devices}\n" in (folder / "config.yaml").read_text()
-        assert _json(folder / "results.json")["images"] == 2
+        assert results(folder)["images"] == 2
     checkpoint = f"checkpoint={runs[0] / 'checkpoints' / 'last.ckpt'}"
     rotated = ("data.test_rotation=null,so3", "hydra.sweep.dir=rotated")
     run("evaluate", "-m", checkpoint, settings[-1], *rotated)
-    figures = [_json(tmp_path / "rotated" / n / "results.json")["confusion"] for n in "01"]
-    assert figures[0] == _json(runs[0] / "results.json")["confusion"] != figures[1]
+    figures = [results(tmp_path / "rotated" / n)["confusion"] for n in "01"]
+    assert figures[0] == results(runs[0])["confusion"] != figures[1]
 
 
 @OLD_SQLALCHEMY
@@ -76,7 +70,7 @@ def test_optuna_compares_runs_of_submitit_by_their_validation(
     assert _runs(tmp_path / "study") == ["0", "1"]
     (first,), (second,) = map(_writers, runs)
     assert len({os.getpid(), first, second}) == 3
-    found = [_json(run / "validation.json") for run in runs]
+    found = [json.loads((run / "validation.json").read_text()) for run in runs]
     assert [figure["figure"] for figure in found] == ["val/miou", "val/miou"]
     best = (tmp_path / "study" / "optimization_results.yaml").read_text()
     (value,) = re.findall(r"best_value: (\S+)", best)

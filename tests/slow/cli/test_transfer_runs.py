@@ -16,13 +16,9 @@ from tests.datamodules.folder.photo_format import write_photo, write_photos
 
 
 def test_real_runs_from_photos_to_panoramas(
-    tmp_path: Path, run: Run, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, run: Run, plain: tuple[str, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "my" / "network").mkdir(parents=True)
-    (tmp_path / "my" / "network" / "plain.yaml").write_text(
-        "_target_: torch.nn.Conv2d\nin_channels: 4\nout_channels: 13\nkernel_size: 1\n"
-    )
-    network = (*SETTINGS, "network=plain", "compare=[]", "trainer.max_epochs=2", "--config-dir=my")
+    network = (*plain, *SETTINGS, "compare=[]", "trainer.max_epochs=2")
     run("transfer", *network)
     stages = ["P", "S", "P-FT-1", "S-FT-1"]
     found = {name: json.loads((OF_SEED_0 / name / "results.json").read_text()) for name in stages}
@@ -48,7 +44,7 @@ def test_real_runs_from_photos_to_panoramas(
     assert out.count("finished before") == 2
     assert (HERE / "transfer.csv").read_text() == before, "the same figures again"
     left = {path.name for path in tmp_path.iterdir() if path.name[0] != "."}  # those are coverage's
-    assert left == {"data", "my", "runs"}
+    assert left == {"data", "own", "runs"}
 
 
 _SETTINGS = (
@@ -59,13 +55,7 @@ _SETTINGS = (
     "level=4",
     "network=unet_small",
     "network.widths=[4,8]",
-    "data.num_workers=0",
-    "photos.data.num_workers=0",
-    "trainer.max_epochs=1",
-    "trainer.accelerator=cpu",
     "compare=[]",
-    "fine_tuning.epochs=[1]",
-    "panels=0",
 )
 
 

@@ -1,4 +1,4 @@
-"""Small data sets of every kind in the real on-disk formats, below a folder with a trying name."""
+"""Small data sets of every kind in the real on-disk formats, and what is done to their files."""
 
 from __future__ import annotations
 
@@ -10,37 +10,31 @@ import cv2
 import numpy as np
 
 from datamodules import FolderPanoramas, ModelNet40, Stanford2D3DS
-from datamodules.core.found import SPLITS
 from datamodules.core.split_module import SplitDataModule
 from tangent_train.rendering import EquirectRepresentation
-from tests.conftest import FabricateStanford
+from tests.conftest import fabricate
 from tests.datamodules.folder.folder_format import write_data_set
 from tests.datamodules.modelnet40.shapes_format import write_tree
 
-NAME = "Küche 1 [b] 部屋 ∕ a,b=c"
 ERP = EquirectRepresentation(level=3)
 BOTH: Any = ("rgb", "depth")
 
 KINDS = ("folder", "stanford", "shapes")
 
 
-def write(kind: str, root: Path, fabricate: FabricateStanford) -> Path:
+def write(kind: str, root: Path) -> Path:
     """Write a data set of one of `KINDS`; returns its root."""
     if kind == "folder":
         return write_data_set(root, depth=True)
-    if kind == "shapes":
-        return write_tree(root)
-    return fabricate(root)
+    return write_tree(root) if kind == "shapes" else fabricate(root)
 
 
 def module(kind: str, root: Path, **settings: Any) -> SplitDataModule[Any]:
     """Its data module, with depth."""
-    make: dict[str, Callable[..., SplitDataModule[Any]]] = {
-        "folder": lambda **more: FolderPanoramas(root, ERP, inputs=BOTH, **more),
-        "stanford": lambda **more: Stanford2D3DS(root, ERP, inputs=BOTH, **more),
-        "shapes": lambda **more: ModelNet40(root, ERP, **more),
-    }
-    return make[kind](**settings)
+    if kind == "shapes":
+        return ModelNet40(root, ERP, **settings)
+    of_images = FolderPanoramas if kind == "folder" else Stanford2D3DS
+    return of_images(root, ERP, inputs=BOTH, **settings)
 
 
 def colors(kind: str, root: Path) -> list[Path]:
@@ -65,12 +59,6 @@ def partner(kind: str, path: Path, part: str) -> Path:
         return path.parents[2] / part / path.parent.name / f"{path.stem}.png"
     domain = "semantic" if part == "labels" else part
     return path.parents[1] / domain / path.name.replace("domain_rgb", f"domain_{domain}")
-
-
-def names(data: SplitDataModule[Any]) -> dict[str, list[str]]:
-    """Names of the images of every split."""
-    sources = {split: data.source(split) for split in SPLITS}
-    return {split: [s.name(index) for index in range(len(s))] for split, s in sources.items()}
 
 
 # --- what is done to files ------------------------------------------------------------------------
@@ -98,6 +86,10 @@ def smaller(path: Path) -> None:
     change(path, lambda image: image[::2, ::2])
 
 
+def narrower(path: Path) -> None:
+    change(path, lambda image: np.ascontiguousarray(image[:, :-4]))
+
+
 def to_8_bits(path: Path) -> None:
     change(path, lambda image: (image >> 8).astype(np.uint8))
 
@@ -107,9 +99,11 @@ def link_to_itself(path: Path) -> None:
     path.symlink_to(path.name)
 
 
-def set_pixel(path: Path, value: Any) -> None:
+def past_the_table(path: Path) -> None:
+    """A label without an entry, in a pixel that training at half the size never reads."""
+
     def edit(image: Any) -> Any:
-        image[-2, -2] = value  # which training at half the size never reads
+        image[-2, -2] = [521 & 255, 521 >> 8, 0]
         return image
 
     change(path, edit)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -48,33 +48,36 @@ class Faulty(nn.Module):
 
 def small_task(network: nn.Module, **settings: Any) -> SegmentationTask:
     """A task on tangent images of the classes of Stanford2D3DS."""
-    optimizer = settings.pop("optimizer", partial(torch.optim.SGD, lr=0.01))
     return SegmentationTask(
         network,
         TangentRepresentation(base_level=0, level=4),
         Stanford2D3DS.class_names,
-        optimizer,
-        **{"class_weights": "none"} | settings,
+        partial(torch.optim.SGD, lr=0.01),
+        class_weights="none",
+        **settings,
     )
 
 
 def small_data(root: Path, **settings: Any) -> Stanford2D3DS:
     """Colours of panoramas of 32×64."""
-    settings = {"inputs": ["rgb"], "panoramas_per_step": 1, **settings}
-    return Stanford2D3DS(root, TangentRepresentation(base_level=0, level=4), **settings)
+    representation = TangentRepresentation(base_level=0, level=4)
+    return Stanford2D3DS(root, representation, inputs=["rgb"], panoramas_per_step=1, **settings)
 
 
-def run_trainer(folder: Path, **settings: Any) -> lightning.Trainer:
+def run_trainer(
+    folder: Path,
+    *,
+    checkpoint_every: int | None = None,
+    callbacks: Sequence[lightning.Callback] = (),
+    plugins: Sequence[Any] = (),
+    **settings: Any,
+) -> lightning.Trainer:
     """As runs make it, in a folder, without its pictures."""
-    last = LastCheckpoint(folder / "checkpoints", settings.pop("checkpoint_every", None))
-    settings["callbacks"] = [*settings.get("callbacks", []), last]
-    plugins = [AtomicCheckpointIO(), *settings.pop("plugins", [])]
     return quiet_trainer(
-        **{
-            "default_root_dir": str(folder),
-            "enable_checkpointing": True,
-            "limit_val_batches": 0,
-            "plugins": plugins,
-            **settings,
-        }
+        default_root_dir=str(folder),
+        enable_checkpointing=True,
+        limit_val_batches=0,
+        callbacks=[*callbacks, LastCheckpoint(folder / "checkpoints", checkpoint_every)],
+        plugins=[AtomicCheckpointIO(), *plugins],
+        **settings,
     )

@@ -9,7 +9,6 @@ import pytest
 import torch
 from lightning.pytorch.plugins import MixedPrecision
 
-from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 from tangent_train.errors import SettingError
 from tests.running import run_python
 from tests.slow.faults.small_runs import Faulty, run_trainer, small_data, small_task
@@ -21,12 +20,6 @@ def _last(folder: Path) -> dict[str, Any]:
     path = folder / "checkpoints" / "last.ckpt"
     content: dict[str, Any] = torch.load(path, weights_only=True)
     return content
-
-
-def _names_of_step(data: Stanford2D3DS, step: int) -> list[str]:
-    """Panoramas of a step of the first epoch, by another loader."""
-    batch = list(data.train_dataloader())[step]
-    return [data.sample_name("train", index) for index in batch.index.tolist()]
 
 
 @pytest.mark.parametrize(
@@ -54,7 +47,7 @@ def test_a_loss_that_is_not_finite_stops_before_the_step(
             small_task(network, **settings), datamodule=data
         )
     batches = step * trainer.get("accumulate_grad_batches", 1) + (1 if trainer else 0)
-    (name,) = _names_of_step(data, batches)
+    name = data.sample_name("train", int(list(data.train_dataloader())[batches].index))
     place = f"loss of step {step} (epoch 0, {name})"
     for word in (place, "optimizer.lr", "trainer.gradient_clip_val"):
         assert word in str(caught.value)
@@ -79,16 +72,12 @@ def test_nan_weights_never_replace_a_good_checkpoint(stanford_root: Path, tmp_pa
         )
 
 
-def _half(scaler: torch.amp.GradScaler) -> dict[str, Any]:
-    """Real half precision with a scaled loss, which works on a CPU as on a GPU."""
-    return {"plugins": [MixedPrecision("16-mixed", "cpu", scaler)], "max_steps": 4}
-
-
 def test_scores_beyond_half_precision_stop_and_another_precision_is_named(
     stanford_root: Path, tmp_path: Path
 ) -> None:
     network = Faulty(1, lambda scores: scores * 1e6)  # beyond 65504
-    trainer = run_trainer(tmp_path, **_half(torch.amp.GradScaler("cpu")))
+    half = MixedPrecision("16-mixed", "cpu", torch.amp.GradScaler("cpu"))
+    trainer = run_trainer(tmp_path, plugins=[half], max_steps=4)
     with pytest.raises(SettingError, match=r"loss of step 1 .* trainer\.precision=bf16-mixed"):
         trainer.fit(small_task(network), datamodule=small_data(stanford_root))
 

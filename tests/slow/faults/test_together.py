@@ -1,33 +1,20 @@
-"""Several processes that prepare, make or read the same files at the same time."""
+"""Several processes that prepare and read the same files at the same time."""
 
 from __future__ import annotations
 
 import multiprocessing
 import zlib
 from concurrent.futures import ProcessPoolExecutor
-from multiprocessing.context import ForkServerContext
 from pathlib import Path
 from typing import Any
 
-import pytest
 import torch
 
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
-from datamodules.synthrooms.generate import RoomSettings, generate_rooms
-from datamodules.synthshapes import generate as shapes
-from datamodules.synthshapes.generate import ShapeSettings, generate_shapes
 from tangent_train.rendering import TangentRepresentation
-from tests.datamodules.data_files import contents
 
 PROCESSES = 3
 PANORAMAS = 14
-
-
-@pytest.fixture(scope="module")
-def processes() -> ForkServerContext:
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["datamodules.stanford2d3ds.panoramas"])
-    return context
 
 
 def _data(root: Path, store: Path | None) -> Stanford2D3DS:
@@ -54,8 +41,10 @@ def _prepare_and_read(root: Path, store: Path, barrier: Any) -> tuple[int, int]:
 
 
 def test_runs_that_prepare_the_same_store_at_once_see_the_same(
-    stanford_root: Path, tmp_path: Path, processes: ForkServerContext
+    stanford_root: Path, tmp_path: Path
 ) -> None:
+    processes = multiprocessing.get_context("forkserver")
+    processes.set_forkserver_preload(["datamodules.stanford2d3ds.panoramas"])
     store = tmp_path / "store"
     with processes.Manager() as manager, ProcessPoolExecutor(PROCESSES, processes) as pool:
         barrier = manager.Barrier(PROCESSES)
@@ -69,24 +58,3 @@ def test_runs_that_prepare_the_same_store_at_once_see_the_same(
     before = {path: path.stat().st_mtime_ns for path in store.rglob("*.npy")}
     data.prepare_data()
     assert {path: path.stat().st_mtime_ns for path in before} == before, "all are whole"
-
-
-# --- generators -----------------------------------------------------------------------------------
-
-
-TINY = RoomSettings(
-    rooms={"1": 2, "5b": 1}, height=16, views_per_camera=1, view_size=8, supersample=1
-)
-
-
-@pytest.mark.parametrize(
-    ("generate", "settings"),
-    [(generate_rooms, TINY), (generate_shapes, ShapeSettings(train=1, test=1))],
-)
-def test_the_same_bytes_for_any_number_of_processes(
-    generate: Any, settings: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(shapes, "_PER_PROCESS", 1)
-    for workers in (0, 2):
-        generate(tmp_path / f"{workers}", settings, workers=workers)
-    assert contents(tmp_path / "2") == contents(tmp_path / "0")

@@ -55,11 +55,8 @@ def test_a_batch_without_labels_changes_nothing(root: Path, tmp_path: Path, half
 
 
 @pytest.mark.parametrize("absent", ["skip", "zero"])
-@pytest.mark.parametrize("how_many", [1, 5])
-def test_panoramas_without_a_labelled_pixel(
-    root: Path, tmp_path: Path, how_many: int, absent: Any
-) -> None:
-    for path in _label_files(root, "5[ab]")[:how_many]:
+def test_panoramas_without_a_labelled_pixel(root: Path, tmp_path: Path, absent: Any) -> None:
+    for path in _label_files(root, "5[ab]"):
         _without_labels(path)
     data = small_data(root)
     task = small_task(Faulty(), absent_class=absent)
@@ -71,14 +68,10 @@ def test_panoramas_without_a_labelled_pixel(
     written = json.loads((tmp_path / "results" / "results.json").read_text())
     assert written["images"] == 5
     assert len(list((tmp_path / "panels").iterdir())) == 2
-    if how_many == 1:
-        assert logged["test/miou"] == pytest.approx(written["miou"])
-        assert written["miou"] > 0
-    else:
-        assert np.sum(written["confusion"]) == 0
-        unknown = None if absent == "skip" else 0
-        assert written["miou"] == unknown
-        assert {row["iou"] for row in written["classes"]} == {unknown}
-        assert np.isnan(logged["test/miou"]) == (absent == "skip")
+    assert np.sum(written["confusion"]) == 0
+    unknown = None if absent == "skip" else 0
+    assert written["miou"] == unknown
+    assert {row["iou"] for row in written["classes"]} == {unknown}
+    assert np.isnan(logged["test/miou"]) == (absent == "skip")
     for name in ("results.csv", "results.md"):
         assert "nan" not in (tmp_path / "results" / name).read_text().lower()

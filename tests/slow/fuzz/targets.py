@@ -33,7 +33,8 @@ from tangent_train.rendering.camera_files import (
     read_cameras,
     write_cameras,
 )
-from tests.datamodules.data_files import gpano_xmp
+from tests.datamodules.data_files import GPANO_TAGS, gpano_xmp
+from tests.datamodules.folder.folder_format import VALUES
 from tests.datamodules.zind.zind_format import SQUARE, Camera, write_home
 
 _SHAPE = (8, 16)
@@ -88,8 +89,7 @@ def _read_pose(path: Path) -> None:
 
 
 def _class_seeds() -> list[bytes]:
-    numbers = {"wall": 1, "floor": [2, 3], "window": 255}
-    return _json([None, "wall", "floor"], numbers, {"wall": "#ff0000", "floor": ["#00ff00"]})
+    return _json([None, "wall", "floor"], VALUES, {"wall": "#ff0000", "floor": ["#00ff00"]})
 
 
 def _read_class_list(path: Path) -> None:
@@ -169,10 +169,7 @@ def _read_home(path: Path) -> None:
 
 
 def _gpano_seeds() -> list[bytes]:
-    tags = {"ProjectionType": "equirectangular", "FullPanoWidthPixels": 360}
-    tags |= {"FullPanoHeightPixels": 180, "CroppedAreaImageWidthPixels": 60}
-    tags |= {"CroppedAreaImageHeightPixels": 40, "CroppedAreaLeftPixels": 100}
-    tags |= {"CroppedAreaTopPixels": 30, "PosePitchDegrees": -3.5, "PoseRollDegrees": 12}
+    tags = GPANO_TAGS | {"PosePitchDegrees": "-3.5", "PoseRollDegrees": "12"}
     black = np.zeros((40, 60, 3), np.uint8)
     return [_image(black, "webp", xmp=gpano_xmp(tags, elements=e)) for e in (False, True)]
 

@@ -17,7 +17,6 @@ from tests.slow.fuzz.targets import TARGETS
 _LONGEST_MESSAGE = 1000
 """Characters of an error, without the path: the file itself is not shown."""
 
-_DEEP = b"[" * 100_000
 _HUGE = b"9" * 400
 
 
@@ -59,8 +58,7 @@ def _changed(name: str, **entries: object) -> bytes:
 
 
 _FOUND = {
-    "label_table": [_DEEP, json.dumps(["x" * 100_000]).encode()],
-    "classes": [_DEEP, json.dumps([f"{i}" for i in range(200_000)]).encode()],
+    "label_table": [json.dumps(["x" * 100_000]).encode()],
     "pose": [
         b'{"camera_location":' * 100_000,
         _changed("pose").replace(b"2.25", _HUGE),
@@ -69,15 +67,13 @@ _FOUND = {
         b'{"camera_k_matrix": [[%b, 0, 1], [0, 1, 1], [0, 0, 1]]}' % _HUGE,
     ],
     "cameras": [
-        _DEEP,
         _changed("cameras", level=10**400),
         _changed("cameras", dim=10**400),
         _changed("cameras", source={"file": "a", "height": 10**400, "width": 1}),
         _changed("cameras", icosahedron_rotation=[[1e308] * 3] * 3),
     ],
     "photo_cameras": [
-        _DEEP,
-        b'{"photo": ' + _DEEP,
+        b'{"photo": ' + b"[" * 100_000,
         b'{"photo": [[%b, 0, 7], [0, 9, 3], [0, 0, 1]]}' % _HUGE,
         json.dumps({"photo": "x" * 100_000}).encode(),
     ],

@@ -115,10 +115,9 @@ class OpenReport:
 
 
 @contextmanager
-def opened(browser: Browser, path: Path, **context: Any) -> Iterator[OpenReport]:
+def opened(browser: Browser, path: Path) -> Iterator[OpenReport]:
     """A report in a window of its own; afterwards nothing must have gone wrong or been fetched."""
-    context.setdefault("viewport", {"width": 600, "height": 800})
-    window = browser.new_context(**context)
+    window = browser.new_context(viewport={"width": 600, "height": 800})
     window.set_default_timeout(20_000)
     report = OpenReport(window.new_page())
 

@@ -16,7 +16,6 @@ from playwright.sync_api import Browser
 from datamodules.images.palette import class_colors
 from tangent_train.geometry import equirect_directions
 from tangent_train.results.html import EncodedImage, encode_image, write_report
-from tangent_train.results.tables import Table
 from tests.rendering.reference import sample_panorama, to_lonlat
 from tests.slow.results.browser import OpenReport, chromium, opened
 
@@ -28,7 +27,6 @@ START_DEG, PLANET_DEG = 95.0, 250.0
 TOLERANCE = 6  # of 255: JPEG and interpolation
 EDGE = 8  # pixels at the rounded corners of the canvas
 WRONG, UNLABELLED = (214, 39, 40), (110, 110, 110)
-PANORAMA, BARE_PANORAMA, FLAT_PHOTO = range(3)
 
 
 def colors_of(directions: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -45,16 +43,12 @@ def classes_of(directions: NDArray[np.float64]) -> NDArray[np.uint8]:
     return classes
 
 
-def panorama_rgb() -> NDArray[np.uint8]:
-    return colors_of(equirect_directions((HEIGHT, WIDTH))).round().astype(np.uint8)
-
-
 def panorama() -> EncodedImage:
     directions = equirect_directions((HEIGHT, WIDTH))
     truth = classes_of(directions)
     prediction = np.maximum(truth, 1)
     prediction[directions[..., 1] < -0.9] = 8
-    rgb = panorama_rgb()
+    rgb = colors_of(directions).round().astype(np.uint8)
     name, note = "a <b>sphere</b>", "mIoU 61.2 %"
     return encode_image(name, rgb, len(NAMES), prediction=prediction, truth=truth, note=note)
 
@@ -109,9 +103,9 @@ def view_of(
     return directions
 
 
-def step_rad(report: OpenReport, width_deg: float = START_DEG) -> float:
+def step_rad(report: OpenReport) -> float:
     """Angle that one pixel of a drag turns: what lies in the middle follows the pointer."""
-    return math.tan(math.radians(width_deg) / 2) / (max(report.box()[2:]) / 2)
+    return math.tan(math.radians(START_DEG) / 2) / (max(report.box()[2:]) / 2)
 
 
 # Not for the whole session: while it runs, no other test could start an event loop.
@@ -127,10 +121,8 @@ def page_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_report(
         path,
         "Test",
-        tables=[Table("Wide", [f"column {k}" for k in range(30)], [["12345.6"] * 30])],
-        images=[panorama(), encode_image("bare", panorama_rgb(), len(NAMES)), photo()],
+        images=[panorama(), photo()],
         class_names=NAMES,
-        notes=["a note without any place to break: " + "x" * 200],
     )
     return path
 
@@ -216,7 +208,7 @@ def test_layers_show_the_colours_of_their_classes(report: OpenReport) -> None:
 
 
 def test_photos_are_flat_with_pan_and_zoom(report: OpenReport) -> None:
-    report.choose(FLAT_PHOTO)
+    report.choose(1)
     report.layer("input")
     assert not report.page.locator(".projection").is_visible()
     x, y, width, height = report.box()
