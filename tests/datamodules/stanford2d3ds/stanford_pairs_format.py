@@ -3,50 +3,67 @@
 from __future__ import annotations
 
 import hashlib
-import shutil
+import json
+import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from datamodules.stanford2d3ds.pairs import published_pairs
-from tests.datamodules.data_files import read_png, write_png
+from datamodules.synthrooms.camera import euler_angles
+from tangent_train.geometry import rotation_about
+from tests.datamodules.data_files import write_png
 
 
-def write_paper_pairs(root: Path, rooms: Path) -> Path:
+def write_paper_pairs(root: Path, rows: int = 8) -> Path:
     """All panoramas of the paper's pairs, and two more of the same rooms.
 
     Args:
         root: Where ``area_1`` comes to be.
-        rooms: Synthetic rooms in the same format, whose depth and poses they have.
+        rows: Of the panoramas.
 
     Returns:
         The same folder.
     """
     names = {name for pair in published_pairs() for name in (pair.left, pair.right)}
-    for number, name in enumerate(sorted(names | {"0123456_hallway_7", "fffffff_office_3"})):
+    for name in sorted(names | {"0123456_hallway_7", "fffffff_office_3"}):
         camera, _, room = name.partition("_")
         filled = camera + hashlib.sha256(name.encode()).hexdigest()[: 32 - len(camera)]
-        write_panorama(root, filled, room, rooms, number)
+        write_panorama(root, filled, room, int(camera, 16) % 200, rows)
     return root
 
 
-def write_panorama(root: Path, camera: str, room: str, rooms: Path, number: int = 0) -> None:
-    """One panorama of one grey: nothing in it is found in another one, which takes long.
+def write_panorama(root: Path, camera: str, room: str, grey: int, rows: int = 8) -> Path:
+    """One panorama of one grey, 2 m all around, its uppermost row without depth.
 
     Args:
         root: Where ``area_1`` comes to be.
         camera: 32 hexadecimal digits.
         room: As ``office_3``.
-        rooms: Synthetic rooms in the same format.
-        number: Grey, and which of their panoramas it has depth and pose of; they take turns.
+        grey: Of all pixels; also decides the pose.
+        rows: Of the panorama.
+
+    Returns:
+        The colours' file.
     """
-    for kind in ("rgb", "depth", "pose"):
-        panoramas = sorted(rooms.glob(f"area_1/pano/{kind}/*"))
-        panorama = panoramas[number % len(panoramas)]
-        name = f"camera_{camera}_{room}_frame_equirectangular_domain_{kind}{panorama.suffix}"
-        path = root / "area_1" / "pano" / kind / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if kind == "rgb":
-            write_png(path, np.full_like(read_png(panorama), number))
-        else:
-            shutil.copyfile(panorama, path)
+    pano = root / "area_1" / "pano"
+    stem = f"camera_{camera}_{room}_frame_equirectangular_domain"
+    pictures: dict[str, Any] = {
+        "rgb": np.full((rows, 2 * rows, 3), grey, np.uint8),
+        "depth": np.full((rows, 2 * rows), 1024, np.uint16),
+    }
+    pictures["depth"][0] = 65535
+    for kind, picture in pictures.items():
+        write_png(pano / kind / f"{stem}_{kind}.png", picture)
+    (pano / "pose").mkdir(exist_ok=True)
+    turn = rotation_about((0, 0, 1), grey / 50) @ rotation_about((1, 0, 0), math.pi / 2)
+    rotation = np.diag([1.0, -1, -1]) @ turn.T
+    location = np.array([grey / 10, 1.0, 1.5])
+    record = {
+        "camera_rt_matrix": np.hstack([rotation, -(rotation @ location)[:, None]]).tolist(),
+        "camera_original_rotation": euler_angles(turn).tolist(),
+        "camera_location": location.tolist(),
+    }
+    (pano / "pose" / f"{stem}_pose.json").write_text(json.dumps(record))
+    return pano / "rgb" / f"{stem}_rgb.png"

@@ -44,6 +44,7 @@ def build_world(folder: Path) -> Path:
     """Make all files that documents name; nothing in the folder depends on where it is."""
     fabricate(folder / "data" / "2d3ds", height=ROWS, photos=2)
     write_panoramas(write_views(folder / "data" / "synthia", _SEQUENCES), _SEQUENCES, ROWS)
+    write_paper_pairs(folder / "data" / "pairs", ROWS)
     write_homes(folder / "zind" / "sample_tour", rows=ROWS)
     write_data_set(folder / "my_rooms", height=ROWS, depth=True)
     write_photos(folder / "my_photos")
@@ -62,7 +63,6 @@ def build_world(folder: Path) -> Path:
         f"tangent-import network=huggingface model={SEGFORMER} output=segformer.ckpt",
     ):
         run(line.split(), {}, folder)
-    write_paper_pairs(folder / "data" / "pairs", folder / "data" / "rooms_demo")
     for root in ("synthrooms", "rooms_standard"):
         shutil.copytree(folder / "data" / "rooms_demo", folder / "data" / root)
     shutil.copyfile(folder / demo / "checkpoints" / "best.ckpt", folder / "other.ckpt")
