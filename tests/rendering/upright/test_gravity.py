@@ -67,6 +67,14 @@ def test_what_is_measured_of_segments() -> None:
     np.testing.assert_allclose(odd[:, 2], 0, atol=1e-12)
 
 
+def test_rims_of_missing_parts_are_no_edges() -> None:
+    image = np.full((256, 512, 3), 130, np.uint8)
+    image[60:190, 180:340] = 20
+    assert len(find_line_segments(image).lengths_rad) >= 4
+    image[image == 20] = 0
+    assert not len(find_line_segments(image).lengths_rad)
+
+
 @pytest.mark.parametrize("height", [128, 700])
 def test_an_edge_all_around_is_found_on_its_great_circle(height: int) -> None:
     normal = unit(np.random.default_rng(height).normal(size=3))
