@@ -68,7 +68,8 @@ def test_what_is_measured_of_segments() -> None:
 
 
 def test_rims_of_missing_parts_are_no_edges() -> None:
-    image = np.full((256, 512, 3), 130, np.uint8)
+    ramp = np.linspace(90, 200, 256, dtype=np.uint8)
+    image = np.broadcast_to(ramp[:, None, None], (256, 512, 3)).copy()
     image[60:190, 180:340] = 20
     assert len(find_line_segments(image).lengths_rad) >= 4
     image[image == 20] = 0
