@@ -10,21 +10,15 @@ import numpy as np
 import torch
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback
-from numpy.typing import NDArray
 
 from tangent_train.errors import at_least
 from tangent_train.files import write_bytes
 from tangent_train.metrics.segmentation import segmentation_scores
 from tangent_train.results.html import EncodedImage, encode_image
-from tangent_train.results.pictures import prediction_panel, shown_arrays
+from tangent_train.results.pictures import evenly_spread, prediction_panel, shown_arrays
 from tangent_train.results.tables import percent
 
 _PANORAMA_DIMENSIONS = 2
-
-
-def evenly_spread(count: int, total: int) -> NDArray[np.float64]:
-    """At most `count` of the numbers from 0 to ``total - 1``, the first and the last among them."""
-    return np.linspace(0, total - 1, min(count, total)).round()
 
 
 class PredictionPanels(Callback):

@@ -10,11 +10,10 @@ from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import TensorBoardLogger
 from numpy.typing import NDArray
 
-from tangent_train.callbacks.panels import evenly_spread
 from tangent_train.errors import at_least
 from tangent_train.metrics.classification import classification_scores
 from tangent_train.metrics.segmentation import segmentation_scores
-from tangent_train.results.pictures import prediction_panel, shown_arrays
+from tangent_train.results.pictures import evenly_spread, prediction_panel, shown_arrays
 
 _MOST_ROWS = 256
 """Larger images are shown smaller: an event file holds the pictures of all validations."""

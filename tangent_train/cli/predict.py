@@ -30,6 +30,7 @@ from tangent_train.inference.judge import NetworkJudge
 from tangent_train.inference.predictor import Predictor
 from tangent_train.inference.views import InputImage, PanoramaViews, PhotoViews
 from tangent_train.results.html import EncodedImage
+from tangent_train.results.pictures import evenly_spread
 from tangent_train.results.predictions import (
     Entry,
     Kind,
@@ -97,8 +98,7 @@ def predict(config: Mapping[str, Any]) -> None:
     original, trained = _networks(settings)
     folder = PredictionFolder(settings.output, trained.class_names, settings.write)
     names = inputs.names()
-    spread = np.linspace(0, len(names) - 1, min(settings.report, len(names))).round()
-    shown = [names[int(number)] for number in spread]
+    shown = [names[number] for number in evenly_spread(settings.report, len(names))]
     label = _Labeller(settings, original, trained, folder, shown)
     if shard is None:
         done = _label(settings, decisive, inputs, label, folder)

@@ -161,6 +161,12 @@ class _Planner:
         own, before = settings["fine_tuning"]["optimizer"], settings["optimizer"]
         optimizer = own if "_target_" in own else before | own
         if optimizer.get("lr") is None:
+            if before.get("lr") is None:
+                raise SettingError(
+                    "fine_tuning.optimizer.lr",
+                    found="null, a tenth of optimizer.lr, which is null",
+                    expected="a learning rate",
+                )
             # 3e-4 of 3e-3, not 3.0000000000000003e-4
             optimizer = optimizer | {"lr": float(f"{before['lr'] / _SLOWER:.12g}")}
         return dict(optimizer)
@@ -195,11 +201,18 @@ def stage_state(stage: Stage) -> State:
     """Progress of a stage, from the files in its folder.
 
     Raises:
-        SettingError: Its folder holds the same stage with other settings.
+        SettingError: Its folder holds something else, or the same stage with other settings.
         DataError: A file of the stage cannot be read.
     """
     record = stage.folder / "stage.json"
     if not record.is_file():
+        if stage.folder.exists() and any(p.name[0] != "." for p in stage.folder.iterdir()):
+            raise SettingError(
+                stage.folder,
+                found="files that tangent-transfer did not write",
+                expected="a new folder, or that of this stage",
+                remedy=_REMEDY,
+            )
         return "new"
     finished = (stage.folder / "results.json").is_file()
     begun = stage.command == "train" and (stage.folder / "checkpoints" / "last.ckpt").is_file()

@@ -58,10 +58,10 @@ def conditions_of(config: DictConfig) -> dict[str, dict[str, Any]]:
     Raises:
         SettingError: The list is invalid.
     """
-    return {
-        name: {f"data.{setting}": value for setting, value in given.items()}
-        for name, given in _named(config, "conditions").items()
-    }
+    found = _named(config, "conditions")
+    if not found:
+        raise SettingError("conditions", found="[]", expected="one or more: [upright]")
+    return {name: {f"data.{n}": v for n, v in given.items()} for name, given in found.items()}
 
 
 def numbers(config: DictConfig, setting: str, least: int) -> list[int]:

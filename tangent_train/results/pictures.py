@@ -20,6 +20,11 @@ _LEGEND_WIDTH = 1200
 """Pixels of width per step of a legend's size."""
 
 
+def evenly_spread(count: int, total: int) -> NDArray[np.intp]:
+    """At most `count` of the numbers from 0 to ``total - 1``, the first and the last among them."""
+    return np.linspace(0, total - 1, min(count, total)).round().astype(np.intp)
+
+
 def colorize(labels: NDArray[np.integer], num_classes: int) -> _Image:
     """Class indices ``(H, W)`` as RGB ``(H, W, 3)``.
 

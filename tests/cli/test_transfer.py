@@ -96,7 +96,7 @@ def test_a_failing_stage_leaves_the_others_and_the_command_goes_on(
     assert resumed.init_from is None, "its own checkpoint has the tensors"
 
 
-def test_a_folder_of_other_settings_is_refused(runs: PretendedRuns) -> None:
+def test_a_folder_of_other_settings_or_files_is_refused(runs: PretendedRuns) -> None:
     run_transfer(*SHORT)
     before = len(runs.started)
     for override, message in {
@@ -105,6 +105,10 @@ def test_a_folder_of_other_settings_is_refused(runs: PretendedRuns) -> None:
     }.items():
         with pytest.raises(REFUSED, match=message):
             run_transfer(override)
+    (OF_SEED_0 / "S-FT-1").mkdir(parents=True)
+    (OF_SEED_0 / "S-FT-1" / "thesis.tex").touch()
+    with pytest.raises(REFUSED, match="S-FT-1: found files that tangent-transfer did not write"):
+        run_transfer()
     assert len(runs.started) == before, "said before anything is run"
 
 

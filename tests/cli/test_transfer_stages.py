@@ -80,6 +80,8 @@ def test_fine_tuning_takes_a_tenth_of_the_rate(rooms: DictConfig) -> None:
     assert tuned["trainer"]["max_epochs"] == 10
     assert (first["optimizer"]["lr"], first["trainer"]["max_epochs"]) == (3e-3, 20)
     assert first["scheduler"]["_target_"].endswith("OneCycleLR")
+    with pytest.raises(SettingError, match=r"fine_tuning\.optimizer\.lr: found null, a tenth"):
+        _stages(rooms, optimizer__lr=None)
 
 
 def _seen(stages: dict[str, Stage], name: str, *settings: str) -> list[Any]:
@@ -161,6 +163,7 @@ def test_data_without_folds() -> None:
         ("compare", "erp"),
         ("compare", ["erp", "erp"]),
         ("compare", ["../erp"]),
+        ("conditions", []),
         ("conditions", [3]),
         ("class_map", "my_map.json"),
     ],
