@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from llvmlite import ir
 from numba import types
-from numba.core import cgutils
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
@@ -27,9 +26,6 @@ LANES = 16
 
 _TILE = 64
 """Rows and columns at the equator of what is added to at once: its sums stay in the cache."""
-
-_LINE = 16
-"""Numbers that come from memory together."""
 
 _ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
 _LN_2, _LOG2_E = np.float32(math.log(2)), np.float32(1 / math.log(2))
@@ -170,22 +166,6 @@ def _transpose(
         return context.get_dummy_value()
 
     return types.void(rows, at, stride, factors, first, columns, to, step), build
-
-
-@intrinsic  # type: ignore[untyped-decorator]
-def _fetch(typing: Any, array: Any, at: Any) -> Any:
-    """Tell the processor that a number of an array will be read soon."""
-
-    def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        byte, number = ir.IntType(8), ir.IntType(32)
-        array, at = arguments
-        place = _address(context, builder, signature.args[0], array, at, byte)
-        kind = ir.FunctionType(ir.VoidType(), [place.type, number, number, number])
-        call = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
-        builder.call(call, [place, number(0), number(3), number(1)])  # for reading, as data
-        return context.get_dummy_value()
-
-    return types.void(array, at), build
 
 
 @njit_fast
@@ -453,15 +433,6 @@ def _softmax_lines(
 
 
 @njit_fast
-def _fetch_row(scores: Array, first: int, size: int, width: int) -> None:
-    """Fetch a part of a row of all ``(K, h, w)`` scores, which begins at a place of the first."""
-    flat = scores.reshape(-1)
-    for k in range(scores.shape[0]):
-        for at in range(first + k * size, first + k * size + width + _LINE - 1, _LINE):
-            _fetch(flat, at)
-
-
-@njit_fast
 def _copy_patch(
     scores: Array, left: int, top: int, spans: Array, softmax: bool, patch: Array
 ) -> None:
@@ -475,7 +446,7 @@ def _copy_patch(
         softmax: Whether to copy probabilities.
         patch: ``(height, B, width, 16)``, written, and perhaps a block of what follows it.
     """
-    num_classes, image_height, image_width = scores.shape
+    num_classes = len(scores)
     height, blocks, width, _ = patch.shape
     stride = -(-width // LANES) * LANES
     lines = np.zeros((LANES * blocks, stride), np.float32)
@@ -483,8 +454,6 @@ def _copy_patch(
     highest, factor = np.empty(width, np.float32), np.ones(stride, np.float32)
     for y in range(height):
         first, wide = spans[y]
-        ahead = (top + y + 1) * image_width + left + first
-        _fetch_row(scores, ahead, image_height * image_width, wide)
         highest[:wide] = -np.inf
         for k in range(num_classes):
             line, there = lines[k], scores[k, top + y]
@@ -710,11 +679,8 @@ def _best_of_part(scores: Array, left: int, top: int, highest: Array, best: Arra
         highest: ``(width,)`` room.
         best: ``(height, width)``, written; −1 where no score is finite and the largest.
     """
-    _, image_height, image_width = scores.shape
     width = best.shape[1]
     for y in range(len(best)):
-        ahead = (top + y + 1) * image_width + left
-        _fetch_row(scores, ahead, image_height * image_width, width)
         highest[:], of_row = -np.inf, best[y]
         of_row[:] = 0
         for k in range(scores.shape[0]):
