@@ -418,11 +418,15 @@ def _softmax_lines(
         lines: ``(K or more, n or more)`` scores, changed; NaN gets a probability of 0.
         num_classes: K.
         count: Number of pixels n.
-        highest: Their highest scores.
+        highest: Room.
         factor: Factors that make the sums 1, written.
     """
     pixels = np.uint64(count)
-    factor[:count] = 0
+    highest[:count], factor[:count] = -np.inf, 0
+    for k in range(num_classes):
+        line = lines[k]
+        for x in range(pixels):
+            highest[x] = line[x] if line[x] > highest[x] else highest[x]
     for k in range(num_classes):
         line = lines[k]
         for x in range(pixels):
@@ -454,14 +458,10 @@ def _copy_patch(
     highest, factor = np.empty(width, np.float32), np.ones(stride, np.float32)
     for y in range(height):
         first, wide = spans[y]
-        highest[:wide] = -np.inf
         for k in range(num_classes):
             line, there = lines[k], scores[k, top + y]
             for x in range(np.uint64(wide)):
                 line[x] = there[np.uint64(left + first) + x]
-            if softmax:
-                for x in range(np.uint64(wide)):
-                    highest[x] = line[x] if line[x] > highest[x] else highest[x]
         if softmax:
             _softmax_lines(lines, num_classes, wide, highest, factor)
         for b in range(blocks):
@@ -527,11 +527,6 @@ def _add_probabilities(
     highest, factor = np.empty(width, np.float32), np.empty(width, np.float32)
     for i in range(top, bottom):
         _to_lines(sums[i - top], lines)
-        highest[:] = -np.inf
-        for k in range(num_classes):
-            line = lines[k]
-            for x in range(width):
-                highest[x] = line[x] if line[x] > highest[x] else highest[x]
         _softmax_lines(lines, num_classes, width, highest, factor)
         for x in range(width):
             if not covered[owner[i, left + x]]:
