@@ -43,13 +43,7 @@ class PredictionPanels(Callback):
         self._encoded: dict[int, EncodedImage] = {}
 
     def on_test_batch_end(  # noqa: D102 - a hook of Lightning
-        self,
-        trainer: Trainer,
-        pl_module: LightningModule,
-        outputs: Any,
-        batch: Any,
-        batch_idx: int,
-        dataloader_idx: int = 0,
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, *_: int
     ) -> None:
         source: Any = trainer.datamodule.source("test")  # type: ignore[attr-defined]
         chosen = evenly_spread(self.count, len(source))
