@@ -42,9 +42,6 @@ class TableCache:
         self.nbytes = 0
         self._tables: OrderedDict[Hashable, tuple[Any, ...]] = OrderedDict()
 
-    def __len__(self) -> int:
-        return len(self._tables)
-
     def get(self, key: Hashable, build: Callable[[], Value]) -> Value:
         """The table of a key, built if it is not held.
 
