@@ -349,33 +349,6 @@ def _split(n: int, side: tuple[int, int], room: _Room) -> tuple[int, int, int, i
 
 
 @njit_fast
-def _needed(n: int, corner: tuple[int, int], high: int, room: _Room) -> Array:
-    """What n pixels need of a part of an image: much less than all of it where that is tilted.
-
-    Args:
-        n: How many pixels.
-        corner: Row and column of the part in the image.
-        high: Rows of the part.
-        room: Their columns and rows.
-
-    Returns:
-        ``(high, 2)`` first column of each row, from the corner, and how many columns.
-    """
-    spans = np.zeros((high, 2), np.int64)
-    spans[:, 0] = np.iinfo(np.int32).max
-    for p in range(n):
-        span, column = spans[room.row[p] - corner[0]], room.column[p] - corner[1]
-        span[0], span[1] = min(span[0], column), max(span[1], column + 2)
-    for y in range(high - 1, 0, -1):  # a pixel needs its row and the next one
-        spans[y, 0] = min(spans[y, 0], spans[y - 1, 0])
-        spans[y, 1] = max(spans[y, 1], spans[y - 1, 1])
-    for y in range(high):
-        spans[y, 0] = min(spans[y, 0], spans[y, 1])
-        spans[y, 1] -= spans[y, 0]
-    return spans
-
-
-@njit_fast
 def _weigh(n: int, step: tuple[int, int], room: _Room, taps: _Taps) -> None:
     """Write the taps of n pixels.
 
@@ -437,16 +410,13 @@ def _softmax_lines(
 
 
 @njit_fast
-def _copy_patch(
-    scores: Array, left: int, top: int, spans: Array, softmax: bool, patch: Array
-) -> None:
+def _copy_patch(scores: Array, left: int, top: int, softmax: bool, patch: Array) -> None:
     """Copy a part of the ``(K, h, w)`` scores of an image to blocks.
 
     Args:
         scores: Of the image.
         left: First column of the part.
         top: First row of the part.
-        spans: What of it is copied, see `_needed`.
         softmax: Whether to copy probabilities.
         patch: ``(height, B, width, 16)``, written, and perhaps a block of what follows it.
     """
@@ -457,16 +427,15 @@ def _copy_patch(
     from_lines, to_pixels = lines.reshape(-1), patch.reshape(-1)
     highest, factor = np.empty(width, np.float32), np.ones(stride, np.float32)
     for y in range(height):
-        first, wide = spans[y]
         for k in range(num_classes):
             line, there = lines[k], scores[k, top + y]
-            for x in range(np.uint64(wide)):
-                line[x] = there[np.uint64(left + first) + x]
+            for x in range(np.uint64(width)):
+                line[x] = there[np.uint64(left) + x]
         if softmax:
-            _softmax_lines(lines, num_classes, wide, highest, factor)
+            _softmax_lines(lines, num_classes, width, highest, factor)
         for b in range(blocks):
-            at, to = LANES * stride * b, LANES * ((y * blocks + b) * width + first)
-            for x in range(0, wide, LANES):
+            at, to = LANES * stride * b, LANES * (y * blocks + b) * width
+            for x in range(0, width, LANES):
                 _transpose(from_lines, at + x, stride, factor, x, to_pixels, to + LANES * x, LANES)
 
 
@@ -614,7 +583,7 @@ def _add_to_tile(
         _weigh(n, (blocks * wide, -top * blocks * wide - left), room, taps)
         patch = _enough(patch, (high * blocks * wide + LANES) * LANES)
         part = _part(patch, (high, blocks, wide, LANES))
-        _copy_patch(scores[m], left, top, _needed(n, (top, left), high, room), softmax, part)
+        _copy_patch(scores[m], left, top, softmax, part)
         _add_patch(part, taps, room.pixel[:n], sums)
     return patch
 
