@@ -25,11 +25,11 @@ SMALL = ("base_level=0", "controls=false", "pictures=0", "level=5")
 
 @pytest.fixture(scope="module")
 def panoramas(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three panoramas from inside a textured ball, two of them alike."""
+    """Three from inside a textured ball: one, another one, the first with a column too many."""
     folder = tmp_path_factory.mktemp("panoramas")
-    pair = ball_pair(shape=(96, 192))
-    for name, side in (("a", pair.left), ("b", pair.right), ("c", pair.left)):
-        assert cv2.imwrite(str(folder / f"{name}.png"), side.rgb)
+    left, right = (side.rgb for side in ball_pair(shape=(96, 192))[2:])
+    for name, rgb in (("a", left), ("b", right), ("c", np.hstack([left, left[:, :1]]))):
+        assert cv2.imwrite(str(folder / f"{name}.png"), rgb)
     return folder
 
 
@@ -137,15 +137,19 @@ def test_a_broken_pair_is_named_and_the_others_are_compared(
     ("arguments", "message"),
     [
         (["input=in"], "output: found none"),
+        (["left={}/a.png", "output=o"], "input: found left="),
+        (["input={}", "pairing=every", "output=o"], "pairing: found every"),
+        (["left={}", "right={}/a.png", "output=o"], "found 4; expected two panoramas"),
+        (["input={}/a.png", "output=o"], "a.png: found 1; expected two panoramas or more"),
         (["data=synthrooms", "output=o"], "found datamodules.SynthRooms; expected pairs:"),
         (["margin=-1", "output=o"], "margin: found -1"),
     ],
 )
 def test_settings_that_cannot_work_are_named(
-    run: Run, tmp_path: Path, arguments: list[str], message: str
+    run: Run, tmp_path: Path, panoramas: Path, arguments: list[str], message: str
 ) -> None:
     with pytest.raises(SystemExit, match=re.escape(message)):
-        run(*arguments)
+        run(*(text.format(panoramas) for text in arguments))
     assert not list(tmp_path.iterdir())
 
 
