@@ -73,11 +73,6 @@ def _mutate_json(content: bytes, rng: Random) -> bytes:
         return content
 
 
-def png_chunk(kind: bytes, data: bytes) -> bytes:
-    """A chunk of a PNG file with its length and checksum."""
-    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-
 def sealed_png(content: bytes) -> bytes:
     """A PNG file whose checksums are right: decoders look at what is in the chunks then."""
     start, sealed = 8, bytearray(content)
