@@ -11,33 +11,127 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 from lightning.pytorch.trainer.states import TrainerFn
 
+from datamodules import FolderPanoramas, ModelNet40, Stanford2D3DS
 from datamodules.core import found as found_module
 from datamodules.core.found import SPLITS
 from datamodules.core.split_module import SplitDataModule
 from tangent_train.errors import DataError
+from tangent_train.rendering import EquirectRepresentation
 from tests.cli.tiny_runs import run_command
+from tests.conftest import fabricate
 from tests.datamodules.data_files import names_of
-from tests.slow.faults import data_sets as sets
-from tests.slow.faults.data_sets import colors, module, partner
+from tests.datamodules.folder.folder_format import write_data_set
+from tests.datamodules.modelnet40.shapes_format import write_tree
+
+_ERP = EquirectRepresentation(level=3)
+_BOTH: Any = ("rgb", "depth")
+
+_KINDS = ("folder", "stanford", "shapes")
+
+
+def _write(kind: str, root: Path) -> Path:
+    """Write a data set of one of `_KINDS`; returns its root."""
+    if kind == "folder":
+        return write_data_set(root, depth=True)
+    return write_tree(root) if kind == "shapes" else fabricate(root)
+
+
+def _module(kind: str, root: Path, **settings: Any) -> SplitDataModule[Any]:
+    """Its data module, with depth."""
+    if kind == "shapes":
+        return ModelNet40(root, _ERP, **settings)
+    of_images = FolderPanoramas if kind == "folder" else Stanford2D3DS
+    return of_images(root, _ERP, inputs=_BOTH, **settings)
+
+
+def _colors(kind: str, root: Path) -> list[Path]:
+    """The files of the colours, or the meshes, in order."""
+    pattern = {
+        "folder": "images/**/*.*",
+        "stanford": "area_*/pano/rgb/*.png",
+        "shapes": "**/*.off",
+    }
+    return sorted(root.glob(pattern[kind]))
+
+
+def _partner(kind: str, path: Path, part: str) -> Path:
+    """The labels or the depth of an image.
+
+    Args:
+        kind: One of `_KINDS`.
+        path: From `_colors`.
+        part: ``labels`` or ``depth``.
+    """
+    if kind == "folder":
+        return path.parents[2] / part / path.parent.name / f"{path.stem}.png"
+    domain = "semantic" if part == "labels" else part
+    return path.parents[1] / domain / path.name.replace("domain_rgb", f"domain_{domain}")
+
+
+def _truncate(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-20])
+
+
+def _corrupt(path: Path) -> None:
+    """Change bytes in the middle: the header, the chunks and the size stay as they are."""
+    content = bytearray(path.read_bytes())
+    middle = content.index(b"IDAT") + 12
+    content[middle : middle + 8] = bytes(255 - byte for byte in content[middle : middle + 8])
+    path.write_bytes(content)
+
+
+def _change(path: Path, edit: Callable[[Any], Any]) -> None:
+    """Write an image with other pixels."""
+    image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+    path.write_bytes(cv2.imencode(".png", edit(image))[1].tobytes())
+
+
+def _smaller(path: Path) -> None:
+    _change(path, lambda image: image[::2, ::2])
+
+
+def _narrower(path: Path) -> None:
+    _change(path, lambda image: np.ascontiguousarray(image[:, :-4]))
+
+
+def _to_8_bits(path: Path) -> None:
+    _change(path, lambda image: (image >> 8).astype(np.uint8))
+
+
+def _link_to_itself(path: Path) -> None:
+    path.unlink()
+    path.symlink_to(path.name)
+
+
+def _past_the_table(path: Path) -> None:
+    """A label without an entry, in a pixel that training at half the size never reads."""
+
+    def edit(image: Any) -> Any:
+        image[-2, -2] = [521 & 255, 521 >> 8, 0]
+        return image
+
+    _change(path, edit)
 
 
 @pytest.fixture
 def root(kind: str, tmp_path: Path) -> Path:
     """A whole data set of a kind, in a folder with a trying name."""
-    return sets.write(kind, tmp_path / "Küche 1 [b] 部屋 ∕ a,b=c")
+    return _write(kind, tmp_path / "Küche 1 [b] 部屋 ∕ a,b=c")
 
 
-@pytest.mark.parametrize("kind", sets.KINDS)
+@pytest.mark.parametrize("kind", _KINDS)
 def test_a_good_data_set_has_no_problem_whatever_its_folder_is_called(
     kind: str, root: Path
 ) -> None:
     before = {path: path.stat().st_mtime_ns for path in root.rglob("*")}
-    problems, count = module(kind, root).check()
+    problems, count = _module(kind, root).check()
     assert not problems.listed()
-    assert count == len(colors(kind, root)) > 0
+    assert count == len(_colors(kind, root)) > 0
     after = {path: path.stat().st_mtime_ns for path in root.rglob("*")}
     assert after == before, "nothing is written"
 
@@ -46,17 +140,17 @@ def test_a_good_data_set_has_no_problem_whatever_its_folder_is_called(
 
 
 _FAULTS = [
-    ("stanford", "rgb", sets.truncate, "truncated; expected a whole PNG"),
-    ("stanford", "labels", sets.corrupt, "no image that can be decoded"),
-    ("stanford", "depth", sets.to_8_bits, "8-bit [a-zA-Z]+; expected 16-bit"),
-    ("stanford", "labels", sets.smaller, "pixels; expected .*, as "),
+    ("stanford", "rgb", _truncate, "truncated; expected a whole PNG"),
+    ("stanford", "labels", _corrupt, "no image that can be decoded"),
+    ("stanford", "depth", _to_8_bits, "8-bit [a-zA-Z]+; expected 16-bit"),
+    ("stanford", "labels", _smaller, "pixels; expected .*, as "),
     ("stanford", "labels", Path.unlink, "No such file"),
-    ("stanford", "labels", sets.past_the_table, r"instance 521 in 1 pixel; expected 0 to 520"),
-    ("stanford", "rgb", sets.link_to_itself, "Too many levels of symbolic links"),
-    ("stanford", "rgb", sets.narrower, "expected twice as wide"),
-    ("folder", "labels", sets.corrupt, "no image that can be decoded"),
-    ("folder", "depth", sets.to_8_bits, "uint8 of shape"),
-    ("shapes", "rgb", sets.truncate, "expected"),
+    ("stanford", "labels", _past_the_table, r"instance 521 in 1 pixel; expected 0 to 520"),
+    ("stanford", "rgb", _link_to_itself, "Too many levels of symbolic links"),
+    ("stanford", "rgb", _narrower, "expected twice as wide"),
+    ("folder", "labels", _corrupt, "no image that can be decoded"),
+    ("folder", "depth", _to_8_bits, "uint8 of shape"),
+    ("shapes", "rgb", _truncate, "expected"),
 ]
 """Kind of data set, part of the second image, what is done to it, what is to be found."""
 
@@ -65,16 +159,16 @@ _FAULTS = [
 def test_a_damaged_file_is_found(
     kind: str, part: str, damage: Callable[[Path], None], expected: str, root: Path
 ) -> None:
-    second = colors(kind, root)[1]
-    path = second if part == "rgb" else partner(kind, second, part)
+    second = _colors(kind, root)[1]
+    path = second if part == "rgb" else _partner(kind, second, part)
     damage(path)
-    problems, _ = module(kind, root).check()
+    problems, _ = _module(kind, root).check()
     by_file = {problem.file: problem for problem in problems.listed()}
     assert str(path) in by_file, by_file
     finding = by_file[str(path)].finding
     assert str(path) not in finding, "said once"
     assert re.search(expected, finding), finding
-    if damage not in (sets.narrower, sets.to_8_bits):  # its partners do not fit then
+    if damage not in (_narrower, _to_8_bits):  # its partners do not fit then
         assert len(by_file) == 1
 
 
@@ -83,29 +177,29 @@ def test_a_damaged_file_is_found(
 
 def _damage(kind: str, root: Path) -> tuple[Path, Path]:
     """An image whose header tells that it is broken, and one that has to be read for that."""
-    paths = [path for path in colors(kind, root) if kind != "folder" or path.suffix == ".png"]
-    sets.truncate(paths[0])
+    paths = [path for path in _colors(kind, root) if kind != "folder" or path.suffix == ".png"]
+    _truncate(paths[0])
     if kind == "shapes":
-        sets.truncate(paths[-1])
+        _truncate(paths[-1])
         return paths[0], paths[-1]
-    labels = partner(kind, paths[-1], "labels")
-    sets.corrupt(labels)
+    labels = _partner(kind, paths[-1], "labels")
+    _corrupt(labels)
     return paths[0], labels
 
 
-@pytest.mark.parametrize("kind", sets.KINDS)
+@pytest.mark.parametrize("kind", _KINDS)
 def test_broken_files_are_refused_or_left_out_and_counted(
     kind: str, root: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    whole = module(kind, root)
+    whole = _module(kind, root)
     before = {split: names_of(whole, split) for split in SPLITS}
     total = sum(map(len, before.values()))
     first, _ = _damage(kind, root)
     with pytest.raises(DataError) as refused:
-        module(kind, root).prepare_data()
+        _module(kind, root).prepare_data()
     assert str(first) in str(refused.value)
     capsys.readouterr()
-    data = module(kind, root, skip_broken=True)
+    data = _module(kind, root, skip_broken=True)
     data.prepare_data()
     data.setup()
     printed = [line for line in capsys.readouterr().out.splitlines() if "left out" in line]
@@ -127,18 +221,18 @@ def test_broken_files_are_refused_or_left_out_and_counted(
 def test_a_store_has_no_holes_unless_they_are_asked_for(
     kind: str, root: Path, tmp_path: Path
 ) -> None:
-    total = len(colors(kind, root))
-    broken = [partner(kind, path, "labels") for path in (colors(kind, root)[i] for i in (5, -1))]
+    total = len(_colors(kind, root))
+    broken = [_partner(kind, path, "labels") for path in (_colors(kind, root)[i] for i in (5, -1))]
     for path in broken:
-        sets.corrupt(path)
+        _corrupt(path)
     store = tmp_path / "store"
-    data = module(kind, root, store=store)
+    data = _module(kind, root, store=store)
     with pytest.raises(DataError, match="found 2 problems") as caught:
         data.prepare_data()
     data.setup()
     assert all(str(path) in str(caught.value) for path in broken), "not only the first"
     assert len(list(store.rglob("*.npy"))) == total - 2, "every readable image is stored"
-    data = module(kind, root, store=store, skip_broken=True)
+    data = _module(kind, root, store=store, skip_broken=True)
     data.prepare_data()
     data.setup()
     sources = [data.source(split) for split in SPLITS]
@@ -163,13 +257,13 @@ def test_training_begins_with_a_look_at_some_images_of_all_splits(
     kind: str, root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(found_module, "SAMPLED", 100)
-    _as_in_training(module(kind, root)).prepare_data()
-    broken = [partner(kind, path, "labels") for path in colors(kind, root)[1::3]]
+    _as_in_training(_module(kind, root)).prepare_data()
+    broken = [_partner(kind, path, "labels") for path in _colors(kind, root)[1::3]]
     for path in broken:
-        sets.corrupt(path)
+        _corrupt(path)
     assert len(broken) > 2
     with pytest.raises(DataError, match=f"found {len(broken)} problems") as caught:
-        _as_in_training(module(kind, root)).prepare_data()
+        _as_in_training(_module(kind, root)).prepare_data()
     text = str(caught.value)
     assert all(str(path) in text for path in broken), "all of these are looked at"
     assert "tangent-check" in text
