@@ -20,7 +20,6 @@ import cv2
 import numpy as np
 import pytest
 from PIL import ExifTags, Image
-from transformers import SegformerConfig, SegformerForSemanticSegmentation, SegformerImageProcessor
 
 from tangent_train.geometry import TangentGrid
 from tangent_train.rendering import write_rig
@@ -30,12 +29,14 @@ from tests.datamodules.folder.photo_format import write_photos
 from tests.datamodules.stanford2d3ds.stanford_pairs_format import write_paper_pairs
 from tests.datamodules.synthia.synthia_format import write_panoramas, write_views
 from tests.datamodules.zind.zind_format import write_homes
+from tests.inference.photo_networks import huggingface_networks as networks
 from tests.slow.documentation.commands import TIME, small, typed
 
 ROOT = Path(__file__).resolve().parents[3]
 SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
 ROWS = 128
 SEGFORMER = "nvidia/segformer-b0-finetuned-ade-512-512"
+"""A photo network as the hub has it, where its name on the hub is a path."""
 _SEQUENCES = dict.fromkeys(("01", "02", "04", "05", "06"), 2)
 _TWO_BATCHES = {"PL_TRAINER_LIMIT_TRAIN_BATCHES": "2", "PL_TRAINER_LIMIT_VAL_BATCHES": "2"}
 
@@ -50,7 +51,8 @@ def build_world(folder: Path) -> Path:
     write_photos(folder / "my_photos")
     _write_pictures(folder)
     _write_colmap_model(folder / "project")
-    _write_segformer(folder / SEGFORMER)
+    small_photos = {"height": 32, "width": 32}
+    networks.saved(networks.segformer, folder / SEGFORMER, size=small_photos)
     demo = f"runs/demo/{TIME}"
     for line in (
         f"tangent-train experiment=rooms/demo hydra.run.dir={demo}",
@@ -118,20 +120,6 @@ def _write_colmap_model(project: Path) -> None:
     (model / "cameras.txt").write_text("1 PINHOLE 32 32 30 30 16 16\n")
     (model / "images.txt").write_text("1 1 0 0 0 0 0 0 1 face_000/a.png\n\n")
     (model / "points3D.txt").write_text("")
-
-
-def _write_segformer(folder: Path) -> None:
-    """A photo network as the hub has it, where its name on the hub is a path."""
-    names = dict(enumerate(("wall", "floor", "ceiling", "windowpane", "door", "sky")))
-    config = SegformerConfig(
-        depths=[1, 1, 1, 1],
-        hidden_sizes=[8, 8, 16, 16],
-        num_attention_heads=[1, 1, 2, 2],
-        decoder_hidden_size=16,
-        id2label=names,
-    )
-    SegformerForSemanticSegmentation(config).save_pretrained(folder)
-    SegformerImageProcessor(size={"height": 32, "width": 32}).save_pretrained(folder)
 
 
 def run(words: list[str], variables: dict[str, str], world: Path) -> None:
