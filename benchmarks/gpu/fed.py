@@ -34,7 +34,7 @@ def fed(quick: bool) -> Iterator[Table]:
     settings += ["task.images_per_chunk=null", "task.channels_last=true", "data.in_memory=false"]
     settings += [f"task.class_weights={[1] * 13}"]
     level, rooms = (5, 4) if quick else (10, 32)
-    settings += [f"level={level}", *(["network.depth=50"] if quick else [])]
+    settings.append(f"level={level}")
     with tempfile.TemporaryDirectory() as root:
         settings.append(f"data.store={root}/store")
         data, task = built(settings, f"{root}/rooms", 2 ** (level + 1), rooms)

@@ -14,7 +14,6 @@ import cv2
 import numpy as np
 import torch
 
-from benchmarks.gpu import segformer
 from benchmarks.labels import NUM_CLASSES
 from benchmarks.measuring import DEVICE, Goal, Row, Table, Way, measure
 from datamodules.core.inputs import Normalization
@@ -30,11 +29,9 @@ from tangent_train.rendering import equirect_to_tangent, tangent_to_labels
 
 def predict(quick: bool) -> Iterator[Table]:
     """2048×1024 and 4096×2048, in bf16, then 200 frames by ``tangent-predict``."""
-    fcn = {"_target_": "models.FCNResNet", "in_channels": 3, "depth": 50 if quick else 101}
-    networks: dict[str, dict[str, Any]] = {
-        "SegFormer-B0": {"_target_": "models.HuggingFaceNetwork", "config": segformer(quick)},
-        "FCN-ResNet101": fcn,
-    }
+    segformer = {"_target_": "models.HuggingFaceNetwork", "config": {"model_type": "segformer"}}
+    fcn = {"_target_": "models.FCNResNet", "in_channels": 3, "depth": 101}
+    networks: dict[str, dict[str, Any]] = {"SegFormer-B0": segformer, "FCN-ResNet101": fcn}
     with tempfile.TemporaryDirectory() as temporary:
         path = Path(temporary) / "net.ckpt"
         for level in (7,) if quick else (9, 10):

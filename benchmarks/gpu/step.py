@@ -11,7 +11,6 @@ import torch
 from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
-from benchmarks.gpu import segformer
 from benchmarks.labels import NUM_CLASSES
 from benchmarks.measuring import DEVICE, Goal, Row, Table, Way, attempted, measure
 from models import FCNResNet, HuggingFaceNetwork, UNet
@@ -44,14 +43,12 @@ def step(quick: bool) -> Iterator[Table]:
     """FCN-ResNet101 (paper, level 10), SegFormer-B0, and the UNet of ``rooms/standard``."""
     side, count = (32, 2) if quick else (512, 16)
     widths = (4, 8, 8) if quick else (16, 32, 64, 128, 256, 256)
-    fcn = FCNResNet(4, NUM_CLASSES, depth=50 if quick else 101, frozen_statistics=True)
+    fcn = FCNResNet(4, NUM_CLASSES, depth=101, frozen_statistics=True)
+    segformer = HuggingFaceNetwork({"model_type": "segformer"}, NUM_CLASSES)
     cases: dict[str, tuple[nn.Module, tuple[int, ...]]] = {
         "UNet": (UNet(4, NUM_CLASSES, widths), (2, 4, 32, 32) if quick else (40, 4, 96, 96)),
         "FCN-ResNet101": (fcn, (count, 4, side, side)),
-        "SegFormer-B0": (
-            HuggingFaceNetwork(segformer(quick), NUM_CLASSES),
-            (count, 3, side, side),
-        ),
+        "SegFormer-B0": (segformer, (count, 3, side, side)),
     }
     for name, (network, size) in cases.items():
         rows: list[Row] = []
