@@ -100,11 +100,12 @@ def make(settings: Any, place: str, file: SettingsFile | None = None, **given: A
         **given: Further arguments, handed on as they are.
 
     Raises:
-        SettingError: The class or function cannot be imported.
+        SettingError: The class or function cannot be imported, or gets text for a number.
         DataError: The file gives forbidden or invalid settings.
     """
     maker, kinds = _maker(settings, place, file)
-    arguments = {name: None for name, kind in kinds.items() if kind is Weights} | {
+    restored = [name for name, kind in kinds.items() if kind is Weights and file is not None]
+    arguments = dict.fromkeys(restored) | {
         name: _argument(value, f"{place}.{name}", file, kinds.get(name, kinds.get("**")), kinds)
         for name, value in settings.items()
         if name != "_target_"
@@ -224,7 +225,7 @@ def _maker(settings: Any, place: str, file: SettingsFile | None) -> tuple[Any, M
     """The class or function that a section names, with the kinds of its arguments in a file."""
     target = settings.get("_target_") if isinstance(settings, Mapping) else None
     if file is None:
-        return import_named(target, place), {"**": Any}
+        return _find(str(target)) or (import_named(target, place), {"**": Any})
     if not isinstance(target, str):
         raise file.refused(place, settings, "a section with a _target_")
     found = _find(target)
@@ -246,6 +247,8 @@ def _argument(
     """A value from settings, with the objects in it made."""
     if file is not None and file.owns(place):
         _check_argument(value, place, file, kind, kinds)
+    elif isinstance(value, str) and _is_whole(kind):
+        raise SettingError(place, found=value, expected=inspect.formatannotation(kind))
     if isinstance(value, Mapping) and "_target_" in value:
         return make(value, place, file)
     if isinstance(value, Mapping):
@@ -267,6 +270,11 @@ def _check_argument(
         return  # `make` looks at it
     if value is not None and kind is not Any and not _fits(value, kind):
         raise file.refused(place, value, f"{inspect.formatannotation(kind)} in a file")
+
+
+def _is_whole(kind: Any) -> bool:
+    """Whether a kind is of whole numbers or booleans only, perhaps optional."""
+    return set() < set(get_args(kind) or (kind,)) - {NoneType} <= {bool, int}
 
 
 def _find(target: str) -> tuple[Any, Mapping[str, Any]] | None:
