@@ -224,21 +224,19 @@ def check_plain(path: Path, value: Any, place: str, depth: int = 0) -> Any:
 def _maker(settings: Any, place: str, file: SettingsFile | None) -> tuple[Any, Mapping[str, Any]]:
     """The class or function that a section names, with the kinds of its arguments in a file."""
     target = settings.get("_target_") if isinstance(settings, Mapping) else None
-    if file is None:
-        return _find(str(target)) or (import_named(target, place), {"**": Any})
-    if not isinstance(target, str):
+    if file is not None and not isinstance(target, str):
         raise file.refused(place, settings, "a section with a _target_")
-    found = _find(target)
-    if found is None and (target in file.trust or not file.owns(f"{place}._target_")):
+    found = _find(str(target))
+    if found is not None:
+        return found
+    if file is None or target in file.trust or not file.owns(f"{place}._target_"):
         return import_named(target, place), {"**": Any}
-    if found is None:
-        raise DataError(
-            file.path,
-            found=f"{place}._target_={target}, which would be called",
-            expected="networks, data and tasks that are registered here",
-            remedy=f"If you know it, and trust who made the file: trust={target}",
-        )
-    return found
+    raise DataError(
+        file.path,
+        found=f"{place}._target_={target}, which would be called",
+        expected="networks, data and tasks that are registered here",
+        remedy=f"If you know it, and trust who made the file: trust={target}",
+    )
 
 
 def _argument(
