@@ -112,24 +112,25 @@ def test_an_interrupted_run_goes_on(
 def test_a_broken_pair_is_named_and_the_others_are_compared(
     run: Run, tmp_path: Path, panoramas: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / "c").mkdir(parents=True)
     for name in ("a.png", "b.png"):
         shutil.copy(panoramas / name, tmp_path / "in")
     whole = (panoramas / "c.png").read_bytes()
-    (tmp_path / "in" / "d.png").write_bytes(whole[:900])
+    (tmp_path / "in" / "c" / "d.png").write_bytes(whole[:900])
     with pytest.raises(SystemExit, match="1 of 2 pairs could not be used"):
         run("input=in", *SMALL, "output=out")
-    assert "Pair b – d: in/d.png: found" in capsys.readouterr().out
+    assert "Pair b – c/d: in/c/d.png: found" in capsys.readouterr().out
     assert pairs_in(tmp_path / "out") == ["a – b"]
     # Mended, only that pair is compared.
-    (tmp_path / "in" / "d.png").write_bytes(whole)
+    (tmp_path / "in" / "c" / "d.png").write_bytes(whole)
     run("input=in", *SMALL, "output=out")
     assert "1 of 2 pairs are done already" in capsys.readouterr().out
-    assert pairs_in(tmp_path / "out") == ["a – b", "b – d"]
+    assert pairs_in(tmp_path / "out") == ["a – b", "b – c/d"]
     # Of nothing but broken pairs there are no results.
     assert cv2.imwrite(str(tmp_path / "square.png"), np.zeros((8, 8, 3), np.uint8))
     with pytest.raises(SystemExit, match="1 of 1 pairs could not be used"):
         run("left=in/a.png", "right=square.png", *SMALL, "output=none")
+    assert "square.png: found 8×8 pixels" in capsys.readouterr().out
     assert not (tmp_path / "none").exists()
 
 
