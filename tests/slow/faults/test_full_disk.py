@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import resource
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -86,12 +87,15 @@ def test_what_tensorboard_cannot_write_stops_with_a_checkpoint_to_go_on_from(
     trainer = run_trainer(tmp_path, max_epochs=9, logger=logger, callbacks=[Pictures()])
     data = small_data(stanford_root)
     message = rf"{re.escape(str(tmp_path))}: found file too large"
+    before = {*threading.enumerate()}
     with (
         pytest.raises(NoRoomError, match=message),
         _small_files(3 * LIMIT),
         machine_faults(tmp_path, data),
     ):
         trainer.fit(small_task(Faulty()), datamodule=data)
+    for thread in {*threading.enumerate()} - before:  # the writer's end belongs to this test
+        thread.join(10)
     said = capfd.readouterr().err
     assert f"tangent-train resume={tmp_path}" in said
     content = torch.load(tmp_path / "checkpoints" / "last.ckpt", weights_only=True)
