@@ -11,14 +11,12 @@ S-level-n    P, tested on panoramas of level n (study of the angular resolution)
 ===========  ===============================================================================
 
 Besides the files of a run, a stage's folder holds ``stage.yaml``, its config for ``tangent-train``
-or ``tangent-evaluate``, and ``stage.json``, a digest of the checkpoint it starts from and of its
-class map.
+or ``tangent-evaluate``, and ``stage.digest``, of the checkpoint it starts from and of its class map.
 """
 
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -31,7 +29,7 @@ from tangent_train.checkpoints.content import read_settings
 from tangent_train.cli.processes import command_line, run_process
 from tangent_train.cli.transfer_views import conditions_of, numbers
 from tangent_train.errors import DataError, SettingError
-from tangent_train.files import parse_json, write_text
+from tangent_train.files import write_text
 from tangent_train.setting_rules import differing_settings
 
 State = Literal["new", "begun", "finished"]
@@ -204,7 +202,7 @@ def stage_state(stage: Stage) -> State:
         SettingError: Its folder holds something else, or the same stage with other settings.
         DataError: A file of the stage cannot be read.
     """
-    record = stage.folder / "stage.json"
+    record = stage.folder / "stage.digest"
     if not record.is_file():
         if stage.folder.exists() and any(p.name[0] != "." for p in stage.folder.iterdir()):
             raise SettingError(
@@ -229,9 +227,9 @@ def stage_state(stage: Stage) -> State:
             expected="the settings of this command",
             remedy=_REMEDY,
         )
-    weights, known = stage.weights, parse_json(record.read_bytes())["weights"]
+    weights, known = stage.weights, record.read_bytes()
     # A network that was trained again is another one; one that is gone is not missed.
-    if weights and weights.is_file() and known != _digest(weights, stage.config):
+    if weights and weights.is_file() and known != _digest(weights, stage.config).encode():
         raise SettingError(
             stage.folder,
             found=f"stage {stage.name} of another network, or with another class map",
@@ -255,7 +253,7 @@ def run_stage(stage: Stage, state: State) -> int:
         DataError: The checkpoint it starts from is missing.
         SettingError: Another command is running it.
     """
-    config, digest = dict(stage.config), None
+    config, digest = dict(stage.config), ""
     if state == "begun":
         config["resume"] = str(stage.folder)
     elif stage.weights is not None:
@@ -272,7 +270,7 @@ def run_stage(stage: Stage, state: State) -> int:
     try:
         with FileLock(stage.folder / ".lock", blocking=False):
             if state == "new":
-                write_text(stage.folder / "stage.json", json.dumps({"weights": digest}) + "\n")
+                write_text(stage.folder / "stage.digest", digest)
             write_text(
                 stage.folder / "stage.yaml", OmegaConf.to_yaml(OmegaConf.create(_HEAD | config))
             )
