@@ -70,8 +70,6 @@ def run_job(
         environment["CUDA_VISIBLE_DEVICES"] = visible_gpus
     status = run_process(command_line(command, [*options, *overrides], folder), environment)
     if status:
-        raise CompactHydraException(
-            f"tangent-{command}: job {hydra.job.num} in {folder} ended with status {status}"
-        )
+        raise CompactHydraException(f"job {hydra.job.num} in {folder} ended with status {status}")
     figure = folder / OBJECTIVE_FILE
     return float(parse_json(figure.read_text())["best"]) if figure.is_file() else None
