@@ -11,14 +11,12 @@ from scipy.integrate import quad
 from tangent_train.errors import SettingError
 from tangent_train.geometry import (
     equirect_directions,
-    equirect_elevations,
     equirect_latitudes,
     equirect_shape,
     equirect_solid_angles,
     equirect_to_lonlat,
     lonlat_to_equirect,
     lonlat_to_xyz,
-    rotation_about,
 )
 
 Shape = tuple[int, int]
@@ -68,10 +66,3 @@ def test_solid_angle_of_a_row_is_the_integral_of_cos_latitude() -> None:
         top = math.pi / 2 - row / height * math.pi
         area, _ = quad(math.cos, top - math.pi / height, top)
         assert angle == pytest.approx(area * 2 * math.pi / width, rel=1e-12)
-
-
-def test_elevations_are_sines_of_angles_above_the_horizon() -> None:
-    up = rotation_about((1, 2, 0), 0.4)[2]
-    found = equirect_elevations((6, 12), up.tolist())
-    assert found.dtype == np.float32
-    np.testing.assert_allclose(found, equirect_directions((6, 12)) @ up, atol=2e-7)

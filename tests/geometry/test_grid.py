@@ -20,20 +20,8 @@ from tangent_train.geometry import (
     rotation_about,
     xyz_to_lonlat,
 )
-from tests.geometry.directions import random_directions
-from tests.rendering.reference import ReferenceGrid, to_xyz
 
 ROTATION = rotation_about((1, 2, -3), 1.1)
-
-
-@pytest.mark.parametrize(("base_level", "level", "dim"), [(0, 5, None), (1, 5, 13), (2, 5, 20)])
-def test_directions_follow_the_textbook_formulas(
-    base_level: int, level: int, dim: int | None
-) -> None:
-    grid = TangentGrid(base_level, level, dim)
-    reference = ReferenceGrid(base_level, level, grid.dim)
-    expected = [to_xyz(reference.lonlat(face)) for face in reference.order(grid.centers_xyz)]
-    np.testing.assert_allclose(grid.directions(), expected, atol=1e-13)
 
 
 @pytest.mark.parametrize("rotation", [None, ROTATION])
@@ -135,16 +123,3 @@ def test_least_dim_covers_the_voronoi_cells_exactly(base_level: int, finer: int)
         TangentGrid(base_level, level, least - 1)
     assert TangentGrid(base_level, level, least).half_extent >= voronoi_extent(base_level)
     assert TangentGrid.least_dim(base_level, level) == least
-
-
-@pytest.mark.parametrize("rotation", [None, rotation_about((1, 1, 0), 2.0)])
-def test_owner_has_the_nearest_centre(rotation: NDArray[np.float64] | None) -> None:
-    grid = TangentGrid(1, 5, rotation=rotation)
-    directions = random_directions(600)
-    angles = np.arccos(np.clip(directions @ grid.centers_xyz.T, -1, 1))
-    expected = angles.argmin(axis=1)
-    np.testing.assert_array_equal(grid.owners(directions), expected)
-    # Vectors of any length and shape.
-    np.testing.assert_array_equal(
-        grid.owners(3 * directions.reshape(20, 30, 3)), expected.reshape(20, 30)
-    )

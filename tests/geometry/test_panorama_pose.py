@@ -10,9 +10,7 @@ from tangent_train.errors import SettingError
 from tangent_train.geometry import (
     FLIP_Y,
     PanoramaPose,
-    lonlat_to_xyz,
     random_rotation,
-    rotation_about,
     xyz_to_lonlat,
 )
 
@@ -24,29 +22,15 @@ def posed(seed: int, mirrored: bool) -> PanoramaPose:
 
 
 def test_a_panorama_in_a_right_handed_room() -> None:
-    # It looks along the room's y axis from 1.5 m above the floor: its right is the room's x.
-    pose = PanoramaPose(rotation_about((0, 0, 1), np.pi / 2) @ FLIP_Y, (3, 4, 1.5))
+    # It looks along the room's y axis, 1.5 m above the floor and lying on a side: right is up.
+    pose = PanoramaPose([[0, 0, -1], [1, 0, 0], [0, 1, 0]], (3, 4, 1.5))
     ahead, right, up = np.eye(3)
     np.testing.assert_allclose(pose.points_m(ahead, 2), (3, 6, 1.5), atol=1e-15)
-    np.testing.assert_allclose(pose.points_m(right, 2), (5, 4, 1.5), atol=1e-15)
-    np.testing.assert_allclose(pose.points_m(up, 2), (3, 4, 3.5), atol=1e-15)
-    direction, distance = pose.seen((3 + np.sqrt(3), 4 - 1, 1.5))
+    np.testing.assert_allclose(pose.points_m(right, 2), (3, 4, 3.5), atol=1e-15)
+    np.testing.assert_allclose(pose.points_m(up, 2), (1, 4, 1.5), atol=1e-15)
+    direction, distance = pose.seen((3, 4 - 1, 1.5 + np.sqrt(3)))
     np.testing.assert_allclose(np.degrees(xyz_to_lonlat(direction)), (120, 0), atol=1e-12)
     assert distance == pytest.approx(2)
-
-
-@pytest.mark.parametrize("mirrored", [False, True])
-def test_points_appear_where_they_came_from(mirrored: bool) -> None:
-    pose = posed(1, mirrored)
-    rng = np.random.default_rng(2)
-    # With both poles and both sides of the seam among them.
-    special = np.radians(np.array([[0, 90], [0, -90], [180, 0], [-180, 10], [179.9, 3]]))
-    some = rng.uniform((-np.pi, -np.pi / 2), (np.pi, np.pi / 2), (40, 2))
-    directions = lonlat_to_xyz(np.concatenate([special, some])).reshape(9, 5, 3)
-    distance_m = rng.uniform(0.1, 9, (9, 5))
-    back, back_m = pose.seen(pose.points_m(directions, distance_m))
-    np.testing.assert_allclose(back, directions, atol=1e-12)
-    np.testing.assert_allclose(back_m, distance_m, atol=1e-12)
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
