@@ -46,21 +46,6 @@ def test_owners_are_the_nearest_centres(
     np.testing.assert_array_equal(tables.owners(grid, shape), owner)
 
 
-def test_feather_tables_hold_every_image_that_sees_a_pixel() -> None:
-    grid, shape = TangentGrid(0, 4), (16, 32)
-    face, _, _, weight = tables.image_table(
-        grid, shape, np.dtype(np.float64), "feather", slice(0, 16)
-    )
-    inside = np.zeros((grid.num_images, *shape), bool)
-    for number, axes in enumerate(grid.world_from_camera):
-        rays = equirect_directions(shape) @ axes
-        edge = grid.dim / 2 * grid.pitch * rays[..., 2]
-        inside[number] = (np.abs(rays[..., :2]) < edge[..., None]).all(axis=-1)
-    assert len(face) == inside.sum(axis=0).max()
-    for number, seen in enumerate(inside):
-        np.testing.assert_array_equal(((face == number) & (weight > 0)).sum(axis=0), seen)
-
-
 @pytest.mark.parametrize("blend", ["feather", "nearest"])
 def test_bands_are_parts_of_the_whole(monkeypatch: pytest.MonkeyPatch, blend: Any) -> None:
     grid, shape = TangentGrid(0, 5), (32, 64)

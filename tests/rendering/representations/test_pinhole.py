@@ -19,10 +19,10 @@ from tangent_train.rendering import (
     equirect_to_tangent,
     rotate_equirect,
     tangent_to_equirect,
-    tangent_to_labels,
 )
 from tangent_train.rendering.representations.views import PinholeViews
 from tests.geometry.directions import unit
+from tests.rendering.reference import certain_labels, panorama_lonlat, sample_panorama
 
 SHAPE = (64, 128)
 TILT = rotation_about((1, 2, 0), math.radians(50)) @ rotation_about((0, 0, 1), 1)
@@ -186,32 +186,16 @@ def test_samples_are_rotated_with_the_whole(representation: Representation) -> N
     np.testing.assert_allclose(rotated.rotations(), TILT @ plain.rotations(), atol=1e-12)
 
 
-@pytest.mark.parametrize("blend", ["nearest", "feather"])
-def test_scores_are_interpolated_and_probabilities_feathered(blend: Blend) -> None:
-    representation, shape = TangentRepresentation(0, 4, blend=blend), (32, 64)
-    scores = 5 * torch.randn(20, 5, 16, 16, generator=torch.Generator().manual_seed(0))
-    blended = scores.softmax(dim=1) if blend == "feather" else scores
-    expected = tangent_to_labels(blended, representation.grid, shape, blend)
-    torch.testing.assert_close(representation.to_labels(scores, shape), expected)
-
-
 @pytest.mark.parametrize("rows", [24, 100])
 def test_scores_of_other_rows_are_interpolated_around_the_sphere(rows: int) -> None:
     """Against bilinear interpolation in double precision, across the seam and beyond the poles."""
     scores = torch.randn(1, 3, rows, 2 * rows, generator=torch.Generator().manual_seed(0))
     found = EquirectRepresentation(5, rows=rows).to_labels(scores, SHAPE).numpy()
-    y, x = ((np.arange(n) + 0.5) * rows / SHAPE[0] - 0.5 for n in SHAPE)
-    expected = np.zeros((3, *SHAPE))
-    for down, across in np.ndindex(2, 2):
-        i, j = np.floor(y).astype(int) + down, np.floor(x).astype(int) + across
-        weight = np.outer(1 - abs(y - i), 1 - abs(x - j))
-        beyond = (i < 0) | (i >= rows)
-        columns = (j[None] + rows * beyond[:, None]) % (2 * rows)
-        expected += weight * scores[0].double().numpy()[:, i.clip(0, rows - 1)[:, None], columns]
-    ordered = np.sort(expected, axis=0)
-    clear = ordered[-1] - ordered[-2] > 1e-4
+    image = scores[0].movedim(0, -1).double().numpy()
+    expected = sample_panorama(image, panorama_lonlat(SHAPE), "bilinear")
+    clear = certain_labels(expected, margin=1e-4)
     assert clear.mean() > 0.99
-    np.testing.assert_array_equal(found[clear], expected.argmax(axis=0)[clear])
+    np.testing.assert_array_equal(found[clear], expected.argmax(axis=-1)[clear])
 
 
 def test_the_identity_is_no_rotation() -> None:
