@@ -59,7 +59,9 @@ def test_a_data_set_is_a_reader_and_its_files(tmp_path: Path) -> None:
     data = _toy(tmp_path)
     data.prepare_data()
     assert len(data.source("train")) == 2
-    sample = data.evaluation_samples("test")[0, 0]
+    samples = data.evaluation_samples("test")
+    sample = samples[0, 0]
+    assert len(samples) == 1
     np.testing.assert_array_equal(sample.target, read_png(tmp_path / "labels" / "c.png"))
     problems, count = data.check()
     assert not problems.items

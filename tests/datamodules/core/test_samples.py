@@ -12,12 +12,10 @@ from datamodules.core.inputs import (
     RGB_NORMALIZATION,
     RGBD_NORMALIZATION,
     Input,
-    Normalization,
     normalize,
 )
 from datamodules.core.panoramas import Panorama
 from datamodules.core.samples import (
-    EvaluationImages,
     TrainingImages,
     jitter_colors,
     render_inputs,
@@ -27,7 +25,6 @@ from tangent_train.rendering import EquirectRepresentation, TangentRepresentatio
 from tangent_train.rendering.representations.views import Representation
 
 DEPTH: tuple[Input, ...] = ("rgb", "depth")
-IDENTITY = Normalization((0, 0, 0, 0), (1 / 255, 1 / 255, 1 / 255, 1))
 
 
 def _positions(index: int) -> Panorama:
@@ -113,6 +110,7 @@ def test_training_sample(erp: Representation) -> None:
         torch.testing.assert_close(rgb[..., channel], sample.labels)
     sample = _training(TangentRepresentation(0, 3, rotation="so3"))[0, 0]
     torch.testing.assert_close(sample.images[1], sample.labels.short() * 4)
+    assert not torch.equal(sample.images[0][..., 0], sample.labels), "colours are interpolated"
 
 
 def test_views_are_those_of_seed_epoch_and_index(erp: Representation) -> None:
@@ -120,17 +118,6 @@ def test_views_are_those_of_seed_epoch_and_index(erp: Representation) -> None:
     assert torch.equal(first, _training(erp)[4, 1].labels)
     assert not torch.equal(first, _training(erp)[5, 1].labels)
     assert not torch.equal(first, _training(erp, seed=1)[4, 1].labels)
-
-
-def test_evaluation_sample(erp: Representation) -> None:
-    dataset = EvaluationImages(POSITIONS, erp, DEPTH)
-    sample = dataset[0, 2]
-    assert len(dataset) == len(_training(erp)) == 3
-    images = normalize(sample.images, IDENTITY, DEPTH)
-    assert images.shape == (1, 4, 16, 32)
-    assert sample.index == 2
-    np.testing.assert_array_equal(sample.target.numpy(), _positions(2).labels)
-    torch.testing.assert_close(images[0, 0], sample.target.float())
 
 
 # --- colours -----------------------------------------------------------------------------------
