@@ -1,8 +1,7 @@
-"""Training and evaluation on a GPU are those on the CPU, and a step waits for nothing."""
+"""Training and evaluation on a GPU are those on the CPU."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from functools import partial
 from typing import Any
 
@@ -61,28 +60,6 @@ def test_two_steps_and_a_test() -> None:
 def test_mixed_precision(precision: str) -> None:
     expected, found = _trained("cpu"), _trained("gpu", precision=precision)
     torch.testing.assert_close(_weights(found), _weights(expected), rtol=0.05, atol=0.05)
-
-
-@pytest.fixture
-def no_waiting() -> Iterator[Any]:
-    """What is called makes every operation an error for which the host waits."""
-    yield lambda: torch.cuda.set_sync_debug_mode("error")
-    torch.cuda.set_sync_debug_mode("default")
-
-
-def test_a_step_does_not_wait(no_waiting: Any) -> None:
-    task = _task(channels_last=True).cuda().train()
-    optimizer = task.optimization(lambda: 1)
-    images = torch.randn(20, 2, 16, 16, device="cuda")
-    labels = torch.randint(0, 3, (20, 16, 16), device="cuda").byte()
-    for step in range(2):
-        if step:  # the first one chooses algorithms
-            no_waiting()
-        optimizer.zero_grad()
-        with torch.autocast("cuda", torch.bfloat16):
-            loss = task.loss_sum((images,), labels) / task.loss_norm(labels)
-        torch.autograd.backward(loss)
-        optimizer.step()
 
 
 def test_cuda_graphs_in_evaluation() -> None:
