@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
 from functools import partial
 from typing import Any
+from unittest.mock import patch
 
 import lightning
 import pytest
@@ -112,16 +112,8 @@ class Exchanges(lightning.Callback):
         torch.distributed.destroy_process_group()
 
 
-@pytest.fixture
-def same_environment() -> Iterator[None]:
-    """Lightning leaves variables behind that tell later processes that they are part of a run."""
-    before = dict(os.environ)
-    yield
-    os.environ.clear()
-    os.environ.update(before)
-
-
-@pytest.mark.usefixtures("same_environment")
+# Lightning leaves variables behind that tell later processes that they are part of a run.
+@patch.dict(os.environ)
 def test_processes_exchange_gradients_once_after_the_last_chunk() -> None:
     exchanges = Exchanges()
     strategy = DDPStrategy(process_group_backend="gloo")
