@@ -148,7 +148,6 @@ _FAULTS = [
     ("stanford", "labels", _past_the_table, r"instance 521 in 1 pixel; expected 0 to 520"),
     ("stanford", "rgb", _link_to_itself, "Too many levels of symbolic links"),
     ("stanford", "rgb", _narrower, "expected twice as wide"),
-    ("folder", "labels", _corrupt, "no image that can be decoded"),
     ("folder", "depth", _to_8_bits, "uint8 of shape"),
     ("shapes", "rgb", _truncate, "expected"),
 ]
