@@ -274,13 +274,6 @@ def test_photos_with_the_networks_pixels_are_labelled_pixel_by_pixel(
         assert (labels == expected).mean() > 0.9
 
 
-def test_a_photo_of_any_resolution_is_seen_at_the_networks() -> None:
-    trained, coarse = trained_network(PERSPECTIVE), _blocks(96, 96)
-    labels = _labels(trained, _photo(coarse.repeat(3, axis=0).repeat(3, axis=1), 60.0))
-    assert labels.shape == (288, 288)
-    assert (labels[1::3, 1::3] == _labels(trained, _photo(coarse, 60.0))).mean() > 0.95
-
-
 def test_crops_have_the_angular_resolution_the_network_was_trained_with() -> None:
     tangent, photos = trained_network(TANGENT), trained_network(PERSPECTIVE)
     assert _radians_per_pixel(tangent) == pytest.approx(TangentGrid(0, 4).pitch)
