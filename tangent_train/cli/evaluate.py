@@ -30,7 +30,7 @@ from tangent_train.cli.say import say
 from tangent_train.cli.stored import GROUPS, run_settings
 from tangent_train.errors import SettingError
 from tangent_train.files import no_room
-from tangent_train.inference.judge import NetworkJudge
+from tangent_train.inference.judge import NetworkJudge, judging_views
 from tangent_train.registry import SettingsFile, make
 from tangent_train.results.evaluation import (
     classification_record,
@@ -179,8 +179,9 @@ class Run:
             return NetworkJudge.of(self.trained, device)
         data, network = self.data, Scores(self.task.network, self.data.num_classes).eval()
         multiple = size_multiple_of(network, data.in_channels) or 1
-        known = data.inputs, data.normalization, self.settings["level"]
-        return NetworkJudge(network, *known, multiple, device=device)
+        level = self.settings["level"]
+        views = judging_views(network, data.representation, level, multiple)
+        return NetworkJudge(network, data.inputs, data.normalization, level, views, device)
 
     def _load(self, tensors: Mapping[str, Any], checkpoint: Path) -> None:
         try:

@@ -11,7 +11,8 @@ S-level-n    P, tested on panoramas of level n (study of the angular resolution)
 ===========  ===============================================================================
 
 Besides the files of a run, a stage's folder holds ``stage.yaml``, its config for ``tangent-train``
-or ``tangent-evaluate``, and ``stage.digest``, of the checkpoint it starts from and of its class map.
+or ``tangent-evaluate``, and ``stage.digest``, that of the checkpoint it starts from and of its
+class map.
 """
 
 from __future__ import annotations

@@ -111,7 +111,7 @@ class PanoramaViews:
         *,
         upright: bool = False,
     ) -> None:
-        self._seen = [_panorama_representation(trained, level, base_level) for level in levels]
+        self._seen = [panorama_representation(trained, level, base_level) for level in levels]
         self._rotations = rotations
         self._turns = turns(rotations, "rotations")
         self.image_size = max(seen.image_size for seen in self._seen)
@@ -226,9 +226,14 @@ def panorama_settings(
     return settings
 
 
-def _panorama_representation(
-    trained: TrainedNetwork, level: int | None, base_level: int | None
+def panorama_representation(
+    trained: TrainedNetwork, level: int | None = None, base_level: int | None = None
 ) -> PinholeRepresentation | EquirectRepresentation:
+    """The representation of panoramas of `panorama_settings`.
+
+    Raises:
+        SettingError: The network cannot take its images.
+    """
     settings = panorama_settings(trained, level, base_level)
     made: Any = make(settings, "representation", trained.source)
     check_size(trained, made.image_size)
@@ -245,7 +250,7 @@ def _photo_representation(
         half_extent /= 2.0 ** (wanted - trained.level)
         size = trained.image_size
     else:
-        seen = _panorama_representation(trained, level, base_level)
+        seen = panorama_representation(trained, level, base_level)
         if isinstance(seen, EquirectRepresentation):
             return _photo_representation(trained, level, _BASE_LEVEL)
         size, half_extent = seen.image_size, seen.grid.dim / 2 * seen.grid.pitch

@@ -11,8 +11,9 @@ from torch import Tensor, nn
 
 from datamodules.core.inputs import Input, Normalization
 from tangent_train.geometry import equirect_directions, random_rotation
-from tangent_train.inference.judge import NetworkJudge
+from tangent_train.inference.judge import NetworkJudge, judging_views
 from tangent_train.inference.views import InputImage
+from tangent_train.rendering import TangentRepresentation
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -27,16 +28,28 @@ class Sky(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.sizes: set[tuple[int, ...]] = set()
+        self.most = 0
 
     def forward(self, images: Tensor) -> Tensor:
         self.sizes.add(tuple(images.shape[-2:]))
+        self.most = max(self.most, len(images))
         upper = torch.arange(images.shape[2]) < images.shape[2] / 2
         fits = (images[:, 0] > 0) == upper[:, None]
         return torch.stack([30.0 * fits, 0.0 * fits], dim=1)
 
 
-def _judge(inputs: tuple[Input, ...] = ("rgb",), **settings: Any) -> NetworkJudge:
-    return NetworkJudge(Sky(), inputs, PLAIN, level=5, **settings)
+class WholeSky(Sky):
+    """The same, given all images of a sphere and where they look."""
+
+    def forward(self, images: Tensor, rays: Tensor) -> Tensor:  # type: ignore[override]
+        assert rays.shape == (1, len(images), 3, 3)
+        return super().forward(images)
+
+
+def _judge(inputs: tuple[Input, ...] = ("rgb",), *, whole: bool = False, **size: Any) -> Any:
+    network = WholeSky() if whole else Sky()
+    views = judging_views(network, TangentRepresentation(0, 5), 5, **size)
+    return NetworkJudge(network, inputs, PLAIN, 5, views)
 
 
 def _bright_above(up: NDArray[np.float64], height: int = 64) -> NDArray[np.uint8]:
@@ -65,11 +78,19 @@ def test_who_is_told_where_up_is_does_not_judge() -> None:
 
 
 @pytest.mark.parametrize(
-    ("settings", "side"),
-    [({}, 29), ({"size_multiple": 16}, 32), ({"fixed_size": (64, 64)}, 64)],
+    ("settings", "side", "count"),
+    [
+        ({}, 29, 4),
+        ({"size_multiple": 16}, 32, 4),
+        ({"fixed_size": (64, 64)}, 64, 4),
+        ({"whole": True}, 32, 20),
+    ],
 )
-def test_images_are_of_a_size_that_the_network_takes(settings: dict[str, Any], side: int) -> None:
-    judge: Any = _judge(**settings)
+def test_images_are_such_as_the_network_takes(
+    settings: dict[str, Any], side: int, count: int
+) -> None:
+    judge = _judge(**settings)
     likely = judge(InputImage(_bright_above(AXES[2])), AXES)
     assert likely.argmax() == 2
     assert judge.network.sizes == {(side, side)}
+    assert judge.network.most == count
