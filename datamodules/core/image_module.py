@@ -37,6 +37,7 @@ from datamodules.core.pipeline import (
     PanoramaJudge,
     PosedUp,
     RotatedPanoramas,
+    full_colors,
     masked,
 )
 from datamodules.core.problems import Problems
@@ -208,16 +209,20 @@ class PanoramaDataModule(ImageDataModule):
     def pipeline(self, found: Found[ImageFiles], split: Split) -> SplitItems[ImageFiles, Panorama]:
         """Panoramas from files or store: masked, rotated, then aligned with gravity."""
         transforms: list[Transform[Panorama, Any]] = []
+        rotated = None
         if self.mask is not None:
             transforms.append(partial(masked, self._masks))
         if self.upright is not None:
             transforms.append(PosedUp())
         if split == "test" and self.test_rotation is not None:
             known = self.upright == "pose"
-            transforms.append(RotatedPanoramas(self.test_rotation, self.seed, known=known))
+            rotated = RotatedPanoramas(self.test_rotation, self.seed, known=known)
+            transforms.append(rotated)
         if self.upright == "auto":
             judge = self.judge if split == "test" else None
-            transforms.append(EstimatedUp(self.max_tilt_deg, judge))
+            reading: Any = found.read
+            colors = partial(full_colors, reading.reader, rotated)
+            transforms.append(EstimatedUp(self.max_tilt_deg, colors, judge))
         return SplitItems(found, split, Panorama, transforms)
 
     def test_dataloader(self) -> DataLoader[Any]:

@@ -11,12 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.core.loading import sample_rng
-from datamodules.core.panoramas import ImageFiles, Panorama
+from datamodules.core.panoramas import ImageFiles, ImageReader, Panorama
 from datamodules.images.gpano import up_of, whole_area
 from datamodules.images.masks import Masks
 from tangent_train.geometry import random_rotation, rotation_about
 from tangent_train.rendering import rotate_equirect
 from tangent_train.rendering.upright.gravity import estimate_up
+
+PanoramaColors = Callable[[int, ImageFiles], "NDArray[np.uint8]"]
+"""RGB ``(H, W, 3)`` of a panorama, given its place in the split and its files."""
 
 PanoramaJudge = Callable[[Panorama, "NDArray[np.float64]"], "NDArray[np.float64]"]
 """Log-likelihoods ``(n,)`` that directions ``(n, 3)`` of a panorama are up."""
@@ -56,23 +59,27 @@ class EstimatedUp:
 
     Args:
         max_tilt_deg: Maximum tilt, see `estimate_up`.
+        colors: A panorama's RGB as large as its file, in which edges are clearest, given its place
+            in the split and its files.
         judge: Log-likelihoods that directions of a panorama are up, see `estimate_up`; it stays in
             its process.
     """
 
-    def __init__(self, max_tilt_deg: float, judge: PanoramaJudge | None = None) -> None:
+    def __init__(
+        self, max_tilt_deg: float, colors: PanoramaColors, judge: PanoramaJudge | None = None
+    ) -> None:
         self._max_tilt_deg = max_tilt_deg
+        self._colors = colors
         self._judge = judge
         self._ups: dict[int, NDArray[np.float64] | None] = {}
 
     def __call__(self, panorama: Panorama, index: int, files: ImageFiles) -> Panorama:
         """The panorama with `up`; None if it cannot be estimated."""
-        del files
         if panorama.up is not None:
             return panorama
         if index not in self._ups:
             judge = None if self._judge is None else partial(self._judge, panorama)
-            self._ups[index] = estimate_up(panorama.rgb, self._max_tilt_deg, judge)
+            self._ups[index] = estimate_up(self._colors(index, files), self._max_tilt_deg, judge)
         return panorama._replace(up=self._ups[index])
 
     def __getstate__(self) -> dict[str, Any]:
@@ -119,3 +126,11 @@ class RotatedPanoramas:
             rotate_equirect(labels, rotation, "nearest"),
             up if self._known else None,
         )
+
+
+def full_colors(
+    reader: ImageReader, rotated: RotatedPanoramas | None, index: int, files: ImageFiles
+) -> NDArray[np.uint8]:
+    """RGB of a panorama, perhaps rotated, as large as its file."""
+    rgb = reader.rgb(files)
+    return rgb if rotated is None else rotate_equirect(rgb, rotated.rotation(index), "bilinear")

@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 import torch
 from lightning.pytorch.plugins import HalfPrecision
+from numpy.typing import NDArray
 
 from datamodules.core.class_weights import class_weights
 from datamodules.core.loading import EpochSampler, sample_rng
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 from tangent_train.errors import SettingError
-from tangent_train.rendering import TangentRepresentation
+from tangent_train.rendering import EquirectRepresentation, TangentRepresentation
 
 MakeModule = Callable[..., Stanford2D3DS]
 
@@ -89,6 +90,22 @@ def test_rotated_panoramas_are_seen_upright_where_up_is_known(
     turned = known.source("test").read(0).up
     assert turned is not None
     assert aware.up @ turned == pytest.approx(0.8)
+
+
+def test_up_is_estimated_from_all_pixels_of_a_file(
+    stanford_root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def estimate(rgb: NDArray[np.uint8], *_: Any) -> None:
+        seen.append(rgb)
+
+    monkeypatch.setattr("datamodules.core.pipeline.estimate_up", estimate)
+    seen: list[NDArray[np.uint8]] = []
+    for level in (3, 4):  # the files have 32 rows
+        representation = EquirectRepresentation(level)
+        module = Stanford2D3DS(stanford_root, representation, test_rotation=30, upright="auto")
+        rotated = module.source("test").read(0).rgb
+    np.testing.assert_array_equal(seen[0], rotated)
+    np.testing.assert_array_equal(seen[1], rotated)
 
 
 def test_processes_share_the_panoramas(
