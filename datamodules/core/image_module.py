@@ -37,7 +37,6 @@ from datamodules.core.pipeline import (
     PanoramaJudge,
     PosedUp,
     RotatedPanoramas,
-    full_colors,
     masked,
 )
 from datamodules.core.problems import Problems
@@ -221,8 +220,7 @@ class PanoramaDataModule(ImageDataModule):
         if self.upright == "auto":
             judge = self.judge if split == "test" else None
             reading: Any = found.read
-            colors = partial(full_colors, reading.reader, rotated)
-            transforms.append(EstimatedUp(self.max_tilt_deg, colors, judge))
+            transforms.append(EstimatedUp(self.max_tilt_deg, reading.reader, rotated, judge))
         return SplitItems(found, split, Panorama, transforms)
 
     def test_dataloader(self) -> DataLoader[Any]:

@@ -18,9 +18,6 @@ from tangent_train.geometry import random_rotation, rotation_about
 from tangent_train.rendering import rotate_equirect
 from tangent_train.rendering.upright.gravity import estimate_up
 
-PanoramaColors = Callable[[int, ImageFiles], "NDArray[np.uint8]"]
-"""RGB ``(H, W, 3)`` of a panorama, given its place in the split and its files."""
-
 PanoramaJudge = Callable[[Panorama, "NDArray[np.float64]"], "NDArray[np.float64]"]
 """Log-likelihoods ``(n,)`` that directions ``(n, 3)`` of a panorama are up."""
 
@@ -50,40 +47,6 @@ class PosedUp:
         if index not in self._ups:
             self._ups[index] = up_of(files.rgb)
         return panorama._replace(up=self._ups[index])
-
-
-class EstimatedUp:
-    """Panoramas with an estimated up direction if it is unknown.
-
-    Views are aligned with gravity; pixels and labels stay in place.
-
-    Args:
-        max_tilt_deg: Maximum tilt, see `estimate_up`.
-        colors: A panorama's RGB as large as its file, in which edges are clearest, given its place
-            in the split and its files.
-        judge: Log-likelihoods that directions of a panorama are up, see `estimate_up`; it stays in
-            its process.
-    """
-
-    def __init__(
-        self, max_tilt_deg: float, colors: PanoramaColors, judge: PanoramaJudge | None = None
-    ) -> None:
-        self._max_tilt_deg = max_tilt_deg
-        self._colors = colors
-        self._judge = judge
-        self._ups: dict[int, NDArray[np.float64] | None] = {}
-
-    def __call__(self, panorama: Panorama, index: int, files: ImageFiles) -> Panorama:
-        """The panorama with `up`; None if it cannot be estimated."""
-        if panorama.up is not None:
-            return panorama
-        if index not in self._ups:
-            judge = None if self._judge is None else partial(self._judge, panorama)
-            self._ups[index] = estimate_up(self._colors(index, files), self._max_tilt_deg, judge)
-        return panorama._replace(up=self._ups[index])
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_judge": None}
 
 
 class RotatedPanoramas:
@@ -128,9 +91,44 @@ class RotatedPanoramas:
         )
 
 
-def full_colors(
-    reader: ImageReader, rotated: RotatedPanoramas | None, index: int, files: ImageFiles
-) -> NDArray[np.uint8]:
-    """RGB of a panorama, perhaps rotated, as large as its file."""
-    rgb = reader.rgb(files)
-    return rgb if rotated is None else rotate_equirect(rgb, rotated.rotation(index), "bilinear")
+class EstimatedUp:
+    """Panoramas with an estimated up direction if it is unknown.
+
+    Views are aligned with gravity; pixels and labels stay in place. Edges are found in the image of
+    the file, which may be larger than the panorama.
+
+    Args:
+        max_tilt_deg: Maximum tilt, see `estimate_up`.
+        reader: Of the files.
+        rotated: Rotates the panoramas, if they are.
+        judge: Log-likelihoods that directions of a panorama are up, see `estimate_up`; it stays in
+            its process.
+    """
+
+    def __init__(
+        self,
+        max_tilt_deg: float,
+        reader: ImageReader,
+        rotated: RotatedPanoramas | None = None,
+        judge: PanoramaJudge | None = None,
+    ) -> None:
+        self._max_tilt_deg = max_tilt_deg
+        self._reader = reader
+        self._rotated = rotated
+        self._judge = judge
+        self._ups: dict[int, NDArray[np.float64] | None] = {}
+
+    def __call__(self, panorama: Panorama, index: int, files: ImageFiles) -> Panorama:
+        """The panorama with `up`; None if it cannot be estimated."""
+        if panorama.up is not None:
+            return panorama
+        if index not in self._ups:
+            judge = None if self._judge is None else partial(self._judge, panorama)
+            rgb = self._reader.rgb(files)
+            if self._rotated is not None:
+                rgb = rotate_equirect(rgb, self._rotated.rotation(index), "bilinear")
+            self._ups[index] = estimate_up(rgb, self._max_tilt_deg, judge)
+        return panorama._replace(up=self._ups[index])
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_judge": None}
