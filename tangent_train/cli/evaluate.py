@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import lightning
-import torch
 from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import TensorBoardLogger
@@ -23,15 +22,14 @@ from tangent_train.callbacks.panels import PredictionPanels
 from tangent_train.callbacks.progress import ProgressBar
 from tangent_train.callbacks.tensorboard import ClassScores, ValidationPictures
 from tangent_train.checkpoints.content import read_checkpoint, write_settings
-from tangent_train.checkpoints.scores import Scores, size_multiple_of
 from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
 from tangent_train.cli.build import Settings, build, build_trained, check_fits, shown
 from tangent_train.cli.say import say
 from tangent_train.cli.stored import GROUPS, run_settings
 from tangent_train.errors import SettingError
 from tangent_train.files import no_room
-from tangent_train.inference.judge import NetworkJudge, judging_views
-from tangent_train.registry import SettingsFile, make
+from tangent_train.inference.judge import NetworkJudge
+from tangent_train.registry import SettingsFile, make, unregistered
 from tangent_train.results.evaluation import (
     classification_record,
     confusion_table,
@@ -160,7 +158,11 @@ class Run:
             check_fits(self.data, content, checkpoint)
             self._load(content["state_dict"], checkpoint)
         if getattr(self.data, "upright", None) == "auto":
-            self.data.judge = self._judge(trainer.strategy.root_device)
+            trained, device = self.trained, trainer.strategy.root_device
+            if trained is None:
+                trained = load_trained(checkpoint, unregistered(self.settings))
+            trained.network.to(device)
+            self.data.judge = NetworkJudge(trained, device)
         trainer.test(self.task, datamodule=self.data, verbose=False)
         task, noun = self.task, self.data.noun
         if task.kind == "classification":
@@ -172,16 +174,6 @@ class Run:
         if record.images != total:
             raise RuntimeError(f"{record.images} of {total} test {noun} were counted")
         self._report(record, checkpoint, trainer.callbacks)  # type: ignore[attr-defined]
-
-    def _judge(self, device: torch.device) -> NetworkJudge:
-        """The network as what says which way is up in the test panoramas."""
-        if self.trained is not None:
-            return NetworkJudge.of(self.trained, device)
-        data, network = self.data, Scores(self.task.network, self.data.num_classes).eval()
-        multiple = size_multiple_of(network, data.in_channels) or 1
-        level = self.settings["level"]
-        views = judging_views(network, data.representation, level, multiple)
-        return NetworkJudge(network, data.inputs, data.normalization, level, views, device)
 
     def _load(self, tensors: Mapping[str, Any], checkpoint: Path) -> None:
         try:

@@ -214,7 +214,7 @@ class _Labeller:
     ) -> None:
         self._settings, self._trained, self._folder = settings, trained, folder
         self._predictor = _predictor(settings, trained)
-        self._judge = NetworkJudge.of(original, self._predictor.device)
+        self._judge = NetworkJudge(original, self._predictor.device)
         self._depth = _depth_folder(settings, trained)
         self._masks = _masks(settings)
         self._shown: dict[str, EncodedImage | None] = dict.fromkeys(shown)

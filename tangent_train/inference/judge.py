@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Self
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -23,12 +24,9 @@ from tangent_train.rendering.representations.views import PinholeViews
 from tangent_train.rendering.upright.gravity import upright_rotation
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from numpy.typing import NDArray
-    from torch import Tensor, nn
+    from torch import Tensor
 
-    from datamodules.core.inputs import Input, Normalization
     from tangent_train.checkpoints.trained import TrainedNetwork
 
 _AROUND = np.arange(4)  # faces of a cube: all but up and down
@@ -46,29 +44,12 @@ class NetworkJudge:
     of a pixel is wrong; a direction becomes more likely by doubt⁻³ of each view.
 
     Attributes:
-        network: Maps images ``(n, C, h, w)``, normalized, to scores ``(n, K, h, w)``.
-        inputs: Its inputs, see `Input`.
-        normalization: Of RGB and depth.
-        level: Level s: angular resolution of the views.
-        views: Of an upright panorama, see `judging_views`.
-        device: Where the network is.
+        trained: The network.
+        device: Where it is.
     """
 
-    network: nn.Module
-    inputs: Sequence[Input]
-    normalization: Normalization
-    level: int
-    views: PinholeViews
+    trained: TrainedNetwork
     device: torch.device | str = "cpu"
-
-    @classmethod
-    def of(cls, trained: TrainedNetwork, device: torch.device | str) -> Self:
-        """The judge of a trained network, which is on the device."""
-        seen = panorama_representation(trained) if sees_rays(trained.network) else None
-        size = trained.size_multiple, trained.fixed_size
-        views = judging_views(trained.network, seen, trained.level, *size)
-        known = trained.network, trained.inputs, trained.normalization, trained.level
-        return cls(*known, views, device)
 
     def __call__(self, image: Any, ups_xyz: NDArray[np.float64]) -> NDArray[np.float64]:
         """Log-likelihoods of directions, up to a constant they share.
@@ -81,56 +62,47 @@ class NetworkJudge:
             ``(n,)``; all 0 of a network that gets the elevation of its pixels, which is told where
             up is and believes it.
         """
-        if "elevation" in self.inputs:
+        if "elevation" in self.trained.inputs:
             return np.zeros(len(ups_xyz))
-        rows = min(image.rgb.shape[0], 2 ** (self.level + 1))
+        rows = min(image.rgb.shape[0], 2 ** (self.trained.level + 1))
         seen = resized(InputImage(image.rgb, image.depth), (rows, 2 * rows))
-        self.network.eval()
         doubts = np.array([self._doubts(seen, up) for up in ups_xyz])
         return -_EXPONENT * np.log(doubts + _LEAST_DOUBT).sum(axis=1)
 
     def _doubts(self, panorama: InputImage, up: NDArray[np.float64]) -> NDArray[np.float32]:
         """Mean doubt in each of the views."""
         image = replace(panorama, up=up)
-        views = replace(self.views, grid=self.views.grid.with_rotation(upright_rotation(up)))
+        grid = self._views.grid.with_rotation(upright_rotation(up))
+        views = replace(self._views, grid=grid)
         rays = torch.from_numpy(world_rays(views, up)).to(self.device)
+        network = self.trained.network
 
         def images(part: slice) -> Tensor:
-            some = replace(views, faces=views.grid.face_indices(views.faces)[part])
-            return view_images(image, some, self.inputs, self.normalization, self.device)
+            some = replace(views, faces=grid.face_indices(views.faces)[part])
+            known = self.trained.inputs, self.trained.normalization
+            return view_images(image, some, *known, self.device)
 
-        per_forward = views_per_forward((views.grid.dim, views.grid.dim))
-        of_sphere = rays if sees_rays(self.network) else None
+        per_forward = views_per_forward((grid.dim, grid.dim))
+        of_sphere = rays if sees_rays(network) else None
         found = [
             1 - scores.softmax(dim=1).amax(dim=1).mean(dim=(1, 2))
-            for _, scores in view_scores(self.network, images, len(rays), per_forward, of_sphere)
+            for _, scores in view_scores(network, images, len(rays), per_forward, of_sphere)
         ]
         return torch.cat(found).cpu().numpy()
 
+    @cached_property
+    def _views(self) -> PinholeViews:
+        """Four level views of 135°, with the pixels of 90° at the network's angular resolution.
 
-def judging_views(
-    network: nn.Module,
-    representation: Any,
-    level: int,
-    size_multiple: int = 1,
-    fixed_size: tuple[int, int] | None = None,
-) -> PinholeViews:
-    """The views by which a network judges.
-
-    Four level ones of 135°; but all of its own for a network with cross-image attention, which
-    knows the images of a whole sphere.
-
-    Args:
-        network: See `NetworkJudge`.
-        representation: Of panoramas.
-        level: Level s: a level view has the pixels of 90° at its angular resolution.
-        size_multiple: Sides of its images must be multiples of this.
-        fixed_size: Rows and columns of the least images that it takes, if they are fixed.
-    """
-    if sees_rays(network) and isinstance(representation, PinholeRepresentation):
-        return PinholeViews(representation.grid)
-    quarter = round(2 / TangentGrid(0, level).pitch)
-    least = quarter if fixed_size is None else max(fixed_size)
-    side = -(-least // size_multiple) * size_multiple
-    beyond = 1 - 1 / math.tan(math.radians(_FOV_DEG / 2))
-    return PinholeViews(CubeGrid(side, margin=round(side / 2 * beyond)), _AROUND)
+        But all of its own for a network with cross-image attention, which knows the images of a
+        whole sphere.
+        """
+        trained = self.trained
+        seen = panorama_representation(trained) if sees_rays(trained.network) else None
+        if isinstance(seen, PinholeRepresentation):
+            return PinholeViews(seen.grid)
+        quarter = round(2 / TangentGrid(0, trained.level).pitch)
+        least = quarter if trained.fixed_size is None else max(trained.fixed_size)
+        side = -(-least // trained.size_multiple) * trained.size_multiple
+        beyond = 1 - 1 / math.tan(math.radians(_FOV_DEG / 2))
+        return PinholeViews(CubeGrid(side, margin=round(side / 2 * beyond)), _AROUND)

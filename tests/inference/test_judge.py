@@ -9,11 +9,12 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from datamodules.core.inputs import Input, Normalization
+from datamodules.core.inputs import Normalization
+from tangent_train.checkpoints.scores import Scores
 from tangent_train.geometry import equirect_directions, random_rotation
-from tangent_train.inference.judge import NetworkJudge, judging_views
+from tangent_train.inference.judge import NetworkJudge
 from tangent_train.inference.views import InputImage
-from tangent_train.rendering import TangentRepresentation
+from tests.inference.trained import TANGENT, trained_network
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -46,10 +47,9 @@ class WholeSky(Sky):
         return super().forward(images)
 
 
-def _judge(inputs: tuple[Input, ...] = ("rgb",), *, whole: bool = False, **size: Any) -> Any:
-    network = WholeSky() if whole else Sky()
-    views = judging_views(network, TangentRepresentation(0, 5), 5, **size)
-    return NetworkJudge(network, inputs, PLAIN, 5, views)
+def _judge(network: Sky | None = None, **changes: Any) -> NetworkJudge:
+    changes |= {"network": Scores(network or Sky(), 2), "normalization": PLAIN}
+    return NetworkJudge(trained_network(TANGENT | {"level": 5}, **changes))
 
 
 def _bright_above(up: NDArray[np.float64], height: int = 64) -> NDArray[np.uint8]:
@@ -73,24 +73,23 @@ def test_the_network_is_surest_of_what_is_upright(height: int) -> None:
 
 
 def test_who_is_told_where_up_is_does_not_judge() -> None:
-    judge = _judge(("rgb", "elevation"))
+    judge = _judge(inputs=("rgb", "elevation"))
     np.testing.assert_array_equal(judge(InputImage(_bright_above(AXES[1])), AXES), np.zeros(6))
 
 
 @pytest.mark.parametrize(
-    ("settings", "side", "count"),
+    ("network", "changes", "side", "count"),
     [
-        ({}, 29, 4),
-        ({"size_multiple": 16}, 32, 4),
-        ({"fixed_size": (64, 64)}, 64, 4),
-        ({"whole": True}, 32, 20),
+        (Sky(), {}, 29, 4),
+        (Sky(), {"size_multiple": 16}, 32, 4),
+        (Sky(), {"fixed_size": (64, 64)}, 64, 4),
+        (WholeSky(), {}, 32, 20),
     ],
 )
 def test_images_are_such_as_the_network_takes(
-    settings: dict[str, Any], side: int, count: int
+    network: Sky, changes: dict[str, Any], side: int, count: int
 ) -> None:
-    judge = _judge(**settings)
-    likely = judge(InputImage(_bright_above(AXES[2])), AXES)
+    likely = _judge(network, **changes)(InputImage(_bright_above(AXES[2])), AXES)
     assert likely.argmax() == 2
-    assert judge.network.sizes == {(side, side)}
-    assert judge.network.most == count
+    assert network.sizes == {(side, side)}
+    assert network.most == count
