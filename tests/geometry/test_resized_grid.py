@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tangent_train.errors import SettingError
 from tangent_train.geometry import CubeGrid, PinholeGrid, TangentGrid, rotation_about
 
 ROTATION, OTHER = rotation_about((1, 2, 3), 0.4), rotation_about((0, 1, 0), 1.1)
@@ -31,8 +30,3 @@ def test_only_the_pixels_are_others(original: PinholeGrid, dim: int) -> None:
     # The outer edges agree: the middle of d pixels is (d − 1)/2.
     edges = original.project(grid.directions([3])[0, 0, 0], 3)
     np.testing.assert_allclose((edges + 0.5) * dim / original.dim, 0.5, atol=1e-9)
-
-
-def test_less_than_two_pixels_are_refused() -> None:
-    with pytest.raises(SettingError, match="dim: found 1; expected 2 or more"):
-        CubeGrid(8).resized(1)

@@ -95,17 +95,14 @@ def test_rotated_panoramas_are_seen_upright_where_up_is_known(
 def test_up_is_estimated_from_all_pixels_of_a_file(
     stanford_root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def estimate(rgb: NDArray[np.uint8], *_: Any) -> None:
-        seen.append(rgb)
-
-    monkeypatch.setattr("datamodules.core.pipeline.estimate_up", estimate)
     seen: list[NDArray[np.uint8]] = []
+    estimate = "datamodules.core.pipeline.estimate_up"
+    monkeypatch.setattr(estimate, lambda rgb, *_: seen.append(rgb))
     for level in (3, 4):  # the files have 32 rows
         representation = EquirectRepresentation(level)
         module = Stanford2D3DS(stanford_root, representation, test_rotation=30, upright="auto")
         rotated = module.source("test").read(0).rgb
-    np.testing.assert_array_equal(seen[0], rotated)
-    np.testing.assert_array_equal(seen[1], rotated)
+    np.testing.assert_array_equal(seen, [rotated, rotated])
 
 
 def test_processes_share_the_panoramas(

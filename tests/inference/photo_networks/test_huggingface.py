@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -38,11 +39,34 @@ def test_segformer(tmp_path: Path) -> None:
     networks.assert_same(scores, expected)
 
 
-def test_mask2former(tmp_path: Path) -> None:
-    """Its scores are logarithms of shares."""
-    network, processor = networks.saved(networks.mask2former, tmp_path)
+@pytest.mark.parametrize(
+    ("made", "shares"),
+    [(networks.mobilevit, False), (networks.mask2former, True), (networks.eomt, True)],
+)
+def test_scores_are_those_of_the_library(
+    made: Callable[[], Any], shares: bool, tmp_path: Path
+) -> None:
+    """Those of queries are logarithms of shares. MobileViT takes blue first."""
+    network, processor = networks.saved(made, tmp_path)
     scores = networks.imported_scores(networks.imported(tmp_path))
     expected = networks.own_scores(network, processor)
+    networks.assert_same(scores.exp() if shares else scores, expected)
+
+
+def test_oneformer_is_asked_for_classes(tmp_path: Path) -> None:
+    (tmp_path / "classes.json").write_text(
+        json.dumps({k: {"name": name, "isthing": 0} for k, name in enumerate(networks.NAMES)})
+    )
+    own: dict[str, Any] = {"repo_path": str(tmp_path), "class_info_file": "classes.json"}
+    network, processor = networks.saved(lambda: networks.oneformer(**own), tmp_path)
+    with pytest.raises(DataError, match=r"no tokenizer\.json or vocab\.json; expected the"):
+        networks.imported(tmp_path)
+    both = networks.transformers.OneFormerProcessor(
+        processor, networks.tokenizer(tmp_path), task_seq_length=24
+    )
+    task = both(networks.photo(), ["semantic"], return_tensors="pt")["task_inputs"]
+    scores = networks.imported_scores(networks.imported(tmp_path))
+    expected = networks.own_scores(network, processor, task_inputs=task)
     networks.assert_same(scores.exp(), expected)
 
 
