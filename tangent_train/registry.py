@@ -245,7 +245,7 @@ def _argument(
     """A value from settings, with the objects in it made."""
     if file is not None and file.owns(place):
         _check_argument(value, place, file, kind, kinds)
-    elif isinstance(value, str) and _is_number(kind):
+    elif isinstance(value, str) and _is_whole(kind):
         raise SettingError(place, found=value, expected=inspect.formatannotation(kind))
     if isinstance(value, Mapping) and "_target_" in value:
         return make(value, place, file)
@@ -270,9 +270,9 @@ def _check_argument(
         raise file.refused(place, value, f"{inspect.formatannotation(kind)} in a file")
 
 
-def _is_number(kind: Any) -> bool:
-    """Whether a kind is of numbers or booleans only, perhaps optional."""
-    return set() < set(get_args(kind) or (kind,)) - {NoneType} <= {bool, int, float}
+def _is_whole(kind: Any) -> bool:
+    """Whether a kind is of whole numbers or booleans only, perhaps optional."""
+    return set() < set(get_args(kind) or (kind,)) - {NoneType} <= {bool, int}
 
 
 def _find(target: str) -> tuple[Any, Mapping[str, Any]] | None:
