@@ -108,6 +108,7 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
     def find(self, problems: Problems) -> Found[ImageFiles]:
         """See `SplitDataModule`."""
         reader, splits = self.find_images(problems)
+        self._rgb = reader.rgb
         name, read = self.reading(reader)
         found = Found(self.noun, splits, read, Store.of(self.store, name, reader.settings))
         check = partial(self.check_image, reader=reader, problems=problems)
@@ -219,8 +220,7 @@ class PanoramaDataModule(ImageDataModule):
             transforms.append(rotated)
         if self.upright == "auto":
             judge = self.judge if split == "test" else None
-            reading: Any = found.read
-            transforms.append(EstimatedUp(self.max_tilt_deg, reading.reader, rotated, judge))
+            transforms.append(EstimatedUp(self.max_tilt_deg, self._rgb, rotated, judge))
         return SplitItems(found, split, Panorama, transforms)
 
     def test_dataloader(self) -> DataLoader[Any]:

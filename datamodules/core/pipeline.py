@@ -11,12 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.core.loading import sample_rng
-from datamodules.core.panoramas import ImageFiles, ImageReader, Panorama
+from datamodules.core.panoramas import ImageFiles, Panorama, resize_area
 from datamodules.images.gpano import up_of, whole_area
 from datamodules.images.masks import Masks
 from tangent_train.geometry import random_rotation, rotation_about
 from tangent_train.rendering import rotate_equirect
 from tangent_train.rendering.upright.gravity import estimate_up
+from tangent_train.rendering.upright.manhattan import MOST_ROWS
 
 PanoramaJudge = Callable[[Panorama, "NDArray[np.float64]"], "NDArray[np.float64]"]
 """Log-likelihoods ``(n,)`` that directions ``(n, 3)`` of a panorama are up."""
@@ -47,6 +48,55 @@ class PosedUp:
         if index not in self._ups:
             self._ups[index] = up_of(files.rgb)
         return panorama._replace(up=self._ups[index])
+
+
+class EstimatedUp:
+    """Panoramas with an estimated up direction if it is unknown.
+
+    Views are aligned with gravity; pixels and labels stay in place. For a panorama of fewer rows
+    than estimates use, the file is read again.
+
+    Args:
+        max_tilt_deg: Maximum tilt, see `estimate_up`.
+        rgb: Reads the colours of a file.
+        rotated: Rotates the panoramas, if they are.
+        judge: Log-likelihoods that directions of a panorama are up, see `estimate_up`; it stays in
+            its process.
+    """
+
+    def __init__(
+        self,
+        max_tilt_deg: float,
+        rgb: Callable[[ImageFiles], NDArray[np.uint8]],
+        rotated: RotatedPanoramas | None = None,
+        judge: PanoramaJudge | None = None,
+    ) -> None:
+        self._max_tilt_deg = max_tilt_deg
+        self._rgb = rgb
+        self._rotated = rotated
+        self._judge = judge
+        self._ups: dict[int, NDArray[np.float64] | None] = {}
+
+    def __call__(self, panorama: Panorama, index: int, files: ImageFiles) -> Panorama:
+        """The panorama with `up`; None if it cannot be estimated."""
+        if panorama.up is not None:
+            return panorama
+        if index not in self._ups:
+            judge = None if self._judge is None else partial(self._judge, panorama)
+            rgb = panorama.rgb if len(panorama.rgb) >= MOST_ROWS else self._larger(index, files)
+            self._ups[index] = estimate_up(rgb, self._max_tilt_deg, judge)
+        return panorama._replace(up=self._ups[index])
+
+    def _larger(self, index: int, files: ImageFiles) -> NDArray[np.uint8]:
+        rgb = self._rgb(files)
+        rows = min(len(rgb), MOST_ROWS)
+        rgb = resize_area(rgb, (rows, 2 * rows))
+        if self._rotated is None:
+            return rgb
+        return rotate_equirect(rgb, self._rotated.rotation(index), "bilinear")
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_judge": None}
 
 
 class RotatedPanoramas:
@@ -89,46 +139,3 @@ class RotatedPanoramas:
             rotate_equirect(labels, rotation, "nearest"),
             up if self._known else None,
         )
-
-
-class EstimatedUp:
-    """Panoramas with an estimated up direction if it is unknown.
-
-    Views are aligned with gravity; pixels and labels stay in place. Edges are found in the image of
-    the file, which may be larger than the panorama.
-
-    Args:
-        max_tilt_deg: Maximum tilt, see `estimate_up`.
-        reader: Of the files.
-        rotated: Rotates the panoramas, if they are.
-        judge: Log-likelihoods that directions of a panorama are up, see `estimate_up`; it stays in
-            its process.
-    """
-
-    def __init__(
-        self,
-        max_tilt_deg: float,
-        reader: ImageReader,
-        rotated: RotatedPanoramas | None = None,
-        judge: PanoramaJudge | None = None,
-    ) -> None:
-        self._max_tilt_deg = max_tilt_deg
-        self._reader = reader
-        self._rotated = rotated
-        self._judge = judge
-        self._ups: dict[int, NDArray[np.float64] | None] = {}
-
-    def __call__(self, panorama: Panorama, index: int, files: ImageFiles) -> Panorama:
-        """The panorama with `up`; None if it cannot be estimated."""
-        if panorama.up is not None:
-            return panorama
-        if index not in self._ups:
-            judge = None if self._judge is None else partial(self._judge, panorama)
-            rgb = self._reader.rgb(files)
-            if self._rotated is not None:
-                rgb = rotate_equirect(rgb, self._rotated.rotation(index), "bilinear")
-            self._ups[index] = estimate_up(rgb, self._max_tilt_deg, judge)
-        return panorama._replace(up=self._ups[index])
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_judge": None}

@@ -22,6 +22,7 @@ from tangent_train.callbacks.panels import PredictionPanels
 from tangent_train.callbacks.progress import ProgressBar
 from tangent_train.callbacks.tensorboard import ClassScores, ValidationPictures
 from tangent_train.checkpoints.content import read_checkpoint, write_settings
+from tangent_train.checkpoints.scores import Scores, size_multiple_of
 from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
 from tangent_train.cli.build import Settings, build, build_trained, check_fits, shown
 from tangent_train.cli.say import say
@@ -29,7 +30,7 @@ from tangent_train.cli.stored import GROUPS, run_settings
 from tangent_train.errors import SettingError
 from tangent_train.files import no_room
 from tangent_train.inference.judge import NetworkJudge
-from tangent_train.registry import SettingsFile, make, unregistered
+from tangent_train.registry import SettingsFile, make
 from tangent_train.results.evaluation import (
     classification_record,
     confusion_table,
@@ -158,11 +159,7 @@ class Run:
             check_fits(self.data, content, checkpoint)
             self._load(content["state_dict"], checkpoint)
         if getattr(self.data, "upright", None) == "auto":
-            trained, device = self.trained, trainer.strategy.root_device
-            if trained is None:
-                trained = load_trained(checkpoint, unregistered(self.settings))
-            trained.network.to(device)
-            self.data.judge = NetworkJudge(trained, device)
+            self.data.judge = NetworkJudge(self._as_trained(), trainer.strategy.root_device)
         trainer.test(self.task, datamodule=self.data, verbose=False)
         task, noun = self.task, self.data.noun
         if task.kind == "classification":
@@ -174,6 +171,23 @@ class Run:
         if record.images != total:
             raise RuntimeError(f"{record.images} of {total} test {noun} were counted")
         self._report(record, checkpoint, trainer.callbacks)  # type: ignore[attr-defined]
+
+    def _as_trained(self) -> TrainedNetwork:
+        """The network of the run, with what it was trained on."""
+        if self.trained is not None:
+            return self.trained
+        data, network = self.data, Scores(self.task.network, self.data.num_classes).eval()
+        return TrainedNetwork(
+            network=network,
+            class_names=data.class_names,
+            inputs=data.inputs,
+            normalization=data.normalization,
+            level=self.settings["level"],
+            representation=self.settings["representation"],
+            image_size=data.representation.image_size,
+            size_multiple=size_multiple_of(network, data.in_channels) or 1,
+            source=self.source,
+        )
 
     def _load(self, tensors: Mapping[str, Any], checkpoint: Path) -> None:
         try:

@@ -12,26 +12,20 @@ import torch
 
 from datamodules.core.samples import world_rays
 from tangent_train.geometry import CubeGrid, TangentGrid
-from tangent_train.inference.predictor import (
-    sees_rays,
-    view_images,
-    view_scores,
-    views_per_forward,
-)
+from tangent_train.inference.predictor import image_scores, sees_rays, views_per_forward
 from tangent_train.inference.views import InputImage, panorama_representation, resized
-from tangent_train.rendering.representations.pinhole import PinholeRepresentation
 from tangent_train.rendering.representations.views import PinholeViews
 from tangent_train.rendering.upright.gravity import upright_rotation
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-    from torch import Tensor
 
     from tangent_train.checkpoints.trained import TrainedNetwork
 
 _AROUND = np.arange(4)  # faces of a cube: all but up and down
 _FOV_DEG = 135.0  # the corners see ceiling and floor, where a wrong direction shows
-_EXPONENT = 3.0  # fitted with one network to the real panoramas of one home, and to synthetic rooms
+_EXPONENT = 3.0  # fitted to the real panoramas of one home, and to synthetic rooms
+_COUNTED = 20  # smaller views show the same
 _LEAST_DOUBT = 1e-4
 
 
@@ -40,8 +34,10 @@ class NetworkJudge:
     """Says how likely directions are to be up, by how sure a network is of what it sees.
 
     A network that was trained on upright images is surest of such. For every direction it gets
-    views that stand upright by it. The doubt of a view is the mean probability that the best class
-    of a pixel is wrong; a direction becomes more likely by doubt⁻³ of each view.
+    views that stand upright by it: four level ones of 135°; but one with cross-image attention all
+    of its own, of which it was more often right. The doubt of a view is the mean probability that
+    the best class of a pixel is wrong; a direction becomes more likely by doubt⁻³ of each view, of
+    up to 20.
 
     Attributes:
         trained: The network.
@@ -67,41 +63,35 @@ class NetworkJudge:
         rows = min(image.rgb.shape[0], 2 ** (self.trained.level + 1))
         seen = resized(InputImage(image.rgb, image.depth), (rows, 2 * rows))
         doubts = np.array([self._doubts(seen, up) for up in ups_xyz])
-        return -_EXPONENT * np.log(doubts + _LEAST_DOUBT).sum(axis=1)
+        counted = min(doubts.shape[1], _COUNTED)
+        return -_EXPONENT * counted * np.log(doubts + _LEAST_DOUBT).mean(axis=1)
 
     def _doubts(self, panorama: InputImage, up: NDArray[np.float64]) -> NDArray[np.float32]:
         """Mean doubt in each of the views."""
-        image = replace(panorama, up=up)
-        grid = self._views.grid.with_rotation(upright_rotation(up))
-        views = replace(self._views, grid=grid)
-        rays = torch.from_numpy(world_rays(views, up)).to(self.device)
-        network = self.trained.network
-
-        def images(part: slice) -> Tensor:
-            some = replace(views, faces=grid.face_indices(views.faces)[part])
-            known = self.trained.inputs, self.trained.normalization
-            return view_images(image, some, *known, self.device)
-
-        per_forward = views_per_forward((grid.dim, grid.dim))
-        of_sphere = rays if sees_rays(network) else None
+        image, grid = replace(panorama, up=up), self._views.grid.with_rotation(upright_rotation(up))
+        views, faces = replace(self._views, grid=grid), grid.face_indices(self._views.faces)
         found = [
             1 - scores.softmax(dim=1).amax(dim=1).mean(dim=(1, 2))
-            for _, scores in view_scores(network, images, len(rays), per_forward, of_sphere)
+            for _, scores in image_scores(
+                self.trained,
+                image,
+                lambda part: replace(views, faces=faces[part]),
+                world_rays(views, up),
+                len(faces),
+                views_per_forward((grid.dim, grid.dim)),
+                self.device,
+            )
         ]
         return torch.cat(found).cpu().numpy()
 
     @cached_property
     def _views(self) -> PinholeViews:
-        """Four level views of 135°, with the pixels of 90° at the network's angular resolution.
-
-        But all of its own for a network with cross-image attention, which knows the images of a
-        whole sphere.
-        """
+        """The views of an upright panorama."""
         trained = self.trained
-        seen = panorama_representation(trained) if sees_rays(trained.network) else None
-        if isinstance(seen, PinholeRepresentation):
+        if sees_rays(trained.network):
+            seen: Any = panorama_representation(trained)
             return PinholeViews(seen.grid)
-        quarter = round(2 / TangentGrid(0, trained.level).pitch)
+        quarter = round(2 / TangentGrid(0, trained.level).pitch)  # pixels of 90° at its resolution
         least = quarter if trained.fixed_size is None else max(trained.fixed_size)
         side = -(-least // trained.size_multiple) * trained.size_multiple
         beyond = 1 - 1 / math.tan(math.radians(_FOV_DEG / 2))

@@ -20,12 +20,11 @@ from tangent_train.errors import SettingError
 from tangent_train.rendering.mosaic import ScoreMosaic
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterator
 
     from numpy.typing import NDArray
     from torch import Tensor, nn
 
-    from datamodules.core.inputs import Input, Normalization
     from tangent_train.checkpoints.trained import TrainedNetwork
     from tangent_train.inference.views import InputImage, PanoramaViews, PhotoViews
 
@@ -41,26 +40,6 @@ def sees_rays(network: nn.Module) -> bool:
 def views_per_forward(image_size: tuple[int, int]) -> int:
     """Views of that many rows and columns per call of a network, which bounds memory."""
     return max(1, _PIXELS_PER_FORWARD // math.prod(image_size))
-
-
-def view_images(
-    image: InputImage,
-    views: Any,
-    inputs: Sequence[Input],
-    normalization: Normalization,
-    device: torch.device | str,
-) -> Tensor:
-    """Some views of an image as a network takes them: ``(n, C, h, w)``, normalized.
-
-    Args:
-        image: A panorama or photo.
-        views: Renders the views.
-        inputs: Of the network.
-        normalization: Of RGB and depth.
-        device: Where the network is.
-    """
-    rendered = [part.to(device) for part in render_inputs(image, views, inputs)]
-    return normalize(rendered, normalization, inputs)
 
 
 @torch.no_grad()
@@ -91,6 +70,48 @@ def view_scores(
         returned = network(views(part), *(() if rays is None else (rays[None],)))
         scores: Tensor = returned["out"] if isinstance(returned, dict) else returned
         yield part, scores.float()
+
+
+def image_scores(
+    trained: TrainedNetwork,
+    image: InputImage,
+    views: Callable[[slice], Any],
+    rays: NDArray[np.float32],
+    count: int,
+    per_forward: int,
+    device: torch.device | str,
+) -> Iterator[tuple[slice, Tensor]]:
+    """Scores of views that are rendered from an image, a few at a time.
+
+    Args:
+        trained: The network, which is on the device.
+        image: A panorama or photo.
+        views: Gives some of the views.
+        rays: ``(N, 3, 3)`` of all of them, see `Views.rays`; ``(0, 3, 3)`` where they are not of
+            one sphere.
+        count: Number of views N.
+        per_forward: Views per call of the network, which bounds memory.
+        device: A torch device.
+
+    Yields:
+        See `view_scores`.
+    """
+    network: Any = trained.network
+    weights = next(network.parameters(), None)
+    # Halves the time of a UNet on a CPU; an ONNX file takes what it was made for.
+    memory_format = torch.contiguous_format if weights is None else torch.channels_last
+    of_sphere = None
+    if sees_rays(network):
+        network = partial(network, images_per_chunk=per_forward)
+        of_sphere = torch.from_numpy(rays).to(device) if len(rays) else None
+
+    def images(part: slice) -> Tensor:
+        rendered = [x.to(device) for x in render_inputs(image, views(part), trained.inputs)]
+        seen = normalize(rendered, trained.normalization, trained.inputs)
+        dtype = seen.dtype if weights is None else weights.dtype
+        return seen.to(dtype).contiguous(memory_format=memory_format)
+
+    return view_scores(network, images, count, per_forward, of_sphere)
 
 
 class Predictor:
@@ -126,19 +147,12 @@ class Predictor:
             device = "cuda" if torch.cuda.is_available() else "cpu"
         try:
             self.device = torch.device(device)
-            network = trained.network.to(self.device).to(memory_format=torch.channels_last)
+            trained.network.to(self.device).to(memory_format=torch.channels_last)
         except (RuntimeError, AssertionError) as error:  # AssertionError: torch without CUDA
             raise SettingError(
                 "device", found=f"{device} ({error})", expected="cpu, or a device of this machine"
             ) from error
-        # Halves the time of a UNet on a CPU; an ONNX file takes what it was made for.
-        in_torch = any(True for _ in network.parameters())
-        self._format = torch.channels_last if in_torch else torch.contiguous_format
         self._per_forward = images_per_forward or views_per_forward(view_sets.image_size)
-        self._network: Any = network
-        self._sees_rays = sees_rays(trained.network)
-        if self._sees_rays:
-            self._network = partial(network, images_per_chunk=self._per_forward)
         self._trained, self._view_sets = trained, view_sets
         self._min_confidence = min_confidence
         self._spare: deque[NDArray[np.float32]] = deque(maxlen=1)
@@ -164,18 +178,10 @@ class Predictor:
         sets = self._view_sets(image)
         height, width = image.rgb.shape[:2]
         mosaic = self._mosaic((height, width), averaged=probabilities or len(sets) > 1)
+        how = self._per_forward, self.device
         for views in sets:
-
-            def images(part: slice, views: Any = views) -> Tensor:
-                known = self._trained.inputs, self._trained.normalization
-                seen = view_images(views.image, views.views(part), *known, self.device)
-                return seen.contiguous(memory_format=self._format)
-
-            rays = torch.from_numpy(views.rays).to(self.device)
-            of_sphere = rays if self._sees_rays and len(rays) else None
-            for part, scores in view_scores(
-                self._network, images, views.count, self._per_forward, of_sphere
-            ):
+            of_view = views.image, views.views, views.rays, views.count
+            for part, scores in image_scores(self._trained, *of_view, *how):
                 views.add(mosaic, scores, part)
                 progress((part.stop - part.start) / views.count / len(sets))
         return mosaic

@@ -40,7 +40,9 @@ class Sky(nn.Module):
 class WholeSky(Sky):
     """The same, given all images of a sphere and where they look."""
 
-    def forward(self, images: Tensor, rays: Tensor) -> Tensor:  # type: ignore[override]
+    def forward(  # type: ignore[override]
+        self, images: Tensor, rays: Tensor, images_per_chunk: int
+    ) -> Tensor:
         assert rays.shape == (1, len(images), 3, 3)
         return super().forward(images)
 

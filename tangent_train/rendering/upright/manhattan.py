@@ -17,7 +17,9 @@ from tangent_train.rendering.forward import equirect_to_tangent
 
 _Float = TypeVar("_Float", bound=np.floating)
 
-_MOST_ROWS = 512
+MOST_ROWS = 512
+"""Larger panoramas are shrunk to that many rows."""
+
 _LEAST_SIDE = 128  # of a face: LSD looks for rows of pixels
 _SHORTEST_RAD = np.radians(3)
 _MOST = 400  # the longest; more only take time
@@ -80,8 +82,8 @@ def find_line_segments(rgb: NDArray[np.uint8]) -> LineSegments:
         The 400 longest of the segments from 3°.
     """
     height, width = rgb.shape[:2]
-    if height > _MOST_ROWS:
-        size = (max(1, round(width * _MOST_ROWS / height)), _MOST_ROWS)
+    if height > MOST_ROWS:
+        size = (max(1, round(width * MOST_ROWS / height)), MOST_ROWS)
         rgb = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
     # In the middle of a face as many pixels per degree as the panorama has at its equator.
     grid = CubeGrid(max(_LEAST_SIDE, round(rgb.shape[0] * 2 / np.pi)))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pickle
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, Literal
 
 import numpy as np
@@ -19,7 +18,10 @@ from tangent_train.geometry import equirect_directions
 
 FILES = [ImageFiles(name, Path(name), Path("labels")) for name in ("0", "1")]
 UP = np.array([0.6, 0.0, 0.8])
-READER: Any = SimpleNamespace(rgb=str)
+
+
+def _rgb(files: ImageFiles) -> NDArray[np.uint8]:
+    return np.full((64, 128, 3), int(files.name), np.uint8)
 
 
 def _heights() -> Panorama:
@@ -92,7 +94,7 @@ def test_only_what_nothing_says_is_estimated_and_only_once(
         return found
 
     monkeypatch.setattr("datamodules.core.pipeline.estimate_up", estimate)
-    upright = EstimatedUp(50, READER)
+    upright = EstimatedUp(50, _rgb)
     for _ in range(2):
         np.testing.assert_array_equal(upright(_heights()._replace(up=-UP), 1, FILES[1]).up, -UP)
         assert upright(_heights(), 0, FILES[0]).up is found
@@ -112,7 +114,7 @@ def test_a_judge_sees_the_panorama_and_stays_in_its_process(
         return up if judge is not None else UP
 
     monkeypatch.setattr("datamodules.core.pipeline.estimate_up", estimate)
-    upright = EstimatedUp(180, READER, None, judge)
+    upright = EstimatedUp(180, _rgb, None, judge)
     judged = upright(_heights(), 0, FILES[0]).up
     sent = pickle.loads(pickle.dumps(upright))  # as to a worker
     np.testing.assert_array_equal(sent(_heights(), 0, FILES[0]).up, judged)

@@ -92,7 +92,7 @@ def test_rotated_panoramas_are_seen_upright_where_up_is_known(
     assert aware.up @ turned == pytest.approx(0.8)
 
 
-def test_up_is_estimated_from_all_pixels_of_a_file(
+def test_up_is_estimated_from_the_file_of_a_small_panorama(
     stanford_root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen: list[NDArray[np.uint8]] = []
