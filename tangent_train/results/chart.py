@@ -67,8 +67,8 @@ class _Panel(NamedTuple):
 
 def _png(rows: Sequence[Row], *panels: _Panel) -> bytes:
     """Panels of bars, and lines over the latitude of the rows that have bands."""
-    banded = [row for row in rows if row.bands]
-    count = len(panels) + bool(banded)
+    banded = any(row.bands for row in rows)
+    count = len(panels) + banded
     width = max(10.0, 0.12 * len(panels[-1].ticks) * len(rows))
     figure = Figure((width, 3.6 * count + 0.2 * len(rows)), dpi=120, layout="constrained")
     plots = figure.subplots(count, 1, squeeze=False)[:, 0]
@@ -78,7 +78,7 @@ def _png(rows: Sequence[Row], *panels: _Panel) -> bytes:
     plots[0].set_title(f"{panels[0].title}\n{_ERROR_BARS}", loc="left")
     if banded:
         plots[-1].set_title("mIoU by latitude", loc="left")
-        _band_lines(plots[-1], banded)
+        _band_lines(plots[-1], rows)
     handles, labels = plots[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper left", frameon=False, ncols=2)
     for text in figure.findobj(Text):
@@ -92,9 +92,7 @@ def _bars(
     axes: Axes, rows: Sequence[Row], ticks: Sequence[str], scores: Sequence[Sequence[Statistic]]
 ) -> None:
     width = 0.8 / len(rows)
-    names = list(dict.fromkeys(row.label.removesuffix(" (paper)") for row in rows))
-    for k, (row, found) in enumerate(zip(rows, scores, strict=True)):
-        number = names.index(row.label.removesuffix(" (paper)"))
+    for k, (row, number, found) in enumerate(zip(rows, _numbers(rows), scores, strict=True)):
         again = number >= len(_COLORS)  # a second row of a colour
         axes.bar(
             np.arange(len(ticks)) + (k - (len(rows) - 1) / 2) * width,
@@ -111,15 +109,21 @@ def _bars(
 
 
 def _band_lines(axes: Axes, rows: Sequence[Row]) -> None:
-    for k, row in enumerate(rows):
+    for row, number in zip(rows, _numbers(rows), strict=True):
         bands = sorted(row.bands)
         centers = [(south + north) / 2 for south, north in bands]
         shares = _percents([row.score("miou", band).mean for band in bands])
-        axes.plot(centers, shares, color=_COLORS[k % len(_COLORS)], marker=".", label=row.label)
+        line = "--" if number >= len(_COLORS) else "-"
+        axes.plot(centers, shares, line, color=_COLORS[number % len(_COLORS)], marker=".")
     axes.set_xticks(range(-90, 91, 30), [f"{k}°" for k in range(-90, 91, 30)])
-    axes.legend(frameon=False, fontsize=8)
     _percent_axis(axes)
     axes.set_xlim(-90, 90)
+
+
+def _numbers(rows: Sequence[Row]) -> list[int]:
+    """A number of every row for its colour, the same for a row of the paper as for one's own."""
+    names = list(dict.fromkeys(row.label.removesuffix(" (paper)") for row in rows))
+    return [names.index(row.label.removesuffix(" (paper)")) for row in rows]
 
 
 def _error_bar(score: Statistic) -> list[float]:
