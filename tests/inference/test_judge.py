@@ -40,9 +40,7 @@ class Sky(nn.Module):
 class WholeSky(Sky):
     """The same, given all images of a sphere and where they look."""
 
-    def forward(  # type: ignore[override]
-        self, images: Tensor, rays: Tensor, images_per_chunk: int
-    ) -> Tensor:
+    def forward(self, images: Tensor, rays: Tensor, **_: Any) -> Tensor:  # type: ignore[override]
         assert rays.shape == (1, len(images), 3, 3)
         return super().forward(images)
 
