@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from datamodules.core.samples import world_rays
 from tangent_train.geometry import CubeGrid, TangentGrid
 from tangent_train.inference.predictor import image_scores, sees_rays, views_per_forward
-from tangent_train.inference.views import InputImage, panorama_representation, resized
+from tangent_train.inference.views import InputImage, grid_set, panorama_representation, resized
 from tangent_train.rendering.representations.views import PinholeViews
 from tangent_train.rendering.upright.gravity import upright_rotation
 
@@ -68,19 +67,12 @@ class NetworkJudge:
 
     def _doubts(self, panorama: InputImage, up: NDArray[np.float64]) -> NDArray[np.float32]:
         """Mean doubt in each of the views."""
-        image, grid = replace(panorama, up=up), self._views.grid.with_rotation(upright_rotation(up))
-        views, faces = replace(self._views, grid=grid), grid.face_indices(self._views.faces)
+        grid = self._views.grid.with_rotation(upright_rotation(up))
+        views = grid_set(replace(panorama, up=up), grid, self._views.faces)
+        per_forward = views_per_forward((grid.dim, grid.dim))
         found = [
             1 - scores.softmax(dim=1).amax(dim=1).mean(dim=(1, 2))
-            for _, scores in image_scores(
-                self.trained,
-                image,
-                lambda part: replace(views, faces=faces[part]),
-                world_rays(views, up),
-                len(faces),
-                views_per_forward((grid.dim, grid.dim)),
-                self.device,
-            )
+            for _, scores in image_scores(self.trained, views, per_forward, self.device)
         ]
         return torch.cat(found).cpu().numpy()
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from torch import Tensor, nn
 
     from tangent_train.checkpoints.trained import TrainedNetwork
-    from tangent_train.inference.views import InputImage, PanoramaViews, PhotoViews
+    from tangent_train.inference.views import InputImage, PanoramaViews, PhotoViews, ViewSet
 
 _PIXELS_PER_FORWARD = 2**20
 
@@ -73,23 +73,13 @@ def view_scores(
 
 
 def image_scores(
-    trained: TrainedNetwork,
-    image: InputImage,
-    views: Callable[[slice], Any],
-    rays: NDArray[np.float32],
-    count: int,
-    per_forward: int,
-    device: torch.device | str,
+    trained: TrainedNetwork, views: ViewSet, per_forward: int, device: torch.device | str
 ) -> Iterator[tuple[slice, Tensor]]:
-    """Scores of views that are rendered from an image, a few at a time.
+    """Scores of the views of an image, rendered a few at a time.
 
     Args:
         trained: The network, which is on the device.
-        image: A panorama or photo.
-        views: Gives some of the views.
-        rays: ``(N, 3, 3)`` of all of them, see `Views.rays`; ``(0, 3, 3)`` where they are not of
-            one sphere.
-        count: Number of views N.
+        views: Of the image.
         per_forward: Views per call of the network, which bounds memory.
         device: A torch device.
 
@@ -103,15 +93,15 @@ def image_scores(
     of_sphere = None
     if sees_rays(network):
         network = partial(network, images_per_chunk=per_forward)
-        of_sphere = torch.from_numpy(rays).to(device) if len(rays) else None
+        of_sphere = torch.from_numpy(views.rays).to(device) if len(views.rays) else None
 
     def images(part: slice) -> Tensor:
-        rendered = [x.to(device) for x in render_inputs(image, views(part), trained.inputs)]
-        seen = normalize(rendered, trained.normalization, trained.inputs)
+        parts = render_inputs(views.image, views.views(part), trained.inputs)
+        seen = normalize([x.to(device) for x in parts], trained.normalization, trained.inputs)
         dtype = seen.dtype if weights is None else weights.dtype
         return seen.to(dtype).contiguous(memory_format=memory_format)
 
-    return view_scores(network, images, count, per_forward, of_sphere)
+    return view_scores(network, images, views.count, per_forward, of_sphere)
 
 
 class Predictor:
@@ -180,8 +170,7 @@ class Predictor:
         mosaic = self._mosaic((height, width), averaged=probabilities or len(sets) > 1)
         how = self._per_forward, self.device
         for views in sets:
-            of_view = views.image, views.views, views.rays, views.count
-            for part, scores in image_scores(self._trained, *of_view, *how):
+            for part, scores in image_scores(self._trained, views, *how):
                 views.add(mosaic, scores, part)
                 progress((part.stop - part.start) / views.count / len(sets))
         return mosaic

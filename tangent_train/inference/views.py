@@ -146,7 +146,7 @@ class PanoramaViews:
         rows = seen.erp_height
         if image.rgb.shape[0] > rows:
             image = resized(image, (rows, 2 * rows))
-        return [_grid_set(image, spun(grid, turn)) for turn in self._turns]
+        return [grid_set(image, spun(grid, turn)) for turn in self._turns]
 
 
 class PhotoViews:
@@ -281,8 +281,11 @@ def check_size(trained: TrainedNetwork, size: tuple[int, int]) -> None:
         )
 
 
-def _grid_set(image: InputImage, grid: PinholeGrid) -> ViewSet:
-    faces = np.arange(grid.num_images)
+def grid_set(
+    image: InputImage, grid: PinholeGrid, faces: NDArray[np.int64] | None = None
+) -> ViewSet:
+    """The images of a grid, or some of them, as views of a panorama."""
+    faces = grid.face_indices(faces)
 
     def views(part: slice) -> PinholeViews:
         return PinholeViews(grid, faces[part])
@@ -290,8 +293,8 @@ def _grid_set(image: InputImage, grid: PinholeGrid) -> ViewSet:
     def add(mosaic: ScoreMosaic, scores: Tensor, part: slice) -> None:
         mosaic.add(scores, grid, faces[part])
 
-    rays = world_rays(PinholeViews(grid), image.up)
-    return ViewSet(image, grid.num_images, views, add, rays)
+    rays = world_rays(PinholeViews(grid, faces), image.up)
+    return ViewSet(image, len(faces), views, add, rays)
 
 
 def _equirect_set(image: InputImage, shift: int, shape: tuple[int, int]) -> ViewSet:
