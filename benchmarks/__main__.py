@@ -6,7 +6,7 @@ python -m benchmarks compare                measure, then compare with the basel
 python -m benchmarks compare results.json   compare what was measured
 python -m benchmarks baseline results.json  make it the baseline, better of several runs
 python -m benchmarks gpu                    all that is measured on a GPU, see docs/gpu.md
-python -m benchmarks gpu correct step       some of it
+python -m benchmarks gpu render step        some of it
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ MEASURED = {
 }
 """Modules of the rows; each has a function of the same name."""
 
-ON_A_GPU = {name: f"benchmarks.gpu.{name}" for name in ("correct", "step", "predict", "fed")}
+ON_A_GPU = {name: f"benchmarks.gpu.{name}" for name in ("render", "step", "predict", "fed")}
 """Likewise, of ``gpu``. What fails is listed, and the others go on."""
 
 BASELINE = Path(__file__).with_name("baseline.json")

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 
 import numpy as np
 import torch
 from torch.nn import functional
 
-from benchmarks.measuring import Goal, Row, Table, Way, added_mib, measure
+from benchmarks.measuring import Goal, Row, Table, Way, measure, peak_mib
 from tangent_train.geometry import TangentGrid, equirect_directions, equirect_shape
 from tangent_train.rendering import tangent_to_labels
 
@@ -22,9 +22,11 @@ def labels(quick: bool) -> Iterator[Table]:
     """Time and memory."""
     level = 6 if quick else 10
     grid, shape = TangentGrid(1, level), equirect_shape(level)
-    scores = random_scores(grid)
-    plain = _plain(scores, grid, shape)
+    small, scores = TangentGrid(1, 5), random_scores(grid)
+    tangent_to_labels(random_scores(small), small, equirect_shape(5))  # compiles
     array = scores.numpy()
+    peak = peak_mib(lambda: tangent_to_labels(array, grid, shape), torch.device("cpu"))
+    plain = _plain(scores, grid, shape)
     agree = np.mean(plain().numpy() == tangent_to_labels(array, grid, shape))
     if agree < 0.995:
         raise RuntimeError(f"{PLAIN} gives other labels: {agree:.1%} agree")
@@ -39,7 +41,7 @@ def labels(quick: bool) -> Iterator[Table]:
     table = Table("labels: time", measure(ways, 2 if quick else 7))
     table.goals = [Goal("as fast as grid_sample", 1 / table.ratio(OURS), 15, True)]
     yield table
-    yield _memory(level, scores.nbytes / 2**20)
+    yield memory_table("labels", scores, {OURS: peak})
 
 
 def random_scores(grid: TangentGrid, apart: int = 32) -> torch.Tensor:
@@ -66,17 +68,16 @@ def _plain(
     return lambda: sample(mosaic, positions)[0].argmax(dim=0)
 
 
-def _memory(level: int, scores_mib: float) -> Table:
-    """The peak of a new process, scores included."""
-    added = added_mib(_labels_of, level)
-    with_ours = "with tangent_to_labels, at most"
-    rows = [Row("the scores", [scores_mib]), Row(with_ours, [scores_mib + added], ours=True)]
-    table = Table("labels: memory", rows, "MiB")
-    table.goals = [Goal("memory, of the scores'", table.ratio(with_ours), 1.3)]
+def memory_table(name: str, scores: torch.Tensor, added_mib: Mapping[str, float]) -> Table:
+    """What renderers take at most, the scores included.
+
+    Args:
+        name: Of the benchmark.
+        scores: Rendered.
+        added_mib: See `peak_mib`, by renderer.
+    """
+    own = scores.nbytes / 2**20
+    rows = [Row(renderer, [own + added], ours=True) for renderer, added in added_mib.items()]
+    table = Table(f"{name}: memory, scores included", [Row("the scores", [own]), *rows], "MiB")
+    table.goals = [Goal(f"{n}, of the scores' memory", table.ratio(n), 1.3) for n in added_mib]
     return table
-
-
-def _labels_of(level: int) -> Callable[[], object]:
-    small, grid = TangentGrid(1, 5), TangentGrid(1, level)
-    tangent_to_labels(random_scores(small), small, equirect_shape(5))  # compiles
-    return partial(tangent_to_labels, random_scores(grid), grid, equirect_shape(level))

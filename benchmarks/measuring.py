@@ -14,12 +14,10 @@ import statistics
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 
@@ -134,28 +132,14 @@ def measure(ways: Sequence[Way], rounds: int) -> list[Row]:
     return rows
 
 
-def added_mib(function: Callable[..., Callable[[], object]], *arguments: Any) -> float:
-    """Memory that a call adds at most, in MiB, in a process of its own.
-
-    Args:
-        function: Prepares, and returns what is called.
-        *arguments: Its own.
-    """
-    with ProcessPoolExecutor(1, get_context("forkserver")) as process:
-        return process.submit(_added_mib, function, arguments).result()
-
-
-def _added_mib(function: Callable[..., Callable[[], object]], arguments: tuple[Any, ...]) -> float:
-    return peak_mib(function(*arguments), torch.device("cpu"))
-
-
 def peak_mib(call: Callable[[], object], device: torch.device = DEVICE) -> float:
-    """Memory of a device that a call adds at most, in MiB."""
+    """Memory of a device that a call adds at most, in MiB; of the CPU, of this process."""
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats()
         before = torch.cuda.memory_allocated()
         call()
         return (torch.cuda.max_memory_allocated() - before) / 2**20
+    Path("/proc/self/clear_refs").write_text("5")  # VmHWM begins anew
     before = _memory_kib("VmRSS")
     call()
     return max(1, _memory_kib("VmHWM") - before) / 2**10
