@@ -18,7 +18,6 @@ import statistics
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import asdict
 from importlib import import_module
 from pathlib import Path
@@ -39,7 +38,7 @@ MEASURED = {
 """Modules of the rows; each has a function of the same name."""
 
 ON_A_GPU = {name: f"benchmarks.gpu.{name}" for name in ("render", "step", "predict", "fed")}
-"""Likewise, of ``gpu``. What fails is listed, and the others go on."""
+"""Likewise, of ``gpu``."""
 
 BASELINE = Path(__file__).with_name("baseline.json")
 _NOISE = 1.1
@@ -78,7 +77,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def run(modules: Mapping[str, str], output: Path, *, quick: bool) -> Path:
     """Measure, print and write ``results.json``, whose path is returned.
 
-    Written after every table: what is stopped keeps what it has.
+    Written after every table: what is stopped keeps what it has. What fails is listed, and the
+    others go on.
 
     Args:
         modules: Of the rows, by name.
@@ -92,16 +92,23 @@ def run(modules: Mapping[str, str], output: Path, *, quick: bool) -> Path:
     content["environment"] = get_pretty_env_info().splitlines()  # type: ignore[no-untyped-call]
     output.mkdir(parents=True, exist_ok=True)
     path = output / "results.json"
+
+    def write() -> None:
+        content["tables"] = [asdict(table) for table in tables]
+        content["quotients"] = quotients(tables)
+        path.write_text(json.dumps(content, indent=1, ensure_ascii=False), "utf-8")
+
     for name, module in modules.items():
-        with attempted(name) if module in ON_A_GPU.values() else nullcontext():
+        with attempted(name):
             for table in getattr(import_module(module), name)(quick):
                 show(table)
                 print(f"[{time.perf_counter() - start:.0f} s]", flush=True)
                 tables.append(table)
-                content["tables"] = [asdict(table) for table in tables]
-                content["quotients"] = quotients(tables)
-                path.write_text(json.dumps(content, indent=1, ensure_ascii=False), "utf-8")
+                write()
+    write()
     print(f"Results are in {path}.")
+    if FAILURES:
+        sys.exit("\n".join(("Failed:", *FAILURES)))
     return path
 
 
