@@ -59,7 +59,8 @@ class PredictionPanels(Callback):
         rgb, truth, labels = shown_arrays(image, target, prediction, representation)
         panel = prediction_panel(rgb, truth, labels, task.class_names)
         encoded = cv2.imencode(".png", cv2.cvtColor(panel, cv2.COLOR_RGB2BGR))[1]
-        write_bytes(self.folder / f"{name.replace('/', '_')}.png", encoded.tobytes())
+        file = f"{index}_{name.replace('/', '_')}.png"  # other names may have "_" in them
+        write_bytes(self.folder / file, encoded.tobytes())
         pairs = truth.astype(np.int64).ravel() * classes + labels.ravel()
         counts = np.bincount(pairs, minlength=classes**2).reshape(classes, classes)
         note = f"mIoU {percent(segmentation_scores(counts).miou)}\u00a0%" if truth.any() else ""

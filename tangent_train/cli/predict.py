@@ -241,9 +241,10 @@ class _Labeller:
     def write(self, job: Job) -> Entry:
         """Write the labels of one image, and return its entry of the summary."""
         image, labels, area = job.value
+        counted: Any = True
         if area is not None:
-            counts = area.cut(self._masks.read(job.item, area))
-            labels = np.where(counts, labels, labels.dtype.type(0))
+            counted = area.cut(self._masks.read(job.item, area))
+            labels = np.where(counted, labels, labels.dtype.type(0))
         folder = self._folder.of_frames if is_video(job.path) else self._folder
         folder.write(job.item, image, labels, area)
         rows, columns = labels.shape
@@ -252,7 +253,7 @@ class _Labeller:
             entry["frame"] = int(job.item.rpartition("/")[2])
         if image.up is not None:
             entry["tilt_deg"] = round(math.degrees(math.acos(np.clip(image.up[2], -1, 1))), 2)
-        entry["classes"] = class_shares(labels, self._folder.class_names, image, area)
+        entry["classes"] = class_shares(labels, self._folder.class_names, image, area, counted)
         if job.item in self._shown:
             self._shown[job.item] = self._folder.viewer_image(job.item, image, labels, area)
         return entry

@@ -136,7 +136,7 @@ class Predictor:
         if device == "auto":
             device = "cuda" if torch.cuda.is_available() else "cpu"
         try:
-            self.device = torch.device(device)
+            self.device = torch.zeros(1, device=device).device  # an ONNX file has nothing to move
             trained.network.to(self.device).to(memory_format=torch.channels_last)
         except (RuntimeError, AssertionError) as error:  # AssertionError: torch without CUDA
             raise SettingError(

@@ -55,25 +55,27 @@ def class_shares(
     class_names: Sequence[str],
     image: InputImage,
     area: PanoramaArea | None = None,
+    counted: NDArray[np.bool_] | bool = True,
 ) -> dict[str, float]:
-    """Share of the labelled solid angle that every class has.
+    """Share of the solid angle that every class has, the unknown class too.
 
     Args:
         labels: ``(H, W)`` of the image, or of its area; 0 unknown.
         class_names: K + 1 names, the unknown class first.
         image: A panorama or photo.
         area: The part of the sphere that the labels are of.
+        counted: ``(H, W)`` pixels that are not masked; all by default.
 
     Returns:
-        By name, without the unknown class; they add up to 1, or are all 0.
+        By name; they add up to 1, or are all 0 where everything is masked.
     """
     count = len(class_names)
-    total = np.zeros(count)
-    for line, weights in zip(labels, _solid_angles(labels.shape, image, area), strict=True):
-        total += np.bincount(line, weights, minlength=count)
-    known = total[1:].sum()
-    shares = total[1:] / known if known > 0 else total[1:]
-    return dict(zip(class_names[1:], map(float, shares), strict=True))
+    total, kept = np.zeros(count), np.broadcast_to(counted, labels.shape)
+    angles = _solid_angles(labels.shape, image, area)
+    for line, weights, own in zip(labels, angles, kept, strict=True):
+        total += np.bincount(line, weights * own, minlength=count)
+    shares = total / (total.sum() or 1)
+    return dict(zip(class_names, map(float, shares), strict=True))
 
 
 def _solid_angles(
@@ -237,8 +239,8 @@ class PredictionFolder:
             settings: Settings of the prediction.
             entries: Of the images done so far.
         """
-        names = self.class_names[1:]
-        values = {name: value for value, name in enumerate(names, start=1)}
+        names = self.class_names
+        values = {name: value for value, name in enumerate(names[1:], start=1)}
         write_text(self.path / "classes.json", json.dumps(values, indent=1) + "\n")
         content = {**settings, "images": entries}
         write_text(self.path / _SUMMARY, json.dumps(content, indent=1) + "\n")
@@ -253,7 +255,7 @@ class PredictionFolder:
         """Mean over the images of `class_shares`, the largest first, of classes that occur."""
         shares = [entry["classes"] for entry in entries if "classes" in entry]
         count = max(1, len(shares))
-        mean = {name: sum(of[name] for of in shares) / count for name in self.class_names[1:]}
+        mean = {name: sum(of[name] for of in shares) / count for name in self.class_names}
         seen = sorted(filter(mean.get, mean), key=mean.__getitem__, reverse=True)
         rows = [[name, percent(mean[name])] for name in seen]
         return Table("Mean over the images", ["class", "solid angle, %"], rows)

@@ -199,9 +199,9 @@ def _identity(record: Record) -> dict[str, Any]:
     network = {"checkpoint": record.checkpoint} if "network" in record.settings else {}
     return network | {
         # Each fold is fine-tuned from a checkpoint of its own.
-        name: value is not None if name == "init_from" else value
+        name: True if name == "init_from" else value
         for name, value in record.settings.items()
-        if not may_differ(name, "report")
+        if value is not None and not may_differ(name, "report")
     }
 
 

@@ -43,7 +43,7 @@ def test_the_panoramas_of_the_panels_are_kept_for_the_report(tmp_path: Path) -> 
     panels.on_test_end(trainer, task)
     chosen = (0, 3, 6, 9)
     assert [image.name for image in panels.images] == [f"area/room {k}" for k in chosen]
-    assert {path.stem for path in tmp_path.iterdir()} == {f"area_room {k}" for k in chosen}
+    assert {path.stem for path in tmp_path.iterdir()} == {f"{k}_area_room {k}" for k in chosen}
     for image, k in zip(panels.images, chosen, strict=True):
         assert image.sphere
         assert np.abs(decoded(image.input).astype(int) - 20 * k).max() <= 1

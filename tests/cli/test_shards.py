@@ -125,5 +125,5 @@ def test_masked_pixels_are_unknown_and_have_no_share(told: Told) -> None:
         plain, found = (np.array(Image.open(path)) for path in paths)
         np.testing.assert_array_equal(found, np.where(counts, plain, 0))
         weights = np.cos(np.radians(90 - (np.arange(16) + 0.5) * 180 / 16))[:, None] * counts
-        shares = [weights[found == value].sum() / weights.sum() for value in (1, 2, 3)]
+        shares = [weights[found == value].sum() / weights.sum() for value in (0, 1, 2, 3)]
         assert list(entry["classes"].values()) == pytest.approx(shares, abs=1e-3)

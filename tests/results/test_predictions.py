@@ -36,10 +36,11 @@ def test_a_cap_of_a_crop_has_its_solid_angle() -> None:
     image = InputImage(np.zeros((180, 360, 3), np.uint8))
     labels = np.full((90, 180), 2)
     labels[:30] = 1  # 60° to 90°: 2π (1 − sin 60°) of 4π
+    labels[60:] = 0  # below 30°: half of it
     cap = (1 - math.sin(math.pi / 3)) / 2
     area = area_of_crop((90, 180), [-90, 90, 0, 90])  # a quarter of the sphere
     shares = class_shares(labels, NAMES, image, area)
-    assert shares == pytest.approx({"up": 2 * cap, "down": 1 - 2 * cap})
+    assert shares == pytest.approx({NAMES[0]: 0.5, "up": 2 * cap, "down": 0.5 - 2 * cap})
 
 
 def test_pixels_of_photos_count_by_their_solid_angle() -> None:
