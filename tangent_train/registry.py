@@ -100,7 +100,8 @@ def make(settings: Any, place: str, file: SettingsFile | None = None, **given: A
         **given: Further arguments, handed on as they are.
 
     Raises:
-        SettingError: The class or function cannot be imported, or gets text for a number.
+        SettingError: The class or function cannot be imported, gets text for a number, or does not
+            take what it gets; of a class of the user's own the error is its own.
         DataError: The file gives forbidden or invalid settings.
     """
     maker, kinds = _maker(settings, place, file)
@@ -117,14 +118,15 @@ def make(settings: Any, place: str, file: SettingsFile | None = None, **given: A
     except (DataError, SettingError):
         raise
     except Exception as error:
-        if file is None or not file.owns(place):
+        of_file, name = file is not None and file.owns(place), settings["_target_"]
+        foreign = _find(name) is None and not name.startswith("lightning.")
+        if not of_file and (foreign or isinstance(error, OSError)):
             raise
-        raise DataError(
-            file.path,
-            found=f"{place}: {settings['_target_']} cannot be made ({type(error).__name__}: "
-            f"{str(error).partition(chr(10))[0]})",
-            expected="settings that it takes",
-        ) from error
+        reason = f"{type(error).__name__}: {str(error).partition(chr(10))[0]}"
+        found, expected = f"{name} cannot be made ({reason})", "settings that it takes"
+        if file is not None and of_file:
+            raise DataError(file.path, found=f"{place}: {found}", expected=expected) from error
+        raise SettingError(place, found=found, expected=expected) from error
 
 
 def maker_of(settings: Any, place: str, file: SettingsFile | None = None) -> Any:

@@ -308,7 +308,8 @@ def _described(path: Path, text: str | bytes | None) -> dict[str, Any]:
             path,
             found=f"no JSON in {where} ({error})",
             expected=_EXPORTED,
-            remedy="It says which classes and which normalization the network has.",
+            remedy="It says which classes and normalization the network has. tangent-import writes "
+            "it for a network of another program.",
         ) from error
     return check_fields(path, check_plain(path, content, where), _KINDS, _EXPORTED, where)
 

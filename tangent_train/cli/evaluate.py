@@ -27,7 +27,7 @@ from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
 from tangent_train.cli.build import Settings, build, build_trained, check_fits, shown
 from tangent_train.cli.say import say
 from tangent_train.cli.stored import GROUPS, run_settings
-from tangent_train.errors import SettingError
+from tangent_train.errors import SettingError, at_least
 from tangent_train.files import no_room
 from tangent_train.inference.judge import NetworkJudge
 from tangent_train.registry import SettingsFile, make
@@ -111,7 +111,9 @@ class Run:
             trained: Network to evaluate; None to make it from the settings.
         """
         folder = Path(HydraConfig.get().runtime.output_dir)
-        lightning.seed_everything(settings["seed"], workers=True, verbose=False)
+        lightning.seed_everything(
+            at_least("seed", settings["seed"], 0), workers=True, verbose=False
+        )
         notes: list[str] = []
         if trained is None:
             data, task = build(settings, source)
@@ -134,6 +136,8 @@ class Run:
         # Devices found, advertisements, what the settings say anyway.
         logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
         every, epochs = section.get("check_val_every_n_epoch"), section.get("max_epochs")
+        if epochs not in (None, -1):
+            at_least("trainer.max_epochs", epochs, 1)
         return make(
             section,
             "trainer",

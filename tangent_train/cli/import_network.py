@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hydra import compose
+from hydra.errors import MissingConfigException
 from omegaconf import OmegaConf
 from rich import get_console
 
@@ -92,7 +93,11 @@ def _load(settings: Settings, normalization: Any) -> PhotoNetwork:
         return network
     from tangent_train.inference.photo_networks import of_config
 
-    config: Any = compose("import", [f"+network@section={name}"])
+    try:
+        config: Any = compose("import", [f"+network@section={name}"])
+    except MissingConfigException as error:
+        known = ", ".join((*_LIBRARIES, *(error.options or ())))
+        raise SettingError("network", found=name, expected=f"of {known}") from error
     section: Any = OmegaConf.to_container(config.section)
     return of_config.load(section, settings.weights, settings.classes, normalization)
 

@@ -21,7 +21,6 @@ _SAID = {
     str: "a name or path",
     Path: "a file or folder",
     NoneType: "null",
-    tuple: "a list",
 }
 
 
@@ -94,4 +93,6 @@ def _as(kind: Any, value: Any) -> Any:
 def _said(kind: Any) -> str:
     if get_origin(kind) is Literal:
         return " or ".join(map(str, get_args(kind)))
+    if get_origin(kind) is tuple:
+        return f"a list (each {_said(get_args(kind)[0])})"
     return _SAID[get_origin(kind) or kind]

@@ -129,6 +129,8 @@ def _use(trained: TrainedNetwork, seen: Mapping[str, Any], photos: tuple[int, in
     """Label one image as the commands will: names that do not fit the scores are refused."""
     try:
         trained.network(torch.zeros(1, 3, seen["dim"], seen["dim"]))
+    except SettingError:
+        raise
     except (RuntimeError, ValueError) as error:
         raise SettingError(
             "level, base_level",
