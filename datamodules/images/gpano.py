@@ -175,13 +175,14 @@ def area_of_crop(size: tuple[int, int], crop: Sequence[float]) -> PanoramaArea:
     return _area(f"crop={list(crop)}", size, across, down)
 
 
-def whole_area(path: Path, size: tuple[int, int]) -> PanoramaArea:
+def whole_area(path: Path, size: tuple[int, int], remedy: str = _NOT_WHOLE) -> PanoramaArea:
     """The place of an image that shows the whole sphere.
 
     Args:
         path: The image, for the message.
         size: Its rows and columns. One column too many or too few is allowed, a rounding error of
             other programs: it is left out, or its neighbour is repeated.
+        remedy: For the message.
 
     Raises:
         DataError: It is not twice as wide as high.
@@ -192,7 +193,7 @@ def whole_area(path: Path, size: tuple[int, int]) -> PanoramaArea:
             path,
             found=f"{height}×{width} pixels",
             expected="a whole panorama, twice as wide as high",
-            remedy=_NOT_WHOLE,
+            remedy=remedy,
         )
     return PanoramaArea((height, 2 * height), (0, height), (0, 2 * height), size)
 

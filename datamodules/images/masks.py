@@ -20,6 +20,8 @@ a file, for all panoramas, or of the PNG files of a folder, which has one for ea
 Counts = Callable[[Path], NDArray[np.bool_]]
 """Reads a mask: where it counts, ``(H, W)``."""
 
+_REMEDY = "Make a mask of the size of its image, or of the whole panorama."
+
 
 def _not_black(path: Path) -> NDArray[np.bool_]:
     pixels = read_pixels(path, indices=False)
@@ -68,7 +70,7 @@ class Masks:
             DataError: It is missing, or not twice as wide as high.
         """
         path = self._checked(self._path / f"{name}.png")
-        whole_area(path, read_image_size(path))
+        whole_area(path, read_image_size(path), _REMEDY)
 
     def read(self, name: str, area: PanoramaArea) -> NDArray[np.uint8]:
         """Where a panorama counts: 255, elsewhere and where it shows nothing 0.
@@ -97,7 +99,7 @@ class Masks:
         if own is not None:
             rows, columns = own.shape
             fits = (rows, columns) == area.image_shape
-            place = area if fits else whole_area(path, (rows, columns))
+            place = area if fits else whole_area(path, (rows, columns), _REMEDY)
             counts[~resize_nearest(place.place(own), area.full_shape)] = 0
         if not self.of_each:
             self._kept = area, counts
