@@ -63,8 +63,9 @@ def built(overrides: Sequence[str], root: str, rows: int, rooms: int = 3) -> tup
 def loader(quick: bool) -> Iterator[Table]:
     """Samples of 4 of 80 RGB-D images from the prepared store, beside decoding PNGs; one worker."""
     level = 6 if quick else 10
-    settings = [f"level={level}", "representation.base_level=1", "data.num_workers=1"]
+    settings = [f"level={level}", "representation=tangent", "representation.base_level=1"]
     settings += ["representation.faces_per_panorama=4", "data.panoramas_per_step=1"]
+    settings += ["data.num_workers=1", "data.in_memory=false"]
     with tempfile.TemporaryDirectory() as root, quiet():
         ways = []
         stores = {"PNG files": "null", "prepared store": f"{root}/store"}
