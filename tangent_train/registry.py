@@ -118,14 +118,14 @@ def make(settings: Any, place: str, file: SettingsFile | None = None, **given: A
     except (DataError, SettingError):
         raise
     except Exception as error:
-        of_file, name = file is not None and file.owns(place), settings["_target_"]
+        source, name = file if file is not None and file.owns(place) else None, settings["_target_"]
         foreign = _find(name) is None and not name.startswith("lightning.")
-        if not of_file and (foreign or isinstance(error, OSError)):
+        if source is None and (foreign or isinstance(error, OSError)):
             raise
         reason = f"{type(error).__name__}: {str(error).partition(chr(10))[0]}"
         found, expected = f"{name} cannot be made ({reason})", "settings that it takes"
-        if file is not None and of_file:
-            raise DataError(file.path, found=f"{place}: {found}", expected=expected) from error
+        if source is not None:
+            raise DataError(source.path, found=f"{place}: {found}", expected=expected) from error
         raise SettingError(place, found=found, expected=expected) from error
 
 

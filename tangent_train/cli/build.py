@@ -48,6 +48,11 @@ def build(settings: Settings, source: SettingsFile | None = None) -> tuple[Any, 
     )
     task = _build_task(settings, data, make(section, "network", source), source)
     _try_network(task, data.in_channels)
+    try:
+        task.make_optimizer([{"params": [torch.zeros(1, 1, requires_grad=True)]}])
+    except (TypeError, ValueError) as error:
+        expected = f"settings that {settings['optimizer']['_target_']} takes"
+        raise SettingError("optimizer", found=str(error), expected=expected) from error
     return data, task
 
 
@@ -137,12 +142,6 @@ def _build_task(
     """The task of a run with its network; see `build`."""
     optimizer = dict(settings["optimizer"])
     backbone_lr_factor = optimizer.pop("backbone_lr_factor", 1.0)
-    make_optimizer = make(optimizer, "optimizer", source)
-    try:
-        make_optimizer([torch.zeros(1, 1, requires_grad=True)])
-    except (TypeError, ValueError) as error:
-        expected = f"settings that {optimizer['_target_']} takes"
-        raise SettingError("optimizer", found=str(error), expected=expected) from error
     scheduler = settings.get("scheduler")
     parts = {} if scheduler is None else {"scheduler": make(scheduler, "scheduler", source)}
     return make(
@@ -152,7 +151,7 @@ def _build_task(
         network=network,
         representation=data.representation,
         class_names=data.class_names,
-        optimizer=make_optimizer,
+        optimizer=make(optimizer, "optimizer", source),
         backbone_lr_factor=backbone_lr_factor,
         **parts,
     )

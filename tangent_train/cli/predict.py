@@ -241,9 +241,9 @@ class _Labeller:
     def write(self, job: Job) -> Entry:
         """Write the labels of one image, and return its entry of the summary."""
         image, labels, area = job.value
-        counted: Any = True
+        counted = np.array(True)
         if area is not None:
-            counted = area.cut(self._masks.read(job.item, area))
+            counted = area.cut(self._masks.read(job.item, area)) > 0
             labels = np.where(counted, labels, labels.dtype.type(0))
         folder = self._folder.of_frames if is_video(job.path) else self._folder
         folder.write(job.item, image, labels, area)

@@ -74,8 +74,10 @@ def class_shares(
     angles = _solid_angles(labels.shape, image, area)
     for line, weights, own in zip(labels, angles, kept, strict=True):
         total += np.bincount(line, weights * own, minlength=count)
-    shares = total / (total.sum() or 1)
-    return dict(zip(class_names, map(float, shares), strict=True))
+    shares = dict.fromkeys(class_names, 0.0)  # a network's own class may be called unknown, too
+    for name, share in zip(class_names, total / (total.sum() or 1), strict=True):
+        shares[name] += float(share)
+    return shares
 
 
 def _solid_angles(
@@ -239,8 +241,8 @@ class PredictionFolder:
             settings: Settings of the prediction.
             entries: Of the images done so far.
         """
-        names = self.class_names
-        values = {name: value for value, name in enumerate(names[1:], start=1)}
+        names = dict.fromkeys(self.class_names)
+        values = {name: value for value, name in enumerate(self.class_names[1:], start=1)}
         write_text(self.path / "classes.json", json.dumps(values, indent=1) + "\n")
         content = {**settings, "images": entries}
         write_text(self.path / _SUMMARY, json.dumps(content, indent=1) + "\n")

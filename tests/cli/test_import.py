@@ -143,7 +143,10 @@ def test_tangent_images_have_the_angular_resolution_of_the_photos(
 @pytest.mark.parametrize(
     ("changes", "told"),
     [
-        (("classes=three.json",), "^tangent-import: class names of the network: found 3, for 4"),
+        (
+            ("classes=three.json",),
+            "^tangent-import: class names of the network: found 3, for 4 scores; expected one for",
+        ),
         (("classes=holes.json",), r"holes\.json: found .*; expected a JSON list"),
         (("normalization=null",), "normalization: found none; expected imagenet, unit, symmetric"),
         (("nothing=[sky]",), "nothing: found sky; expected of background, dark"),

@@ -35,17 +35,20 @@ def test_to_tangent_images(interpolation: Interpolation) -> None:
     torch.testing.assert_close(on_gpu.cpu(), expected)
 
 
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-7), (torch.float32, 1e-4)])
 @pytest.mark.parametrize("blend", ["nearest", "feather"])
-def test_to_the_panorama_and_its_gradient(blend: Blend) -> None:
+def test_to_the_panorama_and_its_gradient(
+    blend: Blend, dtype: torch.dtype, tolerance: float
+) -> None:
     images = _random(GRID.num_images, 2, GRID.dim, GRID.dim)
     weights = _random(2, *SHAPE)
     gradients = []
-    for device, dtype in (("cpu", torch.float64), ("cuda", torch.float32)):
-        source = images.to(device, dtype).requires_grad_()
+    for device, precision in (("cpu", torch.float64), ("cuda", dtype)):
+        source = images.to(device, precision).requires_grad_()
         panorama = tangent_to_equirect(source, GRID, SHAPE, blend)
         (gradient,) = torch.autograd.grad((panorama * weights.to(source)).sum(), source)
         gradients += [panorama.detach().double().cpu(), gradient.double().cpu()]
-    torch.testing.assert_close(gradients[2:], gradients[:2], rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(gradients[2:], gradients[:2], rtol=tolerance, atol=tolerance)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.float16])

@@ -62,6 +62,15 @@ def test_mixed_precision(precision: str) -> None:
     torch.testing.assert_close(_weights(found), _weights(expected), rtol=0.05, atol=0.05)
 
 
+@pytest.mark.parametrize(("half", "tolerance"), [(False, 1e-4), (True, 0.02)])
+def test_scores(half: bool, tolerance: float) -> None:
+    images = torch.randn(20, 2, 16, 16)
+    exact = _task().double().eval()(images.double()).detach()
+    with torch.autocast("cuda", torch.bfloat16, enabled=half):
+        found = _task().cuda().eval()(images.cuda()).detach().cpu().double()
+    assert (found - exact).norm() < tolerance * exact.norm()
+
+
 def test_cuda_graphs_in_evaluation() -> None:
     """They write every result to the same memory."""
     images = torch.randn(20, 2, 16, 16, device="cuda")
