@@ -23,7 +23,7 @@ from tangent_train.rendering.sampling import (
     sample_map,
     sphere_rays,
 )
-from tangent_train.rendering.tables import forward_map, tensors_on
+from tangent_train.rendering.tables import forward_map, forward_positions, tensors_on
 
 Interpolation = Literal["bilinear", "nearest"]
 
@@ -94,10 +94,10 @@ def _render_tensor(
     chunks = [image.new_empty((*batch, 0, channels, grid.dim, grid.dim))]
     for start in range(0, len(indices), step):
         faces = tuple(indices[start : start + step].tolist())
-        # On the CPU they share the memory of the map, which is kept already.
+        # On the CPU the map itself is kept already.
         key = None if image.device.type == "cpu" else ("forward", (height, width), faces, dtype)
-        build = partial(forward_map, grid, (height, width), faces, dtype)
-        u, v = (part.reshape(-1) for part in tensors_on(image.device, grid, key, build)[:2])
+        build = partial(forward_positions, grid, (height, width), faces, dtype)
+        u, v = tensors_on(image.device, grid, key, build)
         if interpolation == "nearest":
             index = nearest_equirect_index(u, v, (height, width))
             values = source.gather(1, index.expand(len(source), -1))

@@ -33,6 +33,8 @@ _SAME_SIZE = {1: np.uint8, 2: np.uint16, 4: np.float32, 8: np.float64}
 """Nearest sampling moves bytes: any dtype goes as one of its size."""
 _BLOCK = 2**18
 """Positions sampled at once where cv2 cannot be used."""
+_COPIED = 36
+"""Bytes of a part of a panorama for each position, at most: to copy more does not pay."""
 
 
 def sphere_rays(shape: tuple[int, int]) -> Rays:
@@ -56,17 +58,56 @@ def map_dtype(exact: bool, interpolation: str) -> np.dtype[np.floating]:
 
 
 class EquirectMap(NamedTuple):
-    """Positions in an ERP.
+    """Positions in an ERP, and in the part of it that is around them.
 
     Attributes:
-        u: ``(h, w)`` columns in [−½, W − ½], float32 or float64.
-        v: ``(h, w)`` rows in [−½, H − ½], same dtype.
+        u: ``(h, w)`` columns in the part, float32 or float64.
+        v: ``(h, w)`` rows in the part, same dtype.
         polar: Flat indices of positions between a pole and the row next to it.
+        part: First row, row after the last, first column and column after the last, int64; columns
+            from W on lie beyond the seam.
     """
 
     u: NDArray[np.floating]
     v: NDArray[np.floating]
     polar: NDArray[np.intp]
+    part: NDArray[np.int64]
+
+    @classmethod
+    def of(
+        cls, u: NDArray[np.floating], v: NDArray[np.floating], shape: tuple[int, int]
+    ) -> EquirectMap:
+        """Find the part around positions.
+
+        Args:
+            u: ``(h, w)`` columns in [−½, W − ½], float32 or float64.
+            v: ``(h, w)`` rows in [−½, H − ½], same dtype.
+            shape: ``(H, W)`` of the ERP.
+        """
+        height, width = shape
+        polar = np.flatnonzero((v < 0) | (v > height - 1))
+        # Columns of the left half are rounded alike in every part: as they are beyond the seam.
+        beyond, left_half = u + u.dtype.type(width), u < width / 2
+        u = np.where(left_half, beyond - u.dtype.type(width), u)
+        # Even, for of two nearest pixels the even one is sampled.
+        top, left = (int(line.min()) // 2 * 2 for line in (v, u))
+        bottom, right = min(height, int(v.max()) + 2), int(u.max()) + 2
+        if u.min() < 0 or right - left > width / 2:
+            joined = np.where(left_half, beyond, u)
+            left, right = int(joined.min()) // 2 * 2, int(joined.max()) + 2
+            if right - left > width / 2:
+                left, right = 0, width
+            else:
+                u = joined
+        part = np.array((top, bottom, left, right))
+        return cls(u - u.dtype.type(left), v - u.dtype.type(top), polar, part)
+
+    def in_panorama(
+        self, chosen: NDArray[np.intp] | slice = slice(None)
+    ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+        """``(P,)`` columns, some beyond the seam, and rows in the ERP of the chosen positions."""
+        top, _, left, _ = self.part.astype(self.u.dtype)
+        return self.u.reshape(-1)[chosen] + left, self.v.reshape(-1)[chosen] + top
 
 
 def equirect_map(
@@ -89,7 +130,7 @@ def equirect_map(
     columns, rows = rays
     u, v = np.empty((2, len(matrices) * len(rows), columns.shape[1]), dtype)
     over_rows(equirect_positions, *u.shape, np.ascontiguousarray(matrices), *rays, *shape, u, v)
-    return EquirectMap(u, v, np.flatnonzero((v < 0) | (v > shape[0] - 1)))
+    return EquirectMap.of(u, v, shape)
 
 
 @njit_exact
@@ -136,7 +177,7 @@ def sample_map(
     other sampling is exact.
 
     Args:
-        table: Positions ``(h, w)`` in the panorama.
+        table: Positions ``(h, w)``.
         image: ``(H, W[, C])``, contiguous.
         interpolation: ``bilinear`` or ``nearest``.
         out: ``(h, w[, C])`` contiguous, same dtype, written.
@@ -157,19 +198,31 @@ def sample_map(
 def _remap(
     table: EquirectMap, image: NDArray[np.generic], nearest: bool, out: NDArray[np.generic]
 ) -> None:
+    top, bottom, left, right = table.part.tolist()
+    part = image[top:bottom, left:right]
+    if right > image.shape[1]:
+        part = np.concatenate([part, image[top:bottom, : right - image.shape[1]]], axis=1)
+    # To copy the part row by row takes less time than to wait for memory at every position.
+    copied = image.dtype.itemsize < 4 and part.nbytes <= _COPIED * table.u.size
     u, v = (line.astype(np.float32, copy=False) for line in table[:2])
     if nearest and len(table.polar):
-        v = v.clip(0, len(image) - 1)
+        v = v.clip(0, len(part) - 1)
     flag = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
     channels = 1 if image.ndim == 2 else image.shape[2]
-    if image.ndim == 2 or channels in (3, 4):
-        cv2.remap(image, u, v, flag, dst=out, borderMode=cv2.BORDER_WRAP)
+    padded = copied and channels % 3 == 0 and not nearest
+    if image.ndim == 2 or (channels in (3, 4) and not padded):
+        part = np.ascontiguousarray(part) if copied else part
+        cv2.remap(part, u, v, flag, dst=out, borderMode=cv2.BORDER_WRAP)
         return
-    # Other numbers of channels cv2 refuses, or samples at rounded positions.
+    # cv2 is fastest with 4 channels. Other numbers it refuses, or samples at rounded positions.
     several = 3 if channels % 3 == 0 else 1
     for first in range(0, channels, several):
-        group = np.ascontiguousarray(image[..., first : first + several])
+        group = np.ascontiguousarray(part[..., first : first + several])
+        if padded:
+            group = cv2.cvtColor(group, cv2.COLOR_RGB2RGBA)
         sampled = cv2.remap(group, u, v, flag, borderMode=cv2.BORDER_WRAP)
+        if padded:
+            sampled = cv2.cvtColor(sampled, cv2.COLOR_RGBA2RGB)
         out[..., first : first + several] = sampled.reshape(*out.shape[:2], several)
 
 
@@ -186,7 +239,7 @@ def _gather(
     target = out.reshape(table.u.size, -1)
     for start in range(0, len(chosen), _BLOCK):
         part = chosen[start : start + _BLOCK]
-        u, v = (torch.from_numpy(line.reshape(-1)[part]) for line in table[:2])
+        u, v = map(torch.from_numpy, table.in_panorama(part))
         if nearest:
             target[part] = source[nearest_equirect_index(u, v, shape).numpy()]
             continue

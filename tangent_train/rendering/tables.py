@@ -73,6 +73,9 @@ def _nbytes(table: tuple[Any, ...]) -> int:
 
 
 TABLES = TableCache(limit=512 * 2**20)
+_ROTATED_SHARE = 16
+_ROTATED = TableCache(limit=TABLES.limit // _ROTATED_SHARE)
+"""Of rotated grids, for depth and labels after RGB: random rotations would evict all others."""
 
 
 def set_table_cache_limit(nbytes: int) -> None:
@@ -90,11 +93,11 @@ def set_table_cache_limit(nbytes: int) -> None:
     if nbytes < 0:
         raise SettingError("table cache limit", found=nbytes, expected="0 bytes or more")
     TABLES.set_limit(nbytes)
+    _ROTATED.set_limit(nbytes // _ROTATED_SHARE)
 
 
 def _cached(grid: PinholeGrid, key: tuple[Hashable, ...], build: Callable[[], Value]) -> Value:
-    """Tables of rotated grids are not cached: random rotations would evict all others."""
-    return build() if grid.rotation is not None else TABLES.get((grid, *key), build)
+    return (TABLES if grid.rotation is None else _ROTATED).get((grid, *key), build)
 
 
 def forward_map(
@@ -119,6 +122,13 @@ def forward_map(
         return equirect_map(world_from_pixel[..., [0, 2, 1]], rays, shape, dtype)
 
     return _cached(grid, ("forward", shape, chosen, dtype), build)
+
+
+def forward_positions(
+    grid: PinholeGrid, shape: tuple[int, int], faces: Sequence[int], dtype: np.dtype[np.floating]
+) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+    """The columns and rows of `forward_map` in the whole ERP, flat."""
+    return forward_map(grid, shape, faces, dtype).in_panorama()
 
 
 def owners(grid: PinholeGrid, shape: tuple[int, int]) -> NDArray[np.integer]:

@@ -30,8 +30,8 @@ def _random(shape: tuple[int, ...], dtype: Any = np.float64) -> Array:
 def _sampled(image: Array, u: Any, v: Any, interpolation: Any = "bilinear") -> Array:
     u, v = (np.atleast_2d(np.asarray(line, np.float32)) for line in (u, v))
     out = np.empty((*u.shape, *image.shape[2:]), image.dtype)
-    polar = np.flatnonzero((v < 0) | (v > len(image) - 1))
-    sampling.sample_map(sampling.EquirectMap(u, v, polar), image, interpolation, out)
+    table = sampling.EquirectMap.of(u, v, (image.shape[0], image.shape[1]))
+    sampling.sample_map(table, image, interpolation, out)
     return out
 
 
@@ -48,6 +48,21 @@ def test_colors_equal_exact_values_everywhere(shape: tuple[int, int], dtype: Any
     v[:2] = np.resize([-0.5, 0, 0.25, height - 1, height - 0.5], 40)
     error = _sampled(image, u, v) - _sampled(image.astype(np.float64), u, v)
     assert np.abs(error).max() <= (0.5 + 1e-4 if dtype == np.uint8 else 1e-5)
+
+
+@pytest.mark.parametrize("channels", [(), (3,), (4,), (6,)])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+@pytest.mark.parametrize("left", [31.0, 57.5, 62.5, -0.5])
+@pytest.mark.parametrize("top", [-0.5, 7.0, 22.5])
+def test_parts_of_panoramas(top: float, left: float, dtype: Any, channels: tuple[int, ...]) -> None:
+    """Ten pixels around, across the seam (63.5 or −0.5), up to a pole, half-way between pixels."""
+    image = _random((32, 64, *channels), dtype)
+    v, u = top + np.mgrid[0:9.125:0.125, 0:9.125:0.125]
+    u = (u - top + left + 0.5) % 64 - 0.5
+    error = _sampled(image, u, v).astype(np.float64) - _sampled(image.astype(np.float64), u, v)
+    assert np.abs(error).max() <= (0.5 + 1e-3 if np.dtype(dtype).kind == "u" else 1e-4)
+    row, column = v.round().astype(int).clip(0, 31), u.round().astype(int) % 64
+    np.testing.assert_array_equal(_sampled(image, u, v, "nearest"), image[row, column])
 
 
 @pytest.mark.parametrize("remap", [32767, 0])

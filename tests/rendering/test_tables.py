@@ -68,11 +68,14 @@ def test_bands_are_parts_of_the_whole(monkeypatch: pytest.MonkeyPatch, blend: An
         torch.testing.assert_close(band, expected, atol=1e-6, rtol=0)
 
 
-def test_tables_are_computed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("rotation", [None, ROTATION])
+def test_tables_are_computed_once(
+    monkeypatch: pytest.MonkeyPatch, rotation: NDArray[np.float64] | None
+) -> None:
     """The released code made its tables anew for every panorama."""
 
     def render(shape: tuple[int, int]) -> list[NDArray[np.generic]]:
-        grid = TangentGrid(0, 4, 15)  # a new, equal grid every time
+        grid = TangentGrid(0, 4, 15, rotation)  # a new, equal grid every time
         panorama = np.random.default_rng(0).random((*shape, 3), np.float32)
         images = torch.from_numpy(equirect_to_tangent(panorama, grid)).permute(0, 3, 1, 2)
         both = [tangent_to_equirect(images, grid, shape, blend) for blend in ("nearest", "feather")]
@@ -91,7 +94,7 @@ def test_tables_are_computed_once(monkeypatch: pytest.MonkeyPatch) -> None:
         render((40, 82))
 
 
-def test_tables_of_rotated_grids_are_not_kept(cache: tables.TableCache) -> None:
+def test_tables_of_rotated_grids_evict_no_others(cache: tables.TableCache) -> None:
     equirect_to_tangent(np.zeros((32, 64)), TangentGrid(0, 4, rotation=ROTATION))
     tangent_to_equirect(torch.zeros(20, 1, 16, 16), TangentGrid(0, 4, rotation=ROTATION), (8, 16))
     assert cache.nbytes == 0
