@@ -21,7 +21,7 @@ from tangent_train.rendering import kernels
 from tangent_train.rendering.compiled import over_rows
 from tangent_train.rendering.tables import sight_of
 
-_NO_TOTAL: NDArray[np.float32] = np.empty((0, 0, 0, 0), np.float32)
+_NO_TOTAL: NDArray[np.float32] = np.empty((0, 0, 0), np.float32)
 _NO_LABELS: NDArray[np.uint8] = np.empty((0, 0), np.uint8)
 
 NO_OWNERS: NDArray[np.uint8] = np.empty((0, 0), np.uint8)
@@ -103,7 +103,7 @@ def _bands(rows: slice, images: int) -> Iterator[tuple[slice, slice]]:
 def zero_sums(
     shape: tuple[int, int], channels: int, spare: NDArray[np.float32] | None = None
 ) -> NDArray[np.float32]:
-    """Sums in blocks of 16 channels, 0; beyond 2 GiB in a temporary file without a name.
+    """Sums of channels, 0; beyond 2 GiB in a temporary file without a name.
 
     Args:
         shape: ``(H, W)``.
@@ -111,12 +111,12 @@ def zero_sums(
         spare: Sums that nobody uses any more; clearing them is faster than new memory.
 
     Returns:
-        ``(H, K / 16, W, 16)``, see `kernels` and `without_blocks`.
+        ``(H, W, Kp)``, see `kernels`.
 
     Raises:
         SettingError: They do not fit on the disk (of the folder TMPDIR).
     """
-    whole = (shape[0], -(-channels // kernels.LANES), shape[1], kernels.LANES)
+    whole = (*shape, -(-channels // kernels.LANES) * kernels.LANES)
     nbytes = math.prod(whole) * 4
     if nbytes <= _IN_MEMORY_BYTES:
         if spare is None or spare.shape != whole:
@@ -135,8 +135,3 @@ def zero_sums(
                 remedy="Set TMPDIR to a folder on a larger disk, or use blend=nearest for labels.",
             ) from error
         return np.memmap(file, np.float32, "r+", shape=whole)
-
-
-def without_blocks(total: NDArray[np.float32], channels: int) -> NDArray[np.float32]:
-    """Sums ``(h, W, K)`` of those in blocks."""
-    return total.swapaxes(1, 2).reshape(len(total), total.shape[2], -1)[..., :channels]

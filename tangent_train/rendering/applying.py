@@ -14,7 +14,6 @@ from tangent_train.errors import SettingError
 from tangent_train.rendering.accumulate import (
     NO_OWNERS,
     add_to_panorama,
-    without_blocks,
     zero_sums,
 )
 from tangent_train.rendering.backward import Blend, tangent_to_equirect
@@ -144,7 +143,7 @@ def _mean(
         add_to_panorama(images, grid, faces, shape, slice(0, height), owner, sums)
     means, size = np.asarray(sums).reshape(-1), width * count
     for i in range(height):
-        row = without_blocks(sums[i : i + 1], count + feather)
+        row = sums[i, :, : count + feather]
         row = row[..., :count] / (row[..., count:] if feather else 1)
         means[i * size : (i + 1) * size] = row.ravel()
     return means[: height * size].reshape(*shape, *channels)

@@ -16,7 +16,6 @@ from tangent_train.rendering.accumulate import (
     NO_OWNERS,
     add_to_panorama,
     label_panorama,
-    without_blocks,
     zero_sums,
 )
 from tangent_train.rendering.checks import (
@@ -172,7 +171,7 @@ def _feathered(
         rows = slice(start, min(shape[0], start + step))
         sums = zero_sums((rows.stop - start, shape[1]), channels + 1)
         add_to_panorama(with_ones, grid, grid.face_indices(), shape, rows, NO_OWNERS, sums)
-        total = without_blocks(sums, channels + 1)
+        total = sums[..., : channels + 1]
         panorama[rows] = total[..., :channels] / total[..., channels:]
     return panorama
 

@@ -4,8 +4,8 @@ A *canvas* is what images are put together on: a panorama, or a photo made of cr
 look along `sampling.Rays`. An image sees a ray at its pixel (u, v) where ``(u, v, 1)`` is
 proportional to its ``(3, 3)`` matrix times the ray, if the third number is positive.
 
-Scores are interpolated 16 classes at a time. Arrays of *blocks* are ``(h, B, w, 16)``: for every
-row, the scores of the first 16 classes at all its pixels, then those of the next 16.
+Sums are arrays ``(H, W, Kp)``: the scores of a pixel lie beside each other, K of them and zeros up
+to a multiple of `LANES`, which compiles to vector code without a rest.
 """
 
 from __future__ import annotations
@@ -14,17 +14,14 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from llvmlite import ir
-from numba import types
-from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from tangent_train.rendering.compiled import njit_exact, njit_fast
 
 LANES = 16
-"""Classes of a block."""
+"""The number of scores of a pixel is a multiple of this."""
 
-_TILE = 64
+_TILE = 128
 """Rows and columns at the equator of what is added to at once: its sums stay in the cache."""
 
 _ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
@@ -89,7 +86,7 @@ class _Taps(NamedTuple):
     """The four pixels of a patch around every position, and their weights.
 
     Attributes:
-        first: Places of the upper left one in the first block of its row.
+        first: Place of the upper left one.
         a: Weights of the upper left one.
         b: Of the upper right one.
         c: Of the lower left one.
@@ -101,71 +98,6 @@ class _Taps(NamedTuple):
     b: Array
     c: Array
     d: Array
-
-
-def _address(context: Any, builder: Any, kind: Any, array: Any, index: Any, target: Any) -> Any:
-    """Address of a number of an array, as one of `target`."""
-    data = context.make_array(kind)(context, builder, array).data
-    return builder.bitcast(builder.gep(data, [index]), target.as_pointer())
-
-
-@intrinsic  # type: ignore[untyped-decorator]
-def _add_block(typing: Any, sums: Any, at: Any, scores: Any, places: Any, weights: Any) -> Any:
-    """Add four weighted runs of 16 numbers to a run of sums; numba's loops do it one by one."""
-
-    def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        block = ir.VectorType(ir.FloatType(), LANES)
-        everywhere = ir.VectorType(ir.IntType(32), LANES)([0] * LANES)
-        sums, at, scores, places, weights = arguments
-        target = _address(context, builder, signature.args[0], sums, at, block)
-        total = builder.load(target, align=4)
-        for n in range(4):
-            place, weight = (builder.extract_value(part, n) for part in (places, weights))
-            source = _address(context, builder, signature.args[2], scores, place, block)
-            one = builder.insert_element(block(ir.Undefined), weight, ir.IntType(32)(0))
-            factors = builder.shuffle_vector(one, one, everywhere)
-            product = builder.fmul(builder.load(source, align=4), factors, flags=("contract",))
-            total = builder.fadd(total, product, flags=("contract",))
-        builder.store(total, target, align=4)
-        return context.get_dummy_value()
-
-    return types.void(sums, at, scores, places, weights), build
-
-
-@intrinsic  # type: ignore[untyped-decorator]
-def _transpose(
-    typing: Any, rows: Any, at: Any, stride: Any, factors: Any, first: Any,
-    columns: Any, to: Any, step: Any,
-) -> Any:  # fmt: skip
-    """Write the columns of 16 rows of 16 numbers, which are multiplied by factors.
-
-    Interleaving the first with the second half of the rows of a square, log2 16 times, transposes
-    it.
-    """
-
-    def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        block = ir.VectorType(ir.FloatType(), LANES)
-
-        def place(array: int, start: int, step: Any, times: int) -> Any:
-            index = builder.add(arguments[start], builder.mul(step, step.type(times)))
-            kind = signature.args[array]
-            return _address(context, builder, kind, arguments[array], index, block)
-
-        _, _, stride, *_, step = arguments
-        factor = builder.load(place(3, 4, stride, 0), align=4)
-        rows = [builder.load(place(0, 1, stride, k), align=4) for k in range(LANES)]
-        rows = [builder.fmul(row, factor) for row in rows]
-        half = LANES // 2
-        masks = [[h + n // 2 + n % 2 * LANES for n in range(LANES)] for h in (0, half)]
-        orders = [ir.VectorType(ir.IntType(32), LANES)(mask) for mask in masks]
-        for _ in range(LANES.bit_length() - 1):
-            pairs = zip(rows[:half], rows[half:], strict=True)
-            rows = [builder.shuffle_vector(*pair, order) for pair in pairs for order in orders]
-        for k, row in enumerate(rows):
-            builder.store(row, place(5, 6, step, k), align=4)
-        return context.get_dummy_value()
-
-    return types.void(rows, at, stride, factors, first, columns, to, step), build
 
 
 @njit_fast
@@ -224,15 +156,9 @@ def _room_for_taps(pixels: int) -> _Taps:
 
 
 @njit_fast
-def _part(room: Array, shape: tuple[int, int, int, int]) -> Array:
-    """The beginning of an array, in a shape."""
-    return room[: shape[0] * shape[1] * shape[2] * shape[3]].reshape(shape)
-
-
-@njit_fast
 def _enough(room: Array, size: int) -> Array:
-    """A flat array, or a new one if it is too small."""
-    return room if len(room) >= size else np.empty(size, room.dtype)
+    """A flat array, or a new one of zeros if it is too small."""
+    return room if len(room) >= size else np.zeros(size, room.dtype)
 
 
 @njit_fast
@@ -382,25 +308,21 @@ def _exp(x: np.float32) -> np.float32:
 
 
 @njit_fast
-def _softmax_lines(
-    lines: Array, num_classes: int, count: int, highest: Array, factor: Array
-) -> None:
+def _softmax_lines(lines: Array, highest: Array, factor: Array) -> None:
     """Softmax over the classes, in place, but for a factor.
 
     Args:
-        lines: ``(K or more, n or more)`` scores, changed; NaN gets a probability of 0.
-        num_classes: K.
-        count: Number of pixels n.
-        highest: Room.
-        factor: Factors that make the sums 1, written.
+        lines: ``(K, n)`` scores, changed; NaN gets a probability of 0.
+        highest: ``(n,)`` room.
+        factor: ``(n,)`` factors that make the sums 1, written.
     """
-    pixels = np.uint64(count)
-    highest[:count], factor[:count] = -np.inf, 0
-    for k in range(num_classes):
+    pixels = np.uint64(len(factor))
+    highest[:], factor[:] = -np.inf, 0
+    for k in range(len(lines)):
         line = lines[k]
         for x in range(pixels):
             highest[x] = line[x] if line[x] > highest[x] else highest[x]
-    for k in range(num_classes):
+    for k in range(len(lines)):
         line = lines[k]
         for x in range(pixels):
             line[x] = _exp(line[x] - highest[x])
@@ -411,48 +333,29 @@ def _softmax_lines(
 
 @njit_fast
 def _copy_patch(scores: Array, left: int, top: int, softmax: bool, patch: Array) -> None:
-    """Copy a part of the ``(K, h, w)`` scores of an image to blocks.
+    """Copy a part of the ``(K, h, w)`` scores of an image, scores of a pixel beside each other.
 
     Args:
         scores: Of the image.
         left: First column of the part.
         top: First row of the part.
         softmax: Whether to copy probabilities.
-        patch: ``(height, B, width, 16)``, written, and perhaps a block of what follows it.
+        patch: ``(height, width, Kp)``, written but for the zeros at the end of each pixel.
     """
-    num_classes = len(scores)
-    height, blocks, width, _ = patch.shape
-    stride = -(-width // LANES) * LANES
-    lines = np.zeros((LANES * blocks, stride), np.float32)
-    from_lines, to_pixels = lines.reshape(-1), patch.reshape(-1)
-    highest, factor = np.empty(width, np.float32), np.ones(stride, np.float32)
-    for y in range(height):
+    num_classes, width = len(scores), patch.shape[1]
+    lines = np.empty((num_classes, width), np.float32)
+    highest, factor = np.empty(width, np.float32), np.ones(width, np.float32)
+    for y in range(len(patch)):
+        pixels = patch[y]
         for k in range(num_classes):
             line, there = lines[k], scores[k, top + y]
             for x in range(np.uint64(width)):
                 line[x] = there[np.uint64(left) + x]
         if softmax:
-            _softmax_lines(lines, num_classes, width, highest, factor)
-        for b in range(blocks):
-            at, to = LANES * stride * b, LANES * (y * blocks + b) * width
-            for x in range(0, width, LANES):
-                _transpose(from_lines, at + x, stride, factor, x, to_pixels, to + LANES * x, LANES)
-
-
-@njit_fast
-def _to_lines(blocks: Array, lines: Array) -> None:
-    """Write ``(B, w, 16)`` numbers of a row as ``(16 B, w or more)`` lines, one per class."""
-    width, stride = blocks.shape[1], lines.shape[1]
-    whole, rest = width - width % LANES, LANES * (width % LANES)
-    last, factor = np.zeros(LANES * LANES, np.float32), np.ones(LANES, np.float32)
-    to = lines.reshape(-1)
-    for b in range(len(blocks)):
-        pixels, first = blocks[b].reshape(-1), LANES * stride * b
-        for x in range(0, whole, LANES):
-            _transpose(pixels, LANES * x, LANES, factor, 0, to, first + x, stride)
-        if rest:
-            last[:rest] = pixels[LANES * whole :]
-            _transpose(last, 0, LANES, factor, 0, to, first + whole, stride)
+            _softmax_lines(lines, highest, factor)
+        for k in range(np.uint64(num_classes)):
+            for x in range(np.uint64(width)):
+                pixels[x, k] = lines[k, x] * factor[x]
 
 
 @njit_fast
@@ -460,20 +363,21 @@ def _add_patch(patch: Array, taps: _Taps, pixel: Array, sums: Array) -> None:
     """Add weighted bilinear samples of a patch to sums.
 
     Args:
-        patch: ``(height, B, width, 16)`` scores of a part of an image.
+        patch: ``(height, width, Kp)`` scores of a part of an image.
         taps: Of pixels.
-        pixel: ``(n,)`` where their sums are in the first block.
-        sums: ``(h, B, w, 16)``, changed.
+        pixel: ``(n,)`` where their sums are.
+        sums: ``(h, w, Kp)``, changed.
     """
     scores, flat = patch.reshape(-1), sums.reshape(-1)
-    blocks, width = patch.shape[1], patch.shape[2]
-    right, below = LANES, LANES * blocks * width
-    for b in range(blocks):
-        for p in range(len(pixel)):
-            a = LANES * (np.int64(taps.first[p]) + b * width)
-            places = a, a + right, a + below, a + below + right
-            weights = taps.a[p], taps.b[p], taps.c[p], taps.d[p]
-            _add_block(flat, LANES * (pixel[p] + b * sums.shape[2]), scores, places, weights)
+    classes = np.uint64(patch.shape[2])
+    right, below = classes, classes * np.uint64(patch.shape[1])
+    for p in range(len(pixel)):
+        at, to = classes * np.uint64(taps.first[p]), classes * np.uint64(pixel[p])
+        a, b, c, d = taps.a[p], taps.b[p], taps.c[p], taps.d[p]
+        for k in range(classes):
+            upper = a * scores[at + k] + b * scores[at + right + k]
+            lower = c * scores[at + below + k] + d * scores[at + below + right + k]
+            flat[to + k] += upper + lower
 
 
 @njit_fast
@@ -487,24 +391,25 @@ def _add_probabilities(
         covered: Whether an image is among those that were added.
         owner: ``(H, W)``.
         num_classes: K.
-        sums: ``(height, B, width, 16)`` scores of the tile.
-        total: ``(H, B, W, 16)``, changed.
+        sums: ``(height, width, Kp)`` scores of the tile.
+        total: ``(H, W, Kp)``, changed.
     """
-    top, bottom, left = tile[0], tile[1], tile[2]
-    blocks, width = sums.shape[1], sums.shape[2]
-    lines = np.empty((LANES * blocks, -(-width // LANES) * LANES), np.float32)
+    top, bottom, left, right = tile
+    width = right - left
+    lines = np.empty((num_classes, width), np.float32)
     highest, factor = np.empty(width, np.float32), np.empty(width, np.float32)
     for i in range(top, bottom):
-        _to_lines(sums[i - top], lines)
-        _softmax_lines(lines, num_classes, width, highest, factor)
+        for k in range(np.uint64(num_classes)):
+            for x in range(np.uint64(width)):
+                lines[k, x] = sums[i - top, x, k]
+        _softmax_lines(lines, highest, factor)
         for x in range(width):
             if not covered[owner[i, left + x]]:
                 factor[x] = 0
-        for b in range(blocks):
-            block, pixels = lines[LANES * b : LANES * (b + 1)], total[i, b, left:]
+        pixels = total[i, left:right]
+        for k in range(np.uint64(num_classes)):
             for x in range(np.uint64(width)):
-                for k in range(np.uint64(LANES)):
-                    pixels[x, k] += block[k, x] * factor[x]
+                pixels[x, k] += lines[k, x] * factor[x]
 
 
 @njit_fast
@@ -521,28 +426,23 @@ def _tiles(start: int, stop: int, sight: Sight) -> list[Tile]:
 
 
 @njit_fast
-def _write_classes(blocks: Array, num_classes: int, least: float, labels: Array) -> None:
+def _write_classes(sums: Array, num_classes: int, least: float, labels: Array) -> None:
     """Write classes of the largest sums of the pixels of a row: of equal ones the first, never NaN.
 
     Args:
-        blocks: ``(B, w, 16)`` sums.
+        sums: ``(w, Kp)``.
         num_classes: K.
         least: Share of the sum of all classes that the largest must have, else the class is K.
         labels: ``(w,)``, written.
     """
-    width = len(labels)
-    highest, best = np.full(width, -np.inf, np.float32), np.zeros(width, np.int32)
-    lines = np.empty((LANES * len(blocks), -(-width // LANES) * LANES), np.float32)
-    _to_lines(blocks, lines)
-    for k in range(num_classes):
-        line, label = lines[k], np.int32(k)
-        for x in range(np.uint64(width)):
-            better = line[x] > highest[x]
-            best[x] = label if better else best[x]
-            highest[x] = line[x] if better else highest[x]
-    for x in range(width):
-        unsure = least > 0 and highest[x] < least * lines[:, x].sum()
-        labels[x] = num_classes if unsure else best[x]
+    for x in range(len(labels)):
+        highest, best = np.float32(-np.inf), 0
+        for k in range(np.uint64(num_classes)):
+            better = sums[x, k] > highest
+            best = k if better else best
+            highest = sums[x, k] if better else highest
+        unsure = least > 0 and highest < least * sums[x, :num_classes].sum()
+        labels[x] = num_classes if unsure else best
 
 
 @njit_fast
@@ -562,12 +462,12 @@ def _add_to_tile(
         room: Room for the tile's pixels.
         taps: Likewise.
         patch: Room for a part of an image.
-        sums: ``(h, B, w, 16)``, changed.
+        sums: ``(h, w, Kp)``, changed.
 
     Returns:
         Perhaps more room for a part of an image.
     """
-    side, blocks, found = (scores.shape[2], scores.shape[3]), sums.shape[1], 0
+    side, classes, found = (scores.shape[2], scores.shape[3]), sums.shape[2], 0
     owned = len(sight.owner) > 0
     if owned:
         found = _owned_runs(tile, sight.owner, room.runs, owns)
@@ -580,9 +480,10 @@ def _add_to_tile(
         if n == 0:
             continue
         top, left, high, wide = _split(n, side, room)
-        _weigh(n, (blocks * wide, -top * blocks * wide - left), room, taps)
-        patch = _enough(patch, (high * blocks * wide + LANES) * LANES)
-        part = _part(patch, (high, blocks, wide, LANES))
+        _weigh(n, (wide, -top * wide - left), room, taps)
+        size = high * wide * classes
+        patch = _enough(patch, size)
+        part = patch[:size].reshape((high, wide, classes))
         _copy_patch(scores[m], left, top, softmax, part)
         _add_patch(part, taps, room.pixel[:n], sums)
     return patch
@@ -594,7 +495,7 @@ def add_images(
 ) -> None:
     """Add weighted scores of images to rows ``start:stop`` of a canvas, or write best classes.
 
-    Works tile by tile: the part of an image that a tile sees is copied to blocks.
+    Works tile by tile: the part of an image that a tile sees is copied.
 
     Args:
         start: First row.
@@ -603,12 +504,12 @@ def add_images(
         sight: Geometry of these images and the canvas.
         softmax: Whether to add probabilities: those of owners are of the interpolated scores,
             feathered ones are interpolated.
-        total: ``(H, B, W, 16)`` sums, changed. Empty where only labels are wanted, for which all
+        total: ``(H, W, Kp)`` sums, changed. Empty where only labels are wanted, for which all
             images of a pixel have to come at once.
         labels: ``(H, W)`` classes of the largest sums, written where `total` is empty.
     """
     num_classes, width = scores.shape[1], sight.columns.shape[1]
-    blocks, afterwards = (num_classes + LANES - 1) // LANES, softmax and len(sight.owner) > 0
+    classes, afterwards = -(-num_classes // LANES) * LANES, softmax and len(sight.owner) > 0
     owns, covered = np.ones(_count(sight), np.bool_), np.zeros(_count(sight), np.bool_)
     for image in sight.images:
         covered[image] = True
@@ -616,13 +517,13 @@ def add_images(
     of_tile = np.empty(0, np.float32)
     for tile in _tiles(start, stop, sight):
         top, bottom, left, right = tile
-        sums, step = total, (blocks * width, 0)
+        sums, step = total, (width, 0)
         if afterwards or len(total) == 0:
-            shape = bottom - top, blocks, right - left, LANES
-            of_tile = _enough(of_tile, _TILE**2 * blocks * LANES)
-            sums = _part(of_tile, shape)
+            high, wide = bottom - top, right - left
+            of_tile = _enough(of_tile, _TILE**2 * classes)
+            sums = of_tile[: high * wide * classes].reshape((high, wide, classes))
             sums[:] = 0
-            step = blocks * shape[2], -top * blocks * shape[2] - left
+            step = wide, -top * wide - left
         before = softmax and not afterwards
         patch = _add_to_tile(tile, scores, sight, before, step, owns, room, taps, patch, sums)
         if len(total) == 0:

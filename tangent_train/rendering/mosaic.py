@@ -17,7 +17,6 @@ from tangent_train.rendering.accumulate import (
     NO_OWNERS,
     add_to_panorama,
     label_panorama,
-    without_blocks,
     zero_sums,
 )
 from tangent_train.rendering.checks import check_blend
@@ -141,7 +140,7 @@ class ScoreMosaic:
 
     def probabilities(self, rows: slice | NDArray[np.intp]) -> NDArray[np.float32]:
         """``(h, W, K)`` probabilities of some rows, which add up to 1; only where averaged."""
-        total = without_blocks(self.sums[rows], self._num_classes)
+        total = self.sums[rows][..., : self._num_classes]
         return total / np.maximum(total.sum(axis=-1, keepdims=True), np.float32(1e-37))
 
     def _owners(
