@@ -217,7 +217,7 @@ def _remap(
     # cv2 is fastest with 4 channels. Other numbers it refuses, or samples at rounded positions.
     several = 3 if channels % 3 == 0 else 1
     for first in range(0, channels, several):
-        group = np.ascontiguousarray(part[..., first : first + several])
+        group = part[..., first : first + several]
         if padded:
             group = cv2.cvtColor(group, cv2.COLOR_RGB2RGBA)
         sampled = cv2.remap(group, u, v, flag, borderMode=cv2.BORDER_WRAP)

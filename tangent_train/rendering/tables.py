@@ -82,7 +82,7 @@ def set_table_cache_limit(nbytes: int) -> None:
     """Bound the memory of the rendering tables of this process, 512 MiB at first.
 
     At level 10 and base level 1 the tables take 168 MB for panorama to images and, in PyTorch,
-    117 MB back. Tables on a GPU count too.
+    117 MB back. Tables on a GPU count too; those of rotated grids have another sixteenth.
 
     Args:
         nbytes: Maximum number of bytes held; 0 disables the cache.

@@ -29,6 +29,7 @@ ROTATION = random_rotation(np.random.default_rng(2))
 def cache(monkeypatch: pytest.MonkeyPatch) -> tables.TableCache:
     fresh = tables.TableCache(limit=2**24)
     monkeypatch.setattr(tables, "TABLES", fresh)
+    monkeypatch.setattr(tables, "_ROTATED", tables.TableCache(limit=2**24))
     return fresh
 
 
@@ -97,7 +98,9 @@ def test_tables_are_computed_once(
 def test_tables_of_rotated_grids_evict_no_others(cache: tables.TableCache) -> None:
     equirect_to_tangent(np.zeros((32, 64)), TangentGrid(0, 4, rotation=ROTATION))
     tangent_to_equirect(torch.zeros(20, 1, 16, 16), TangentGrid(0, 4, rotation=ROTATION), (8, 16))
-    assert cache.nbytes == 0
+    assert cache.nbytes == 0 < tables._ROTATED.nbytes
+    set_table_cache_limit(0)
+    assert tables._ROTATED.nbytes == 0
 
 
 def test_the_cache_is_bounded_by_bytes() -> None:
