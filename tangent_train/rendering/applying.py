@@ -11,11 +11,7 @@ import torch
 from torch import Tensor
 
 from tangent_train.errors import SettingError
-from tangent_train.rendering.accumulate import (
-    NO_OWNERS,
-    add_to_panorama,
-    zero_sums,
-)
+from tangent_train.rendering.accumulate import NO_OWNERS, add_to_panorama, zero_sums
 from tangent_train.rendering.backward import Blend, tangent_to_equirect
 from tangent_train.rendering.checks import check_blend, check_panorama
 from tangent_train.rendering.forward import Pixels, equirect_to_tangent

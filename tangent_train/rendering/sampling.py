@@ -58,7 +58,7 @@ def map_dtype(exact: bool, interpolation: str) -> np.dtype[np.floating]:
 
 
 class EquirectMap(NamedTuple):
-    """Positions in an ERP, and in the part of it that is around them.
+    """Positions in an ERP, given in the part of it that is around them.
 
     Attributes:
         u: ``(h, w)`` columns in the part, float32 or float64.
