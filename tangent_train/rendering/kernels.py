@@ -21,8 +21,8 @@ from tangent_train.rendering.compiled import njit_exact, njit_fast
 LANES = 16
 """The number of scores of a pixel is a multiple of this."""
 
-_TILE = 128
-"""Rows and columns at the equator of what is added to at once: its sums stay in the cache."""
+_TILE_SCORES = 2**18
+"""Sums of what is added to at once: they stay in the cache."""
 
 _ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
 _LN_2, _LOG2_E = np.float32(math.log(2)), np.float32(1 / math.log(2))
@@ -359,25 +359,27 @@ def _copy_patch(scores: Array, left: int, top: int, softmax: bool, patch: Array)
 
 
 @njit_fast
-def _add_patch(patch: Array, taps: _Taps, pixel: Array, sums: Array) -> None:
+def _add_samples(
+    patch: Array, step: int, blocks: int, taps: _Taps, pixel: Array, sums: Array
+) -> None:
     """Add weighted bilinear samples of a patch to sums.
 
     Args:
-        patch: ``(height, width, Kp)`` scores of a part of an image.
-        taps: Of pixels.
+        patch: Scores of a part of an image, flat.
+        step: Numbers from a row of it to the next one.
+        blocks: ``Kp / LANES``: the compiler has to know that there is no rest.
+        taps: Of n pixels.
         pixel: ``(n,)`` where their sums are.
-        sums: ``(h, w, Kp)``, changed.
+        sums: ``(h, w, Kp)``, flat, changed.
     """
-    scores, flat = patch.reshape(-1), sums.reshape(-1)
-    classes = np.uint64(patch.shape[2])
-    right, below = classes, classes * np.uint64(patch.shape[1])
+    classes, below = np.uint64(LANES) * np.uint64(blocks), np.uint64(step)
     for p in range(len(pixel)):
         at, to = classes * np.uint64(taps.first[p]), classes * np.uint64(pixel[p])
         a, b, c, d = taps.a[p], taps.b[p], taps.c[p], taps.d[p]
         for k in range(classes):
-            upper = a * scores[at + k] + b * scores[at + right + k]
-            lower = c * scores[at + below + k] + d * scores[at + below + right + k]
-            flat[to + k] += upper + lower
+            upper = a * patch[at + k] + b * patch[at + classes + k]
+            lower = c * patch[at + below + k] + d * patch[at + below + classes + k]
+            sums[to + k] += upper + lower
 
 
 @njit_fast
@@ -413,15 +415,16 @@ def _add_probabilities(
 
 
 @njit_fast
-def _tiles(start: int, stop: int, sight: Sight) -> list[Tile]:
-    """Tiles of rows ``start:stop``, about square on the sphere."""
+def _tiles(start: int, stop: int, sight: Sight, pixels: int) -> list[Tile]:
+    """Tiles of `pixels` or fewer, about square on the sphere, that cover rows ``start:stop``."""
     tiles, bottom, width = [], start, sight.columns.shape[1]
     while bottom < stop:
-        top, stretch = bottom, abs(sight.rows[bottom, 0])
-        rows = max(1, int(_TILE * math.sqrt(stretch)))
-        bottom, across = min(stop, top + rows), _TILE**2 // rows
-        for left in range(0, width, across):
-            tiles.append((top, bottom, left, min(width, left + across)))  # noqa: PERF401
+        top, left = bottom, stop - bottom
+        parts = round(left / math.sqrt(pixels * abs(sight.rows[top, 0])))
+        rows = -(-left // max(1, parts))
+        bottom, across = top + rows, pixels // rows
+        for first in range(0, width, across):
+            tiles.append((top, bottom, first, min(width, first + across)))  # noqa: PERF401
     return tiles
 
 
@@ -436,11 +439,12 @@ def _write_classes(sums: Array, num_classes: int, least: float, labels: Array) -
         labels: ``(w,)``, written.
     """
     for x in range(len(labels)):
-        highest, best = np.float32(-np.inf), 0
+        highest, best = np.float32(-np.inf), np.int32(0)
         for k in range(np.uint64(num_classes)):
-            better = sums[x, k] > highest
-            best = k if better else best
-            highest = sums[x, k] if better else highest
+            score = sums[x, k]
+            # A sum, not a choice: that would be compiled to a branch, slow where classes change.
+            best += (np.int32(k) - best) * np.int32(score > highest)
+            highest = score if score > highest else highest
         unsure = least > 0 and highest < least * sums[x, :num_classes].sum()
         labels[x] = num_classes if unsure else best
 
@@ -483,9 +487,9 @@ def _add_to_tile(
         _weigh(n, (wide, -top * wide - left), room, taps)
         size = high * wide * classes
         patch = _enough(patch, size)
-        part = patch[:size].reshape((high, wide, classes))
-        _copy_patch(scores[m], left, top, softmax, part)
-        _add_patch(part, taps, room.pixel[:n], sums)
+        part, step_down = patch[:size], wide * classes
+        _copy_patch(scores[m], left, top, softmax, part.reshape((high, wide, classes)))
+        _add_samples(part, step_down, classes // LANES, taps, room.pixel[:n], sums.reshape(-1))
     return patch
 
 
@@ -513,14 +517,15 @@ def add_images(
     owns, covered = np.ones(_count(sight), np.bool_), np.zeros(_count(sight), np.bool_)
     for image in sight.images:
         covered[image] = True
-    room, taps, patch = _room(_TILE**2), _room_for_taps(_TILE**2), np.empty(0, np.float32)
+    pixels = max(64, _TILE_SCORES // classes)
+    room, taps, patch = _room(pixels), _room_for_taps(pixels), np.empty(0, np.float32)
     of_tile = np.empty(0, np.float32)
-    for tile in _tiles(start, stop, sight):
+    for tile in _tiles(start, stop, sight, pixels):
         top, bottom, left, right = tile
         sums, step = total, (width, 0)
         if afterwards or len(total) == 0:
             high, wide = bottom - top, right - left
-            of_tile = _enough(of_tile, _TILE**2 * classes)
+            of_tile = _enough(of_tile, pixels * classes)
             sums = of_tile[: high * wide * classes].reshape((high, wide, classes))
             sums[:] = 0
             step = wide, -top * wide - left
@@ -633,11 +638,11 @@ def label_images(start: int, stop: int, scores: Array, sight: Sight, labels: Arr
         sight: Geometry of these images and the canvas, with owners.
         labels: ``(H, W)``, written.
     """
-    side, width = (scores.shape[2], scores.shape[3]), labels.shape[1]
-    room, taps, owns = _room(_TILE**2), _room_for_taps(_TILE**2), np.empty(_count(sight), np.bool_)
-    highest, unlike = np.empty(max(side[1], _TILE**2), np.float32), np.empty(_TILE**2, np.int32)
+    side, width, pixels = (scores.shape[2], scores.shape[3]), labels.shape[1], _TILE_SCORES // LANES
+    room, taps, owns = _room(pixels), _room_for_taps(pixels), np.empty(_count(sight), np.bool_)
+    highest, unlike = np.empty(max(side[1], pixels), np.float32), np.empty(pixels, np.int32)
     best, flat = np.empty(0, np.int32), labels.reshape(-1)
-    for tile in _tiles(start, stop, sight):
+    for tile in _tiles(start, stop, sight, pixels):
         found = _owned_runs(tile, sight.owner, room.runs, owns)
         for m in range(len(scores)):
             if not owns[sight.images[m]]:

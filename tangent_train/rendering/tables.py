@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Sequence
 from contextlib import suppress
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tangent_train.errors import SettingError
-from tangent_train.geometry import PinholeGrid, equirect_latitudes, xyz_to_lonlat
+from tangent_train.geometry import PinholeGrid
 from tangent_train.rendering import kernels
 from tangent_train.rendering.compiled import njit_exact, over_rows
 from tangent_train.rendering.sampling import (
@@ -251,26 +252,66 @@ def sight_of(
     axes = grid.world_from_camera[faces]
     matrices = np.ascontiguousarray(grid.camera_matrix @ axes.transpose(0, 2, 1))
     columns, lines = sphere_rays(shape)
-    if owner.size > 0:
-        spans = np.empty((len(faces), 0, 2), np.int32)
-    else:
-        spans = _spans(grid, faces, shape[1], equirect_latitudes(shape[0])[rows])
+
+    def build() -> tuple[NDArray[np.int32]]:
+        spans = np.empty((len(faces), rows.stop - rows.start, 2), np.int32)
+        u, v, w = matrices[:, None].transpose(2, 0, 1, 3)
+        last = grid.dim - 0.5
+        edges = np.concatenate([u + w / 2, last * w - u, v + w / 2, last * w - v], axis=1)
+        over_rows(find_spans, spans.shape[1], len(faces), edges, lines[rows], shape[1], spans)
+        return (spans,)
+
+    spans = np.empty((0, 0, 2), np.int32)
+    if owner.size == 0:
+        key = "spans", shape, rows.start, rows.stop, *map(int, faces)
+        (spans,) = _cached(grid, key, build)
     return kernels.Sight(faces, matrices, spans, columns, lines[rows], owner)
 
 
-def _spans(
-    grid: PinholeGrid, faces: NDArray[np.int64], width: int, row_lat: NDArray[np.float64]
-) -> NDArray[np.int32]:
-    """Columns of ERP rows that may see something of images: within their corners' angle."""
-    reach = np.arctan(np.sqrt(2) * grid.dim / 2 * grid.pitch)
-    lon, lat = xyz_to_lonlat(grid.centers_xyz[faces]).T[..., None]
-    # cos(reach) = sin φ sin φ₀ + cos φ cos φ₀ cos(λ − λ₀)
-    across = np.maximum(np.cos(row_lat) * np.cos(lat), 1e-12)
-    cosine = (np.cos(reach) - np.sin(row_lat) * np.sin(lat)) / across
-    spread = np.arccos(cosine.clip(-1, 1)) / (2 * np.pi) * width
-    first = np.floor((lon / (2 * np.pi) + 0.5) * width - spread) - 1
-    count = np.where(cosine > 1 + 1e-9, 0, np.minimum(width, np.ceil(2 * spread) + 3))
-    return np.stack([first % width, count], axis=-1).astype(np.int32)
+@njit_exact
+def find_spans(start: int, stop: int, edges: Array, rows: Array, width: int, spans: Array) -> None:
+    """Find the columns of ERP rows ``start:stop`` that may see something of images.
+
+    An image is seen between four planes through the centre of the sphere. What a row sees of it
+    begins and ends where the row crosses one of them between the others.
+
+    Args:
+        start: First row.
+        stop: One past the last row.
+        edges: ``(n, 4, 3)`` normals of the planes, inwards.
+        rows: From `sphere_rays`.
+        width: W.
+        spans: ``(n, H, 2)`` see `kernels.Sight`, written.
+    """
+    for m in range(len(edges)):
+        forward = edges[m, 0] + edges[m, 1]
+        middle = math.atan2(forward[1], forward[0])
+        x0, y0 = math.cos(middle), math.sin(middle)
+        for i in range(start, stop):
+            r, z = rows[i]
+            least, most, around = math.inf, -math.inf, True
+            for nx, ny, nz in edges[m]:
+                # Opposite of the middle an image is seen only beyond a pole that it contains.
+                around &= nz * z - r * (nx * x0 + ny * y0) >= 0
+                ground = math.hypot(nx, ny)
+                c = -nz * z / (r * ground)  # cosine of the angle from (nx, ny) to the crossings
+                if not -1 < c < 1:
+                    continue
+                for s in (-math.sqrt(1 - c * c), math.sqrt(1 - c * c)):
+                    x, y = r * (nx * c - ny * s) / ground, r * (ny * c + nx * s) / ground
+                    seen = True
+                    for ox, oy, oz in edges[m]:
+                        seen &= ox * x + oy * y + oz * z > -1e-6
+                    if seen:
+                        angle = math.atan2(x0 * y - y0 * x, x0 * x + y0 * y)
+                        least, most = min(least, angle), max(most, angle)
+            if around:
+                least, most = -math.pi, math.pi
+            spans[m, i] = 0
+            if least <= most:
+                first = math.floor(((middle + least) / (2 * math.pi) + 0.5) * width - 0.5)
+                last = math.ceil(((middle + most) / (2 * math.pi) + 0.5) * width - 0.5)
+                spans[m, i, 0], spans[m, i, 1] = first % width, min(last - first + 1, width)
 
 
 def tensors_on(

@@ -20,6 +20,7 @@ from tangent_train.rendering import (
     tangent_to_equirect,
     tangent_to_labels,
 )
+from tangent_train.rendering.accumulate import NO_OWNERS
 from tangent_train.rendering.compiled import over_rows
 
 ROTATION = random_rotation(np.random.default_rng(2))
@@ -45,6 +46,21 @@ def test_owners_are_the_nearest_centres(
     owned = np.take_along_axis(cosines, owner[..., None], axis=-1)[..., 0]
     np.testing.assert_allclose(owned, cosines.max(axis=-1), rtol=0, atol=1e-12)
     np.testing.assert_array_equal(tables.owners(grid, shape), owner)
+
+
+@pytest.mark.parametrize("at_pole", [None, 0, 7])
+def test_spans_hold_what_images_see_and_little_more(at_pole: int | None) -> None:
+    shape, grid = (130, 200), TangentGrid(1, 6)
+    if at_pole is not None:
+        grid = grid.with_rotation([[1], [-1], [1]] * grid.world_from_camera[at_pole].T)
+    sight = tables.sight_of(grid, grid.face_indices(), shape, slice(0, 130), NO_OWNERS)
+    first, count = np.moveaxis(sight.spans[..., None], 2, 0)
+    held = (np.arange(shape[1]) - first) % shape[1] < count
+    x, y, z = np.einsum("nji,hwj->inhw", grid.world_from_camera, equirect_directions(shape))
+    half = grid.dim / 2 * grid.pitch
+    seen = (z > 0) & (np.maximum(np.abs(x), np.abs(y)) < half * z)
+    assert not np.any(seen & ~held)
+    assert held.sum() < 1.1 * seen.sum()
 
 
 @pytest.mark.parametrize("blend", ["feather", "nearest"])
