@@ -58,8 +58,6 @@ SMALL: dict[str, Any] = {
     "fine_tuning.epochs": "[]",
     "seeds": "[0]",
     "folds": "[1]",
-    "study_levels": "[5,6]",
-    "study_max_rows": 128,
     "max_pairs": 2,
 }
 """Appended to a command where its config has the setting and it is not null."""

@@ -174,31 +174,36 @@ def test_a_damaged_file_is_found(
 # --- left out -----------------------------------------------------------------------------------
 
 
-def _damage(kind: str, root: Path) -> tuple[Path, Path]:
-    """An image whose header tells that it is broken, and one that has to be read for that."""
+def _damage(kind: str, root: Path, *, headers: bool = True) -> list[Path]:
+    """Two broken files: the header of the first tells it, the other one has to be decoded."""
     paths = [path for path in _colors(kind, root) if kind != "folder" or path.suffix == ".png"]
-    _truncate(paths[0])
-    if kind == "shapes":
-        _truncate(paths[-1])
-        return paths[0], paths[-1]
-    labels = _partner(kind, paths[-1], "labels")
-    _corrupt(labels)
-    return paths[0], labels
+    broken = [paths[1], paths[-1]]
+    for number, path in enumerate(broken):
+        if kind == "shapes" or (headers and number == 0):
+            _truncate(path)
+        else:
+            broken[number] = _partner(kind, path, "labels")
+            _corrupt(broken[number])
+    return broken
 
 
+@pytest.mark.parametrize("stored", [False, True])
 @pytest.mark.parametrize("kind", _KINDS)
 def test_broken_files_are_refused_or_left_out_and_counted(
-    kind: str, root: Path, capsys: pytest.CaptureFixture[str]
+    kind: str, stored: bool, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    whole = _module(kind, root)
+    whole, settings = _module(kind, root), {"store": tmp_path / "store" if stored else None}
     before = {split: names_of(whole, split) for split in SPLITS}
     total = sum(map(len, before.values()))
-    first, _ = _damage(kind, root)
+    broken = _damage(kind, root, headers=not stored)
     with pytest.raises(DataError) as refused:
-        _module(kind, root).prepare_data()
-    assert str(first) in str(refused.value)
+        _module(kind, root, **settings).prepare_data()
+    named = [str(path) in str(refused.value) for path in broken]
+    assert named == [True, stored or kind == "shapes"]
+    kept = len(list((tmp_path / "store").rglob("*.npy")))
+    assert kept == (total - 2 if stored else 0), "every readable one is stored"
     capsys.readouterr()
-    data = _module(kind, root, skip_broken=True)
+    data = _module(kind, root, skip_broken=True, **settings)
     data.prepare_data()
     data.setup()
     printed = [line for line in capsys.readouterr().out.splitlines() if "left out" in line]
@@ -214,31 +219,6 @@ def test_broken_files_are_refused_or_left_out_and_counted(
         for index in range(len(after)):
             data.source(split).read(index)
     assert left == total - 2
-
-
-@pytest.mark.parametrize("kind", ["folder"])
-def test_a_store_has_no_holes_unless_they_are_asked_for(
-    kind: str, root: Path, tmp_path: Path
-) -> None:
-    total = len(_colors(kind, root))
-    broken = [_partner(kind, path, "labels") for path in (_colors(kind, root)[i] for i in (5, -1))]
-    for path in broken:
-        _corrupt(path)
-    store = tmp_path / "store"
-    data = _module(kind, root, store=store)
-    with pytest.raises(DataError, match="found 2 problems") as caught:
-        data.prepare_data()
-    data.setup()
-    assert all(str(path) in str(caught.value) for path in broken), "not only the first"
-    assert len(list(store.rglob("*.npy"))) == total - 2, "every readable image is stored"
-    data = _module(kind, root, store=store, skip_broken=True)
-    data.prepare_data()
-    data.setup()
-    sources = [data.source(split) for split in SPLITS]
-    assert sum(map(len, sources)) == total - 2
-    for source in sources:
-        for index in range(len(source)):
-            assert source.read(index).rgb.shape == (16, 32, 3)
 
 
 # --- as training begins -------------------------------------------------------------------------
