@@ -63,10 +63,8 @@ def _blocks(height: int, width: int) -> NDArray[np.uint8]:
 
 
 def test_images_share_memory_only_one_after_the_other() -> None:
-    trained, (bright, dark) = (
-        trained_network(TANGENT),
-        (_blocks(32, 64), _blocks(32, 64)[::-1].copy()),
-    )
+    trained = trained_network(TANGENT)
+    bright, dark = _blocks(32, 64), _blocks(32, 64)[::-1].copy()
     predictor = Predictor(trained, PanoramaViews(trained, blend="feather"))
     first = predictor.predict(InputImage(bright))
     expected = first.probabilities(slice(None))

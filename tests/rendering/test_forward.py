@@ -10,12 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from tangent_train.errors import SettingError
-from tangent_train.geometry import (
-    TangentGrid,
-    equirect_shape,
-    random_rotation,
-    xyz_to_lonlat,
-)
+from tangent_train.geometry import TangentGrid, equirect_shape, random_rotation, xyz_to_lonlat
 from tangent_train.rendering import equirect_to_tangent, sampling
 
 Array = NDArray[Any]

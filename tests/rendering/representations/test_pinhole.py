@@ -80,7 +80,7 @@ def test_labels_come_back_from_the_views_of_the_whole_sphere(
         EquirectRepresentation(5, rotation="so3"),
     ],
 )
-def test_a_sample_depends_on_its_generator_alone_and_keeps_image_and_labels_together(
+def test_a_sample_depends_on_its_generator_alone_and_rotates_with_the_whole(
     representation: Representation,
 ) -> None:
     labels = _labels()
@@ -95,6 +95,8 @@ def test_a_sample_depends_on_its_generator_alone_and_keeps_image_and_labels_toge
         seen.append(label_views)
     np.testing.assert_array_equal(seen[0], seen[1])
     assert not np.array_equal(seen[0], seen[2])
+    plain, rotated = (r.sample(_rng()) for r in (representation, representation.turned(TILT)))
+    np.testing.assert_allclose(rotated.rotations(), TILT @ plain.rotations(), atol=1e-12)
 
 
 def test_faces_are_drawn_without_repetition_and_all_of_them_sooner_or_later() -> None:
@@ -171,19 +173,6 @@ def test_rotated_views_see_the_panorama_rotated_back(representation: Representat
     expected = representation.whole().render(rotate_equirect(image, TILT.T), "bilinear")
     np.testing.assert_allclose(views, expected, atol=2)
     np.testing.assert_array_equal(representation.turned(TILT).whole().rotations(), TILT[None])
-
-
-@pytest.mark.parametrize(
-    "representation",
-    [
-        TangentRepresentation(0, 5, rotation="so3"),
-        CubemapRepresentation(5, rotation="yaw"),
-        EquirectRepresentation(5, rotation="so3"),
-    ],
-)
-def test_samples_are_rotated_with_the_whole(representation: Representation) -> None:
-    plain, rotated = (r.sample(_rng()) for r in (representation, representation.turned(TILT)))
-    np.testing.assert_allclose(rotated.rotations(), TILT @ plain.rotations(), atol=1e-12)
 
 
 @pytest.mark.parametrize("rows", [24, 100])
