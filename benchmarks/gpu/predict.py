@@ -21,7 +21,7 @@ from tangent_train.checkpoints.trained import TrainedNetwork
 from tangent_train.cli.processes import command_line, run_process
 from tangent_train.geometry import TangentGrid, equirect_shape
 from tangent_train.inference.photo_networks import PhotoNetwork, import_network
-from tangent_train.inference.predictor import Predictor, view_scores
+from tangent_train.inference.predictor import Predictor, view_scores, views_per_forward
 from tangent_train.inference.views import InputImage, PanoramaViews
 from tangent_train.registry import make
 from tangent_train.rendering import equirect_to_tangent, tangent_to_labels
@@ -66,7 +66,7 @@ def _rows(trained: TrainedNetwork, level: int, rounds: int) -> list[Row]:
         blend: Predictor(trained, PanoramaViews(trained, blend=blend), DEVICE.type)
         for blend in ("feather", "nearest")
     }
-    per_forward = max(1, 2**20 // grid.dim**2)
+    per_forward = views_per_forward((grid.dim, grid.dim))
     count = min(per_forward, grid.num_images)
     random = torch.randn(count, 3, grid.dim, grid.dim, device=DEVICE)
     random = random.contiguous(memory_format=torch.channels_last)

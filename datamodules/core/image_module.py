@@ -32,13 +32,7 @@ from datamodules.core.panoramas import (
     Turn,
     check_headers,
 )
-from datamodules.core.pipeline import (
-    EstimatedUp,
-    PanoramaJudge,
-    PosedUp,
-    RotatedPanoramas,
-    masked,
-)
+from datamodules.core.pipeline import EstimatedUp, PanoramaJudge, PosedUp, RotatedPanoramas, masked
 from datamodules.core.problems import Problems
 from datamodules.core.progress import show_progress
 from datamodules.core.samples import EvaluationImages, TrainingImages

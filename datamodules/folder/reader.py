@@ -17,12 +17,7 @@ from datamodules.folder.cameras import FolderCameras
 from datamodules.folder.classes import FolderClasses, read_classes
 from datamodules.images.image_files import IMAGE_SUFFIXES, find_depth, image_paths, walk_files
 from datamodules.images.masks import Masks
-from datamodules.images.pixel_files import (
-    read_depth_m,
-    read_image_size,
-    read_pixels,
-    read_rgb,
-)
+from datamodules.images.pixel_files import read_depth_m, read_image_size, read_pixels, read_rgb
 from datamodules.images.png import PngHeader, read_png_header
 from tangent_train.errors import DataError, SettingError
 

@@ -31,12 +31,7 @@ from tangent_train.inference.predictor import Predictor
 from tangent_train.inference.views import InputImage, PanoramaViews, PhotoViews
 from tangent_train.results.html import EncodedImage
 from tangent_train.results.pictures import evenly_spread
-from tangent_train.results.predictions import (
-    Entry,
-    Kind,
-    PredictionFolder,
-    class_shares,
-)
+from tangent_train.results.predictions import Entry, Kind, PredictionFolder, class_shares
 
 _DECISIVE = (
     "checkpoint", "class_map", "unmapped", "depth_scale", "projection", "crop", "fov", "level",

@@ -37,8 +37,6 @@ _RUN = {
 
 _EXPECTED = "the settings of a run"
 
-_PIXELS_PER_FORWARD = 2**20
-
 
 @dataclass(frozen=True)
 class StoredRun:
@@ -155,6 +153,7 @@ class StoredNetwork:
             DataError: The file cannot be used.
         """
         from tangent_train.checkpoints.trained import load_trained
+        from tangent_train.inference.predictor import views_per_forward
         from tangent_train.inference.views import panorama_settings
 
         own = _named(self.typed)
@@ -180,9 +179,8 @@ class StoredNetwork:
         if "inputs" in said["data"]:  # images, not shapes
             known = {name: v for name, v in tied.items() if f"data.{name}" not in own}
             settings["data"] = dict(said["data"]) | known
-        rows, columns = trained.image_size
         if "task.images_per_forward" not in own:  # photo networks have many classes, large images
-            at_once = max(1, _PIXELS_PER_FORWARD // (rows * columns))
+            at_once = views_per_forward(trained.image_size)
             settings["task"] = dict(said["task"]) | {"images_per_forward": at_once}
         of_user = (said.keys() - {"network", "representation"}) | own
         return settings, SettingsFile(self.path, trust, of_user), trained

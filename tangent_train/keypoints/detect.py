@@ -11,11 +11,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from tangent_train.geometry import equirect_to_lonlat, lonlat_to_xyz
-from tangent_train.keypoints.spherical import (
-    SphericalKeypoints,
-    equirect_jacobian,
-    local_to_sphere,
-)
+from tangent_train.keypoints.spherical import SphericalKeypoints, equirect_jacobian, local_to_sphere
 from tangent_train.rendering import equirect_to_tangent
 
 if TYPE_CHECKING:

@@ -22,10 +22,7 @@ from tangent_train.rendering.representations.pinhole import (
     CubemapRepresentation,
     TangentRepresentation,
 )
-from tangent_train.rendering.representations.views import (
-    Assembler,
-    Representation,
-)
+from tangent_train.rendering.representations.views import Assembler, Representation
 from tangent_train.rendering.tables import set_table_cache_limit
 
 __all__ = [

@@ -12,12 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tangent_train.geometry import PinholeGrid
-from tangent_train.rendering.accumulate import (
-    NO_OWNERS,
-    add_to_panorama,
-    label_panorama,
-    zero_sums,
-)
+from tangent_train.rendering.accumulate import NO_OWNERS, add_to_panorama, label_panorama, zero_sums
 from tangent_train.rendering.checks import (
     check_blend,
     check_images,

@@ -13,12 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tangent_train.rendering import kernels
-from tangent_train.rendering.accumulate import (
-    NO_OWNERS,
-    add_to_panorama,
-    label_panorama,
-    zero_sums,
-)
+from tangent_train.rendering.accumulate import NO_OWNERS, add_to_panorama, label_panorama, zero_sums
 from tangent_train.rendering.checks import check_blend
 from tangent_train.rendering.compiled import over_rows
 from tangent_train.rendering.sampling import plane_rays

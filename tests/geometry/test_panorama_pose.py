@@ -7,12 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tangent_train.errors import SettingError
-from tangent_train.geometry import (
-    FLIP_Y,
-    PanoramaPose,
-    random_rotation,
-    xyz_to_lonlat,
-)
+from tangent_train.geometry import FLIP_Y, PanoramaPose, random_rotation, xyz_to_lonlat
 
 
 def posed(seed: int, mirrored: bool) -> PanoramaPose:

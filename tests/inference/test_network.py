@@ -16,13 +16,7 @@ import tangent_train as tt
 from tangent_train.errors import DataError, SettingError
 from tangent_train.inference.network import Network
 from tests.cli.tiny_runs import run_command
-from tests.inference.trained import (
-    CUBE,
-    PERSPECTIVE,
-    TANGENT,
-    sphere,
-    write_checkpoint,
-)
+from tests.inference.trained import CUBE, PERSPECTIVE, TANGENT, sphere, write_checkpoint
 
 Predicted = Callable[..., tuple[NDArray[Any], NDArray[Any]]]
 

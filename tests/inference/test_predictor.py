@@ -21,11 +21,7 @@ from datamodules.core.samples import render_inputs
 from tangent_train.checkpoints.scores import Scores
 from tangent_train.checkpoints.trained import TrainedNetwork
 from tangent_train.errors import SettingError
-from tangent_train.geometry import (
-    TangentGrid,
-    camera_matrix_from_fov,
-    rotation_about,
-)
+from tangent_train.geometry import TangentGrid, camera_matrix_from_fov, rotation_about
 from tangent_train.inference.predictor import Predictor
 from tangent_train.inference.views import InputImage, PanoramaViews, PhotoViews
 from tangent_train.registry import make

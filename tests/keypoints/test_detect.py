@@ -9,12 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from tangent_train.geometry import (
-    TangentGrid,
-    lonlat_to_xyz,
-    random_rotation,
-    rotation_about,
-)
+from tangent_train.geometry import TangentGrid, lonlat_to_xyz, random_rotation, rotation_about
 from tangent_train.keypoints.detect import (
     detect,
     detect_on_equirect,

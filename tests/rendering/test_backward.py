@@ -10,11 +10,7 @@ import torch
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry import TangentGrid
-from tangent_train.rendering import (
-    equirect_to_tangent,
-    tangent_to_equirect,
-    tangent_to_labels,
-)
+from tangent_train.rendering import equirect_to_tangent, tangent_to_equirect, tangent_to_labels
 
 BLENDS: list[Any] = ["nearest", "feather"]
 

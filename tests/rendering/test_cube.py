@@ -7,10 +7,7 @@ import pytest
 import torch
 
 from tangent_train.geometry import CubeGrid, equirect_directions
-from tangent_train.rendering import (
-    tangent_to_equirect,
-    tangent_to_labels,
-)
+from tangent_train.rendering import tangent_to_equirect, tangent_to_labels
 
 
 @pytest.mark.parametrize("shape", [(6, 12), (33, 67)])

@@ -12,12 +12,7 @@ import pytest
 from PIL import Image, ImageFile
 
 from datamodules.images.gpano import area_of
-from datamodules.images.pixel_files import (
-    read_depth_m,
-    read_image_size,
-    read_pixels,
-    read_rgb,
-)
+from datamodules.images.pixel_files import read_depth_m, read_image_size, read_pixels, read_rgb
 from tangent_train.errors import DataError
 from tests.slow.fuzz.mutation import sealed_png
 

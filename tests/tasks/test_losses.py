@@ -7,11 +7,7 @@ import pytest
 import torch
 from torch.nn import functional
 
-from tangent_train.tasks.losses import (
-    auxiliary_sum,
-    cross_entropy_norm,
-    cross_entropy_sum,
-)
+from tangent_train.tasks.losses import auxiliary_sum, cross_entropy_norm, cross_entropy_sum
 
 
 @pytest.mark.parametrize("smoothing", [0.0, 0.1])

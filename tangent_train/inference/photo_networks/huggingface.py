@@ -11,10 +11,7 @@ from torch import Tensor
 from datamodules.core.inputs import Normalization
 from models.huggingface import HuggingFaceNetwork, architecture
 from tangent_train.errors import DataError, SettingError
-from tangent_train.inference.photo_networks.network import (
-    PhotoNetwork,
-    class_names_in,
-)
+from tangent_train.inference.photo_networks.network import PhotoNetwork, class_names_in
 from tangent_train.inference.photo_networks.saved import json_in, saved_folder, tensors_in
 from tangent_train.inference.quiet import quiet
 from tangent_train.registry import SettingsFile, make

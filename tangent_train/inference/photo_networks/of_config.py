@@ -10,11 +10,7 @@ from datamodules.core.inputs import Normalization
 from models.pretrained import load_tensors, read_tensors
 from tangent_train.checkpoints.trained import completed_settings
 from tangent_train.errors import SettingError
-from tangent_train.inference.photo_networks.network import (
-    USUAL_SIZE,
-    PhotoNetwork,
-    class_names_in,
-)
+from tangent_train.inference.photo_networks.network import USUAL_SIZE, PhotoNetwork, class_names_in
 from tangent_train.registry import make
 
 

@@ -8,11 +8,7 @@ from typing import Any
 from datamodules.core.inputs import Normalization
 from models.onnx_network import OnnxNetwork
 from tangent_train.errors import SettingError
-from tangent_train.inference.photo_networks.network import (
-    USUAL_SIZE,
-    PhotoNetwork,
-    class_names_in,
-)
+from tangent_train.inference.photo_networks.network import USUAL_SIZE, PhotoNetwork, class_names_in
 
 
 def load(*, file: Path | None, classes: Path | None, normalization: Any, **_: Any) -> PhotoNetwork:

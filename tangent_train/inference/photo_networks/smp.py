@@ -8,11 +8,7 @@ from typing import Any
 from datamodules.core.inputs import Normalization
 from models.pretrained import load_tensors
 from tangent_train.errors import DataError, SettingError
-from tangent_train.inference.photo_networks.network import (
-    USUAL_SIZE,
-    PhotoNetwork,
-    class_names_in,
-)
+from tangent_train.inference.photo_networks.network import USUAL_SIZE, PhotoNetwork, class_names_in
 from tangent_train.inference.photo_networks.saved import json_in, saved_folder, tensors_in
 from tangent_train.registry import SettingsFile, make
 

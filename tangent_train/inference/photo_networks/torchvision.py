@@ -12,10 +12,7 @@ from torchvision.models import WeightsEnum
 from datamodules.core.inputs import Normalization
 from models.pretrained import fetch_tensors, load_tensors, read_tensors
 from tangent_train.errors import SettingError
-from tangent_train.inference.photo_networks.network import (
-    PhotoNetwork,
-    class_names_in,
-)
+from tangent_train.inference.photo_networks.network import PhotoNetwork, class_names_in
 
 _AUXILIARY = "aux_classifier."
 

@@ -13,13 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tangent_train.files import csv_text, write_text
-from tangent_train.results.keypoints.compare import (
-    AS_GIVEN,
-    AUC_DEG,
-    ROTATED,
-    Comparison,
-    Row,
-)
+from tangent_train.results.keypoints.compare import AS_GIVEN, AUC_DEG, ROTATED, Comparison, Row
 from tangent_train.results.tables import Table, percent
 
 if TYPE_CHECKING:

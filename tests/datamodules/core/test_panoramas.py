@@ -6,12 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from datamodules.core.panoramas import (
-    mask_black,
-    resize_area,
-    resize_depth,
-    resize_nearest,
-)
+from datamodules.core.panoramas import mask_black, resize_area, resize_depth, resize_nearest
 
 # --- sizes -------------------------------------------------------------------------------------
 

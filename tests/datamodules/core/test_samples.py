@@ -8,18 +8,9 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from datamodules.core.inputs import (
-    RGB_NORMALIZATION,
-    RGBD_NORMALIZATION,
-    Input,
-    normalize,
-)
+from datamodules.core.inputs import RGB_NORMALIZATION, RGBD_NORMALIZATION, Input, normalize
 from datamodules.core.panoramas import Panorama
-from datamodules.core.samples import (
-    TrainingImages,
-    jitter_colors,
-    render_inputs,
-)
+from datamodules.core.samples import TrainingImages, jitter_colors, render_inputs
 from tangent_train.geometry import equirect_directions
 from tangent_train.rendering import EquirectRepresentation, TangentRepresentation
 from tangent_train.rendering.representations.views import Representation

@@ -11,16 +11,8 @@ from datamodules.core.panoramas import Photo
 from datamodules.folder.labelled import FolderPhotos
 from tangent_train.errors import DataError
 from tangent_train.rendering import PerspectiveRepresentation
-from tests.datamodules.folder.folder_format import (
-    CLASS_OF_STORED,
-    save,
-    write_classes,
-)
-from tests.datamodules.folder.photo_format import (
-    displayed,
-    write_cameras,
-    write_photo,
-)
+from tests.datamodules.folder.folder_format import CLASS_OF_STORED, save, write_classes
+from tests.datamodules.folder.photo_format import displayed, write_cameras, write_photo
 
 CROPS = PerspectiveRepresentation(level=4, fov_deg=20, dim=8)
 K: list[list[float]] = [[70, 0, 30.5], [0, 72, 20], [0, 0, 1]]

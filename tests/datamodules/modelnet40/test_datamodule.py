@@ -14,15 +14,9 @@ from datamodules.core.found import SPLITS, Split
 from datamodules.modelnet40.datamodule import ModelNet40
 from datamodules.modelnet40.meshes import CHANNELS, clean_mesh, mesh_spheres, read_off
 from datamodules.modelnet40.shape_files import MODELNET40, find_shapes
-from datamodules.modelnet40.shape_samples import (
-    STEPS,
-    ShapeViews,
-)
+from datamodules.modelnet40.shape_samples import STEPS, ShapeViews
 from tangent_train.errors import DataError
-from tangent_train.rendering import (
-    TangentRepresentation,
-    equirect_to_tangent,
-)
+from tangent_train.rendering import TangentRepresentation, equirect_to_tangent
 from tests.datamodules.data_files import names_of
 from tests.datamodules.modelnet40.shapes_format import COUNTS, write_tree
 

@@ -20,12 +20,7 @@ from datamodules.synthrooms.raycast import RayScene
 from datamodules.synthrooms.render import MISSING, Camera, Holes, Picture, render
 from datamodules.synthrooms.room import Light, Room
 from datamodules.synthrooms.scene import shell
-from tangent_train.geometry import (
-    FLIP_Y,
-    equirect_directions,
-    random_rotation,
-    rotation_about,
-)
+from tangent_train.geometry import FLIP_Y, equirect_directions, random_rotation, rotation_about
 
 SIZE = np.array([5.0, 4.0, 3.0])
 HERE = np.array([1.5, 2.2, 1.4])

@@ -13,11 +13,7 @@ from segmentation_models_pytorch import encoders
 
 from tangent_train.errors import DataError, SettingError
 from tangent_train.inference.photo_networks import PhotoNetwork, import_network, smp
-from tests.inference.photo_networks.huggingface_networks import (
-    change_json,
-    imported_scores,
-    photo,
-)
+from tests.inference.photo_networks.huggingface_networks import change_json, imported_scores, photo
 
 NAMES = ["wall", "floor", "sky"]
 

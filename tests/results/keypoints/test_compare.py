@@ -6,14 +6,7 @@ import numpy as np
 import pytest
 
 from datamodules.core.panorama_pairs import PanoramaPair
-from tangent_train.results.keypoints.compare import (
-    AS_GIVEN,
-    CUBE,
-    ROTATED,
-    SHRUNK,
-    Comparer,
-    Ways,
-)
+from tangent_train.results.keypoints.compare import AS_GIVEN, CUBE, ROTATED, SHRUNK, Comparer, Ways
 from tests.results.keypoints.ball_room import ball_pair
 
 pytest.importorskip("pycolmap")

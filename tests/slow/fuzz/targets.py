@@ -28,11 +28,7 @@ from datamodules.stanford2d3ds.reader import CLASSES, LabelTable, read_camera_ma
 from datamodules.zind.homes import list_panoramas
 from tangent_train.errors import DataError
 from tangent_train.geometry import TangentGrid, rotation_about
-from tangent_train.rendering.camera_files import (
-    CameraFile,
-    read_cameras,
-    write_cameras,
-)
+from tangent_train.rendering.camera_files import CameraFile, read_cameras, write_cameras
 from tests.datamodules.data_files import GPANO_TAGS, gpano_xmp
 from tests.datamodules.folder.folder_format import VALUES
 from tests.datamodules.zind.zind_format import SQUARE, Camera, write_home
