@@ -28,13 +28,8 @@ from torch.utils.collect_env import get_pretty_env_info
 from benchmarks.measuring import DEVICE, FAILURES, Table, attempted
 from tangent_train.results.tables import Table as TextTable
 
-MEASURED = {
-    "images": "benchmarks.images",
-    "labels": "benchmarks.labels",
-    "loader": "benchmarks.training",
-    "step": "benchmarks.training",
-    "evaluation": "benchmarks.training",
-}
+MEASURED = {name: f"benchmarks.{name}" for name in ("images", "labels")}
+MEASURED |= dict.fromkeys(("loader", "step", "evaluation"), "benchmarks.training")
 """Modules of the rows; each has a function of the same name."""
 
 ON_A_GPU = {name: f"benchmarks.gpu.{name}" for name in ("render", "step", "predict", "fed")}
@@ -132,9 +127,9 @@ def quotients(tables: Sequence[Table]) -> dict[str, dict[str, float]]:
     for table in tables:
         for row in table.rows[1:]:
             if row.ours:
-                values = table.ratios(row.name)
-                interval = {"median": table.ratio(row.name), "low": min(values)}
-                found[f"{table.name}: {row.name}"] = interval | {"high": max(values)}
+                values, name = table.ratios(row.name), f"{table.name}: {row.name}"
+                found[name] = {"median": statistics.median(values)}
+                found[name] |= {"low": min(values), "high": max(values)}
     return found
 
 
@@ -169,14 +164,11 @@ def compare(content: Mapping[str, Any]) -> None:
 
 def write_baseline(runs: Sequence[Mapping[str, Any]]) -> None:
     """Write the median of several runs' medians, and the widest interval."""
+    picked: dict[str, Any] = {"median": statistics.median_low, "low": min, "high": max}
     rows = {}
     for name in dict.fromkeys(name for one in runs for name in one["quotients"]):
         found = [one["quotients"][name] for one in runs if name in one["quotients"]]
-        row = {
-            "median": statistics.median_low(one["median"] for one in found),
-            "low": min(one["low"] for one in found),
-            "high": max(one["high"] for one in found),
-        }
+        row = {key: pick([one[key] for one in found]) for key, pick in picked.items()}
         rows[name] = {key: float(f"{value:.4g}") for key, value in row.items()}
     cores = sorted({one["cores"] for one in runs})
     text = json.dumps({"cores": cores, "runs": len(runs), "quotients": rows}, indent=1)

@@ -30,11 +30,10 @@ _WARM, _TIMED, _PROFILED = (8, 30, 10) if _ON_GPU else (1, 2, 1)
 
 def fed(quick: bool) -> Iterator[Table]:
     """The paper's best row at level 10, in bf16: FCN-ResNet101 on 16 RGB-D images a step."""
-    settings = ["experiment=paper/semseg_s10_b1_rgbd", "network.weights=null"]
+    level, rooms = (5, 4) if quick else (10, 32)
+    settings = ["experiment=paper/semseg_s10_b1_rgbd", f"level={level}", "network.weights=null"]
     settings += ["task.images_per_chunk=null", "task.channels_last=true", "data.in_memory=false"]
     settings += [f"task.class_weights={[1] * 13}"]
-    level, rooms = (5, 4) if quick else (10, 32)
-    settings.append(f"level={level}")
     with tempfile.TemporaryDirectory() as root:
         settings.append(f"data.store={root}/store")
         data, task = built(settings, f"{root}/rooms", 2 ** (level + 1), rooms)

@@ -45,8 +45,8 @@ def predict(quick: bool) -> Iterator[Table]:
                     table.goals.append(Goal(goal, outside, 10))
                 yield table
         _imported(networks["SegFormer-B0"], 7 if quick else 9, path)
-        rows = _folder(path, 7 if quick else 9, 2 if quick else 200)
-        yield Table("predict: tangent-predict, of each frame", rows)
+        row = _folder(path, 7 if quick else 9, 2 if quick else 200)
+        yield Table("predict: of each frame", [row])
 
 
 def _imported(settings: dict[str, Any], level: int, path: Path) -> TrainedNetwork:
@@ -62,10 +62,6 @@ def _rows(trained: TrainedNetwork, level: int, rounds: int) -> list[Row]:
     """The network alone, `Predictor` as it is, and everything on the device."""
     shape, grid = equirect_shape(level), TangentGrid(1, level)
     image = InputImage(np.random.default_rng(0).integers(0, 256, (*shape, 3), np.uint8))
-    predictors = {
-        blend: Predictor(trained, PanoramaViews(trained, blend=blend), DEVICE.type)
-        for blend in ("feather", "nearest")
-    }
     per_forward = views_per_forward((grid.dim, grid.dim))
     count = min(per_forward, grid.num_images)
     random = torch.randn(count, 3, grid.dim, grid.dim, device=DEVICE)
@@ -84,17 +80,16 @@ def _rows(trained: TrainedNetwork, level: int, rounds: int) -> list[Row]:
     def labelled(predictor: Predictor) -> None:
         trained.labels(predictor.predict(image).labels())
 
-    ways = [
-        Way("the network", lambda: scores(lambda part: random[: part.stop - part.start])),
-        Way("Predictor, feather", partial(labelled, predictors["feather"]), ours=True),
-        Way("Predictor, nearest", partial(labelled, predictors["nearest"]), ours=True),
-        Way("rendered and labelled on the device, nearest", on_device),
-    ]
+    ways = [Way("the network", lambda: scores(lambda part: random[: part.stop - part.start]))]
+    for blend in ("feather", "nearest"):
+        predictor = Predictor(trained, PanoramaViews(trained, blend=blend), DEVICE.type)
+        ways.append(Way(f"Predictor, {blend}", partial(labelled, predictor), ours=True))
+    ways.append(Way("rendered and labelled on the device, nearest", on_device))
     with torch.autocast(DEVICE.type, torch.bfloat16, enabled=DEVICE.type == "cuda"):
         return measure(ways, rounds)
 
 
-def _folder(checkpoint: Path, level: int, count: int) -> list[Row]:
+def _folder(checkpoint: Path, level: int, count: int) -> Row:
     """All of the command, its start too; float32, as the command computes."""
     folder, frames = checkpoint.parent, checkpoint.with_name("frames")
     frames.mkdir()
@@ -102,12 +97,8 @@ def _folder(checkpoint: Path, level: int, count: int) -> list[Row]:
     cv2.imwrite(str(frames / "0.jpg"), cv2.resize(noise, equirect_shape(level)[::-1]))
     for number in range(1, count):
         shutil.copy(frames / "0.jpg", frames / f"{number}.jpg")
-    given = [f"checkpoint={checkpoint}", f"input={frames}", f"device={DEVICE.type}"]
-    rows = []
-    for blend in ("feather", "nearest"):
-        more = [f"blend={blend}", f"output={folder / blend}"]
-        start = time.perf_counter()
-        if status := run_process(command_line("predict", [*given, *more], folder)):
-            raise RuntimeError(f"tangent-predict ended with status {status}")
-        rows.append(Row(blend, [(time.perf_counter() - start) / count], True))
-    return rows
+    given = [f"checkpoint={checkpoint}", f"input={frames}", f"output={folder / 'labels'}"]
+    start = time.perf_counter()
+    if status := run_process(command_line("predict", [*given, f"device={DEVICE.type}"], folder)):
+        raise RuntimeError(f"tangent-predict ended with status {status}")
+    return Row("tangent-predict", [(time.perf_counter() - start) / count], True)

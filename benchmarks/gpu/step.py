@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import nn
@@ -21,22 +21,14 @@ PEAK_FLOPS = 989e12
 """Dense bf16 operations a second of an H100 or H200 SXM (NVIDIA's data sheets)."""
 
 
-class _Mode(NamedTuple):
-    """How a step is computed; `compile` are arguments of `torch.compile`."""
-
-    name: str
-    tf32: bool = True
-    half: bool = False
-    compile: dict[str, Any] | None = None
-
-
-_MODES = (
-    _Mode("float32, TF32 off", tf32=False),
-    _Mode("float32, TF32"),
-    _Mode("bf16, channels last", half=True),
-    _Mode("the same, compiled", half=True, compile={}),
-    _Mode("the same, CUDA graphs", half=True, compile={"mode": "reduce-overhead"}),
-)
+_MODES: dict[str, dict[str, Any]] = {
+    "float32, TF32 off": {"tf32": False},
+    "float32, TF32": {},
+    "bf16, channels last": {"half": True},
+    "the same, compiled": {"half": True, "compiled": {}},
+    "the same, CUDA graphs": {"half": True, "compiled": {"mode": "reduce-overhead"}},
+}
+"""Arguments of `_step` by name."""
 
 
 def step(quick: bool) -> Iterator[Table]:
@@ -52,9 +44,9 @@ def step(quick: bool) -> Iterator[Table]:
     }
     for name, (network, size) in cases.items():
         rows: list[Row] = []
-        for mode in _MODES:
-            with attempted(f"{name}, {mode.name}"):
-                taken = Way(mode.name, _step(network, size, mode), ours=True)
+        for mode, settings in _MODES.items():
+            with attempted(f"{name}, {mode}"):
+                taken = Way(mode, _step(network, size, **settings), ours=True)
                 rows += measure([taken], 1 if quick else 5)
         table = Table(f"step: {name}, {size[0]} images of {size[-1]}²", rows)
         if name == "FCN-ResNet101":
@@ -65,15 +57,22 @@ def step(quick: bool) -> Iterator[Table]:
             ]
         yield table
         with FlopCounterMode(display=False) as counter:
-            _step(network, size, _MODES[0])()
+            _step(network, size)()
         share = 100 * counter.get_total_flops() / PEAK_FLOPS
         rows = [Row(row.name, [share / s for s in row.values], True) for row in rows]
         yield Table(f"step: {name}, share of the bf16 peak of {PEAK_FLOPS:.3g}/s", rows, "%")
 
 
-def _step(network: nn.Module, size: tuple[int, ...], mode: _Mode) -> Callable[[], object]:
-    """A step of the task, without its loader."""
-    torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = mode.tf32
+def _step(
+    network: nn.Module,
+    size: tuple[int, ...],
+    *,
+    tf32: bool = True,
+    half: bool = False,
+    compiled: dict[str, Any] | None = None,
+) -> Callable[[], object]:
+    """A step of the task, without its loader; `compiled` are arguments of `torch.compile`."""
+    torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = tf32
     names = ("unknown", *map(str, range(NUM_CLASSES)))
     on_gpu = DEVICE.type == "cuda"
     task = SegmentationTask(
@@ -81,8 +80,8 @@ def _step(network: nn.Module, size: tuple[int, ...], mode: _Mode) -> Callable[[]
         TangentRepresentation(base_level=0, level=4),
         names,
         partial(torch.optim.Adam, lr=1e-4),
-        channels_last=mode.half,
-        compile=mode.compile if on_gpu or mode.compile is None else {"backend": "eager"},
+        channels_last=half,
+        compile=compiled if on_gpu or compiled is None else {"backend": "eager"},
     )
     task = task.to(DEVICE).train()
     optimizer = task.optimization(lambda: 1)
@@ -91,7 +90,7 @@ def _step(network: nn.Module, size: tuple[int, ...], mode: _Mode) -> Callable[[]
 
     def take() -> None:
         optimizer.zero_grad()
-        with torch.autocast(DEVICE.type, torch.bfloat16, enabled=mode.half and on_gpu):
+        with torch.autocast(DEVICE.type, torch.bfloat16, enabled=half and on_gpu):
             loss = task.loss_sum((images,), labels) / task.loss_norm(labels)
         torch.autograd.backward(loss)
         optimizer.step()
