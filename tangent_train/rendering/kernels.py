@@ -419,9 +419,9 @@ def _tiles(start: int, stop: int, sight: Sight, pixels: int) -> list[Tile]:
     """Tiles of `pixels` or fewer, about square on the sphere, that cover rows ``start:stop``."""
     tiles, bottom, width = [], start, sight.columns.shape[1]
     while bottom < stop:
-        top, left = bottom, stop - bottom
-        parts = round(left / math.sqrt(pixels * abs(sight.rows[top, 0])))
-        rows = -(-left // max(1, parts))
+        top, remaining = bottom, stop - bottom
+        parts = round(remaining / math.sqrt(pixels * abs(sight.rows[top, 0])))
+        rows = -(-remaining // max(1, parts))
         bottom, across = top + rows, pixels // rows
         for first in range(0, width, across):
             tiles.append((top, bottom, first, min(width, first + across)))  # noqa: PERF401
