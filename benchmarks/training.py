@@ -188,7 +188,7 @@ def evaluation(quick: bool) -> Iterator[Table]:
         data, task = built(overrides, f"{root}/rooms", 2 ** (level + 1), rooms=1)
         network, grid = task.network.eval(), data.representation.grid
         images = torch.randn(16, 3, grid.dim, grid.dim)
-        task.network = nn.Conv2d(3, data.num_classes, 1)
+        task.network = nn.ConstantPad3d((0, 0, 0, 0, 0, data.num_classes - 3), 0.0)
         trainer = lightning.Trainer(accelerator="cpu", logger=False, default_root_dir=root)
         data.setup("test")
         panoramas = len(data.test_dataloader())
