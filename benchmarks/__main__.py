@@ -128,8 +128,8 @@ def quotients(tables: Sequence[Table]) -> dict[str, dict[str, float]]:
         for row in table.rows[1:]:
             if row.ours:
                 values, name = table.ratios(row.name), f"{table.name}: {row.name}"
-                found[name] = {"median": statistics.median(values)}
-                found[name] |= {"low": min(values), "high": max(values)}
+                median = statistics.median(values)
+                found[name] = {"median": median, "low": min(values), "high": max(values)}
     return found
 
 

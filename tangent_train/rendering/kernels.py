@@ -360,19 +360,20 @@ def _copy_patch(scores: Array, left: int, top: int, softmax: bool, patch: Array)
 
 @njit_fast
 def _add_samples(
-    patch: Array, step: int, blocks: int, taps: _Taps, pixel: Array, sums: Array
+    patch: Array, width: int, blocks: int, taps: _Taps, pixel: Array, sums: Array
 ) -> None:
     """Add weighted bilinear samples of a patch to sums.
 
     Args:
         patch: Scores of a part of an image, flat.
-        step: Numbers from a row of it to the next one.
+        width: Pixels in a row of it.
         blocks: ``Kp / LANES``: the compiler has to know that there is no rest.
         taps: Of n pixels.
         pixel: ``(n,)`` where their sums are.
         sums: ``(h, w, Kp)``, flat, changed.
     """
-    classes, below = np.uint64(LANES) * np.uint64(blocks), np.uint64(step)
+    classes = np.uint64(LANES) * np.uint64(blocks)
+    below = classes * np.uint64(width)
     for p in range(len(pixel)):
         at, to = classes * np.uint64(taps.first[p]), classes * np.uint64(pixel[p])
         a, b, c, d = taps.a[p], taps.b[p], taps.c[p], taps.d[p]
@@ -487,9 +488,9 @@ def _add_to_tile(
         _weigh(n, (wide, -top * wide - left), room, taps)
         size = high * wide * classes
         patch = _enough(patch, size)
-        part, step_down = patch[:size], wide * classes
+        part, blocks = patch[:size], classes // LANES
         _copy_patch(scores[m], left, top, softmax, part.reshape((high, wide, classes)))
-        _add_samples(part, step_down, classes // LANES, taps, room.pixel[:n], sums.reshape(-1))
+        _add_samples(part, wide, blocks, taps, room.pixel[:n], sums.reshape(-1))
     return patch
 
 

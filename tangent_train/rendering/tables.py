@@ -269,6 +269,15 @@ def sight_of(
 
 
 @njit_exact
+def _inside(normals: Array, x: float, y: float, z: float) -> bool:
+    """Whether a ray is on the inner side of planes, but for rounding."""
+    inside = True
+    for nx, ny, nz in normals:
+        inside &= nx * x + ny * y + nz * z > -1e-6
+    return inside
+
+
+@njit_exact
 def find_spans(start: int, stop: int, edges: Array, rows: Array, width: int, spans: Array) -> None:
     """Find the columns of ERP rows ``start:stop`` that may see something of images.
 
@@ -289,23 +298,20 @@ def find_spans(start: int, stop: int, edges: Array, rows: Array, width: int, spa
         x0, y0 = math.cos(middle), math.sin(middle)
         for i in range(start, stop):
             r, z = rows[i]
-            least, most, around = math.inf, -math.inf, True
+            least, most = math.inf, -math.inf
             for nx, ny, nz in edges[m]:
-                # Opposite of the middle an image is seen only beyond a pole that it contains.
-                around &= nz * z - r * (nx * x0 + ny * y0) >= 0
                 ground = math.hypot(nx, ny)
                 c = -nz * z / (r * ground)  # cosine of the angle from (nx, ny) to the crossings
                 if not -1 < c < 1:
                     continue
-                for s in (-math.sqrt(1 - c * c), math.sqrt(1 - c * c)):
+                root = math.sqrt(1 - c * c)
+                for s in (-root, root):
                     x, y = r * (nx * c - ny * s) / ground, r * (ny * c + nx * s) / ground
-                    seen = True
-                    for ox, oy, oz in edges[m]:
-                        seen &= ox * x + oy * y + oz * z > -1e-6
-                    if seen:
+                    if _inside(edges[m], x, y, z):
                         angle = math.atan2(x0 * y - y0 * x, x0 * x + y0 * y)
                         least, most = min(least, angle), max(most, angle)
-            if around:
+            # Opposite of its middle an image is seen only beyond a pole that it contains.
+            if _inside(edges[m], -r * x0, -r * y0, z):
                 least, most = -math.pi, math.pi
             spans[m, i] = 0
             if least <= most:

@@ -182,6 +182,11 @@ def test_intervals_are_those_of_data_sets_drawn_one_after_another(absent: Any) -
     assert low[0] < high[0]
 
 
+def test_intervals_are_the_same_in_any_order() -> None:
+    _, of_images = _random_images(9)
+    assert bootstrap_intervals(of_images) == bootstrap_intervals(of_images[::-1])
+
+
 def test_draws_without_labels_are_left_out() -> None:
     _, of_images = _random_images(1)
     with_one = bootstrap_intervals(np.concatenate([of_images, np.zeros_like(of_images)]))

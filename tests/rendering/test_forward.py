@@ -60,6 +60,14 @@ def test_parts_of_panoramas(top: float, left: float, dtype: Any, channels: tuple
     np.testing.assert_array_equal(_sampled(image, u, v, "nearest"), image[row, column])
 
 
+@pytest.mark.parametrize("remap", [32767, 0])
+def test_nearest_wraps_at_the_seam(monkeypatch: pytest.MonkeyPatch, remap: int) -> None:
+    monkeypatch.setattr(sampling, "_REMAP_LIMIT", remap)
+    image = np.arange(128, dtype=np.int16).reshape(4, 32)
+    found = _sampled(image, [-0.6, -0.4, 31.4, 31.6], [-0.5, 0, 3, 3.5], "nearest")
+    np.testing.assert_array_equal(found, [[31, 0, 127, 96]])
+
+
 @pytest.mark.parametrize("base_level", [0, 1])
 def test_labels_at_the_seam_are_never_unknown(base_level: int) -> None:
     """They were, in the released code."""

@@ -200,6 +200,7 @@ def test_broken_files_are_refused_or_left_out_and_counted(
         _module(kind, root, **settings).prepare_data()
     named = [str(path) in str(refused.value) for path in broken]
     assert named == [True, stored or kind == "shapes"]
+    assert ("found 2 problems" in str(refused.value)) == all(named)
     kept = len(list((tmp_path / "store").rglob("*.npy")))
     assert kept == (total - 2 if stored else 0), "every readable one is stored"
     capsys.readouterr()
@@ -217,7 +218,8 @@ def test_broken_files_are_refused_or_left_out_and_counted(
         left += len(after)
         assert [name for name in before[split] if name in after] == after
         for index in range(len(after)):
-            data.source(split).read(index)
+            read = data.source(split).read(index)
+            assert kind == "shapes" or read.rgb.shape == (16, 32, 3)
     assert left == total - 2
 
 
