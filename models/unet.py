@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from tangent_train.errors import SettingError
+from tangent_train.errors import SettingError, width_height
 from tangent_train.registry import registered
 
 
@@ -142,7 +142,7 @@ def check_sides(images: Tensor, stride: int, network: str) -> None:
     if height % stride or width % stride:
         raise SettingError(
             f"image size for the {network}",
-            found=f"{height}×{width}",
+            found=width_height((height, width)),
             expected=f"sides that are multiples of {stride}",
             remedy=f"Set representation.crop_multiple={stride}, or choose another "
             "representation.dim, level or network.",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 _LONGEST = 400  # characters of what was found: a file may hold anything
@@ -27,6 +27,18 @@ def counted(count: int, plural: str) -> str:
     ('1 panorama', '20 photos')
     """
     return f"{count} {plural.removesuffix('s') if count == 1 else plural}"
+
+
+def width_height(size: Sequence[float]) -> str:
+    """The size of an image as people read it.
+
+    Args:
+        size: Rows and columns.
+
+    >>> width_height((1024, 2048))
+    '2048 × 1024 (width × height)'
+    """
+    return f"{size[1]:.10g} × {size[0]:.10g} (width × height)"
 
 
 class _ExplainedError(ValueError):

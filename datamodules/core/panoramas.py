@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from datamodules.core.problems import Problems
 from datamodules.images.pixel_files import read_rgb
 from datamodules.images.png import check_panorama_size, check_png
-from tangent_train.errors import DataError
+from tangent_train.errors import DataError, width_height
 from tangent_train.rendering.upright.gravity import upright_rotation
 
 if TYPE_CHECKING:
@@ -403,8 +403,8 @@ def check_headers(
                     remedy = "Export it as the image is displayed, turned as its EXIF data say."
                 raise DataError(
                     path,
-                    found=f"{found[0]}×{found[1]} pixels",
-                    expected=f"{size[0]}×{size[1]}, as {files.rgb}" if size else "",
+                    found=width_height(found),
+                    expected=f"{width_height(size)}, as {files.rgb}" if size else "",
                     remedy=remedy,
                 )
     return size

@@ -7,7 +7,6 @@ have, the place of the image in it, and the pitch and roll of the camera.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,14 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.core.panoramas import resize_nearest
-from tangent_train.errors import DataError, SettingError
+from datamodules.images.xmp import read_properties
+from tangent_train.errors import DataError, SettingError, width_height
 from tangent_train.rendering.upright.gravity import up_from_pose
 
 _Pixel = TypeVar("_Pixel", bound=np.generic)
 
-_NAMESPACE = b"http://ns.google.com/photos/1.0/panorama/"
-_REACH = 1 << 16  # bytes around the namespace in which the tags are
-_TAG = re.compile(rb"""[\s<]GPano:(\w+)(?:\s*=\s*["']([^"'<]{0,40})|>\s*([^<]{0,40}))""")
+_NAMESPACE = "http://ns.google.com/photos/1.0/panorama/"
 _SIZES = (
     "FullPanoWidthPixels",
     "FullPanoHeightPixels",
@@ -109,9 +107,9 @@ def area_of(path: Path, size: tuple[int, int]) -> PanoramaArea:
     Raises:
         DataError: The tags cannot be those of such an image, or none say what it shows.
     """
-    tags = _gpano_tags(path)
+    tags = read_properties(path, _NAMESPACE)
     projection = tags.get("ProjectionType", "equirectangular")
-    if projection != "equirectangular":
+    if projection.lower() != "equirectangular":
         raise DataError(
             path,
             found=f"GPano:ProjectionType {projection}",
@@ -129,8 +127,9 @@ def area_of(path: Path, size: tuple[int, int]) -> PanoramaArea:
     ):
         raise DataError(
             path,
-            found=f"GPano tags of {height:g}×{width:g} pixels at ({top:g}, {left:g}) of "
-            f"{full_height:g}×{full_width:g} in an image of {size[0]}×{size[1]}",
+            found=f"GPano tags of {width_height((height, width))}, {left:g} from the left and "
+            f"{top:g} from the top of {width_height((full_height, full_width))}, in an image of "
+            f"{width_height(size)}",
             expected="a part, shaped like this image, of a panorama twice as wide as high",
             remedy=f"The image may have been cut after they were written. {_SAY_IT}",
         )
@@ -167,8 +166,8 @@ def area_of_crop(size: tuple[int, int], crop: Sequence[float]) -> PanoramaArea:
     if not _agree(*pixels_deg):
         raise SettingError(
             "crop",
-            found=f"{list(crop)}, pixels of {pixels_deg[0]:.4g}°×{pixels_deg[1]:.4g}° in an image "
-            f"of {size[0]}×{size[1]}",
+            found=f"{list(crop)}, pixels {pixels_deg[0]:.4g}° wide and {pixels_deg[1]:.4g}° high "
+            f"in an image of {width_height(size)}",
             expected="angles that make them square",
         )
     across, down = ((west + 180) / 360, width / 360), ((90 - north) / 180, (north - south) / 180)
@@ -191,7 +190,7 @@ def whole_area(path: Path, size: tuple[int, int], remedy: str = _NOT_WHOLE) -> P
     if abs(width - 2 * height) > 1 or width < 2:
         raise DataError(
             path,
-            found=f"{height}×{width} pixels",
+            found=width_height(size),
             expected="a whole panorama, twice as wide as high",
             remedy=remedy,
         )
@@ -211,25 +210,10 @@ def up_of(path: Path) -> NDArray[np.float64] | None:
     Raises:
         DataError: A tag is not such an angle.
     """
-    tags = _gpano_tags(path)
+    tags = read_properties(path, _NAMESPACE)
     pitch = _number(path, "PosePitchDegrees", tags.get("PosePitchDegrees", "0"), 90)
     roll = _number(path, "PoseRollDegrees", tags.get("PoseRollDegrees", "0"), 180)
     return None if pitch == roll == 0 else up_from_pose(pitch, roll)
-
-
-def _gpano_tags(path: Path) -> dict[str, str]:
-    """GPano tags, written as attributes or as elements; nothing is parsed as XML.
-
-    The file is scanned for them as for XMP packets (XMP specification part 3): all image formats
-    hold XMP as plain UTF-8, and exiftool writes it behind the pixels of PNG files.
-    """
-    content = path.read_bytes()
-    place = content.find(_NAMESPACE)
-    packet = content[max(place - _REACH, 0) : place + _REACH] if place >= 0 else b""
-    return {
-        name.decode(): (attribute or element).decode(errors="replace").strip()
-        for name, attribute, element in _TAG.findall(packet)
-    }
 
 
 def _number(path: Path, name: str, text: str, most: float) -> float:

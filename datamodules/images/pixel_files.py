@@ -1,7 +1,7 @@
 """Reading and writing images: colours, depth, labels, arrays.
 
-Pillow opens and identifies every image; OpenCV writes, and decodes the 16-bit colours that Pillow
-would cut to 8 bits.
+Pillow opens and identifies every image; OpenCV writes, and decodes what Pillow would cut to 8 bits
+or read in the wrong byte order: 16-bit colours, and TIFF files of more than 8 bits.
 """
 
 from __future__ import annotations
@@ -16,11 +16,16 @@ import cv2
 import numpy as np
 from numpy.lib.format import open_memmap
 from numpy.typing import DTypeLike, NDArray
-from PIL import ExifTags, Image, ImageOps
+from PIL import ExifTags, Image, TiffImagePlugin, TiffTags
 
 from datamodules.images.exr import read_exr, read_exr_size
-from datamodules.images.png import MOST_PIXELS, check_pixels, read_png_header
-from tangent_train.errors import DataError, SettingError
+from datamodules.images.png import (
+    MOST_PIXELS,
+    check_pixels,
+    read_png_header,
+    read_png_metadata,
+)
+from tangent_train.errors import DataError, SettingError, width_height
 from tangent_train.files import atomic_path, reserve, write_bytes
 
 _WRITABLE = {
@@ -44,6 +49,17 @@ LOSSY_SUFFIXES = (".jpg", ".jpeg", ".webp")
 
 _FORMATS = ("JPEG", "PNG", "TIFF", "WEBP")
 _SINGLE_CHANNEL = ("L", "I", "F", "I;16", "I;16L", "I;16B", "I;16N")
+_FIRST_TRANSPOSED = 5  # EXIF orientation from which rows are stored as columns
+_BITS, _PHOTOMETRIC, _BIT_ORDER, _CHANNELS, _PLANES = 258, 262, 266, 277, 284  # TIFF tags
+_EXTRA_CHANNELS, _SAMPLE_FORMAT, _SUBSAMPLING = 338, 339, 530
+_LAYOUT = (_BITS, _PHOTOMETRIC, _BIT_ORDER, _CHANNELS, _PLANES, _EXTRA_CHANNELS, _SAMPLE_FORMAT)
+_ASSOCIATED_ALPHA = 1
+_EXACT_TYPES = {
+    (number, 8 * size): np.dtype(f"{kind}{size}")
+    for number, kind, sizes in ((1, "u", (2, 4, 8)), (2, "i", (1, 2, 4)), (3, "f", (4, 8)))
+    for size in sizes
+}
+"""Types of TIFF channels beyond 8 bits, by SampleFormat and BitsPerSample."""
 _MOST_M = 1e4  # depth beyond it marks missing: some files have 1e10 there
 _MISSING_UNITS = 65535
 _FILM_DIAGONAL_MM = math.hypot(36, 24)
@@ -55,31 +71,52 @@ Image.MAX_IMAGE_PIXELS = MOST_PIXELS
 def _opened(path: Path) -> Iterator[Image.Image]:
     """An image whose size is allowed, not decoded yet; errors in the block name the file."""
     try:
-        with Image.open(path, formats=_FORMATS) as image:
+        # Not by its name: Pillow would map raw TIFF files into memory, and turn these wrongly.
+        with path.open("rb") as file, Image.open(file, formats=_FORMATS) as image:
             check_pixels(path, image.height, image.width)
             if image.format == "PNG":
                 read_png_header(path)
+                image.info |= read_png_metadata(path)
             yield image
     except (DataError, MemoryError):
         raise
     # Decoders of broken files raise anything, from OSError to SyntaxError and IndexError.
     except Exception as error:
+        reason = getattr(error, "strerror", None) or str(error).partition(" <")[0]
         raise DataError(
             path,
-            found=f"no image that can be decoded ({getattr(error, 'strerror', None) or error})",
+            found=f"no image that can be decoded ({reason})",
             expected="a whole JPEG, PNG, TIFF or WebP image",
             remedy="Copy or export the file again.",
         ) from error
 
 
 def _exif(image: Image.Image) -> Image.Exif:
-    """EXIF data; none where they are broken, or behind the pixels of a PNG file."""
-    if image.format == "PNG" and "exif" not in image.info:
-        return Image.Exif()  # Pillow would decode the pixels to look for them
+    """EXIF data; none where they are broken."""
     try:
-        return image.getexif()
+        # Of PNG files, Pillow would decode the pixels to look for more.
+        return Image.Image.getexif(image)
     except Exception:  # the parser raises many kinds of errors
         return Image.Exif()
+
+
+def read_metadata(path: Path) -> tuple[dict[Any, Any], list[bytes]]:
+    """Read what an image file holds beside its pixels, as Pillow gives it.
+
+    Args:
+        path: See `read_pixels`; arrays and OpenEXR images have nothing.
+
+    Returns:
+        Texts and data by name; the APP1 segments of a JPEG file.
+
+    Raises:
+        DataError: It cannot be read, or is not an image.
+    """
+    if path.suffix.lower() in (".npy", ".exr"):
+        return {}, []
+    with _opened(path) as image:
+        segments = getattr(image, "applist", [])
+        return image.info, [content for name, content in segments if name == "APP1"]
 
 
 def read_image_size(path: Path) -> tuple[int, int]:
@@ -98,11 +135,24 @@ def read_image_size(path: Path) -> tuple[int, int]:
         return _upright_size(image)
 
 
+def _orientation(image: Image.Image) -> int:
+    """EXIF orientation of the pixels that Pillow decodes, 1 to 8."""
+    # It turns TIFF files itself.
+    found = 1 if image.format == "TIFF" else _exif(image).get(ExifTags.Base.Orientation)
+    return found if found in range(1, 9) else 1
+
+
 def _upright_size(image: Image.Image) -> tuple[int, int]:
-    # Of TIFF files, Pillow gives the size after rotation.
-    orientation = 1 if image.format == "TIFF" else _exif(image).get(ExifTags.Base.Orientation)
-    quarter = orientation in (5, 6, 7, 8)
+    quarter = _orientation(image) >= _FIRST_TRANSPOSED
     return (image.width, image.height) if quarter else (image.height, image.width)
+
+
+def _turned(pixels: NDArray[Any], orientation: int) -> NDArray[Any]:
+    """Pixels as displayed, by their EXIF orientation (CIPA DC-008, tag 274)."""
+    pixels = pixels.swapaxes(0, 1) if orientation >= _FIRST_TRANSPOSED else pixels
+    pixels = pixels[:, ::-1] if orientation in (2, 3, 6, 7) else pixels
+    pixels = pixels[::-1] if orientation in (3, 4, 7, 8) else pixels
+    return np.ascontiguousarray(pixels)
 
 
 def read_pixels(path: Path, *, indices: bool) -> NDArray[Any]:
@@ -125,27 +175,72 @@ def read_pixels(path: Path, *, indices: bool) -> NDArray[Any]:
     if suffix == ".exr":
         return read_exr(path)
     with _opened(path) as image:
-        tiles = str(getattr(image, "tile", ""))  # how pixels are stored: "RGB;16B"
-        if image.mode in ("RGB", "RGBA", "LA") and ";16" in tiles:
-            return _decode_16_bit(path, grey=image.mode == "LA")
-        oriented = ExifTags.Base.Orientation in _exif(image)
-        image.load()
-        upright = ImageOps.exif_transpose(image) if oriented else image
-        if upright.mode in _SINGLE_CHANNEL or (upright.mode in ("1", "P") and indices):
-            stored = np.array(upright, np.uint8 if upright.mode == "1" else None)
-            return stored.astype(stored.dtype.newbyteorder("="), copy=False)
-        if upright.mode == "LA":
-            return np.array(upright.getchannel(0))
-        upright.info.pop("transparency", None)  # Pillow warns that RGB loses it
-        return np.array(upright if upright.mode == "RGB" else upright.convert("RGB"))
+        size, orientation = _upright_size(image), _orientation(image)
+        exact = _exact_type(path, image)
+        pixels = _decode(image, indices=indices) if exact is None else _decode_exactly(path, *exact)
+        pixels = _turned(pixels, orientation)
+        if pixels.shape[:2] != size:
+            raise ValueError(f"{width_height(pixels.shape)}, in its header {width_height(size)}")
+        return pixels
 
 
-def _decode_16_bit(path: Path, *, grey: bool) -> NDArray[Any]:
+def _decode(image: Image.Image, *, indices: bool) -> NDArray[Any]:
+    image.load()
+    if image.mode in _SINGLE_CHANNEL or (image.mode in ("1", "P") and indices):
+        stored = np.array(image, np.uint8 if image.mode == "1" else None)
+        return stored.astype(stored.dtype.newbyteorder("="), copy=False)
+    if image.mode == "LA":
+        return np.array(image.getchannel(0))
+    image.info.pop("transparency", None)  # Pillow warns that RGB loses it
+    return np.array(image if image.mode == "RGB" else image.convert("RGB"))
+
+
+def _exact_type(path: Path, image: Image.Image) -> tuple[np.dtype[Any], bool] | None:
+    """Type of the channels of a file that OpenCV decodes, and if it is grey; None for Pillow.
+
+    Raises:
+        DataError: Neither decodes it rightly.
+    """
+    if image.format == "PNG":
+        header = read_png_header(path)
+        return (np.dtype(np.uint16), "grey" in header.color) if header.bits == 16 else None
+    if not isinstance(image, TiffImagePlugin.TiffImageFile):
+        return None
+    tags: Any = image.tag_v2
+    channels = tags.get(_CHANNELS, 1)
+    bits, kinds = set(tags.get(_BITS, (1,))), set(tags.get(_SAMPLE_FORMAT, (1,)))
+    if kinds == {1} and max(bits) <= 8:
+        exact = None
+        right = image.mode != "YCbCr" or tags.get(_SUBSAMPLING) == (1, 1)
+        right &= (tags.get(_PLANES), tags.get(_BIT_ORDER)) != (2, 2)
+    else:
+        exact = _EXACT_TYPES.get((*kinds, *bits))
+        is_plain = tags.get(_PHOTOMETRIC) == {1: 1, 3: 2, 4: 2}.get(channels)
+        is_interleaved = channels == 1 or tags.get(_PLANES, 1) == 1
+        is_straight = _ASSOCIATED_ALPHA not in tags.get(_EXTRA_CHANNELS, ())
+        right = exact is not None and is_plain and is_interleaved and is_straight
+    if not right:
+        raise DataError(
+            path,
+            found="a TIFF layout that cannot be decoded: "
+            + ", ".join(
+                f"{TiffTags.lookup(tag).name} {tags[tag]}" for tag in _LAYOUT if tag in tags
+            ),
+            expected="grey or RGB, all channels of one type, interleaved "
+            "(PlanarConfiguration 1), without premultiplied alpha",
+            remedy="Export the image as PNG, or as TIFF with interleaved channels.",
+        )
+    return None if exact is None else (exact, channels == 1)
+
+
+def _decode_exactly(path: Path, dtype: np.dtype[Any], grey: bool) -> NDArray[Any]:
     # From memory: `cv2.imread` knows no paths beyond the system's code page.
     pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
-    if pixels is None:
+    if pixels is None or pixels.dtype != dtype or pixels.shape[2:] not in ((), (3,), (4,)):
         raise ValueError("broken pixels")
-    return np.ascontiguousarray(pixels[..., 0] if grey else pixels[..., 2::-1])
+    if grey:
+        return np.ascontiguousarray(pixels.reshape(*pixels.shape[:2], -1)[..., 0])
+    return pixels[..., 2::-1]
 
 
 def read_rgb(path: Path) -> NDArray[np.uint8]:
@@ -315,6 +410,6 @@ def write_pixels(path: Path, pixels: NDArray[Any]) -> None:
     ordered = np.ascontiguousarray(pixels if pixels.ndim == 2 else pixels[..., ::-1])
     done, encoded = cv2.imencode(suffix, ordered)
     if not done:
-        found = f"{pixels.shape[0]}×{pixels.shape[1]} pixels"
+        found = width_height(pixels.shape)
         raise SettingError(path.name, found=found, expected=f"a size that {suffix} files can have")
     write_bytes(path, encoded.tobytes())

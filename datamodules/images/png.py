@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import io
 import os
 import struct
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
-from tangent_train.errors import DataError, SettingError
+from PIL import Image
+
+from tangent_train.errors import DataError, SettingError, width_height
 
 MOST_PIXELS = 32768 * 16384
 """Pixels of an image, at most: a file of a few kilobytes can claim more than memory holds."""
@@ -16,6 +20,10 @@ MOST_PIXELS = 32768 * 16384
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _HEADER = struct.Struct(">16sIIBB")  # start; width, height, bits, color
 _START = _SIGNATURE + b"\x00\x00\x00\rIHDR"
+_METADATA = (b"IHDR", b"eXIf", b"iTXt", b"tEXt", b"zTXt")
+_NO_PIXELS = b"".join(
+    struct.pack(">I4sI", 0, name, zlib.crc32(name)) for name in (b"IDAT", b"IEND")
+)
 _COLOR_TYPES = {0: "grey", 2: "RGB", 3: "palette", 4: "grey with alpha", 6: "RGBA"}
 _REMEDY = "Copy or extract the file again."
 
@@ -38,7 +46,7 @@ def check_pixels(path: Path, height: int, width: int) -> None:
     if not 0 < height * width <= MOST_PIXELS:
         raise DataError(
             path,
-            found=f"{height}×{width} pixels",
+            found=width_height((height, width)),
             expected=f"1 to {MOST_PIXELS} pixels",
             remedy="Shrink the image.",
         )
@@ -54,7 +62,7 @@ def read_png_header(path: Path) -> PngHeader:
         with path.open("rb") as file:
             start = file.read(_HEADER.size)
             is_png = start.startswith(_START) and len(start) == _HEADER.size
-            is_whole = is_png and _has_all_chunks(file)
+            is_whole = is_png and bool(_chunks(file))
     except OSError as error:
         raise DataError(path, found=error, expected="a PNG file", remedy=_REMEDY) from error
     if not is_whole:
@@ -65,18 +73,37 @@ def read_png_header(path: Path) -> PngHeader:
     return PngHeader(height, width, bits, _COLOR_TYPES.get(color, f"color type {color}"))
 
 
-def _has_all_chunks(file: BinaryIO) -> bool:
+def _chunks(file: BinaryIO) -> list[tuple[bytes, int, int]]:
+    """Name, position and size of all chunks; none of a truncated file."""
     # Decoders allocate the bytes that a chunk claims, up to 2 GB, before they read them.
     size = file.seek(0, os.SEEK_END)
     position, name = len(_SIGNATURE), b""
+    chunks = []
     while name != b"IEND":
         file.seek(position)
         head = file.read(8)
-        name = head[4:]
-        position += 12 + int.from_bytes(head[:4], "big")
+        name, whole = head[4:], 12 + int.from_bytes(head[:4], "big")
+        chunks.append((name, position, whole))
+        position += whole
         if position > size or not name.isalpha():
-            return False
-    return True
+            return []
+    return chunks
+
+
+def read_png_metadata(path: Path) -> dict[str, Any]:
+    """Read the texts and EXIF data of a whole PNG file, before or behind its pixels.
+
+    Returns:
+        The ``info`` that Pillow would have after decoding the pixels.
+    """
+    with path.open("rb") as file:
+        parts = [_SIGNATURE]
+        for name, position, size in _chunks(file):
+            if name in _METADATA:
+                file.seek(position)
+                parts.append(file.read(size))
+    with Image.open(io.BytesIO(b"".join([*parts, _NO_PIXELS])), formats=["PNG"]) as image:
+        return dict(image.info)
 
 
 def check_png(path: Path, bits: int, colors: Sequence[str]) -> PngHeader:
@@ -117,7 +144,7 @@ def check_panorama_size(path: Path, size: tuple[int, int], erp_height: int) -> N
     if width != 2 * height:
         raise DataError(
             path,
-            found=f"{height}×{width} pixels",
+            found=width_height(size),
             expected="twice as wide as high",
             remedy="Only full 360°×180° panoramas can be used.",
         )

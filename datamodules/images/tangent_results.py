@@ -117,7 +117,7 @@ class TangentResults:
             ] != array.shape[1]:
                 raise DataError(
                     file,
-                    found=f"{'×'.join(map(str, array.shape))} of {array.dtype}",
+                    found=f"{array.dtype} of shape {array.shape}",
                     expected=f"squares, all alike: {square}",
                 )
         decided = _kind_of(files[0], first) if kind == "auto" else kind
@@ -125,7 +125,7 @@ class TangentResults:
         if first.dtype.kind not in _TYPES[decided] or first.shape[2:] not in channels:
             raise DataError(
                 files[0],
-                found=f"{'×'.join(map(str, first.shape))} of {first.dtype}",
+                found=f"{first.dtype} of shape {first.shape}",
                 expected=f"{decided}",
                 remedy=f"Say what they are with kind={', '.join(get_args(Kind))}: labels and depth "
                 "have one channel, colours one or three.",

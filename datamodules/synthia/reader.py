@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from datamodules.core.inputs import RGBD_NORMALIZATION, Normalization
 from datamodules.core.panoramas import ImageFiles, PngReader, meters_to_steps, resize_nearest
 from datamodules.images.pixel_files import read_pixels
-from tangent_train.errors import DataError, at_least
+from tangent_train.errors import DataError, at_least, width_height
 
 VIEWS: tuple[str, ...] = ("F", "R", "B", "L")
 """Front, right, back, left: each rotated by 90° to the right of the previous one."""
@@ -203,7 +203,7 @@ def read_camera(folder: Path, size: tuple[int, int]) -> NDArray[np.float64]:
             path,
             found=repr(text[:80]) if path.exists() else "no such file",
             expected="focal length, centre x and y, and perhaps the baseline, in pixels of "
-            f"views of {size[0]}×{size[1]}; only of {_SIZE[0]}×{_SIZE[1]} is it known without",
+            f"views of {width_height(size)}; only of {width_height(_SIZE)} is it known without",
             remedy="Extract the file again.",
         )
     return np.array([[focal, 0, x - 0.5], [0, focal, y - 0.5], [0, 0, 1]])

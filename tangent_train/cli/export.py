@@ -12,6 +12,7 @@ from rich import get_console
 from tangent_train.checkpoints.trained import load_trained
 from tangent_train.cli.say import say
 from tangent_train.cli.settings import check_new, typed
+from tangent_train.errors import width_height
 from tangent_train.inference.export import export_network
 from tangent_train.inference.predictor import sees_rays
 
@@ -47,7 +48,7 @@ def export(config: Mapping[str, Any]) -> None:
         size, opset = settings.image_size, settings.opset
         written = export_network(trained, output, image_size=size, opset=opset)
     fixed, multiple = written.trained.fixed_size, trained.size_multiple
-    sides = "{}×{}".format(*fixed) if fixed else "h×w"
+    sides = width_height(fixed) if fixed else "of any size"
     sides += f", multiples of {multiple}" if multiple > 1 and not fixed else ""
     say(
         f"{output}: {output.stat().st_size / 1e6:.1f} MB\n"

@@ -15,7 +15,7 @@ from rich import get_console
 
 from tangent_train.cli.say import say
 from tangent_train.cli.settings import check_new, typed
-from tangent_train.errors import SettingError
+from tangent_train.errors import SettingError, width_height
 
 if TYPE_CHECKING:
     from tangent_train.checkpoints.trained import TrainedNetwork
@@ -108,7 +108,7 @@ def _understood(path: Path, trained: TrainedNetwork, settings: Settings) -> str:
     names = trained.class_names[1:]
     mean, std = trained.normalization.mean, trained.normalization.std
     numbers = [" ".join(f"{value:.4g}" for value in values) for values in (mean, std)]
-    size = "{}×{}".format(*trained.fixed_size) if trained.fixed_size else "any"
+    size = width_height(trained.fixed_size) if trained.fixed_size else "any"
     multiple = f", multiples of {trained.size_multiple}" if trained.size_multiple > 1 else ""
     lines = [
         f"{path}: {path.stat().st_size / 1e6:.1f} MB",

@@ -16,7 +16,7 @@ from datamodules.core.panorama_pairs import ImagePairs, PanoramaPair, PanoramaPa
 from datamodules.images.pixel_files import read_image_size
 from tangent_train.cli.say import say
 from tangent_train.cli.settings import typed
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError, SettingError, width_height
 from tangent_train.files import read_json, write_bytes
 from tangent_train.keypoints.colmap import add_pair
 from tangent_train.keypoints.two_view import colmap
@@ -142,9 +142,9 @@ def _export(
     """
     sides = (pair.left.file, pair.right.file)
     shapes = (read_image_size(sides[0]), read_image_size(sides[1]))
-    for file, (height, width) in zip(sides, shapes, strict=True):
-        if abs(width - 2 * height) > 1:
-            found = f"{height}×{width} pixels, a part of a panorama"
+    for file, shape in zip(sides, shapes, strict=True):
+        if abs(shape[1] - 2 * shape[0]) > 1:
+            found = f"{width_height(shape)}, a part of a panorama"
             raise DataError(
                 file, found=found, expected="a whole panorama: COLMAP supports no partial ones"
             )

@@ -12,7 +12,7 @@ from datamodules.core.panoramas import meters_to_steps, resize_nearest
 from datamodules.images.gpano import PanoramaArea, area_of, area_of_crop, up_of, whole_area
 from datamodules.images.image_files import find_depth
 from datamodules.images.pixel_files import photo_fov_deg, read_depth_m, read_rgb
-from tangent_train.errors import DataError
+from tangent_train.errors import DataError, width_height
 from tangent_train.geometry import camera_matrix_from_fov
 from tangent_train.inference.views import InputImage
 from tangent_train.rendering.upright.gravity import estimate_up
@@ -58,8 +58,8 @@ class DepthFolder:
         if abs(width * shape[0] / (height * shape[1]) - 1) > _ASPECT_TOLERANCE:
             raise DataError(
                 path,
-                found=f"{height}×{width} pixels",
-                expected=f"the aspect ratio of the image, which has {shape[0]}×{shape[1]}",
+                found=width_height((height, width)),
+                expected=f"the aspect ratio of the image, {width_height(shape)}",
             )
         return meters_to_steps(resize_nearest(depth_m, shape))
 

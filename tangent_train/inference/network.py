@@ -15,7 +15,7 @@ from torch import Tensor
 from datamodules.core.panoramas import meters_to_steps
 from datamodules.images.palette import class_colors
 from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
-from tangent_train.errors import SettingError
+from tangent_train.errors import SettingError, width_height
 from tangent_train.geometry import camera_matrix_from_fov
 from tangent_train.inference.class_maps import Unmapped, load_class_map, map_classes
 from tangent_train.inference.predictor import Predictor
@@ -178,7 +178,7 @@ class Network:
         if size[1] != 2 * size[0]:
             raise SettingError(
                 "panorama",
-                found="{}×{} pixels".format(*size),
+                found=width_height(size),
                 expected="the whole sphere, twice as wide as high",
                 remedy="Of a photo, give fov=, its horizontal field of view in degrees.",
             )
@@ -199,7 +199,7 @@ class Network:
             raise SettingError(
                 "depth",
                 found=_described(depth),
-                expected="{}×{} floats, in metres".format(*size)
+                expected=f"floats in metres, {width_height(size)}"
                 if wanted
                 else f"None: the network sees {' and '.join(self.trained.inputs)}",
             )

@@ -11,7 +11,7 @@ import numpy as np
 
 from datamodules.core.panoramas import distance_from_z_depth, resize_area, resize_depth
 from datamodules.core.samples import world_rays
-from tangent_train.errors import SettingError
+from tangent_train.errors import SettingError, width_height
 from tangent_train.registry import make
 from tangent_train.rendering import EquirectRepresentation, PerspectiveRepresentation
 from tangent_train.rendering.representations.equirect import EquirectViews, as_crop, column_shifts
@@ -273,8 +273,8 @@ def check_size(trained: TrainedNetwork, size: tuple[int, int]) -> None:
     if small or (fixed is None and any(side % multiple for side in size)):
         raise SettingError(
             "level and base_level",
-            found="images of {}×{}".format(*size),
-            expected="at least {}×{}, as the network's file takes".format(*fixed)
+            found=f"images of {width_height(size)}",
+            expected=f"at least {width_height(fixed)}, as the network's file takes"
             if fixed
             else f"multiples of {multiple}, as the network needs",
             remedy="Choose other levels, or leave both as trained.",

@@ -167,7 +167,7 @@ def test_settings_of_an_evaluation(run_folder: Path, rooms: str, run: Run) -> No
         (["representation.faces_per_panorama=99"], "representation.faces_per_panorama: found 99"),
         (["level=high"], "representation.level: found high; expected int"),
         (["task.channels_last=maybe"], "task.channels_last: found maybe; expected bool"),
-        (["network=unet"], "image size for the UNet: found 48×48"),
+        (["network=unet"], "image size for the UNet: found 48 × 48"),
         (["network.num_classes=5"], "scores of the network"),
         (["network.in_channels=3"], "network: found UNet, which does not take"),
         (["task=classification"], "task: found classification, with panoramas"),

@@ -130,7 +130,7 @@ def test_a_broken_pair_is_named_and_the_others_are_compared(
     assert cv2.imwrite(str(tmp_path / "square.png"), np.zeros((8, 8, 3), np.uint8))
     with pytest.raises(SystemExit, match="1 of 1 pairs could not be used"):
         run("left=in/a.png", "right=square.png", *SMALL, "output=none")
-    assert "square.png: found 8×8 pixels" in capsys.readouterr().out
+    assert "square.png: found 8 × 8 (width × height)" in capsys.readouterr().out
     assert not (tmp_path / "none").exists()
 
 

@@ -218,7 +218,10 @@ def test_a_broken_panorama_does_not_stop_the_others(tmp_path: Path, refused: Ref
     said = refused(input=tmp_path / "in", output=tmp_path / "tan", base_level=0)
     assert "2 of 4 panoramas could not be rendered" in said
     assert "in/b.png" in said
-    assert "in/photo.jpg: found 30×40 pixels; expected a whole panorama, twice as wide" in said
+    assert (
+        "in/photo.jpg: found 40 × 30 (width × height); expected a whole panorama, twice as wide"
+        in said
+    )
     assert sorted(path.name for path in (tmp_path / "tan").iterdir()) == ["a", "c"]
     (tmp_path / "tan" / "a" / "face_019.png").unlink()
     said = refused(back=tmp_path / "tan", output=tmp_path / "back")
@@ -267,7 +270,7 @@ def test_settings_that_cannot_work(
         (
             {"face_003.png": (16, 16, 3)},
             {},
-            r"face_003\.png: found 16×16×3 of uint8; expected squares, all alike: 32×32",
+            r"003\.png: found uint8 of shape \(16, 16, 3\); expected squares, all alike: 32×32",
         ),
         ({}, {"kind": "labels"}, "expected labels.*Say what they are with kind=.*one channel"),
         ({}, {"z_depth": True}, "z_depth: found true for color"),

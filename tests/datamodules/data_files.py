@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.core.found import Split
@@ -37,15 +40,110 @@ def read_png(path: Path) -> NDArray[Any]:
     return image
 
 
+def png_bytes(
+    pixels: NDArray[np.unsignedinteger], before: bytes = b"", behind: bytes = b""
+) -> bytes:
+    """A PNG file of ``(H, W[, C])`` with chunks before and behind its pixels, byte by byte."""
+    height, width = pixels.shape[:2]
+    channels = pixels.size // height // width
+    rows = pixels.astype(pixels.dtype.newbyteorder(">")).reshape(height, -1)
+    data = b"".join(b"\0" + row.tobytes() for row in rows)
+    header = struct.pack(
+        ">IIBBBBB", width, height, 8 * pixels.itemsize, (0, 4, 2, 6)[channels - 1], 0, 0, 0
+    )
+    parts = [png_chunk(b"IHDR", header), before, png_chunk(b"IDAT", zlib.compress(data)), behind]
+    return b"\x89PNG\r\n\x1a\n" + b"".join([*parts, png_chunk(b"IEND", b"")])
+
+
+def png_chunk(name: bytes, content: bytes) -> bytes:
+    """A chunk of a PNG file."""
+    check = zlib.crc32(name + content)
+    return struct.pack(">I", len(content)) + name + content + struct.pack(">I", check)
+
+
+def exif_orientation(orientation: int) -> bytes:
+    """EXIF data with one tag."""
+    return b"MM\0*\0\0\0\x08\0\x01" + struct.pack(">HHIHHI", 274, 3, 1, orientation, 0, 0)
+
+
+def turned(stored: NDArray[Any], orientation: int) -> NDArray[Any]:
+    """Pixels as displayed: where EXIF has the first row and the first column (CIPA DC-008)."""
+    row_side, column_side = ("tl", "tr", "br", "bl", "lt", "rt", "rb", "lb")[orientation - 1]
+    shown = stored if row_side in "tb" else stored.swapaxes(0, 1)
+    if "r" in (row_side, column_side):
+        shown = shown[:, ::-1]
+    return shown[::-1] if "b" in (row_side, column_side) else shown
+
+
+def tiff_bytes(
+    pixels: NDArray[Any], order: str = "<", tags: Mapping[int, Any] = {}, *, big: bool = False
+) -> bytes:
+    """A TIFF file of ``(H, W[, C])`` in one strip, byte by byte; of planes, one strip each.
+
+    Args:
+        pixels: Its pixels.
+        order: Byte order.
+        tags: Other tags, all 16-bit numbers. 284: planes; 259: 8 of a compressed file; 266: 2 of
+            reversed bits.
+        big: BigTIFF.
+    """
+    height, width = pixels.shape[:2]
+    channels = pixels.size // height // width
+    stored = pixels.reshape(height, width, channels).astype(pixels.dtype.newbyteorder(order))
+    planes = np.moveaxis(stored, -1, 0) if tags.get(284) == 2 else [stored]
+    strips = [np.ascontiguousarray(plane).tobytes() for plane in planes]
+    if tags.get(266) == 2:
+        strips = [bytes(int(f"{byte:08b}"[::-1], 2) for byte in strip) for strip in strips]
+    if tags.get(259) == 8:
+        strips = [zlib.compress(strip) for strip in strips]
+    size, head, entry = (8, 16, 20) if big else (4, 8, 12)
+    places = np.cumsum([head, *map(len, strips)]).tolist()
+    shorts = {256: width, 257: height, 258: [8 * pixels.itemsize] * channels, 277: channels}
+    shorts |= {259: 1, 262: 1 if channels < 3 else 2, 278: height} | tags
+    values = {tag: np.array(value, f"{order}u2") for tag, value in shorts.items()}
+    values |= {273: np.array(places[:-1], f"{order}u4")}
+    values |= {279: np.array([len(strip) for strip in strips], f"{order}u4")}
+    count, start = ("Q", "HHQ") if big else ("H", "HHI")
+    behind = places[-1] + struct.calcsize(f"={count}") + entry * len(values) + size
+    entries, extra = b"", b""
+    for tag, value in sorted(values.items()):
+        content = value.tobytes()
+        if len(content) > size:
+            extra, content = extra + content, (behind + len(extra)).to_bytes(size, _NAMES[order])
+        kind = {2: 3, 4: 4}[value.itemsize]
+        entries += struct.pack(f"{order}{start}", tag, kind, value.size) + content.ljust(
+            size, b"\0"
+        )
+    magic = {"<": b"II", ">": b"MM"}[order]
+    magic += struct.pack(f"{order}HHH", 43, 8, 0) if big else struct.pack(f"{order}H", 42)
+    directory = struct.pack(f"{order}{count}", len(values)) + entries + bytes(size)
+    first = places[-1].to_bytes(size, _NAMES[order])
+    return b"".join([magic, first, *strips, directory, extra])
+
+
+_NAMES: Mapping[str, Any] = {"<": "little", ">": "big"}
+
+
 def gpano_xmp(tags: Mapping[str, object], *, elements: bool = False) -> bytes:
     """XMP data with GPano tags as attributes or, beside those of another program, elements."""
-    begin = '<r:Description xmlns:GPano="http://ns.google.com/photos/1.0/panorama/"'
+    listed = " ".join(f'GPano:{name}="{value}"' for name, value in tags.items())
+    description = f"<rdf:Description {listed}/>"
     if elements:
         listed = "".join(f"<GPano:{name}>\n {v}\n</GPano:{name}>" for name, v in tags.items())
-        other = "<o:CroppedAreaTopPixels>7</o:CroppedAreaTopPixels>"
-        return f"{other}{begin}>{listed}</r:Description>".encode()
-    listed = " ".join(f'GPano:{name}="{value}"' for name, value in tags.items())
-    return f"{begin} {listed}/>".encode()
+        other = '<o:CroppedAreaTopPixels xmlns:o="of/another">7</o:CroppedAreaTopPixels>'
+        description = f"<rdf:Description>{other}{listed}</rdf:Description>"
+    return xmp_packet(description)
+
+
+def xmp_packet(content: str, prefix: str = "GPano") -> bytes:
+    """An XMP packet of RDF, with the namespace of the GPano tags under a prefix."""
+    return (
+        '<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>'
+        '<x:xmpmeta xmlns:x="adobe:ns:meta/">'
+        '<rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#"'
+        f' xmlns:{prefix}="http://ns.google.com/photos/1.0/panorama/">'
+        f'{content}</rdf:RDF></x:xmpmeta>\n <?xpacket end="w"?>'
+    ).encode()
 
 
 def contents(root: Path) -> dict[str, bytes]:

@@ -123,7 +123,9 @@ def test_depth_is_in_metres(tmp_path: Path, predicted: Predicted) -> None:
     np.testing.assert_array_equal(network.labels(tensors[0], depth=tensors[1]), expected)
     assert (network.labels(panorama, depth=depth_m * 0) != expected).any()
     for wrong in (None, depth_m[:16], steps):
-        with pytest.raises(SettingError, match=r"depth: .*expected 32×64 floats, in metres"):
+        with pytest.raises(
+            SettingError, match=r"depth: .*expected floats in metres, 64 × 32 \(width × height\)"
+        ):
             network.labels(panorama, depth=wrong)
 
 
@@ -148,7 +150,7 @@ _RGB = np.zeros((16, 32, 3), np.uint8)
 @pytest.mark.parametrize(
     ("image", "message"),
     [
-        (_RGB[:, :31], "found 16×31 pixels; expected the whole sphere.*fov="),
+        (_RGB[:, :31], r"found 31 × 16 \(width × height\); expected the whole sphere.*fov="),
         (_RGB[..., 0], r"ndarray \(16, 32\) of uint8; expected .* array \(H, W, 3\)"),
         (torch.zeros(16, 32, 3, dtype=torch.uint8), r"found Tensor \(16, 32, 3\).*\(3, H, W\)"),
         (torch.zeros(3, 16, 32), "found Tensor.*float32; expected RGB of 0 to 255"),

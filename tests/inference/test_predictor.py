@@ -304,7 +304,7 @@ def test_impossible_settings_are_refused() -> None:
     strided = trained_network(TANGENT, size_multiple=16)
     with pytest.raises(SettingError, match="multiples of 16"):
         PanoramaViews(strided, levels=(3,))
-    with pytest.raises(SettingError, match="at least 24×48"):
+    with pytest.raises(SettingError, match=r"at least 48 × 24 \(width"):
         PanoramaViews(trained_network(ERP, fixed_size=(24, 48)), levels=(3,))
     with pytest.raises(SettingError, match="device"):
         Predictor(trained, PanoramaViews(trained), "nonsense")

@@ -56,9 +56,13 @@ def test_scores_have_the_size_of_the_images_and_every_parameter_learns(network: 
 
 
 def test_a_side_that_does_not_fit_is_refused() -> None:
-    with pytest.raises(SettingError, match=r"48×64; expected sides that are multiples of 32"):
+    with pytest.raises(
+        SettingError, match=r"64 × 48 \(width × height\); expected sides that are multiples of 32"
+    ):
         UNet(3, 4)(torch.zeros(1, 3, 48, 64))
-    with pytest.raises(SettingError, match=r"HexUNet: found 24×32; .* multiples of 16"):
+    with pytest.raises(
+        SettingError, match=r"HexUNet: found 32 × 24 \(width × height\); .* multiples of 16"
+    ):
         HexUNet(3, 4)(torch.zeros(1, 3, 24, 32))
 
 

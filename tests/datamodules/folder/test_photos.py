@@ -172,7 +172,7 @@ def test_labels_of_another_size(tmp_path: Path) -> None:
     save(tmp_path / "labels" / "a.png", np.ones((30, 20), np.uint8))
     save(tmp_path / "labels" / "b.png", np.ones((40, 60), np.uint8))
     (_, small, resized), (_, turned, as_displayed) = _found(tmp_path)
-    assert "30×20 pixels; expected 60×40" in small
+    assert "20 × 30 (width × height); expected 40 × 60 (width × height)" in small
     assert "one size" in resized
-    assert "40×60 pixels; expected 60×40" in turned
+    assert "60 × 40 (width × height); expected 40 × 60 (width × height)" in turned
     assert "EXIF" in as_displayed

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import io
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,7 +15,14 @@ from datamodules.images.gpano import PanoramaArea, area_of, area_of_crop, up_of,
 from tangent_train.errors import DataError, SettingError
 from tangent_train.geometry import equirect_to_lonlat
 from tangent_train.rendering.upright.gravity import up_from_pose
-from tests.datamodules.data_files import GPANO_TAGS, gpano_xmp
+from tests.datamodules.data_files import (
+    GPANO_TAGS,
+    exif_orientation,
+    gpano_xmp,
+    png_bytes,
+    png_chunk,
+    xmp_packet,
+)
 
 
 def _save(
@@ -39,6 +48,147 @@ _AREA = PanoramaArea((180, 360), (30, 70), (100, 160), (40, 60))
 @pytest.mark.parametrize("elements", [False, True])
 def test_tags_of_all_formats(tmp_path: Path, suffix: str, elements: bool) -> None:
     path = _save(tmp_path / f"image{suffix}", GPANO_TAGS, elements=elements)
+    assert area_of(path, (40, 60)) == _AREA
+
+
+# XMP: ways to write the same, and places to write it to.
+
+_PITCH, _ROLL = "-24.5", "8.96"
+_UP = up_from_pose(-24.5, 8.96)
+_RDF = 'xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#"'
+_ATTRIBUTES = f'GPano:PosePitchDegrees="{_PITCH}" GPano:PoseRollDegrees="{_ROLL}"'
+_ELEMENTS = (
+    f"<GPano:PosePitchDegrees>{_PITCH}</GPano:PosePitchDegrees>"
+    f"<GPano:PoseRollDegrees>{_ROLL}</GPano:PoseRollDegrees>"
+)
+_OTHERS = (  # of the image that this one was made from, and of another program
+    '<m:Ingredients xmlns:m="of/another"><rdf:Bag><rdf:li rdf:parseType="Resource">'
+    "<GPano:PosePitchDegrees>1</GPano:PosePitchDegrees></rdf:li>"
+    '<rdf:li><rdf:Description GPano:PosePitchDegrees="2"/></rdf:li></rdf:Bag></m:Ingredients>'
+    '<m:PosePitchDegrees xmlns:m="of/another">3</m:PosePitchDegrees>'
+)
+_FORMS = {
+    "attributes": f'<rdf:Description rdf:about="" {_ATTRIBUTES}/>',
+    "single quotes": f"<rdf:Description {_ATTRIBUTES}/>".replace('"', "'"),
+    "elements": f"<rdf:Description>{_ELEMENTS}</rdf:Description>",
+    "white space": f"<rdf:Description>\n{_ELEMENTS}</rdf:Description>".replace(">-", ">\n\t-"),
+    "two descriptions": f"<rdf:Description/><rdf:Description {_ATTRIBUTES}/>",
+    "beside others": f"<rdf:Description>{_OTHERS}{_ELEMENTS}{_OTHERS}</rdf:Description>",
+    "after others": f"<rdf:Description {_ATTRIBUTES}>{_OTHERS}</rdf:Description>",
+    "references": f"<rdf:Description {_ATTRIBUTES}/>".replace("-24", "&#x2d;&#50;4"),
+    "comments": f"<rdf:Description>{_ELEMENTS}</rdf:Description>".replace(">-", "><!-- ° -->-"),
+    "character data": f"<rdf:Description>{_ELEMENTS}</rdf:Description>".replace(
+        _PITCH, f"<![CDATA[{_PITCH}]]>"
+    ),
+    "language": f"<rdf:Description>{_ELEMENTS}</rdf:Description>".replace(
+        "PitchDegrees>-", 'PitchDegrees xml:lang="x-default">-'
+    ),
+    "qualifiers": f"<rdf:Description>{_ELEMENTS}</rdf:Description>".replace(
+        f"Degrees>{_PITCH}<",
+        f'Degrees rdf:parseType="Resource"><rdf:value>{_PITCH}</rdf:value>'
+        '<q:by xmlns:q="of/q">me</q:by><',
+    ),
+    "qualifiers in a description": f"<rdf:Description>{_ELEMENTS}</rdf:Description>".replace(
+        f"Degrees>{_PITCH}<",
+        f'Degrees>\n<rdf:Description><q:by xmlns:q="of/q">me</q:by><rdf:value>{_PITCH}</rdf:value>'
+        "</rdf:Description>\n<",
+    ),
+    "a value as attribute": f"<rdf:Description>{_ELEMENTS}</rdf:Description>".replace(
+        f"Degrees>{_PITCH}</GPano:PosePitchDegrees>",
+        f'Degrees rdf:value="{_PITCH}" q:by="me" xmlns:q="of/q"/>',
+    ),
+}
+
+
+def _jpeg(*segments: bytes) -> bytes:
+    """A JPEG file with APP1 segments."""
+    file = io.BytesIO()
+    Image.new("RGB", (60, 40)).save(file, "JPEG")
+    parts = [b"\xff\xe1" + (len(s) + 2).to_bytes(2, "big") + s for s in segments]
+    return b"".join([file.getvalue()[:2], *parts, file.getvalue()[2:]])
+
+
+def _adobe(packet: bytes) -> bytes:
+    return b"http://ns.adobe.com/xap/1.0/\0" + packet
+
+
+@pytest.mark.parametrize("prefix", ["GPano", "ns1", "photo-sphere"])
+@pytest.mark.parametrize("form", _FORMS)
+def test_forms_of_xmp(tmp_path: Path, form: str, prefix: str) -> None:
+    packet = xmp_packet(_FORMS[form].replace("GPano", prefix), prefix)
+    (tmp_path / "image.jpg").write_bytes(_jpeg(_adobe(packet)))
+    np.testing.assert_array_equal(up_of(tmp_path / "image.jpg"), _UP)
+
+
+def test_places_of_xmp(tmp_path: Path) -> None:
+    """In every format where programs put it, with what fills the packet or without."""
+    packet = xmp_packet(_FORMS["attributes"])
+    title = b"XML:com.adobe.xmp\0"
+    raw = b"\nxmp\n%8d\n%s\n" % (len(packet), packet.hex().encode())
+    app1 = _adobe(packet)
+    raw_app1 = b"\napp1\n%8d\n%s\n" % (len(app1), app1.hex().encode())
+    chunks = {
+        "plain": png_chunk(b"iTXt", title + b"\0\0\0\0" + packet),
+        "compressed": png_chunk(b"iTXt", title + b"\1\0en\0\0" + zlib.compress(packet)),
+        "raw": png_chunk(b"tEXt", b"Raw profile type xmp\0" + raw),
+        "raw, compressed": png_chunk(b"zTXt", b"Raw profile type xmp\0\0" + zlib.compress(raw)),
+        "raw APP1": png_chunk(b"tEXt", b"Raw profile type APP1\0" + raw_app1),
+    }
+    pixels = np.zeros((40, 60, 3), np.uint8)
+    files = {f"{name}, before.png": png_bytes(pixels, before=c) for name, c in chunks.items()}
+    files |= {f"{name}, behind.png": png_bytes(pixels, behind=c) for name, c in chunks.items()}
+    files["main.jpg"] = _jpeg(b"Exif\0\0" + exif_orientation(1), _adobe(packet))
+    files["padded.jpg"] = _jpeg(_adobe(packet + b" \n" * 2000 + b"\0"))
+    named = "0123456789ABCDEF0123456789ABCDEF"
+    extended = [
+        b"http://ns.adobe.com/xmp/extension/\0" + name.encode() + len(packet).to_bytes(4, "big")
+        + start.to_bytes(4, "big") + packet[start : start + 200]
+        for name in ("F" * 32, named)
+        for start in reversed(range(0, len(packet), 200))
+    ]  # fmt: skip
+    note = f'<rdf:Description n:HasExtendedXMP="{named}" xmlns:n="http://ns.adobe.com/xmp/note/"/>'
+    files["extended.jpg"] = _jpeg(_adobe(xmp_packet(note)), *extended)
+    for name, content in files.items():
+        (tmp_path / name).write_bytes(content)
+    Image.fromarray(pixels).save(tmp_path / "xmp.tif", tiffinfo={700: packet})
+    Image.fromarray(pixels).save(tmp_path / "xmp.webp", xmp=packet, lossless=True)
+    Image.fromarray(pixels).save(
+        tmp_path / "utf16.jpg", xmp=packet.decode().encode("utf-16"), quality=90
+    )
+    for path in sorted(tmp_path.iterdir()):
+        np.testing.assert_array_equal(up_of(path), _UP, err_msg=path.name)
+    foreign = _jpeg(_adobe(xmp_packet("<rdf:Description/>")), *extended)
+    (tmp_path / "foreign.jpg").write_bytes(foreign)
+    assert up_of(tmp_path / "foreign.jpg") is None
+
+
+@pytest.mark.parametrize(
+    "packet",
+    [
+        xmp_packet(_FORMS["attributes"])[:-60],
+        xmp_packet(_FORMS["attributes"]).replace(b"rdf:about", b"other:about"),
+        b'<!DOCTYPE x [<!ENTITY a "aaaa">]>' + xmp_packet(_FORMS["attributes"]),
+        '<?xml version="1.0" encoding="UTF-16"?><!DOCTYPE x>'.encode("utf-16")
+        + xmp_packet(_FORMS["attributes"]).decode().encode("utf-16-le"),
+    ],
+    ids=["truncated", "unknown prefix", "entities", "UTF-16"],
+)
+def test_xmp_that_cannot_be_read(tmp_path: Path, packet: bytes) -> None:
+    """Refused with these tags; without them it is nobody's business."""
+    path = tmp_path / "image.jpg"
+    path.write_bytes(_jpeg(_adobe(packet)))
+    with pytest.raises(DataError, match=r"image\.jpg: found XMP data that .*exiftool"):
+        up_of(path)
+    other = packet.replace(b"photos", b"videos").replace(
+        *(s.encode("utf-16-le") for s in ("photos", "videos"))
+    )
+    path.write_bytes(_jpeg(_adobe(other)))
+    assert up_of(path) is None
+
+
+@pytest.mark.parametrize("projection", ["Equirectangular", "EQUIRECTANGULAR"])
+def test_the_projection_in_any_case(tmp_path: Path, projection: str) -> None:
+    path = _save(tmp_path / "image.jpg", GPANO_TAGS | {"ProjectionType": projection})
     assert area_of(path, (40, 60)) == _AREA
 
 
@@ -79,10 +229,18 @@ def _angles_deg(area: PanoramaArea, corner_xy: tuple[int, int]) -> NDArray[np.fl
     [
         ({"ProjectionType": "cylindrical"}, (40, 60), "GPano:ProjectionType cylindrical"),
         ({"FullPanoWidthPixels": "many"}, (40, 60), "GPano:FullPanoWidthPixels 'many'"),
-        ({"FullPanoHeightPixels": "100"}, (40, 60), r"of 100×360 .*expected a part"),
-        ({"CroppedAreaTopPixels": "150"}, (40, 60), r"at \(150, 100\) of 180×360"),
-        ({"CroppedAreaImageWidthPixels": "0"}, (40, 60), "40×0 pixels"),
-        ({}, (40, 50), r"in an image of 40×50; .*may have been cut after"),
+        (
+            {"FullPanoHeightPixels": "100"},
+            (40, 60),
+            r"of 360 × 100 \(width × height\), .*expected a part",
+        ),
+        (
+            {"CroppedAreaTopPixels": "150"},
+            (40, 60),
+            "100 from the left and 150 from the top of 360 × 180",
+        ),
+        ({"CroppedAreaImageWidthPixels": "0"}, (40, 60), "tags of 0 × 40"),
+        ({}, (40, 50), r"in an image of 50 × 40 \(width × height\); .*may have been cut after"),
         ({"FullPanoWidthPixels": "9e7", "FullPanoHeightPixels": "4.5e7"}, (40, 60), "columns"),
     ],
 )
@@ -135,7 +293,7 @@ def test_whole_panoramas_may_lack_a_column_or_have_one_more(tmp_path: Path, widt
 
 @pytest.mark.parametrize("size", [(10, 18), (10, 22), (1, 1)])
 def test_other_shapes_are_refused(tmp_path: Path, size: tuple[int, int]) -> None:
-    message = rf"a\.jpg: found {size[0]}×{size[1]} pixels.*crop=.*GPano.*projection=perspective"
+    message = rf"a\.jpg: found {size[1]} × {size[0]} .*crop=.*GPano.*projection=perspective"
     with pytest.raises(DataError, match=message):
         whole_area(tmp_path / "a.jpg", size)
 
@@ -173,7 +331,7 @@ def test_edges_are_where_the_crop_says(seed: int) -> None:
         ((0, 181, -90, 90), "expected .*−180 to 180"),
         ((0, 90, 20, 20), "south below north"),
         ((180, -180, 0, 10), "east other than west"),
-        ((0, 40, 0, 10), r"pixels of 0\.4°×0\.1° in an image of 100×100; .* square"),
+        ((0, 40, 0, 10), r"pixels 0\.4° wide and 0\.1° high in an image of 100 × 100 .* square"),
     ],
 )
 def test_impossible_crops(crop: tuple[float, ...], message: str) -> None:

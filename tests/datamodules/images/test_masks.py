@@ -59,7 +59,7 @@ def test_every_panorama_has_its_own(tmp_path: Path) -> None:
         np.testing.assert_array_equal(found, np.where(spotted(32, seed), 255, 0))
     write_pixels(tmp_path / "square.png", np.ones((20, 20), np.uint8))
     for use in (masks.check, lambda name: masks.read(name, WHOLE)):
-        with pytest.raises(DataError, match=r"square\.png: found 20×20.*twice as wide as high"):
+        with pytest.raises(DataError, match=r"square\.png: found 20 × 20 .*twice as wide as high"):
             use("square")
 
 

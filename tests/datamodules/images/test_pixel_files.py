@@ -22,7 +22,14 @@ from datamodules.images.pixel_files import (
 )
 from datamodules.images.png import read_png_header
 from tangent_train.errors import DataError, SettingError
-from tests.datamodules.data_files import write_png
+from tests.datamodules.data_files import (
+    exif_orientation,
+    png_bytes,
+    png_chunk,
+    tiff_bytes,
+    turned,
+    write_png,
+)
 
 
 def _noise(shape: tuple[int, ...], dtype: Any = np.uint8) -> NDArray[Any]:
@@ -118,6 +125,128 @@ def test_jpeg_gives_the_upright_pixels_of_another_decoder(tmp_path: Path, orient
     assert expected is not None
     np.testing.assert_array_equal(read_rgb(tmp_path / "image.jpg"), expected[..., ::-1])
     assert read_image_size(tmp_path / "image.jpg") == expected.shape[:2]
+
+
+_EXIF_FORMS = {
+    "chunk": lambda exif: png_chunk(b"eXIf", exif),
+    "raw profile": lambda exif: png_chunk(
+        b"tEXt",
+        b"Raw profile type exif\0\nexif\n%8d\n%s"
+        % (len(exif) + 6, (b"Exif\0\0" + exif).hex().encode()),
+    ),
+}
+
+
+@pytest.mark.parametrize("form", _EXIF_FORMS)
+@pytest.mark.parametrize("place", ["before", "behind"])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("channels", [(), (2,), (3,), (4,)])
+def test_png_is_turned_wherever_its_exif_data_are(
+    tmp_path: Path, form: str, place: str, dtype: Any, channels: tuple[int, ...]
+) -> None:
+    """Labels too: 16-bit PNG files were read as they are stored, and all with EXIF data behind."""
+    stored = _noise((4, 6, *channels), dtype)
+    path = tmp_path / "image.png"
+    for orientation in range(1, 9):
+        chunk = _EXIF_FORMS[form](exif_orientation(orientation))
+        path.write_bytes(png_bytes(stored, **{place: chunk}))
+        shown = turned(stored, orientation)
+        expected = {2: shown[..., 0], 4: shown[..., :3]}.get(stored.size // 24, shown)
+        np.testing.assert_array_equal(read_pixels(path, indices=True), expected)
+        assert read_image_size(path) == expected.shape[:2]
+
+
+@pytest.mark.parametrize("suffix", [".png", ".webp"])
+def test_lossless_images_are_turned(tmp_path: Path, suffix: str) -> None:
+    stored = _noise((6, 10, 3))
+    for orientation in range(1, 9):
+        path = tmp_path / f"{orientation}{suffix}"
+        exif = b"Exif\0\0" + exif_orientation(orientation)
+        Image.fromarray(stored).save(path, exif=exif, lossless=True)
+        np.testing.assert_array_equal(read_rgb(path), turned(stored, orientation))
+        assert read_image_size(path) == turned(stored, orientation).shape[:2]
+
+
+# Layouts of TIFF files: of every one the pixels, or an error.
+
+
+def _values(dtype: str, channels: int) -> NDArray[Any]:
+    """Large and small, negative where the type allows it."""
+    bits = 8 * np.dtype(dtype).itemsize
+    values = np.arange(6 * 10 * channels).reshape(6, 10, channels) * 0.37 + 1
+    if dtype[0] != "f":
+        values = values / values.max() * 2.0 ** (bits - (dtype[0] == "i")) * 0.99
+        values[::2] *= -1 if dtype[0] == "i" else 1
+    return values.astype(dtype)[..., 0] if channels == 1 else values.astype(dtype)
+
+
+@pytest.mark.parametrize("dtype", ["u1", "u2", "u4", "i1", "i2", "i4", "f2", "f4", "f8"])
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("channels", [1, 2, 3, 4, 5])
+@pytest.mark.parametrize("compression", [1, 8])
+def test_tiff_gives_its_values_or_an_error(
+    tmp_path: Path, dtype: str, order: str, channels: int, compression: int
+) -> None:
+    """Big-endian and compressed, or of planes, or above 2³¹, some were garbage without an error."""
+    values = _values(dtype, channels)
+    kept = values[..., 0] if channels == 2 else values[..., :3] if channels > 3 else values
+    kind = {"u": 1, "i": 2, "f": 3}[dtype[0]]
+    extra = {338: [2] * (channels - 3)} if channels > 3 else {338: [2]} if channels == 2 else {}
+    path = tmp_path / "image.tif"
+    decoded = set()
+    for planes in (1, 2):
+        for fill in (1, 2):
+            tags = {259: compression, 284: planes, 266: fill, 339: [kind] * channels, **extra}
+            path.write_bytes(tiff_bytes(values, order, tags))
+            try:
+                found = read_pixels(path, indices=True)
+            except DataError:
+                continue
+            np.testing.assert_array_equal(found, kept)
+            assert found.dtype.isnative
+            decoded.add((planes, fill))
+    common = {("u1", 1), ("u1", 3), ("u1", 4), ("u2", 1), ("u2", 3), ("u2", 4), ("f4", 1)}
+    if (dtype, channels) in common:
+        assert (1, 1) in decoded
+
+
+@pytest.mark.parametrize("dtype", ["u1", "u2", "f4"])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_tiff_is_turned(tmp_path: Path, dtype: str, channels: int) -> None:
+    values, path = _values(dtype, channels), tmp_path / "image.tif"
+    for orientation in range(1, 9):
+        tags = {274: orientation, 339: [3 if dtype == "f4" else 1] * channels}
+        path.write_bytes(tiff_bytes(values, tags=tags))
+        expected = turned(values, orientation)
+        if (dtype, channels) != ("f4", 3):  # which Pillow does not open
+            np.testing.assert_array_equal(read_pixels(path, indices=True), expected)
+            assert read_image_size(path) == expected.shape[:2]
+
+
+def test_other_tiff_files(tmp_path: Path) -> None:
+    path = tmp_path / "image.tif"
+    values = _values("u2", 3)
+    path.write_bytes(tiff_bytes(values, big=True))
+    np.testing.assert_array_equal(read_pixels(path, indices=True), values)
+    grey = _values("u1", 1)
+    path.write_bytes(tiff_bytes(grey, tags={262: 0}))  # 0 is white
+    np.testing.assert_array_equal(read_rgb(path)[..., 0], 255 - grey)
+    inks = _values("u1", 4)
+    path.write_bytes(tiff_bytes(inks, tags={262: 5}))
+    expected = (255.0 - inks[..., :3]) * (255.0 - inks[..., 3:]) / 255
+    assert np.abs(read_rgb(path) - expected).max() <= 1
+    for pixels, tags in [
+        (values, {284: 2}),  # planes
+        (grey.astype(np.uint16) * 257, {262: 0}),
+        (_values("u2", 4), {338: 1}),  # colours multiplied by alpha
+        (_values("u2", 4), {262: 5}),
+        (_values("u1", 3), {262: 6, 530: [2, 2]}),  # colours of fewer pixels
+        (grey.astype(np.uint16) // 16, {258: 12}),
+        (values, {339: [1, 1, 2]}),
+    ]:
+        path.write_bytes(tiff_bytes(pixels, tags=tags))
+        with pytest.raises(DataError, match=r"image\.tif: found .*(layout|no image)"):
+            read_pixels(path, indices=False)
 
 
 @pytest.mark.parametrize("read", [read_rgb, read_image_size, photo_fov_deg])

@@ -40,7 +40,7 @@ def test_cameras(tmp_path: Path, text: str | None) -> None:
 )
 def test_strange_cameras(tmp_path: Path, text: str) -> None:
     _write_camera(tmp_path, text)
-    with pytest.raises(DataError, match=r"intrinsics\.txt: found .* views of 760×1280"):
+    with pytest.raises(DataError, match=r"intrinsics\.txt: found .* views of 1280 × 760"):
         read_camera(tmp_path, (760, 1280))
 
 
