@@ -170,7 +170,7 @@ def load_plain(path: Path, expected: str, *, mmap: bool = False) -> Any:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """`json.loads`, with a `ValueError` for text that is nested too deeply.
+    """`json.loads`, with a `ValueError` for a name given twice, or text that is nested too deeply.
 
     Args:
         text: UTF-8, UTF-16 or UTF-32 where it is bytes.
@@ -179,9 +179,17 @@ def parse_json(text: str | bytes) -> Any:
         ValueError: It is no JSON.
     """
     try:
-        return json.loads(text)
+        return json.loads(text, object_pairs_hook=_without_repetition)
     except RecursionError as error:
         raise ValueError("its brackets are nested too deeply") from error
+
+
+def _without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    content = dict(pairs)
+    if len(content) < len(pairs):
+        names = [name for name, _ in pairs]
+        raise ValueError(f"the name {next(n for n in names if names.count(n) > 1)!r} twice")
+    return content
 
 
 def read_json(path: Path, expected: str, remedy: str = "") -> Any:

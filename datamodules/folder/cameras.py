@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from datamodules.core.panoramas import ImageFiles
 from datamodules.core.problems import Problems
+from datamodules.images.image_files import composed
 from datamodules.images.pixel_files import photo_fov_deg, read_image_size
 from tangent_train.errors import DataError
 from tangent_train.files import read_json
@@ -151,7 +152,7 @@ def read_cameras(path: Path, fov_deg: float | None) -> FolderCameras:
     content = read_json(path, _EXAMPLE) if os.path.lexists(path) else {}
     if not isinstance(content, dict):
         raise DataError(path, found=json.dumps(content), expected=_EXAMPLE)
-    given = {PurePosixPath(name).as_posix(): value for name, value in content.items()}
+    given = {PurePosixPath(composed(name)).as_posix(): value for name, value in content.items()}
     if len(given) < len(content):
         raise DataError(path, found="one name written in two ways", expected="every name once")
     return FolderCameras(path, given, fov_deg)

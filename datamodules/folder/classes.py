@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from datamodules.images.image_files import composed
 from tangent_train.errors import DataError, counted
 from tangent_train.files import read_json
 
@@ -140,6 +141,7 @@ def read_classes(path: Path) -> FolderClasses:
         named = [(n, given if isinstance(given, list) else [given]) for n, given in content.items()]
     else:
         raise DataError(path, found=json.dumps(content), expected=_EXPECTED)
+    named = [(composed(n) if isinstance(n, str) else n, given) for n, given in named]
     _check_names(path, [name for name, _ in named])
     codes = _codes(path, named)
     ordered = sorted(codes)
@@ -169,7 +171,12 @@ def _check_names(path: Path, names: list[Any]) -> None:
         )
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
-        raise DataError(path, found=f"class {twice[0]!r} twice", expected="every name once")
+        raise DataError(
+            path,
+            found=f"class {twice[0]!r} twice",
+            expected="every name once",
+            remedy='For several values or colours, write {"floor": [2, 3]}.',
+        )
 
 
 def _codes(path: Path, named: list[tuple[str, list[Any]]]) -> dict[int, int]:

@@ -103,9 +103,11 @@ class LabelledFolder(ImageDataModule):
     def _check_classes(self, images: Sequence[ImageFiles], problems: Problems) -> None:
         """Check the class list against the first few label images."""
         classes = self._classes
+        reader = FolderReader(classes, self.depth_units_per_m)
         seen: set[int] = set()
         for files in images:
             with problems.noted(files.name):
+                reader.size("labels", files.labels)  # else it would be refused in other words
                 stored = read_codes(files.labels, in_colors=classes.in_colors)
                 if classes.decode(stored, files.labels).any():
                     return

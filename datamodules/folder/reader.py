@@ -15,7 +15,14 @@ from datamodules.core.panoramas import ImageFiles, ImageReader, meters_to_steps,
 from datamodules.core.problems import Problems
 from datamodules.folder.cameras import FolderCameras
 from datamodules.folder.classes import FolderClasses, read_classes
-from datamodules.images.image_files import IMAGE_SUFFIXES, find_depth, image_paths, walk_files
+from datamodules.images.image_files import (
+    IMAGE_SUFFIXES,
+    NamedFiles,
+    composed,
+    find_depth,
+    image_paths,
+    walk_files,
+)
 from datamodules.images.masks import Masks
 from datamodules.images.pixel_files import read_depth_m, read_image_size, read_pixels, read_rgb
 from datamodules.images.png import PngHeader, read_png_header
@@ -52,9 +59,7 @@ class FolderReader(ImageReader):
         """See `ImageReader`, as all others."""
         if part == "labels":
             _check_there(path)
-            header = read_png_header(path)
-            _check_kind(path, header, in_colors=self.classes.in_colors)
-            return header.height, header.width
+            _check_kind(path, read_png_header(path), in_colors=self.classes.in_colors)
         return read_image_size(path)
 
     def rgb(self, files: ImageFiles) -> NDArray[np.uint8]:
@@ -79,11 +84,11 @@ class FolderReader(ImageReader):
 def list_images(root: Path, problems: Problems, *, with_depth: bool) -> list[ImageFiles]:
     """All images of a data set, in the order of their names.
 
-    A name is the path of the image in ``images/`` without ending.
+    A name is the path of the image in ``images/`` without ending, see `composed`.
 
     Args:
         root: Folder with ``images/`` and ``labels/``.
-        problems: Duplicate names and missing or ambiguous depth are added.
+        problems: Duplicate names and missing or ambiguous files are added.
         with_depth: Whether depth is wanted.
 
     Raises:
@@ -94,10 +99,13 @@ def list_images(root: Path, problems: Problems, *, with_depth: bool) -> list[Ima
             expected = "a data set: images/, labels/ and classes.json, see docs/own_data.md"
             raise DataError(folder, found="no such folder", expected=expected)
     found: dict[str, ImageFiles] = {}
+    pictures, labels = NamedFiles(root / "images"), NamedFiles(root / "labels")
+    depths = NamedFiles(root / "depth") if with_depth else None
     for rgb in image_paths(root / "images"):
         name = _name(root / "images", rgb)
-        depth = None
+        own, depth = labels.folder / f"{name}.png", None
         with problems.noted(name):
+            pictures.path(rgb.relative_to(pictures.folder).as_posix())
             if name in found:
                 raise DataError(
                     rgb,
@@ -105,10 +113,11 @@ def list_images(root: Path, problems: Problems, *, with_depth: bool) -> list[Ima
                     expected="one image of each name: its labels have the same one",
                     remedy="Rename or remove one of them.",
                 )
-            if with_depth:
+            own = labels.path(f"{name}.png")
+            if depths is not None:
                 without = "Or train without depth: data.inputs=[rgb]."
-                depth = find_depth(root / "depth", name, without)
-        found.setdefault(name, ImageFiles(name, rgb, root / "labels" / f"{name}.png", depth))
+                depth = find_depth(depths, name, without)
+        found.setdefault(name, ImageFiles(name, rgb, own, depth))
     return [found[name] for name in sorted(found)]
 
 
@@ -134,7 +143,7 @@ def note_ignored(root: Path, problems: Problems) -> None:
 
 
 def _name(folder: Path, path: Path) -> str:
-    return path.relative_to(folder).with_suffix("").as_posix()
+    return composed(path.relative_to(folder).with_suffix("").as_posix())
 
 
 def _check_there(path: Path) -> None:
@@ -191,7 +200,7 @@ def class_masks(folder: Path, ignored: Sequence[str]) -> Masks:
         SettingError: It does not name one of the classes.
     """
     classes = read_classes(folder / "classes.json")
-    names = classes.names
+    names, ignored = classes.names, list(map(composed, ignored))
     if set(ignored) - set(names):
         found = ", ".join(sorted(set(ignored) - set(names)))
         raise SettingError("mask_classes", found=found, expected=f"of {', '.join(names)}")

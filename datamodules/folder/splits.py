@@ -11,6 +11,7 @@ from lightning.pytorch.utilities import rank_zero_warn
 from datamodules.core.found import SPLITS, Split, draw_groups
 from datamodules.core.panoramas import ImageFiles
 from datamodules.core.problems import Problems
+from datamodules.images.image_files import composed
 from tangent_train.errors import DataError, counted
 
 
@@ -153,7 +154,7 @@ def _listed_name(path: Path, line: str, names: dict[str, str], owners: dict[str,
 def _lines(path: Path) -> list[str]:
     """The names in a list, without empty lines and those that begin with #."""
     try:
-        lines = [line.strip() for line in path.read_text("utf-8-sig").splitlines()]
+        lines = [composed(line.strip()) for line in path.read_text("utf-8-sig").splitlines()]
     except (OSError, UnicodeDecodeError) as error:
         raise DataError(path, found=error, expected="names, one per line, in UTF-8") from error
     return [line for line in lines if line and not line.startswith("#")]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import glob
 import os
+import unicodedata
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -78,11 +79,59 @@ def _refuse(error: OSError) -> None:
     raise DataError(error.filename, found=error, expected=expected) from error
 
 
-def find_depth(folder: Path, name: str, remedy: str) -> Path:
+def composed(name: str) -> str:
+    """A name with composed letters (Unicode's form NFC).
+
+    Keyboards write "ü" as one character; macOS and its archives, as "u" and an accent.
+
+    >>> composed("u" + chr(0x308)) == "ü"
+    True
+    """
+    return unicodedata.normalize("NFC", name)
+
+
+class NamedFiles:
+    """Files of a folder and its subfolders by `composed` names.
+
+    Args:
+        folder: There or not.
+
+    Raises:
+        DataError: A folder cannot be opened.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._found: dict[str, list[Path]] = {}
+        for path in walk_files(folder):
+            name = composed(path.relative_to(folder).as_posix())
+            self._found.setdefault(name, []).append(path)
+
+    def path(self, name: str) -> Path:
+        """The file of a name, there or not.
+
+        Args:
+            name: Its path in the folder.
+
+        Raises:
+            DataError: There are several.
+        """
+        paths = self._found.get(composed(name), [self.folder / name])
+        if len(paths) > 1:
+            raise DataError(
+                paths[0],
+                found=f"{paths[0].name!a} and {paths[1].name!a}, which look the same",
+                expected="one file of each name, however its letters are encoded",
+                remedy="Rename or remove one of them.",
+            )
+        return paths[0]
+
+
+def find_depth(files: NamedFiles, name: str, remedy: str) -> Path:
     """The depth map of an image.
 
     Args:
-        folder: Of the depth maps.
+        files: The depth maps.
         name: Path of the image below the folder of images, without suffix. The depth map has the
             same name, or that with ``_depth`` at the end, and one of `DEPTH_SUFFIXES`.
         remedy: Remedy if there is none.
@@ -90,11 +139,11 @@ def find_depth(folder: Path, name: str, remedy: str) -> Path:
     Raises:
         DataError: There is none, or there are several.
     """
-    candidates = [folder / f"{name}{end}{s}" for end in ("", "_depth") for s in DEPTH_SUFFIXES]
+    candidates = [files.path(f"{name}{end}{s}") for end in ("", "_depth") for s in DEPTH_SUFFIXES]
     found = [path for path in candidates if path.is_file()]
     if len(found) != 1:
         raise DataError(
-            folder / name,
+            files.folder / name,
             found=", ".join(path.name for path in found) or "no such file",
             expected="one file of this name, or with _depth at its end, and one of "
             f"{', '.join(DEPTH_SUFFIXES)}",

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from datamodules.core.panoramas import resize_nearest
 from datamodules.images.gpano import PanoramaArea, whole_area
+from datamodules.images.image_files import NamedFiles
 from datamodules.images.pixel_files import LOSSY_SUFFIXES, read_image_size, read_pixels
 from tangent_train.errors import DataError, SettingError
 
@@ -49,10 +50,12 @@ class Masks:
     ) -> None:
         self._lowest_deg, self._path, self._of_all = -90.0, Path(), None
         self._counts, self.of_each = counts, False
+        self._files: NamedFiles | None = None
         self._kept: tuple[PanoramaArea, NDArray[np.uint8]] | None = None
         if isinstance(mask, str | Path):
             self._path = Path(mask)
             self.of_each = self._path.is_dir()
+            self._files = NamedFiles(self._path) if self.of_each else None
             self._of_all = None if self.of_each else self._read(self._path)
         elif isinstance(mask, int | float) and not isinstance(mask, bool) and -90 < mask <= 0:
             self._lowest_deg = float(mask)
@@ -69,7 +72,7 @@ class Masks:
         Raises:
             DataError: It is missing, or not twice as wide as high.
         """
-        path = self._checked(self._path / f"{name}.png")
+        path = self._checked(self._file(name))
         whole_area(path, read_image_size(path), _REMEDY)
 
     def read(self, name: str, area: PanoramaArea) -> NDArray[np.uint8]:
@@ -91,7 +94,7 @@ class Masks:
             return kept[1]
         path, own = self._path, self._of_all
         if self.of_each:
-            path = self._path / f"{name}.png"
+            path = self._file(name)
             own = self._read(path)
         counts = area.place(np.full(area.image_shape, 255, np.uint8))
         rows = area.full_shape[0]
@@ -104,6 +107,9 @@ class Masks:
         if not self.of_each:
             self._kept = area, counts
         return counts
+
+    def _file(self, name: str) -> Path:
+        return self._path if self._files is None else self._files.path(f"{name}.png")
 
     def _read(self, path: Path) -> NDArray[np.bool_]:
         return self._counts(self._checked(path))

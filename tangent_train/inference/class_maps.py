@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
+from datamodules.images.image_files import composed
 from tangent_train.checkpoints.scores import Scores
 from tangent_train.checkpoints.trained import TrainedNetwork
 from tangent_train.errors import DataError, SettingError
@@ -171,5 +172,5 @@ def map_classes(
 
 def _plain(name: str) -> str:
     """The first synonym of a name, as names are compared."""
-    first = name.partition(",")[0].replace("-", " ").replace("_", " ")
+    first = composed(name).partition(",")[0].replace("-", " ").replace("_", " ")
     return " ".join(first.casefold().split())

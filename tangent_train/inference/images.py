@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from datamodules.core.panoramas import meters_to_steps, resize_nearest
 from datamodules.images.gpano import PanoramaArea, area_of, area_of_crop, up_of, whole_area
-from datamodules.images.image_files import find_depth
+from datamodules.images.image_files import NamedFiles, find_depth
 from datamodules.images.pixel_files import photo_fov_deg, read_depth_m, read_rgb
 from tangent_train.errors import DataError, width_height
 from tangent_train.geometry import camera_matrix_from_fov
@@ -41,6 +41,10 @@ class DepthFolder:
     path: Path
     units_per_m: float
 
+    @cached_property
+    def _files(self) -> NamedFiles:
+        return NamedFiles(self.path)
+
     def read(self, name: str, shape: tuple[int, int]) -> NDArray[np.uint16]:
         """Depth of an image in steps of 1/512 m, 0 where missing.
 
@@ -52,7 +56,7 @@ class DepthFolder:
             DataError: There is none, it is broken, or its aspect ratio is another.
         """
         remedy = "Put depth into a folder of its own, with the names of the images."
-        path = find_depth(self.path, name, remedy)
+        path = find_depth(self._files, name, remedy)
         depth_m = read_depth_m(path, self.units_per_m)
         height, width = depth_m.shape
         if abs(width * shape[0] / (height * shape[1]) - 1) > _ASPECT_TOLERANCE:

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from datamodules.folder.classes import UNKNOWN_NAME
+from datamodules.images.image_files import composed
 from datamodules.images.pixel_files import array_file, read_pixels, write_pixels
 from datamodules.images.videos import write_video
 from tangent_train.errors import SettingError
@@ -235,15 +237,21 @@ class PredictionFolder:
                 array[part] = scores.probabilities(rows[part])[:, columns, : shape[-1]]
 
     def write_summary(self, settings: Mapping[str, Any], entries: Sequence[Entry]) -> None:
-        """Write ``summary.json``, ``summary.csv`` and ``classes.json`` (label values by name).
+        """Write ``summary.json``, ``summary.csv`` and ``classes.json`` (labels by name).
+
+        Labels whose class is called unknown are left out of ``classes.json``: they have no class.
 
         Args:
             settings: Settings of the prediction.
             entries: Of the images done so far.
         """
         names = dict.fromkeys(self.class_names)
-        values = {name: value for value, name in enumerate(self.class_names[1:], start=1)}
-        write_text(self.path / "classes.json", json.dumps(values, indent=1) + "\n")
+        labels: dict[str, list[int]] = {}
+        for label, name in enumerate(map(composed, self.class_names)):
+            if name != UNKNOWN_NAME:
+                labels.setdefault(name, []).append(label)
+        lines = (f" {json.dumps(name)}: {given}" for name, given in labels.items())
+        write_text(self.path / "classes.json", "{\n" + ",\n".join(lines) + "\n}\n")
         content = {**settings, "images": entries}
         write_text(self.path / _SUMMARY, json.dumps(content, indent=1) + "\n")
         columns = ("file", "rows", "columns")

@@ -50,7 +50,7 @@ def test_a_folder_of_panoramas(tmp_path: Path, predict: Predict) -> None:
     assert rows["broken.jpg"]["dark"] == ""
     assert rows["a=b.png"]["dark"] == str(entries["a=b"]["classes"]["dark"])
     names = json.loads((output / "classes.json").read_text())
-    assert names == {"dark": 1, "green": 2, "bright": 3}
+    assert names == {"dark": [1], "green": [2], "bright": [3]}
     for remedy in ("16 × 16", "crop=", "GPano", "projection=perspective"):
         assert remedy in entries["square"]["error"]
     assert sum(entries["a=b"]["classes"].values()) == pytest.approx(1)

@@ -8,11 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from datamodules.images.gpano import area_of_crop
+from datamodules.folder.classes import read_classes
+from datamodules.folder.reader import class_masks
+from datamodules.images.gpano import area_of_crop, whole_area
 from datamodules.images.image_files import short_names
+from datamodules.images.pixel_files import write_pixels
 from tangent_train.geometry import camera_matrix_from_fov
 from tangent_train.inference.views import InputImage
-from tangent_train.results.predictions import class_shares
+from tangent_train.results.predictions import PredictionFolder, class_shares
 
 NAMES = ("unknown", "up", "down")
 
@@ -30,6 +33,21 @@ NAMES = ("unknown", "up", "down")
 )
 def test_names_are_short_and_unlike(paths: list[str], names: list[str]) -> None:
     assert short_names([Path(path) for path in paths]) == names
+
+
+def test_classes_of_one_name_are_read_back_as_one(tmp_path: Path) -> None:
+    """By data=folder and mask_classes=: they had kept the last of its labels."""
+    names = ("unknown", "door", "wall", "door", "u\u0308", "unknown", "Wall", "ü")
+    PredictionFolder(tmp_path, names, ["labels"]).write_summary({}, [])
+    labels = np.array([list(range(8))] * 4, np.uint8)
+    write_pixels(tmp_path / "labels" / "a.png", labels)
+    classes = read_classes(tmp_path / "classes.json")
+    assert classes.names == ("door", "wall", "ü", "Wall")
+    assert classes.decode(labels)[0].tolist() == [0, 1, 2, 1, 3, 0, 4, 3]
+    area = whole_area(Path("a"), (4, 8))
+    for ignored, masked in ((["door", "Wall"], [1, 3, 6]), (["u\u0308"], [4, 7])):
+        counts = class_masks(tmp_path, ignored).read("a", area)
+        assert np.flatnonzero(counts[0] == 0).tolist() == masked
 
 
 def test_a_cap_of_a_crop_has_its_solid_angle() -> None:

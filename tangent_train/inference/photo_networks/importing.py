@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 
+from datamodules.images.image_files import composed
 from models.onnx_network import OnnxNetwork
 from tangent_train.checkpoints.scores import Groups, Scores, size_multiple_of
 from tangent_train.checkpoints.trained import (
@@ -108,6 +109,7 @@ def _groups(
     score_names: Collection[str], nothing: Collection[str], wins: bool
 ) -> tuple[list[str], Groups | None]:
     """Names of the labels, and the scores of each; see `TrainedNetwork.groups`."""
+    score_names, nothing = list(map(composed, score_names)), list(map(composed, nothing))
     places = list(enumerate(score_names))
     missing = set(nothing) - set(score_names)
     if missing:

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import re
+import unicodedata
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -122,6 +124,64 @@ def test_files_that_cannot_be_used(own_root: Path, erp: Any) -> None:
     assert re.match(r"8-bit RGB; expected .*names values", found["scene_1"])
     assert "view.1.jpg beside it" in found["scene_2"]
     assert re.match(r"no such file; .*data\.inputs=\[rgb\]", found["scene_3"])
+
+
+def test_problems_are_listed_once(tmp_path: Path, erp: Any) -> None:
+    """Those of the first images too, whose labels are read twice."""
+    write_classes(tmp_path, ["wall"])
+    for name in "abcd":
+        write_panorama(tmp_path, name, 0, 16)
+        save(tmp_path / "labels" / f"{name}.png", np.zeros((16, 32), np.uint8))
+    (tmp_path / "labels/a.png").unlink()
+    (tmp_path / "labels/b.png").write_bytes((tmp_path / "labels/c.png").read_bytes()[:-20])
+    save(tmp_path / "labels/c.png", np.zeros((16, 32, 3), np.uint8))
+    save(tmp_path / "labels/d.png", np.full((16, 32), 7, np.uint8))
+    problems, _ = FolderPanoramas(tmp_path, erp).check()
+    files = [Path(problem.file).name for problem in problems.listed()]
+    assert files == ["a.png", "b.png", "c.png", "d.png"]
+
+
+# Names
+
+NFC, NFD = (unicodedata.normalize(form, "küche/Tür") for form in ("NFC", "NFD"))
+
+
+@pytest.mark.parametrize("forms", list(product((NFC, NFD), repeat=5)))
+def test_names_that_look_the_same_are_the_same(
+    tmp_path: Path, erp: Any, forms: tuple[str, ...]
+) -> None:
+    image, labels, depth, mask, listed = forms
+    write_classes(tmp_path)
+    for number, name in enumerate((NFC, "b", "c")):
+        write_panorama(tmp_path, name, number, 16, depth=True)
+        save(tmp_path / "masks" / f"{name}.png", np.ones((16, 32), np.uint8))
+    for folder, name in (("images", image), ("labels", labels), ("depth", depth), ("masks", mask)):
+        (tmp_path / folder / NFC).with_suffix(".png").rename(tmp_path / "moved")
+        path = (tmp_path / folder / name).with_suffix(".png")
+        path.parent.mkdir(exist_ok=True)
+        (tmp_path / "moved").rename(path)
+    (tmp_path / "test.txt").write_text(f"{listed}\n", "utf-8")
+    settings: Any = {"inputs": ["rgb", "depth"], "mask": tmp_path / "masks"}
+    module = FolderPanoramas(tmp_path, erp, **settings)
+    assert module.check()[0].listed() == []
+    assert module.source("test").name(0) == NFC
+    assert module.source("test").read(0).labels.any()
+
+
+@pytest.mark.parametrize("folder", ["images", "labels", "depth", "masks"])
+def test_two_files_that_look_the_same_are_refused(tmp_path: Path, erp: Any, folder: str) -> None:
+    write_classes(tmp_path)
+    for name in (NFC, "b", "c"):
+        write_panorama(tmp_path, name, 0, 16, depth=True)
+        save(tmp_path / "masks" / f"{name}.png", np.ones((16, 32), np.uint8))
+    other = (tmp_path / folder / NFD).with_suffix(".png")
+    other.parent.mkdir(exist_ok=True)
+    other.write_bytes((tmp_path / folder / "b.png").read_bytes())
+    settings: Any = {"inputs": ["rgb", "depth"], "mask": tmp_path / "masks"}
+    problems, _ = FolderPanoramas(tmp_path, erp, **settings).check()
+    (problem,) = problems.listed()
+    assert r"'T\xfcr.png'" in problem.finding
+    assert r"'Tu\u0308r.png', which look the same" in problem.finding
 
 
 def test_missing_folders_and_classes(tmp_path: Path, erp: Any) -> None:

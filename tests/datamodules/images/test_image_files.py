@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from datamodules.images.image_files import find_depth, image_paths
+from datamodules.images.image_files import NamedFiles, find_depth, image_paths
 from tangent_train.errors import DataError
 
 
@@ -61,10 +61,11 @@ def test_no_images(tmp_path: Path, pattern: str, found: str) -> None:
 
 def test_depth_is_found_by_the_name_of_the_image(tmp_path: Path) -> None:
     _touch(tmp_path / "a" / "x.png", tmp_path / "a" / "y_depth.exr", tmp_path / "a" / "z.txt")
-    assert find_depth(tmp_path, "a/x", "") == tmp_path / "a" / "x.png"
-    assert find_depth(tmp_path, "a/y", "") == tmp_path / "a" / "y_depth.exr"
+    depths = NamedFiles(tmp_path)
+    assert find_depth(depths, "a/x", "") == tmp_path / "a" / "x.png"
+    assert find_depth(depths, "a/y", "") == tmp_path / "a" / "y_depth.exr"
     with pytest.raises(DataError, match=r"a.z: found no such file; .*_depth.* Remedy"):
-        find_depth(tmp_path, "a/z", "Remedy")
+        find_depth(depths, "a/z", "Remedy")
     _touch(tmp_path / "a" / "x_depth.npy")
     with pytest.raises(DataError, match=r"a.x: found x\.png, x_depth\.npy; expected one file"):
-        find_depth(tmp_path, "a/x", "Remedy")
+        find_depth(NamedFiles(tmp_path), "a/x", "Remedy")
