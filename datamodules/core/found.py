@@ -63,7 +63,7 @@ class Found(Generic[_Item]):
         noun: Name of the items, in the plural.
         splits: Their files.
         read: Reads one from its files, a named tuple of arrays; may have methods `labels`, and
-            `parts` that gives what decodes each of its files by itself.
+            `parts` that returns functions which decode each of its files by itself.
         store: Prepared store, if any.
         in_parallel: The results of some work on each, as they come.
     """
@@ -78,27 +78,37 @@ class Found(Generic[_Item]):
         """Items of some splits."""
         return [item for split in splits for item in self.splits[split]]
 
-    def check(self, problems: Problems) -> int:
+    def check(self, problems: Problems, label_counts: dict[str, NDArray[np.int64]]) -> int:
         """Decode every file by itself and note what is broken; nothing is written.
 
         Args:
             problems: Known problems; new ones are added.
+            label_counts: For every image the pixels of each label are added; nothing for shapes.
 
         Returns:
             How many images or shapes were read.
         """
         items = problems.without(self.of())
-        parts = getattr(self.read, "parts", partial(_whole, self.read))
+        in_parts = hasattr(self.read, "parts")
+        read: Any = self.read
+        parts = partial(read.parts, label_counts) if in_parts else partial(_whole, read)
         self._note(problems, parts, items, "Checking")
         return len(items)
 
-    def read_all(self, splits: Sequence[Split], problems: Problems) -> None:
-        """Read everything once, into the store if there is one; note what is broken."""
+    def read_all(self, splits: Sequence[Split], problems: Problems, *, whole: bool = False) -> None:
+        """Read everything once, into the store if there is one; note what is broken.
+
+        Args:
+            splits: The splits to read.
+            problems: Known problems; new ones are added.
+            whole: Whether to check the content of the store too; it is checked before use anyway.
+        """
         items, store = problems.without(self.of(splits)), self.store
         if store is None:
             self._note(problems, partial(_whole, self.read), items, "Checking the data")
             return
-        missing = [item for item in items if not store.is_current(item.name, item.parts)]
+        is_current = partial(store.is_current, whole=whole)
+        missing = [item for item in items if not is_current(item.name, item.parts)]
         if missing:
             before = len(items) - len(missing)
             make = partial(_stored, self.read, store)

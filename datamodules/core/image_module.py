@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -92,7 +92,7 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
         """
 
     @abstractmethod
-    def reading(self, reader: ImageReader) -> tuple[str, Callable[[ImageFiles], Any]]:
+    def reading(self, reader: ImageReader) -> tuple[str, PanoramaReading | PhotoReading]:
         """What reads one image as it is stored, and the name of that in the store."""
 
     @abstractmethod
@@ -104,7 +104,8 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
         reader, splits = self.find_images(problems)
         self._rgb = reader.rgb
         name, read = self.reading(reader)
-        found = Found(self.noun, splits, read, Store.of(self.store, name, reader.settings))
+        store = Store.of(self.store, name, reader.settings, read.layout)
+        found = Found(self.noun, splits, read, store)
         check = partial(self.check_image, reader=reader, problems=problems)
         for _ in in_threads(check, found.of()):
             pass

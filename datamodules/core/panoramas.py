@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.core.problems import Problems
+from datamodules.core.store import Declared, Layout
 from datamodules.images.pixel_files import read_rgb
 from datamodules.images.png import check_panorama_size, check_png
 from tangent_train.errors import DataError, width_height
@@ -330,6 +331,16 @@ class _Reading:
     num_classes: int
     shape: tuple[int, int] | None = None
 
+    @property
+    def layout(self) -> Layout:
+        """The arrays of an image, as a store holds them."""
+        height, width = self.shape or ("H", "W")
+        return {
+            "rgb": Declared("uint8", (height, width, 3)),
+            "depth": Declared("uint16", (height, width)),
+            "labels": Declared("uint8", (height, width), self.num_classes - 1),
+        }
+
     def labels(self, files: ImageFiles) -> NDArray[np.uint8]:
         """Its labels alone, none beyond the classes."""
         labels = self.reader.labels(files, self.shape)
@@ -342,9 +353,21 @@ class _Reading:
             )
         return labels
 
-    def parts(self, files: ImageFiles) -> list[Callable[[], object]]:
-        """Functions that decode each of its files separately."""
-        read = {"labels": replace(self, shape=None).labels}
+    def parts(
+        self, label_counts: dict[str, NDArray[np.int64]], files: ImageFiles
+    ) -> list[Callable[[], object]]:
+        """Functions that decode each of its files separately.
+
+        Args:
+            label_counts: The pixels of each label are added under the name of the image.
+            files: Of the image.
+        """
+
+        def count_labels(files: ImageFiles) -> None:
+            labels = replace(self, shape=None).labels(files)
+            label_counts[files.name] = np.bincount(labels.ravel(), minlength=self.num_classes)
+
+        read = {"labels": count_labels}
         return [partial(read.get(part, getattr(self.reader, part)), files) for part in files.parts]
 
 
@@ -360,6 +383,11 @@ class PanoramaReading(_Reading):
 
 class PhotoReading(_Reading):
     """Reads photos; z-depth becomes distance from the centre of projection."""
+
+    @property
+    def layout(self) -> Layout:
+        """See `PanoramaReading`."""
+        return {**super().layout, "camera_matrix": Declared("float64", (3, 3))}
 
     def __call__(self, files: ImageFiles) -> Photo:
         """One photo."""

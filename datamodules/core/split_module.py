@@ -12,6 +12,7 @@ import numpy as np
 from lightning import LightningDataModule
 from lightning.pytorch.trainer.states import TrainerFn
 from lightning.pytorch.utilities import rank_zero_only, rank_zero_warn
+from numpy.typing import NDArray
 from rich.console import Console
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
@@ -63,6 +64,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
         kind: Kind of its labels.
         noun: Name of the items, in the plural.
         is_made: Whether `make_files` generates all of it.
+        label_counts: After `check`, ``(K+1,)`` pixels of each label by split, as files have them.
 
     Raises:
         SettingError: A setting is invalid.
@@ -93,6 +95,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
         for name in ("num_workers", "seed", "stream"):
             self.require(name, getattr(self, name) >= 0, "0 or more")
         self.require(self._per_step, self.per_step >= 1, "1 or more")
+        self.label_counts: dict[Split, NDArray[np.int64]] = {}
         self._found: Found[_Item] | None = None
         self._sources: dict[Split, SplitItems[_Item, Any]] = {}
         self._start = (0, 0)
@@ -204,7 +207,8 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
         self._found = found = self._usable(sample=stage == TrainerFn.FITTING)
         if not self.skip_broken and found.store is not None:
             problems = Problems()
-            found.read_all(("test",) if stage == TrainerFn.TESTING else SPLITS, problems)
+            splits: Sequence[Split] = ("test",) if stage == TrainerFn.TESTING else SPLITS
+            found.read_all(splits, problems, whole=self.trainer is None)
             problems.refuse(self.root, _GO_ON)
 
     def prepare_part(self, part: Callable[[Sequence[_Item]], Sequence[_Item]]) -> int:
@@ -229,7 +233,8 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
         if not self.skip_broken:
             problems.refuse(self.root, _GO_ON)
         items = part(found.of())
-        replace(found, splits={"train": items, "val": [], "test": []}).read_all(SPLITS, problems)
+        part_of = replace(found, splits={"train": items, "val": [], "test": []})
+        part_of.read_all(SPLITS, problems, whole=True)
         if not self.skip_broken:
             problems.refuse(self.root, _GO_ON)
         return len(problems.without(items))
@@ -241,12 +246,13 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
         return self._found
 
     def check(self) -> tuple[Problems, int]:
-        """Read the whole data set; nothing is generated or written.
+        """Read the whole data set, and count its labels; nothing is generated or written.
 
         Returns:
             All problems, and the number of images or shapes read.
         """
         problems, count = Problems(), 0
+        of_images: dict[str, NDArray[np.int64]] = {}
         with problems.noted():
             if self.is_made and not self.root.is_dir():
                 raise DataError(
@@ -255,7 +261,11 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
                     expected="the data set",
                     remedy="Run tangent-prepare with the same settings.",
                 )
-            count = self._listed(problems).check(problems)
+            found = self._listed(problems)
+            count = found.check(problems, of_images)
+            for split in SPLITS:
+                counts = [of_images[i.name] for i in found.splits[split] if i.name in of_images]
+                self.label_counts[split] = np.sum(counts or [[0] * len(self.class_names)], axis=0)
         return problems, count
 
     def check_classes(self) -> None:

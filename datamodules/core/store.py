@@ -2,7 +2,8 @@
 
 A store is a folder of ``.npy`` files, one for each panorama, photo or shape. A file holds one
 record whose fields are the arrays (``numpy.load`` reads it), followed by one line of JSON: name,
-size and time of the files it was made from. It counts as out of date when these change.
+size and time of the files it was made from, and a checksum of everything before. It counts as out
+of date when the files change.
 
 Memory-mapped: rendering a tangent image touches only the pages it needs, shared by all processes.
 docs/store.md compares this with other formats.
@@ -12,9 +13,10 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping
+import zlib
+from collections.abc import Callable, Container, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,29 +30,72 @@ _REMEDY = (
 )
 
 
+class Declared(NamedTuple):
+    """An array of every item of a store.
+
+    Attributes:
+        dtype: Name of its type.
+        shape: Its sides; named ones have any length, which arrays of one item share.
+        most: Its largest value; None if any is allowed.
+    """
+
+    dtype: str
+    shape: tuple[int | str, ...]
+    most: int | None = None
+
+    def __str__(self) -> str:
+        """As messages show it."""
+        most = "" if self.most is None else f" up to {self.most}"
+        return f"{self.dtype} ({', '.join(map(str, self.shape))}){most}"
+
+    def allows(self, array: NDArray[Any], lengths: dict[int | str, int], *, values: bool) -> bool:
+        """True if an array of an item is as declared.
+
+        Args:
+            array: The array.
+            lengths: Sides of the item so far; those of the array are added.
+            values: Whether its values are looked at.
+        """
+        if array.dtype != self.dtype or array.ndim != len(self.shape):
+            return False
+        sides = zip(self.shape, array.shape, strict=True)
+        fits = all(lengths.setdefault(s, n if isinstance(s, str) else s) == n for s, n in sides)
+        return fits and not (values and self.most is not None and array.max(initial=0) > self.most)
+
+
+Layout = Mapping[str, Declared]
+"""Arrays by name; an item has all but perhaps ``depth``."""
+
+
 class Store:
     """A folder of prepared arrays.
 
     Args:
         folder: The folder; created on the first write.
+        layout: The arrays that items may have.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, layout: Layout) -> None:
         self.folder = folder
+        self._layout = layout
+        self._whole: set[str] = set()
 
     @classmethod
-    def of(cls, folder: Path | None, name: str, settings: Mapping[str, str]) -> Store | None:
+    def of(
+        cls, folder: Path | None, name: str, settings: Mapping[str, str], layout: Layout
+    ) -> Store | None:
         """Store of one choice of settings, in its own subfolder.
 
         Args:
             folder: Of the stores of all choices; without it, there is no store.
             name: Prefix of the subfolder's name.
             settings: Settings that affect the arrays besides the files.
+            layout: The arrays that items may have.
         """
         if folder is None:
             return None
         digest = hashlib.sha256(repr(sorted(settings.items())).encode()).hexdigest()
-        return cls(folder / f"{name}_{digest[:8]}")
+        return cls(folder / f"{name}_{digest[:8]}", layout)
 
     def path(self, name: str) -> Path:
         """The file of one item."""
@@ -76,42 +121,72 @@ class Store:
         record = np.empty((), [(key, a.dtype, a.shape) for key, a in arrays.items()])
         for key, array in arrays.items():
             record[key] = array
-        with atomic_path(self.path(name)) as temporary, temporary.open("wb") as file:
-            np.save(file, record, allow_pickle=False)
-            file.write(b"\n" + json.dumps(made_from).encode())
+        with atomic_path(self.path(name)) as temporary:
+            np.save(temporary, record, allow_pickle=False)
+            content = {"made_from": made_from, "crc32": zlib.crc32(np.memmap(temporary, mode="r"))}
+            with temporary.open("ab") as file:
+                file.write(b"\n" + json.dumps(content).encode())
 
-    def read(self, name: str, files: Mapping[str, Path]) -> dict[str, NDArray[Any]]:
+    def read(
+        self, name: str, files: Mapping[str, Path], *, whole: bool = True
+    ) -> dict[str, NDArray[Any]]:
         """The arrays of one item, read-only views of its file.
+
+        Types and shapes, and the source files, are checked every time; all bytes against the
+        checksum, and the largest values, the first time only.
 
         Args:
             name: Of the item.
             files: Required source files; it may have more.
+            whole: Whether to check the content too.
 
         Raises:
-            DataError: It is missing, truncated or out of date.
+            DataError: It is missing, damaged, out of date, or has other arrays than declared.
         """
         path = self.path(name)
         try:
             record: Any = np.load(path, mmap_mode="r", allow_pickle=False)
+            size = record.offset + record.nbytes
             with path.open("rb") as file:
-                file.seek(record.offset + record.nbytes)
-                made_from = dict(parse_json(file.read()))
+                file.seek(size)
+                content = parse_json(file.read())
+            checked = not whole or name in self._whole
+            total = None if checked else zlib.crc32(np.memmap(path, mode="r", shape=size))
             arrays = {key: np.asarray(record[key]) for key in record.dtype.names}
-            found = {part: made_from.get(part, "nothing") for part in files}
+            written, found = content["crc32"], dict.fromkeys(files, "nothing")
+            found |= content["made_from"]
         except FileNotFoundError as error:
             raise _unusable(path, "no such file", "a file of the prepared store") from error
         except Exception as error:  # NumPy has many ways to say that a file is damaged
             what = f"a damaged file ({type(error).__name__}: {error})"
             raise _unusable(path, what, "a whole one") from error
+        if total not in (None, written):
+            raise _unusable(path, "a damaged file (another checksum)", "a whole one")
         for part, stamp in _stamps(files).items():
             if found[part] != stamp:
                 raise _unusable(path, f"{part} made from {found[part]}", stamp)
+        self._check_layout(path, arrays, files, values=not checked)
+        self._whole |= {name} if whole else set()
         return arrays
 
-    def is_current(self, name: str, files: Mapping[str, Path]) -> bool:
-        """Whether the file of one item is there, whole and up to date."""
+    def _check_layout(
+        self, path: Path, arrays: Mapping[str, NDArray[Any]], files: Container[str], *, values: bool
+    ) -> None:
+        """Refuse arrays that are not the declared ones."""
+        required = {key for key in self._layout if key != "depth" or key in files}
+        lengths: dict[int | str, int] = {}
+        if required <= arrays.keys() <= self._layout.keys() and all(
+            self._layout[key].allows(array, lengths, values=values) for key, array in arrays.items()
+        ):
+            return
+        found = (f"{key}: {array.dtype} {array.shape}" for key, array in arrays.items())
+        expected = (f"{key}: {declared}" for key, declared in self._layout.items())
+        raise _unusable(path, ", ".join(found), ", ".join(expected))
+
+    def is_current(self, name: str, files: Mapping[str, Path], *, whole: bool) -> bool:
+        """True if `read` finds nothing wrong with the file of an item."""
         try:
-            self.read(name, files)
+            self.read(name, files, whole=whole)
         except (DataError, OSError):
             return False
         return True

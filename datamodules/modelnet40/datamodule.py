@@ -18,10 +18,11 @@ from datamodules.core.found import Found, Split, SplitItems, draw_groups
 from datamodules.core.problems import Problems
 from datamodules.core.processes import in_processes
 from datamodules.core.split_module import Kind, SplitDataModule
-from datamodules.core.store import Store
+from datamodules.core.store import Declared, Store
 from datamodules.modelnet40.meshes import CHANNELS
 from datamodules.modelnet40.shape_files import MODELNET40, ShapeFile, find_shapes
 from datamodules.modelnet40.shape_samples import (
+    MOST_STEPS,
     SPHERE_NORMALIZATION,
     ShapeSample,
     ShapeViews,
@@ -99,7 +100,8 @@ class ModelNet40(SplitDataModule[ShapeFile]):
                 raise DataError(self.root, found=f"no {split} shape", expected="some")
         shape = self.erp_height, 2 * self.erp_height
         folder = (self.store or self.root) / f"spheres_{shape[0]}x{shape[1]}"
-        return Found(self.noun, splits, partial(make_spheres, shape), Store(folder), _in_processes)
+        store = Store(folder, {"spheres": Declared("uint16", (*shape, CHANNELS), MOST_STEPS)})
+        return Found(self.noun, splits, partial(make_spheres, shape), store, _in_processes)
 
     def pipeline(self, found: Found[ShapeFile], split: Split) -> SplitItems[ShapeFile, Spheres]:
         """The spheres in the store."""

@@ -42,6 +42,10 @@ coarse around 1, and OpenCV does not sample it.
 """
 
 
+MOST_STEPS = 2 * STEPS - 1
+"""The largest prepared value."""
+
+
 class Spheres(NamedTuple):
     """A mesh as seen from the sphere around it.
 

@@ -3,21 +3,29 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import redirect_stdout
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from tangent_train.cli.say import say
 from tangent_train.errors import counted
 from tangent_train.registry import make
-from tangent_train.results.tables import Table
+from tangent_train.results.tables import Table, percent
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+_MOST_UNKNOWN = 0.5
+_MOST_NAMED = 10
 
 
 def check(settings: Mapping[str, Any]) -> None:
     """Read the whole data set of a run; exit with status 1 if there are problems.
 
     On a terminal the problems are a table, elsewhere lines of file, finding and remedy with tabs
-    between them; progress and the summary go to standard error then.
+    between them; progress, the shares of the classes and the summary go to standard error then.
 
     Args:
         settings: The composed ``check.yaml``.
@@ -35,7 +43,40 @@ def check(settings: Mapping[str, Any]) -> None:
         Table("", ("file", "finding", "remedy"), rows, text_columns=range(3), lines=True).print()
     for row in () if terminal else rows:
         sys.stdout.write("\t".join(row) + "\n")
+    labelled = {split: n / n.sum() for split, n in data.label_counts.items() if n.sum()}
+    warnings = _doubts(labelled, data.class_names)
+    with redirect_stdout(sys.stdout if terminal else sys.stderr):
+        if labelled:
+            _share_table(labelled, data.class_names).print()
+        for warning in warnings:
+            say(f"Warning: {warning}", error=not terminal)
     found = counted(len(listed), "problems") if listed else "Nothing is wrong"
-    say(f"{found}; {read}.", error=bool(listed) and not terminal)
+    if warnings:
+        found = f"{counted(len(listed), 'problems')} and {counted(len(warnings), 'warnings')}"
+    say(f"{found}; {read}.", error=bool(listed or warnings) and not terminal)
     if listed:
         sys.exit(1)
+
+
+def _share_table(shares: Mapping[str, NDArray[np.float64]], class_names: Sequence[str]) -> Table:
+    rows = [
+        [repr(name)[1:-1], *(percent(of[label]) for of in shares.values())]
+        for label, name in enumerate(class_names)
+    ]
+    return Table("Pixels of each class, %", ["class", *shares], rows)
+
+
+def _doubts(shares: Mapping[str, NDArray[np.float64]], class_names: Sequence[str]) -> list[str]:
+    """What makes it likely that labels and classes do not belong together."""
+    doubts = []
+    for split, of in shares.items():
+        missing = [repr(class_names[label])[1:-1] for label in np.flatnonzero(of == 0) if label]
+        if of[0] > _MOST_UNKNOWN:
+            doubts.append(f"{percent(of[0])} % of the pixels for {split} are unknown.")
+        if missing:
+            more = f" and {len(missing) - _MOST_NAMED} more" if len(missing) > _MOST_NAMED else ""
+            doubts.append(
+                f"No pixel for {split} is of {len(missing)} of {len(class_names) - 1} classes: "
+                f"{', '.join(missing[:_MOST_NAMED])}{more}."
+            )
+    return doubts

@@ -129,8 +129,11 @@ def headline(record: Record) -> str:
         for name, heading in SCORES[record.kind].means.items()
         if record.means[name] is not None
     ]
+    absent = record.absent
+    some = f", {len(record.classes) - len(absent)} of {len(record.classes)} classes"
     told = " (in brackets: 95\u00a0% intervals)" if record.intervals else ""
-    return f"{', '.join(means)} over {counted(record.images, record.noun)}".strip() + told
+    over = counted(record.images, record.noun) + (some if absent else "")
+    return f"{', '.join(means)} over {over}".strip() + told
 
 
 def result_tables(record: Record) -> list[Table]:
@@ -160,7 +163,8 @@ def result_tables(record: Record) -> list[Table]:
     rows.append(["mean", *means])
     texts = [0, *(1 + k for k, name in enumerate(columns) if name == "taken_for")]
     header = ["class", *(headings[name] for name in columns)]
-    tables = [Table("Per class", header, rows, text_columns=texts)]
+    note = f"Means without classes that no label has: {', '.join(record.absent)}."
+    tables = [Table("Per class", header, rows, note if record.absent else "", text_columns=texts)]
     if record.latitude_bands:
         rows = [
             ["{}° … {}°".format(*b["latitude_deg"]), _cell(b["miou"]), _cell(b["macc"])]

@@ -137,6 +137,11 @@ class Record:
         return tuple(entry["class"] for entry in self.classes)
 
     @property
+    def absent(self) -> tuple[str, ...]:
+        """Classes that no label has, so that the means leave them out."""
+        return tuple(entry["class"] for entry in self.classes if entry["accuracy"] is None)
+
+    @property
     def bands(self) -> tuple[Band, ...]:
         """The latitude bands."""
         return tuple(tuple(entry["latitude_deg"]) for entry in self.latitude_bands)

@@ -103,6 +103,16 @@ def test_photos_have_neither_solid_angles_nor_latitudes() -> None:
     assert headline(plain) == "mAcc 46.7\u00a0%, mIoU 35.2\u00a0% over 7 photos"
 
 
+def test_means_over_fewer_classes_say_so() -> None:
+    """Of labels that have one class, 100 % mIoU is not that of all."""
+    few = segmentation_record(_matrices({(1, 1): 90}), NAMES, "skip")
+    assert headline(few).endswith(" over 7 panoramas, 1 of 3 classes")
+    assert result_tables(few)[0].note == "Means without classes that no label has: floor, =sofa."
+    as_zero = segmentation_record(_matrices({(1, 1): 90}), NAMES, "zero")
+    assert headline(as_zero).endswith(" over 7 panoramas")
+    assert result_tables(as_zero)[0].note == ""
+
+
 def test_means_stand_with_their_intervals(tmp_path: Path) -> None:
     """Two images, of one class each: a draw has either, or both."""
     of_images = np.zeros((2, 2, 3, 3))
@@ -119,7 +129,9 @@ def test_means_stand_with_their_intervals(tmp_path: Path) -> None:
     assert record.intervals == {name: pytest.approx(ends) for name, ends in expected.items()}
     text = "mAcc 70.0 [50.0, 90.0]\u00a0%, mIoU 52.7 [33.3, 81.8]\u00a0%, "
     assert headline(record).startswith(text)
-    assert headline(record).endswith(" over 7 panoramas (in brackets: 95\u00a0% intervals)")
+    assert headline(record).endswith(
+        " over 7 panoramas, 2 of 3 classes (in brackets: 95\u00a0% intervals)"
+    )
     write_results(record, tmp_path)
     mean = "| mean | 52.7 [33.3, 81.8] | 70.0 [50.0, 90.0] | 52.7 [25.0, 81.8] | 70.0 [40.0, 90.0]"
     assert mean in (tmp_path / "results.md").read_text()

@@ -74,7 +74,7 @@ def created(tmp_path: Path) -> Path:
 def _read_store(path: Path) -> None:
     copy = path.with_name("copy.npy")
     copy.write_bytes(path.read_bytes())
-    Store(path.parent).read("copy", {})
+    Store(path.parent, {}).read("copy", {})
 
 
 @pytest.mark.parametrize("make", CREATORS)

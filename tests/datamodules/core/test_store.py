@@ -3,6 +3,7 @@ from __future__ import annotations
 import os
 from collections import namedtuple
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import pytest
 import torch
 
 from datamodules import Stanford2D3DS
-from datamodules.core.store import Store
+from datamodules.core.store import Declared, Store
 from tangent_train.cli.each import Shard
 from tangent_train.errors import DataError, SettingError
 from tangent_train.rendering import EquirectRepresentation
@@ -56,6 +57,9 @@ def _made(folder: Path, before: dict[Path, int]) -> set[Path]:
 # --- one file ----------------------------------------------------------------------------------
 
 
+NUMBERS = {"rgb": Declared("int64", ("n",))}
+
+
 @pytest.fixture
 def source(tmp_path: Path) -> Path:
     path = tmp_path / "image.png"
@@ -70,8 +74,13 @@ def test_what_is_written_is_mapped(source: Path, store: Path) -> None:
         "depth": rng.integers(0, 2**16, (5, 7), np.uint16),
         "camera_matrix": rng.random((3, 3)),
     }
-    Store(store).make("room/küche 1", {"rgb": source}, lambda: arrays)
-    found = Store(store).read("room/küche 1", {"rgb": source})
+    layout = {
+        "rgb": Declared("uint8", ("H", "W", 3)),
+        "depth": Declared("uint16", (5, 7)),
+        "camera_matrix": Declared("float64", (3, 3)),
+    }
+    Store(store, layout).make("room/küche 1", {"rgb": source}, lambda: arrays)
+    found = Store(store, layout).read("room/küche 1", {"rgb": source})
     record = np.load(store / "room" / "küche 1.npy", allow_pickle=False)
     for name, array in arrays.items():
         assert found[name].dtype == array.dtype
@@ -85,12 +94,19 @@ def _objects(path: Path) -> None:
     np.save(path, np.array([{}], object), allow_pickle=True)
 
 
+def _flip(path: Path, place: int) -> None:
+    content = bytearray(path.read_bytes())
+    content[place] ^= 1
+    path.write_bytes(content)
+
+
 @pytest.mark.parametrize(
     "damage",
     [
         lambda path: path.unlink(),
         lambda path: path.write_bytes(path.read_bytes()[:-5]),
         lambda path: path.write_bytes(path.read_bytes().rpartition(b"\n")[0] + b"\n[]"),
+        *(partial(_flip, place=place) for place in (0, 9, 30, 90, 128, 1000, 4000, 4130, -2)),
         lambda path: np.save(path, np.zeros(3)),
         _objects,
     ],
@@ -98,18 +114,64 @@ def _objects(path: Path) -> None:
 def test_damage_is_found_on_opening(
     source: Path, store: Path, damage: Callable[[Path], object]
 ) -> None:
-    one = Store(store)
+    one = Store(store, NUMBERS)
     one.make("a", {"rgb": source}, lambda: {"rgb": np.arange(500)})
-    assert one.is_current("a", {"rgb": source})
+    assert Store(store, NUMBERS).is_current("a", {"rgb": source}, whole=True)
     damage(one.path("a"))
-    assert not one.is_current("a", {"rgb": source})
+    assert not one.is_current("a", {"rgb": source}, whole=True)
     with pytest.raises(DataError, match=r"a\.npy: found .*Run tangent-prepare"):
+        one.read("a", {"rgb": source})
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda arrays: arrays | {"rgb": arrays["rgb"].astype(np.int16)},
+        lambda arrays: arrays | {"rgb": arrays["rgb"][:, ::2]},
+        lambda arrays: {key: array[:-1] for key, array in arrays.items()},
+        lambda arrays: arrays | {"labels": arrays["labels"][..., None]},
+        lambda arrays: arrays | {"labels": arrays["labels"] + np.uint8(1)},
+        lambda arrays: arrays | {"more": arrays["labels"]},
+        lambda arrays: {"labels": arrays["labels"]},
+        lambda arrays: {},
+    ],
+)
+@pytest.mark.parametrize("side", [4, "H"])
+def test_other_arrays_than_declared_are_refused(
+    source: Path, store: Path, change: Any, side: int | str
+) -> None:
+    """A whole file, as of another level or other classes, in the place of this one."""
+    layout = {"rgb": Declared("uint8", (side, 6, 3)), "labels": Declared("uint8", (side, 6), 5)}
+    arrays = {"rgb": np.zeros((4, 6, 3), np.uint8), "labels": np.full((4, 6), 5, np.uint8)}
+    files = {"rgb": source}
+    Store(store, layout).make("a", files, lambda: arrays)
+    assert Store(store, layout).is_current("a", files, whole=True)
+    changed = change(arrays)
+    Store(store, layout).make("a", files, lambda: changed)
+    if side == "H" and {array.shape[:2] for array in changed.values()} == {(3, 6)}:
+        assert Store(store, layout).is_current("a", files, whole=True)
+        return
+    message = r"a\.npy: found .*expected rgb: uint8 \([4H], 6, 3\), labels: .* up to 5.*Run"
+    with pytest.raises(DataError, match=message):
+        Store(store, layout).read("a", files)
+
+
+def test_a_source_that_changes_while_it_is_read_is_noticed(source: Path, store: Path) -> None:
+    """The arrays are of the old file: they must not count as those of the new one."""
+
+    def read() -> dict[str, Any]:
+        source.write_bytes(b"another file")
+        return {"rgb": np.arange(5)}
+
+    one = Store(store, NUMBERS)
+    one.make("a", {"rgb": source}, read)
+    with pytest.raises(DataError, match=r"found rgb made from image\.png \(3 bytes"):
         one.read("a", {"rgb": source})
 
 
 @pytest.mark.parametrize(("size", "seconds"), [(3, -1), (4, 0)])
 def test_a_changed_source_is_noticed(source: Path, store: Path, size: int, seconds: int) -> None:
-    one = Store(store)
+    one = Store(store, NUMBERS)
     one.make("a", {"rgb": source}, lambda: {"rgb": np.arange(5)})
     time = source.stat().st_mtime_ns
     source.write_bytes(b"x" * size)
@@ -161,10 +223,11 @@ def test_what_is_there_is_kept_and_what_is_not_is_made(
     assert len(before) == PANORAMAS
     make_module(fold=2, seed=1).prepare_data()  # other splits of the same panoramas
     assert _times(store) == before
-    damaged = sorted(before)[3]
+    damaged, flipped = sorted(before)[3:5]
     damaged.write_bytes(damaged.read_bytes()[:-9])
+    _flip(flipped, 2000)
     make_module().prepare_data()
-    assert _made(store, before) == {damaged}
+    assert _made(store, before) == {damaged, flipped}
     make_module(unknown="any_black").prepare_data()
     Stanford2D3DS(root, EquirectRepresentation(level=2), store=store).prepare_data()
     assert len(_times(store)) == 3 * PANORAMAS, "choices and sizes lie beside each other"

@@ -1,0 +1,74 @@
+"""``tangent-check``: shares of the classes, and what makes them doubtful."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tangent_train.cli.check import check
+from tests.datamodules.folder.folder_format import save, write_classes
+from tests.running import composed_settings
+
+
+def _checked(root: Path, capsys: pytest.CaptureFixture[str]) -> tuple[str, str]:
+    settings = ["data=folder", "level=4", f"data.root='{root}'", "data.validation_fraction=0"]
+    check(composed_settings("check", *settings))
+    return capsys.readouterr()
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """Rows of labels 0 to 4, eight of each but 1; the test has no 4."""
+    for name in ("a", "b", "test"):
+        labels = np.repeat(np.array([0, 2, 3, 4 if name != "test" else 3], np.uint8), 8)
+        rgb = np.zeros((32, 64, 3), np.uint8)
+        save(tmp_path / "images" / f"{name}.png", rgb)
+        save(tmp_path / "labels" / f"{name}.png", np.tile(labels[:, None], (1, 64)))
+    (tmp_path / "test.txt").write_text("test")
+    return tmp_path
+
+
+def test_shares_and_classes_that_do_not_occur(
+    root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_classes(root, [None, "door", "wall", "floor", "sofa"])
+    out, err = _checked(root, capsys)
+    assert out == "", "problems alone"
+    rows = [line.split() for line in err.splitlines()]
+    shares = {words[1]: words[3::2] for words in rows if words[:1] == ["│"]}
+    assert shares == {
+        "unknown": ["25.0", "25.0"],
+        "door": ["0.0", "0.0"],
+        "wall": ["25.0", "25.0"],
+        "floor": ["25.0", "50.0"],
+        "sofa": ["25.0", "0.0"],
+    }
+    warnings = [line for line in err.splitlines() if line.startswith("Warning: ")]
+    assert warnings == [
+        "Warning: No pixel for train is of 1 of 4 classes: door.",
+        "Warning: No pixel for test is of 2 of 4 classes: door, sofa.",
+    ]
+    assert "0 problems and 2 warnings; 3 panoramas of" in err
+
+
+def test_classes_of_other_labels(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """By one off, almost everything is unknown."""
+    classes: dict[str, Any] = {"door": 11, "wall": 12, "floor": 13, "sofa": 4}
+    write_classes(root, classes)
+    _, err = _checked(root, capsys)
+    assert "Nothing is wrong" not in err
+    assert "Warning: 75.0 % of the pixels for train are unknown." in err
+    assert "No pixel for train is of 3 of 4 classes: door, wall, floor." in err
+    assert "Warning: 100.0 % of the pixels for test are unknown." in err
+
+
+def test_nothing_is_wrong(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_classes(root, [None, None, "wall", "floor", None])
+    out, err = _checked(root, capsys)
+    assert (out, "Warning" in err) == (
+        "Nothing is wrong; 3 panoramas of " + str(root) + " checked.\n",
+        False,
+    )
