@@ -323,7 +323,8 @@ def _padded(
     """A photo mirrored at its borders as far as a crop is larger.
 
     Returns:
-        The image with distance as depth, its K, and what maps boxes in it to boxes in the photo.
+        The image with distance as depth; its K, with the principal point in a corner; and what maps
+        boxes in it to boxes in the photo.
     """
     matrix, size = np.array(image.camera_matrix), image.rgb.shape[:2]
     depth = None if image.depth is None else distance_from_z_depth(image.depth, matrix)
@@ -339,8 +340,7 @@ def _padded(
     rgb = cv2.copyMakeBorder(resize_area(image.rgb, (rows, columns)), *borders)
     if depth is not None:
         depth = cv2.copyMakeBorder(resize_depth(depth, (rows, columns)), *borders)
-    matrix[:2, 2] += 0.5
-    matrix[:2] *= scale[:, None]
-    matrix[:2, 2] += (left - 0.5, top - 0.5)
+    # Crops that cover the whole image do not depend on its principal point.
+    focal = np.diag([*np.diag(matrix)[:2] * scale, 1])
     offset, factor = np.tile((left, top), 2), np.tile(scale, 2)
-    return InputImage(rgb, depth), matrix, lambda boxes: (boxes - offset) / factor
+    return InputImage(rgb, depth), focal, lambda boxes: (boxes - offset) / factor

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,8 @@ import pytest
 from PIL import Image
 
 from datamodules.images.pixel_files import read_pixels, write_pixels
-from tangent_train.geometry import FLIP_Y, TangentGrid
+from tangent_train.geometry import FLIP_Y, TangentGrid, random_rotation
+from tangent_train.keypoints.colmap import panorama_poses
 from tangent_train.rendering import read_rig
 from tests.cli.rendering import Refused, render_with, smooth
 from tests.datamodules.data_files import contents, gpano_xmp
@@ -164,6 +166,39 @@ def test_what_a_partial_panorama_does_not_show_is_ignored(tmp_path: Path) -> Non
 
 
 # Poses.
+
+
+def test_poses_of_panoramas_are_those_of_their_images(project: Path, tmp_path: Path) -> None:
+    """A model whose panoramas stand where we say: x to the middle column, y to its left, z up."""
+    first = json.loads((project / "rig_config.json").read_text())[0]["cameras"][0]
+    rng = np.random.default_rng(5)
+    model, true = pycolmap.Reconstruction(), {}
+    with _database(project) as database:
+        for camera in database.read_all_cameras():
+            model.add_camera(camera)
+        (rig,) = database.read_all_rigs()
+        model.add_rig(rig)
+        for frame in database.read_all_frames():
+            images = [database.read_image(data.id) for data in frame.data_ids]
+            axes, location = random_rotation(rng), rng.normal(size=3)
+            from_world = (axes @ np.array(first["world_from_camera"])).T
+            motion = np.column_stack([from_world, -from_world @ location])
+            frame.rig_from_world = pycolmap.Rigid3d(motion)
+            model.add_frame(frame)
+            for image in images:
+                model.add_image(image)
+            model.register_frame(frame.frame_id)
+            true[images[0].name.partition("/")[2].replace("__", "/")] = axes, location
+    (tmp_path / "model").mkdir()
+    model.write(tmp_path / "model")
+    found = panorama_poses(tmp_path / "model", read_rig(project / "rig_config.json"))
+    assert found.keys() == true.keys() == set(NAMES)
+    directions = random_directions(20)
+    for name, (axes, location) in true.items():
+        points = found[name].points_m(directions, 3.0)
+        # In this package y is to the right of the middle column.
+        expected = location + 3 * (directions * (1, -1, 1)) @ axes.T
+        np.testing.assert_allclose(points, expected, atol=1e-9)
 
 
 def test_models_of_something_else(project: Path, tmp_path: Path, refused: Refused) -> None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from datamodules.core.inputs import RGB_NORMALIZATION, RGBD_NORMALIZATION, Input, normalize
 from datamodules.core.panoramas import Panorama
-from datamodules.core.samples import TrainingImages, jitter_colors, render_inputs
+from datamodules.core.samples import TrainingImages, jitter_colors, render_inputs, world_rays
 from tangent_train.geometry import equirect_directions
 from tangent_train.rendering import EquirectRepresentation, TangentRepresentation
 from tangent_train.rendering.representations.views import Representation
@@ -80,6 +80,23 @@ def test_elevation_is_how_far_a_pixel_looks_up(
         expected = directions @ np.array((0, 0, 1) if up is None else up)
         np.testing.assert_allclose(elevation, expected, atol=1e-5)
         assert elevation.dtype == np.float32
+
+
+@pytest.mark.parametrize("tilt_deg", [0, 25, 140])
+def test_rays_of_a_tilted_panorama_point_where_its_pixels_are_in_the_world(tilt_deg: int) -> None:
+    """Tilted about y; the directions of pixels come from a rendered picture of directions."""
+    sine, cosine = np.sin(np.radians(tilt_deg)), np.cos(np.radians(tilt_deg))
+    views = TangentRepresentation(0, 5, rotation="so3").sample(np.random.default_rng(2))
+    rays = world_rays(views, np.array([sine, 0, cosine]))
+    ahead, right, up = np.moveaxis(
+        views.render(equirect_directions((256, 512)).astype(np.float32), "bilinear"), -1, 0
+    )
+    expected = np.stack([ahead * cosine - up * sine, right, ahead * sine + up * cosine], -1)
+    places = (2 * np.arange(32) + 1) / 32 - 1
+    plane = np.stack([*np.meshgrid(places, places), np.ones((32, 32))], -1)
+    found = np.einsum("nij,hwj->nhwi", rays, plane)
+    found /= np.linalg.norm(found, axis=-1, keepdims=True)
+    np.testing.assert_allclose(found, expected, atol=2e-3)
 
 
 # --- samples -----------------------------------------------------------------------------------
