@@ -31,7 +31,7 @@ def _sampled(image: Array, u: Any, v: Any, interpolation: Any = "bilinear") -> A
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.float32])
-@pytest.mark.parametrize("shape", [(1, 2), (2, 3), (5, 11), (64, 128)])
+@pytest.mark.parametrize("shape", [(1, 2), (2, 3), (5, 11), (64, 128), (3, 32768), (2, 40001)])
 def test_colors_equal_exact_values_everywhere(shape: tuple[int, int], dtype: Any) -> None:
     height, width = shape
     image = _random((*shape, 3), dtype)
@@ -83,6 +83,17 @@ def test_labels_at_the_seam_are_never_unknown(base_level: int) -> None:
     np.testing.assert_array_equal(images == 1, lon < -np.pi + step)
     np.testing.assert_array_equal(images == 2, lon >= np.pi - step)
     assert (images == 1).any(axis=(1, 2)).sum() >= 4
+
+
+@pytest.mark.parametrize("width", [32766, 32767, 32768, 65537])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+def test_nearest_columns_beyond_the_limit_of_opencv(width: int, dtype: Any) -> None:
+    image = _random((2, width), np.float64).astype(np.float32)
+    image = image if dtype == np.float32 else (image * np.iinfo(dtype).max).astype(dtype)
+    columns = np.arange(width)
+    for row in (0, 1):
+        found = _sampled(image, columns, np.full(width, row), "nearest")
+        np.testing.assert_array_equal(found[0], image[row])
 
 
 @pytest.mark.parametrize("interpolation", ["bilinear", "nearest"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from PIL import ExifTags, Image
+from PIL import ExifTags, Image, ImageCms
 
 from datamodules.images.pixel_files import (
     check_writable,
@@ -165,6 +166,57 @@ def test_lossless_images_are_turned(tmp_path: Path, suffix: str) -> None:
         Image.fromarray(stored).save(path, exif=exif, lossless=True)
         np.testing.assert_array_equal(read_rgb(path), turned(stored, orientation))
         assert read_image_size(path) == turned(stored, orientation).shape[:2]
+
+
+_MODES: dict[str, Callable[[Image.Image, Path], None]] = {
+    "inks.jpg": lambda image, path: image.convert("CMYK").save(path, quality=95, subsampling=0),
+    "inks.tif": lambda image, path: image.convert("CMYK").save(path),
+    "two pictures.jpg": lambda image, path: image.save(
+        path, "MPO", save_all=True, append_images=[image.rotate(180)], quality=95
+    ),
+    "progressive.jpg": lambda image, path: image.save(path, progressive=True, quality=95),
+    "palette.tif": lambda image, path: image.convert(
+        "P", palette=Image.Palette.ADAPTIVE, colors=8
+    ).save(path),
+    "a transparent color.png": lambda image, path: image.save(path, transparency=(255, 0, 0)),
+    "transparent.png": lambda image, path: _with_alpha(image).save(path),
+    "transparent.webp": lambda image, path: _with_alpha(image).save(
+        path, lossless=True, exact=True
+    ),
+    "animated.webp": lambda image, path: image.save(
+        path, save_all=True, append_images=[image.rotate(180)], lossless=True
+    ),
+    "animated.png": lambda image, path: image.save(
+        path, save_all=True, append_images=[image.rotate(180)]
+    ),
+    "pages.tif": lambda image, path: image.save(
+        path, save_all=True, append_images=[image.rotate(180)]
+    ),
+    "png.jpg": lambda image, path: image.save(path, "PNG"),
+    "jpeg.png": lambda image, path: image.save(path, "JPEG", quality=95, subsampling=0),
+    "jpeg.tif": lambda image, path: image.save(path, compression="jpeg"),
+    "lab.tif": lambda image, path: ImageCms.profileToProfile(
+        image, ImageCms.createProfile("sRGB"), ImageCms.createProfile("LAB"), outputMode="LAB"
+    ).save(path),
+}
+
+
+def _with_alpha(image: Image.Image) -> Image.Image:
+    image = image.copy()
+    image.putalpha(0)
+    return image
+
+
+@pytest.mark.parametrize("name", _MODES)
+def test_colors_of_cameras_and_programs(tmp_path: Path, name: str) -> None:
+    """Red and green over blue and white; the first picture of several."""
+    corners = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 255]]], np.uint8)
+    rgb = corners.repeat(32, axis=0).repeat(64, axis=1)
+    _MODES[name](Image.fromarray(rgb), tmp_path / name)
+    found = read_rgb(tmp_path / name)
+    assert read_image_size(tmp_path / name) == found.shape[:2] == (64, 128)
+    away = np.abs(found.astype(int) - rgb).max(axis=-1)
+    assert (away < 60).mean() > 0.94  # those at the edges are mixed by some formats
 
 
 # Layouts of TIFF files: of every one the pixels, or an error.
