@@ -19,6 +19,7 @@ from numpy.typing import DTypeLike, NDArray
 from PIL import ExifTags, Image, ImageOps
 
 from datamodules.images.exr import read_exr, read_exr_size
+from datamodules.images.image_files import IMAGE_FORMATS
 from datamodules.images.png import MOST_PIXELS, check_pixels, read_png_header
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import atomic_path, reserve, write_bytes
@@ -42,7 +43,6 @@ READABLE_SUFFIXES = (*PIXEL_SUFFIXES, ".exr")
 LOSSY_SUFFIXES = (".jpg", ".jpeg", ".webp")
 """Formats that change pixels a little: not for labels and depth."""
 
-_FORMATS = ("JPEG", "PNG", "TIFF", "WEBP")
 _SINGLE_CHANNEL = ("L", "I", "F", "I;16", "I;16L", "I;16B", "I;16N")
 _MOST_M = 1e4  # depth beyond it marks missing: some files have 1e10 there
 _MISSING_UNITS = 65535
@@ -55,7 +55,7 @@ Image.MAX_IMAGE_PIXELS = MOST_PIXELS
 def _opened(path: Path) -> Iterator[Image.Image]:
     """An image whose size is allowed, not decoded yet; errors in the block name the file."""
     try:
-        with Image.open(path, formats=_FORMATS) as image:
+        with Image.open(path, formats=IMAGE_FORMATS) as image:
             check_pixels(path, image.height, image.width)
             if image.format == "PNG":
                 read_png_header(path)
@@ -67,8 +67,8 @@ def _opened(path: Path) -> Iterator[Image.Image]:
         raise DataError(
             path,
             found=f"no image that can be decoded ({getattr(error, 'strerror', None) or error})",
-            expected="a whole JPEG, PNG, TIFF or WebP image",
-            remedy="Copy or export the file again.",
+            expected=f"a whole image of a format that is read: {', '.join(IMAGE_FORMATS)}",
+            remedy="Copy or export the file again, for example as JPEG or PNG.",
         ) from error
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
 from functools import partial
 from itertools import count, takewhile
 from pathlib import Path
@@ -34,85 +33,76 @@ _QUALITY = {"crf": "18", "preset": "veryfast"}
 _BT709 = 1  # of the matrix, primaries and transfer: what players assume of large videos
 
 
-@dataclass(frozen=True)
-class Video:
-    """A video file that was read once without decoding it.
+def read_video_size(path: Path) -> tuple[int, int, int]:
+    """Number of frames that players show, and rows and columns of the first one, upright.
 
-    Attributes:
-        path: The file.
-        count: Number of frames that players show.
-        shape: Rows and columns of the upright first frame.
+    All packets are read; only the first frame is decoded.
+
+    Raises:
+        DataError: It cannot be read, is truncated or damaged, or has no video stream or no frames.
+        SettingError: PyAV is missing.
     """
+    _check_end(path)
+    first, packets, times = None, 0, []
+    with _logged_errors(path) as errors, _opened(path) as (container, stream):
+        stream.thread_type = "NONE"  # errors of other threads are not logged here
+        for packet in container.demux(stream):
+            if packet.is_corrupt:
+                raise _damaged(path, f"packet {packets} is incomplete")
+            if packet.size:
+                packets += 1
+                times += [packet.pts] if _is_shown(packet) else []
+            first = first or next(iter(packet.decode()), None)
+        indexed = sum(entry.size > 0 for entry in stream.index_entries)
+    if packets < indexed:
+        raise _damaged(path, f"{packets} of {indexed} packets")
+    if errors:
+        raise _damaged(path, errors[0])
+    if first is None:
+        raise DataError(path, found="no frame that can be decoded", expected="a whole video")
+    check_pixels(path, first.height, first.width)
+    rows, columns = _upright(path, first).shape[:2]
+    # A cut without encoding leaves frames before the first one that need what was cut off.
+    start = first.pts
+    return sum(None in (time, start) or time >= start for time in times), rows, columns
 
-    path: Path
-    count: int
-    shape: tuple[int, int]
 
-    @classmethod
-    def read(cls, path: Path) -> Video:
-        """Read the packets of a video, and decode its first frame.
+def read_frames(
+    path: Path, frames: int | None = None, every: int = 1
+) -> Generator[Callable[[], NDArray[np.uint8]]]:
+    """The first and then every n-th frame of a video, decoded in a thread a few ahead.
 
-        Raises:
-            DataError: It cannot be read, is truncated or damaged, or has no video stream or no
-                frames.
-            SettingError: PyAV is missing.
-        """
-        _check_end(path)
-        first, packets, times = None, 0, []
-        with _logged_errors(path) as errors, _opened(path) as (container, stream):
-            stream.thread_type = "NONE"  # errors of other threads are not logged here
-            for packet in container.demux(stream):
-                if packet.is_corrupt:
-                    raise _damaged(path, f"packet {packets} is incomplete")
-                if packet.size:
-                    packets += 1
-                    times += [packet.pts] if _is_shown(packet) else []
-                first = first or next(iter(packet.decode()), None)
-            indexed = sum(entry.size > 0 for entry in stream.index_entries)
-        if packets < indexed:
-            raise _damaged(path, f"{packets} of {indexed} packets")
-        if errors:
-            raise _damaged(path, errors[0])
-        if first is None:
-            raise DataError(path, found="no frame that can be decoded", expected="a whole video")
-        check_pixels(path, first.height, first.width)
-        rows, columns = _upright(path, first).shape[:2]
-        # A cut without encoding leaves frames before the first one that need what was cut off.
-        start = first.pts
-        shown = sum(time is None or start is None or time >= start for time in times)
-        return cls(path, shown, (rows, columns))
+    Args:
+        path: The video.
+        frames: Number of frames by `read_video_size`; None to read it.
+        every: Distance n of the frames.
 
-    def frames(self, every: int = 1) -> Generator[tuple[int, Callable[[], NDArray[np.uint8]]]]:
-        """The frames, decoded in a thread a few ahead.
+    Yields:
+        A function that returns a frame, upright in RGB, ``(H, W, 3)``; not calling it saves the
+        conversion.
 
-        Args:
-            every: Yield the first and then every n-th frame.
+    Raises:
+        DataError: A frame is damaged, or there are more or fewer.
+    """
+    for frame in _frames(path, read_video_size(path)[0] if frames is None else frames, every):
+        yield partial(_upright, path, frame)
 
-        Yields:
-            Number of a frame, and a function that returns it, upright in RGB, ``(H, W, 3)``; not
-            calling it saves the conversion.
 
-        Raises:
-            DataError: A frame is damaged, or there are more or fewer than `count`.
-        """
-        for number, frame in self._decoded(every):
-            yield number, partial(_upright, self.path, frame)
+def _frames(path: Path, expected: int, every: int) -> Generator[Any]:
+    def decoded() -> Generator[Any]:
+        number = -1
+        with _opened(path) as (container, stream):
+            for number, frame in enumerate(container.decode(stream)):
+                if frame.is_corrupt:
+                    raise _damaged(path, f"frame {number} is incomplete")
+                if number % every == 0:
+                    yield frame
+        if number + 1 != expected:
+            raise _damaged(path, f"{number + 1} of {expected} frames")
 
-    def _decoded(self, every: int) -> Generator[tuple[int, Any]]:
-        def decoded() -> Generator[tuple[int, Any]]:
-            number = -1
-            with _opened(self.path) as (container, stream):
-                for number, frame in enumerate(container.decode(stream)):
-                    if frame.is_corrupt:
-                        raise _damaged(self.path, f"frame {number} is incomplete")
-                    if number % every == 0:
-                        yield number, frame
-            if number + 1 != self.count:
-                raise _damaged(self.path, f"{number + 1} frames in {self.count} packets")
-
-        source = decoded()
-        with closing(in_threads(lambda _: next(source, None), count(), 1, _AHEAD)) as frames:
-            yield from takewhile(lambda frame: frame is not None, frames)
+    source = decoded()
+    with closing(in_threads(lambda _: next(source, None), count(), 1, _AHEAD)) as frames:
+        yield from takewhile(lambda frame: frame is not None, frames)
 
 
 @contextmanager
@@ -242,7 +232,8 @@ def _upright(path: Path, frame: Any) -> NDArray[np.uint8]:
 
 def write_video(
     path: Path,
-    source: Video,
+    source: Path,
+    size: tuple[int, int, int],
     paint: Callable[[int, NDArray[np.uint8]], NDArray[np.uint8]],
     every: int = 1,
 ) -> None:
@@ -251,6 +242,7 @@ def write_video(
     Args:
         path: The file, which appears once complete.
         source: The other video.
+        size: Its number of frames, rows and columns by `read_video_size`.
         paint: Returns a frame ``(H, W, 3)`` of the new one for the number of a frame and the
             upright frame of the other one. Called in threads.
         every: Take the first and then every n-th frame.
@@ -262,11 +254,12 @@ def write_video(
     import av
     from av.video.reformatter import Colorspace
 
-    rows, columns = source.shape
+    expected, rows, columns = size
 
     def painted(numbered: tuple[int, Any]) -> Any:
-        number, frame = numbered
-        picture = np.ascontiguousarray(paint(number, _upright(source.path, frame)))
+        place, frame = numbered
+        number = place * every
+        picture = np.ascontiguousarray(paint(number, _upright(source, frame)))
         made = av.VideoFrame.from_ndarray(picture, format="rgb24")
         made = made.reformat(columns, rows, pixels, dst_colorspace=Colorspace.ITU709)
         made.time_base = stream.time_base
@@ -275,7 +268,7 @@ def write_video(
 
     with (
         atomic_path(path) as temporary,
-        _opened(source.path) as (_, stream),
+        _opened(source) as (_, stream),
         av.open(_file_url(temporary), "w", format="mp4") as output,
     ):
         rate = stream.average_rate or 30
@@ -287,7 +280,8 @@ def write_video(
         encoder.codec_context.time_base = stream.time_base
         encoder.codec_context.colorspace = encoder.codec_context.color_primaries = _BT709
         encoder.codec_context.color_trc = _BT709
-        with closing(in_threads(painted, source._decoded(every), ahead=_AHEAD)) as frames:
+        numbered = enumerate(_frames(source, expected, every))
+        with closing(in_threads(painted, numbered, ahead=_AHEAD)) as frames:
             for frame in frames:
                 output.mux(encoder.encode(frame))
         output.mux(encoder.encode(None))

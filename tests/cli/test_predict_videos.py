@@ -87,20 +87,20 @@ def test_an_interrupted_video_is_resumed(
 ) -> None:
     video = _write_video(tmp_path / "in" / "walk.mp4")
 
-    def interrupted(path: Path) -> Any:
-        for number, frame in enumerate(read_frames(path)):
+    def interrupted(path: Path, *settings: int) -> Any:
+        for number, frame in enumerate(read_frames(path, *settings)):
             if number == 4:
                 raise KeyboardInterrupt
             yield frame
 
-    monkeypatch.setattr("tangent_train.cli.predict_inputs.read_frames", interrupted)
+    monkeypatch.setattr("tangent_train.cli.input_files.read_frames", interrupted)
     with pytest.raises(SystemExit) as stopped:
         predict(input=video)
     assert stopped.value.code == 130
     assert "4 of 7 images are done. resume=true" in capsys.readouterr().out
     assert len(predicted(tmp_path / "out")) == 4
     assert not (tmp_path / "out" / "overlay").exists()
-    monkeypatch.setattr("tangent_train.cli.predict_inputs.read_frames", read_frames)
+    monkeypatch.setattr("tangent_train.cli.input_files.read_frames", read_frames)
     before = (tmp_path / "out" / "labels" / "walk" / "000003.png").stat().st_mtime_ns
     predict(input=video, resume="true")
     assert (tmp_path / "out" / "labels" / "walk" / "000003.png").stat().st_mtime_ns == before
