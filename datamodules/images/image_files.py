@@ -71,7 +71,7 @@ def image_paths(
         )
     skipped = Counter(file.suffix.lower() or "without suffix" for file in found.difference(images))
     if skipped:
-        kinds = ", ".join(f"{count} {suffix}" for suffix, count in sorted(skipped.items()))
+        kinds = ", ".join(f"{count} {repr(kind)[1:-1]}" for kind, count in sorted(skipped.items()))
         tell(f"Skipped: {kinds}. Convert images of other formats, for example to JPEG or PNG.")
     return images
 

@@ -94,7 +94,7 @@ def _frames(path: Path, expected: int, every: int) -> Generator[Any]:
         with _opened(path) as (container, stream):
             for number, frame in enumerate(container.decode(stream)):
                 if frame.is_corrupt:
-                    raise _damaged(path, f"frame {number} is incomplete")
+                    raise _damaged(path, f"frame {number}, and frames before that refer to it")
                 if number % every == 0:
                     yield frame
         if number + 1 != expected:

@@ -140,7 +140,7 @@ def test_the_check_names_what_a_hand_made_data_set_gets_wrong(tmp_path: Path, er
     labels.joinpath("a.png").rename(labels / "a_mask.png")
     save(labels / "b.jpg", np.zeros((16, 32), np.uint8))
     (labels / "b.png").unlink()
-    for name in ("walk.mp4", "sketch.bmp"):
+    for name in ("walk.mp4", "sketch.heic"):
         (tmp_path / "images" / name).write_bytes(b"anything")
     # Splits that are impossible hide nothing.
     (tmp_path / "test.txt").write_text("")
@@ -151,8 +151,8 @@ def test_the_check_names_what_a_hand_made_data_set_gets_wrong(tmp_path: Path, er
     assert findings["b.png"][0].startswith("no such file, but b.jpg; expected the labels of")
     assert "PNG (JPEG changes values)" in findings["b.png"][1]
     assert findings["a_mask.png"][0].startswith("labels of no image")
-    assert findings["walk.mp4"][0].startswith("no image; expected images (.jpg")
+    assert findings["walk.mp4"][0].startswith("no image; expected images (.")
     assert "extract frames" in findings["walk.mp4"][1]
-    assert findings["sketch.bmp"][1].startswith("Convert it")
+    assert findings["sketch.heic"][1].startswith("Convert it")
     assert findings[tmp_path.name][0].startswith("no images for test")
     assert len(findings) == 6
