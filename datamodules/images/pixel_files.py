@@ -67,7 +67,7 @@ def _opened(path: Path) -> Iterator[Image.Image]:
         raise DataError(
             path,
             found=f"no image that can be decoded ({getattr(error, 'strerror', None) or error})",
-            expected=f"a whole image of a format that is read: {', '.join(IMAGE_FORMATS)}",
+            expected=f"a whole image of a known format ({', '.join(IMAGE_FORMATS)})",
             remedy="Copy or export the file again, for example as JPEG or PNG.",
         ) from error
 
@@ -109,7 +109,8 @@ def read_pixels(path: Path, *, indices: bool) -> NDArray[Any]:
     """Read an image or an array as stored; alpha is dropped, the EXIF orientation applied.
 
     Args:
-        path: JPEG, PNG, TIFF, WebP, OpenEXR (one channel of it) or ``.npy``.
+        path: An image of `IMAGE_FORMATS` (its first picture), OpenEXR (one channel of it) or
+            ``.npy``.
         indices: Of an image with a palette (or of 1 bit), whether to give indices or colours.
 
     Returns:
@@ -155,7 +156,7 @@ def read_rgb(path: Path) -> NDArray[np.uint8]:
     dropped; the EXIF orientation is applied.
 
     Args:
-        path: JPEG, PNG, TIFF or WebP.
+        path: An image of `IMAGE_FORMATS`.
 
     Raises:
         DataError: The file cannot be read, is broken, or holds other values than colours.

@@ -156,3 +156,15 @@ def test_the_check_names_what_a_hand_made_data_set_gets_wrong(tmp_path: Path, er
     assert findings["sketch.heic"][1].startswith("Convert it")
     assert findings[tmp_path.name][0].startswith("no images for test")
     assert len(findings) == 6
+
+
+def test_files_that_are_not_images_are_counted_before_training(
+    tmp_path: Path, erp: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_classes(tmp_path)
+    for number in range(3):
+        write_panorama(tmp_path, f"{number}", number, 16)
+    for name in ("a.heic", "b.HEIC", "walk.mp4"):
+        (tmp_path / "images" / name).write_bytes(b"anything")
+    FolderPanoramas(tmp_path, erp).prepare_data()
+    assert "Skipped: 2 .heic, 1 .mp4. Convert" in capsys.readouterr().out
