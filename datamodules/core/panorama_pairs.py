@@ -12,6 +12,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from datamodules.core.split_module import tell
 from datamodules.images.gpano import area_of
 from datamodules.images.image_files import image_paths, short_names
 from datamodules.images.pixel_files import read_rgb
@@ -169,9 +170,11 @@ class ImagePairs(PanoramaPairs):
         if pairing not in ("consecutive", "all"):
             raise SettingError("pairing", found=pairing, expected="consecutive or all")
         if input is not None:
-            paths = image_paths(input)
+            paths = image_paths(input, tell=tell)
         else:
-            paths = [path for side in (str(left), str(right)) for path in image_paths(side)]
+            paths = [
+                path for side in (str(left), str(right)) for path in image_paths(side, tell=tell)
+            ]
         if len(paths) < 2 or (input is None and len(paths) > 2):
             expected = "two panoramas" + ("" if input is None else " or more")
             raise DataError(input or left, found=f"{len(paths)}", expected=expected)

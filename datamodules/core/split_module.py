@@ -321,7 +321,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
                 )
         if problems.items:
             total = len(problems.items.union(item.name for item in found.of()))
-            _tell(
+            tell(
                 f"{len(problems.items)} of {total} {self.noun} are broken and left out "
                 "(data.skip_broken=true); tangent-check lists them."
             )
@@ -463,5 +463,6 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
 
 
 @rank_zero_only
-def _tell(text: str) -> None:
+def tell(text: str) -> None:
+    """Print text as it is, in the first process."""
     Console(soft_wrap=True, highlight=False).print(text, markup=False)

@@ -22,10 +22,12 @@ from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, P
 from datamodules.core.inputs import Input
 from datamodules.core.panoramas import ImageFiles
 from datamodules.core.problems import Problems
+from datamodules.core.split_module import tell
 from datamodules.folder.cameras import read_cameras
 from datamodules.folder.classes import UNKNOWN_NAME, read_classes
 from datamodules.folder.reader import FolderReader, list_images, note_ignored, read_codes
 from datamodules.folder.splits import FolderSplits
+from datamodules.images.image_files import image_paths
 from tangent_train.errors import DataError
 from tangent_train.registry import registered
 
@@ -79,6 +81,11 @@ class LabelledFolder(ImageDataModule):
         with problems.noted():
             self._check_classes(problems.without(images)[:_TRIED], problems)
         return self.make_reader(images, problems), splits
+
+    def prepare_data(self) -> None:
+        """See `SplitDataModule`; files that are not images are counted."""
+        super().prepare_data()
+        image_paths(self.root / "images", tell=tell)
 
     def check(self) -> tuple[Problems, int]:
         """See `SplitDataModule`; files that training would pass over are named too."""

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.images.image_files import short_names
 from datamodules.images.pixel_files import write_pixels
 from datamodules.images.tangent_folders import face_name, shrink_to_level, write_each
 from tangent_train.errors import DataError
@@ -22,27 +21,26 @@ from tangent_train.rendering import Interpolation, equirect_to_tangent
 from tangent_train.rendering.camera_files import RIG_FILE, write_rig
 
 
-def flat_names(paths: Sequence[Path]) -> list[str]:
-    """Names of `short_names` without folders.
+def flat_names(names: Sequence[str]) -> dict[str, str]:
+    """Names without folders, by the names of panoramas.
 
     Raises:
         DataError: Two are the same.
 
-    >>> from pathlib import Path
-    >>> flat_names([Path("a/x/1.jpg"), Path("a/1.jpg")])
-    ['x__1', '1']
+    >>> flat_names(["x/1", "1"])
+    {'x/1': 'x__1', '1': '1'}
     """
-    names = [name.replace("/", "__") for name in short_names(paths)]
-    places: dict[str, Path] = {}
-    for name, path in zip(names, paths, strict=True):
-        if places.setdefault(name.casefold(), path) != path:
+    flat = {name: name.replace("/", "__") for name in names}
+    places: dict[str, str] = {}
+    for name, short in flat.items():
+        if places.setdefault(short.casefold(), name) != name:
             raise DataError(
-                path,
-                found=f"{places[name.casefold()]}, which is called {name} too",
+                name,
+                found=f"{places[short.casefold()]}, which is called {short} too",
                 expected="panoramas whose paths differ with __ for /",
                 remedy="Rename one of them.",
             )
-    return names
+    return flat
 
 
 class ColmapProject:

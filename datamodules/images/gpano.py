@@ -36,7 +36,7 @@ _MOST_COLUMNS = 32768  # of the whole panorama
 _SAY_IT = "Say with crop=[west,east,south,north] in degrees what the image shows."
 _NOT_WHOLE = (
     "If it is a part of a panorama, say which with crop=[west,east,south,north] in degrees or with "
-    "GPano tags in its XMP data; if it is a photo, choose projection=perspective."
+    "GPano tags in its XMP data. Photos are for tangent-predict with projection=perspective."
 )
 
 

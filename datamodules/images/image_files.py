@@ -6,25 +6,41 @@ import glob
 import os
 import unicodedata
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+
+from PIL import Image
 
 from tangent_train.errors import DataError
 
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
+IMAGE_FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP", "GIF", "AVIF")
+"""Pillow's names of the formats that are read; AVIF where Pillow was built with it."""
+
+IMAGE_SUFFIXES = tuple(
+    sorted(
+        suffix for suffix, name in Image.registered_extensions().items() if name in IMAGE_FORMATS
+    )
+)
 """Suffixes of images, in lower case."""
 
 DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".npy", ".exr")
 """Suffixes of depth maps."""
 
 
-def image_paths(pattern: str | Path, suffixes: Sequence[str] = IMAGE_SUFFIXES) -> list[Path]:
+def image_paths(
+    pattern: str | Path,
+    suffixes: Sequence[str] = IMAGE_SUFFIXES,
+    is_result: Callable[[Path], bool] = lambda path: False,
+    tell: Callable[[str], object] = lambda text: None,
+) -> list[Path]:
     """The images that a setting names.
 
     Args:
         pattern: A file; a folder, searched recursively; or a glob pattern, with ``**`` for folders
             of any depth. ``~`` is the home folder.
         suffixes: Of images, in lower case.
+        is_result: True for files that a command wrote: they are passed over.
+        tell: Called with the number of the other files of a folder or pattern, if there are any.
 
     Returns:
         Sorted paths. Of folders and patterns only files with one of the suffixes, in lower or upper
@@ -36,22 +52,28 @@ def image_paths(pattern: str | Path, suffixes: Sequence[str] = IMAGE_SUFFIXES) -
     path = Path(pattern)
     # The shell leaves the ~ of "input=~/holiday" alone.
     path = path.expanduser() if path.parts[:1] == ("~",) else path
-    if path.is_file():
+    if path.is_file() and not is_result(path):
         return [path]
     if path.is_dir():
-        found = list(walk_files(path))
+        named = list(walk_files(path))
     else:
-        found = [Path(name) for name in glob.glob(str(path), recursive=True)]  # noqa: PTH207
-    images = sorted({file for file in found if file.suffix.lower() in suffixes})
+        named = [Path(name) for name in glob.glob(str(path), recursive=True)]  # noqa: PTH207
     # Links that lead nowhere stay: whoever reads them says so.
-    images = [file for file in images if not file.is_dir() and not file.name.startswith(".")]
+    files = {file for file in named if not file.is_dir() and not file.name.startswith(".")}
+    found = {file for file in files if not is_result(file)}
+    images = sorted(file for file in found if file.suffix.lower() in suffixes)
     if not images:
+        others = f"{len(found)} files, none of them an image" if found else "nothing"
         raise DataError(
             pattern,
-            found=f"{len(found)} files, none of them an image" if found else "nothing",
+            found="only results of this command" if files and not found else others,
             expected=f"an image, a folder of images or a pattern such as 'holiday/*.jpg' "
             f"({', '.join(suffixes)})",
         )
+    skipped = Counter(file.suffix.lower() or "without suffix" for file in found.difference(images))
+    if skipped:
+        kinds = ", ".join(f"{count} {repr(kind)[1:-1]}" for kind, count in sorted(skipped.items()))
+        tell(f"Skipped: {kinds}. Convert images of other formats, for example to JPEG or PNG.")
     return images
 
 

@@ -19,6 +19,7 @@ from numpy.typing import DTypeLike, NDArray
 from PIL import ExifTags, Image, TiffImagePlugin, TiffTags
 
 from datamodules.images.exr import read_exr, read_exr_size
+from datamodules.images.image_files import IMAGE_FORMATS
 from datamodules.images.png import (
     MOST_PIXELS,
     check_pixels,
@@ -47,7 +48,6 @@ READABLE_SUFFIXES = (*PIXEL_SUFFIXES, ".exr")
 LOSSY_SUFFIXES = (".jpg", ".jpeg", ".webp")
 """Formats that change pixels a little: not for labels and depth."""
 
-_FORMATS = ("JPEG", "PNG", "TIFF", "WEBP")
 _SINGLE_CHANNEL = ("L", "I", "F", "I;16", "I;16L", "I;16B", "I;16N")
 _FIRST_TRANSPOSED = 5  # EXIF orientation from which rows are stored as columns
 _BITS, _PHOTOMETRIC, _BIT_ORDER, _CHANNELS, _PLANES = 258, 262, 266, 277, 284  # TIFF tags
@@ -72,7 +72,7 @@ def _opened(path: Path) -> Iterator[Image.Image]:
     """An image whose size is allowed, not decoded yet; errors in the block name the file."""
     try:
         # Not by its name: Pillow would map raw TIFF files into memory, and turn these wrongly.
-        with path.open("rb") as file, Image.open(file, formats=_FORMATS) as image:
+        with path.open("rb") as file, Image.open(file, formats=IMAGE_FORMATS) as image:
             check_pixels(path, image.height, image.width)
             if image.format == "PNG":
                 read_png_header(path)
@@ -86,8 +86,8 @@ def _opened(path: Path) -> Iterator[Image.Image]:
         raise DataError(
             path,
             found=f"no image that can be decoded ({reason})",
-            expected="a whole JPEG, PNG, TIFF or WebP image",
-            remedy="Copy or export the file again.",
+            expected=f"a whole image of a known format ({', '.join(IMAGE_FORMATS)})",
+            remedy="Copy or export the file again, for example as JPEG or PNG.",
         ) from error
 
 
@@ -159,7 +159,8 @@ def read_pixels(path: Path, *, indices: bool) -> NDArray[Any]:
     """Read an image or an array as stored; alpha is dropped, the EXIF orientation applied.
 
     Args:
-        path: JPEG, PNG, TIFF, WebP, OpenEXR (one channel of it) or ``.npy``.
+        path: An image of `IMAGE_FORMATS` (its first picture), OpenEXR (one channel of it) or
+            ``.npy``.
         indices: Of an image with a palette (or of 1 bit), whether to give indices or colours.
 
     Returns:
@@ -250,7 +251,7 @@ def read_rgb(path: Path) -> NDArray[np.uint8]:
     dropped; the EXIF orientation is applied.
 
     Args:
-        path: JPEG, PNG, TIFF or WebP.
+        path: An image of `IMAGE_FORMATS`.
 
     Raises:
         DataError: The file cannot be read, is broken, or holds other values than colours.

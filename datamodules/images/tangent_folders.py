@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.images.gpano import PanoramaArea, area_of, whole_area
-from datamodules.images.image_files import IMAGE_SUFFIXES
+from datamodules.images.gpano import PanoramaArea, area_of, area_of_crop, whole_area
 from datamodules.images.pixel_files import read_pixels, write_pixels
+from datamodules.images.videos import VIDEO_SUFFIXES
 from tangent_train.errors import SettingError
 from tangent_train.geometry import TangentGrid, equirect_shape
 from tangent_train.rendering import Interpolation, equirect_to_tangent
@@ -32,35 +32,51 @@ from tangent_train.threads import in_threads
 _RESIZABLE = (np.uint8, np.uint16, np.float32, np.float64)
 
 
-def panorama_area(path: Path, size: tuple[int, int]) -> PanoramaArea:
-    """The part of the sphere that an image shows by its tags; arrays have none.
+def panorama_area(
+    path: Path, size: tuple[int, int], crop: Sequence[float] | None = None
+) -> PanoramaArea:
+    """The part of the sphere that a file shows.
 
     Args:
-        path: An image or a ``.npy`` file.
-        size: Its rows and columns.
+        path: An image, or an array or video, which have no GPano tags.
+        size: Its rows and columns, of a video those of a frame.
+        crop: That part, see `area_of_crop`; None for that of its GPano tags.
 
     Raises:
         DataError: It is neither a whole panorama nor tagged as a part of one.
+        SettingError: The crop does not fit.
     """
-    tagged = path.suffix.lower() in IMAGE_SUFFIXES
-    return area_of(path, size) if tagged else whole_area(path, size)
+    if crop is not None:
+        return area_of_crop(size, crop)
+    is_tagged = path.suffix.lower() not in (".npy", ".exr", *VIDEO_SUFFIXES)
+    return area_of(path, size) if is_tagged else whole_area(path, size)
 
 
-def read_panorama(path: Path, interpolation: Interpolation) -> NDArray[Any]:
+def read_panorama(
+    path: Path,
+    interpolation: Interpolation,
+    crop: Sequence[float] | None = None,
+    frame: Callable[[], NDArray[np.uint8]] | None = None,
+) -> tuple[NDArray[Any], PanoramaArea]:
     """Read a panorama of any dtype; a part of a panorama is placed on the whole sphere.
 
     Args:
-        path: An image or a ``.npy`` file.
+        path: An image, an array or a video.
         interpolation: With ``nearest``, images with a palette give its indices.
+        crop: See `panorama_area`.
+        frame: Returns the frame, if the file is a video.
 
     Returns:
-        ``(H, W)`` or ``(H, W, C)``, the whole sphere; 0 where a part of a panorama shows nothing.
+        ``(H, W)`` or ``(H, W, C)``, the whole sphere, 0 where a part of a panorama shows nothing;
+        and that part.
 
     Raises:
         DataError: The file cannot be used.
+        SettingError: The crop does not fit.
     """
-    image = read_pixels(path, indices=interpolation == "nearest")
-    return panorama_area(path, (image.shape[0], image.shape[1])).place(image)
+    image = read_pixels(path, indices=interpolation == "nearest") if frame is None else frame()
+    area = panorama_area(path, (image.shape[0], image.shape[1]), crop)
+    return area.place(image), area
 
 
 def face_name(grid: TangentGrid, face: int) -> str:

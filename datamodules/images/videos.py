@@ -20,82 +20,232 @@ from tangent_train.threads import in_threads
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
 """Suffixes of videos, in lower case."""
 
+_READERS = "mov,matroska,avi"
+"""FFmpeg's readers of these files. Others read playlists, scripts and neighbors of a file."""
+
+_EBML = (b"\x1a\x45\xdf\xa3", b"\x18\x53\x80\x67")  # Matroska's header, and its segment
+_BOXES = (b"moov", b"moof", b"mdat")
+_SHOWN_VP8 = 0x10
+_STRAIGHT = 0.02  # of a matrix: about a degree
 _AHEAD = 2
 _ENCODER = "libx264"
 _QUALITY = {"crf": "18", "preset": "veryfast"}
 _BT709 = 1  # of the matrix, primaries and transfer: what players assume of large videos
 
 
-@contextmanager
-def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
-    """A container and its first video stream; errors in the block name the file."""
-    with of_extra("video", path):
-        import av
-    try:
-        with av.open(str(path)) as container:
-            if not container.streams.video:
-                raise DataError(path, found="no video stream", expected="a video")
-            stream = container.streams.video[0]
-            stream.thread_type = "AUTO"
-            yield container, stream
-    except av.FFmpegError as error:
-        raise DataError(
-            path,
-            found=f"a video that cannot be decoded ({error.strerror})",
-            expected="one that decodes to its end",
-            remedy="Copy or export it again.",
-        ) from error
-
-
 def read_video_size(path: Path) -> tuple[int, int, int]:
-    """Number of frames, rows and columns of a video; nothing is decoded.
+    """Number of frames that players show, and rows and columns of the first one, upright.
+
+    All packets are read; only the first frame is decoded.
 
     Raises:
-        DataError: It cannot be read, or has no video stream or no frames.
+        DataError: It cannot be read, is truncated or damaged, or has no video stream or no frames.
         SettingError: PyAV is missing.
     """
-    with _opened(path) as (container, stream):
-        # Some formats do not say it: their packets are counted.
-        frames = stream.frames or sum(packet.size > 0 for packet in container.demux(stream))
-        if not frames:
-            raise DataError(path, found="no frames", expected="a whole video")
-        check_pixels(path, stream.height, stream.width)
-        return frames, stream.height, stream.width
+    _check_end(path)
+    first, packets, times = None, 0, []
+    with _logged_errors(path) as errors, _opened(path) as (container, stream):
+        stream.thread_type = "NONE"  # errors of other threads are not logged here
+        for packet in container.demux(stream):
+            if packet.is_corrupt:
+                raise _damaged(path, f"packet {packets} is incomplete")
+            if packet.size:
+                packets += 1
+                times += [packet.pts] if _is_shown(packet) else []
+            first = first or next(iter(packet.decode()), None)
+        indexed = sum(entry.size > 0 for entry in stream.index_entries)
+    if packets < indexed:
+        raise _damaged(path, f"{packets} of {indexed} packets")
+    if errors:
+        raise _damaged(path, errors[0])
+    if first is None:
+        raise DataError(path, found="no frame that can be decoded", expected="a whole video")
+    check_pixels(path, first.height, first.width)
+    rows, columns = _upright(path, first).shape[:2]
+    # A cut without encoding leaves frames before the first one that need what was cut off.
+    start = first.pts
+    return sum(None in (time, start) or time >= start for time in times), rows, columns
 
 
-def read_frames(path: Path) -> Generator[Callable[[], NDArray[np.uint8]]]:
-    """The frames of a video, decoded in a thread a few ahead.
+def read_frames(
+    path: Path, frames: int | None = None, every: int = 1
+) -> Generator[Callable[[], NDArray[np.uint8]]]:
+    """The first and then every n-th frame of a video, decoded in a thread a few ahead.
+
+    Args:
+        path: The video.
+        frames: Number of frames by `read_video_size`; None to read it.
+        every: Distance n of the frames.
 
     Yields:
-        What gives a frame in RGB, ``(H, W, 3)``; not calling it saves the conversion.
+        A function that returns a frame, upright in RGB, ``(H, W, 3)``; not calling it saves the
+        conversion.
 
     Raises:
-        DataError: The video cannot be decoded to its end.
+        DataError: A frame is damaged, or there are more or fewer.
     """
-    for frame in _frames(path):
-        yield partial(frame.to_ndarray, format="rgb24")
+    for frame in _frames(path, read_video_size(path)[0] if frames is None else frames, every):
+        yield partial(_upright, path, frame)
 
 
-def _frames(path: Path) -> Generator[Any]:
+def _frames(path: Path, expected: int, every: int) -> Generator[Any]:
     def decoded() -> Generator[Any]:
+        number = -1
         with _opened(path) as (container, stream):
-            yield from container.decode(stream)
+            for number, frame in enumerate(container.decode(stream)):
+                if frame.is_corrupt:
+                    raise _damaged(path, f"frame {number}, and frames before that refer to it")
+                if number % every == 0:
+                    yield frame
+        if number + 1 != expected:
+            raise _damaged(path, f"{number + 1} of {expected} frames")
 
     source = decoded()
     with closing(in_threads(lambda _: next(source, None), count(), 1, _AHEAD)) as frames:
         yield from takewhile(lambda frame: frame is not None, frames)
 
 
+@contextmanager
+def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
+    """A container and its video stream; errors in the block name the file."""
+    with of_extra("video", path):
+        import av
+    options = {"format_whitelist": _READERS, "protocol_whitelist": "file"}
+    try:
+        with av.open(
+            _file_url(path), container_options=options, metadata_errors="replace"
+        ) as container:
+            stream = container.streams.best("video")
+            if stream is None or stream.disposition & stream.disposition.attached_pic:
+                raise DataError(path, found="no video stream", expected="a video")
+            if stream.codec_context is None:
+                raise DataError(path, found="a codec that FFmpeg lacks", expected="another one")
+            stream.thread_type = "AUTO"
+            yield container, stream
+    except av.FFmpegError as error:
+        raise DataError(
+            path,
+            found=f"a video that cannot be decoded ({error.strerror})",
+            expected="a whole MP4, QuickTime, Matroska, WebM or AVI file",
+            remedy="Copy or export it again.",
+        ) from error
+
+
+def _file_url(path: Path) -> str:
+    # A name alone may be that of another protocol: "http:…".
+    return f"file:{path.absolute()}"
+
+
+@contextmanager
+def _logged_errors(path: Path) -> Iterator[list[str]]:
+    """What FFmpeg's reader of Matroska logs: it passes over what it cannot read."""
+    with of_extra("video", path):
+        import av.logging as log
+    errors: list[str] = []
+    level, skips = log.get_level(), log.get_skip_repeated()
+    log.set_level(log.ERROR)
+    log.set_skip_repeated(False)  # another file may have the same errors
+    try:
+        with log.Capture() as messages:
+            yield errors
+        errors += [text.strip() for _, name, text in messages if name.startswith("matroska")]
+    finally:
+        log.set_level(level)
+        log.set_skip_repeated(skips)
+
+
+def _check_end(path: Path) -> None:
+    """Refuse a file that ends within one of its outermost elements.
+
+    These are EBML elements (RFC 8794), RIFF chunks of AVI, and boxes (ISO 14496-12).
+    """
+    end = 0
+    try:
+        with path.open("rb") as file:
+            size = path.stat().st_size
+            while head := file.read(16):
+                if head[:4] in _EBML and len(head) > 4:
+                    width = 9 - head[4].bit_length()  # of the length
+                    length = int.from_bytes(head[4 : 4 + width]) % (1 << 7 * width)
+                    if length == (1 << 7 * width) - 1:  # unknown: a live stream
+                        break
+                    length += 4 + width
+                elif head[:4] == b"RIFF":
+                    length = 8 + int.from_bytes(head[4:8], "little")
+                else:
+                    length = int.from_bytes(head[:4])
+                    length = int.from_bytes(head[8:16]) if length == 1 else length
+                    if length < 8 or not head[4:8].isalnum():  # the last box, or no box at all
+                        break
+                is_known = head[:4] in (*_EBML, b"RIFF") or head[4:8] in _BOXES
+                if is_known and end + length > size:
+                    raise _damaged(path, f"it ends at byte {size} of {end + length}")
+                end = file.seek(end + length)
+    except OSError as error:
+        raise DataError(path, found=error, expected="a video that can be read") from error
+
+
+def _is_shown(packet: Any) -> bool:
+    """False for packets that an edit list hides, and reference frames of VP8 (RFC 6386, 9.1)."""
+    hidden = packet.stream.codec_context.name == "vp8" and not bytes(packet)[0] & _SHOWN_VP8
+    return not (packet.is_discard or hidden)
+
+
+def _damaged(path: Path, detail: str) -> DataError:
+    return DataError(
+        path,
+        found=f"a truncated or damaged video ({detail})",
+        expected="a whole one",
+        remedy="Copy or export it again. To use what is left of it, repair it, for example with "
+        "ffmpeg -i <video> -c copy <repaired>.",
+    )
+
+
+def _upright(path: Path, frame: Any) -> NDArray[np.uint8]:
+    """A frame ``(H, W, 3)`` in RGB as players show it, by its display matrix.
+
+    The matrix M of ISO 14496-12 takes a stored pixel [x y 1] to the shown one [x y 1] M.
+
+    Raises:
+        DataError: It is not a rotation by quarter turns, mirrored or not.
+    """
+    rgb: NDArray[np.uint8] = frame.to_ndarray(format="rgb24")
+    data = frame.side_data.get("DISPLAYMATRIX")
+    if data is None:
+        return rgb
+    # Its rows are what gives the column and the row of a shown pixel.
+    matrix = np.frombuffer(bytes(data), np.int32).reshape(3, 3)[:2, :2].T.astype(float)
+    is_transposed = abs(matrix[0, 1]) > abs(matrix[0, 0])
+    straight = matrix[:, ::-1] if is_transposed else matrix
+    along, across = np.diagonal(straight), np.diagonal(straight[:, ::-1])
+    if (abs(across) > _STRAIGHT * abs(along)).any():
+        raise DataError(
+            path,
+            found=f"a display matrix {matrix.T.tolist()}",
+            expected="a rotation by 90°, 180° or 270°, mirrored or not",
+            remedy="Export the video upright.",
+        )
+    turned = rgb.swapaxes(0, 1) if is_transposed else rgb
+    turned = turned[:, ::-1] if along[0] < 0 else turned
+    return np.ascontiguousarray(turned[::-1] if along[1] < 0 else turned)
+
+
 def write_video(
-    path: Path, source: Path, paint: Callable[[int, NDArray[np.uint8]], NDArray[np.uint8]]
+    path: Path,
+    source: Path,
+    size: tuple[int, int, int],
+    paint: Callable[[int, NDArray[np.uint8]], NDArray[np.uint8]],
+    every: int = 1,
 ) -> None:
     """Write a video (H.264 in MP4) with the size, rate and times of another; without its sound.
 
     Args:
         path: The file, which appears once complete.
         source: The other video.
-        paint: Gives a frame ``(H, W, 3)`` of the new one, by its number and the other's. Called in
-            threads.
+        size: Its number of frames, rows and columns by `read_video_size`.
+        paint: Returns a frame ``(H, W, 3)`` of the new one for the number of a frame and the
+            upright frame of the other one. Called in threads.
+        every: Take the first and then every n-th frame.
 
     Raises:
         DataError: The other one cannot be decoded.
@@ -104,11 +254,14 @@ def write_video(
     import av
     from av.video.reformatter import Colorspace
 
+    expected, rows, columns = size
+
     def painted(numbered: tuple[int, Any]) -> Any:
-        number, frame = numbered
-        picture = np.ascontiguousarray(paint(number, frame.to_ndarray(format="rgb24")))
+        place, frame = numbered
+        number = place * every
+        picture = np.ascontiguousarray(paint(number, _upright(source, frame)))
         made = av.VideoFrame.from_ndarray(picture, format="rgb24")
-        made = made.reformat(format=pixels, dst_colorspace=Colorspace.ITU709)
+        made = made.reformat(columns, rows, pixels, dst_colorspace=Colorspace.ITU709)
         made.time_base = stream.time_base
         made.pts = number * step if frame.pts is None else frame.pts
         return made
@@ -116,18 +269,19 @@ def write_video(
     with (
         atomic_path(path) as temporary,
         _opened(source) as (_, stream),
-        av.open(str(temporary), "w", format="mp4") as output,
+        av.open(_file_url(temporary), "w", format="mp4") as output,
     ):
         rate = stream.average_rate or 30
         step = max(1, round(1 / (rate * stream.time_base)))
         # Players want colours at half the resolution, which takes an even size.
-        pixels = "yuv444p" if stream.height % 2 or stream.width % 2 else "yuv420p"
+        pixels = "yuv444p" if rows % 2 or columns % 2 else "yuv420p"
         encoder: Any = output.add_stream(_ENCODER, rate=rate, options=_QUALITY)
-        encoder.width, encoder.height, encoder.pix_fmt = stream.width, stream.height, pixels
+        encoder.width, encoder.height, encoder.pix_fmt = columns, rows, pixels
         encoder.codec_context.time_base = stream.time_base
         encoder.codec_context.colorspace = encoder.codec_context.color_primaries = _BT709
         encoder.codec_context.color_trc = _BT709
-        with closing(in_threads(painted, enumerate(_frames(source)), ahead=_AHEAD)) as frames:
+        numbered = enumerate(_frames(source, expected, every))
+        with closing(in_threads(painted, numbered, ahead=_AHEAD)) as frames:
             for frame in frames:
                 output.mux(encoder.encode(frame))
         output.mux(encoder.encode(None))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,12 +14,13 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.images.gpano import PanoramaArea, area_of_crop, whole_area
+from datamodules.images.gpano import PanoramaArea
 from datamodules.images.masks import Mask, Masks
 from datamodules.images.pixel_files import read_pixels
+from datamodules.images.tangent_folders import panorama_area
 from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
 from tangent_train.cli.each import Job, Shard, each
-from tangent_train.cli.predict_inputs import Inputs, is_video
+from tangent_train.cli.input_files import Inputs, InputSettings, is_video
 from tangent_train.cli.predict_shards import PredictionShard
 from tangent_train.cli.say import say
 from tangent_train.cli.settings import typed
@@ -31,21 +32,27 @@ from tangent_train.inference.predictor import Predictor
 from tangent_train.inference.views import InputImage, PanoramaViews, PhotoViews
 from tangent_train.results.html import EncodedImage
 from tangent_train.results.pictures import evenly_spread
-from tangent_train.results.predictions import Entry, Kind, PredictionFolder, class_shares
+from tangent_train.results.predictions import (
+    Entry,
+    Kind,
+    PredictionFolder,
+    class_shares,
+    is_result_in,
+)
 
 _DECISIVE = (
     "checkpoint", "class_map", "unmapped", "depth_scale", "projection", "crop", "fov", "level",
     "levels", "base_level", "blend", "rotations", "upright", "max_tilt_deg", "mask",
-    "min_confidence",
+    "min_confidence", "every",
 )  # fmt: skip
-"""Settings that labels depend on: those of resumed predictions must be the same."""
+"""Settings that results depend on: those of resumed predictions must be the same."""
 
 _SAVED_EVERY_S = 10.0
 """So much work is done again after a process was killed."""
 
 
 @dataclass(frozen=True)
-class Settings:
+class Settings(InputSettings):
     """See ``configs/predict.yaml``."""
 
     checkpoint: Path
@@ -56,7 +63,6 @@ class Settings:
     depth: Path | None
     depth_scale: float
     projection: Literal["equirectangular", "perspective"]
-    crop: tuple[float, ...] | None
     fov: float | None
     level: int | None
     levels: tuple[int, ...] | None
@@ -173,7 +179,7 @@ def _finish(
     used = {entry["name"] for entry in entries if "classes" in entry}
     if not used:
         return
-    pictures = label.pictures({name: path for name, path in inputs.files.items() if name in used})
+    pictures = label.pictures(inputs, used)
     if pictures:
         folder.write_page(entries, pictures)
     folder.mean_shares(entries).print()
@@ -253,18 +259,22 @@ class _Labeller:
             self._shown[job.item] = self._folder.viewer_image(job.item, image, labels, area)
         return entry
 
-    def pictures(self, images: Mapping[str, Path]) -> list[EncodedImage]:
+    def pictures(self, inputs: Inputs, used: Set[str]) -> list[EncodedImage]:
         """Pictures for the report; images labelled earlier or elsewhere are read again.
 
         Args:
-            images: That have been labelled.
+            inputs: All images and videos.
+            used: Names of the images and frames that have been labelled.
         """
-        for name in self._shown.keys() & images.keys():
-            labels = self._folder.files(name).get("labels")
-            if self._shown[name] is None and labels is not None:
-                image, area = self.read(Job(name, images[name]))
+        earlier = {name for name in self._shown.keys() & used if self._shown[name] is None}
+        files = {name: self._folder.files(name).get("labels") for name in earlier}
+        wanted = {name for name, labels in files.items() if labels is not None}
+        for job in inputs.missing({name for name in inputs.names() if name not in wanted}):
+            labels = files.get(job.item)
+            if labels is not None and not job.error:
+                image, area = self.read(job)
                 read = read_pixels(labels, indices=True)
-                self._shown[name] = self._folder.viewer_image(name, image, read, area)
+                self._shown[job.item] = self._folder.viewer_image(job.item, image, read, area)
         return [picture for picture in self._shown.values() if picture is not None]
 
 
@@ -276,7 +286,8 @@ def _make_videos(
     videos = [job for job in inputs.videos.values() if str(job.path) not in failed]
 
     def write(job: Job, _: Callable[[float], object]) -> None:
-        folder.write_videos(job.item, job.path, again=job.path in labelled)
+        again = job.path in labelled
+        folder.write_videos(job.item, job.path, job.value, inputs.every, again=again)
 
     done = each("Making videos", videos, len(videos), write)
     return [{"file": str(j.path), "name": j.item, "error": j.error} for j in done if j.error]
@@ -297,14 +308,10 @@ def _inputs(settings: Settings) -> Inputs:
     """The images and videos."""
 
     def check_size(path: Path, size: tuple[int, int]) -> None:
-        if settings.projection == "perspective":
-            return
-        if settings.crop is None:
-            whole_area(path, size)
-        else:
-            area_of_crop(size, settings.crop)
+        if settings.projection == "equirectangular":
+            panorama_area(path, size, settings.crop)
 
-    inputs = Inputs.find(settings.input, settings.output, check_size)
+    inputs = Inputs.find(settings, is_result_in(settings.output), check_size)
     pictures = {"color", "overlay"}.intersection(settings.write)
     if inputs.videos and pictures and "labels" not in settings.write:
         raise SettingError(

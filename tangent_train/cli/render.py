@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from datamodules.folder.reader import class_masks
 from datamodules.images.colmap_project import ColmapProject, flat_names
-from datamodules.images.image_files import image_paths, short_names
 from datamodules.images.masks import Mask, Masks
 from datamodules.images.pixel_files import (
     LOSSY_SUFFIXES,
@@ -32,6 +31,7 @@ from datamodules.images.tangent_folders import (
 )
 from datamodules.images.tangent_results import Kind, TangentResults, result_files
 from tangent_train.cli.each import Job, each
+from tangent_train.cli.input_files import Inputs, InputSettings, is_video
 from tangent_train.cli.say import say
 from tangent_train.cli.settings import check_new, typed
 from tangent_train.errors import DataError, SettingError, counted
@@ -51,10 +51,9 @@ _Work = Callable[[Job, Callable[[float], object]], Path]
 
 
 @dataclass(frozen=True)
-class Settings:
+class Settings(InputSettings):
     """See ``configs/render.yaml``."""
 
-    input: str | None
     output: Path | None
     overwrite: bool
     base_level: int
@@ -107,13 +106,13 @@ def render(config: Mapping[str, Any]) -> None:
     elif colmap:
         _colmap(settings)
     else:
-        jobs, work = _forward(settings) if settings.input is not None else _back(settings)
-        _end(_each(jobs, work), len(jobs))
+        jobs, count, work = _forward(settings) if settings.input is not None else _back(settings)
+        _end(_each(jobs, count, work), count)
 
 
-def _each(jobs: Sequence[Job], work: _Work) -> list[Path]:
+def _each(jobs: Iterable[Job], count: int, work: _Work) -> list[Path]:
     """Results of the panoramas that could be rendered."""
-    return [job.value for job in each("Rendering", jobs, len(jobs), work) if not job.error]
+    return [job.value for job in each("Rendering", jobs, count, work) if not job.error]
 
 
 def _end(done: Sequence[Path], count: int) -> None:
@@ -126,44 +125,45 @@ def _end(done: Sequence[Path], count: int) -> None:
         sys.exit(f"tangent-render: {failed} could not be rendered, see above")
 
 
-def _forward(settings: Settings) -> tuple[list[Job], _Work]:
-    """The folder of every panorama, and the function that renders to it."""
-    paths, suffix = _panoramas(settings), _suffix(settings)
-    if settings.figure is not None and len(paths) > 1:
-        raise SettingError("figure", found=f"{len(paths)} panoramas", expected="one")
-    output = Path() if settings.output is None else settings.output
-    jobs = [Job(output / name, path) for name, path in zip(short_names(paths), paths, strict=True)]
-    check_new(settings, *(job.item for job in jobs if settings.output), settings.figure)
+def _forward(settings: Settings) -> tuple[Iterable[Job], int, _Work]:
+    """The panoramas, their number, and the function that renders one to its folder."""
+    inputs, suffix = _panoramas(settings), _suffix(settings)
+    names, output = inputs.names(), settings.output
+    if settings.figure is not None and len(names) > 1:
+        raise SettingError("figure", found=f"{len(names)} panoramas", expected="one")
+    folders = [] if output is None else [output / name for name in names]
+    check_new(settings, *folders, settings.figure)
 
     def work(job: Job, progress: Callable[[float], object]) -> Path:
-        image = read_panorama(job.path, settings.interpolation)
+        image, _ = read_panorama(job.path, settings.interpolation, settings.crop, job.value)
         shape = image.shape[0], image.shape[1]
         grid, faces = _grid(settings, shape[0])
         if settings.figure is not None:
             write_pixels(settings.figure, tangent_figure(image, grid))
-            if settings.output is None:
+            if output is None:
                 return settings.figure
         files = tuple(f"{face_name(grid, face)}{suffix}" for face in faces)
         if settings.interpolation == "bilinear":
             image = shrink_to_level(image, grid.level)
         cameras = CameraFile(job.path.name, shape, grid, faces, files)
-        write_tangent_folder(job.item, image, cameras, settings.interpolation, progress)
-        return Path(job.item)
+        folder = (output or Path()) / job.item
+        write_tangent_folder(folder, image, cameras, settings.interpolation, progress)
+        return folder
 
-    return jobs, work
+    return inputs.missing(()), len(names), work
 
 
-def _panoramas(settings: Settings) -> list[Path]:
+def _panoramas(settings: Settings) -> Inputs:
     """The panoramas of `input`, without tangent images that are among them."""
-    paths = [
-        path
-        for path in image_paths(settings.input or "")
-        if not (path.parent / CAMERAS_FILE).exists()
-        and not any((folder / RIG_FILE).exists() for folder in path.absolute().parents[2:3])
-    ]
-    if not paths:
-        raise DataError(settings.input, found="only tangent images", expected="panoramas")
-    return paths
+
+    def is_result(path: Path) -> bool:
+        in_project = any((folder / RIG_FILE).exists() for folder in path.absolute().parents[2:3])
+        return in_project or path.name == RIG_FILE or (path.parent / CAMERAS_FILE).exists()
+
+    def check_size(path: Path, size: tuple[int, int]) -> None:
+        panorama_area(path, size, settings.crop)
+
+    return Inputs.find(settings, is_result, check_size)
 
 
 def _suffix(settings: Settings) -> str:
@@ -183,30 +183,29 @@ def _grid(settings: Settings, rows: int) -> tuple[TangentGrid, tuple[int, ...]]:
 
 def _colmap(settings: Settings) -> None:
     """Render panoramas to one project for COLMAP."""
-    paths, suffix, output = _panoramas(settings), _suffix(settings), settings.output or Path()
+    inputs, suffix, output = _panoramas(settings), _suffix(settings), settings.output or Path()
     if suffix == ".npy":
         raise SettingError("format", found="npy", expected="png, jpg, webp or tif for COLMAP")
     check_new(settings, output)
     masks = _masks(settings)
-    names = dict(zip(paths, short_names(paths), strict=True))
+    names = flat_names(inputs.names())
     # One camera has images of one size. If no panorama can be read, each says why below.
-    grid, faces = _grid(settings, max(map(_rows, paths)) or 512)
+    grid, faces = _grid(settings, max(_rows(settings, inputs)) or 512)
     with replaced_folder(output) as folder:
         project = ColmapProject(folder, grid, faces, suffix, settings.interpolation)
 
         def work(job: Job, progress: Callable[[float], object]) -> Path:
-            path, name = job.path, names[job.path]
-            image = read_panorama(path, settings.interpolation)
-            counts = masks.read(name, panorama_area(path, read_image_size(path)))
-            file = name.removesuffix(path.suffix) + path.suffix
-            project.add(job.item, file, image, counts, progress)
+            name, path = job.item, job.path
+            image, area = read_panorama(path, settings.interpolation, settings.crop, job.value)
+            file = name if is_video(path) else name.removesuffix(path.suffix) + path.suffix
+            project.add(names[name], file, image, masks.read(name, area), progress)
             return output
 
-        done = _each(list(map(Job, flat_names(paths), paths)), work)
+        done = _each(inputs.missing(()), len(names), work)
         if not done:
-            _end(done, len(paths))
+            _end(done, len(names))
         project.write_rig()
-    _end(done, len(paths))
+    _end(done, len(names))
 
 
 def _masks(settings: Settings) -> Masks:
@@ -221,11 +220,15 @@ def _masks(settings: Settings) -> Masks:
     return class_masks(settings.mask, settings.mask_classes)
 
 
-def _rows(path: Path) -> int:
-    """Rows of the whole panorama; 0 if the file cannot be read."""
-    with suppress(DataError):
-        return panorama_area(path, read_image_size(path)).full_shape[0]
-    return 0
+def _rows(settings: Settings, inputs: Inputs) -> Iterator[int]:
+    """Rows of the whole panoramas; 0 of files that cannot be read."""
+    for name, path in inputs.files.items():
+        rows, video = 0, inputs.videos.get(name)
+        with suppress(DataError, SettingError):
+            if video is None or video.value is not None:
+                size = read_image_size(path) if video is None else video.value[1:]
+                rows = panorama_area(path, size, settings.crop).full_shape[0]
+        yield rows
 
 
 def _poses(settings: Settings, model: Path) -> None:
@@ -251,8 +254,8 @@ def _rotation(settings: Settings) -> NDArray[np.float64] | None:
     )
 
 
-def _back(settings: Settings) -> tuple[list[Job], _Work]:
-    """The folder of the results of every panorama, and the function that renders them."""
+def _back(settings: Settings) -> tuple[list[Job], int, _Work]:
+    """The folders of the results of panoramas, their number, and the function that renders one."""
     back, output = settings.back or Path(), settings.output or Path()
     if not back.is_dir():
         raise DataError(back, found="no such folder", expected="a folder of results")
@@ -288,4 +291,4 @@ def _back(settings: Settings) -> tuple[list[Job], _Work]:
         results.write(path, shape, settings.blend, z_depth=settings.z_depth)
         return path
 
-    return jobs, work
+    return jobs, len(jobs), work

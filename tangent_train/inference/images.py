@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from datamodules.core.panoramas import meters_to_steps, resize_nearest
-from datamodules.images.gpano import PanoramaArea, area_of, area_of_crop, up_of, whole_area
+from datamodules.images.gpano import PanoramaArea, up_of
 from datamodules.images.image_files import NamedFiles, find_depth
 from datamodules.images.pixel_files import photo_fov_deg, read_depth_m, read_rgb
+from datamodules.images.tangent_folders import panorama_area
 from tangent_train.errors import DataError, width_height
 from tangent_train.geometry import camera_matrix_from_fov
 from tangent_train.inference.views import InputImage
@@ -96,10 +97,7 @@ def read_panorama(
     """
     rgb = read_rgb(path) if frame is None else frame()
     size = (rgb.shape[0], rgb.shape[1])
-    if crop is not None:
-        area = area_of_crop(size, crop)
-    else:
-        area = area_of(path, size) if frame is None else whole_area(path, size)
+    area = panorama_area(path, size, crop)
     whole = area.place(rgb)
     placed_depth = None if depth is None else area.place(depth.read(name, size))
     up = None if upright is None or frame is not None else up_of(path)

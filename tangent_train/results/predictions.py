@@ -22,7 +22,7 @@ from tangent_train.results.pictures import colorize, mixed_picture, overlay_pict
 from tangent_train.results.tables import Table, percent
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -50,6 +50,12 @@ Entry = dict[str, Any]
 def frame_name(video: str, number: int) -> str:
     """Name of a frame of a video, ``walk/000012``; numbers begin with 0."""
     return f"{video}/{number:06d}"
+
+
+def is_result_in(output: Path) -> Callable[[Path], bool]:
+    """A function that is true for the files of predictions in an output folder."""
+    results = [(output / name).resolve() for name in _RESULTS]
+    return lambda path: any(path.resolve().is_relative_to(result) for result in results)
 
 
 def class_shares(
@@ -192,12 +198,16 @@ class PredictionFolder:
             rgb = image.rgb if area is None else area.cut(image.rgb)
             write_pixels(files["overlay"], overlay_picture(rgb, labels, self.class_names))
 
-    def write_videos(self, name: str, path: Path, *, again: bool) -> None:
-        """Write the pictures that are wanted of a video, from the labels of all its frames.
+    def write_videos(
+        self, name: str, path: Path, size: tuple[int, int, int], every: int, *, again: bool
+    ) -> None:
+        """Write the pictures that are wanted of a video, from the labels of its frames.
 
         Args:
             name: Of the video.
             path: Its file.
+            size: Its number of frames, rows and columns.
+            every: Its first and then every n-th frame have labels.
             again: Whether to replace existing ones.
 
         Raises:
@@ -206,7 +216,7 @@ class PredictionFolder:
         for kind in _PICTURES:
             file = self.path / kind / f"{name}.mp4"
             if kind in self.kinds and (again or not file.exists()):
-                write_video(file, path, partial(self._painted, name, kind))
+                write_video(file, path, size, partial(self._painted, name, kind), every)
 
     def _painted(
         self, name: str, kind: Kind, number: int, rgb: NDArray[np.uint8]

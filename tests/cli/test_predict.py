@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from PIL import Image
 
 from datamodules.images.pixel_files import write_pixels
 from tangent_train.geometry import rotation_about
@@ -25,17 +26,25 @@ from tests.inference.trained import PERSPECTIVE, sphere, write_checkpoint
 from tests.rendering.drawn_room import draw_room
 
 
-def test_a_folder_of_panoramas(tmp_path: Path, predict: Predict) -> None:
+def test_a_folder_of_panoramas(
+    tmp_path: Path, predict: Predict, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Names that command lines and shells dislike, several formats and sizes, broken files."""
-    folder, output = tmp_path / "my, panoramas (2)", tmp_path / "out='1'"
+    folder = tmp_path / "my, panoramas (2)"
+    output = folder / "out='1'"
     write_pixels(folder / "a=b.png", sphere(32))
     write_pixels(folder / "flat" / "küche #1.tif", sphere(50))
     write_pixels(folder / "flat" / "caf\udce9 ${x}.webp", sphere(16))
     write_pixels(folder / "square.png", sphere(16)[:, :16])
     (folder / "broken.jpg").write_bytes(b"\xff\xd8\xff nothing")
-    with pytest.raises(SystemExit, match="2 of 5 images could not be used"):
-        predict(input=folder, output=output)
-    for name, height in {"a=b": 32, "flat/küche #1": 50}.items():
+    for name in ("b.bmp", "c.gif"):
+        Image.fromarray(sphere(32)).save(folder / name)
+    (folder / "phone.HEIC").write_bytes(b"not decoded")
+    for overwrite in (False, True):  # results are not counted as skipped
+        with pytest.raises(SystemExit, match="2 of 7 images could not be used"):
+            predict(input=folder, output=output, overwrite=overwrite)
+        assert "Skipped: 1 .heic. Convert" in capsys.readouterr().out
+    for name, height in {"a=b": 32, "flat/küche #1": 50, "b": 32, "c": 32}.items():
         labels = read_png(output / "labels" / f"{name}.png")
         assert labels.shape == (height, 2 * height)
         assert labels.dtype == np.uint8
@@ -43,7 +52,7 @@ def test_a_folder_of_panoramas(tmp_path: Path, predict: Predict) -> None:
         for kind in ("color", "overlay"):
             assert read_png(output / kind / f"{name}.png").shape[1:] == (2 * height, 3)
     entries = predicted(output)
-    assert len(entries) == 5
+    assert len(entries) == 7
     assert "found" in entries["broken"]["error"]
     with (output / "summary.csv").open(newline="") as file:
         rows = {Path(row["file"]).name: row for row in csv.DictReader(file)}

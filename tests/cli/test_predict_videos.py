@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from datamodules.images.palette import class_colors
 from datamodules.images.videos import read_frames
 from tests.cli.tiny_runs import Predict, predicted
-from tests.datamodules.data_files import read_png
+from tests.datamodules.data_files import hide_start, read_png
 from tests.inference.trained import CLASS_NAMES, sphere
 
 av: Any = pytest.importorskip("av")
@@ -24,15 +25,19 @@ TIMES = [0, 1, 2, 4, 5, 9, 10]
 """Of the frames, in sixteenths of a second: the rate varies."""
 
 
-def _write_video(path: Path, shape: tuple[int, int] = (32, 64)) -> Path:
+def _write_video(path: Path, shape: tuple[int, int] = (32, 64), turns: int = 0) -> Path:
+    """A video, perhaps stored rotated clockwise by quarter turns."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(path), "w") as output:
         stream = output.add_stream("mpeg4", rate=16)
-        stream.height, stream.width = shape
+        stream.height, stream.width = shape[::-1] if turns % 2 else shape
+        if turns:
+            stream.set_display_rotation(90 * turns)
         stream.codec_context.time_base = Fraction(1, 16)
         for number, time in enumerate(TIMES):
             rgb = np.roll(sphere(shape[0]), 5 * number, axis=1)[:, : shape[1]]
-            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(rgb), format="rgb24")
+            stored = np.ascontiguousarray(np.rot90(rgb, -turns))
+            frame = av.VideoFrame.from_ndarray(stored, format="rgb24")
             frame.pts, frame.time_base = time, Fraction(1, 16)
             output.mux(stream.encode(frame))
         output.mux(stream.encode(None))
@@ -79,6 +84,72 @@ def test_frames_get_the_labels_of_images_and_pictures_are_a_video(
     assert entries["walk.mp4/000003"]["classes"] == entries["walk/000003"]["classes"]
 
 
+@pytest.mark.parametrize("turns", [1, 2])
+def test_a_rotated_video_is_labelled_as_it_is_shown(
+    tmp_path: Path, predict: Predict, turns: int
+) -> None:
+    video = _write_video(tmp_path / "in" / "walk.mp4", turns=turns)
+    frames, _ = _decoded(video)
+    for number, rgb in enumerate(np.rot90(frames, turns, axes=(1, 2))):
+        path = tmp_path / "in" / "upright" / f"{number:06d}.png"
+        path.parent.mkdir(exist_ok=True)
+        cv2.imwrite(str(path), np.ascontiguousarray(rgb[..., ::-1]))
+    predict()
+    labels = _labels(tmp_path / "out" / "labels" / "walk")
+    for name, expected in _labels(tmp_path / "out" / "labels" / "upright").items():
+        np.testing.assert_array_equal(labels[name], expected)
+    shown = class_colors(len(CLASS_NAMES)).astype(float)[np.stack(list(labels.values()))]
+    with av.open(str(tmp_path / "out" / "color" / "walk.mp4")) as container:
+        made = list(container.decode(video=0))
+    assert {frame.rotation for frame in made} == {0}
+    colors = np.stack([frame.to_ndarray(format="rgb24") for frame in made])
+    assert colors.shape == shown.shape
+    assert np.abs(colors - shown).mean() < 8
+
+
+def test_every_third_frame(
+    tmp_path: Path, predict: Predict, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With the numbers and times that they have in the video."""
+    video = _write_video(tmp_path / "in" / "walk.mp4")
+    cv2.imwrite(str(tmp_path / "in" / "a.png"), sphere(32))
+    predict(output="all")
+    predict(every=3)
+    assert "4 images, 0 done already" in capsys.readouterr().out
+    whole, third = (_labels(tmp_path / name / "labels" / "walk") for name in ("all", "out"))
+    assert list(third) == ["000000", "000003", "000006"]
+    assert all((third[name] == whole[name]).all() for name in third)
+    for kind in ("color", "overlay"):
+        made, times = _decoded(tmp_path / "out" / kind / "walk.mp4")
+        assert times == pytest.approx(_decoded(video)[1][::3])
+        expected = _decoded(tmp_path / "all" / kind / "walk.mp4")[0][::3]
+        assert np.abs(made.astype(int) - expected).mean() < 8
+    page = tmp_path / "out" / "report.html"
+    for missing in ("000003", None):  # the others, and then all, are read again for the report
+        page.unlink()
+        if missing:
+            (tmp_path / "out" / "labels" / "walk" / f"{missing}.png").unlink()
+        predict(every=3, resume="true")
+        assert f"4 images, {3 if missing else 4} done already" in capsys.readouterr().out
+        assert set(re.findall(r"walk/\d{6}", page.read_text())) == {f"walk/{n}" for n in third}
+    with pytest.raises(SystemExit, match="every=2, another setting"):
+        predict(every=2, resume="true")
+    with pytest.raises(SystemExit, match="every: found 0"):
+        predict(every=0, output="none")
+
+
+def test_hidden_frames_are_neither_counted_nor_shown(
+    tmp_path: Path, predict: Predict, capsys: pytest.CaptureFixture[str]
+) -> None:
+    video = _write_video(tmp_path / "in" / "walk.mp4")
+    hide_start(video, 4 / 16)  # the fourth frame's time
+    for done in (0, 4):
+        predict(report=12, resume="true")
+        assert f"4 images, {done} done already" in capsys.readouterr().out
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert set(re.findall(r"walk/\d{6}", page)) == {f"walk/{n:06d}" for n in range(4)}
+
+
 def test_an_interrupted_video_is_resumed(
     tmp_path: Path,
     predict: Predict,
@@ -87,20 +158,20 @@ def test_an_interrupted_video_is_resumed(
 ) -> None:
     video = _write_video(tmp_path / "in" / "walk.mp4")
 
-    def interrupted(path: Path) -> Any:
-        for number, frame in enumerate(read_frames(path)):
+    def interrupted(path: Path, *settings: int) -> Any:
+        for number, frame in enumerate(read_frames(path, *settings)):
             if number == 4:
                 raise KeyboardInterrupt
             yield frame
 
-    monkeypatch.setattr("tangent_train.cli.predict_inputs.read_frames", interrupted)
+    monkeypatch.setattr("tangent_train.cli.input_files.read_frames", interrupted)
     with pytest.raises(SystemExit) as stopped:
         predict(input=video)
     assert stopped.value.code == 130
     assert "4 of 7 images are done. resume=true" in capsys.readouterr().out
     assert len(predicted(tmp_path / "out")) == 4
     assert not (tmp_path / "out" / "overlay").exists()
-    monkeypatch.setattr("tangent_train.cli.predict_inputs.read_frames", read_frames)
+    monkeypatch.setattr("tangent_train.cli.input_files.read_frames", read_frames)
     before = (tmp_path / "out" / "labels" / "walk" / "000003.png").stat().st_mtime_ns
     predict(input=video, resume="true")
     assert (tmp_path / "out" / "labels" / "walk" / "000003.png").stat().st_mtime_ns == before
@@ -111,6 +182,15 @@ def test_an_interrupted_video_is_resumed(
     first, second = (_labels(tmp_path / name / "labels") for name in ("out", "again"))
     assert first.keys() == second.keys()
     assert all((first[name] == second[name]).all() for name in first)
+
+
+def _without_pictures(video: Path) -> bytes:
+    with av.open(str(video)) as container:
+        packets = [(packet.pos, packet.size) for packet in container.demux(video=0) if packet.size]
+    content = bytearray(video.read_bytes())
+    for start, size in packets:
+        content[start : start + size] = bytes(size)
+    return bytes(content)
 
 
 def test_videos_that_cannot_be_used(
@@ -124,24 +204,28 @@ def test_videos_that_cannot_be_used(
     good = _write_video(folder / "good.mp4")
     _write_video(folder / "narrow.mp4", (32, 48))
     (folder / "broken.mp4").write_bytes(b"nothing" * 100)
-    (folder / "cut.mp4").write_bytes(good.read_bytes()[:900])
+    (folder / "cut.avi").write_bytes(_write_video(folder / "cut.avi").read_bytes()[:-900])
+    (folder / "gray.mp4").write_bytes(_without_pictures(good))
     with av.open(str(folder / "sound.mp4"), "w") as output:
         stream = output.add_stream("aac", rate=44100)
         sound = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), "fltp", "mono")
         sound.sample_rate = 44100
         output.mux(stream.encode(sound))
         output.mux(stream.encode(None))
-    with pytest.raises(SystemExit, match="4 of 11 images could not be used"):
+    with pytest.raises(SystemExit, match="5 of 12 images could not be used"):
         predict(write="[labels]")
     said = " ".join(capsys.readouterr().out.split())
     for name, message in (
         ("broken", "cannot be decoded"),
-        ("cut", "found no frames"),
+        ("cut", "truncated or damaged"),
+        ("gray", "cannot be decoded"),
         ("narrow", "expected a whole panorama"),
         ("sound", "no video stream"),
     ):
-        assert said.count(f"{name}.mp4: found") == 1
+        assert len(re.findall(rf"{name}\.\w+: found", said)) == 1
         assert message in predicted(tmp_path / "out")[name]["error"]
+    with pytest.raises(SystemExit, match="1 of 1 images could not be used"):
+        predict(input=folder / "gray.mp4", output="other")
     with pytest.raises(SystemExit, match="write: found color of a video without labels"):
         predict(write="[color]", output="other")
     monkeypatch.setitem(__import__("sys").modules, "av", None)

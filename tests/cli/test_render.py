@@ -13,7 +13,12 @@ import pytest
 
 from datamodules.images.pixel_files import read_pixels, write_pixels
 from tangent_train.geometry import TangentGrid, equirect_directions
-from tangent_train.rendering import equirect_to_tangent, read_cameras, tangent_to_equirect
+from tangent_train.rendering import (
+    equirect_to_tangent,
+    read_cameras,
+    read_rig,
+    tangent_to_equirect,
+)
 from tests.cli.rendering import Refused, render_with, smooth
 from tests.datamodules.data_files import contents
 
@@ -253,6 +258,70 @@ def test_a_broken_panorama_does_not_stop_the_others(tmp_path: Path, refused: Ref
     said = refused(back=tmp_path / "tan", output=tmp_path / "back")
     assert re.search(r"face_019.*1 of 2 panoramas could not", said, re.DOTALL)
     assert [path.name for path in (tmp_path / "back").iterdir()] == ["c.png"]
+
+
+def test_every_fourth_frame_of_a_video(tmp_path: Path) -> None:
+    """Its folders have the numbers of the frames; a project for COLMAP has the same images."""
+    av: Any = pytest.importorskip("av")
+    path, shown = tmp_path / "in" / "walk.mp4", []
+    path.parent.mkdir()
+    with av.open(str(path), "w") as output:
+        stream = output.add_stream("libx264rgb", rate=10, options={"crf": "0"})
+        stream.height, stream.width, stream.pix_fmt = 64, 32, "rgb24"
+        stream.set_display_rotation(90)
+        for number in range(9):
+            shown.append(np.roll(smooth(32), 3 * number, axis=1))
+            stored = np.ascontiguousarray(np.rot90(shown[-1], -1))
+            output.mux(stream.encode(av.VideoFrame.from_ndarray(stored, format="rgb24")))
+        output.mux(stream.encode(None))
+    write_pixels(tmp_path / "in" / "a.png", smooth(32))
+    settings = {"input": tmp_path / "in", "every": 4, "base_level": 0, "faces": [3]}
+    render_with(output=tmp_path / "tan", **settings)
+    written = {file.parent.relative_to(tmp_path) for file in tmp_path.glob("tan/**/face_003.png")}
+    names = ["a", "walk/000000", "walk/000004", "walk/000008"]
+    assert written == {Path("tan", name) for name in names}
+    masked = np.full((32, 64), 255, np.uint8)
+    masked[:, :32] = 0
+    write_pixels(tmp_path / "masks" / "walk" / "000004.png", masked)
+    for name in ("a", "walk/000000", "walk/000008"):
+        write_pixels(tmp_path / "masks" / f"{name}.png", np.full_like(masked, 255))
+    render_with(output=tmp_path / "project", colmap=True, mask=tmp_path / "masks", **settings)
+    rig = read_rig(tmp_path / "project" / "rig_config.json")
+    files = ["a.png", *names[1:]]
+    assert dict(rig.panoramas) == {
+        f"{name.replace('/', '__')}.png": file for name, file in zip(names, files, strict=True)
+    }
+    for name, panorama in zip(names, [smooth(32), *shown[::4]], strict=True):
+        (expected,) = equirect_to_tangent(panorama, TangentGrid(0, 4), [3])
+        np.testing.assert_array_equal(_read(tmp_path / "tan" / name / "face_003.png"), expected)
+        image = f"face_003/{name.replace('/', '__')}.png"
+        np.testing.assert_array_equal(_read(tmp_path / "project" / "images" / image), expected)
+        mask = _read(tmp_path / "project" / "masks" / f"{image}.png")
+        assert mask.all() == (name != "walk/000004")
+
+
+@pytest.mark.parametrize("colmap", [False, True])
+def test_a_strip_whose_angles_are_given(tmp_path: Path, refused: Refused, colmap: bool) -> None:
+    """As one whose tags are; without either, the message names settings of the command."""
+    whole = smooth(32)
+    whole[:8] = whole[24:] = 0
+    write_pixels(tmp_path / "whole.png", whole)
+    write_pixels(tmp_path / "strip.png", whole[8:24])
+    settings = {"base_level": 0, "faces": [9], "colmap": colmap}
+    said = refused(input=tmp_path / "strip.png", output=tmp_path / "none", **settings)
+    assert "crop=[west,east,south,north]" in said
+    assert "tangent-predict with projection=perspective" in said
+    crop = [-180, 180, -45, 45]
+    render_with(input=tmp_path / "strip.png", output=tmp_path / "strip", crop=crop, **settings)
+    render_with(input=tmp_path / "whole.png", output=tmp_path / "whole", **settings)
+    images = "images/face_009/strip.png" if colmap else "strip/face_009.png"
+    again = _read(tmp_path / "strip" / images)
+    expected = _read(tmp_path / "whole" / images.replace("strip", "whole"))
+    np.testing.assert_array_equal(again, expected)
+    said = refused(input=tmp_path / "whole.png", output=tmp_path / "no", crop=crop, **settings)
+    assert "crop: found" in said
+    if colmap:
+        assert not _read(tmp_path / "strip" / "masks" / "face_009" / "strip.png.png").all()
 
 
 # What is refused.

@@ -245,6 +245,6 @@ def test_settings_that_make_no_project(panoramas: Path, tmp_path: Path, refused:
     said = refused(mask=tmp_path / "mask.jpg", **settings)
     assert "mask.jpg: found JPEG or WebP, which blur masks" in said
     write_pixels(panoramas / "hall__room.png", smooth(16))
-    assert "room.png, which is called hall__room too" in refused(**settings)
+    assert "hall/room, which is called hall__room too" in refused(**settings)
     assert not (tmp_path / "out").exists()
     assert not list(tmp_path.glob(".partial*"))

@@ -200,7 +200,7 @@ def test_the_check_names_what_a_hand_made_data_set_gets_wrong(tmp_path: Path, er
     labels.joinpath("a.png").rename(labels / "a_mask.png")
     save(labels / "b.jpg", np.zeros((16, 32), np.uint8))
     (labels / "b.png").unlink()
-    for name in ("walk.mp4", "sketch.bmp"):
+    for name in ("walk.mp4", "sketch.heic"):
         (tmp_path / "images" / name).write_bytes(b"anything")
     # Splits that are impossible hide nothing.
     (tmp_path / "test.txt").write_text("")
@@ -211,8 +211,20 @@ def test_the_check_names_what_a_hand_made_data_set_gets_wrong(tmp_path: Path, er
     assert findings["b.png"][0].startswith("no such file, but b.jpg; expected the labels of")
     assert "PNG (JPEG changes values)" in findings["b.png"][1]
     assert findings["a_mask.png"][0].startswith("labels of no image")
-    assert findings["walk.mp4"][0].startswith("no image; expected images (.jpg")
+    assert findings["walk.mp4"][0].startswith("no image; expected images (.")
     assert "extract frames" in findings["walk.mp4"][1]
-    assert findings["sketch.bmp"][1].startswith("Convert it")
+    assert findings["sketch.heic"][1].startswith("Convert it")
     assert findings[tmp_path.name][0].startswith("no images for test")
     assert len(findings) == 6
+
+
+def test_files_that_are_not_images_are_counted_before_training(
+    tmp_path: Path, erp: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_classes(tmp_path)
+    for number in range(3):
+        write_panorama(tmp_path, f"{number}", number, 16)
+    for name in ("a.heic", "b.HEIC", "walk.mp4"):
+        (tmp_path / "images" / name).write_bytes(b"anything")
+    FolderPanoramas(tmp_path, erp).prepare_data()
+    assert "Skipped: 2 .heic, 1 .mp4. Convert" in capsys.readouterr().out

@@ -4,6 +4,7 @@ import re
 from pathlib import Path
 
 import pytest
+from PIL import features
 
 from datamodules.images.image_files import NamedFiles, find_depth, image_paths
 from tangent_train.errors import DataError
@@ -16,13 +17,20 @@ def _touch(*paths: Path) -> None:
 
 
 def test_a_folder_is_searched_for_images_only(tmp_path: Path) -> None:
-    names = ["b.JPG", "a.png", "deep/er/c.TIFF", "deep/d.webp", "e.jpeg", "f.tif"]
+    names = ["b.JPG", "a.png", "deep/er/c.TIFF", "deep/d.webp", "e.jpeg", "f.tif", "g.bmp", "h.GIF"]
+    names += ["i.avif"] if features.check("avif") else []
     others = ["notes.txt", ".hidden.jpg", ".thumbnails/a.jpg", "jpg", "deep/x.jpg.part"]
+    others += ["phone.HEIC", "deep/phone.heic", "escape.\x1b[2J"]
     _touch(*(tmp_path / name for name in names + others))
     (tmp_path / "folder.png").mkdir()
-    found = image_paths(tmp_path)
+    told: list[str] = []
+    found = image_paths(tmp_path, tell=told.append)
     assert found == sorted(tmp_path / name for name in names)
     assert image_paths(str(tmp_path)) == found
+    counts = r"Skipped: 1 .\x1b[2j, 2 .heic, 1 .part, 1 .txt, 1 without suffix. Convert"
+    assert [text.partition(" images")[0] for text in told] == [counts]
+    image_paths(tmp_path / "*.png", tell=told.append)
+    assert len(told) == 1
 
 
 def test_names_may_have_the_characters_of_a_pattern(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from PIL import ExifTags, Image, ImageCms
+from PIL import ExifTags, Image, ImageCms, features
 
 from datamodules.images.pixel_files import (
     check_writable,
@@ -299,6 +299,48 @@ def test_other_tiff_files(tmp_path: Path) -> None:
         path.write_bytes(tiff_bytes(pixels, tags=tags))
         with pytest.raises(DataError, match=r"image\.tif: found .*(layout|no image)"):
             read_pixels(path, indices=False)
+
+
+_AVIF = pytest.mark.skipif(not features.check("avif"), reason="Pillow without AVIF")
+
+
+@pytest.mark.parametrize(
+    ("suffix", "modes"),
+    [
+        (".bmp", "RGB RGBA P L 1"),
+        (".gif", "P L 1 animated"),
+        pytest.param(".avif", "RGB RGBA L animated", marks=_AVIF),
+    ],
+)
+def test_other_formats(tmp_path: Path, suffix: str, modes: str) -> None:
+    """Of an animation, the first picture."""
+    path, rgb = tmp_path / f"image{suffix}", np.kron(_noise((4, 8, 3)), np.ones((8, 8, 1)))
+    for mode in modes.split():
+        image = Image.fromarray(rgb.astype(np.uint8)).convert(mode.replace("animated", "P"))
+        frames = {"save_all": True, "append_images": [image.rotate(180)]}
+        lossless = {"quality": 100, "subsampling": "4:4:4"} if suffix == ".avif" else {}
+        image.save(path, **lossless, **(frames if mode == "animated" else {}))
+        read = read_rgb(path)
+        assert read.shape == (32, 64, 3) == (*read_image_size(path), 3)
+        difference = np.abs(read.astype(int) - np.array(image.convert("RGB")))
+        assert difference.max() <= (4 if lossless else 0)
+        path.write_bytes(path.read_bytes()[: 700 if mode == "animated" else -40])
+        with pytest.raises(DataError, match=rf"image{suffix}: found no image that can be decoded"):
+            read_rgb(path)
+
+
+@_AVIF
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_avif_is_upright(tmp_path: Path, orientation: int) -> None:
+    rgb, exif = np.kron(_noise((3, 5, 3)), np.ones((8, 8, 1))).astype(np.uint8), Image.Exif()
+    exif[ExifTags.Base.Orientation] = orientation
+    path = tmp_path / "image.avif"
+    Image.fromarray(rgb).save(tmp_path / "image.jpg", exif=exif, quality=100, subsampling=0)
+    Image.fromarray(rgb).save(path, exif=exif, quality=100, subsampling="4:4:4")
+    expected = cv2.imread(str(tmp_path / "image.jpg"))  # OpenCV applies it
+    assert expected is not None
+    assert read_image_size(path) == expected.shape[:2]
+    assert np.abs(read_rgb(path).astype(int) - expected[..., ::-1]).max() <= 8
 
 
 @pytest.mark.parametrize("read", [read_rgb, read_image_size, photo_fov_deg])
