@@ -10,6 +10,7 @@ import os
 import re
 import shutil
 import tempfile
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -170,18 +171,27 @@ def load_plain(path: Path, expected: str, *, mmap: bool = False) -> Any:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """`json.loads`, with a `ValueError` for text that is nested too deeply.
+    """`json.loads`, with a `ValueError` for text that is nested too deeply or names a value twice.
 
     Args:
         text: UTF-8, UTF-16 or UTF-32 where it is bytes.
 
     Raises:
-        ValueError: It is no JSON.
+        ValueError: The text is not JSON.
     """
     try:
-        return json.loads(text)
+        return json.loads(text, object_pairs_hook=_unique)
     except RecursionError as error:
         raise ValueError("its brackets are nested too deeply") from error
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """A mapping that has every name once: readers differ in which of two values they take."""
+    content = dict(pairs)
+    if len(content) < len(pairs):
+        ((name, _),) = Counter(name for name, _ in pairs).most_common(1)
+        raise ValueError(f"{name!r} is there twice")
+    return content
 
 
 def read_json(path: Path, expected: str, remedy: str = "") -> Any:

@@ -201,19 +201,26 @@ def check_fields(
 def check_plain(path: Path, value: Any, place: str, depth: int = 0) -> Any:
     """Plain values of a file: numbers, texts, lists and mappings of these.
 
+    Names in mappings are texts without a dot: ``a.b`` is always the value ``b`` in the mapping
+    ``a``, so that a place in a file has one name, and a name one place.
+
     Args:
         path: The file, for the message.
         value: The values.
-        place: Of them in the file, for the message.
-        depth: In how many others they are.
+        place: Place of the values in the file, for the message.
+        depth: Number of mappings and lists around the values.
 
     Raises:
-        DataError: There are other values, or they are nested too deeply.
+        DataError: There are other values or names, or they are nested too deeply.
     """
     expected = f"plain values, at most {_DEEPEST} inside each other"
     if depth > _DEEPEST:
         raise DataError(path, found=f"more of them in {place[:80]}…", expected=expected)
-    if isinstance(value, Mapping) and all(type(name) is str for name in value):
+    if isinstance(value, Mapping):
+        for name in value:
+            if not _fits(name, Text) or "." in name:
+                found, names = f"the name {name!r} in {place}", "names of settings, without dots"
+                raise DataError(path, found=found, expected=names)
         return {n: check_plain(path, v, f"{place}.{n}", depth + 1) for n, v in value.items()}
     if isinstance(value, list | tuple):
         return [check_plain(path, v, f"{place}.{k}", depth + 1) for k, v in enumerate(value)]

@@ -61,7 +61,8 @@ def read_settings(path: Path) -> dict[str, Any]:
     """The settings of a run, from the file that `write_settings` wrote.
 
     Nothing is interpolated: ``${oc.env:HOME}`` is an ordinary string. Aliases, by which a few lines
-    can stand for more than fits into memory, are not followed.
+    can stand for more than fits into memory, are not followed, nor are mappings merged (``<<``);
+    every name is there once.
 
     Raises:
         DataError: It is missing, or something else.
@@ -71,7 +72,7 @@ def read_settings(path: Path) -> dict[str, Any]:
         text = path.read_text(encoding="utf-8")
         events = yaml.parse(text, yaml.SafeLoader)
         aliased = any(isinstance(event, yaml.AliasEvent) for event in events)
-        content = None if aliased else yaml.safe_load(text)
+        content = None if aliased else yaml.load(text, _Loader)
     except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
         first_line = f"{type(error).__name__}: {error}".partition("\n")[0]
         raise DataError(path, found=first_line, expected=expected) from error
@@ -80,6 +81,14 @@ def read_settings(path: Path) -> dict[str, Any]:
         raise DataError(path, found=found, expected=f"{expected}, without aliases")
     settings: dict[str, Any] = check_plain(path, content, "settings")
     return settings
+
+
+class _Loader(yaml.SafeLoader):  # type: ignore[misc]
+    def flatten_mapping(self, node: Any) -> None:
+        """Refuse names that are there twice, of which PyYAML takes the last one."""
+        names = [(name.tag, str(name.value)) for name, _ in node.value]
+        if len(set(names)) < len(names):
+            raise yaml.YAMLError(f"a name twice among {', '.join(n for _, n in names)}")
 
 
 class _Dumper(yaml.SafeDumper):  # type: ignore[misc]

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import copy
 from collections import OrderedDict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from tangent_train import registry
 from tests.security.watch import CANARY
 
 _NAMES = (
@@ -104,6 +105,49 @@ def replaced(content: Any, place: tuple[Any, ...], value: Any) -> Any:
         inside = inside[name]
     inside[place[-1]] = value
     return changed
+
+
+def places_of_arguments(settings: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
+    """Where every argument is, or could be, of what the sections of a config name."""
+    for name, section in settings.items():
+        if isinstance(section, Mapping) and "_target_" in section:
+            found = registry._find(section["_target_"])
+            assert found is not None
+            yield from ((name, argument) for argument in {**section, **found[1]})
+
+
+def _similar(name: str) -> list[str]:
+    """Names that a second reading may take for this one, or for something inside it."""
+    full_width = "".join(chr(ord(c) + 0xFEE0) if "!" <= c <= "~" else c for c in name)
+    around = [f" {name}", f"{name} ", f"{name}\n", f"{name}\u200b", f"+{name}", f"~{name}"]
+    inside = [f"{name}.x", f"{name}._target_", f".{name}", f"{name}.", f"{name}@x", f"'{name}'"]
+    return [name.upper(), name.title(), full_width, *around, *inside]
+
+
+def second_readings(
+    settings: Mapping[str, Any], at: Iterable[tuple[str, ...]], forbidden: Path
+) -> Iterator[dict[str, Any]]:
+    """Settings with a section that would be called, under a name that can be read in two ways.
+
+    At every place the section is the value, and something harmless has a name with dots that means
+    the same place, or one that looks like it; and the other way round.
+
+    Args:
+        settings: Honest ones.
+        at: Places of them.
+        forbidden: A folder that exists and nobody else names.
+    """
+    command = {"_target_": f"{CANARY}.fire", "path": str(forbidden / "x")}
+    for k, place in enumerate(at):
+        section = place[:-1]
+        similar = _similar(place[-1])
+        names = [((), ".".join(place)), *((place[:n], ".".join(place[n:])) for n in (1, 2))]
+        names = [(inside, name) for inside, name in names if "." in name]
+        names.append((section, similar[k % len(similar)]))
+        for inside, name in names:
+            other = (*inside, name)
+            yield replaced(replaced(settings, place, command), other, "x")
+            yield replaced(settings, other, command)
 
 
 def sampled(
