@@ -72,7 +72,7 @@ def read_settings(path: Path) -> dict[str, Any]:
         text = path.read_text(encoding="utf-8")
         events = yaml.parse(text, yaml.SafeLoader)
         aliased = any(isinstance(event, yaml.AliasEvent) for event in events)
-        content = None if aliased else yaml.load(text, _Loader)
+        content = None if aliased else _Loader(text).get_single_data()
     except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
         first_line = f"{type(error).__name__}: {error}".partition("\n")[0]
         raise DataError(path, found=first_line, expected=expected) from error
@@ -98,5 +98,10 @@ class _Dumper(yaml.SafeDumper):  # type: ignore[misc]
 
 
 def write_settings(path: Path, settings: Mapping[str, Any]) -> None:
-    """Write settings as YAML, with strings quoted so that every reader takes them literally."""
+    """Write settings as YAML, with strings quoted so that every reader takes them literally.
+
+    Raises:
+        DataError: They hold what `read_settings` and `read_checkpoint` refuse.
+    """
+    check_plain(path, settings, "settings")
     write_text(path, yaml.dump(dict(settings), Dumper=_Dumper, sort_keys=False, allow_unicode=True))

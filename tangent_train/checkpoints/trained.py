@@ -20,7 +20,7 @@ from models.onnx_network import OnnxNetwork
 from tangent_train.checkpoints.content import GROUPS, INPUTS, NORMALIZATION, read_checkpoint
 from tangent_train.checkpoints.scores import Groups, Scores, size_multiple_of
 from tangent_train.errors import DataError, SettingError
-from tangent_train.files import parse_json
+from tangent_train.files import load_plain, parse_json
 from tangent_train.registry import SettingsFile, Text, check_fields, check_plain, make
 
 METADATA_KEY = "tangent_train"
@@ -182,17 +182,24 @@ def load_trained(path: Path, trust: Collection[str] = ()) -> TrainedNetwork:
 
 
 def start_in(path: Path) -> Start | None:
-    """The description of the network in a file of this package; None for other files."""
-    try:
-        if path.suffix.lower() == ".safetensors":
-            with _safetensors(path) as file:
-                content = _described(path, (file.metadata() or {}).get(METADATA_KEY))
-        else:
-            names = ("class_names", "config", "groups", "inputs", "normalization")
-            content = read_checkpoint(path, names)
-            content["settings"] = content["config"].get("network")
-    except DataError:
-        return None
+    """The description of the network in a file of this package; None for other files.
+
+    Raises:
+        DataError: The file is missing, or its description cannot be used.
+    """
+    if path.suffix.lower() == ".safetensors":
+        with _safetensors(path) as file:
+            text = (file.metadata() or {}).get(METADATA_KEY)
+        if text is None:
+            return None
+        content = _described(path, text)
+    else:
+        names = ("class_names", "config", "groups", "inputs", "normalization")
+        plain = load_plain(path, f"{_TRAINED}, or a state dict", mmap=True)
+        if not isinstance(plain, Mapping) or "tangent_train_version" not in plain:
+            return None
+        content = read_checkpoint(path, names)
+        content["settings"] = content["config"].get("network")
     if not isinstance(content["settings"], Mapping):
         return None
     return Start(

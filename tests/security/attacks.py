@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import copy
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 from typing import Any
 
@@ -148,6 +150,21 @@ def second_readings(
             other = (*inside, name)
             yield replaced(replaced(settings, place, command), other, "x")
             yield replaced(settings, other, command)
+
+
+def named_twice(
+    content: Any, place: tuple[Any, ...], value: Any, dump: Callable[[Any], str]
+) -> Iterator[str]:
+    """Texts in which a name is there twice, its own value before and after another one."""
+    *section, name = place
+    inside = reduce(getitem, section, content)
+    rest = {n: v for n, v in inside.items() if n != name}
+    first = {"named-twice": value, name: inside.get(name), **rest}
+    last = {**rest, name: inside.get(name), "named-twice": value}
+    for mapping in (first, last):
+        text = dump(replaced(content, tuple(section), mapping) if section else mapping)
+        assert text.count("named-twice") == 1
+        yield text.replace("named-twice", name)
 
 
 def sampled(

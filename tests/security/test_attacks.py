@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,7 @@ from tests.cli.tiny_runs import run_command
 from tests.security.attacks import (
     attacks,
     json_attacks,
+    named_twice,
     places,
     places_of_arguments,
     replaced,
@@ -102,6 +103,15 @@ def test_under_names_that_can_be_read_in_two_ways(content: dict[str, Any], forbi
             _nothing_happens(use, path, forbidden, config)
 
 
+def _named_twice(
+    content: Any, forbidden: Path, dump: Callable[[Any], str]
+) -> Iterator[tuple[Any, str]]:
+    """Every name of honest content twice, as text."""
+    for place in places(content):
+        for text in named_twice(content, place, f"{forbidden}/x", dump):
+            yield place, text
+
+
 def test_in_the_metadata_of_an_exported_network(run: Path, forbidden: Path) -> None:
     header = (run.parent / "net.safetensors").read_bytes()
     length = int.from_bytes(header[:8], "little")
@@ -117,6 +127,10 @@ def test_in_the_metadata_of_an_exported_network(run: Path, forbidden: Path) -> N
         for path in (one, other):
             _nothing_happens(load_trained, path, forbidden, (place, value))
         _nothing_happens(start_in, one, forbidden, (place, value))
+    for place, text in _named_twice(described, forbidden, json.dumps):
+        save_file(tensors, one, {METADATA_KEY: text})
+        with pytest.raises(DataError, match="is there twice"):
+            pytest.fail(f"{place}: {load_trained(one)}")
 
 
 def test_in_the_settings_of_a_run(run: Path, forbidden: Path) -> None:
@@ -126,6 +140,13 @@ def test_in_the_settings_of_a_run(run: Path, forbidden: Path) -> None:
     for place, value in sampled(list(json_attacks(forbidden)), list(places(settings))):
         (folder / "config.yaml").write_text(yaml.safe_dump(replaced(settings, place, value)))
         _nothing_happens(load_record, folder, forbidden, (place, value))
+    for place, text in _named_twice(settings, forbidden, yaml.safe_dump):
+        (folder / "config.yaml").write_text(text)
+        with pytest.raises(DataError, match=r"config\.yaml: found YAMLError: a name twice"):
+            pytest.fail(f"{place}: {load_record(folder)}")
+    (folder / "config.yaml").write_text(f"<<: {{name: x}}\n{yaml.safe_dump(settings)}")
+    with pytest.raises(DataError, match=r"config\.yaml: found ConstructorError"):
+        load_record(folder)
 
 
 def test_in_lists_of_cameras_and_results_of_keypoints(
@@ -146,3 +167,7 @@ def test_in_lists_of_cameras_and_results_of_keypoints(
         for place, value in sampled(list(json_attacks(forbidden)), list(places(honest))):
             path.write_text(json.dumps(replaced(honest, place, value)))
             _nothing_happens(use, path, forbidden, (path, place, value))
+        for place, text in _named_twice(honest, forbidden, json.dumps):
+            path.write_text(text)
+            with pytest.raises(DataError, match="is there twice"):
+                pytest.fail(f"{place}: {use(path)}")

@@ -22,7 +22,7 @@ from tangent_train.cli.compose import config_folder
 from tangent_train.errors import DataError, SettingError
 from tangent_train.registry import SettingsFile, make
 from tests.cli.tiny_runs import run_command
-from tests.security.honest import settled, with_config
+from tests.security.honest import SETTINGS, settled, with_config
 from tests.security.watch import CANARY, watched
 
 _FIRE = f"{CANARY}.fire"
@@ -31,7 +31,7 @@ _UNET = {"_target_": "models.UNet", "in_channels": 3, "num_classes": 13, "widths
 
 def test_what_concerns_this_machine_is_its_own(content: dict[str, Any], forbidden: Path) -> None:
     """Compiler options, folders and the number of processes."""
-    options = {"options": {"cpp.cxx": f"sh -c 'id > {forbidden}/x'"}}
+    options = {"options": {"cxx": f"sh -c 'id > {forbidden}/x'"}}
     config = content["config"]
     many = {"devices": 3, "strategy": "ddp", "num_nodes": 2, "accelerator": "gpu"}
     path = with_config(
@@ -150,6 +150,19 @@ def test_terminals_get_no_commands(content: dict[str, Any], run: Path, tmp_path:
     shown = console.export_text()
     assert "[/nope][link=x]a.b" in shown
     assert "\x07" not in shown
+
+
+@pytest.mark.parametrize("override", ["+network.inner={a.b:1}", "name='a\x1b[2J'"])
+def test_what_no_reader_takes_is_not_trained(
+    override: str, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A network of one's own takes any settings; its checkpoints must be readable."""
+    monkeypatch.chdir(run.parent)
+    own = ("data.root=rooms", f"network._target_={OWN}", "~network.widths", override)
+    refused = pytest.raises(SystemExit, match=r"config\.yaml: found .*settings\.n.*; expected ")
+    with refused:
+        run_command(monkeypatch, "train", *SETTINGS, *own, f"hydra.run.dir={tmp_path}/run")
+    assert not (tmp_path / "run" / "checkpoints").exists()
 
 
 def test_aliases_in_settings_are_not_followed(tmp_path: Path) -> None:
