@@ -15,6 +15,7 @@ import inspect
 import re
 import sys
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, fields, is_dataclass
 from functools import partial
 from importlib import import_module
@@ -24,6 +25,7 @@ from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from tangent_train.errors import DataError, SettingError, printable
+from tangent_train.offline import offline
 
 _HOMES = ("datamodules", "models", "tangent_train.rendering", "tangent_train.tasks")
 """Packages whose public names files may give, where they are registered."""
@@ -113,12 +115,13 @@ def make(settings: Any, place: str, file: SettingsFile | None = None, **given: A
     }
     if arguments.pop("_partial_", False):
         return partial(maker, **arguments, **given)
+    source, name = file if file is not None and file.owns(place) else None, settings["_target_"]
     try:
-        return maker(**arguments | given)
+        with nullcontext() if source is None else offline():
+            return maker(**arguments | given)
     except (DataError, SettingError):
         raise
     except Exception as error:
-        source, name = file if file is not None and file.owns(place) else None, settings["_target_"]
         foreign = _find(name) is None and not name.startswith("lightning.")
         if source is None and (foreign or isinstance(error, OSError)):
             raise

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -20,6 +21,20 @@ from tests.security.honest import SETTINGS
 from tests.security.watch import CANARY, watched
 
 _COMMAND = {"_target_": f"{CANARY}.fire"}
+_GPT2 = {"model_type": "timm_backbone", "backbone": "gpt2"}
+_HUGGINGFACE = (
+    ({"model_type": "upernet", "backbone_config": _GPT2}, "Unknown model (gpt2)"),
+    (
+        {
+            "model_type": "upernet",
+            "backbone_config": {"model_type": "sam3", "vision_config": _GPT2},
+        },
+        "network",
+    ),
+    ({"model_type": CANARY, "auto_map": {"AutoConfig": f"{CANARY}.C"}}, "network.config"),
+)
+"""Configs of transformers that ask for something on the hub."""
+
 _WITHOUT_NETWORK = [said for said in SETTINGS if not said.startswith("network")]
 _CHECKPOINT = "theirs/checkpoints/last.ckpt"
 
@@ -39,7 +54,7 @@ def use(run: Path, forbidden: Path, monkeypatch: pytest.MonkeyPatch) -> Use:
         assert happened == []
         said = str(ended.value)
         assert said.startswith(f"tangent-{command}: ")
-        assert "theirs" in said
+        assert "theirs" in said or "network.config" in said
         assert found in said
         assert "\n" not in said
 
@@ -75,9 +90,14 @@ def test_checkpoints(
     Path(_CHECKPOINT).parent.mkdir(parents=True)
     torch.save(content | {"config": _attack(content["config"])}, _CHECKPOINT)
     use("the name 'data.mask' in config; expected", command, *arguments)
-    if command != "transfer":  # which reads nothing but the tensors and the fold
-        torch.save(content | {"config": _plain_attack(content["config"])}, _CHECKPOINT)
-        use(f"{{'_target_': '{CANARY}.fire'}}", command, *arguments)
+    if command == "transfer":  # reads nothing more but the tensors and the fold
+        return
+    torch.save(content | {"config": _plain_attack(content["config"])}, _CHECKPOINT)
+    use(f"{{'_target_': '{CANARY}.fire'}}", command, *arguments)
+    for config, found in _HUGGINGFACE:
+        network = {"_target_": "models.HuggingFaceNetwork", "config": config, "num_classes": 13}
+        torch.save(content | {"config": content["config"] | {"network": network}}, _CHECKPOINT)
+        use(found, command, *arguments)
 
 
 def test_checkpoints_in_python(content: dict[str, Any], forbidden: Path, tmp_path: Path) -> None:
@@ -122,3 +142,9 @@ def test_networks_of_other_libraries(network: str, use: Use) -> None:
     write_linear(Path("net.onnx"), np.zeros((2, 3), np.float32), np.zeros(2, np.float32))
     arguments = (f"network={network}", source, *given, f"output=ours.{suffix}")
     use("'0' is there twice", "import", *arguments)
+    if network == "huggingface":
+        labels = {"id2label": {"0": "wall", "1": "floor"}}
+        for config, found in _HUGGINGFACE:
+            Path("theirs/config.json").write_text(json.dumps(config | labels))
+            Path("theirs/preprocessor_config.json").write_text("{}")
+            use(found, "import", *arguments)

@@ -14,6 +14,7 @@ from tangent_train.errors import DataError, SettingError
 from tangent_train.inference.photo_networks.network import PhotoNetwork, class_names_in
 from tangent_train.inference.photo_networks.saved import json_in, saved_folder, tensors_in
 from tangent_train.inference.quiet import quiet
+from tangent_train.offline import offline
 from tangent_train.registry import SettingsFile, make
 
 _TASK = "the task is semantic"
@@ -38,6 +39,11 @@ def load(*, model: str | None, classes: Path | None, normalization: Any, **_: An
         SettingError: A setting is impossible, or transformers is missing.
     """
     folder = saved_folder(model)
+    with offline():
+        return _from_folder(folder, classes, normalization)
+
+
+def _from_folder(folder: Path, classes: Path | None, normalization: Any) -> PhotoNetwork:
     config = json_in(folder, "config.json")
     names = _names(config, folder / "config.json")
     processor = _processor(folder)
