@@ -221,7 +221,7 @@ def check_plain(path: Path, value: Any, place: str, depth: int = 0) -> Any:
         raise DataError(path, found=f"more of them in {place[:80]}…", expected=expected)
     if isinstance(value, Mapping):
         for name in value:
-            if not _fits(name, Text) or "." in name:
+            if not is_text(name) or "." in name:
                 found, names = f"the name {name!r} in {place}", "names of settings, without dots"
                 raise DataError(path, found=found, expected=names)
         return {n: check_plain(path, v, f"{place}.{n}", depth + 1) for n, v in value.items()}
@@ -335,6 +335,11 @@ def _is_plain(hint: Any) -> bool:
     return hint in _PLAIN or origin is Literal
 
 
+def is_text(value: Any) -> bool:
+    """True for text of one line without control characters, such as a class name: a `Text`."""
+    return isinstance(value, str) and "\n" not in value and printable(value) == value
+
+
 def _fits(value: Any, kind: Any) -> bool:
     """Whether a value is of a kind: a type of plain values, or `Text`."""
     origin, arguments = get_origin(kind), get_args(kind)
@@ -351,7 +356,7 @@ def _fits(value: Any, kind: Any) -> bool:
     if kind is str:
         return isinstance(value, str) and _WORD.fullmatch(value) is not None
     if kind is Text:
-        return isinstance(value, str) and "\n" not in value and printable(value) == value
+        return is_text(value)
     if kind is dict:
         return isinstance(value, Mapping)
     return type(value) in (int, float) if kind is float else type(value) is kind

@@ -21,7 +21,7 @@ from tangent_train.cli.build import build
 from tangent_train.cli.compose import config_folder
 from tangent_train.errors import DataError, SettingError
 from tangent_train.registry import SettingsFile, make
-from tests.cli.tiny_runs import run_command
+from tests.cli.tiny_runs import results, run_command
 from tests.security.honest import SETTINGS, settled, with_config
 from tests.security.watch import CANARY, watched
 
@@ -207,6 +207,26 @@ def test_ones_own_network_is_trusted_by_its_name(content: dict[str, Any], tmp_pa
     path = _own(content, tmp_path / "x.ckpt", inner={"a": [{"_target_": _FIRE}]})
     with pytest.raises(DataError, match=rf"network\.inner\.a\.0\._target_={_FIRE}"):
         load_trained(path, [OWN])
+
+
+@pytest.mark.parametrize("section", ["optimizer", "scheduler"])
+def test_an_evaluation_needs_no_trust_for_what_only_trains(
+    section: str,
+    run: Path,
+    content: dict[str, Any],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(run.parent)
+    named = {section: {"_target_": _FIRE, "_partial_": True}}
+    path = with_config(content, tmp_path, **named)
+    said = (f"checkpoint={path}", "data.root=rooms", f"hydra.run.dir={tmp_path}/evaluated")
+    with watched(tmp_path / "forbidden") as happened:
+        run_command(monkeypatch, "evaluate", *said)
+    assert happened == []
+    assert results(tmp_path / "evaluated") == results(run)
+    with pytest.raises(SystemExit, match=rf"{section}\._target_={_FIRE}, which would be called"):
+        run_command(monkeypatch, "train", f"resume={path.parents[1]}", "data.root=rooms")
 
 
 def test_files_may_name_all_that_the_configs_name() -> None:

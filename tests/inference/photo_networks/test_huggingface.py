@@ -98,6 +98,7 @@ def test_float16_weights_are_stored_as_float32(folder: Path) -> None:
     ("file", "changes", "message"),
     [
         ("config.json", {"id2label": {"0": "wall", "2": "floor"}}, "id2label.*name of every score"),
+        ("config.json", {"id2label": {"0": "wall", "1": "a\x1b[2J"}}, "name of every score"),
         (
             "config.json",
             {"id2label": {"0": "wall", "1": "floor"}},
