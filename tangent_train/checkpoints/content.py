@@ -38,18 +38,18 @@ def read_checkpoint(path: Path, needed: Collection[str] = tuple(_FIELDS)) -> dic
     """The content of a checkpoint; nothing but tensors and plain values is unpickled.
 
     Args:
-        path: The file; tensors are memory-mapped.
+        path: The file; tensors are memory-mapped, and compared with their checksums if needed.
         needed: Which of its fields: ``config`` (the resolved settings of the run, plain values),
             ``class_names``, ``epoch``, ``groups``, ``inputs``, ``kind``, ``normalization``,
             ``state_dict``.
 
     Raises:
-        DataError: The file is missing, no checkpoint, or of another program.
+        DataError: The file is missing, damaged, no checkpoint, or of another program.
     """
     if path.is_dir():
         remedy = "Give its checkpoints/best.ckpt."
         raise DataError(path, found="a folder", expected=_EXPECTED, remedy=remedy)
-    content = load_plain(path, _EXPECTED, mmap=True)
+    content = load_plain(path, _EXPECTED, mmap=True, whole="state_dict" in needed)
     kinds = {name: kind for name, kind in _FIELDS.items() if name in needed}
     found = check_fields(path, content, kinds, _EXPECTED)
     if "config" in found:
