@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
+from inspect import signature
 from typing import Any
 
 import torch
@@ -12,46 +12,58 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from models.unet import check_sides
-from tangent_train.errors import SettingError
+from tangent_train.errors import SettingError, of_extra
 from tangent_train.registry import registered
+from tangent_train.setting_rules import flat_settings
 
 _Value = bool | int | float | str | None
 _Values = _Value | Sequence[_Value | Sequence[_Value | Sequence[_Value]]]
 _Section = Mapping[str, _Values | Mapping[str, _Values]]
-
-_NO_ARCHITECTURE = re.compile(
-    "_.*|architectures|auto_map|.*_implementation|.*quantization.*|(torch_)?dtype|name_or_path|"
-    "trust_remote_code|use_kernels|use_pretrained_backbone|backbone_kwargs|return_dict|"
-    "id2label|label2id|num_labels|output_(attentions|hidden_states)|transformers_version"
-)
-"""Settings that name code, files or labels, or what a network returns."""
 
 _MASK2FORMER = (384, 384)
 """Rows and columns of Mask2Former's masks before they are added, for images of any size
 (``Mask2FormerImageProcessor.post_process_semantic_segmentation``)."""
 
 
-def architecture(config: Mapping[str, Any]) -> dict[str, Any]:
+def architecture(config: Mapping[str, Any], kind: Any = None) -> dict[str, Any]:
     """The settings of transformers that describe a network, and those of the networks inside it.
 
-    Nothing is left that would fetch or run something: no code of a model's author, no kernels, and
-    no backbones by name, except those of timm, which are made without their weights.
+    These are the arguments that the class of the settings declares. Nothing else gets through, such
+    as code of a model's author, kernels, quantizers, other names for settings (``attribute_map``),
+    labels, or backbones on the hub. Backbones of timm are made by name without their weights.
 
     Args:
         config: Content of a ``config.json``, or ``PreTrainedConfig.to_dict``.
+        kind: Class of the settings; None or `AutoConfig` for that of its ``model_type``.
+
+    Raises:
+        SettingError: There is no such class, or transformers is missing.
     """
-    by_name = config.get("model_type") == "timm_backbone"
-    return {
-        name: _plain(value)
-        for name, value in config.items()
-        if not _NO_ARCHITECTURE.fullmatch(name) and (by_name or name != "backbone")
-    }
+    with of_extra("huggingface", "network"):
+        from transformers import CONFIG_MAPPING, AutoConfig, PreTrainedConfig
 
+    if kind in (None, AutoConfig):
+        name = config.get("model_type")
+        if not isinstance(name, str) or name not in CONFIG_MAPPING:
+            found, expected = name or "none", "a kind of network that transformers has"
+            raise SettingError("network.config.model_type", found=found, expected=expected)
+        kind = CONFIG_MAPPING[name]
+    # Those of every network are about labels, results, and how a file was written.
+    declared = signature(kind).parameters.keys() - signature(PreTrainedConfig).parameters.keys()
+    names = {name.removeprefix("_") for name in declared}
+    names |= {alias for alias, name in kind.attribute_map.items() if name in declared}
 
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return architecture(value)
-    return [_plain(one) for one in value] if isinstance(value, list | tuple) else value
+    def plain(value: Any, own: Any = None) -> Any:
+        if isinstance(value, list | tuple):
+            return [plain(one) for one in value]
+        if not isinstance(value, Mapping):
+            return value
+        if own is not None or "model_type" in value:
+            return architecture(value, own)
+        return {name: plain(inner) for name, inner in value.items()}
+
+    known = {n: plain(value, kind.sub_configs.get(n)) for n, value in config.items() if n in names}
+    return {"model_type": kind.model_type, **known}
 
 
 def _patch_size(config: Any) -> int:
@@ -75,7 +87,8 @@ class HuggingFaceNetwork(nn.Module):
         network: The network as transformers makes it.
 
     Raises:
-        SettingError: There is no such network, or transformers is missing.
+        SettingError: There is no such network, `config` holds more than its `architecture`, or
+            transformers is missing.
     """
 
     def __init__(
@@ -86,21 +99,22 @@ class HuggingFaceNetwork(nn.Module):
         task: Sequence[int] | None = None,
     ) -> None:
         super().__init__()
-        try:
-            from transformers import (
-                MODEL_FOR_SEMANTIC_SEGMENTATION_MAPPING,
-                MODEL_FOR_UNIVERSAL_SEGMENTATION_MAPPING,
-                AutoConfig,
-                AutoModelForSemanticSegmentation,
-                AutoModelForUniversalSegmentation,
-            )
-        except ImportError as error:
+        known = architecture(config)
+        unknown = dict(flat_settings(config)).keys() - dict(flat_settings(known)).keys()
+        if unknown:
             raise SettingError(
-                "network",
-                found=f"a network of transformers ({error})",
-                expected="the package transformers, to make it",
-                remedy="Run: pip install 'tangent-train[huggingface]'",
-            ) from error
+                f"network.config.{min(unknown)}",
+                found="a value",
+                expected=f"settings that transformers declares for {known['model_type']}",
+            )
+        from transformers import (
+            MODEL_FOR_SEMANTIC_SEGMENTATION_MAPPING,
+            MODEL_FOR_UNIVERSAL_SEGMENTATION_MAPPING,
+            AutoConfig,
+            AutoModelForSemanticSegmentation,
+            AutoModelForUniversalSegmentation,
+        )
+
         kind = config.get("model_type")
         semantic = {made.model_type for made in MODEL_FOR_SEMANTIC_SEGMENTATION_MAPPING}
         universal = {made.model_type for made in MODEL_FOR_UNIVERSAL_SEGMENTATION_MAPPING}
@@ -111,7 +125,7 @@ class HuggingFaceNetwork(nn.Module):
                 expected="a network for semantic segmentation "
                 f"({', '.join(sorted(semantic | universal))})",
             )
-        made = AutoConfig.for_model(**architecture(config), num_labels=num_classes)
+        made = AutoConfig.for_model(**known, num_labels=num_classes)
         auto: Any = AutoModelForUniversalSegmentation
         if kind in semantic:
             auto = AutoModelForSemanticSegmentation

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from tangent_train.errors import DataError, SettingError
+from tangent_train.files import crc32_of
 
 _TYPES = {"tensor(float)": torch.float32, "tensor(float16)": torch.float16}
 _COLORS = 3
@@ -35,6 +36,7 @@ class OnnxNetwork(nn.Module):
     Attributes:
         path: The file.
         metadata: The file's own, text by key.
+        checksum: Checksum of its tensors.
         image_size: The only rows and columns it takes; None where it takes others.
 
     Raises:
@@ -66,7 +68,10 @@ class OnnxNetwork(nn.Module):
         usable |= {"CUDAExecutionProvider"} if torch.cuda.is_available() else set()
         providers = [name for name in onnxruntime.get_available_providers() if name in usable]
         try:
-            graph = onnx.load(path, load_external_data=False)
+            # Both read the file alike, whatever its name and its first bytes are.
+            graph = onnx.load(path, format="protobuf", load_external_data=False)
+            options.add_session_config_entry("session.load_model_format", "ONNX")
+            self.checksum = graph_checksum(graph)
             if not any(tensor.data_location for tensor in _tensors(graph)):
                 self._session = onnxruntime.InferenceSession(path, options, providers=providers)
         except Exception as error:  # whatever the parser of protocol buffers raises
@@ -139,6 +144,11 @@ class OnnxNetwork(nn.Module):
         if scores.shape[2:] == size:
             return scores.float()
         return functional.interpolate(scores.float(), size, mode="bilinear")
+
+
+def graph_checksum(graph: Any) -> str:
+    """CRC-32 of all tensors in an ONNX graph, in their order."""
+    return crc32_of(tensor.SerializeToString(deterministic=True) for tensor in _tensors(graph))
 
 
 def _channels_first(returned: Tensor, size: tuple[int, int], last: bool) -> Tensor | None:

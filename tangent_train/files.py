@@ -10,10 +10,14 @@ import os
 import re
 import shutil
 import tempfile
+import zlib
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import reduce
 from pathlib import Path
 from typing import IO, Any
+from zipfile import ZipFile, is_zipfile
 
 from tangent_train.errors import DataError, SettingError
 
@@ -142,13 +146,15 @@ def _refused(path: Path) -> OSError:
     return OSError()
 
 
-def load_plain(path: Path, expected: str, *, mmap: bool = False) -> Any:
+def load_plain(path: Path, expected: str, *, mmap: bool = False, whole: bool = True) -> Any:
     """Load a file of `torch.save` that holds tensors and plain values; nothing else is unpickled.
 
     Args:
         path: The file.
         expected: For the message.
         mmap: Map the tensors into memory instead of reading them.
+        whole: Compare everything in the file with its checksums, which torch does not; this reads
+            all of it. Files of torch before version 1.6 have none.
 
     Raises:
         DataError: It is missing, damaged, or holds other objects.
@@ -156,7 +162,11 @@ def load_plain(path: Path, expected: str, *, mmap: bool = False) -> Any:
     import torch
 
     try:
-        return torch.load(path, map_location="cpu", weights_only=True, mmap=mmap)
+        content = torch.load(path, map_location="cpu", weights_only=True, mmap=mmap)
+        damaged = None
+        if whole and is_zipfile(path):
+            with ZipFile(path) as archive:
+                damaged = archive.testzip()
     except FileNotFoundError as error:
         raise DataError(path, found="no such file", expected=expected) from error
     except Exception as error:
@@ -167,28 +177,55 @@ def load_plain(path: Path, expected: str, *, mmap: bool = False) -> Any:
             found = "a damaged file, or none of torch.save"
             remedy = ""
         raise DataError(path, found=found, expected=expected, remedy=remedy) from error
+    check_sum(path, damaged is None)
+    return content
+
+
+def check_sum(path: Path, same: bool) -> None:
+    """Refuse a file whose content is another one than when it was written.
+
+    Args:
+        path: The file.
+        same: True if its checksum is right.
+
+    Raises:
+        DataError: It is not.
+    """
+    if not same:
+        raise DataError(
+            path,
+            found="a damaged file, whose checksum is wrong",
+            expected="the file as it was written",
+            remedy="Copy it again from where it was written.",
+        )
+
+
+def crc32_of(parts: Iterable[bytes | memoryview]) -> str:
+    """CRC-32 of bytes, one after the other, as eight hexadecimal digits."""
+    return f"{reduce(lambda crc, part: zlib.crc32(part, crc), parts, 0):08x}"
 
 
 def parse_json(text: str | bytes) -> Any:
-    """`json.loads`, with a `ValueError` for a name given twice, or text that is nested too deeply.
+    """`json.loads`, with a `ValueError` for text that is nested too deeply or names a value twice.
 
     Args:
         text: UTF-8, UTF-16 or UTF-32 where it is bytes.
 
     Raises:
-        ValueError: It is no JSON.
+        ValueError: The text is not JSON.
     """
     try:
-        return json.loads(text, object_pairs_hook=_without_repetition)
+        return json.loads(text, object_pairs_hook=_unique)
     except RecursionError as error:
         raise ValueError("its brackets are nested too deeply") from error
 
 
-def _without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """A mapping that has every name once: readers differ in which of two values they take."""
     content = dict(pairs)
     if len(content) < len(pairs):
-        names = [name for name, _ in pairs]
-        raise ValueError(f"the name {next(n for n in names if names.count(n) > 1)!r} twice")
+        ((name, _),) = Counter(name for name, _ in pairs).most_common(1)
+        raise ValueError(f"{name!r} is there twice")
     return content
 
 

@@ -15,6 +15,7 @@ import inspect
 import re
 import sys
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, fields, is_dataclass
 from functools import partial
 from importlib import import_module
@@ -24,6 +25,7 @@ from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from tangent_train.errors import DataError, SettingError, printable
+from tangent_train.offline import offline
 
 _HOMES = ("datamodules", "models", "tangent_train.rendering", "tangent_train.tasks")
 """Packages whose public names files may give, where they are registered."""
@@ -113,12 +115,13 @@ def make(settings: Any, place: str, file: SettingsFile | None = None, **given: A
     }
     if arguments.pop("_partial_", False):
         return partial(maker, **arguments, **given)
+    source, name = file if file is not None and file.owns(place) else None, settings["_target_"]
     try:
-        return maker(**arguments | given)
+        with nullcontext() if source is None else offline():
+            return maker(**arguments | given)
     except (DataError, SettingError):
         raise
     except Exception as error:
-        source, name = file if file is not None and file.owns(place) else None, settings["_target_"]
         foreign = _find(name) is None and not name.startswith("lightning.")
         if source is None and (foreign or isinstance(error, OSError)):
             raise
@@ -201,19 +204,26 @@ def check_fields(
 def check_plain(path: Path, value: Any, place: str, depth: int = 0) -> Any:
     """Plain values of a file: numbers, texts, lists and mappings of these.
 
+    Names in mappings are texts without a dot: ``a.b`` is always the value ``b`` in the mapping
+    ``a``, so that a place in a file has one name, and a name one place.
+
     Args:
         path: The file, for the message.
         value: The values.
-        place: Of them in the file, for the message.
-        depth: In how many others they are.
+        place: Place of the values in the file, for the message.
+        depth: Number of mappings and lists around the values.
 
     Raises:
-        DataError: There are other values, or they are nested too deeply.
+        DataError: There are other values or names, or they are nested too deeply.
     """
     expected = f"plain values, at most {_DEEPEST} inside each other"
     if depth > _DEEPEST:
         raise DataError(path, found=f"more of them in {place[:80]}…", expected=expected)
-    if isinstance(value, Mapping) and all(type(name) is str for name in value):
+    if isinstance(value, Mapping):
+        for name in value:
+            if not is_text(name) or "." in name:
+                found, names = f"the name {name!r} in {place}", "names of settings, without dots"
+                raise DataError(path, found=found, expected=names)
         return {n: check_plain(path, v, f"{place}.{n}", depth + 1) for n, v in value.items()}
     if isinstance(value, list | tuple):
         return [check_plain(path, v, f"{place}.{k}", depth + 1) for k, v in enumerate(value)]
@@ -325,6 +335,11 @@ def _is_plain(hint: Any) -> bool:
     return hint in _PLAIN or origin is Literal
 
 
+def is_text(value: Any) -> bool:
+    """True for text of one line without control characters, such as a class name: a `Text`."""
+    return isinstance(value, str) and "\n" not in value and printable(value) == value
+
+
 def _fits(value: Any, kind: Any) -> bool:
     """Whether a value is of a kind: a type of plain values, or `Text`."""
     origin, arguments = get_origin(kind), get_args(kind)
@@ -341,7 +356,7 @@ def _fits(value: Any, kind: Any) -> bool:
     if kind is str:
         return isinstance(value, str) and _WORD.fullmatch(value) is not None
     if kind is Text:
-        return isinstance(value, str) and "\n" not in value and printable(value) == value
+        return is_text(value)
     if kind is dict:
         return isinstance(value, Mapping)
     return type(value) in (int, float) if kind is float else type(value) is kind

@@ -23,6 +23,7 @@ from datamodules.core.inputs import Normalization
 from datamodules.core.loading import EpochSampler, make_loader, this_process
 from datamodules.core.problems import Problems
 from tangent_train.errors import DataError, SettingError
+from tangent_train.registry import is_text
 from tangent_train.threads import in_threads
 
 Kind = Literal["segmentation", "classification"]
@@ -269,7 +270,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
         return problems, count
 
     def check_classes(self) -> None:
-        """Check that the data set names its classes.
+        """Check that the data set names its classes, in names that checkpoints can hold.
 
         Raises:
             SettingError: It does not.
@@ -280,6 +281,13 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
                 f"class_names of {type(self).__name__}",
                 found=f"{names[0]} first" if names else "none",
                 expected="unknown, then the classes: label 0 is ignored",
+            )
+        strange = [name for name in names if not is_text(name)]
+        if strange:
+            raise SettingError(
+                f"class_names of {type(self).__name__}",
+                found=repr(strange[0]),
+                expected="names without control characters and line ends",
             )
 
     def _listed(self, problems: Problems) -> Found[_Item]:

@@ -38,18 +38,18 @@ def read_checkpoint(path: Path, needed: Collection[str] = tuple(_FIELDS)) -> dic
     """The content of a checkpoint; nothing but tensors and plain values is unpickled.
 
     Args:
-        path: The file; tensors are memory-mapped.
+        path: The file; tensors are memory-mapped, and compared with their checksums if needed.
         needed: Which of its fields: ``config`` (the resolved settings of the run, plain values),
             ``class_names``, ``epoch``, ``groups``, ``inputs``, ``kind``, ``normalization``,
             ``state_dict``.
 
     Raises:
-        DataError: The file is missing, no checkpoint, or of another program.
+        DataError: The file is missing, damaged, no checkpoint, or of another program.
     """
     if path.is_dir():
         remedy = "Give its checkpoints/best.ckpt."
         raise DataError(path, found="a folder", expected=_EXPECTED, remedy=remedy)
-    content = load_plain(path, _EXPECTED, mmap=True)
+    content = load_plain(path, _EXPECTED, mmap=True, whole="state_dict" in needed)
     kinds = {name: kind for name, kind in _FIELDS.items() if name in needed}
     found = check_fields(path, content, kinds, _EXPECTED)
     if "config" in found:
@@ -61,7 +61,8 @@ def read_settings(path: Path) -> dict[str, Any]:
     """The settings of a run, from the file that `write_settings` wrote.
 
     Nothing is interpolated: ``${oc.env:HOME}`` is an ordinary string. Aliases, by which a few lines
-    can stand for more than fits into memory, are not followed.
+    can stand for more than fits into memory, are not followed, nor are mappings merged (``<<``);
+    every name is there once.
 
     Raises:
         DataError: It is missing, or something else.
@@ -71,7 +72,7 @@ def read_settings(path: Path) -> dict[str, Any]:
         text = path.read_text(encoding="utf-8")
         events = yaml.parse(text, yaml.SafeLoader)
         aliased = any(isinstance(event, yaml.AliasEvent) for event in events)
-        content = None if aliased else yaml.safe_load(text)
+        content = None if aliased else _Loader(text).get_single_data()
     except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
         first_line = f"{type(error).__name__}: {error}".partition("\n")[0]
         raise DataError(path, found=first_line, expected=expected) from error
@@ -82,6 +83,14 @@ def read_settings(path: Path) -> dict[str, Any]:
     return settings
 
 
+class _Loader(yaml.SafeLoader):  # type: ignore[misc]
+    def flatten_mapping(self, node: Any) -> None:
+        """Refuse names that are there twice, of which PyYAML takes the last one."""
+        names = [(name.tag, str(name.value)) for name, _ in node.value]
+        if len(set(names)) < len(names):
+            raise yaml.YAMLError(f"a name twice among {', '.join(n for _, n in names)}")
+
+
 class _Dumper(yaml.SafeDumper):  # type: ignore[misc]
     def ignore_aliases(self, data: Any) -> bool:
         """Write out what appears twice."""
@@ -89,5 +98,10 @@ class _Dumper(yaml.SafeDumper):  # type: ignore[misc]
 
 
 def write_settings(path: Path, settings: Mapping[str, Any]) -> None:
-    """Write settings as YAML, with strings quoted so that every reader takes them literally."""
+    """Write settings as YAML, with strings quoted so that every reader takes them literally.
+
+    Raises:
+        DataError: They hold what `read_settings` and `read_checkpoint` refuse.
+    """
+    check_plain(path, settings, "settings")
     write_text(path, yaml.dump(dict(settings), Dumper=_Dumper, sort_keys=False, allow_unicode=True))

@@ -11,20 +11,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
 from datamodules.core.inputs import Input, Normalization, channel_names
-from models.onnx_network import OnnxNetwork
+from models.onnx_network import OnnxNetwork, graph_checksum
 from tangent_train.checkpoints.content import GROUPS, INPUTS, NORMALIZATION, read_checkpoint
 from tangent_train.checkpoints.scores import Groups, Scores, size_multiple_of
 from tangent_train.errors import DataError, SettingError
-from tangent_train.files import parse_json
+from tangent_train.files import check_sum, crc32_of, load_plain, parse_json
 from tangent_train.registry import SettingsFile, Text, check_fields, check_plain, make
 
 METADATA_KEY = "tangent_train"
 """Names the JSON text: in an ONNX file's ``metadata_props``, in safetensors' ``__metadata__``."""
+
+CHECKSUM_KEY = "tangent_train_crc32"
+"""Names the checksum of the tensors there."""
 
 _PREFIX = "network."
 """Begins the names of the network's tensors in a checkpoint."""
@@ -165,11 +169,14 @@ def load_trained(path: Path, trust: Collection[str] = ()) -> TrainedNetwork:
         if path.suffix.lower() == ".onnx":
             network = OnnxNetwork(path)
             described = _described(path, network.metadata.get(METADATA_KEY))
+            _check_tensors(path, network.metadata, network.checksum)
             return _trained(described | {"settings": None}, network, source)
         if path.suffix.lower() == ".safetensors":
             with _safetensors(path) as file:
-                described = _described(path, (file.metadata() or {}).get(METADATA_KEY))
+                metadata = file.metadata() or {}
+                described = _described(path, metadata.get(METADATA_KEY))
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            _check_tensors(path, metadata, tensor_checksum(tensors))
             return _trained(described, _network(described, tensors, source), source)
         return _from_checkpoint(source)
     except DataError:
@@ -182,17 +189,24 @@ def load_trained(path: Path, trust: Collection[str] = ()) -> TrainedNetwork:
 
 
 def start_in(path: Path) -> Start | None:
-    """The description of the network in a file of this package; None for other files."""
-    try:
-        if path.suffix.lower() == ".safetensors":
-            with _safetensors(path) as file:
-                content = _described(path, (file.metadata() or {}).get(METADATA_KEY))
-        else:
-            names = ("class_names", "config", "groups", "inputs", "normalization")
-            content = read_checkpoint(path, names)
-            content["settings"] = content["config"].get("network")
-    except DataError:
-        return None
+    """The description of the network in a file of this package; None for other files.
+
+    Raises:
+        DataError: The file is missing, or its description cannot be used.
+    """
+    if path.suffix.lower() == ".safetensors":
+        with _safetensors(path) as file:
+            text = (file.metadata() or {}).get(METADATA_KEY)
+        if text is None:
+            return None
+        content = _described(path, text)
+    else:
+        names = ("class_names", "config", "groups", "inputs", "normalization")
+        plain = load_plain(path, f"{_TRAINED}, or a state dict", mmap=True, whole=False)
+        if not isinstance(plain, Mapping) or "tangent_train_version" not in plain:
+            return None
+        content = read_checkpoint(path, names)
+        content["settings"] = content["config"].get("network")
     if not isinstance(content["settings"], Mapping):
         return None
     return Start(
@@ -224,6 +238,34 @@ def metadata_json(trained: TrainedNetwork) -> str:
     mean, std = trained.normalization.mean, trained.normalization.std
     content["normalization"] = {"mean": mean, "std": std}
     return json.dumps(content | {"tangent_train_version": version("tangent-train")})
+
+
+def _check_tensors(path: Path, metadata: Mapping[str, str], checksum: str) -> None:
+    """Refuse other tensors than those that were written; other programs write no checksum."""
+    check_sum(path, metadata.get(CHECKSUM_KEY, checksum) == checksum)
+
+
+def write_metadata(source: Path, path: Path, text: str) -> None:
+    """Write an ONNX file with our metadata among its own, and the checksum of its tensors.
+
+    Args:
+        source: An ONNX file without external tensors.
+        path: The file to write.
+        text: See `metadata_json`.
+    """
+    import onnx
+
+    graph = onnx.load(source, format="protobuf")
+    entries = {entry.key: entry.value for entry in graph.metadata_props}
+    ours = {METADATA_KEY: text, CHECKSUM_KEY: graph_checksum(graph)}
+    onnx.helper.set_model_props(graph, entries | ours)  # in place of those that were there
+    onnx.save(graph, path, format="protobuf")
+
+
+def tensor_checksum(tensors: Mapping[str, Tensor]) -> str:
+    """CRC-32 of the numbers in contiguous tensors, in the order of their names."""
+    ordered = (tensors[name].reshape(-1).view(torch.uint8) for name in sorted(tensors))
+    return crc32_of(tensor.numpy().data for tensor in ordered)
 
 
 def _from_checkpoint(source: SettingsFile) -> TrainedNetwork:

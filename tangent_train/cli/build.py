@@ -24,7 +24,9 @@ Settings = Mapping[str, Any]
 """All settings of a run, resolved: plain values in nested sections."""
 
 
-def build(settings: Settings, source: SettingsFile | None = None) -> tuple[Any, Any]:
+def build(
+    settings: Settings, source: SettingsFile | None = None, *, trains: bool = True
+) -> tuple[Any, Any]:
     """The data module and the task of a run.
 
     Network settings that are null are taken from the data: ``in_channels``, and ``num_classes`` or
@@ -34,6 +36,7 @@ def build(settings: Settings, source: SettingsFile | None = None) -> tuple[Any, 
     Args:
         settings: Of the run.
         source: The file they come from, see `registry.make`.
+        trains: False if the task is only evaluated: its optimizer and scheduler are not made.
 
     Returns:
         Data module and task.
@@ -46,8 +49,11 @@ def build(settings: Settings, source: SettingsFile | None = None) -> tuple[Any, 
     section = completed_settings(
         settings["network"], data.in_channels, data.num_classes, restored=restored
     )
-    task = _build_task(settings, data, make(section, "network", source), source)
+    network = make(section, "network", source)
+    task = _build_task(settings, data, network, source, trains=trains)
     _try_network(task, data.in_channels)
+    if not trains:
+        return data, task
     try:
         task.make_optimizer([{"params": [torch.zeros(1, 1, requires_grad=True)]}])
     except (TypeError, ValueError) as error:
@@ -96,7 +102,8 @@ def build_trained(
         trained, notes = mapped.trained, [f"Class map {class_map.name}: {mapped}."]
     check_fits(data, shown(trained), settings["checkpoint"])
     check_size(trained, data.representation.image_size)
-    return data, _build_task(settings, data, trained.network, source), notes
+    task = _build_task(settings, data, trained.network, source, trains=False)
+    return data, task, notes
 
 
 @dataclass(frozen=True)
@@ -137,13 +144,16 @@ def shown(of: Any) -> dict[str, Any]:
 
 
 def _build_task(
-    settings: Settings, data: Any, network: nn.Module, source: SettingsFile | None = None
+    settings: Settings, data: Any, network: nn.Module, source: SettingsFile | None, *, trains: bool
 ) -> Any:
     """The task of a run with its network; see `build`."""
-    optimizer = dict(settings["optimizer"])
-    backbone_lr_factor = optimizer.pop("backbone_lr_factor", 1.0)
-    scheduler = settings.get("scheduler")
-    parts = {} if scheduler is None else {"scheduler": make(scheduler, "scheduler", source)}
+    parts: dict[str, Any] = {"optimizer": _no_optimizer}
+    if trains:
+        optimizer = dict(settings["optimizer"])
+        parts["backbone_lr_factor"] = optimizer.pop("backbone_lr_factor", 1.0)
+        parts["optimizer"] = make(optimizer, "optimizer", source)
+    if trains and settings.get("scheduler") is not None:
+        parts["scheduler"] = make(settings["scheduler"], "scheduler", source)
     return make(
         settings["task"],
         "task",
@@ -151,10 +161,12 @@ def _build_task(
         network=network,
         representation=data.representation,
         class_names=data.class_names,
-        optimizer=make(optimizer, "optimizer", source),
-        backbone_lr_factor=backbone_lr_factor,
         **parts,
     )
+
+
+def _no_optimizer(*_: Any, **__: Any) -> Any:
+    raise RuntimeError("a task that is only evaluated has no optimizer")
 
 
 def _try_network(task: Any, channels: int) -> None:

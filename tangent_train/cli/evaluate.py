@@ -70,7 +70,7 @@ def evaluate(
         settings = {name: value for name, value in settings.items() if name != "unmapped"}
     if trained is None and (mapped or run_settings(checkpoint) is None):
         trained = load_trained(checkpoint, settings.get("trust", ()))
-    run = Run.begin(settings, source, trained)
+    run = Run.begin(settings, source, trained, trains=False)
     with machine_faults(run.folder, run.data):
         run.test(run.trainer([]), checkpoint)
 
@@ -102,6 +102,8 @@ class Run:
         settings: Settings,
         source: SettingsFile | None,
         trained: TrainedNetwork | None = None,
+        *,
+        trains: bool = True,
     ) -> Run:
         """Build the objects, and write the settings to the run's folder.
 
@@ -109,6 +111,7 @@ class Run:
             settings: Of the run.
             source: The file they come from.
             trained: Network to evaluate; None to make it from the settings.
+            trains: False if the task is only evaluated, see `build`.
         """
         folder = Path(HydraConfig.get().runtime.output_dir)
         lightning.seed_everything(
@@ -116,7 +119,7 @@ class Run:
         )
         notes: list[str] = []
         if trained is None:
-            data, task = build(settings, source)
+            data, task = build(settings, source, trains=trains)
         else:
             data, task, notes = build_trained(settings, trained, source)
         kept = {n: value for n, value in settings.items() if n not in ("choices", "trust")}

@@ -17,7 +17,7 @@ from tangent_train.cli.compose import config_folder, quoted
 from tangent_train.cli.settings import Trust, typed
 from tangent_train.errors import DataError, SettingError
 from tangent_train.registry import SettingsFile, Text, check_fields
-from tangent_train.setting_rules import OF_THIS_MACHINE, flat_settings, from_file
+from tangent_train.setting_rules import from_file
 
 _SECTIONS = ("data", "representation", "network", "task", "optimizer", "scheduler", "trainer")
 GROUPS = ("experiment", *_SECTIONS)
@@ -84,25 +84,29 @@ class StoredRun:
         of_run |= check_fields(self.path, self.config, sections, _EXPECTED)
         settings = dict(said)
         settings |= {name: value for name, value in of_run.items() if name not in own}
+        local: set[str] = set()
         for name in sections.keys() - own:
             if settings[name] is not None:
-                settings[name] = self._section(name, said.get(name) or {}, own)
+                settings[name], names = self._section(name, said.get(name) or {}, own)
+                local |= names
         for name in own:
             _lay(settings, said, name.split("."))
         if "data" in own:
             settings["data"] |= self._of_the_network(settings["data"], own)
         trust = typed(Trust, said).trust
-        local = {n for n, value in flat_settings(self.config) if not from_file(n, value)}
-        return settings, SettingsFile(self.path, trust, own.union(local, OF_THIS_MACHINE))
+        return settings, SettingsFile(self.path, trust, own | local)
 
-    def _section(self, name: str, here: Mapping[str, Any], own: set[str]) -> dict[str, Any]:
-        """A section of the file, with machine-specific settings from the user's own config."""
+    def _section(
+        self, name: str, here: Mapping[str, Any], own: set[str]
+    ) -> tuple[dict[str, Any], set[str]]:
+        """A section of the file with machine-specific settings of the user, and their names."""
         theirs = self.config[name]
         names = {*theirs, *here}
         local = {n for n in names if not from_file(f"{name}.{n}", theirs.get(n))}
         section = {n: v for n, v in theirs.items() if n not in local}
-        if here.get("_target_") == theirs.get("_target_"):
-            section |= {n: v for n, v in here.items() if n in local}
+        same = here.get("_target_") == theirs.get("_target_")
+        of_user = {n: v for n, v in here.items() if n in local and same}
+        section |= of_user
         for n in sorted(local & {"root", "mask"} if name == "data" else ()):
             if f"data.{n}" not in own and section.get(n) != theirs.get(n):
                 raise SettingError(
@@ -111,7 +115,7 @@ class StoredRun:
                     expected="that of the run on this machine",
                     remedy=f"The run had data.{n}={theirs.get(n)!r}: add that if it is right here.",
                 )
-        return section
+        return section, {f"{name}.{n}" for n in of_user}
 
     def _of_the_network(self, data: Mapping[str, Any], own: set[str]) -> dict[str, Any]:
         """Settings tied to the network, not to the data: its test fold and its inputs."""

@@ -42,7 +42,8 @@ def train(settings: Settings, source: SettingsFile | None = None) -> float | Non
     resumed = start = None
     if settings["resume"] is not None:
         resumed = Path(settings["resume"]) / "checkpoints" / "last.ckpt"
-        _check_resumed(settings, **read_checkpoint(resumed, ("config", "epoch")))
+        content = read_checkpoint(resumed, ("config", "epoch", "state_dict"))
+        _check_resumed(settings, content["config"], content["epoch"])
     elif settings["init_from"] is not None:
         start = Path(settings["init_from"])
         settings, source = begin_from(start, settings)

@@ -12,10 +12,13 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from tangent_train.checkpoints.trained import (
+    CHECKSUM_KEY,
     METADATA_KEY,
     TrainedNetwork,
     load_trained,
     metadata_json,
+    tensor_checksum,
+    write_metadata,
 )
 from tangent_train.errors import SettingError
 from tangent_train.files import atomic_path
@@ -147,15 +150,16 @@ def _write_onnx(trained: TrainedNetwork, path: Path, opset: int | None) -> None:
         raise SettingError("opset", found=opset, expected=f"{written} for this network")
     groups = [[k] for k in range(trained.network.num_scores)] if trained.groups else None
     written_as = replace(trained, settings=None, groups=groups)  # the graph adds them up
-    program.model.metadata_props[METADATA_KEY] = metadata_json(written_as)
     program.save(path, external_data=False)
+    write_metadata(path, path, metadata_json(written_as))
 
 
 def _write_safetensors(trained: TrainedNetwork, path: Path) -> None:
     # Copies: the format knows neither tensors that share memory nor other memory formats.
     tensors = trained.network.network.state_dict()
     tensors = {name: tensor.contiguous().clone() for name, tensor in tensors.items()}
-    save_file(tensors, path, metadata={"format": "pt", METADATA_KEY: metadata_json(trained)})
+    described = {METADATA_KEY: metadata_json(trained), CHECKSUM_KEY: tensor_checksum(tensors)}
+    save_file(tensors, path, metadata={"format": "pt", **described})
     path.chmod(0o644)  # it was replaced by one that only its owner may read
 
 

@@ -148,6 +148,7 @@ def test_tangent_images_have_the_angular_resolution_of_the_photos(
             "^tangent-import: class names of the network: found 3, for 4 scores; expected one for",
         ),
         (("classes=holes.json",), r"holes\.json: found .*; expected a JSON list"),
+        (("classes=escapes.json",), r"escapes\.json: found .*; expected a JSON list"),
         (("normalization=null",), "normalization: found none; expected imagenet, unit, symmetric"),
         (("nothing=[sky]",), "nothing: found sky; expected of background, dark"),
         (("nothing=[background,dark,green,bright]",), "nothing: found all classes"),
@@ -170,6 +171,7 @@ def test_what_does_not_fit_is_one_clear_message(
 ) -> None:
     (here / "three.json").write_text(json.dumps(NAMES[1:]))
     (here / "holes.json").write_text(json.dumps({"0": "wall", "2": "floor"}))
+    (here / "escapes.json").write_text(json.dumps([*NAMES[1:], "a\x1b[2J"]))
     before = set(here.iterdir())
     with pytest.raises(SystemExit, match=told):
         run("import", *OF_ONNX, "output=ours.onnx", *changes)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,16 @@ from tangent_train.registry import make
 from tangent_train.rendering.camera_files import read_cameras
 from tangent_train.results.record import load_record
 from tests.cli.tiny_runs import run_command
-from tests.security.attacks import attacks, json_attacks, places, replaced, sampled
+from tests.security.attacks import (
+    attacks,
+    json_attacks,
+    named_twice,
+    places,
+    places_of_arguments,
+    replaced,
+    sampled,
+    second_readings,
+)
 from tests.security.honest import composed
 from tests.security.watch import watched
 
@@ -40,20 +49,8 @@ def _nothing_happens(use: Callable[[Path], Any], path: Path, forbidden: Path, wh
 
 def test_in_a_checkpoint(content: dict[str, Any], forbidden: Path) -> None:
     """Every attack, and an attack at every place."""
-    honest, path = forbidden.parent / "honest.ckpt", forbidden.parent / "x.ckpt"
-    torch.save(content, honest)
-    stored = stored_run("evaluate", [f"checkpoint={honest}", "data.root=rooms"])
-    assert isinstance(stored, StoredRun)
-    said = composed(stored.arguments)
-
-    def evaluated(path: Path) -> None:
-        stored = stored_run("evaluate", [f"checkpoint={path}", "data.root=rooms"])
-        assert isinstance(stored, StoredRun)
-        settings, source = stored.settings(said)
-        build(settings, source)
-        make(settings["trainer"], "trainer", source, logger=False)
-
-    lighter = content | {"optimizer_states": [], "loops": {}}
+    path, lighter = forbidden.parent / "x.ckpt", _light(content)
+    evaluated = _evaluation(lighter, path)
     all_places = [("config", *place) for place in places(content["config"])]
     all_places += [(name,) for name in ("config", "class_names", "inputs", "kind", "state_dict")]
     all_places += [("normalization",), ("normalization", "mean")]
@@ -61,6 +58,58 @@ def test_in_a_checkpoint(content: dict[str, Any], forbidden: Path) -> None:
         torch.save(replaced(lighter, place, value), path)
         for use in (load_trained, evaluated, start_in):
             _nothing_happens(use, path, forbidden, (place, value))
+
+
+def _light(content: dict[str, Any]) -> dict[str, Any]:
+    """A checkpoint without what attacks leave alone."""
+    return content | {"optimizer_states": [], "loops": {}}
+
+
+def _evaluation(content: dict[str, Any], path: Path, *typed: str) -> Callable[[Path], None]:
+    """What ``tangent-evaluate checkpoint=<path> data.root=rooms …`` builds.
+
+    Args:
+        content: An honest checkpoint.
+        path: Where to write it.
+        *typed: Further settings that the user types.
+    """
+    torch.save(content, path)
+    typed = (f"checkpoint={path}", "data.root=rooms", *typed)
+    stored = stored_run("evaluate", typed)
+    assert isinstance(stored, StoredRun)
+    said = composed(stored.arguments)
+
+    def evaluated(path: Path) -> None:
+        stored = stored_run("evaluate", typed)
+        assert isinstance(stored, StoredRun)
+        settings, source = stored.settings(said)
+        build(settings, source)
+        make(settings["trainer"], "trainer", source, logger=False)
+
+    evaluated(path)
+    return evaluated
+
+
+def test_under_names_that_can_be_read_in_two_ways(content: dict[str, Any], forbidden: Path) -> None:
+    """At every argument of every section, beside settings that the user types."""
+    path, lighter = forbidden.parent / "x.ckpt", _light(content)
+    typed = ("data.fold=1", "trainer.max_epochs=1", "task.compile=null", "optimizer.lr=0.1")
+    evaluated = _evaluation(lighter, path, *typed)
+    at = list(places_of_arguments(content["config"]))
+    assert ("data", "mask") in at
+    for config in second_readings(content["config"], at, forbidden):
+        torch.save(lighter | {"config": config}, path)
+        for use in (load_trained, evaluated, start_in):
+            _nothing_happens(use, path, forbidden, config)
+
+
+def _named_twice(
+    content: Any, forbidden: Path, dump: Callable[[Any], str]
+) -> Iterator[tuple[Any, str]]:
+    """Every name of honest content twice, as text."""
+    for place in places(content):
+        for text in named_twice(content, place, f"{forbidden}/x", dump):
+            yield place, text
 
 
 def test_in_the_metadata_of_an_exported_network(run: Path, forbidden: Path) -> None:
@@ -78,6 +127,10 @@ def test_in_the_metadata_of_an_exported_network(run: Path, forbidden: Path) -> N
         for path in (one, other):
             _nothing_happens(load_trained, path, forbidden, (place, value))
         _nothing_happens(start_in, one, forbidden, (place, value))
+    for place, text in _named_twice(described, forbidden, json.dumps):
+        save_file(tensors, one, {METADATA_KEY: text})
+        with pytest.raises(DataError, match="is there twice"):
+            pytest.fail(f"{place}: {load_trained(one)}")
 
 
 def test_in_the_settings_of_a_run(run: Path, forbidden: Path) -> None:
@@ -87,6 +140,13 @@ def test_in_the_settings_of_a_run(run: Path, forbidden: Path) -> None:
     for place, value in sampled(list(json_attacks(forbidden)), list(places(settings))):
         (folder / "config.yaml").write_text(yaml.safe_dump(replaced(settings, place, value)))
         _nothing_happens(load_record, folder, forbidden, (place, value))
+    for place, text in _named_twice(settings, forbidden, yaml.safe_dump):
+        (folder / "config.yaml").write_text(text)
+        with pytest.raises(DataError, match=r"config\.yaml: found YAMLError: a name twice"):
+            pytest.fail(f"{place}: {load_record(folder)}")
+    (folder / "config.yaml").write_text(f"<<: {{name: x}}\n{yaml.safe_dump(settings)}")
+    with pytest.raises(DataError, match=r"config\.yaml: found ConstructorError"):
+        load_record(folder)
 
 
 def test_in_lists_of_cameras_and_results_of_keypoints(
@@ -107,3 +167,7 @@ def test_in_lists_of_cameras_and_results_of_keypoints(
         for place, value in sampled(list(json_attacks(forbidden)), list(places(honest))):
             path.write_text(json.dumps(replaced(honest, place, value)))
             _nothing_happens(use, path, forbidden, (path, place, value))
+        for place, text in _named_twice(honest, forbidden, json.dumps):
+            path.write_text(text)
+            with pytest.raises(DataError, match="is there twice"):
+                pytest.fail(f"{place}: {use(path)}")

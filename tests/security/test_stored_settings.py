@@ -21,8 +21,8 @@ from tangent_train.cli.build import build
 from tangent_train.cli.compose import config_folder
 from tangent_train.errors import DataError, SettingError
 from tangent_train.registry import SettingsFile, make
-from tests.cli.tiny_runs import run_command
-from tests.security.honest import settled, with_config
+from tests.cli.tiny_runs import results, run_command
+from tests.security.honest import SETTINGS, settled, with_config
 from tests.security.watch import CANARY, watched
 
 _FIRE = f"{CANARY}.fire"
@@ -31,7 +31,7 @@ _UNET = {"_target_": "models.UNet", "in_channels": 3, "num_classes": 13, "widths
 
 def test_what_concerns_this_machine_is_its_own(content: dict[str, Any], forbidden: Path) -> None:
     """Compiler options, folders and the number of processes."""
-    options = {"options": {"cpp.cxx": f"sh -c 'id > {forbidden}/x'"}}
+    options = {"options": {"cxx": f"sh -c 'id > {forbidden}/x'"}}
     config = content["config"]
     many = {"devices": 3, "strategy": "ddp", "num_nodes": 2, "accelerator": "gpu"}
     path = with_config(
@@ -152,6 +152,19 @@ def test_terminals_get_no_commands(content: dict[str, Any], run: Path, tmp_path:
     assert "\x07" not in shown
 
 
+@pytest.mark.parametrize("override", ["+network.inner={a.b:1}", "name='a\x1b[2J'"])
+def test_what_no_reader_takes_is_not_trained(
+    override: str, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A network of one's own takes any settings; its checkpoints must be readable."""
+    monkeypatch.chdir(run.parent)
+    own = ("data.root=rooms", f"network._target_={OWN}", "~network.widths", override)
+    refused = pytest.raises(SystemExit, match=r"config\.yaml: found .*settings\.n.*; expected ")
+    with refused:
+        run_command(monkeypatch, "train", *SETTINGS, *own, f"hydra.run.dir={tmp_path}/run")
+    assert not (tmp_path / "run" / "checkpoints").exists()
+
+
 def test_aliases_in_settings_are_not_followed(tmp_path: Path) -> None:
     lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x]"]
     lines += [f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]" for k in range(1, 12)]
@@ -194,6 +207,26 @@ def test_ones_own_network_is_trusted_by_its_name(content: dict[str, Any], tmp_pa
     path = _own(content, tmp_path / "x.ckpt", inner={"a": [{"_target_": _FIRE}]})
     with pytest.raises(DataError, match=rf"network\.inner\.a\.0\._target_={_FIRE}"):
         load_trained(path, [OWN])
+
+
+@pytest.mark.parametrize("section", ["optimizer", "scheduler"])
+def test_an_evaluation_needs_no_trust_for_what_only_trains(
+    section: str,
+    run: Path,
+    content: dict[str, Any],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(run.parent)
+    named = {section: {"_target_": _FIRE, "_partial_": True}}
+    path = with_config(content, tmp_path, **named)
+    said = (f"checkpoint={path}", "data.root=rooms", f"hydra.run.dir={tmp_path}/evaluated")
+    with watched(tmp_path / "forbidden") as happened:
+        run_command(monkeypatch, "evaluate", *said)
+    assert happened == []
+    assert results(tmp_path / "evaluated") == results(run)
+    with pytest.raises(SystemExit, match=rf"{section}\._target_={_FIRE}, which would be called"):
+        run_command(monkeypatch, "train", f"resume={path.parents[1]}", "data.root=rooms")
 
 
 def test_files_may_name_all_that_the_configs_name() -> None:

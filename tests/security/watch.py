@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.abc import MetaPathFinder
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,13 @@ def watched(forbidden: Path) -> Iterator[list[str]]:
         _watching.pop()
 
 
+class _Finder(MetaPathFinder):
+    """Sees `importlib.import_module` too, which raises no event."""
+
+    def find_spec(self, name: str, *_: Any) -> None:
+        _hook("import", (name,))
+
+
 def _hook(event: str, arguments: tuple[Any, ...]) -> None:
     for happened, forbidden in _watching:
         imported = event == "import" and any(m in str(arguments[0]) for m in _MODULES)
@@ -47,4 +55,5 @@ def _hook(event: str, arguments: tuple[Any, ...]) -> None:
             happened.append(f"{event} {str(arguments)[:200]}")
 
 
+sys.meta_path.insert(0, _Finder())
 sys.addaudithook(_hook)

@@ -14,7 +14,8 @@ from tangent_train.errors import DataError, SettingError
 from tangent_train.inference.photo_networks.network import PhotoNetwork, class_names_in
 from tangent_train.inference.photo_networks.saved import json_in, saved_folder, tensors_in
 from tangent_train.inference.quiet import quiet
-from tangent_train.registry import SettingsFile, make
+from tangent_train.offline import offline
+from tangent_train.registry import SettingsFile, is_text, make
 
 _TASK = "the task is semantic"
 _VOCABULARIES = ("tokenizer.json", "vocab.json")
@@ -38,6 +39,11 @@ def load(*, model: str | None, classes: Path | None, normalization: Any, **_: An
         SettingError: A setting is impossible, or transformers is missing.
     """
     folder = saved_folder(model)
+    with offline():
+        return _from_folder(folder, classes, normalization)
+
+
+def _from_folder(folder: Path, classes: Path | None, normalization: Any) -> PhotoNetwork:
     config = json_in(folder, "config.json")
     names = _names(config, folder / "config.json")
     processor = _processor(folder)
@@ -69,7 +75,7 @@ def _names(config: Mapping[str, Any], path: Path) -> list[str]:
     by_place = config.get("id2label")
     places = by_place if isinstance(by_place, Mapping) else {}
     names = [str(places.get(str(place), "")).strip() for place in range(len(places))]
-    if not names or not all(names):
+    if not names or not all(name and is_text(name) for name in names):
         raise DataError(
             path,
             found=f"id2label: {by_place}",

@@ -15,10 +15,10 @@ from datamodules.images.image_files import composed
 from models.onnx_network import OnnxNetwork
 from tangent_train.checkpoints.scores import Groups, Scores, size_multiple_of
 from tangent_train.checkpoints.trained import (
-    METADATA_KEY,
     TrainedNetwork,
     load_trained,
     metadata_json,
+    write_metadata,
 )
 from tangent_train.errors import SettingError
 from tangent_train.files import atomic_path
@@ -178,8 +178,6 @@ def _write_onnx(
     groups: Groups | None,
     seen: Mapping[str, Any],
 ) -> None:
-    import onnx
-
     inner: Any = network.network
     scores = Scores(inner, len(names) - 1, groups)
     fixed = inner.image_size
@@ -195,7 +193,4 @@ def _write_onnx(
         fixed_size=fixed,
         groups=groups,
     )
-    graph = onnx.load(inner.path)
-    entries = inner.metadata | {METADATA_KEY: metadata_json(described)}
-    onnx.helper.set_model_props(graph, entries)  # in place of what was there
-    onnx.save(graph, path)
+    write_metadata(inner.path, path, metadata_json(described))

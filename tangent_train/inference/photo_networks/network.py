@@ -12,6 +12,7 @@ from torch import nn
 from datamodules.core.inputs import Normalization
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import read_json
+from tangent_train.registry import is_text
 
 USUAL_SIZE = (512, 512)
 """Rows and columns of the photos, where nothing says what they were."""
@@ -57,6 +58,6 @@ def class_names_in(path: Path | None) -> tuple[str, ...]:
     names = content if isinstance(content, list) else []
     if isinstance(content, dict):
         names = [content.get(str(place)) for place in range(len(content))]
-    if not names or not all(isinstance(name, str) and name for name in names):
+    if not names or not all(name and is_text(name) for name in names):
         raise DataError(path, found=str(content)[:80], expected=expected)
     return tuple(names)

@@ -10,6 +10,7 @@ from models.pretrained import load_tensors
 from tangent_train.errors import DataError, SettingError
 from tangent_train.inference.photo_networks.network import USUAL_SIZE, PhotoNetwork, class_names_in
 from tangent_train.inference.photo_networks.saved import json_in, saved_folder, tensors_in
+from tangent_train.offline import offline
 from tangent_train.registry import SettingsFile, make
 
 _CLASS = "_model_class"
@@ -63,8 +64,9 @@ def _of_encoder(config: dict[str, Any]) -> Normalization:
 
     name, weights = config.get("encoder_name"), config.get("encoder_weights") or "imagenet"
     try:
-        given = encoders.get_preprocessing_params(name, weights)
-    except Exception as error:  # of the library, the hub, or the connection
+        with offline():  # a file named the encoder
+            given = encoders.get_preprocessing_params(name, weights)
+    except Exception as error:  # of the library, or because its file was never fetched
         found = f"none, and none known of {name} ({str(error).partition(chr(10))[0]})"
         raise SettingError("normalization", found=found, expected=_NORMALIZATION) from error
     if given["input_space"] != "RGB":

@@ -88,6 +88,21 @@ def test_the_first_class_is_the_unknown_one(
         data.prepare_data()
 
 
+def test_names_of_classes_are_lines_of_text(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Others would make every checkpoint of a training unreadable."""
+    _write(tmp_path, 2)
+    data = _toy(tmp_path)
+    monkeypatch.setattr(Toy, "class_names", ("unknown", "wall\x1b[2J"))
+    message = r"class_names of Toy: found 'wall.x1b\[2J'; expected names without control"
+    for use in (data.prepare_data, data.check_classes):
+        with pytest.raises(SettingError, match=message):
+            use()
+    problems, _ = data.check()
+    assert "expected names without control characters" in str(problems.listed())
+
+
 def test_a_data_set_without_images_is_refused(tmp_path: Path) -> None:
     data = _toy(tmp_path / "nowhere")
     with pytest.raises(DataError, match="nowhere: found no panoramas"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +12,17 @@ import huggingface_hub
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
+from transformers import quantizers
 
-from models import HuggingFaceNetwork
 from tangent_train.checkpoints.trained import load_trained
 from tangent_train.errors import DataError, SettingError
 from tangent_train.inference.photo_networks import huggingface, import_network
+from tangent_train.registry import SettingsFile, make
 from tests.inference.photo_networks import huggingface_networks as networks
+from tests.security.attacks import undeclared_settings
 from tests.security.watch import CANARY, watched
+
+_GPT2 = {"model_type": "timm_backbone", "backbone": "gpt2"}
 
 
 @pytest.fixture
@@ -93,6 +98,7 @@ def test_float16_weights_are_stored_as_float32(folder: Path) -> None:
     ("file", "changes", "message"),
     [
         ("config.json", {"id2label": {"0": "wall", "2": "floor"}}, "id2label.*name of every score"),
+        ("config.json", {"id2label": {"0": "wall", "1": "a\x1b[2J"}}, "name of every score"),
         (
             "config.json",
             {"id2label": {"0": "wall", "1": "floor"}},
@@ -180,26 +186,96 @@ def test_nothing_in_a_folder_or_checkpoint_runs_or_fetches(folder: Path, tmp_pat
         networks.imported(folder)
         content = torch.load(path, weights_only=True)
         inner = content["config"]["network"]["config"]
-        assert not {"auto_map", "backbone", "_attn_implementation"} & set(inner)
-        inner.update(backbone=CANARY, use_timm_backbone=False, attn_implementation=CANARY)
-        torch.save(content, path)
-        load_trained(path)
-    assert happened == []
-    for name, value in (("auto_map", {"AutoConfig": {"_target_": "os.system"}}), ("_x", 1)):
-        torch.save(content | {"config": _with(content["config"], name, value)}, path)
-        with pytest.raises(DataError, match=r"network\.config"):
-            load_trained(path)
-
-
-def test_backbones_are_not_looked_up_by_name(tmp_path: Path) -> None:
-    config: dict[str, Any] = {"model_type": "dpt", "is_hybrid": True, "backbone": CANARY}
-    config |= {"use_timm_backbone": False, "use_pretrained_backbone": True}
-    with watched(tmp_path) as happened, torch.device("meta"):
-        HuggingFaceNetwork(config, num_classes=2)
+        assert set(inner) <= {
+            "model_type",
+            *signature(networks.transformers.SegformerConfig).parameters,
+        }
     assert happened == []
 
 
-def _with(config: dict[str, Any], name: str, value: Any) -> dict[str, Any]:
-    """A config with another setting of transformers."""
-    network = config["network"]
-    return config | {"network": network | {"config": network["config"] | {name: value}}}
+@pytest.mark.parametrize("made", [networks.segformer, networks.mask2former])
+def test_settings_that_transformers_does_not_declare(
+    made: Callable[[], Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They are left out at the import of a folder, and refused in a checkpoint."""
+
+    def load_quantizer(*_: Any, **__: Any) -> None:
+        raise AssertionError("a quantizer")
+
+    monkeypatch.setattr(quantizers.auto.AutoHfQuantizer, "from_config", load_quantizer)
+    networks.saved(made, tmp_path / "net")
+    path = tmp_path / "net" / "config.json"
+    honest = json.loads(path.read_text())
+    checkpoint = tmp_path / "net" / "imported.ckpt"
+    networks.imported(tmp_path / "net")
+    content = torch.load(checkpoint, weights_only=True)
+    for attack in undeclared_settings(tmp_path / "forbidden"):
+        for place in ((), ("backbone_config",)):
+            if place and "backbone_config" not in honest:
+                continue
+            with watched(tmp_path / "forbidden") as happened:
+                path.write_text(json.dumps(_with(honest, place, attack)))
+                networks.imported(tmp_path / "net")
+                torch.save(
+                    _with(content, ("config", "network", "config", *place), attack), checkpoint
+                )
+                with pytest.raises(DataError, match=r"imported\.ckpt: found .*network\.config"):
+                    load_trained(checkpoint)
+            assert happened == [], attack
+
+
+def _with(content: Any, place: tuple[str, ...], more: dict[str, Any]) -> Any:
+    """A copy with more at a place."""
+    if not place:
+        return content | more
+    return content | {place[0]: _with(content[place[0]], place[1:], more)}
+
+
+@pytest.mark.parametrize(
+    "backbone",
+    [
+        _GPT2,
+        {"model_type": "timm_backbone", "backbone": f"hf-hub:{CANARY}/x"},
+        {"model_type": "timm_backbone", "backbone": f"local-dir:{CANARY}"},
+        # A class whose own network inside is not of the kind that it says.
+        {
+            "model_type": "sam3",
+            "vision_config": {"model_type": "timm_backbone", "backbone": "gpt2"},
+        },
+        {"model_type": "dpt", "backbone": "gpt2", "use_timm_backbone": False},
+        {"model_type": CANARY, "auto_map": {"AutoConfig": f"{CANARY}--x.Config"}},
+        {"backbone": "gpt2"},
+        "gpt2",
+    ],
+)
+def test_backbones_are_not_looked_up(backbone: Any, folder: Path, tmp_path: Path) -> None:
+    path = folder / "config.json"
+    networks.change_json(path, model_type="upernet", backbone_config=backbone)
+    config = {"model_type": "upernet", "backbone_config": backbone}
+    network = {"_target_": "models.HuggingFaceNetwork", "config": config, "num_classes": 2}
+    uses: tuple[Callable[[], Any], ...] = (
+        lambda: networks.imported(folder),
+        lambda: make(network, "network", SettingsFile(path)),
+    )
+    for use in uses:
+        refused = pytest.raises((DataError, SettingError), match="network")
+        with watched(tmp_path / "forbidden") as happened, torch.device("meta"), refused:
+            use()
+        assert happened == []
+
+
+def fetching() -> None:
+    """A network that needs a file of the hub, at an address where nobody answers."""
+    huggingface_hub.hf_hub_download("someone/net", "config.json", endpoint="http://127.0.0.1:9")
+
+
+def test_the_hub_is_offline_for_files_alone(tmp_path: Path) -> None:
+    section = {"_target_": f"{__name__}.fetching"}
+    file = SettingsFile(tmp_path / "x.ckpt", trust=[f"{__name__}.fetching"])
+    with watched(tmp_path / "forbidden") as happened:
+        with pytest.raises(DataError, match=r"x\.ckpt: found .*fetching cannot be made"):
+            make(section, "network", file)
+        assert happened == []
+        with pytest.raises(OSError):  # noqa: PT011 - any error of the connection
+            make(section, "network")
+        assert happened
