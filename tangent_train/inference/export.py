@@ -146,7 +146,8 @@ def _write_onnx(trained: TrainedNetwork, path: Path, opset: int | None) -> None:
     if opset not in (None, written):
         raise SettingError("opset", found=opset, expected=f"{written} for this network")
     groups = [[k] for k in range(trained.network.num_scores)] if trained.groups else None
-    written_as = replace(trained, settings=None, groups=groups)  # the graph adds them up
+    # The graph computes the logits and adds them up.
+    written_as = replace(trained, settings=None, groups=groups, score_kind="logits")
     program.model.metadata_props[METADATA_KEY] = metadata_json(written_as)
     program.save(path, external_data=False)
 
