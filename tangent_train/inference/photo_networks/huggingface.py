@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
 from datamodules.core.inputs import Normalization
@@ -96,8 +97,11 @@ def _names(config: Mapping[str, Any], path: Path) -> list[str]:
 def _processor(folder: Path) -> dict[str, Any]:
     """Settings of the image processor, with those of its class where the file has none.
 
-    ``do_flip_channel_order``, ``mean`` and ``std``, of images from 0 to 1, are what it does to five
-    images of one color. Texts are left out, for some of them are names of files to be fetched.
+    ``do_flip_channel_order``, ``mean`` and ``std``, of images from 0 to 1, are measured. Texts are
+    left out, for some of them are names of files to be fetched.
+
+    Raises:
+        DataError: There is no usable image processor.
     """
     path, content = _processor_file(folder)
     kind = _processor_class(content, folder)
@@ -106,34 +110,42 @@ def _processor(folder: Path) -> dict[str, Any]:
         for name, value in content.items()
         if name in kind.valid_kwargs.__annotations__ and not isinstance(value, str)
     }
-    as_they_are = {n: False for n in _NOT_OF_COLORS if n in kind.valid_kwargs.__annotations__}
-    colors = np.array([[0, 0, 0], [255, 0, 0], [0, 255, 0], [0, 0, 255], [51, 204, 102]], np.uint8)
-    images = [np.broadcast_to(color, (_SIDE, _SIDE, 3)) for color in colors]
     try:
         with quiet():
             made = kind(**known)
-            pixels = made(images, return_tensors="np", **as_they_are)["pixel_values"]
-        black, *primary, mixed = np.array(pixels, np.float64)[:, :, _SIDE // 2, _SIDE // 2]
-        gains = np.array(primary) - black  # (channel of the image, channel of the network)
-        order = np.abs(gains).argmax(axis=0)
-        gain = gains[order, [0, 1, 2]]
-        expected = black + gain * colors[-1][order] / _BYTE
-        affine = np.allclose(mixed, expected, rtol=1e-3, atol=1e-3 * np.abs(gain).max())
-        if order.tolist() not in ([0, 1, 2], [2, 1, 0]) or gain.min() <= 0 or not affine:
-            raise ArithmeticError(f"it makes {mixed.round(3)} of {colors[-1]}")
+            order, black, gain = _response(made)
     except Exception as error:  # whatever a processor raises about its settings
         raise DataError(
             path,
             found=f"no normalization in {content} ({str(error).partition(chr(10))[0]})",
             expected=f"settings of {kind.__name__} that multiply three channels",
         ) from error
-    back = np.argsort(order)
-    mean, std = (-black / gain)[back], (1 / gain)[back]
-    return made.to_dict() | {
-        "do_flip_channel_order": order[0] == 2,
-        "mean": [float(f"{value:.6g}") for value in mean],
-        "std": [float(f"{value:.6g}") for value in std],
-    }
+    numbers = {"mean": (-black / gain)[order], "std": (1 / gain)[order]}
+    rounded = {n: [float(f"{value:.6g}") for value in values] for n, values in numbers.items()}
+    settings: dict[str, Any] = made.to_dict()
+    return settings | rounded | {"do_flip_channel_order": bool(order[0])}
+
+
+def _response(processor: Any) -> tuple[NDArray[np.intp], NDArray[Any], NDArray[Any]]:
+    """The image's channel in each of the network's, its value for black and its range to 1.
+
+    Raises:
+        ArithmeticError: The processor does not multiply three channels, in their order or reversed.
+    """
+    known = processor.valid_kwargs.__annotations__
+    as_they_are = {name: False for name in _NOT_OF_COLORS if name in known}
+    colors = np.array([[0, 0, 0], [255, 0, 0], [0, 255, 0], [0, 0, 255], [51, 204, 102]], np.uint8)
+    images = [np.tile(color, (_SIDE, _SIDE, 1)) for color in colors]
+    seen = np.asarray(processor(images, return_tensors="np", **as_they_are)["pixel_values"])
+    black, *primary, mixed = seen[:, :, _SIDE // 2, _SIDE // 2].astype(np.float64)
+    ranges = np.array(primary) - black  # (channel of the image, channel of the network)
+    order = np.abs(ranges).argmax(axis=0)
+    gain = ranges[order, np.arange(len(order))]
+    error = np.abs(mixed - black - gain * colors[-1][order] / _BYTE).max()
+    in_order = order.tolist() in ([0, 1, 2], [2, 1, 0])
+    if not (in_order and np.isfinite(seen).all() and gain.min() > 0 and error < 1e-3 * gain.max()):
+        raise ArithmeticError(f"makes {mixed.round(3).tolist()} of {colors[-1].tolist()}")
+    return order, black, gain
 
 
 def _processor_file(folder: Path) -> tuple[Path, dict[str, Any]]:

@@ -158,8 +158,7 @@ def _groups(
     if not wins and (len(kept) == 1 or (nothing and kind == "labels")):
         raise SettingError(
             "nothing_wins",
-            found="false"
-            + (f", with {kept[0][1]} alone" if len(kept) == 1 else ", and label maps"),
+            found=f"false, for {kept[0][1]} alone" if len(kept) == 1 else "false, for label maps",
             expected="true: where nothing may not win, the network has no other class to give",
         )
     if wins:

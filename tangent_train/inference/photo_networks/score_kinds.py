@@ -63,7 +63,15 @@ def try_network(network: PhotoNetwork) -> tuple[ScoreKind, int]:
     if kind == "labels":
         found = np.unique(pixels.nan_to_num(_VOID).numpy())
         _check_labels(found.tolist(), len(network.score_names))
-    return (_OF_ONE_SCORE.get(kind, kind) if count == 1 else kind), count
+    kind = _OF_ONE_SCORE.get(kind, kind) if count == 1 else kind
+    least, most = pixels.amin().item(), pixels.amax().item()
+    if kind in ("sigmoid", "probabilities") and (least < 0 or (most > 1 and kind == "sigmoid")):
+        raise SettingError(
+            "scores",
+            found=f"{kind}, but numbers from {least:g} to {most:g}",
+            expected="probabilities from 0 to 1",
+        )
+    return kind, count
 
 
 def _images(network: PhotoNetwork) -> Iterator[Tensor]:
@@ -137,7 +145,7 @@ def _kind_of(scores: Tensor) -> ScoreKind:
             return "logits"
     raise SettingError(
         "scores",
-        found=f"{len(scores)} scores of a pixel, from {least:g} to {most:g}",
+        found=f"{len(scores)} per pixel, from {least:g} to {most:g}",
         expected=f"of a kind that can be recognized: {', '.join(get_args(ScoreKind))}",
         remedy="Name it: scores=logits for a network whose last step, a softmax or a sigmoid, is "
         "missing; scores=probabilities for one that ends in it.",
