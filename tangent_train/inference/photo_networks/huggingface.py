@@ -58,8 +58,6 @@ def load(*, model: str | None, classes: Path | None, normalization: Any, **_: An
     if config.get("model_type") == "oneformer":
         settings["task"] = _task(folder, config)
     network = make(settings, "network", SettingsFile(folder / "config.json"))
-    tensors, remarks = tensors_in(folder)
-    _load_tensors(network, tensors, folder)
     if len(names) == 1 and network.is_universal:
         raise DataError(
             folder / "config.json",
@@ -67,6 +65,8 @@ def load(*, model: str | None, classes: Path | None, normalization: Any, **_: An
             expected="two classes at least: masks say which class a pixel has, not whether it has "
             "one",
         )
+    tensors, remarks = tensors_in(folder)
+    _load_tensors(network, tensors, folder)
     settings["config"] = architecture(network.network.config.to_dict())
     given = None if normalization is None else Normalization.of(normalization, 3)
     return PhotoNetwork(

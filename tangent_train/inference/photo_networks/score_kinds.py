@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from itertools import islice
 from math import nan
 from typing import get_args
 
@@ -28,6 +27,9 @@ _ROUNDED = 2e-3
 _WILD = 30.0
 """Standard deviation of an image that drives scores far from 0 and 1."""
 
+_CERTAIN = ("logits", "sigmoid_logits")
+"""Kinds that no further image makes another one."""
+
 _OF_ONE_SCORE: dict[ScoreKind, ScoreKind] = {
     "logits": "sigmoid_logits",
     "probabilities": "sigmoid",
@@ -39,8 +41,8 @@ _OF_ONE_SCORE: dict[ScoreKind, ScoreKind] = {
 def try_network(network: PhotoNetwork) -> tuple[ScoreKind, int]:
     """The kind of a network's scores and their number K, 1 of label maps.
 
-    The kind is the one that the user or the network's library states. Else the network sees four
-    images, for one alone may mislead:
+    The kind is the one that the user or the network's library states. Else the network sees up to
+    four images, for one alone may mislead:
 
     * One score: whole numbers are labels, numbers from 0 to 1 come from a sigmoid, and numbers
       of both signs go into one.
@@ -54,17 +56,29 @@ def try_network(network: PhotoNetwork) -> tuple[ScoreKind, int]:
         SettingError: The network does not take RGB images of its size, or its scores fit no kind.
     """
     network.network.eval()
-    known = network.score_kind
-    images = islice(_images(network), None if known in (None, "labels") else 1)
-    tried = [_scores(network, image) for image in images]
-    count = tried[0].shape[1]
-    pixels = torch.cat([one.movedim(1, 0).flatten(1) for one in tried], dim=1)
-    kind = known or _kind_of(pixels)
+    kind = network.score_kind
+    pixels = torch.empty(0)
+    for image in _images(network):
+        scores = _scores(network, image).movedim(1, 0).flatten(1)
+        pixels = torch.cat([pixels, scores], dim=1) if len(pixels) else scores
+        if network.score_kind is None:
+            kind = _kind_of(pixels)
+        if kind in _CERTAIN or network.score_kind not in (None, "labels"):
+            break
+    count = len(pixels)
+    least, most = pixels.amin().item(), pixels.amax().item()
+    if kind is None:
+        raise SettingError(
+            "scores",
+            found=f"{count} per pixel, from {least:g} to {most:g}",
+            expected=f"of a kind that can be recognized: {', '.join(get_args(ScoreKind))}",
+            remedy="Name it: scores=logits for a network whose last step, a softmax or a sigmoid, "
+            "is missing; scores=probabilities for one that ends in it.",
+        )
     if kind == "labels":
         found = np.unique(pixels.nan_to_num(_VOID).numpy())
         _check_labels(found.tolist(), len(network.score_names))
     kind = _OF_ONE_SCORE.get(kind, kind) if count == 1 else kind
-    least, most = pixels.amin().item(), pixels.amax().item()
     if kind in ("sigmoid", "probabilities") and (least < 0 or (most > 1 and kind == "sigmoid")):
         raise SettingError(
             "scores",
@@ -121,8 +135,8 @@ def _check_labels(found: Sequence[float], named: int) -> None:
         )
 
 
-def _kind_of(scores: Tensor) -> ScoreKind:
-    """The kind of the scores ``(K, pixels)`` of several images."""
+def _kind_of(scores: Tensor) -> ScoreKind | None:
+    """The kind of the scores ``(K, pixels)`` of some images; None if they fit none."""
     whole = bool(((scores == scores.round()) | scores.isnan()).all())
     scores = scores[:, scores.isfinite().all(dim=0)]
     least, most = (scores.amin().item(), scores.amax().item()) if scores.numel() else (nan, nan)
@@ -143,10 +157,4 @@ def _kind_of(scores: Tensor) -> ScoreKind:
             return "sigmoid"
         if least < 0 or not whole:
             return "logits"
-    raise SettingError(
-        "scores",
-        found=f"{len(scores)} per pixel, from {least:g} to {most:g}",
-        expected=f"of a kind that can be recognized: {', '.join(get_args(ScoreKind))}",
-        remedy="Name it: scores=logits for a network whose last step, a softmax or a sigmoid, is "
-        "missing; scores=probabilities for one that ends in it.",
-    )
+    return None
