@@ -11,7 +11,7 @@ from torch.nn import functional
 from torch.nn.modules.batchnorm import _BatchNorm
 from torchvision.models import get_model, get_weight
 
-from models.pretrained import fetch_tensors, load_tensors, read_tensors
+from models.pretrained import fetch_tensors, load_tensors, tensors_for
 from models.stem import widen_stem
 from tangent_train.errors import SettingError
 from tangent_train.registry import registered
@@ -58,13 +58,13 @@ class FCNResNet(nn.Module):
         super().__init__()
         if depth not in (50, 101):
             raise SettingError("network.depth", found=depth, expected="50 or 101")
-        tensors = None if weights is None else _tensors(str(weights), depth)
         untrained = {"weights": None, "weights_backbone": None, "aux_loss": False}
         fcn: Any = get_model(f"fcn_resnet{depth}", num_classes=num_classes, **untrained)
         self.backbone: nn.Module = fcn.backbone
         self.classifier: nn.Module = fcn.classifier
         self.frozen_statistics = frozen_statistics
-        if tensors is not None:
+        if weights is not None:
+            tensors = _tensors(self, str(weights), depth)
             with_head = any(name.startswith(_HEAD) for name in tensors)
             load_tensors(self, tensors, weights, fresh=_LAST if with_head else _HEAD)
         widen_stem(self.backbone, in_channels)
@@ -86,12 +86,12 @@ class FCNResNet(nn.Module):
         return functional.interpolate(scores, images.shape[-2:], mode="bilinear")
 
 
-def _tensors(weights: str, depth: int) -> dict[str, Tensor]:
+def _tensors(network: nn.Module, weights: str, depth: int) -> dict[str, Tensor]:
     """The tensors that `weights` names, under the names of the FCN."""
     if weights in _PUBLISHED:
         tensors = fetch_tensors(get_weight(_PUBLISHED[weights].format(depth)))
     elif Path(weights).is_file():
-        tensors = read_tensors(Path(weights))
+        tensors = tensors_for(network, Path(weights))
     else:
         raise SettingError(
             "network.weights", found=weights, expected="null, coco, imagenet or an existing file"

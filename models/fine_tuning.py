@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from torch import Tensor, nn
 
-from models.pretrained import read_tensors
+from models.pretrained import tensors_for
 from models.stem import select_channels
 from tangent_train.errors import DataError, printable
 
@@ -52,9 +52,8 @@ def initialize(
 ) -> Origins:
     """Load matching tensors from a checkpoint, state dict or safetensors file, in place.
 
-    Names are compared without the prefix that most of the file's (``module.``, ``model.net.``, …)
-    or the network's have, and without ``network.``, so tensors move into and out of modules that
-    wrap a network, as `SphereContext` and `AuxiliaryHead` do. Filters of the first convolution for
+    Names are matched by `tensors_for`, so that tensors move into and out of modules that wrap a
+    network, as `SphereContext` and `AuxiliaryHead` do. Filters of the first convolution for
     input channels that the file does not know start at zero (paper, supplement, "Level 10
     parameters"), so RGB-D begins as RGB. Other tensors of another shape stay as they are: the last
     layer, for another number of classes.
@@ -111,23 +110,6 @@ def initialize(
     )
 
 
-def tensors_for(network: nn.Module, path: Path) -> dict[str, Tensor]:
-    """The tensors of a file by the names that a network has for them, see `initialize`.
-
-    Raises:
-        DataError: The file cannot be read.
-    """
-    inner_own = {_inner(name): name for name in network.state_dict()}
-    inner = {_inner(name): tensor for name, tensor in read_tensors(path).items()}
-    outside, inside = _prefix(inner, inner_own), _prefix(inner_own, inner)
-    renamed = {}
-    for name, tensor in inner.items():
-        if name.startswith(outside):
-            place = inside + name.removeprefix(outside)
-            renamed[inner_own.get(place, place)] = tensor
-    return renamed
-
-
 def _channel_names(
     given: Tensor, wanted: Tensor, channels: tuple[Sequence[str], Sequence[str]] | None
 ) -> tuple[Sequence[str], Sequence[str]]:
@@ -145,22 +127,6 @@ def _by_channel(given: Tensor, before: Sequence[str], now: Sequence[str]) -> tup
     notes = [f"starts at zero: {new}"] * bool(new) + [f"left out: {lost}"] * bool(lost)
     places = [before.index(name) if name in before else None for name in now]
     return select_channels(given, places), "; ".join(notes)
-
-
-def _inner(name: str) -> str:
-    """The name without the attributes by which modules of this package hold a network."""
-    return ".".join(part for part in name.split(".") if part != "network")
-
-
-def _prefix(names: Iterable[str], ends: Mapping[str, object]) -> str:
-    """The commonest prefix, of equally common ones the shortest, before one of these ends."""
-    counts: Counter[str] = Counter()
-    for name in names:
-        parts = name.split(".")
-        for k in range(len(parts)):
-            if ".".join(parts[k:]) in ends:
-                counts["".join(f"{part}." for part in parts[:k])] += 1
-    return min(counts, key=lambda prefix: (-counts[prefix], len(prefix)), default="")
 
 
 def _by_reason(reasons: Mapping[str, str]) -> Iterator[str]:

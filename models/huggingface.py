@@ -85,6 +85,7 @@ class HuggingFaceNetwork(nn.Module):
 
     Attributes:
         network: The network as transformers makes it.
+        is_universal: True if it gives masks with classes.
 
     Raises:
         SettingError: There is no such network, `config` holds more than its `architecture`, or
@@ -126,9 +127,10 @@ class HuggingFaceNetwork(nn.Module):
                 f"({', '.join(sorted(semantic | universal))})",
             )
         made = AutoConfig.for_model(**known, num_labels=num_classes)
-        auto: Any = AutoModelForUniversalSegmentation
-        if kind in semantic:
-            auto = AutoModelForSemanticSegmentation
+        self.is_universal = kind not in semantic
+        auto: Any = AutoModelForSemanticSegmentation
+        if self.is_universal:
+            auto = AutoModelForUniversalSegmentation
         self.network: Any = auto.from_config(made, trust_remote_code=False)
         self._bgr = bgr
         self._patch = _patch_size(made)

@@ -104,7 +104,7 @@ class OnnxNetwork(nn.Module):
         self.metadata: dict[str, str] = dict(self._session.get_modelmeta().custom_metadata_map)
 
     def forward(self, images: Float[Tensor, "batch channels height width"]) -> Tensor:
-        """Scores ``(B, K, h, w)`` of every pixel, or label maps ``(B, h, w)`` where it gives those.
+        """Scores ``(B, K, h, w)`` of every pixel as float32, label maps with K = 1.
 
         Raises:
             SettingError: The file was made for images of another shape, or gives something else.
@@ -139,11 +139,12 @@ class OnnxNetwork(nn.Module):
                 found="×".join(map(str, returned.shape)),
                 expected="scores (B, K, h, w) or (B, h, w, K), or labels (B, h, w)",
             )
-        if not scores.is_floating_point():
-            return functional.interpolate(scores.float(), size)[:, 0].long()
+        scores = scores.float()
         if scores.shape[2:] == size:
-            return scores.float()
-        return functional.interpolate(scores.float(), size, mode="bilinear")
+            return scores
+        if scores.shape[1] == 1 and bool(((scores == scores.round()) | scores.isnan()).all()):
+            return functional.interpolate(scores, size)  # whole numbers: labels
+        return functional.interpolate(scores, size, mode="bilinear")
 
 
 def graph_checksum(graph: Any) -> str:
@@ -152,7 +153,7 @@ def graph_checksum(graph: Any) -> str:
 
 
 def _channels_first(returned: Tensor, size: tuple[int, int], last: bool) -> Tensor | None:
-    """The output of a network as ``(B, K, h, w)``; labels with K = 1; None for anything else.
+    """The output of a network as ``(B, K, h, w)``, maps with K = 1; None for anything else.
 
     The axis of the classes is the one without which rows and columns have one stride.
 
@@ -161,7 +162,7 @@ def _channels_first(returned: Tensor, size: tuple[int, int], last: bool) -> Tens
         size: Rows and columns of the images.
         last: Whether the channels of the images are last, to decide where both axes could be.
     """
-    if returned.ndim == _LABEL_MAP and not returned.is_floating_point():
+    if returned.ndim == _LABEL_MAP:
         returned = returned[:, None]
     if returned.ndim != _LABEL_MAP + 1:
         return None

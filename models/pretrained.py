@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from http.client import HTTPException
 from pathlib import Path
 from typing import Any
 
+import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
@@ -18,12 +20,59 @@ from tangent_train.files import load_plain
 _PREFIX = "network."
 """Begins the names of the network's tensors in a checkpoint of this package."""
 
+_MOST_MAPPINGS = 100
+"""Mappings of a file that are looked through."""
+
 _COUNTER = "num_batches_tracked"
 """A buffer of batch normalization that older files lack and nothing here uses."""
 
 
-def read_tensors(path: Path) -> dict[str, Tensor]:
-    """Tensors of a state dict, or those under ``network.`` of a checkpoint, by name.
+def tensors_for(network: nn.Module, path: Path) -> dict[str, Tensor]:
+    """The tensors of a file by the names that a network has for them.
+
+    They are those of the mapping in the file (``state_dict``, ``model``, or all of it) of which
+    most names fit. Names are compared without the prefix that most of the file's (``module.``,
+    ``_orig_mod.``, ``model.net.``, …) or the network's have, and without ``network.``.
+
+    Args:
+        network: The network.
+        path: See `read_tensors`.
+
+    Raises:
+        DataError: The file cannot be read, or several mappings with other values fit equally well
+            and none is called ``state_dict``.
+    """
+    own = network.state_dict()
+    found = {place: _renamed(tensors, own) for place, tensors in read_tensors(path).items()}
+    fitting = {place: len(own.keys() & tensors.keys()) for place, tensors in found.items()}
+    best = [place for place, count in fitting.items() if count == max(fitting.values())]
+    if "state_dict" in best:
+        return found["state_dict"]
+    first = found[best[0]]
+    if fitting[best[0]] and any(_differ(first, found[place], own) for place in best):
+        raise DataError(
+            path,
+            found=f"several state dicts: {', '.join(filter(None, best))}",
+            expected="the tensors of one network, or of several one called state_dict",
+            remedy=f"Save one of them alone: torch.save(torch.load(…)['{best[-1]}'], 'state.pt').",
+        )
+    return first
+
+
+def _differ(tensors: Mapping[str, Tensor], others: Mapping[str, Tensor], names: Any) -> bool:
+    """Whether any of these tensors have other values."""
+    pairs = [(tensors.get(name), others.get(name)) for name in names]
+    return not all(
+        a is b or (a is not None and b is not None and a.dtype == b.dtype and torch.equal(a, b))
+        for a, b in pairs
+    )
+
+
+def read_tensors(path: Path) -> dict[str, dict[str, Tensor]]:
+    """The mappings with tensors in a file, by their place, such as ``state_dict``; the whole is "".
+
+    Names of tensors in mappings inside them are joined by dots. Those of ``state_dict`` are the
+    ones under ``network.`` if there are any, as in checkpoints of this package.
 
     Args:
         path: A file of `torch.save`, of which only tensors and plain values are unpickled, or a
@@ -41,17 +90,58 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
             raise DataError(path, found=found, expected=expected) from error
     else:
         content = load_plain(path, expected)
-    if isinstance(content, dict) and isinstance(content.get("state_dict"), dict):
-        inside = content["state_dict"]
-        ours = {n.removeprefix(_PREFIX): t for n, t in inside.items() if n.startswith(_PREFIX)}
-        content = ours or inside
-    if (
-        not isinstance(content, dict)
-        or not content
-        or not all(isinstance(tensor, Tensor) for tensor in content.values())
-    ):
-        raise DataError(path, found="something else", expected=expected)
-    return dict(content)
+    mappings = _mappings(content, set()) if isinstance(content, Mapping) else {}
+    if not mappings:
+        raise DataError(path, found="no named tensors", expected=expected)
+    whole = mappings.get("state_dict", {})
+    ours = {name: tensor for name, tensor in whole.items() if name.startswith(_PREFIX)}
+    return mappings | ({"state_dict": ours} if ours else {})
+
+
+def _mappings(content: Mapping[Any, Any], seen: set[int]) -> dict[str, dict[str, Tensor]]:
+    """The mappings with tensors in one, each once, itself as ""; see `read_tensors`."""
+    seen.add(id(content))
+    tensors: dict[str, Tensor] = {}
+    inside: dict[str, dict[str, Tensor]] = {}
+    for name, value in content.items():
+        if not isinstance(name, str):
+            continue
+        if isinstance(value, Tensor):
+            tensors[name] = value
+        elif isinstance(value, Mapping) and id(value) not in seen and len(seen) < _MOST_MAPPINGS:
+            found = _mappings(value, seen)
+            inside |= {f"{name}.{place}".rstrip("."): within for place, within in found.items()}
+            tensors |= {f"{name}.{inner}": tensor for inner, tensor in found.get("", {}).items()}
+    return ({"": tensors} if tensors else {}) | inside
+
+
+def _renamed(tensors: Mapping[str, Tensor], own: Iterable[str]) -> dict[str, Tensor]:
+    """Tensors by the names of a network, see `tensors_for`."""
+    inner_own = {_inner(name): name for name in own}
+    inner = {_inner(name): tensor for name, tensor in tensors.items()}
+    outside, inside = _prefix(inner, inner_own), _prefix(inner_own, inner)
+    renamed = {}
+    for name, tensor in inner.items():
+        if name.startswith(outside):
+            place = inside + name.removeprefix(outside)
+            renamed[inner_own.get(place, place)] = tensor
+    return renamed
+
+
+def _inner(name: str) -> str:
+    """The name without the attributes by which modules of this package hold a network."""
+    return ".".join(part for part in name.split(".") if part != "network")
+
+
+def _prefix(names: Iterable[str], ends: Mapping[str, object]) -> str:
+    """The commonest prefix, of equally common ones the shortest, before one of these ends."""
+    counts: Counter[str] = Counter()
+    for name in names:
+        parts = name.split(".")
+        for k in range(len(parts)):
+            if ".".join(parts[k:]) in ends:
+                counts["".join(f"{part}." for part in parts[:k])] += 1
+    return min(counts, key=lambda prefix: (-counts[prefix], len(prefix)), default="")
 
 
 def fetch_tensors(weights: WeightsEnum) -> dict[str, Tensor]:
@@ -69,9 +159,14 @@ def fetch_tensors(weights: WeightsEnum) -> dict[str, Tensor]:
             weights.url,
             found=f"no way to fetch it ({error})",
             expected="an internet connection the first time these weights are used",
-            remedy="Fetch the file on another machine and set network.weights to its path.",
+            remedy=f"Fetch it on another machine and save it as {_cached(weights.url)}.",
         ) from error
     return dict(tensors)
+
+
+def _cached(url: str) -> Path:
+    """The file in which torch looks for what it has fetched."""
+    return Path(torch.hub.get_dir(), "checkpoints", url.rpartition("/")[2])
 
 
 def load_tensors(

@@ -25,6 +25,11 @@ INPUTS: tuple[Input, ...] = get_args(Input)
 
 _COLORS = ("red", "green", "blue")
 
+_BYTE = 255
+
+_SHAPES = 6
+"""Channels of spheres of shapes, which are no colors."""
+
 MAX_DEPTH_M = 4.0
 """Depth is clipped to this (released code of the paper)."""
 
@@ -70,12 +75,14 @@ class Normalization:
             setting: For the message.
 
         Raises:
-            SettingError: It is something else, or has other channels.
+            SettingError: It is something else, has other channels, or is of RGB from 0 to 255.
         """
         if isinstance(given, str):
             given = _NAMED.get(given, given)
         if isinstance(given, Mapping) and set(given) == {"mean", "std"}:
             given = cls(given["mean"], given["std"])
+            if given.channels < _SHAPES:
+                _check_colors(given, setting)
         if not isinstance(given, cls):
             raise SettingError(
                 setting,
@@ -95,6 +102,22 @@ class Normalization:
     def channels(self) -> int:
         """3, 4 with depth, or 6 of shapes."""
         return len(self.mean)
+
+
+def _check_colors(given: Normalization, setting: str) -> None:
+    """Refuse numbers of RGB that are not of images from 0 to 1."""
+    mean, std = given.mean[:3], given.std[:3]
+    if min(mean) >= 0 and max(*mean, *std) <= 1:
+        return
+    numbers = [[float(f"{value / _BYTE:.4g}") for value in values] for values in (mean, std)]
+    raise SettingError(
+        setting,
+        found=f"mean {mean}, std {std} of red, green and blue",
+        expected="numbers from 0 to 1, for images from 0 to 1",
+        remedy="If they are of images from 0 to 255, divide all by 255: mean {}, std {}.".format(
+            *numbers
+        ),
+    )
 
 
 _NAMED = {

@@ -21,14 +21,28 @@ NORMALIZATION = dict[str, list[float]]
 GROUPS = list[list[int]] | None
 """The scores of a photo network that make each class, see `Groups`."""
 
+ScoreKind = Literal["logits", "probabilities", "sigmoid_logits", "sigmoid", "labels"]
+"""Output of a network.
+
+* `logits`: scores before a softmax over the K classes.
+* `probabilities`: scores after that softmax.
+* `sigmoid_logits`: scores before a sigmoid of every class. They get a further score of 0 in place
+  K, "none of the classes", which wins where no class has a probability above ½.
+* `sigmoid`: probabilities after that sigmoid, with the same place K.
+* `labels`: label maps ``(B, h, w)`` or ``(B, 1, h, w)``. Other values than 0 … K − 1, and NaN, are
+  in place K.
+"""
+
 _FIELDS = {
     "config": dict,
     "class_names": list[Text],
+    "fixed_size": list[int] | None,  # of imported networks
     "epoch": int | None,  # of runs: the last that has begun, from 0
     "groups": GROUPS,
     "inputs": INPUTS | None,  # None of shapes, whose six channels are all there is
     "kind": Literal["segmentation", "classification"],
     "normalization": NORMALIZATION,
+    "score_kind": ScoreKind | None,  # of imported networks; None: logits
     "state_dict": dict,
 }
 _EXPECTED = "a checkpoint written by tangent-train"
@@ -40,8 +54,8 @@ def read_checkpoint(path: Path, needed: Collection[str] = tuple(_FIELDS)) -> dic
     Args:
         path: The file; tensors are memory-mapped, and compared with their checksums if needed.
         needed: Which of its fields: ``config`` (the resolved settings of the run, plain values),
-            ``class_names``, ``epoch``, ``groups``, ``inputs``, ``kind``, ``normalization``,
-            ``state_dict``.
+            ``class_names``, ``epoch``, ``fixed_size``, ``groups``, ``inputs``, ``kind``,
+            ``normalization``, ``score_kind``, ``state_dict``.
 
     Raises:
         DataError: The file is missing, damaged, no checkpoint, or of another program.

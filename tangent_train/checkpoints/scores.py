@@ -11,7 +11,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from tangent_train.checkpoints.content import ScoreKind
 from tangent_train.errors import SettingError
+
+_LABEL_MAP = 3
+"""Dimensions of label maps without an axis of scores."""
 
 _CERTAIN = 20.0
 """Score of a pixel's class where the network gives nothing but labels."""
@@ -25,11 +29,12 @@ class Scores(nn.Module):
 
     Args:
         network: Maps images ``(B, C, h, w)`` to scores ``(B, K, h, w)``, to a dict with those under
-            ``"out"`` (torchvision's), or to label maps ``(B, h, w)`` of whole numbers.
+            ``"out"`` (torchvision's), or to label maps.
         num_classes: K.
         groups: Of every class the network's scores that make it up; scores in no group never win,
             nor do classes without scores.
         tile: Rows and columns of the only images that the network takes: larger ones are divided.
+        kind: What the network returns. Of kinds with a place K, groups name that place.
 
     Attributes:
         num_scores: Scores of a pixel: K, or the number of groups.
@@ -41,12 +46,14 @@ class Scores(nn.Module):
         num_classes: int,
         groups: Groups | None = None,
         tile: tuple[int, int] | None = None,
+        kind: ScoreKind = "logits",
     ) -> None:
         super().__init__()
         self.network = network
         self.num_scores = num_classes if groups is None else len(groups)
         self._groups = groups
         self._tile = tile
+        self._kind = kind
 
     def forward(self, images: Tensor, *arguments: Any, **settings: Any) -> Tensor:
         """Scores ``(B, num_scores, h, w)``.
@@ -66,12 +73,9 @@ class Scores(nn.Module):
 
     def _of(self, images: Tensor, *arguments: Any, **settings: Any) -> Tensor:
         returned = self.network(images, *arguments, **settings)
-        scores: Tensor = returned["out"] if isinstance(returned, dict) else returned
         groups = self._groups
         needed = self.num_scores if groups is None else 1 + max(k for g in groups for k in g)
-        if not scores.is_floating_point():  # label maps
-            scores = functional.one_hot(scores, max(needed, 1 + int(scores.max()))).movedim(-1, 1)
-            scores = scores * _CERTAIN
+        scores = as_logits(plain_scores(returned), self._kind, needed - 1)
         count = scores.shape[1]
         if count < needed or (groups is None and count > needed):
             raise SettingError(
@@ -82,6 +86,37 @@ class Scores(nn.Module):
         if groups is None:
             return scores
         return torch.cat([_sum(scores, group) for group in groups], dim=1)
+
+
+def plain_scores(returned: Any) -> Tensor:
+    """Scores or label maps that a network returned, which torchvision's keep in a dict."""
+    scores: Tensor = returned["out"] if isinstance(returned, dict) else returned
+    return scores
+
+
+def as_logits(scores: Tensor, kind: ScoreKind, num_labels: int) -> Tensor:
+    """Scores whose softmax is the probability of every class.
+
+    Args:
+        scores: Scores ``(B, K, h, w)`` or label maps.
+        kind: See `ScoreKind`.
+        num_labels: K of label maps.
+
+    Returns:
+        ``(B, K, h, w)``, or ``(B, K + 1, h, w)`` of the kinds with a place K.
+    """
+    if kind == "labels":
+        values = scores if scores.ndim == _LABEL_MAP else scores[:, 0]
+        known = (values >= 0) & (values < num_labels)  # never true of NaN
+        labels = torch.where(known, values.long(), num_labels)
+        return functional.one_hot(labels, num_labels + 1).movedim(-1, 1) * _CERTAIN
+    if kind == "probabilities":
+        return scores.clamp_min(torch.finfo(scores.dtype).tiny).log()
+    if kind == "logits":
+        return scores
+    if kind == "sigmoid":
+        scores = scores.logit(torch.finfo(scores.dtype).eps)
+    return torch.cat([scores, torch.zeros_like(scores[:, :1])], dim=1)
 
 
 def _sum(scores: Tensor, group: Sequence[int]) -> Tensor:

@@ -18,7 +18,13 @@ from torch import Tensor, nn
 
 from datamodules.core.inputs import Input, Normalization, channel_names
 from models.onnx_network import OnnxNetwork, graph_checksum
-from tangent_train.checkpoints.content import GROUPS, INPUTS, NORMALIZATION, read_checkpoint
+from tangent_train.checkpoints.content import (
+    GROUPS,
+    INPUTS,
+    NORMALIZATION,
+    ScoreKind,
+    read_checkpoint,
+)
 from tangent_train.checkpoints.scores import Groups, Scores, size_multiple_of
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import check_sum, crc32_of, load_plain, parse_json
@@ -62,6 +68,7 @@ class TrainedNetwork:
             where it takes others.
         groups: Scores of a photo network that make up every class, and in a last group those that
             mean nothing: where they win, the label is 0. None where every score is a class.
+        score_kind: Output of the network inside `network`.
         settings: The section of the config that makes it, complete; None where only the computation
             is known (ONNX).
         source: The file that `representation` and `settings` come from.
@@ -77,6 +84,7 @@ class TrainedNetwork:
     size_multiple: int = 1
     fixed_size: tuple[int, int] | None = None
     groups: Groups | None = None
+    score_kind: ScoreKind = "logits"
     settings: Mapping[str, Any] | None = None
     source: SettingsFile | None = None
 
@@ -101,6 +109,7 @@ class Start:
         inputs: Its inputs; None of shapes.
         normalization: Their ``mean`` and ``std``.
         groups: See `TrainedNetwork`.
+        score_kind: See `TrainedNetwork`.
         settings: The section of a config that makes it, for any data: null where the data decides
             (see `completed_settings`), and without other pretrained weights.
     """
@@ -109,6 +118,7 @@ class Start:
     inputs: tuple[Input, ...] | None
     normalization: Mapping[str, Sequence[float]]
     groups: Groups | None
+    score_kind: ScoreKind
     settings: dict[str, Any]
 
 
@@ -122,6 +132,7 @@ _KINDS = {
     "size_multiple": int,
     "fixed_size": list[int] | None,
     "groups": GROUPS,
+    "score_kind": ScoreKind,
     "settings": dict | None,
 }
 """Metadata of an exported network."""
@@ -201,7 +212,7 @@ def start_in(path: Path) -> Start | None:
             return None
         content = _described(path, text)
     else:
-        names = ("class_names", "config", "groups", "inputs", "normalization")
+        names = ("class_names", "config", "groups", "inputs", "normalization", "score_kind")
         plain = load_plain(path, f"{_TRAINED}, or a state dict", mmap=True, whole=False)
         if not isinstance(plain, Mapping) or "tangent_train_version" not in plain:
             return None
@@ -214,6 +225,7 @@ def start_in(path: Path) -> Start | None:
         inputs=tuple(content["inputs"] or ()) or None,
         normalization=content["normalization"],
         groups=content["groups"],
+        score_kind=content["score_kind"] or "logits",
         settings=_for_any_data(content["settings"]),
     )
 
@@ -284,7 +296,7 @@ def _from_checkpoint(source: SettingsFile) -> TrainedNetwork:
     config["settings"] = config.pop("network")
     names = ("class_names", "inputs", "normalization")
     described = config | {name: content[name] or [] for name in names}
-    described["groups"] = content["groups"]
+    described |= {"groups": content["groups"], "score_kind": content["score_kind"] or "logits"}
     tensors = {
         name.removeprefix(_PREFIX): tensor
         for name, tensor in content["state_dict"].items()
@@ -292,10 +304,14 @@ def _from_checkpoint(source: SettingsFile) -> TrainedNetwork:
     }
     size = make(config["representation"], "representation", source).image_size
     network = _network(described, tensors, source)
-    scores = Scores(network, len(described["class_names"]) - 1, described["groups"])
-    multiple = size_multiple_of(scores, len(channel_names(described["inputs"])))
-    described |= {"image_size": size, "size_multiple": multiple or 1}
-    return _trained(described | {"fixed_size": None if multiple else size}, network, source)
+    kind = described["score_kind"]
+    scores = Scores(network, len(described["class_names"]) - 1, described["groups"], kind=kind)
+    fixed, multiple = content["fixed_size"], None
+    if fixed is None:
+        multiple = size_multiple_of(scores, len(channel_names(described["inputs"])))
+        fixed = None if multiple else size
+    described |= {"image_size": size, "size_multiple": multiple or 1, "fixed_size": fixed}
+    return _trained(described, network, source)
 
 
 def _network(
@@ -328,8 +344,10 @@ def _trained(
     rows, columns = described["image_size"]
     names, groups = tuple(described["class_names"]), described["groups"]
     tile = None if fixed is None else (fixed[0], fixed[1])
+    if tile is not None and min(tile) < 1:
+        raise ValueError(f"fixed_size={fixed}")
     known = {
-        "network": Scores(network, len(names) - 1, groups, tile).eval(),
+        "network": Scores(network, len(names) - 1, groups, tile, described["score_kind"]).eval(),
         "class_names": names,
         "inputs": tuple(described["inputs"]),
         "normalization": Normalization(normalization.get("mean", ()), normalization.get("std", ())),

@@ -41,7 +41,7 @@ def begin_from(path: Path, settings: Settings) -> tuple[Settings, SettingsFile |
         Settings of the run, and the source of those that the file gave, if any.
 
     Raises:
-        DataError: It is an ONNX file.
+        DataError: It is an ONNX file, or its network returns no scores that can be trained.
     """
     if path.suffix.lower() == ".onnx":
         raise DataError(
@@ -59,6 +59,13 @@ def begin_from(path: Path, settings: Settings) -> tuple[Settings, SettingsFile |
     if any(map(_TYPED.match, hydra.overrides.task)) or _wraps(network, target):
         told.append(f"Network of the config: {network['_target_']}")
     else:
+        if start.score_kind in ("probabilities", "sigmoid", "labels"):
+            raise DataError(
+                path,
+                found=f"a network that returns {start.score_kind}",
+                expected="scores before a softmax or sigmoid, which the losses need",
+                remedy="Take the last step out of the network, and import it again.",
+            )
         changed["network"] = start.settings
         source = SettingsFile(path, typed(Trust, settings).trust, settings.keys() - {"network"})
         told.append(f"Network of {path}: {target} (another: network=…)")

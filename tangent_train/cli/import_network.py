@@ -13,6 +13,7 @@ from hydra.errors import MissingConfigException
 from omegaconf import OmegaConf
 from rich import get_console
 
+from tangent_train.checkpoints.content import ScoreKind
 from tangent_train.cli.say import say
 from tangent_train.cli.settings import check_new, typed
 from tangent_train.errors import SettingError, width_height
@@ -26,6 +27,15 @@ _LIBRARIES = ("torchvision", "huggingface", "smp", "onnx")
 """Each a file of `tangent_train.inference.photo_networks` with a function `load`."""
 
 
+_SAID: dict[ScoreKind, str] = {
+    "logits": "scores before a softmax",
+    "probabilities": "probabilities after a softmax",
+    "sigmoid_logits": "scores before a sigmoid, with ½ as the threshold",
+    "sigmoid": "probabilities after a sigmoid, with ½ as the threshold",
+    "labels": "label maps, of which other values are unknown",
+}
+
+
 @dataclass(frozen=True)
 class Settings:
     """See ``configs/import.yaml``; `normalization` may also be a mapping."""
@@ -37,6 +47,8 @@ class Settings:
     classes: Path | None
     nothing: tuple[str, ...]
     nothing_wins: bool
+    scores: ScoreKind | None
+    image_size: tuple[int, ...] | None
     fov: float
     level: int | None
     base_level: int | None
@@ -72,10 +84,23 @@ def import_network(config: Mapping[str, Any]) -> None:
             base_level=settings.base_level,
             nothing=settings.nothing,
             nothing_wins=settings.nothing_wins,
+            image_size=_rows_and_columns(settings.image_size),
+            score_kind=settings.scores,
         )
     say(_understood(output, trained, settings))
     for remark in network.remarks:
         say(remark)
+
+
+def _rows_and_columns(given: tuple[int, ...] | None) -> tuple[int, int] | None:
+    """A size of images; one number is that of a square."""
+    if given is None:
+        return None
+    if len(given) not in (1, 2) or min(given) < 1:
+        raise SettingError(
+            "image_size", found=list(given), expected="[rows,columns], or the side of a square"
+        )
+    return given[0], given[-1]
 
 
 def _load(settings: Settings, normalization: Any) -> PhotoNetwork:
@@ -113,6 +138,7 @@ def _understood(path: Path, trained: TrainedNetwork, settings: Settings) -> str:
     lines = [
         f"{path}: {path.stat().st_size / 1e6:.1f} MB",
         f"{len(names)} classes: {', '.join(names)}",
+        f"the network returns {_SAID[trained.score_kind]}",
         f"normalization of images from 0 to 1: mean {numbers[0]}, std {numbers[1]}",
         f"image size: {size}{multiple}",
         f"photos of {settings.fov:g}° → panoramas of level {trained.level} as "

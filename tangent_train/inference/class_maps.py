@@ -154,12 +154,19 @@ def map_classes(
             found=f"no class of {class_map.source or 'the map'} in a network of {', '.join(own)}",
             expected="a map whose source classes are the network's",
         )
+    if left and unmapped == "never" and trained.score_kind == "labels":
+        raise SettingError(
+            "unmapped",
+            found="never, for a network that returns labels",
+            expected="unknown: there is no second best class",
+        )
     scores = [[k for place in group for k in groups[place]] for group in places.values()]
     nothing = [k for group in groups[len(own) :] for k in group]
     if unmapped == "unknown":
         nothing += [k for place in left for k in groups[place]]
     scores += [nothing] if nothing else []
-    network = Scores(trained.network.network, len(targets), scores, trained.fixed_size).eval()
+    how = scores, trained.fixed_size, trained.score_kind
+    network = Scores(trained.network.network, len(targets), *how).eval()
     names = ("unknown", *targets)
     found = {str(target): [own[k] for k in group] for target, group in places.items()}
     return MappedNetwork(

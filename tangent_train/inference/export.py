@@ -149,7 +149,8 @@ def _write_onnx(trained: TrainedNetwork, path: Path, opset: int | None) -> None:
     if opset not in (None, written):
         raise SettingError("opset", found=opset, expected=f"{written} for this network")
     groups = [[k] for k in range(trained.network.num_scores)] if trained.groups else None
-    written_as = replace(trained, settings=None, groups=groups)  # the graph adds them up
+    # The graph computes the logits and adds them up.
+    written_as = replace(trained, settings=None, groups=groups, score_kind="logits")
     program.save(path, external_data=False)
     write_metadata(path, path, metadata_json(written_as))
 

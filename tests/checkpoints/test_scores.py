@@ -11,10 +11,10 @@ from tangent_train.errors import SettingError
 
 
 class LabelMaps(nn.Module):
-    """A network that says the class of a pixel, which is its red channel, and no scores."""
+    """A network that returns the class of a pixel, which is its red channel, and no scores."""
 
     def forward(self, images: Tensor) -> Tensor:
-        return images[:, 0].long()
+        return images[:, 0]
 
 
 @pytest.mark.parametrize(
@@ -29,12 +29,11 @@ def test_other_numbers_of_names_than_of_scores_are_refused(
 
 
 def test_label_maps_are_certain() -> None:
-    images = torch.tensor([0.0, 2.0, 1.0]).expand(1, 3, 2, 3)
-    scores = Scores(LabelMaps(), 3)(images)
-    assert scores.argmax(dim=1).tolist() == [[[0, 2, 1]] * 2]
+    """Other values are in the last group."""
+    images = torch.tensor([0.0, 2.0, 1.0, -1.0, 3.0, 255.0, torch.nan]).expand(1, 3, 2, 7)
+    scores = Scores(LabelMaps(), 3, [[0], [1], [2], [3]], kind="labels")(images)
+    assert scores.argmax(dim=1).tolist() == [[[0, 2, 1, 3, 3, 3, 3]] * 2]
     assert float(scores.softmax(dim=1).amax(dim=1).min()) > 0.999
-    with pytest.raises(SettingError, match="found 2, for 3 scores"):
-        Scores(LabelMaps(), 2)(images)
 
 
 @pytest.mark.parametrize("size", [(4, 6), (5, 6), (11, 13)])

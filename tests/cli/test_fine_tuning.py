@@ -29,16 +29,29 @@ IMAGENET = {"mean": [0.485, 0.456, 0.406], "std": [0.229, 0.224, 0.225]}
 UNET = {"_target_": "models.UNet", "in_channels": 3, "num_classes": 21, "widths": [4, 8, 12]}
 
 
-def _write_imported(path: Path, classes: int) -> Path:
+def _write_imported(path: Path, classes: int, **stated: Any) -> Path:
     """Write a network with random numbers as `tangent-import` does."""
     torch.manual_seed(3)
     settings = UNET | {"num_classes": classes}
     network = with_statistics(make(settings, "network"))
+    if stated:
+        network.head.weight.data.fill_(0)
+        network.head.bias.data.fill_(1 / classes)
     names = [f"thing {number}" for number in range(classes)]
     normalization = Normalization.of("imagenet", 3)
     photo = PhotoNetwork(network, settings, names, normalization, (64, 64))
-    import_network(photo, path, level=6)
+    import_network(photo, path, level=6, **stated)
     return path
+
+
+def test_a_network_that_returns_probabilities_is_not_trained(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = _write_imported(tmp_path / "net.ckpt", 21, score_kind="probabilities")
+    with pytest.raises(DataError, match=r"returns probabilities; expected scores before a softmax"):
+        _begun(monkeypatch, path)
+    settings, _ = _begun(monkeypatch, path, "network=unet_small")
+    assert settings["network"]["_target_"] == "models.UNet"
 
 
 @pytest.fixture

@@ -62,6 +62,75 @@ def test_an_onnx_file_labels_panoramas(
     assert set(np.unique(expected)) == ({0, 1, 2, 3} if wins else {1, 2, 3})
 
 
+@pytest.mark.parametrize("size", [(48, 96), (96, 48), (32, 64), (20, 50)])
+def test_a_file_for_images_that_are_not_square(
+    size: tuple[int, int], here: Path, run: Run, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Larger images are divided into tiles: labels are those of every pixel's own scores."""
+    write_linear(here / "net.onnx", WEIGHT, BIAS, shape=(1, 3, *size))
+    run("import", *OF_ONNX, "output=ours.onnx")
+    assert f"image size: {size[0]}×{size[1]}\n" in capsys.readouterr().out
+    trained = load_trained(here / "ours.onnx")
+    assert trained.fixed_size == size
+    assert trained.image_size == (max(size), max(size))
+    with pytest.raises(SystemExit, match=r"found 64×65; expected {}×{}, the".format(*size)):
+        run("import", *OF_ONNX, "output=other.onnx", "image_size=[64,65]")
+    colors = np.array([[0, 0, 0], [0, 255, 0], [255, 255, 255]], np.uint8)
+    rgb = colors[[0, 1, 2, 1]].repeat(32, axis=0)[None].repeat(64, axis=0)
+    mosaic = Predictor(trained, PanoramaViews(trained)).predict(InputImage(rgb))
+    labels = trained.labels(mosaic.labels())
+    expected = (rgb / 255 @ WEIGHT.T + BIAS).argmax(axis=-1) + 1
+    middle = np.arange(128).reshape(4, 32)[:, 10:22].ravel()  # away from the edges of the blocks
+    np.testing.assert_array_equal(labels[16:48][:, middle], expected[16:48][:, middle])
+
+
+def test_any_network_is_given_one_size_if_asked(here: Path, run: Run) -> None:
+    torch.manual_seed(0)
+    network = UNet(3, 4, (16, 32, 64, 128, 256)).eval()
+    torch.save({"model": {f"module.{n}": t for n, t in network.state_dict().items()}}, "state.pt")
+    given = ("network=unet_small", "weights=state.pt", "classes=classes.json", "normalization=unit")
+    run("import", *given, "image_size=[32,64]", "output=net.ckpt")
+    trained = load_trained(here / "net.ckpt")
+    assert (trained.fixed_size, trained.image_size) == ((32, 64), (64, 64))
+    images = torch.rand(1, 3, 64, 64)
+    with torch.no_grad():
+        expected = torch.cat([network(images[:, :, :32]), network(images[:, :, 32:])], dim=2)
+        torch.testing.assert_close(trained.network(images), expected)
+    for wrong in ("image_size=0", "image_size=[32,64,3]"):
+        with pytest.raises(SystemExit, match=r"size: found .*; expected \[rows,columns\], or"):
+            run("import", *given, wrong, "output=other.ckpt")
+
+
+def test_published_weights_without_internet(
+    here: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The remedy works: the file, fetched elsewhere, where torch looks for it."""
+    name = "lraspp_mobilenet_v3_large"
+    monkeypatch.setenv("TORCH_HOME", str(here / "torch"))
+    monkeypatch.setattr(torch.hub, "download_url_to_file", _no_internet)
+    given = ("network=torchvision", f"model={name}", "weights=DEFAULT", "output=net.ckpt")
+    with pytest.raises(SystemExit, match="Fetch it on another machine and save it as") as told:
+        run("import", *given)
+    file = Path(str(told.value).rpartition("save it as ")[2].removesuffix("."))
+    network = torchvision_models.get_model(name, weights=None, weights_backbone=None)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    torch.save(network.state_dict(), file)
+    run("import", *given)
+    assert load_trained(here / "net.ckpt").class_names[1] == "__background__"
+
+
+def _no_internet(*_: object, **__: object) -> None:
+    raise OSError("no route to host")
+
+
+def test_what_the_network_returns_can_be_said(here: Path, run: Run) -> None:
+    run("import", *OF_ONNX, "output=ours.onnx", "scores=sigmoid_logits")
+    trained = load_trained(here / "ours.onnx")
+    assert (trained.score_kind, trained.groups) == ("sigmoid_logits", [[0], [1], [2], [3], [4]])
+    with pytest.raises(SystemExit, match="scores: found softmax; expected"):
+        run("import", *OF_ONNX, "output=other.onnx", "scores=softmax")
+
+
 def test_a_network_of_a_config_and_its_export_compute_the_same(here: Path, run: Run) -> None:
     torch.manual_seed(0)
     network = UNet(3, 4, (16, 32, 64, 128, 256)).eval()

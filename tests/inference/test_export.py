@@ -84,6 +84,7 @@ def test_everything_known_of_a_network_comes_back(
         "size_multiple": 4,
         "fixed_size": None,
         "groups": None,
+        "score_kind": "logits",
         "settings": UNET if suffix == ".safetensors" else None,
         "tangent_train_version": version("tangent-train"),
     }

@@ -17,13 +17,14 @@ def write_onnx(
     *nodes: Any,
     shape: Sequence[Any] = ("n", 3, "h", "w"),
     kind: int = TensorProto.FLOAT,
+    returned: int | None = None,
     outputs: Sequence[str] = ("scores",),
     properties: dict[str, str] | None = None,
     **tensors: NDArray[Any],
 ) -> Path:
-    """A network of nodes from "images" to the outputs."""
+    """A network of nodes from "images" to the outputs, which are of the type `returned`."""
     images = helper.make_tensor_value_info("images", kind, shape)
-    last = TensorProto.INT64 if nodes[-1].op_type == "ArgMax" else kind
+    last = returned or (TensorProto.INT64 if nodes[-1].op_type == "ArgMax" else kind)
     values = [helper.make_tensor_value_info(name, last, None) for name in outputs]
     constants = [numpy_helper.from_array(tensor, name) for name, tensor in tensors.items()]
     graph = helper.make_graph(nodes, "theirs", [images], values, constants)
@@ -34,9 +35,13 @@ def write_onnx(
 
 
 def write_linear(
-    path: Path, weight: NDArray[np.float32], bias: NDArray[np.float32], **settings: Any
+    path: Path,
+    weight: NDArray[np.floating],
+    bias: NDArray[np.floating],
+    *after: Any,
+    **settings: Any,
 ) -> Path:
-    """Scores ``weight · pixel + bias`` of every pixel."""
-    outputs = settings.get("outputs", ("scores",))
+    """Scores ``weight · pixel + bias`` of every pixel, and nodes that begin with "linear"."""
+    outputs = ["linear"] if after else settings.get("outputs", ("scores",))
     nodes = [helper.make_node("Conv", ["images", "weight", "bias"], [name]) for name in outputs]
-    return write_onnx(path, *nodes, weight=weight[:, :, None, None], bias=bias, **settings)
+    return write_onnx(path, *nodes, *after, weight=weight[:, :, None, None], bias=bias, **settings)

@@ -68,7 +68,7 @@ def test_published_weights_come_from_the_cache_or_the_internet(
 
     with monkeypatch.context() as patch:
         patch.setattr(torch.hub, "download_url_to_file", refuse)
-        message = r"pth: found no way to fetch it .*no route.* set network\.weights to its path"
+        message = r"found no way to fetch it .*no route.* save it as .*hub/checkpoints/resnet50-"
         with pytest.raises(DataError, match=message):
             FCNResNet(3, 14, 50, weights="imagenet")
     torch.save(_resnet(published), tmp_path / "hub" / "checkpoints" / url.rpartition("/")[2])

@@ -12,6 +12,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from models import AuxiliaryHead, SphereContext, initialize
+from models.pretrained import load_tensors, tensors_for
 from tangent_train.errors import DataError
 from tests.models.sphere_networks import ATTENTION, STAGE, awake, small_unet
 
@@ -60,6 +61,69 @@ def test_any_file_gives_the_same_network(suffix: str, form: dict[str, Any], tmp_
     assert not origins.adapted
     assert not origins.fresh
     assert not origins.unused
+
+
+@pytest.mark.parametrize(
+    "wrapped",
+    [
+        lambda tensors: {"model": tensors, "epoch": 3, "best": torch.tensor(0.5)},
+        lambda tensors: {"model_state_dict": tensors, "optimizer_state_dict": {"state": {}}},
+        lambda tensors: {"checkpoint": {"net": _named("module._orig_mod.", tensors)}},
+        lambda tensors: {"meta": {"classes": ["a"]}, "state_dict": _named("backbone.", tensors)},
+        lambda tensors: {"state_dict": _named("model.", tensors) | {"loss.weight": torch.ones(2)}},
+        lambda tensors: {"state_dict": tensors, "state_dict_ema": _changed(tensors)},
+        lambda tensors: {"model": tensors, "ema": dict(tensors)},
+        lambda tensors: {"model": tensors, "optimizer": {"state": {0: {"exp_avg": torch.ones(3)}}}},
+        lambda tensors: {"first": _part(tensors, "01"), "rest": _part(tensors, "23")},
+        lambda tensors: tensors | {"nothing": None},
+        lambda tensors: {name: nn.Parameter(t) for name, t in tensors.items() if t.ndim},
+    ],
+)
+@pytest.mark.parametrize("strict", [False, True])
+def test_state_dicts_are_found_in_what_people_save(
+    wrapped: Any, strict: bool, tmp_path: Path
+) -> None:
+    other, network = _network(), _network()
+    tensors = other.state_dict()
+    content = wrapped(tensors)
+    if "first" in content:
+        other = nn.ModuleDict({"first": other[:2], "rest": other[2:]})  # type: ignore[index]
+        network = nn.ModuleDict({"first": network[:2], "rest": network[2:]})  # type: ignore[index]
+    torch.save(content, tmp_path / "x.pt")
+    if strict:
+        load_tensors(network, tensors_for(network, tmp_path / "x.pt"), "x.pt")
+    else:
+        assert not initialize(network, tmp_path / "x.pt").unused
+    for name, parameter in other.named_parameters():
+        assert torch.equal(network.get_parameter(name), parameter)
+
+
+def _named(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    return {prefix + name: tensor for name, tensor in tensors.items()}
+
+
+def _changed(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    return {name: tensor + 1 for name, tensor in tensors.items()}
+
+
+def _part(tensors: dict[str, Tensor], layers: str) -> dict[str, Tensor]:
+    return {name: tensor for name, tensor in tensors.items() if name[0] in layers}
+
+
+def test_two_state_dicts_of_equal_right_are_refused(tmp_path: Path) -> None:
+    network = _network()
+    tensors = network.state_dict()
+    torch.save({"model": tensors, "model_ema": _changed(tensors)}, tmp_path / "x.pt")
+    with pytest.raises(DataError, match=r"several state dicts: model, model_ema; .*Save one of"):
+        initialize(network, tmp_path / "x.pt")
+    endless: dict[str, Any] = {"a": {"b": torch.ones(1)}}
+    endless["a"]["again"] = endless
+    torch.save(endless, tmp_path / "endless.pt")
+    with pytest.raises(DataError, match=r"endless\.pt: found no tensor that fits, but a\.b"):
+        initialize(network, tmp_path / "endless.pt")
+    torch.save({"epoch": 3}, tmp_path / "none.pt")
+    with pytest.raises(DataError, match=r"none\.pt: found no named tensors; expected a state dict"):
+        initialize(network, tmp_path / "none.pt")
 
 
 def test_depth_starts_at_zero_and_other_classes_untrained(tmp_path: Path) -> None:

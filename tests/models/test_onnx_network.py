@@ -86,6 +86,21 @@ def test_channels_may_be_last(tmp_path: Path) -> None:
     torch.testing.assert_close(mixed(images), images)
 
 
+def test_as_many_classes_as_rows_and_columns(tmp_path: Path) -> None:
+    """The axis of the classes is where the channels of the images are."""
+    weight, bias = np.random.default_rng(0).normal(size=(4, 3)), np.zeros(4)
+    arrays = weight.astype(np.float32), bias.astype(np.float32)
+    images = torch.randn(2, 3, 4, 4)
+    expected = torch.einsum("kc,bchw->bkhw", torch.from_numpy(arrays[0]), images)
+    first = OnnxNetwork(write_linear(tmp_path / "first.onnx", *arrays))
+    torch.testing.assert_close(first(images), expected)
+    nodes = [
+        helper.make_node("MatMul", ["images", "weight"], ["scores"]),
+    ]
+    path = write_onnx(tmp_path / "last.onnx", *nodes, shape=("b", "h", "w", 3), weight=arrays[0].T)
+    torch.testing.assert_close(OnnxNetwork(path)(images), expected)
+
+
 def test_coarser_scores_are_interpolated_and_labels_repeated(tmp_path: Path) -> None:
     images = torch.randn(2, 3, 8, 12)
     pool = helper.make_node("AveragePool", ["images"], ["p"], kernel_shape=[4, 4], strides=[4, 4])
@@ -97,15 +112,16 @@ def test_coarser_scores_are_interpolated_and_labels_repeated(tmp_path: Path) -> 
     for keep in (0, 1):
         best = helper.make_node("ArgMax", ["p"], ["scores"], axis=1, keepdims=keep)
         labels = OnnxNetwork(write_onnx(tmp_path / f"labels{keep}.onnx", pool, best))(images)
-        assert labels.dtype == torch.int64
-        torch.testing.assert_close(labels[:, 1::4, 2::4], coarse.argmax(dim=1))
-        assert labels.shape == (2, 8, 12)
+        assert labels.shape == (2, 1, 8, 12)
+        torch.testing.assert_close(labels[:, 0, 1::4, 2::4], coarse.argmax(dim=1).float())
+        assert set(labels.unique().tolist()) <= {0, 1, 2}
 
 
 def test_files_of_a_fixed_batch_and_of_half_precision(tmp_path: Path) -> None:
-    images = torch.randn(5, 3, 4, 4)
-    fixed = OnnxNetwork(write_onnx(tmp_path / "fixed.onnx", IDENTITY, shape=(2, 3, 4, 4)))
-    torch.testing.assert_close(fixed(images), images)
+    images = torch.randn(7, 3, 4, 4)
+    for batch in (2, 4):  # the last call has 1 or 3 images
+        fixed = OnnxNetwork(write_onnx(tmp_path / "fixed.onnx", IDENTITY, shape=(batch, 3, 4, 4)))
+        torch.testing.assert_close(fixed(images), images)
     half = OnnxNetwork(write_onnx(tmp_path / "half.onnx", IDENTITY, kind=TensorProto.FLOAT16))
     assert half(images).dtype == torch.float32
     torch.testing.assert_close(half(images), images.half().float())

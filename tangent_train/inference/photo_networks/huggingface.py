@@ -6,12 +6,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
 from datamodules.core.inputs import Normalization
 from models.huggingface import HuggingFaceNetwork, architecture
-from tangent_train.errors import DataError, SettingError
-from tangent_train.inference.photo_networks.network import PhotoNetwork, class_names_in
+from tangent_train.errors import DataError
+from tangent_train.inference.photo_networks.network import USUAL_SIZE, PhotoNetwork, class_names_in
 from tangent_train.inference.photo_networks.saved import json_in, saved_folder, tensors_in
 from tangent_train.inference.quiet import quiet
 from tangent_train.offline import offline
@@ -20,6 +22,12 @@ from tangent_train.registry import SettingsFile, is_text, make
 _TASK = "the task is semantic"
 _VOCABULARIES = ("tokenizer.json", "vocab.json")
 _BYTE = 255
+_SIDE = 32
+"""Rows and columns of images that are given to an image processor."""
+
+_NOT_OF_COLORS = ("do_resize", "do_center_crop", "do_pad", "do_split_image")
+"""Settings of an image processor that change positions of pixels."""
+
 _LISTED = 4
 """Wrong tensors in a message."""
 
@@ -56,6 +64,13 @@ def _from_folder(folder: Path, classes: Path | None, normalization: Any) -> Phot
     if config.get("model_type") == "oneformer":
         settings["task"] = _task(folder, config)
     network = make(settings, "network", SettingsFile(folder / "config.json"))
+    if len(names) == 1 and network.is_universal:
+        raise DataError(
+            folder / "config.json",
+            found="masks of one class",
+            expected="two classes at least: masks say which class a pixel has, not whether it has "
+            "one",
+        )
     tensors, remarks = tensors_in(folder)
     _load_tensors(network, tensors, folder)
     settings["config"] = architecture(network.network.config.to_dict())
@@ -64,8 +79,9 @@ def _from_folder(folder: Path, classes: Path | None, normalization: Any) -> Phot
         network=network,
         settings=settings,
         score_names=names if classes is None else class_names_in(classes),
-        normalization=given or _normalization(processor, folder),
+        normalization=given or Normalization(processor["mean"], processor["std"]),
         image_size=_image_size(processor, folder),
+        score_kind="logits",
         remarks=remarks,
     )
 
@@ -85,50 +101,100 @@ def _names(config: Mapping[str, Any], path: Path) -> list[str]:
 
 
 def _processor(folder: Path) -> dict[str, Any]:
-    """Settings of the image processor; it is not made, for that may fetch files."""
-    own, shared = "preprocessor_config.json", "processor_config.json"
-    if (folder / shared).is_file():
-        inside = json_in(folder, shared).get("image_processor")
+    """Settings of the image processor, with those of its class where the file has none.
+
+    ``do_flip_channel_order``, ``mean`` and ``std``, of images from 0 to 1, are measured. Texts are
+    left out, for some of them are names of files to be fetched.
+
+    Raises:
+        DataError: There is no usable image processor.
+    """
+    path, content = _processor_file(folder)
+    kind = _processor_class(content, folder)
+    known = {
+        name: value
+        for name, value in content.items()
+        if name in kind.valid_kwargs.__annotations__ and not isinstance(value, str)
+    }
+    try:
+        with quiet():
+            made = kind(**known)
+            order, black, gain = _response(made)
+    except Exception as error:  # whatever a processor raises about its settings
+        raise DataError(
+            path,
+            found=f"no normalization in {content} ({str(error).partition(chr(10))[0]})",
+            expected=f"settings of {kind.__name__} that multiply three channels",
+        ) from error
+    numbers = {"mean": (-black / gain)[order], "std": (1 / gain)[order]}
+    rounded = {n: [float(f"{value:.6g}") for value in values] for n, values in numbers.items()}
+    settings: dict[str, Any] = made.to_dict()
+    return settings | rounded | {"do_flip_channel_order": bool(order[0])}
+
+
+def _response(processor: Any) -> tuple[NDArray[np.intp], NDArray[Any], NDArray[Any]]:
+    """The image's channel in each of the network's, its value for black and its range to 1.
+
+    Raises:
+        ArithmeticError: The processor does not multiply three channels, in their order or reversed.
+    """
+    known = processor.valid_kwargs.__annotations__
+    as_they_are = {name: False for name in _NOT_OF_COLORS if name in known}
+    colors = np.array([[0, 0, 0], [255, 0, 0], [0, 255, 0], [0, 0, 255], [51, 204, 102]], np.uint8)
+    images = [np.tile(color, (_SIDE, _SIDE, 1)) for color in colors]
+    seen = np.asarray(processor(images, return_tensors="np", **as_they_are)["pixel_values"])
+    black, *primary, mixed = seen[:, :, _SIDE // 2, _SIDE // 2].astype(np.float64)
+    ranges = np.array(primary) - black  # (channel of the image, channel of the network)
+    order = np.abs(ranges).argmax(axis=0)
+    gain = ranges[order, np.arange(len(order))]
+    error = np.abs(mixed - black - gain * colors[-1][order] / _BYTE).max()
+    in_order = order.tolist() in ([0, 1, 2], [2, 1, 0])
+    if not (in_order and np.isfinite(seen).all() and gain.min() > 0 and error < 1e-3 * gain.max()):
+        raise ArithmeticError(f"makes {mixed.round(3).tolist()} of {colors[-1].tolist()}")
+    return order, black, gain
+
+
+def _processor_file(folder: Path) -> tuple[Path, dict[str, Any]]:
+    own, shared = folder / "preprocessor_config.json", folder / "processor_config.json"
+    if shared.is_file():
+        inside = json_in(folder, shared.name).get("image_processor")
         if isinstance(inside, dict):
-            return inside
-    if not (folder / own).is_file():
+            return shared, inside
+    if not own.is_file():
         raise DataError(
             folder,
-            found=f"no {own}",
+            found=f"no {own.name}",
             expected="the image processor of the network: its normalization and image size",
             remedy="Copy that file from the model that this one was fine-tuned from.",
         )
-    return json_in(folder, own)
+    return own, json_in(folder, own.name)
 
 
-def _normalization(processor: Mapping[str, Any], folder: Path) -> Normalization:
-    """Of images from 0 to 1, what the image processor does with those from 0 to 255."""
-    mean, std = (0, 0, 0), (1, 1, 1)
-    try:
-        scale = _BYTE * (processor.get("rescale_factor", 1 / _BYTE))
-        if not processor.get("do_rescale", True):
-            scale = _BYTE
-        if processor.get("do_normalize", False):  # MobileViT's has a mean, and no such setting
-            mean, std = processor["image_mean"], processor["image_std"]
-        return Normalization.of(
-            {"mean": [value / scale for value in mean], "std": [value / scale for value in std]}, 3
-        )
-    except (ArithmeticError, KeyError, TypeError, SettingError) as error:
-        raise DataError(
-            folder / "preprocessor_config.json",
-            found=f"no normalization in {dict(processor)} ({error})",
-            expected="rescale_factor, image_mean and image_std of three channels",
-        ) from error
+def _processor_class(content: Mapping[str, Any], folder: Path) -> Any:
+    """The class that a file names, also under its older names, or else that of the network."""
+    import transformers  # every class of it is loaded when it is asked for
+    from transformers import IMAGE_PROCESSOR_MAPPING, AutoConfig
+    from transformers.image_processing_utils import BaseImageProcessor
+
+    older = str(content.get("feature_extractor_type", "")).replace("Feature", "Image")
+    name = str(content.get("image_processor_type") or older.replace("Extractor", "Processor"))
+    kind = getattr(transformers, name.removesuffix("Fast"), None)
+    if not (isinstance(kind, type) and issubclass(kind, BaseImageProcessor)):
+        model = AutoConfig.for_model(json_in(folder, "config.json")["model_type"])
+        kinds: Any = IMAGE_PROCESSOR_MAPPING[type(model)]
+        kind = kinds.get("torchvision") or kinds["pil"]
+    return kind
 
 
 def _image_size(processor: Mapping[str, Any], folder: Path) -> tuple[int, int]:
     """Rows and columns of the images that the image processor makes."""
-    given = processor.get("size")
+    given = processor.get("size") if processor.get("do_resize") else None
     if processor.get("do_center_crop") and processor.get("crop_size"):
         given = processor["crop_size"]
-    sides = given if isinstance(given, Mapping) else {"shortest_edge": given}
-    shortest = sides.get("shortest_edge", sides.get("longest_edge"))
-    rows, columns = sides.get("height", shortest), sides.get("width", shortest)
+    if given is None:
+        return USUAL_SIZE
+    shortest = given.get("shortest_edge", given.get("longest_edge"))
+    rows, columns = given.get("height", shortest), given.get("width", shortest)
     if not (isinstance(rows, int) and isinstance(columns, int) and min(rows, columns) > 0):
         raise DataError(
             folder / "preprocessor_config.json",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from datamodules.images.image_files import composed
-from models.onnx_network import OnnxNetwork
+from tangent_train.checkpoints.content import ScoreKind
 from tangent_train.checkpoints.scores import Groups, Scores, size_multiple_of
 from tangent_train.checkpoints.trained import (
     TrainedNetwork,
@@ -24,6 +24,8 @@ from tangent_train.errors import SettingError
 from tangent_train.files import atomic_path
 from tangent_train.geometry import vertex_resolution
 from tangent_train.inference.photo_networks.network import PhotoNetwork
+from tangent_train.inference.photo_networks.score_kinds import try_network
+from tangent_train.inference.views import check_size
 from tangent_train.registry import unregistered
 
 _TANGENT = "tangent_train.rendering.TangentRepresentation"
@@ -39,17 +41,22 @@ def import_network(
     base_level: int | None = None,
     nothing: Collection[str] = (),
     nothing_wins: bool = True,
+    image_size: tuple[int, int] | None = None,
+    score_kind: ScoreKind | None = None,
 ) -> TrainedNetwork:
-    """Write a photo network as a checkpoint, read it again and label one image with it.
+    """Try a photo network, write it as a checkpoint and read it again.
 
     Args:
-        network: The network.
+        network: The network, in evaluation mode afterwards.
         path: The file: ``.ckpt``, or ``.onnx`` of a network from such a file.
         fov_deg: Horizontal field of view of the photos it was trained on.
         level: Level s of the panoramas; None for the angular resolution of those photos.
         base_level: Base level b of the tangent images; None for the size of those photos.
         nothing: Names of scores that mean nothing, such as a background.
         nothing_wins: Whether these may win, which is then written as unknown (label 0).
+        image_size: The only rows and columns to give the network; None for the size that it says
+            and, where it takes others, any.
+        score_kind: What it returns; None for what its library says, or to find it by trying.
 
     Returns:
         The network as its file gives it back.
@@ -58,15 +65,38 @@ def import_network(
         SettingError: A setting is impossible, or the names do not fit the scores.
         NoRoomError: The disk is full.
     """
-    seen = representation_of(network.image_size, fov_deg, level, base_level)
-    names, groups = _groups(network.score_names, nothing, nothing_wins)
+    if image_size not in (None, network.image_size) and network.fixed_size:
+        raise SettingError(
+            "image_size",
+            found="{}×{}".format(*image_size),
+            expected="{}×{}, the only size that the file takes".format(*network.image_size),
+        )
+    if image_size is not None:
+        network = replace(network, image_size=image_size, fixed_size=True)
+    kind, count = try_network(replace(network, score_kind=score_kind or network.score_kind))
+    names, groups = _groups(network.score_names, kind, count, nothing, nothing_wins)
+    scores = Scores(network.network, len(names) - 1, groups, kind=kind)
+    multiple = None if network.fixed_size else size_multiple_of(scores, 3)
+    fixed = None if multiple else network.image_size
+    seen = representation_of(network.image_size, fov_deg, level, base_level, is_fixed=not multiple)
+    described = TrainedNetwork(
+        network=Scores(network.network, len(names) - 1, groups, fixed, kind),
+        class_names=tuple(names),
+        inputs=("rgb",),
+        normalization=network.normalization,
+        level=seen["level"],
+        representation=seen,
+        image_size=(seen["dim"], seen["dim"]),
+        size_multiple=multiple or 1,
+        fixed_size=fixed,
+        groups=groups,
+        score_kind=kind,
+        settings=network.settings,
+    )
+    check_size(described, described.image_size)
     with atomic_path(path) as temporary:
-        if isinstance(network.network, OnnxNetwork):
-            _write_onnx(network, temporary, names, groups, seen)
-        else:
-            _write_checkpoint(network, temporary, names, groups, seen)
+        (_write_onnx if network.settings is None else _write_checkpoint)(described, temporary)
         trained = load_trained(temporary, unregistered(network.settings))  # it was made from them
-        _use(trained, seen, network.image_size)
     source = None if trained.source is None else replace(trained.source, path=path)
     return replace(trained, source=source)
 
@@ -76,18 +106,22 @@ def representation_of(
     fov_deg: float,
     level: int | None = None,
     base_level: int | None = None,
+    *,
+    is_fixed: bool = False,
 ) -> dict[str, Any]:
     """Settings of the tangent images that look most like the photos a network was trained on.
 
     Level s has the focal length nearest to theirs, ``2^s / R_v(−1)`` pixels;
     base level b the largest images that are not larger than theirs. Their side is that of the
-    photos' shorter one: what is beyond the default side overlaps with other images.
+    photos' shorter one: what is beyond the default side overlaps with other images. Images of a
+    network that takes one size only have its longer side, and are divided where it is not square.
 
     Args:
         image_size: Rows and columns of the photos.
         fov_deg: Their horizontal field of view.
         level: Given level s.
         base_level: Given base level b.
+        is_fixed: True if the network takes images of this size only.
 
     Raises:
         SettingError: An impossible field of view, or levels that do not fit.
@@ -98,7 +132,7 @@ def representation_of(
         focal = image_size[1] / 2 / math.tan(math.radians(fov_deg) / 2)
         level = round(math.log2(focal * vertex_resolution(-1)))
         level = min(max(level, _LEVELS[0]), _LEVELS[1])
-    side = min(image_size)
+    side = max(image_size) if is_fixed else min(image_size)
     if base_level is None:
         base_level = max(0, math.ceil(level - math.log2(side)))
     dim = max(side, 2 ** (level - base_level))
@@ -106,91 +140,85 @@ def representation_of(
 
 
 def _groups(
-    score_names: Collection[str], nothing: Collection[str], wins: bool
+    score_names: Sequence[str],
+    kind: ScoreKind,
+    count: int,
+    nothing: Collection[str],
+    wins: bool,
 ) -> tuple[list[str], Groups | None]:
     """Names of the labels, and the scores of each; see `TrainedNetwork.groups`."""
     score_names, nothing = list(map(composed, score_names)), list(map(composed, nothing))
-    places = list(enumerate(score_names))
     missing = set(nothing) - set(score_names)
     if missing:
         raise SettingError(
             "nothing", found=", ".join(sorted(missing)), expected=f"of {', '.join(score_names)}"
         )
-    kept = [(k, name) for k, name in places if name not in nothing]
+    places, rest = _places(len(score_names), kind, count)
+    kept = [(k, name) for k, name in zip(places, score_names, strict=True) if name not in nothing]
     if not kept:
         raise SettingError("nothing", found="all classes", expected="some of them")
-    names = ["unknown", *(name for _, name in kept)]
-    if not nothing:
-        return names, None
-    empty = [[k for k, name in places if name in nothing]] if wins else []
-    return names, [[k] for k, _ in kept] + empty
-
-
-@torch.no_grad()
-def _use(trained: TrainedNetwork, seen: Mapping[str, Any], photos: tuple[int, int]) -> None:
-    """Label one image as the commands will: names that do not fit the scores are refused."""
-    try:
-        trained.network(torch.zeros(1, 3, seen["dim"], seen["dim"]))
-    except SettingError:
-        raise
-    except (RuntimeError, ValueError) as error:
+    if not wins and (len(kept) == 1 or (nothing and kind == "labels")):
         raise SettingError(
-            "level, base_level",
-            found=f"tangent images of {seen['dim']}×{seen['dim']}, which the network does not take "
-            f"({str(error).partition(chr(10))[0]})",
-            expected=f"its own images, of {'×'.join(map(str, photos))}",
-            remedy="Leave base_level null, or make it larger.",
-        ) from error
+            "nothing_wins",
+            found=f"false, for {kept[0][1]} alone" if len(kept) == 1 else "false, for label maps",
+            expected="true: where nothing may not win, the network has no other class to give",
+        )
+    if wins:
+        rest += [k for k, name in zip(places, score_names, strict=True) if name in nothing]
+    elif kind != "labels":
+        rest = []
+    names = ["unknown", *(name for _, name in kept)]
+    if kind in ("logits", "probabilities") and not nothing:
+        return names, None
+    return names, [[k] for k, _ in kept] + ([rest] if rest else [])
 
 
-def _write_checkpoint(
-    network: PhotoNetwork,
-    path: Path,
-    names: list[str],
-    groups: Groups | None,
-    seen: Mapping[str, Any],
-) -> None:
+def _places(named: int, kind: ScoreKind, count: int) -> tuple[list[int], list[int]]:
+    """Places of the named classes, and those of none of them, see `ScoreKind`.
+
+    One score, or labels of one name, are of a class and its background. The background has the
+    first of two names.
+    """
+    places = list(range(named))
+    if kind == "labels":
+        return ([1], [0, 2]) if named == 1 else (places, [named])
+    independent = kind in ("sigmoid_logits", "sigmoid")
+    if independent and (count, named) == (1, 2):
+        return [1, 0], []
+    if named != count:
+        raise SettingError(
+            "class names of the network",
+            found=f"{named}, for {count} score{'s' * (count > 1)}",
+            expected="one for every score"
+            + (", or two for one score, the background first" if count == 1 else ""),
+        )
+    return places, [count] if independent else []
+
+
+def _write_checkpoint(described: TrainedNetwork, path: Path) -> None:
     config = {
-        "network": network.settings,
-        "representation": dict(seen),
-        "level": seen["level"],
+        "network": described.settings,
+        "representation": dict(described.representation),
+        "level": described.level,
     }
-    mean, std = network.normalization.mean, network.normalization.std
-    tensors = network.network.state_dict()
+    mean, std = described.normalization.mean, described.normalization.std
+    tensors = described.network.state_dict()
     content = {
         "config": config,
         "kind": "segmentation",
-        "class_names": names,
-        "groups": groups,
+        "class_names": list(described.class_names),
+        "fixed_size": described.fixed_size and list(described.fixed_size),
+        "groups": described.groups,
         "inputs": ["rgb"],
         "normalization": {"mean": list(mean), "std": list(std)},
-        "state_dict": {f"network.{n}": t.contiguous().float() if t.is_floating_point() else t
-                       for n, t in tensors.items()},
+        "score_kind": described.score_kind,
+        "state_dict": {name: t.contiguous().float() if t.is_floating_point() else t
+                       for name, t in tensors.items()},
         "tangent_train_version": version("tangent-train"),
     }  # fmt: skip
     torch.save(content, path)
 
 
-def _write_onnx(
-    network: PhotoNetwork,
-    path: Path,
-    names: list[str],
-    groups: Groups | None,
-    seen: Mapping[str, Any],
-) -> None:
-    inner: Any = network.network
-    scores = Scores(inner, len(names) - 1, groups)
-    fixed = inner.image_size
-    described = TrainedNetwork(
-        network=scores,
-        class_names=tuple(names),
-        inputs=("rgb",),
-        normalization=network.normalization,
-        level=seen["level"],
-        representation=seen,
-        image_size=(seen["dim"], seen["dim"]),
-        size_multiple=1 if fixed else size_multiple_of(scores, 3) or 1,
-        fixed_size=fixed,
-        groups=groups,
-    )
+def _write_onnx(described: TrainedNetwork, path: Path) -> None:
+    inner: Any = described.network.network
     write_metadata(inner.path, path, metadata_json(described))

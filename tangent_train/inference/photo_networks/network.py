@@ -10,6 +10,7 @@ from typing import Any
 from torch import nn
 
 from datamodules.core.inputs import Normalization
+from tangent_train.checkpoints.content import ScoreKind
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import read_json
 from tangent_train.registry import is_text
@@ -29,6 +30,8 @@ class PhotoNetwork:
         score_names: Name of every score.
         normalization: Of the images.
         image_size: Rows and columns that it was trained for.
+        fixed_size: True if it takes images of this size only.
+        score_kind: Output of the network where its library says it; None to find it by trying.
         remarks: What else the user should know, a sentence each.
     """
 
@@ -36,7 +39,9 @@ class PhotoNetwork:
     settings: Mapping[str, Any] | None
     score_names: Sequence[str]
     normalization: Normalization
-    image_size: tuple[int, int]
+    image_size: tuple[int, int] = USUAL_SIZE
+    fixed_size: bool = False
+    score_kind: ScoreKind | None = None
     remarks: Sequence[str] = ()
 
 

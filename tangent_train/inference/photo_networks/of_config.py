@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from datamodules.core.inputs import Normalization
-from models.pretrained import load_tensors, read_tensors
+from models.pretrained import load_tensors, tensors_for
 from tangent_train.checkpoints.trained import completed_settings
 from tangent_train.errors import SettingError
-from tangent_train.inference.photo_networks.network import USUAL_SIZE, PhotoNetwork, class_names_in
+from tangent_train.inference.photo_networks.network import PhotoNetwork, class_names_in
 from tangent_train.registry import make
 
 
@@ -34,5 +34,5 @@ def load(
     names = class_names_in(classes)
     whole = completed_settings(settings, 3, len(names), restored=True)
     network = make(whole, "network")
-    load_tensors(network, read_tensors(Path(weights).expanduser()), weights)
-    return PhotoNetwork(network, whole, names, Normalization.of(normalization, 3), USUAL_SIZE)
+    load_tensors(network, tensors_for(network, Path(weights).expanduser()), weights)
+    return PhotoNetwork(network, whole, names, Normalization.of(normalization, 3))

@@ -32,4 +32,5 @@ def load(*, file: Path | None, classes: Path | None, normalization: Any, **_: An
         score_names=class_names_in(classes),
         normalization=Normalization.of(normalization, 3),
         image_size=network.image_size or USUAL_SIZE,
+        fixed_size=network.image_size is not None,
     )

@@ -79,7 +79,7 @@ def tensors_in(folder: Path) -> tuple[dict[str, Tensor], Sequence[str]]:
             remedy="Where you trust them, load them with from_pretrained(…) of their library and "
             "write them with save_pretrained(…), which makes safetensors.",
         )
-    tensors = {name: t for path in paths for name, t in read_tensors(path).items()}
+    tensors = {name: t for path in paths for name, t in read_tensors(path)[""].items()}
     floats = {name: t for name, t in tensors.items() if t.is_floating_point()}
     kinds = sorted({str(t.dtype).removeprefix("torch.") for t in floats.values()} - {"float32"})
     remarks = [f"weights as {', '.join(kinds)} are stored as float32"] if kinds else []

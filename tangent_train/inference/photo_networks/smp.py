@@ -8,12 +8,16 @@ from typing import Any
 from datamodules.core.inputs import Normalization
 from models.pretrained import load_tensors
 from tangent_train.errors import DataError, SettingError
-from tangent_train.inference.photo_networks.network import USUAL_SIZE, PhotoNetwork, class_names_in
+from tangent_train.inference.photo_networks.network import PhotoNetwork, class_names_in
 from tangent_train.inference.photo_networks.saved import json_in, saved_folder, tensors_in
 from tangent_train.offline import offline
 from tangent_train.registry import SettingsFile, make
 
 _CLASS = "_model_class"
+_LEFT_OUT = {"activation", "aux_params"}
+"""Settings of what follows the scores, and of a second output: classes of the whole image."""
+
+_HEAD_OF_IMAGES = "classification_head."
 _NORMALIZATION = "imagenet, unit, symmetric, or {mean: […], std: […]} of RGB from 0 to 1"
 
 
@@ -36,24 +40,25 @@ def load(*, model: str | None, classes: Path | None, normalization: Any, **_: An
         "_target_": f"segmentation_models_pytorch.{config.get(_CLASS)}",
         **{name: value for name, value in config.items() if not name.startswith("_")},
         "encoder_weights": None,
-        "activation": None,  # scores, not probabilities
+        **dict.fromkeys(_LEFT_OUT & config.keys()),
     }
-    network = make(settings, "network", SettingsFile(path))
-    if config.get("classes") == 1:
+    if config.get("in_channels", 3) != 3:
         raise DataError(
             path,
-            found="a network with one score, of one class or not",
-            expected="a score for every class, at least two",
+            found=f"in_channels: {config['in_channels']}",
+            expected="3: the commands give a photo network RGB images only",
         )
+    network = make(settings, "network", SettingsFile(path))
     given = None if normalization is None else Normalization.of(normalization, 3)
     tensors, remarks = tensors_in(folder)
+    tensors = {name: t for name, t in tensors.items() if not name.startswith(_HEAD_OF_IMAGES)}
     load_tensors(network, tensors, folder)
     return PhotoNetwork(
         network=network,
         settings=settings,
         score_names=class_names_in(classes),
         normalization=given or _of_encoder(config),
-        image_size=USUAL_SIZE,
+        score_kind="sigmoid_logits" if "sigmoid" in str(config.get("activation")) else "logits",
         remarks=remarks,
     )
 

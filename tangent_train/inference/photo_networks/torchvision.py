@@ -10,7 +10,7 @@ from torchvision import models
 from torchvision.models import WeightsEnum
 
 from datamodules.core.inputs import Normalization
-from models.pretrained import fetch_tensors, load_tensors, read_tensors
+from models.pretrained import fetch_tensors, load_tensors, tensors_for
 from tangent_train.errors import SettingError
 from tangent_train.inference.photo_networks.network import PhotoNetwork, class_names_in
 
@@ -44,8 +44,6 @@ def load(
     chosen: WeightsEnum = published["DEFAULT" if is_file else weights]
     preset: Any = chosen.transforms()
     names = tuple(chosen.meta["categories"]) if classes is None else class_names_in(classes)
-    tensors = read_tensors(Path(weights).expanduser()) if is_file else fetch_tensors(chosen)
-    tensors = {name: t for name, t in tensors.items() if not name.startswith(_AUXILIARY)}
     settings = {
         "_target_": f"torchvision.models.segmentation.{model}",
         "num_classes": len(names),
@@ -56,6 +54,9 @@ def load(
     if "aux_loss" in inspect.signature(builder).parameters:
         settings["aux_loss"] = False
     network = builder(**{name: value for name, value in settings.items() if name != "_target_"})
+    file = Path(weights).expanduser()
+    tensors = tensors_for(network, file) if is_file else fetch_tensors(chosen)
+    tensors = {name: t for name, t in tensors.items() if not name.startswith(_AUXILIARY)}
     load_tensors(network, tensors, weights)
     own = Normalization(preset.mean, preset.std)
     return PhotoNetwork(
@@ -64,4 +65,5 @@ def load(
         score_names=names,
         normalization=own if normalization is None else Normalization.of(normalization, 3),
         image_size=(preset.resize_size[0], preset.resize_size[0]),
+        score_kind="logits",
     )

@@ -48,6 +48,21 @@ CROPS: Any = PerspectiveRepresentation(level=5)
         (FolderPanoramas, {"test_fraction": 0}, "test_fraction"),
         (FolderPanoramas, {"split_seed": -1}, "split_seed"),
         (FolderPanoramas, {"normalization": {"mean": [0]}}, "normalization"),
+        (
+            FolderPanoramas,
+            {"normalization": {"mean": [123.7, 116.3, 103.5], "std": [58.4, 57.1, 57.4]}},
+            r"normalization: .*divide all by 255: mean \[0\.4851, 0\.4561, 0\.4059\], std ",
+        ),
+        (
+            FolderPanoramas,
+            {"normalization": {"mean": [0, 0, 0], "std": [255, 255, 255]}},
+            r"normalization: .*std \[1\.0, 1\.0, 1\.0\]",
+        ),
+        (
+            FolderPanoramas,
+            {"normalization": {"mean": [-0.5, 0, 0], "std": [1, 1, 1]}},
+            r"normalization: .*expected numbers from 0 to 1",
+        ),
         (Zind, {"inputs": ["rgb", "depth"]}, "inputs"),
         (Zind, {"doors": "open"}, "doors"),
         (Zind, {"test_fraction": 1.1}, "test_fraction"),

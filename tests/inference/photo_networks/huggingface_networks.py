@@ -126,6 +126,14 @@ def own_scores(network: Any, processor: Any, **arguments: Any) -> Tensor:
     return scores
 
 
+@torch.no_grad()
+def own_logits(network: Any, processor: Any) -> Tensor:
+    """``(K, h, w)`` logits of the library for the photo, enlarged as its pipeline does."""
+    pixels = processor(photo(), return_tensors="pt", do_resize=False)["pixel_values"]
+    logits = network(pixel_values=pixels)["logits"]
+    return torch.nn.functional.interpolate(logits, (_SIDE, _SIDE), mode="bilinear")[0]
+
+
 def imported(folder: Path, **settings: Any) -> TrainedNetwork:
     """The same network, as its checkpoint gives it back."""
     given: dict[str, Any] = {"classes": None, "normalization": None} | settings

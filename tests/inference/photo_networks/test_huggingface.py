@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import huggingface_hub
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
@@ -80,9 +81,94 @@ def test_a_network_for_images_of_one_size(tmp_path: Path) -> None:
     trained = networks.imported(tmp_path)
     assert trained.fixed_size == trained.image_size == (64, 64)
     network = huggingface.load(model=str(tmp_path), classes=None, normalization=None)
-    with pytest.raises(SettingError, match=r"256×256, which .*; expected its own images, of 64×64"):
-        import_network(network, tmp_path / "large.ckpt", level=8, base_level=0)
-    assert not (tmp_path / "large.ckpt").exists()
+    import_network(network, tmp_path / "large.ckpt", level=8, base_level=0)
+    large = load_trained(tmp_path / "large.ckpt")  # tangent images are divided
+    assert (large.fixed_size, large.image_size) == ((64, 64), (256, 256))
+    images = torch.randn(1, 3, 64, 128)
+    with torch.no_grad():
+        parts = [trained.network(images[..., :64]), trained.network(images[..., 64:])]
+        torch.testing.assert_close(large.network(images), torch.cat(parts, dim=-1))
+    with pytest.raises(SettingError, match="image_size: found images of 65×64, which the network"):
+        import_network(network, tmp_path / "large.ckpt", image_size=(65, 64))
+
+
+def test_one_label_is_of_a_class_and_its_background(tmp_path: Path) -> None:
+    """transformers trains such a network with a sigmoid."""
+
+    def one_class() -> networks.Made:
+        network, processor = networks.segformer()
+        config = network.config.__class__(**network.config.to_dict() | {"num_labels": 1})
+        return type(network)(config), processor
+
+    network, processor = networks.saved(one_class, tmp_path)
+    logits = networks.own_logits(network, processor)
+    with torch.no_grad():
+        network.decode_head.classifier.bias -= logits.mean()
+    network.save_pretrained(tmp_path)
+    logits = networks.own_logits(network, processor)
+    trained = networks.imported(tmp_path)
+    assert trained.class_names == ("unknown", "LABEL_0")
+    scores = networks.imported_scores(trained)
+    networks.assert_same(scores.softmax(dim=0)[:1], logits.sigmoid())
+    assert 0.2 < float((logits > 0).float().mean()) < 0.8
+    assert torch.equal(scores.argmax(dim=0) == 0, logits[0] > 0)
+    networks.saved(networks.mask2former, tmp_path / "masks")
+    config = {"id2label": {"0": "sky"}, "label2id": {"sky": 0}}
+    networks.change_json(tmp_path / "masks" / "config.json", **config)
+    with pytest.raises(DataError, match="found masks of one class; expected two classes at least"):
+        networks.imported(tmp_path / "masks")
+
+
+_PROCESSORS = (
+    *("Segformer", "Beit", "DPT", "MaskFormer", "Mask2Former", "MobileViT", "MobileNetV2", "Eomt"),
+    *("OneFormer", "ViT", "ConvNext", "EfficientNet"),
+)
+
+
+@pytest.mark.parametrize("name", _PROCESSORS)
+def test_an_image_processor_is_the_librarys_whatever_its_file_leaves_out(
+    name: str, tmp_path: Path
+) -> None:
+    """Of one colour, what transformers' processor makes."""
+    kind = getattr(networks.transformers, f"{name}ImageProcessor")
+    kind().save_pretrained(tmp_path)
+    path = tmp_path / "preprocessor_config.json"
+    whole = json.loads(path.read_text())
+    types = {"image_processor_type": f"{name}ImageProcessor"}
+    changes: list[dict[str, Any]] = [
+        {},
+        *({one: None} for one in whole if one not in types),
+        dict.fromkeys(whole) | types,
+        dict.fromkeys(whole) | {"feature_extractor_type": f"{name}FeatureExtractor"},
+        {"image_processor_type": f"{name}ImageProcessorFast"},
+        {"do_rescale": False},
+        {"do_normalize": False},
+        {"do_flip_channel_order": False},
+        {"do_flip_channel_order": True, "do_normalize": True, "image_mean": [0.1, 0.2, 0.3]},
+        {"rescale_factor": 1 / 128, "image_std": 0.3},
+    ]
+    color = np.array([200, 30, 90], np.uint8)
+    photo = np.tile(color, (32, 32, 1))
+    for change in changes:
+        content = {n: v for n, v in (whole | change).items() if v is not None}
+        path.write_text(json.dumps(content))
+        own = networks.transformers.AutoImageProcessor.from_pretrained(tmp_path)
+        sizes = {n: False for n in ("do_resize", "do_center_crop", "do_pad") if hasattr(own, n)}
+        pixels = np.asarray(own(photo, return_tensors="np", **sizes)["pixel_values"])
+        expected = np.moveaxis(pixels.reshape(-1, *pixels.shape[-3:])[0], 0, -1)[16, 16]
+        found = huggingface._processor(tmp_path)
+        ours = (color / 255 - found["mean"]) / found["std"]
+        ours = ours[::-1] if found["do_flip_channel_order"] else ours
+        np.testing.assert_allclose(ours, expected, rtol=1e-4, atol=1e-4, err_msg=f"{change}")
+
+
+def test_an_image_processor_without_a_type_is_that_of_the_network(folder: Path) -> None:
+    expected = networks.imported(folder)
+    networks.change_json(folder / "preprocessor_config.json", image_processor_type=None)
+    found = networks.imported(folder)
+    assert (found.normalization, found.image_size) == (expected.normalization, expected.image_size)
+    networks.change_json(folder / "preprocessor_config.json", do_resize=False)
+    assert networks.imported(folder).image_size == (512, 512)
 
 
 def test_float16_weights_are_stored_as_float32(folder: Path) -> None:

@@ -11,6 +11,7 @@ import segmentation_models_pytorch  # type: ignore[import-untyped]
 import torch
 from segmentation_models_pytorch import encoders
 
+from tangent_train.checkpoints.trained import load_trained
 from tangent_train.errors import DataError, SettingError
 from tangent_train.inference.photo_networks import PhotoNetwork, import_network, smp
 from tests.inference.photo_networks.huggingface_networks import change_json, imported_scores, photo
@@ -84,13 +85,58 @@ def test_a_file_names_an_encoder_and_nothing_is_fetched(folder: Path, tmp_path: 
     assert happened == []
 
 
+@torch.no_grad()
+@pytest.mark.parametrize("activation", [None, "sigmoid"])
+def test_a_second_output_and_one_score(activation: str | None, tmp_path: Path) -> None:
+    """A head for classes of the whole image is left out; the library's own threshold is ½."""
+    torch.manual_seed(0)
+    aux = {"classes": 2, "dropout": 0.1}
+    settings: dict[str, Any] = {"encoder_weights": None, "classes": 1, "aux_params": aux}
+    own = segmentation_models_pytorch.Unet("resnet18", activation=activation, **settings).eval()
+    own.segmentation_head[0].bias.fill_(-float(own(_pixels())[0].logit().mean()) if activation
+                                        else -float(own(_pixels())[0].mean()))  # fmt: skip
+    own.save_pretrained(tmp_path / "net")
+    (tmp_path / "classes.json").write_text(json.dumps(["sky"]))
+    trained = import_network(_load(tmp_path / "net", "unit"), tmp_path / "net.ckpt")
+    shares = own(_pixels())[0][0, 0] if activation else own(_pixels())[0][0, 0].sigmoid()
+    scores = imported_scores(trained)
+    torch.testing.assert_close(scores.softmax(dim=0)[0], shares, rtol=0, atol=1e-4)
+    best = scores.argmax(dim=0).numpy().astype("uint8")
+    labels = torch.from_numpy(trained.labels(best))
+    assert 0.2 < float((shares > 0.5).float().mean()) < 0.8
+    assert torch.equal(labels == 1, shares > 0.5)
+
+
+def test_a_network_of_one_size_is_given_it(tmp_path: Path) -> None:
+    """DPT on a vision transformer for 224 × 224."""
+    settings: dict[str, Any] = {"encoder_weights": None, "classes": len(NAMES), "encoder_depth": 2}
+    settings |= {"encoder_output_indices": [0, 1], "decoder_intermediate_channels": (8, 8)}
+    settings |= {"decoder_fusion_channels": 8}
+    own = segmentation_models_pytorch.DPT("tu-vit_tiny_patch16_224.augreg_in21k", **settings)
+    own.eval().save_pretrained(tmp_path / "net")
+    (tmp_path / "classes.json").write_text(json.dumps(NAMES))
+    network = _load(tmp_path / "net", "unit")
+    with pytest.raises(SettingError, match=r"found images of 512×512, .* Set image_size=\[rows"):
+        import_network(network, tmp_path / "net.ckpt")
+    import_network(network, tmp_path / "net.ckpt", image_size=(224, 224), level=9, base_level=0)
+    trained = load_trained(tmp_path / "net.ckpt")
+    assert (trained.fixed_size, trained.image_size) == ((224, 224), (512, 512))
+    images = torch.rand(1, 3, 224, 448)
+    with torch.no_grad():
+        expected = torch.cat([own(images[..., :224]), own(images[..., 224:])], dim=-1)
+        torch.testing.assert_close(trained.network(images), expected, rtol=0, atol=1e-4)
+
+
+def _pixels() -> torch.Tensor:
+    return torch.from_numpy(photo()).permute(2, 0, 1)[None] / 255
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"_model_class": "encoders"}, "segmentation_models_pytorch.encoders, which would be"),
         ({"encoder_name": "tu-hf-hub:someone/net"}, "encoder_name='tu-hf-hub"),
-        ({"aux_params": {"classes": 4}}, "aux_params="),
-        ({"classes": 1}, "found a network with one score"),
+        ({"in_channels": 4}, "in_channels: 4; expected 3: the commands give .* RGB images only"),
         ({"decoder_channels": [8, 8, 16]}, "expected the tensors of Unet"),
     ],
 )
