@@ -63,6 +63,8 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
         kind: Kind of its labels.
         noun: Name of the items, in the plural.
         is_made: Whether `make_files` generates all of it.
+        try_step: Refuses a training step of some items, before these are decoded; None before a
+            task is known.
 
     Raises:
         SettingError: A setting is invalid.
@@ -93,6 +95,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
         for name in ("num_workers", "seed", "stream"):
             self.require(name, getattr(self, name) >= 0, "0 or more")
         self.require(self._per_step, self.per_step >= 1, "1 or more")
+        self.try_step: Callable[[int], None] | None = None
         self._found: Found[_Item] | None = None
         self._sources: dict[Split, SplitItems[_Item, Any]] = {}
         self._start = (0, 0)
@@ -202,6 +205,10 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
         self.make_files()
         stage = None if self.trainer is None else self.trainer.state.fn
         self._found = found = self._usable(sample=stage == TrainerFn.FITTING)
+        if self.try_step is not None and self.trainer is not None and stage == TrainerFn.FITTING:
+            count = len(found.splits["train"]) // self.trainer.world_size
+            for size in {min(self.per_step, count), count % self.per_step} - {0}:
+                self.try_step(size)  # the last step of an epoch may be smaller
         if not self.skip_broken and found.store is not None:
             problems = Problems()
             found.read_all(("test",) if stage == TrainerFn.TESTING else SPLITS, problems)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -13,7 +14,7 @@ from torch import nn
 from datamodules.core.split_module import SplitDataModule
 from tangent_train.checkpoints.trained import TrainedNetwork, completed_settings
 from tangent_train.cli.settings import typed
-from tangent_train.errors import SettingError
+from tangent_train.errors import SettingError, counted
 from tangent_train.inference.class_maps import Unmapped, load_class_map, map_classes
 from tangent_train.inference.views import check_size
 from tangent_train.registry import SettingsFile, make, maker_of
@@ -48,6 +49,11 @@ def build(settings: Settings, source: SettingsFile | None = None) -> tuple[Any, 
     )
     task = _build_task(settings, data, make(section, "network", source), source)
     _try_network(task, data.in_channels)
+    if settings.get("checkpoint") is None:
+        synchronized = bool(settings["trainer"].get("sync_batchnorm"))
+        probe = copy.deepcopy(task).to("meta")
+        data.try_step = partial(_try_step, probe, data, synchronized)
+        data.try_step(data.per_step)
     try:
         task.make_optimizer([{"params": [torch.zeros(1, 1, requires_grad=True)]}])
     except (TypeError, ValueError) as error:
@@ -178,3 +184,45 @@ def _try_network(task: Any, channels: int) -> None:
                 expected=f"one that maps {task.takes}",
                 remedy="A network for photos takes data.inputs=[rgb]." if channels > _RGB else "",
             ) from error
+
+
+def _try_step(probe: Any, data: Any, synchronized: bool, samples: int) -> None:
+    """Run the network in training mode on the smallest chunk of a training step.
+
+    Batch normalization fails on a single value per channel, as of one image of 1×1 features. Images
+    are empty, and nothing is computed where shapes are enough to know.
+
+    Args:
+        probe: The task, on the device ``meta``.
+        data: The data module.
+        synchronized: Whether several processes normalize together.
+        samples: Panoramas, photos or shapes of the step.
+
+    Raises:
+        SettingError: The network cannot be trained on it.
+    """
+    if synchronized and (data.trainer is None or data.trainer.world_size > 1):
+        return
+    step = probe.empty_step(data.in_channels, samples)
+    chunk = min(probe.chunks(step), key=len)
+    with torch.random.fork_rng(), torch.no_grad():
+        try:
+            probe.train().network.forward(chunk)  # a compiled one is not compiled for this
+            return
+        except (RuntimeError, ValueError):  # also NotImplementedError, of what only computes
+            try:
+                network = copy.deepcopy(probe.network).to_empty(device="cpu")
+                network.forward(torch.zeros(chunk.shape))
+                return
+            except (RuntimeError, ValueError) as error:
+                reason = error
+    per_step, noun = f"data.{data.noun}_per_step", data.noun
+    raise SettingError(
+        per_step if len(chunk) == len(step) else "task.images_per_chunk",
+        found=f"a training step of {counted(samples, noun)} with {tuple(chunk.shape)} as its "
+        f"smallest input, on which {type(probe.network).__name__} cannot be trained "
+        f"({str(reason).partition(chr(10))[0]})",
+        expected="more than one image at a time",
+        remedy=f"Set {per_step} so that the last step of an epoch has more of its {noun}, raise "
+        "task.images_per_chunk, or choose a network without batch normalization.",
+    )
