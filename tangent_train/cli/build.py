@@ -216,13 +216,14 @@ def _try_step(probe: Any, data: Any, synchronized: bool, samples: int) -> None:
                 return
             except (RuntimeError, ValueError) as error:
                 reason = error
-    per_step, noun = f"data.{data.noun}_per_step", data.noun
+    per_step = f"data.{data.noun}_per_step"
+    is_whole = len(chunk) == len(step)
     raise SettingError(
-        per_step if len(chunk) == len(step) else "task.images_per_chunk",
-        found=f"a training step of {counted(samples, noun)} with {tuple(chunk.shape)} as its "
-        f"smallest input, on which {type(probe.network).__name__} cannot be trained "
-        f"({str(reason).partition(chr(10))[0]})",
-        expected="more than one image at a time",
-        remedy=f"Set {per_step} so that the last step of an epoch has more of its {noun}, raise "
-        "task.images_per_chunk, or choose a network without batch normalization.",
+        per_step if is_whole else "task.images_per_chunk",
+        found=f"{data.per_step if is_whole else probe.images_per_chunk}, so that in a step of "
+        f"{counted(samples, data.noun)} {type(probe.network).__name__} gets {tuple(chunk.shape)}, "
+        f"on which it cannot be trained ({str(reason).partition(chr(10))[0]})",
+        expected="more images at a time, in the last step of an epoch too",
+        remedy=f"Change {per_step} or task.images_per_chunk, or choose a network without batch "
+        "normalization.",
     )

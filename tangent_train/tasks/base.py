@@ -168,8 +168,9 @@ class Task(lightning.LightningModule, ABC):
             return
         unit = "steps" if self._is_stepped_every_step else "epochs"
         if then[unit] != now[unit] and (unit == "steps" or self._ends_at(then[unit])):
+            others = ", trainer.devices and data.…_per_step" * (unit == "steps")
             raise SettingError(
-                "trainer.max_epochs, trainer.max_steps, trainer.devices and data.…_per_step",
+                f"trainer.max_epochs, trainer.max_steps{others}",
                 found=f"{now[unit]} training {unit}",
                 expected=f"{then[unit]}, which the schedule of the resumed run was made for",
                 remedy="Resume with the same. To train for longer, start a new run with a schedule "
