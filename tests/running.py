@@ -5,6 +5,9 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import time
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -38,3 +41,34 @@ def run_python(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str
         capture_output=True,
         text=True,
     )
+
+
+def further_processes(first: int) -> list[int]:
+    """Processes of a run that its first one has started."""
+    found = []
+    with suppress(FileNotFoundError, ProcessLookupError):  # one that has just ended
+        for number in Path(f"/proc/{first}/task/{first}/children").read_text().split():
+            if b"LOCAL_RANK=1" in Path(f"/proc/{number}/environ").read_bytes():
+                found.append(int(number))
+    return found
+
+
+def has_ended(process: int) -> bool:
+    """True if a process is gone, or only waits for its parent to notice."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return True
+
+
+def wait_for(done: Callable[[], object], seconds: float = 60.0) -> None:
+    """Wait until something is true.
+
+    Raises:
+        TimeoutError: It is not in time.
+    """
+    end = time.monotonic() + seconds
+    while not done():
+        if time.monotonic() > end:
+            raise TimeoutError
+        time.sleep(0.02)

@@ -205,25 +205,30 @@ def _try_step(probe: Any, data: Any, synchronized: bool, samples: int) -> None:
         return
     step = probe.empty_step(data.in_channels, samples)
     chunk = min(probe.chunks(step), key=len)
-    with torch.random.fork_rng(), torch.no_grad():
-        try:
-            probe.train().network.forward(chunk)  # a compiled one is not compiled for this
+    reason = None
+    for device in ("meta", "cpu"):  # what shapes do not show is computed
+        network = copy.deepcopy(probe.train().network).to_empty(device=device)
+        reason = _training_fault(network, torch.zeros(chunk.shape, device=device))
+        if reason is None:
             return
-        except (RuntimeError, ValueError):  # also NotImplementedError, of what only computes
-            try:
-                network = copy.deepcopy(probe.network).to_empty(device="cpu")
-                network.forward(torch.zeros(chunk.shape))
-                return
-            except (RuntimeError, ValueError) as error:
-                reason = error
     per_step = f"data.{data.noun}_per_step"
     is_whole = len(chunk) == len(step)
     raise SettingError(
         per_step if is_whole else "task.images_per_chunk",
         found=f"{data.per_step if is_whole else probe.images_per_chunk}, so that in a step of "
         f"{counted(samples, data.noun)} {type(probe.network).__name__} gets {tuple(chunk.shape)}, "
-        f"on which it cannot be trained ({str(reason).partition(chr(10))[0]})",
+        f"on which it cannot be trained ({reason})",
         expected="more images at a time, in the last step of an epoch too",
         remedy=f"Change {per_step} or task.images_per_chunk, or choose a network without batch "
         "normalization.",
     )
+
+
+def _training_fault(network: nn.Module, images: torch.Tensor) -> str | None:
+    """The first line of the error of a network on images; None without one."""
+    try:
+        with torch.random.fork_rng(), torch.no_grad():
+            network.forward(images)  # a compiled one is not compiled for this
+    except (RuntimeError, ValueError) as error:
+        return str(error).partition("\n")[0]
+    return None

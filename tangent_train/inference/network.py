@@ -1,8 +1,9 @@
-"""Trained networks in Python: labels of arrays and tensors."""
+"""Trained networks in Python: labels of files, images in memory and tensors."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, get_args
@@ -10,14 +11,20 @@ from typing import Any, get_args
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from PIL import Image, ImageOps
 from torch import Tensor
 
+from datamodules.core.image_module import Upright
 from datamodules.core.panoramas import meters_to_steps
+from datamodules.images.gpano import PanoramaArea, area_of_crop, whole_area
+from datamodules.images.masks import Mask, Masks
 from datamodules.images.palette import class_colors
 from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
 from tangent_train.errors import SettingError
 from tangent_train.geometry import camera_matrix_from_fov
 from tangent_train.inference.class_maps import Unmapped, load_class_map, map_classes
+from tangent_train.inference.images import read_panorama, read_photo, with_up
+from tangent_train.inference.judge import NetworkJudge
 from tangent_train.inference.predictor import Predictor
 from tangent_train.inference.views import InputImage, PanoramaViews, PhotoViews
 from tangent_train.rendering import Blend
@@ -27,6 +34,16 @@ from tangent_train.rendering.mosaic import ScoreMosaic
 
 Depth = Tensor | NDArray[Any] | None
 """``(H, W)`` floats: metres, 0 or NaN where missing."""
+
+Picture = str | Path | Image.Image | NDArray[Any] | Tensor
+"""A file; an image of Pillow; or RGB of 0 to 255, an array ``(H, W, 3)`` or tensor ``(3, H, W)`` of
+uint8 on any device."""
+
+_NOT_WHOLE = (
+    "Of a photo, give fov=, its horizontal field of view in degrees; of a part of a panorama, crop="
+    "[west, east, south, north] in degrees."
+)
+_SHOWN = 6
 
 
 def load(
@@ -44,7 +61,7 @@ def load(
     min_confidence: float = 0.0,
     trust: str | Sequence[str] = (),
 ) -> Network:
-    """A trained network from a file, for panoramas and photos in memory.
+    """A trained network from a file, for panoramas and photos.
 
     The settings are those of ``tangent-predict``, and so are the labels.
 
@@ -70,29 +87,36 @@ def load(
         SettingError: A setting does not suit the network.
     """
     check_choice("unmapped", unmapped, get_args(Unmapped))
-    trained = load_trained(Path(path), (trust,) if isinstance(trust, str) else trust)
+    original = load_trained(Path(path), (trust,) if isinstance(trust, str) else trust)
+    trained = original
     if class_map is not None:
-        trained = map_classes(trained, load_class_map(str(class_map)), unmapped).trained
+        trained = map_classes(original, load_class_map(str(class_map)), unmapped).trained
     views = PanoramaViews(trained, levels or (level,), base_level, blend, rotations)
     how = device, images_per_forward, min_confidence
+    panoramas = Predictor(trained, views, *how)
     return Network(
         trained,
-        Predictor(trained, views, *how),
+        views,
+        panoramas,
         lambda: Predictor(trained, PhotoViews(trained, level, base_level, blend), *how),
+        NetworkJudge(original, panoramas.device),
     )
 
 
 class Network:
-    """A trained network for panoramas and photos in memory; made by `load`.
+    """A trained network for panoramas and photos; made by `load`.
 
-    Images are RGB of 0 to 255: arrays ``(H, W, 3)`` or tensors ``(3, H, W)`` on any device, uint8.
-    Panoramas show the whole sphere, W = 2 H, of any size. What is returned has the size of the
-    image: arrays for arrays, tensors on the image's device for tensors.
+    Images are files or in memory, see `Picture`. Files are read as by ``tangent-predict``, with
+    their GPano tags; of an image of Pillow the EXIF orientation is applied, of other images the
+    pixels are all there is. What is returned has the size of the image: tensors on the image's
+    device for tensors, else arrays.
 
     Args:
         trained: The network.
+        views: Its views of panoramas.
         panoramas: Its predictor of panoramas.
         photos: Makes its predictor of photos.
+        judge: Helps to estimate which way is up.
 
     Attributes:
         trained: The network, with its inputs, level and representation.
@@ -101,20 +125,43 @@ class Network:
     """
 
     def __init__(
-        self, trained: TrainedNetwork, panoramas: Predictor, photos: Callable[[], Predictor]
+        self,
+        trained: TrainedNetwork,
+        views: PanoramaViews,
+        panoramas: Predictor,
+        photos: Callable[[], Predictor],
+        judge: NetworkJudge,
     ) -> None:
         self.trained = trained
         self.class_names = trained.class_names
         self.palette = class_colors(len(trained.class_names))
+        self._views = views
         self._panoramas = panoramas
         self._make_photos = photos
+        self._judge = judge
+
+    def __repr__(self) -> str:
+        """Classes, inputs, views and device."""
+        trained, names = self.trained, self.class_names[1:]
+        shown = ", ".join(names[:_SHOWN]) + ", …" * (len(names) > _SHOWN)
+        rows, columns = trained.image_size
+        kind = str(trained.representation["_target_"]).rpartition(".")[2]
+        return (
+            f"<Network of {len(names)} classes ({shown}), inputs {', '.join(trained.inputs)}, "
+            f"trained at level {trained.level} on {columns}×{rows} images of {kind}, "
+            f"on {self._panoramas.device}>"
+        )
 
     def labels(
         self,
-        image: Pixels,
+        image: Picture,
         *,
         depth: Depth = None,
         fov: float | None = None,
+        crop: Sequence[float] | None = None,
+        upright: Upright = None,
+        max_tilt_deg: float = 60.0,
+        mask: Mask | str | NDArray[Any] | Tensor = None,
     ) -> Pixels:
         """Label of every pixel.
 
@@ -123,33 +170,54 @@ class Network:
             depth: ``(H, W)`` floats in metres, for networks that see depth, 0 or NaN where missing:
                 the distance from the centre, in photos along the optical axis.
             fov: Horizontal field of view of a photo in degrees; None for a panorama.
+            crop: West, east, south and north of a part of a panorama in degrees, see
+                `area_of_crop`; None for that of its file's GPano tags, else the whole sphere,
+                W = 2 H.
+            upright: Align a panorama with gravity: ``pose`` by its file's GPano tags, ``auto``
+                likewise, else as estimated from the image.
+            max_tilt_deg: Of ``auto``: the largest tilt considered.
+            mask: Pixels of a panorama that get the label 0: below a latitude in degrees, or black
+                ones of a file, see `Masks`; or where an array or tensor ``(H, W)`` is 0 or False.
 
         Returns:
             ``(H, W)`` labels 1 … K, and 0 where the network sees nothing it knows: an array of
             uint8, or uint16 of many classes, or a tensor of int64.
 
         Raises:
+            DataError: A file cannot be used, or the image is not a whole panorama.
             SettingError: The image cannot be used, or the network needs another input.
         """
-        mosaic = self._predict(image, depth, fov, probabilities=False)
+        if mask is not None and fov is not None:
+            raise SettingError("mask", found="one, with fov=", expected="None for photos")
+        hidden = mask if isinstance(mask, np.ndarray | Tensor) else Masks(mask)
+        mosaic, area = self._predict(image, depth, fov, crop, upright, max_tilt_deg)
         labels: Any = self.trained.labels(mosaic.labels())
+        if area is not None:
+            labels = area.cut(labels)
+            labels = np.where(_counted(hidden, image, area), labels, labels.dtype.type(0))
         if isinstance(image, Tensor):
             return torch.from_numpy(labels.astype(np.int64)).to(image.device)
         return labels
 
     def scores(
         self,
-        image: Pixels,
+        image: Picture,
         *,
         depth: Depth = None,
         fov: float | None = None,
+        crop: Sequence[float] | None = None,
+        upright: Upright = None,
+        max_tilt_deg: float = 60.0,
     ) -> Pixels:
         """Probability of every class at every pixel.
 
         Args:
-            image: See `labels`.
-            depth: See `labels`.
-            fov: See `labels`.
+            image: See `labels`, also for the others.
+            depth: Depth of the image.
+            fov: Field of view of a photo.
+            crop: Part of the sphere.
+            upright: Source of the zenith.
+            max_tilt_deg: Largest tilt considered.
 
         Returns:
             An array ``(H, W, K)`` or a tensor ``(K, H, W)`` of float32; number k is that of label
@@ -157,32 +225,46 @@ class Network:
             of the classes.
 
         Raises:
+            DataError: See `labels`.
             SettingError: See `labels`.
         """
-        mosaic = self._predict(image, depth, fov, probabilities=True)
+        mosaic, area = self._predict(
+            image, depth, fov, crop, upright, max_tilt_deg, probabilities=True
+        )
         scores: Any = mosaic.probabilities(slice(None))[..., : len(self.class_names) - 1]
-        scores = np.ascontiguousarray(scores)
+        scores = np.ascontiguousarray(scores if area is None else area.cut(scores))
         if isinstance(image, Tensor):
             return torch.from_numpy(scores).movedim(-1, 0).to(image.device)
         return scores
 
     def _predict(
-        self, image: Any, depth: Any, fov: float | None, *, probabilities: bool
-    ) -> ScoreMosaic:
-        rgb = _rgb(image)
-        size = (rgb.shape[0], rgb.shape[1])
-        steps = self._depth(depth, size)
+        self,
+        image: Any,
+        depth: Any,
+        fov: float | None,
+        crop: Sequence[float] | None,
+        upright: Upright,
+        max_tilt_deg: float,
+        *,
+        probabilities: bool = False,
+    ) -> tuple[ScoreMosaic, PanoramaArea | None]:
+        """Scores of the whole sphere, with the part that the image shows; or those of a photo."""
         if fov is not None:
-            photo = InputImage(rgb, steps, camera_matrix=camera_matrix_from_fov(fov, size))
-            return self._photos.predict(photo, probabilities=probabilities)
-        if size[1] != 2 * size[0]:
-            raise SettingError(
-                "panorama",
-                found="{}×{} pixels".format(*size),
-                expected="the whole sphere, twice as wide as high",
-                remedy="Of a photo, give fov=, its horizontal field of view in degrees.",
-            )
-        return self._panoramas.predict(InputImage(rgb, steps), probabilities=probabilities)
+            if crop is not None or upright is not None:
+                given = "crop" if crop is not None else "upright"
+                raise SettingError(given, found="one, with fov=", expected="None for photos")
+            photo = _read_photo(image, fov)
+            photo = replace(photo, depth=self._depth(depth, photo.rgb.shape[:2]))
+            return self._photos.predict(photo, probabilities=probabilities), None
+        if upright is not None:
+            check_choice("upright", upright, ("pose", "auto"))
+            self._views.need_tangent_images(f"upright={upright}")
+        panorama, area = _read_panorama(image, crop, upright)
+        steps = self._depth(depth, area.image_shape)
+        panorama = replace(panorama, depth=None if steps is None else area.place(steps))
+        if upright == "auto":
+            panorama = with_up(panorama, max_tilt_deg, self._judge)
+        return self._panoramas.predict(panorama, probabilities=probabilities), area
 
     @cached_property
     def _photos(self) -> Predictor:
@@ -206,8 +288,56 @@ class Network:
         return meters_to_steps(np.nan_to_num(array.astype(np.float32), posinf=0).clip(min=0))
 
 
+def _read_photo(image: Any, fov: float) -> InputImage:
+    if isinstance(image, str | Path):
+        return read_photo(Path(image).expanduser(), Path(image).stem, fov_deg=fov)
+    rgb = _rgb(image)
+    return InputImage(rgb, camera_matrix=camera_matrix_from_fov(fov, (rgb.shape[0], rgb.shape[1])))
+
+
+def _read_panorama(
+    image: Any, crop: Sequence[float] | None, upright: Upright
+) -> tuple[InputImage, PanoramaArea]:
+    """The whole sphere, black outside of the image's area, and that area."""
+    if isinstance(image, str | Path):
+        path = Path(image).expanduser()
+        return read_panorama(path, path.stem, crop=crop, upright=upright)
+    if upright == "pose":
+        raise SettingError(
+            "upright",
+            found=f"pose, of {_described(image)}",
+            expected="auto or None: only files have GPano tags",
+            remedy="Give the path of the panorama.",
+        )
+    rgb = _rgb(image)
+    size = rgb.shape[0], rgb.shape[1]
+    whole = whole_area(Path("panorama"), size, _NOT_WHOLE) if crop is None else None
+    area = whole or area_of_crop(size, crop or ())
+    return InputImage(area.place(rgb)), area
+
+
+def _counted(mask: Any, image: Any, area: PanoramaArea) -> NDArray[np.bool_]:
+    """Where the pixels of an image count, of its size."""
+    if isinstance(mask, Masks):
+        is_file = isinstance(image, str | Path)
+        if mask.of_each and not is_file:
+            found = f"a folder, for {_described(image)}"
+            raise SettingError(
+                "mask", found=found, expected="a file, which has the name of no image"
+            )
+        return area.cut(mask.read(Path(image).stem if is_file else "", area)) > 0
+    array = mask.detach().cpu().numpy() if isinstance(mask, Tensor) else mask
+    if array.shape != area.image_shape:
+        expected = "(H, W) of the image, {}, {}".format(*area.image_shape)
+        raise SettingError("mask", found=_described(mask), expected=expected)
+    counted: NDArray[np.bool_] = array != 0
+    return counted
+
+
 def _rgb(image: Any) -> NDArray[np.uint8]:
     """An image ``(H, W, 3)``."""
+    if isinstance(image, Image.Image):
+        image = _pillow_rgb(image)
     is_tensor = isinstance(image, Tensor)
     array = image.detach().cpu().numpy() if is_tensor else image
     fits = isinstance(array, np.ndarray) and array.ndim == 3 and array.dtype == np.uint8
@@ -217,8 +347,22 @@ def _rgb(image: Any) -> NDArray[np.uint8]:
     raise SettingError(
         "image",
         found=_described(image),
-        expected="RGB of 0 to 255: a uint8 tensor (3, H, W) or array (H, W, 3)",
+        expected="RGB of 0 to 255: a uint8 tensor (3, H, W) or array (H, W, 3); an image of "
+        "Pillow; or the path of a file",
     )
+
+
+def _pillow_rgb(image: Image.Image) -> NDArray[Any]:
+    """The pixels of an image as `read_rgb` gives those of a file, upright and without alpha."""
+    upright = ImageOps.exif_transpose(image)
+    if upright.mode.startswith("I;16"):
+        grey = (np.asarray(upright) >> 8).astype(np.uint8)
+        return np.repeat(grey[..., None], 3, axis=-1)
+    if upright.mode in ("I", "F"):
+        found = f"an image of Pillow with the mode {upright.mode}"
+        raise SettingError("image", found=found, expected="colours of 8 or 16 bits")
+    upright.info.pop("transparency", None)  # Pillow warns that RGB loses it
+    return np.asarray(upright.convert("RGB"))
 
 
 def _described(value: Any) -> str:
