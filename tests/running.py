@@ -7,7 +7,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -45,12 +44,15 @@ def run_python(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str
 
 def further_processes(first: int) -> list[int]:
     """Processes of a run that its first one has started."""
-    found = []
-    with suppress(FileNotFoundError, ProcessLookupError):  # one that has just ended
-        for number in Path(f"/proc/{first}/task/{first}/children").read_text().split():
-            if b"LOCAL_RANK=1" in Path(f"/proc/{number}/environ").read_bytes():
-                found.append(int(number))
-    return found
+    children = Path(f"/proc/{first}/task/{first}/children").read_text().split()
+    return [int(number) for number in children if b"LOCAL_RANK=1" in _environment(number)]
+
+
+def _environment(number: str) -> bytes:
+    try:
+        return Path(f"/proc/{number}/environ").read_bytes()
+    except (FileNotFoundError, ProcessLookupError):  # it has just ended
+        return b""
 
 
 def has_ended(process: int) -> bool:

@@ -95,6 +95,37 @@ def test_ctrl_c_ends_a_run_as_a_shell_says_it(
     assert ended.value.code == 128 + signal.SIGINT
 
 
+def test_a_checkpoint_within_an_epoch_holds_the_average_with_its_last_step(
+    rooms: str, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    weights: list[dict[str, torch.Tensor]] = []
+    step = SegmentationTask.training_step
+
+    def kept(task: SegmentationTask, *arguments: object) -> torch.Tensor:
+        weights.append({n: p.detach().double().clone() for n, p in task.named_parameters()})
+        if len(weights) == 4:
+            raise CutError
+        return step(task, *arguments)
+
+    class CutError(Exception):
+        pass
+
+    monkeypatch.setattr(SegmentationTask, "training_step", kept)
+    typed = ("ema=0.7", "checkpoint_every_n_steps=1", "data.panoramas_per_step=1")
+    with pytest.raises(CutError):
+        run("train", *SETTINGS, rooms, *typed, "hydra.run.dir=run")
+    content = torch.load(tmp_path / "run" / "checkpoints" / "last.ckpt", weights_only=True)
+    assert content["global_step"] == 3
+    found: dict[str, torch.Tensor] = {}
+    for name, third in weights[3].items():  # the average begins with the first step
+        first, second = weights[1][name], weights[2][name]
+        expected = 0.7 * (0.7 * first + 0.3 * second) + 0.3 * third
+        found[name] = (content["state_dict"][name].double() - expected).abs().max()
+        assert torch.equal(content["current_model_state"][name].double(), third)
+    assert max(found.values()) < 1e-6
+    assert max((w - weights[2][n]).abs().max() for n, w in weights[3].items()) > 1e-4
+
+
 def test_without_validation_the_last_epoch_is_tested(rooms: str, tmp_path: Path, run: Run) -> None:
     checkpoints = tmp_path / "run" / "checkpoints"
     typed = ("scheduler=constant", "data.validation_fraction=0", "trainer.max_epochs=1")
