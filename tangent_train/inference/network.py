@@ -29,7 +29,6 @@ from tangent_train.inference.predictor import Predictor
 from tangent_train.inference.views import InputImage, PanoramaViews, PhotoViews
 from tangent_train.rendering import Blend
 from tangent_train.rendering.checks import check_choice
-from tangent_train.rendering.forward import Pixels
 from tangent_train.rendering.mosaic import ScoreMosaic
 
 Depth = Tensor | NDArray[Any] | None
@@ -162,7 +161,7 @@ class Network:
         upright: Upright = None,
         max_tilt_deg: float = 60.0,
         mask: Mask | str | NDArray[Any] | Tensor = None,
-    ) -> Pixels:
+    ) -> Any:
         """Label of every pixel.
 
         Args:
@@ -208,7 +207,7 @@ class Network:
         crop: Sequence[float] | None = None,
         upright: Upright = None,
         max_tilt_deg: float = 60.0,
-    ) -> Pixels:
+    ) -> Any:
         """Probability of every class at every pixel.
 
         Args:

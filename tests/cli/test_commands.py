@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import cv2
 import pytest
@@ -101,7 +102,7 @@ def test_a_checkpoint_within_an_epoch_holds_the_average_with_its_last_step(
     weights: list[dict[str, torch.Tensor]] = []
     step = SegmentationTask.training_step
 
-    def kept(task: SegmentationTask, *arguments: object) -> torch.Tensor:
+    def kept(task: SegmentationTask, *arguments: Any) -> torch.Tensor:
         weights.append({n: p.detach().double().clone() for n, p in task.named_parameters()})
         if len(weights) == 4:
             raise CutError

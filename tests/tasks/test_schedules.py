@@ -74,7 +74,7 @@ def _linear_to_zero(optimizer: Any, total_steps: int) -> Any:
     return lr_scheduler.LambdaLR(optimizer, lambda step: 1 - step / total_steps)
 
 
-FIXED = {
+FIXED: dict[str, Any] = {
     "cosine": partial(lr_scheduler.CosineAnnealingLR, T_max=4),
     "cosine with a floor": partial(lr_scheduler.CosineAnnealingLR, T_max=4, eta_min=0.01),
     "cosine to its last epoch": partial(lr_scheduler.CosineAnnealingLR, T_max=3),
@@ -92,7 +92,7 @@ FIXED = {
         for name in ("cosine", "linear", "polynomial", "cosine_with_restarts")
     },
 }
-ENDLESS = {
+ENDLESS: dict[str, tuple[Any, Any]] = {
     "none": (None, lambda epoch: 1),
     "constant": (partial(lr_scheduler.ConstantLR, factor=1, total_iters=0), lambda epoch: 1),
     "steps": (
