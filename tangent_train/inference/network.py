@@ -11,22 +11,27 @@ from typing import Any, get_args
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import Image, ImageOps
 from torch import Tensor
 
 from datamodules.core.image_module import Upright
 from datamodules.core.panoramas import meters_to_steps
-from datamodules.images.gpano import PanoramaArea, area_of_crop, whole_area
+from datamodules.images.gpano import PanoramaArea
 from datamodules.images.masks import Mask, Masks
 from datamodules.images.palette import class_colors
 from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
 from tangent_train.errors import SettingError
-from tangent_train.geometry import camera_matrix_from_fov
 from tangent_train.inference.class_maps import Unmapped, load_class_map, map_classes
-from tangent_train.inference.images import read_panorama, read_photo, with_up
+from tangent_train.inference.images import with_up
 from tangent_train.inference.judge import NetworkJudge
+from tangent_train.inference.picture import (
+    Picture,
+    counted_pixels,
+    described,
+    panorama_of,
+    photo_of,
+)
 from tangent_train.inference.predictor import Predictor
-from tangent_train.inference.views import InputImage, PanoramaViews, PhotoViews
+from tangent_train.inference.views import PanoramaViews, PhotoViews
 from tangent_train.rendering import Blend
 from tangent_train.rendering.checks import check_choice
 from tangent_train.rendering.mosaic import ScoreMosaic
@@ -34,14 +39,6 @@ from tangent_train.rendering.mosaic import ScoreMosaic
 Depth = Tensor | NDArray[Any] | None
 """``(H, W)`` floats: metres, 0 or NaN where missing."""
 
-Picture = str | Path | Image.Image | NDArray[Any] | Tensor
-"""A file; an image of Pillow; or RGB of 0 to 255, an array ``(H, W, 3)`` or tensor ``(3, H, W)`` of
-uint8 on any device."""
-
-_NOT_WHOLE = (
-    "Of a photo, give fov=, its horizontal field of view in degrees; of a part of a panorama, crop="
-    "[west, east, south, north] in degrees."
-)
 _SHOWN = 6
 
 
@@ -193,7 +190,7 @@ class Network:
         labels: Any = self.trained.labels(mosaic.labels())
         if area is not None:
             labels = area.cut(labels)
-            labels = np.where(_counted(hidden, image, area), labels, labels.dtype.type(0))
+            labels = np.where(counted_pixels(hidden, image, area), labels, labels.dtype.type(0))
         if isinstance(image, Tensor):
             return torch.from_numpy(labels.astype(np.int64)).to(image.device)
         return labels
@@ -252,13 +249,13 @@ class Network:
             if crop is not None or upright is not None:
                 given = "crop" if crop is not None else "upright"
                 raise SettingError(given, found="one, with fov=", expected="None for photos")
-            photo = _read_photo(image, fov)
+            photo = photo_of(image, fov)
             photo = replace(photo, depth=self._depth(depth, photo.rgb.shape[:2]))
             return self._photos.predict(photo, probabilities=probabilities), None
         if upright is not None:
             check_choice("upright", upright, ("pose", "auto"))
             self._views.need_tangent_images(f"upright={upright}")
-        panorama, area = _read_panorama(image, crop, upright)
+        panorama, area = panorama_of(image, crop, upright)
         steps = self._depth(depth, area.image_shape)
         panorama = replace(panorama, depth=None if steps is None else area.place(steps))
         if upright == "auto":
@@ -279,93 +276,9 @@ class Network:
         if not (wanted and fits):
             raise SettingError(
                 "depth",
-                found=_described(depth),
+                found=described(depth),
                 expected="{}×{} floats, in metres".format(*size)
                 if wanted
                 else f"None: the network sees {' and '.join(self.trained.inputs)}",
             )
         return meters_to_steps(np.nan_to_num(array.astype(np.float32), posinf=0).clip(min=0))
-
-
-def _read_photo(image: Any, fov: float) -> InputImage:
-    if isinstance(image, str | Path):
-        return read_photo(Path(image).expanduser(), Path(image).stem, fov_deg=fov)
-    rgb = _rgb(image)
-    return InputImage(rgb, camera_matrix=camera_matrix_from_fov(fov, (rgb.shape[0], rgb.shape[1])))
-
-
-def _read_panorama(
-    image: Any, crop: Sequence[float] | None, upright: Upright
-) -> tuple[InputImage, PanoramaArea]:
-    """The whole sphere, black outside of the image's area, and that area."""
-    if isinstance(image, str | Path):
-        path = Path(image).expanduser()
-        return read_panorama(path, path.stem, crop=crop, upright=upright)
-    if upright == "pose":
-        raise SettingError(
-            "upright",
-            found=f"pose, of {_described(image)}",
-            expected="auto or None: only files have GPano tags",
-            remedy="Give the path of the panorama.",
-        )
-    rgb = _rgb(image)
-    size = rgb.shape[0], rgb.shape[1]
-    whole = whole_area(Path("panorama"), size, _NOT_WHOLE) if crop is None else None
-    area = whole or area_of_crop(size, crop or ())
-    return InputImage(area.place(rgb)), area
-
-
-def _counted(mask: Any, image: Any, area: PanoramaArea) -> NDArray[np.bool_]:
-    """Where the pixels of an image count, of its size."""
-    if isinstance(mask, Masks):
-        is_file = isinstance(image, str | Path)
-        if mask.of_each and not is_file:
-            found = f"a folder, for {_described(image)}"
-            raise SettingError(
-                "mask", found=found, expected="a file, which has the name of no image"
-            )
-        return area.cut(mask.read(Path(image).stem if is_file else "", area)) > 0
-    array = mask.detach().cpu().numpy() if isinstance(mask, Tensor) else mask
-    if array.shape != area.image_shape:
-        expected = "(H, W) of the image, {}, {}".format(*area.image_shape)
-        raise SettingError("mask", found=_described(mask), expected=expected)
-    counted: NDArray[np.bool_] = array != 0
-    return counted
-
-
-def _rgb(image: Any) -> NDArray[np.uint8]:
-    """An image ``(H, W, 3)``."""
-    if isinstance(image, Image.Image):
-        image = _pillow_rgb(image)
-    is_tensor = isinstance(image, Tensor)
-    array = image.detach().cpu().numpy() if is_tensor else image
-    fits = isinstance(array, np.ndarray) and array.ndim == 3 and array.dtype == np.uint8
-    channels = 0 if is_tensor else -1
-    if fits and array.shape[channels] == 3 and array.size:
-        return np.ascontiguousarray(np.moveaxis(array, channels, -1))
-    raise SettingError(
-        "image",
-        found=_described(image),
-        expected="RGB of 0 to 255: a uint8 tensor (3, H, W) or array (H, W, 3); an image of "
-        "Pillow; or the path of a file",
-    )
-
-
-def _pillow_rgb(image: Image.Image) -> NDArray[Any]:
-    """The pixels of an image as `read_rgb` gives those of a file, upright and without alpha."""
-    upright = ImageOps.exif_transpose(image)
-    if upright.mode.startswith("I;16"):
-        grey = (np.asarray(upright) >> 8).astype(np.uint8)
-        return np.repeat(grey[..., None], 3, axis=-1)
-    if upright.mode in ("I", "F"):
-        found = f"an image of Pillow with the mode {upright.mode}"
-        raise SettingError("image", found=found, expected="colours of 8 or 16 bits")
-    upright.info.pop("transparency", None)  # Pillow warns that RGB loses it
-    return np.asarray(upright.convert("RGB"))
-
-
-def _described(value: Any) -> str:
-    if value is None:
-        return "none"
-    kind = type(value).__name__
-    return f"{kind} {tuple(value.shape)} of {value.dtype}" if hasattr(value, "dtype") else kind

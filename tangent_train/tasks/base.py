@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import itertools
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -19,6 +18,7 @@ from datamodules.core.split_module import Kind
 from tangent_train.errors import SettingError
 from tangent_train.tasks.divergence import check_weights, refuse_loss
 from tangent_train.tasks.fine_tuning import freeze, groups_of, rates_of
+from tangent_train.tasks.schedules import ends_at
 
 Part = tuple[tuple[Tensor, ...], Tensor]
 """Inputs of the network and their labels."""
@@ -163,12 +163,15 @@ class Task(lightning.LightningModule, ABC):
         Raises:
             SettingError: The length has changed.
         """
-        then, now = self._trained_length, self._length()
-        if then is None or then == now or self.make_scheduler is None:
+        then, now, scheduler = self._trained_length, self._length(), self.make_scheduler
+        if then is None or scheduler is None:
             return
-        unit = "steps" if self._is_stepped_every_step else "epochs"
-        if then[unit] != now[unit] and (unit == "steps" or self._ends_at(then[unit])):
-            others = ", trainer.devices and data.…_per_step" * (unit == "steps")
+        by_step = self._is_stepped_every_step
+        unit = "steps" if by_step else "epochs"
+        if then[unit] != now[unit] and (
+            by_step or ends_at(then[unit], self.make_optimizer, scheduler)
+        ):
+            others = ", trainer.devices and data.…_per_step" * by_step
             raise SettingError(
                 f"trainer.max_epochs, trainer.max_steps{others}",
                 found=f"{now[unit]} training {unit}",
@@ -318,27 +321,6 @@ class Task(lightning.LightningModule, ABC):
         if not math.isfinite(steps):
             return {"steps": -1, "epochs": -1}
         return {"steps": int(steps), "epochs": math.ceil(steps / max(each, 1))}
-
-    def _ends_at(self, epochs: int) -> bool:
-        """True if the schedule was made for a number of epochs, whatever its settings are called.
-
-        Its rate then changes in every epoch up to the last or to the one after it, and from there
-        on it stays or turns back.
-        """
-        optimizer = self.make_optimizer([{"params": [torch.zeros(1, requires_grad=True)]}])
-        scheduler: Any = self.make_scheduler(optimizer)  # type: ignore[misc]
-        rates = [optimizer.param_groups[0]["lr"]]
-        for _ in range(2 * epochs + 1):
-            optimizer.step()
-            scheduler.step()
-            rates.append(optimizer.param_groups[0]["lr"])
-        changes = [after - before for before, after in itertools.pairwise(rates)]
-        return any(
-            all(changes[max(end - 2, 0) : end])
-            and (not any(changes[end:]) or changes[end - 1] * changes[end] < 0)
-            for end in (epochs - 1, epochs)
-            if end > 0
-        )
 
     def checked_scores(self, scores: Any, expected: tuple[int, ...]) -> Tensor:
         """The network's scores.
