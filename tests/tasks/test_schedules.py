@@ -18,8 +18,6 @@ from tangent_train.callbacks.checkpoints import AtomicCheckpointIO, LastCheckpoi
 from tangent_train.errors import SettingError
 from tests.tasks.shapes import Shapes, quiet_trainer, shape_task
 
-pytestmark = pytest.mark.filterwarnings("ignore:Detected call of `lr_scheduler.step.. before")
-
 LR = 0.1
 STEPS = 3  # of an epoch
 

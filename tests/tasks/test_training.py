@@ -144,10 +144,11 @@ class Exchanges(lightning.Callback):
 
 # Lightning leaves variables behind that tell later processes that they are part of a run.
 @patch.dict(os.environ)
-def test_processes_exchange_gradients_once_after_the_last_chunk() -> None:
+@pytest.mark.parametrize("batch_size", [3, 1], ids=["plain", "accumulated"])
+def test_processes_exchange_gradients_once_after_the_last_chunk(batch_size: int) -> None:
     exchanges = Exchanges()
     strategy = DDPStrategy(process_group_backend="gloo")
     trainer = {"devices": 1, "strategy": strategy, "callbacks": [exchanges]}
-    found, _ = _gradients(7, trainer=trainer)
+    found, _ = _gradients(7, batch_size, trainer)
     assert exchanges.count == 1
-    torch.testing.assert_close(found, _expected(3)[0])
+    torch.testing.assert_close(found, _expected(batch_size)[0])
