@@ -145,7 +145,7 @@ class SphereContext(nn.Module):
     @torch.compiler.disable  # type: ignore[untyped-decorator]
     def _in_chunks(self, images: Tensor, rays: Tensor, size: int) -> Any:
         """Encode in chunks, mix the tokens of all, decode in chunks."""
-        chunks = torch.split(images, size)
+        chunks = torch.tensor_split(images, -(-len(images) // size))  # even ones
         # Evaluation draws nothing.
         first = int(torch.randint(2**62, ())) if self.training else 0
         seeds = range(first, first + len(chunks))
@@ -153,7 +153,7 @@ class SphereContext(nn.Module):
             self._recomputed(self.encode, chunk, seed=seed, counted=False)
             for chunk, seed in zip(chunks, seeds, strict=True)
         ]
-        contexts = torch.split(self.mix(rays, torch.cat(tokens)), size)
+        contexts = torch.tensor_split(self.mix(rays, torch.cat(tokens)), len(chunks))
         parts = [
             self._recomputed(self.decode, chunk, context, seed=seed, counted=True)
             for chunk, context, seed in zip(chunks, contexts, seeds, strict=True)

@@ -66,6 +66,8 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
         noun: Name of the items, in the plural.
         is_made: Whether `make_files` generates all of it.
         label_counts: After `check`, ``(K+1,)`` pixels of each label by split, as files have them.
+        try_step: Refuses a training step of some items, before these are decoded; None before a
+            task is known.
 
     Raises:
         SettingError: A setting is invalid.
@@ -97,6 +99,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
             self.require(name, getattr(self, name) >= 0, "0 or more")
         self.require(self._per_step, self.per_step >= 1, "1 or more")
         self.label_counts: dict[Split, NDArray[np.int64]] = {}
+        self.try_step: Callable[[int], None] | None = None
         self._found: Found[_Item] | None = None
         self._sources: dict[Split, SplitItems[_Item, Any]] = {}
         self._start = (0, 0)
@@ -206,6 +209,10 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
         self.make_files()
         stage = None if self.trainer is None else self.trainer.state.fn
         self._found = found = self._usable(sample=stage == TrainerFn.FITTING)
+        if self.try_step is not None and self.trainer is not None and stage == TrainerFn.FITTING:
+            count = len(found.splits["train"]) // self.trainer.world_size
+            for size in {min(self.per_step, count), count % self.per_step} - {0}:
+                self.try_step(size)  # the last step of an epoch may be smaller
         if not self.skip_broken and found.store is not None:
             problems = Problems()
             splits: Sequence[Split] = ("test",) if stage == TrainerFn.TESTING else SPLITS

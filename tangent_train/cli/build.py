@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -13,7 +14,7 @@ from torch import nn
 from datamodules.core.split_module import SplitDataModule
 from tangent_train.checkpoints.trained import TrainedNetwork, completed_settings
 from tangent_train.cli.settings import typed
-from tangent_train.errors import SettingError
+from tangent_train.errors import SettingError, counted
 from tangent_train.inference.class_maps import Unmapped, load_class_map, map_classes
 from tangent_train.inference.views import check_size
 from tangent_train.registry import SettingsFile, make, maker_of
@@ -54,6 +55,10 @@ def build(
     _try_network(task, data.in_channels)
     if not trains:
         return data, task
+    synchronized = bool(settings["trainer"].get("sync_batchnorm"))
+    probe = copy.deepcopy(task).to("meta")
+    data.try_step = partial(_try_step, probe, data, synchronized)
+    data.try_step(data.per_step)
     try:
         task.make_optimizer([{"params": [torch.zeros(1, 1, requires_grad=True)]}])
     except (TypeError, ValueError) as error:
@@ -190,3 +195,51 @@ def _try_network(task: Any, channels: int) -> None:
                 expected=f"one that maps {task.takes}",
                 remedy="A network for photos takes data.inputs=[rgb]." if channels > _RGB else "",
             ) from error
+
+
+def _try_step(probe: Any, data: Any, synchronized: bool, samples: int) -> None:
+    """Run the network in training mode on the smallest chunk of a training step.
+
+    Batch normalization fails on a single value per channel, as of one image of 1×1 features. Images
+    are empty, and nothing is computed where shapes are enough to know.
+
+    Args:
+        probe: The task, on the device ``meta``.
+        data: The data module.
+        synchronized: Whether several processes normalize together.
+        samples: Panoramas, photos or shapes of the step.
+
+    Raises:
+        SettingError: The network cannot be trained on it.
+    """
+    if synchronized and (data.trainer is None or data.trainer.world_size > 1):
+        return
+    step = probe.empty_step(data.in_channels, samples)
+    chunk = min(probe.chunks(step), key=len)
+    reason = None
+    for device in ("meta", "cpu"):  # what shapes do not show is computed
+        network = copy.deepcopy(probe.train().network).to_empty(device=device)
+        reason = _training_fault(network, torch.zeros(chunk.shape, device=device))
+        if reason is None:
+            return
+    per_step = f"data.{data.noun}_per_step"
+    is_whole = len(chunk) == len(step)
+    raise SettingError(
+        per_step if is_whole else "task.images_per_chunk",
+        found=f"{data.per_step if is_whole else probe.images_per_chunk}, so that in a step of "
+        f"{counted(samples, data.noun)} {type(probe.network).__name__} gets {tuple(chunk.shape)}, "
+        f"on which it cannot be trained ({reason})",
+        expected="more images at a time, in the last step of an epoch too",
+        remedy=f"Change {per_step} or task.images_per_chunk, or choose a network without batch "
+        "normalization.",
+    )
+
+
+def _training_fault(network: nn.Module, images: torch.Tensor) -> str | None:
+    """The first line of the error of a network on images; None without one."""
+    try:
+        with torch.random.fork_rng(), torch.no_grad():
+            network.forward(images)  # a compiled one is not compiled for this
+    except (RuntimeError, ValueError) as error:
+        return str(error).partition("\n")[0]
+    return None

@@ -35,9 +35,10 @@ def _main(command: str) -> None:
 
     from tangent_train.cli.compose import config_folder, named, quote_path
     from tangent_train.cli.help import annotate
-    from tangent_train.cli.processes import ended_by_sigterm
+    from tangent_train.cli.processes import end_with_first_process, ended_by_sigterm
     from tangent_train.cli.stored import stored_run
 
+    end_with_first_process()
     typed = sys.argv[1:]
     arguments = typed[1:] if __name__ == "__main__" else typed
     visible_gpus = os.environ.get("CUDA_VISIBLE_DEVICES")

@@ -6,6 +6,8 @@ import os
 import signal
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -14,6 +16,8 @@ from typing import NoReturn
 from tangent_train.cli.compose import quoted
 
 _PATIENCE_S = 30.0  # for a last checkpoint
+_WATCHED_EVERY_S = 1.0
+_FIRST = "TANGENT_TRAIN_FIRST_PROCESS"
 
 
 class SigtermError(KeyboardInterrupt):
@@ -59,6 +63,28 @@ def run_process(line: Sequence[str], changes: Mapping[str, str | None] | None = 
                 process.kill()
                 process.wait()
             raise
+
+
+def end_with_first_process() -> None:
+    """End this process with the first one of its run, which has started it.
+
+    Lightning starts the other processes of a run on several devices, and ends the first one when
+    one of them fails. A first process that was killed cannot end them: they would wait for it as
+    long as for a slow one, up to an hour.
+    """
+    first = os.environ.get(_FIRST)
+    if first is None or int(os.environ.get("LOCAL_RANK", "0")) == 0:
+        os.environ[_FIRST] = str(os.getpid())
+        return
+
+    def watch() -> NoReturn:
+        while os.getppid() == int(first):
+            time.sleep(_WATCHED_EVERY_S)
+        sys.stderr.write("tangent-train: ended, because the first process of the run has ended\n")
+        sys.stderr.flush()
+        os._exit(1)  # at once, also while another thread waits in a library
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 @contextmanager

@@ -1,8 +1,9 @@
-"""Trained networks in Python: labels of arrays and tensors."""
+"""Trained networks in Python: labels of files, images in memory and tensors."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, get_args
@@ -12,21 +13,33 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from datamodules.core.image_module import Upright
 from datamodules.core.panoramas import meters_to_steps
+from datamodules.images.gpano import PanoramaArea
+from datamodules.images.masks import Mask, Masks
 from datamodules.images.palette import class_colors
 from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
 from tangent_train.errors import SettingError, width_height
-from tangent_train.geometry import camera_matrix_from_fov
 from tangent_train.inference.class_maps import Unmapped, load_class_map, map_classes
+from tangent_train.inference.images import with_up
+from tangent_train.inference.judge import NetworkJudge
+from tangent_train.inference.picture import (
+    Picture,
+    counted_pixels,
+    described,
+    panorama_of,
+    photo_of,
+)
 from tangent_train.inference.predictor import Predictor
-from tangent_train.inference.views import InputImage, PanoramaViews, PhotoViews
+from tangent_train.inference.views import PanoramaViews, PhotoViews
 from tangent_train.rendering import Blend
 from tangent_train.rendering.checks import check_choice
-from tangent_train.rendering.forward import Pixels
 from tangent_train.rendering.mosaic import ScoreMosaic
 
 Depth = Tensor | NDArray[Any] | None
 """``(H, W)`` floats: metres, 0 or NaN where missing."""
+
+_SHOWN = 6
 
 
 def load(
@@ -44,7 +57,7 @@ def load(
     min_confidence: float = 0.0,
     trust: str | Sequence[str] = (),
 ) -> Network:
-    """A trained network from a file, for panoramas and photos in memory.
+    """A trained network from a file, for panoramas and photos.
 
     The settings are those of ``tangent-predict``, and so are the labels.
 
@@ -70,29 +83,36 @@ def load(
         SettingError: A setting does not suit the network.
     """
     check_choice("unmapped", unmapped, get_args(Unmapped))
-    trained = load_trained(Path(path), (trust,) if isinstance(trust, str) else trust)
+    original = load_trained(Path(path), (trust,) if isinstance(trust, str) else trust)
+    trained = original
     if class_map is not None:
-        trained = map_classes(trained, load_class_map(str(class_map)), unmapped).trained
+        trained = map_classes(original, load_class_map(str(class_map)), unmapped).trained
     views = PanoramaViews(trained, levels or (level,), base_level, blend, rotations)
     how = device, images_per_forward, min_confidence
+    panoramas = Predictor(trained, views, *how)
     return Network(
         trained,
-        Predictor(trained, views, *how),
+        views,
+        panoramas,
         lambda: Predictor(trained, PhotoViews(trained, level, base_level, blend), *how),
+        NetworkJudge(original, panoramas.device),
     )
 
 
 class Network:
-    """A trained network for panoramas and photos in memory; made by `load`.
+    """A trained network for panoramas and photos; made by `load`.
 
-    Images are RGB of 0 to 255: arrays ``(H, W, 3)`` or tensors ``(3, H, W)`` on any device, uint8.
-    Panoramas show the whole sphere, W = 2 H, of any size. What is returned has the size of the
-    image: arrays for arrays, tensors on the image's device for tensors.
+    Images are files or in memory, see `Picture`. Files are read as by ``tangent-predict``, with
+    their GPano tags; of an image of Pillow the EXIF orientation is applied, of other images the
+    pixels are all there is. What is returned has the size of the image: tensors on the image's
+    device for tensors, else arrays.
 
     Args:
         trained: The network.
+        views: Its views of panoramas.
         panoramas: Its predictor of panoramas.
         photos: Makes its predictor of photos.
+        judge: Helps to estimate which way is up.
 
     Attributes:
         trained: The network, with its inputs, level and representation.
@@ -101,21 +121,44 @@ class Network:
     """
 
     def __init__(
-        self, trained: TrainedNetwork, panoramas: Predictor, photos: Callable[[], Predictor]
+        self,
+        trained: TrainedNetwork,
+        views: PanoramaViews,
+        panoramas: Predictor,
+        photos: Callable[[], Predictor],
+        judge: NetworkJudge,
     ) -> None:
         self.trained = trained
         self.class_names = trained.class_names
         self.palette = class_colors(len(trained.class_names))
+        self._views = views
         self._panoramas = panoramas
         self._make_photos = photos
+        self._judge = judge
+
+    def __repr__(self) -> str:
+        """Classes, inputs, views and device."""
+        trained, names = self.trained, self.class_names[1:]
+        shown = ", ".join(names[:_SHOWN]) + ", …" * (len(names) > _SHOWN)
+        rows, columns = trained.image_size
+        kind = str(trained.representation["_target_"]).rpartition(".")[2]
+        return (
+            f"<Network of {len(names)} classes ({shown}), inputs {', '.join(trained.inputs)}, "
+            f"trained at level {trained.level} on {columns}×{rows} images of {kind}, "
+            f"on {self._panoramas.device}>"
+        )
 
     def labels(
         self,
-        image: Pixels,
+        image: Picture,
         *,
         depth: Depth = None,
         fov: float | None = None,
-    ) -> Pixels:
+        crop: Sequence[float] | None = None,
+        upright: Upright = None,
+        max_tilt_deg: float = 60.0,
+        mask: Mask | str | NDArray[Any] | Tensor = None,
+    ) -> Any:
         """Label of every pixel.
 
         Args:
@@ -123,33 +166,54 @@ class Network:
             depth: ``(H, W)`` floats in metres, for networks that see depth, 0 or NaN where missing:
                 the distance from the centre, in photos along the optical axis.
             fov: Horizontal field of view of a photo in degrees; None for a panorama.
+            crop: West, east, south and north of a part of a panorama in degrees, see
+                `area_of_crop`; None for that of its file's GPano tags, else the whole sphere,
+                W = 2 H.
+            upright: Align a panorama with gravity: ``pose`` by its file's GPano tags, ``auto``
+                likewise, else as estimated from the image.
+            max_tilt_deg: Of ``auto``: the largest tilt considered.
+            mask: Pixels of a panorama that get the label 0: below a latitude in degrees, or black
+                ones of a file, see `Masks`; or where an array or tensor ``(H, W)`` is 0 or False.
 
         Returns:
             ``(H, W)`` labels 1 … K, and 0 where the network sees nothing it knows: an array of
             uint8, or uint16 of many classes, or a tensor of int64.
 
         Raises:
+            DataError: A file cannot be used, or the image is not a whole panorama.
             SettingError: The image cannot be used, or the network needs another input.
         """
-        mosaic = self._predict(image, depth, fov, probabilities=False)
+        if mask is not None and fov is not None:
+            raise SettingError("mask", found="one, with fov=", expected="None for photos")
+        hidden = mask if isinstance(mask, np.ndarray | Tensor) else Masks(mask)
+        mosaic, area = self._predict(image, depth, fov, crop, upright, max_tilt_deg)
         labels: Any = self.trained.labels(mosaic.labels())
+        if area is not None:
+            labels = area.cut(labels)
+            labels = np.where(counted_pixels(hidden, image, area), labels, labels.dtype.type(0))
         if isinstance(image, Tensor):
             return torch.from_numpy(labels.astype(np.int64)).to(image.device)
         return labels
 
     def scores(
         self,
-        image: Pixels,
+        image: Picture,
         *,
         depth: Depth = None,
         fov: float | None = None,
-    ) -> Pixels:
+        crop: Sequence[float] | None = None,
+        upright: Upright = None,
+        max_tilt_deg: float = 60.0,
+    ) -> Any:
         """Probability of every class at every pixel.
 
         Args:
-            image: See `labels`.
-            depth: See `labels`.
-            fov: See `labels`.
+            image: See `labels`, also for the others.
+            depth: Depth of the image.
+            fov: Field of view of a photo.
+            crop: Part of the sphere.
+            upright: Source of the zenith.
+            max_tilt_deg: Largest tilt considered.
 
         Returns:
             An array ``(H, W, K)`` or a tensor ``(K, H, W)`` of float32; number k is that of label
@@ -157,32 +221,46 @@ class Network:
             of the classes.
 
         Raises:
+            DataError: See `labels`.
             SettingError: See `labels`.
         """
-        mosaic = self._predict(image, depth, fov, probabilities=True)
+        mosaic, area = self._predict(
+            image, depth, fov, crop, upright, max_tilt_deg, probabilities=True
+        )
         scores: Any = mosaic.probabilities(slice(None))[..., : len(self.class_names) - 1]
-        scores = np.ascontiguousarray(scores)
+        scores = np.ascontiguousarray(scores if area is None else area.cut(scores))
         if isinstance(image, Tensor):
             return torch.from_numpy(scores).movedim(-1, 0).to(image.device)
         return scores
 
     def _predict(
-        self, image: Any, depth: Any, fov: float | None, *, probabilities: bool
-    ) -> ScoreMosaic:
-        rgb = _rgb(image)
-        size = (rgb.shape[0], rgb.shape[1])
-        steps = self._depth(depth, size)
+        self,
+        image: Any,
+        depth: Any,
+        fov: float | None,
+        crop: Sequence[float] | None,
+        upright: Upright,
+        max_tilt_deg: float,
+        *,
+        probabilities: bool = False,
+    ) -> tuple[ScoreMosaic, PanoramaArea | None]:
+        """Scores of the whole sphere, with the part that the image shows; or those of a photo."""
         if fov is not None:
-            photo = InputImage(rgb, steps, camera_matrix=camera_matrix_from_fov(fov, size))
-            return self._photos.predict(photo, probabilities=probabilities)
-        if size[1] != 2 * size[0]:
-            raise SettingError(
-                "panorama",
-                found=width_height(size),
-                expected="the whole sphere, twice as wide as high",
-                remedy="Of a photo, give fov=, its horizontal field of view in degrees.",
-            )
-        return self._panoramas.predict(InputImage(rgb, steps), probabilities=probabilities)
+            if crop is not None or upright is not None:
+                given = "crop" if crop is not None else "upright"
+                raise SettingError(given, found="one, with fov=", expected="None for photos")
+            photo = photo_of(image, fov)
+            photo = replace(photo, depth=self._depth(depth, photo.rgb.shape[:2]))
+            return self._photos.predict(photo, probabilities=probabilities), None
+        if upright is not None:
+            check_choice("upright", upright, ("pose", "auto"))
+            self._views.need_tangent_images(f"upright={upright}")
+        panorama, area = panorama_of(image, crop, upright)
+        steps = self._depth(depth, area.image_shape)
+        panorama = replace(panorama, depth=None if steps is None else area.place(steps))
+        if upright == "auto":
+            panorama = with_up(panorama, max_tilt_deg, self._judge)
+        return self._panoramas.predict(panorama, probabilities=probabilities), area
 
     @cached_property
     def _photos(self) -> Predictor:
@@ -198,31 +276,9 @@ class Network:
         if not (wanted and fits):
             raise SettingError(
                 "depth",
-                found=_described(depth),
+                found=described(depth),
                 expected=f"floats in metres, {width_height(size)}"
                 if wanted
                 else f"None: the network sees {' and '.join(self.trained.inputs)}",
             )
         return meters_to_steps(np.nan_to_num(array.astype(np.float32), posinf=0).clip(min=0))
-
-
-def _rgb(image: Any) -> NDArray[np.uint8]:
-    """An image ``(H, W, 3)``."""
-    is_tensor = isinstance(image, Tensor)
-    array = image.detach().cpu().numpy() if is_tensor else image
-    fits = isinstance(array, np.ndarray) and array.ndim == 3 and array.dtype == np.uint8
-    channels = 0 if is_tensor else -1
-    if fits and array.shape[channels] == 3 and array.size:
-        return np.ascontiguousarray(np.moveaxis(array, channels, -1))
-    raise SettingError(
-        "image",
-        found=_described(image),
-        expected="RGB of 0 to 255: a uint8 tensor (3, H, W) or array (H, W, 3)",
-    )
-
-
-def _described(value: Any) -> str:
-    if value is None:
-        return "none"
-    kind = type(value).__name__
-    return f"{kind} {tuple(value.shape)} of {value.dtype}" if hasattr(value, "dtype") else kind

@@ -116,18 +116,28 @@ class PanoramaViews:
         self._turns = turns(rotations, "rotations")
         self.image_size = max(seen.image_size for seen in self._seen)
         self.blend: Blend = blend
+        if upright or len(levels) > 1:
+            self.need_tangent_images(f"upright={upright} and {len(levels)} levels")
         for seen in self._seen:
-            if isinstance(seen, EquirectRepresentation):
-                if upright or len(levels) > 1:
-                    raise SettingError(
-                        "upright and levels",
-                        found=f"{upright}, {len(levels)} levels",
-                        expected="null and one for a network that takes equirectangular images",
-                        remedy="Give base_level= to use tangent images.",
-                    )
+            if isinstance(seen, EquirectRepresentation) or not seen.grid.overlapping:
                 self.blend = "nearest"
-            elif not seen.grid.overlapping:
-                self.blend = "nearest"
+
+    def need_tangent_images(self, given: str) -> None:
+        """Refuse settings that equirectangular images do not have.
+
+        Args:
+            given: The settings, for the message.
+
+        Raises:
+            SettingError: The network takes such images.
+        """
+        if any(isinstance(seen, EquirectRepresentation) for seen in self._seen):
+            raise SettingError(
+                "upright and levels",
+                found=given,
+                expected="neither, for a network that takes equirectangular images",
+                remedy="Give base_level= to use tangent images.",
+            )
 
     def __call__(self, image: InputImage) -> list[ViewSet]:
         """One set for every level and rotation."""

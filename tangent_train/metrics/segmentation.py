@@ -13,7 +13,7 @@ from torchmetrics import Metric
 from torchmetrics.utilities import dim_zero_cat
 
 from tangent_train.errors import SettingError
-from tangent_train.geometry import equirect_latitudes, equirect_solid_angles
+from tangent_train.geometry import equirect_solid_angles
 
 AbsentClass = Literal["skip", "zero"]
 """Whether a class without labelled pixels is left out of a mean or counts as 0."""
@@ -22,7 +22,8 @@ UNKNOWN = 0
 """Class index of unlabelled pixels, everywhere."""
 
 BAND_EDGES_DEG = (90, 60, 30, 0, -30, -60, -90)
-"""Latitude bands, from north to south."""
+"""Latitude bands, from north to south. A row whose centre is on the edge of two bands counts in the
+northern one."""
 
 Interval = tuple[float, float]
 """Lower and upper end of a score, shares of 1."""
@@ -168,7 +169,7 @@ class ConfusionMatrix(Metric):
 
     Attributes:
         pixels: ``(K+1, K+1)`` pixels; rows truth, columns prediction.
-        bands: ``(6, K+1, K+1)`` pixels per latitude band of 30°, north first.
+        bands: ``(6, K+1, K+1)`` pixels per latitude band of 30°, see `BAND_EDGES_DEG`.
         steradians: ``(K+1, K+1)`` the same over all latitudes, in steradians.
         images: Panoramas and photos seen.
         of_images: See `ConfusionMatrices`; a part for each image.
@@ -240,8 +241,9 @@ class ConfusionMatrix(Metric):
         k = self.num_classes
         rows = known.nonzero()[:, 0]
         height, width = known.shape
-        latitudes = np.degrees(equirect_latitudes(height))
-        band_of_row = np.searchsorted(-np.array(BAND_EDGES_DEG[1:-1]), -latitudes, side="left")
+        # In degrees, and divided last: a row on the edge of a band is exactly there.
+        southward_deg = (2 * np.arange(height) + 1) * 90 / height - 90
+        band_of_row = np.searchsorted(-np.array(BAND_EDGES_DEG[1:-1]), southward_deg, side="left")
         # Integers first, sums of them after: the same figures in any order, on any device.
         by_row = torch.bincount(rows * k * k + pairs, minlength=height * k * k).reshape(
             height, k, k

@@ -18,6 +18,7 @@ from datamodules.core.split_module import Kind
 from tangent_train.errors import SettingError
 from tangent_train.tasks.divergence import check_weights, refuse_loss
 from tangent_train.tasks.fine_tuning import freeze, groups_of, rates_of
+from tangent_train.tasks.schedules import ends_at
 
 Part = tuple[tuple[Tensor, ...], Tensor]
 """Inputs of the network and their labels."""
@@ -26,8 +27,8 @@ Part = tuple[tuple[Tensor, ...], Tensor]
 class Task(lightning.LightningModule, ABC):
     """Trains a network on batches of spheres and scores it.
 
-    All images of a batch, on all processes, make one gradient: the loss is a sum over the batch
-    divided by a norm of the batch, in whatever chunks it is computed.
+    All images of a step, on all processes and in all accumulated batches, make one gradient: the
+    loss is a sum over the step divided by a norm of the step, in whatever chunks it is computed.
 
     Args:
         network: The network to train.
@@ -38,8 +39,8 @@ class Task(lightning.LightningModule, ABC):
             `total_steps` gets the length of the training and is stepped every step, others every
             epoch.
         label_smoothing: Fraction of the target that is spread over all classes.
-        images_per_chunk: Images per forward pass in training, which bounds memory; None for the
-            whole batch. Batch normalization sees one chunk at a time.
+        images_per_chunk: Most images per forward pass in training, which bounds memory; None for
+            the whole batch. Batch normalization sees one chunk at a time; chunks are even.
         channels_last: Memory format of network and images, often faster.
         compile: Arguments of `torch.compile`, empty for its defaults; None to disable it.
         frozen: Names of modules and parameters of the network that are not trained; such modules
@@ -107,6 +108,8 @@ class Task(lightning.LightningModule, ABC):
         self._frozen = tuple(freeze(self.network, frozen))
         self.confusion: Any = self.metric(len(self.class_names))
         self._pending: tuple[Tensor, Any, Any] | None = None
+        self._step_norm: Any = None
+        self._trained_length: Mapping[str, int] | None = None
 
     @abstractmethod
     def example(self, channels: int) -> Tensor:
@@ -132,15 +135,27 @@ class Task(lightning.LightningModule, ABC):
     def scores(self) -> dict[str, float]:
         """The scores of `matrices` by name."""
 
+    @abstractmethod
+    def empty_step(self, channels: int, samples: int) -> Tensor:
+        """Empty inputs of the network for a training step of some samples, without memory."""
+
     def training_parts(self, batch: Any) -> list[Part]:
-        """A batch in parts of at most `images_per_chunk` images, but no less than one input."""
+        """A batch in parts, see `chunks`."""
         inputs, labels = self.training_pairs(batch)
-        images_each = inputs.shape[1:-3].numel()
-        size = len(inputs)
-        if self.images_per_chunk is not None:
-            size = max(1, self.images_per_chunk // images_each)
-        pairs = zip(torch.split(inputs, size), torch.split(labels, size), strict=True)
-        return [((part,), of_part) for part, of_part in pairs]
+        parts = self.chunks(inputs)
+        of_parts = torch.tensor_split(labels, len(parts))
+        return [((part,), of_part) for part, of_part in zip(parts, of_parts, strict=True)]
+
+    def chunks(self, inputs: Tensor) -> tuple[Tensor, ...]:
+        """Even chunks of at most `images_per_chunk` images, but no less than one input.
+
+        Even, because batch normalization fails on a single value per channel: 20 images in chunks
+        of at most 19 are 10 and 10, not 19 and 1.
+        """
+        if self.images_per_chunk is None:
+            return (inputs,)
+        size = max(1, self.images_per_chunk // inputs.shape[1:-3].numel())
+        return torch.tensor_split(inputs, -(-len(inputs) // size))
 
     def on_train_start(self) -> None:
         """Refuse to resume a schedule that was made for another length of training.
@@ -148,44 +163,60 @@ class Task(lightning.LightningModule, ABC):
         Raises:
             SettingError: The length has changed.
         """
-        steps = self.trainer.estimated_stepping_batches
-        for config in self.trainer.lr_scheduler_configs:
-            planned = getattr(config.scheduler, "total_steps", steps)
-            if planned != steps:
-                raise SettingError(
-                    "trainer.max_epochs, trainer.devices and data.…_per_step",
-                    found=f"{steps} training steps",
-                    expected=f"{planned}, which the schedule of the resumed run was made for",
-                    remedy="Resume with the same, or start a new run.",
-                )
+        then, now, scheduler = self._trained_length, self._length(), self.make_scheduler
+        if then is None or scheduler is None:
+            return
+        by_step = self._is_stepped_every_step
+        unit = "steps" if by_step else "epochs"
+        if then[unit] != now[unit] and (
+            by_step or ends_at(then[unit], self.make_optimizer, scheduler)
+        ):
+            others = ", trainer.devices and data.…_per_step" * by_step
+            raise SettingError(
+                f"trainer.max_epochs, trainer.max_steps{others}",
+                found=f"{now[unit]} training {unit}",
+                expected=f"{then[unit]}, which the schedule of the resumed run was made for",
+                remedy="Resume with the same. To train for longer, start a new run with a schedule "
+                "of its own from the weights: init_from=<run>/checkpoints/last.ckpt",
+            )
 
     def training_step(self, batch: Any, batch_idx: int) -> Tensor:
-        """One gradient of the whole batch, over all chunks and processes.
+        """Add to the gradient of a step over all chunks, accumulated batches and processes.
 
         All parts but the last are back-propagated here, Lightning does the last one. On several
         processes this is still inside `DistributedDataParallel.forward`, which exchanges gradients
         only in a backward pass that follows it: once, after the last part.
+
+        With `trainer.accumulate_grad_batches` the gradients are always those of the batches so far:
+        before another one they shrink by the growth of the norm.
         """
         *parts, last = self.training_parts(batch)
-        strategy, batches = self.trainer.strategy, self.trainer.accumulate_grad_batches
+        strategy = self.trainer.strategy
         # The mean over processes, as gradients are averaged.
         norm: Any = sum(self.loss_norm(labels) for _, labels in (*parts, last))
         norm = strategy.reduce(norm, reduce_op="mean").clamp(min=torch.finfo(norm.dtype).tiny)
-        if batch_idx % batches == 0:
+        if batch_idx % self.trainer.accumulate_grad_batches == 0:
             self.trainer.optimizers[0].zero_grad()
+            self._step_norm = norm
+        else:
+            before, self._step_norm = self._step_norm, self._step_norm + norm
+            for parameter in self.parameters():
+                if parameter.grad is not None:
+                    parameter.grad *= before / self._step_norm
         value = norm.new_zeros(())
         for part in parts:
-            loss = self.loss_sum(*part) / norm
-            strategy.backward(loss / batches, None)
+            loss = self.loss_sum(*part)
+            strategy.backward(loss / self._step_norm, None)
             value += loss.detach()
-        loss = self.loss_sum(*last) / norm
-        whole: Any = strategy.reduce(value + loss.detach(), reduce_op="mean")
+        loss = self.loss_sum(*last)
+        whole: Any = strategy.reduce((value + loss.detach()) / norm, reduce_op="mean")
         # Copied while a GPU is busy with the backward pass.
         copied = torch.cuda.Event() if whole.is_cuda else None  # type: ignore[no-untyped-call]
         self._pending = (whole.to("cpu", non_blocking=True), copied, batch)
         if copied is not None:
             copied.record()
-        return loss
+        # Lightning divides by the number of accumulated batches.
+        return loss / self._step_norm * self.trainer.accumulate_grad_batches
 
     def on_after_backward(self) -> None:
         """Log the loss, and stop before a step with a non-finite one, on all processes.
@@ -215,13 +246,16 @@ class Task(lightning.LightningModule, ABC):
         return self
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Add `fresh`; see also `check_weights`."""
+        """Add `fresh` and the length of the training; see also `check_weights`."""
         check_weights(self)
+        checkpoint["length"] = self._length()
         if self.fresh is not None:
             checkpoint["fresh"] = sorted(self.fresh)
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Take `fresh`, before the optimizer is made."""
+        """Take `fresh`, before the optimizer is made, and the length of the training."""
+        length = checkpoint["length"]
+        self._trained_length = {unit: int(length[unit]) for unit in ("steps", "epochs")}
         fresh = checkpoint.get("fresh")
         self.fresh = None if fresh is None else frozenset(map(str, fresh))
 
@@ -263,7 +297,7 @@ class Task(lightning.LightningModule, ABC):
             group["lr"] *= of_group
         if self.make_scheduler is None:
             return optimizer
-        by_step = "total_steps" in inspect.signature(self.make_scheduler).parameters
+        by_step = self._is_stepped_every_step
         settings: dict[str, Any] = {"total_steps": count_steps()} if by_step else {}
         if factor != 1:
             settings |= rates_of(self.make_scheduler, factors)
@@ -272,6 +306,21 @@ class Task(lightning.LightningModule, ABC):
             "interval": "step" if by_step else "epoch",
         }
         return {"optimizer": optimizer, "lr_scheduler": scheduler}
+
+    @property
+    def _is_stepped_every_step(self) -> bool:
+        """True if the scheduler gets the number of steps; others are stepped every epoch."""
+        scheduler = self.make_scheduler
+        return scheduler is not None and "total_steps" in inspect.signature(scheduler).parameters
+
+    def _length(self) -> dict[str, int]:
+        """Planned steps and epochs of the training; −1 without an end."""
+        trainer = self.trainer
+        steps = trainer.estimated_stepping_batches
+        each = math.ceil(trainer.num_training_batches / trainer.accumulate_grad_batches)
+        if not math.isfinite(steps):
+            return {"steps": -1, "epochs": -1}
+        return {"steps": int(steps), "epochs": math.ceil(steps / max(each, 1))}
 
     def checked_scores(self, scores: Any, expected: tuple[int, ...]) -> Tensor:
         """The network's scores.

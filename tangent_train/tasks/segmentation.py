@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, get_args
 
+import numpy as np
 import torch
 from jaxtyping import Float, Integer
 from torch import Tensor, nn
@@ -16,6 +17,7 @@ from tangent_train.inference.predictor import sees_rays, view_scores
 from tangent_train.metrics.segmentation import AbsentClass, ConfusionMatrix, segmentation_scores
 from tangent_train.registry import registered
 from tangent_train.rendering import Assembler, EquirectRepresentation
+from tangent_train.rendering.representations.views import Representation
 from tangent_train.tasks.base import Part, Task
 from tangent_train.tasks.losses import auxiliary_sum, cross_entropy_norm, cross_entropy_sum
 
@@ -138,6 +140,15 @@ class SegmentationTask(Task):
     def example(self, channels: int) -> Tensor:
         """One empty image ``(1, C, h, w)``."""
         return torch.zeros(1, channels, *self.representation.image_size)
+
+    def empty_step(self, channels: int, samples: int) -> Tensor:
+        """Empty images ``(n, C, h, w)``: all views of some panoramas, or one crop of each photo."""
+        images, seen = (1, *self.representation.image_size), self.representation
+        if isinstance(seen, Representation):
+            rows = seen.erp_height
+            views = seen.sample(np.random.default_rng(0))
+            images = views.render(np.zeros((rows, 2 * rows), np.uint8), "nearest").shape
+        return torch.empty(samples * images[0], channels, *images[1:], device="meta")
 
     def training_pairs(self, batch: Any) -> tuple[Tensor, Tensor]:
         """All images of all panoramas or photos ``(n, C, h, w)`` and labels ``(n, h, w)``."""

@@ -8,11 +8,13 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import cv2
 import pytest
 import torch
 
+from datamodules.core.split_module import SplitDataModule
 from tangent_train.checkpoints.content import read_settings
 from tangent_train.results.record import load_record
 from tangent_train.tasks.segmentation import SegmentationTask
@@ -94,6 +96,37 @@ def test_ctrl_c_ends_a_run_as_a_shell_says_it(
     assert ended.value.code == 128 + signal.SIGINT
 
 
+def test_a_checkpoint_within_an_epoch_holds_the_average_with_its_last_step(
+    rooms: str, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    weights: list[dict[str, torch.Tensor]] = []
+    step = SegmentationTask.training_step
+
+    def kept(task: SegmentationTask, *arguments: Any) -> torch.Tensor:
+        weights.append({n: p.detach().double().clone() for n, p in task.named_parameters()})
+        if len(weights) == 4:
+            raise CutError
+        return step(task, *arguments)
+
+    class CutError(Exception):
+        pass
+
+    monkeypatch.setattr(SegmentationTask, "training_step", kept)
+    typed = ("ema=0.7", "checkpoint_every_n_steps=1", "data.panoramas_per_step=1")
+    with pytest.raises(CutError):
+        run("train", *SETTINGS, rooms, *typed, "hydra.run.dir=run")
+    content = torch.load(tmp_path / "run" / "checkpoints" / "last.ckpt", weights_only=True)
+    assert content["global_step"] == 3
+    found: dict[str, torch.Tensor] = {}
+    for name, third in weights[3].items():  # the average begins with the first step
+        first, second = weights[1][name], weights[2][name]
+        expected = 0.7 * (0.7 * first + 0.3 * second) + 0.3 * third
+        found[name] = (content["state_dict"][name].double() - expected).abs().max()
+        assert torch.equal(content["current_model_state"][name].double(), third)
+    assert max(found.values()) < 1e-6
+    assert max((w - weights[2][n]).abs().max() for n, w in weights[3].items()) > 1e-4
+
+
 def test_without_validation_the_last_epoch_is_tested(rooms: str, tmp_path: Path, run: Run) -> None:
     checkpoints = tmp_path / "run" / "checkpoints"
     typed = ("scheduler=constant", "data.validation_fraction=0", "trainer.max_epochs=1")
@@ -141,6 +174,30 @@ def test_a_run_is_neither_resumed_nor_evaluated_as_another(
         run(command, begun[command], rooms, override)
 
 
+@pytest.mark.parametrize("faces", [1, 2])
+def test_the_last_step_of_an_epoch_is_tried_before_training(
+    faces: int, rooms: str, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of 7 panoramas, 2 a step; DeepLab's pooled features have one value per image and channel."""
+
+    class BegunError(Exception):
+        pass
+
+    def begin(*_: object) -> None:
+        raise BegunError
+
+    monkeypatch.setattr(SplitDataModule, "class_weights", begin)  # reads the labels
+    settings = [text for text in SETTINGS if not text.startswith("network.")]
+    settings += ["network=deeplabv3_mobilenet", "data.inputs=[rgb]", "data.validation_fraction=0"]
+    settings += [f"representation.faces_per_panorama={faces}", "scheduler=constant"]
+    message = (
+        r"data.panoramas_per_step: found 2, so that in a step of 1 panorama .*\(1, 3, 16, 16\)"
+    )
+    refused = pytest.raises(SystemExit, match=message)
+    with refused if faces == 1 else pytest.raises(BegunError):
+        run("train", *settings, rooms, "hydra.run.dir=run")
+
+
 def test_settings_of_an_evaluation(run_folder: Path, rooms: str, run: Run) -> None:
     arguments = [f"checkpoint={run_folder / 'checkpoints' / 'best.ckpt'}", rooms]
     same = [text for text in SETTINGS if text.startswith("data.rooms.")]
@@ -181,6 +238,10 @@ def test_settings_of_an_evaluation(run_folder: Path, rooms: str, run: Run) -> No
         (["trainer.precision=fp16"], "trainer: found .*Precision 'fp16' is invalid"),
         (["optimizer.backbone_lr_factor=0.5"], r"lr_factor: found 0\.5; .*without init_from="),
         (["hydra.run.dir=file/run"], "file/run: found not a directory"),
+        (
+            ["network=deeplabv3_mobilenet", "data.inputs=[rgb]", "task.images_per_chunk=1"],
+            r"task.images_per_chunk: found 1, .* DeepLabV3 gets \(1, 3, .*more than 1 value",
+        ),
     ],
 )
 def test_impossible_settings_are_refused_before_any_data_is_made(

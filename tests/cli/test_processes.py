@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
 from tangent_train.cli import processes
+from tests.running import further_processes, has_ended, wait_for
 
 
 def _python(code: str) -> list[str]:
@@ -50,3 +52,24 @@ def test_ctrl_c_ends_a_job_that_does_not_listen(
         signal.signal(signal.SIGINT, before)
     with pytest.raises(ProcessLookupError):
         os.kill(int(number.read_text()), 0)
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs /proc")
+@pytest.mark.parametrize("moment", ["at once", "waiting"])
+def test_further_processes_of_a_run_end_with_a_killed_first_one(
+    moment: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They wait in C without a timeout, as for the others of a process group."""
+    monkeypatch.delenv("LOCAL_RANK", raising=False)
+    mark = tmp_path / "begun"
+    begin = "from tangent_train.cli.processes import end_with_first_process as begin\nbegin()\n"
+    wait = f"open({str(mark)!r}, 'w')\nimport threading\nlock = threading.Lock()\n"
+    further = _python(f"{begin}{wait}lock.acquire()\nlock.acquire()")
+    start = f"import subprocess\nos.environ['LOCAL_RANK'] = '1'\nsubprocess.run({further})"
+    with subprocess.Popen(_python(begin + start)) as first:
+        wait_for(lambda: further_processes(first.pid))
+        (other,) = further_processes(first.pid)
+        if moment == "waiting":
+            wait_for(mark.exists)
+        first.kill()
+        wait_for(lambda: has_ended(other))

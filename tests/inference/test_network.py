@@ -11,23 +11,30 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from PIL import ExifTags, Image
+from PIL.PngImagePlugin import PngInfo
 
 import tangent_train as tt
 from tangent_train.errors import DataError, SettingError
 from tangent_train.inference.network import Network
 from tests.cli.tiny_runs import run_command
-from tests.inference.trained import CUBE, PERSPECTIVE, TANGENT, sphere, write_checkpoint
+from tests.datamodules.data_files import gpano_xmp
+from tests.inference.trained import CUBE, ERP, PERSPECTIVE, TANGENT, sphere, write_checkpoint
 
 Predicted = Callable[..., tuple[NDArray[Any], NDArray[Any]]]
 
 
 @pytest.fixture
 def predicted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Predicted:
-    """Labels and probabilities that `tangent-predict` writes of an image, with ``net.ckpt``."""
+    """Labels and probabilities that `tangent-predict` writes of an image, with ``net.ckpt``.
 
-    def run(rgb: NDArray[np.uint8], *typed: str) -> tuple[NDArray[Any], NDArray[Any]]:
+    None for the one that is in the folder.
+    """
+
+    def run(rgb: NDArray[np.uint8] | None, *typed: str) -> tuple[NDArray[Any], NDArray[Any]]:
         monkeypatch.chdir(tmp_path)
-        cv2.imwrite("room.png", rgb[..., ::-1])
+        if rgb is not None:
+            cv2.imwrite("room.png", rgb[..., ::-1])
         given = ["checkpoint=net.ckpt", "input=room.png", "output=out"]
         given += ["write=[labels,probabilities]"]
         run_command(monkeypatch, "predict", *given, "report=0", *typed)
@@ -90,6 +97,111 @@ def test_tensors_get_what_arrays_get(network: Network) -> None:
     np.testing.assert_array_equal(network.labels(photo, fov=60).numpy(), expected)
 
 
+def _write(rgb: NDArray[np.uint8], tags: dict[str, object]) -> None:
+    """A panorama with GPano tags, as ``room.png`` in the working folder."""
+    text = PngInfo()
+    text.add_itxt("XML:com.adobe.xmp", gpano_xmp(tags).decode())
+    Image.fromarray(rgb).save("room.png", pnginfo=text)
+
+
+# Rows 8 to 28 and columns 20 to 70 of 50 × 100.
+PART: dict[str, object] = {
+    "FullPanoWidthPixels": 100, "FullPanoHeightPixels": 50, "CroppedAreaLeftPixels": 20,
+    "CroppedAreaTopPixels": 8, "CroppedAreaImageWidthPixels": 50,
+    "CroppedAreaImageHeightPixels": 20,
+}  # fmt: skip
+CROP = [-108, 72, -10.8, 61.2]
+POSE: dict[str, object] = {"PosePitchDegrees": 30, "PoseRollDegrees": -20}
+
+
+@pytest.mark.parametrize(
+    ("tags", "shown", "typed", "settings"),
+    [
+        ({}, np.s_[8:28, 20:70], [f"crop={CROP}"], {"crop": CROP}),
+        (PART, np.s_[8:28, 20:70], [], {}),
+        (PART, np.s_[8:28, 20:70], ["mask=-5"], {"mask": -5}),
+        (POSE, np.s_[:], ["upright=pose"], {"upright": "pose"}),
+        (POSE, np.s_[:], ["upright=auto"], {"upright": "auto"}),
+        (
+            {},
+            np.s_[:],
+            ["upright=auto", "max_tilt_deg=40"],
+            {"upright": "auto", "max_tilt_deg": 40},
+        ),
+        ({}, np.s_[:], ["mask=mask.png"], {"mask": "mask.png"}),
+        ({}, np.s_[:], ["mask=masks"], {"mask": Path("masks")}),
+        ({}, np.s_[:], ["mask=-30.5"], {"mask": -30.5}),
+    ],
+)
+def test_files_get_the_labels_and_scores_of_tangent_predict(
+    tmp_path: Path,
+    predicted: Predicted,
+    network: Network,
+    monkeypatch: pytest.MonkeyPatch,
+    tags: dict[str, object],
+    shown: Any,
+    typed: list[str],
+    settings: dict[str, Any],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    rgb = sphere(50)[shown]
+    _write(rgb, tags)
+    mask = np.zeros((50, 100), np.uint8)
+    mask[10:30, 7:50] = 1
+    Path("masks").mkdir()
+    for path in ("mask.png", "masks/room.png"):
+        cv2.imwrite(path, mask)
+    expected, probabilities = predicted(None, *typed)
+    for given in ("room.png", tmp_path / "room.png"):
+        np.testing.assert_array_equal(network.labels(given, **settings), expected)
+    without = {name: value for name, value in settings.items() if name != "mask"}
+    np.testing.assert_allclose(network.scores("room.png", **without), probabilities, atol=1e-3)
+    assert (expected == 0).any() == ("mask" in settings)
+    if not tags and not Path(str(settings.get("mask"))).is_dir():
+        np.testing.assert_array_equal(network.labels(rgb, **settings), expected)
+        tensor = torch.from_numpy(rgb.copy()).permute(2, 0, 1)
+        np.testing.assert_array_equal(network.labels(tensor, **settings).numpy(), expected)
+    if settings.get("mask") == "mask.png":
+        for array in (mask, mask > 0, torch.from_numpy(mask)):
+            np.testing.assert_array_equal(network.labels(rgb, mask=array), expected)
+
+
+def test_the_zenith_of_a_tilted_panorama_matters(
+    tmp_path: Path, network: Network, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    _write(sphere(50), POSE)
+    upright = network.scores("room.png", upright="pose")
+    np.testing.assert_array_equal(network.scores("room.png", upright="auto"), upright)
+    assert np.abs(upright - network.scores("room.png")).max() > 0.01, "other images, other scores"
+
+
+@pytest.mark.parametrize("mode", ["RGB", "RGBA", "L", "LA", "P", "CMYK", "1", "I;16"])
+@pytest.mark.parametrize("orientation", [1, 6, 3])
+def test_images_of_pillow_get_what_their_files_get(
+    mode: str, orientation: int, tmp_path: Path, network: Network
+) -> None:
+    image = Image.fromarray(sphere(24)[:, :31])
+    image = image.convert("L" if mode == "I;16" else mode)
+    if mode == "I;16":
+        image = Image.fromarray(np.asarray(image).astype(np.uint16) * 256 + 77)
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = orientation
+    path = tmp_path / ("photo.jpg" if mode == "CMYK" else "photo.png")
+    image.save(path, exif=exif)
+    expected = network.labels(path, fov=60)
+    assert expected.shape == ((31, 24) if orientation == 6 else (24, 31))
+    with Image.open(path) as opened:
+        np.testing.assert_array_equal(network.labels(opened, fov=60), expected)
+
+
+def test_a_network_says_what_it_is(network: Network) -> None:
+    assert repr(network) == (
+        "<Network of 3 classes (dark, green, bright), inputs rgb, trained at level 4 on 16×16 "
+        "images of TangentRepresentation, on cpu>"
+    )
+
+
 @pytest.mark.gpu
 def test_a_gpu_gives_what_the_cpu_gives(tmp_path: Path, network: Network) -> None:
     panorama = torch.from_numpy(sphere(33)).permute(2, 0, 1)
@@ -150,17 +262,49 @@ _RGB = np.zeros((16, 32, 3), np.uint8)
 @pytest.mark.parametrize(
     ("image", "message"),
     [
-        (_RGB[:, :31], r"found 31 × 16 \(width × height\); expected the whole sphere.*fov="),
+        (_RGB[:, :30], "expected a whole panorama, twice as wide as high.*fov=.*crop="),
         (_RGB[..., 0], r"ndarray \(16, 32\) of uint8; expected .* array \(H, W, 3\)"),
         (torch.zeros(16, 32, 3, dtype=torch.uint8), r"found Tensor \(16, 32, 3\).*\(3, H, W\)"),
         (torch.zeros(3, 16, 32), "found Tensor.*float32; expected RGB of 0 to 255"),
         (_RGB[:0, :0], r"\(0, 0, 3\)"),
-        ("room.jpg", "found str"),
+        ("room.jpg", "room.jpg: found .*No such file"),
+        (Image.new("F", (32, 16)), "mode F; expected colours"),
+        ([[0]], "found list; expected RGB"),
     ],
 )
 def test_other_images_are_refused(image: Any, message: str, network: Network) -> None:
-    with pytest.raises(SettingError, match=message):
+    with pytest.raises((DataError, SettingError), match=message):
         network.labels(image)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"fov": 60, "crop": [0, 90, 0, 45]}, "crop: found one, with fov=; expected None"),
+        ({"fov": 60, "upright": "auto"}, "upright: found one, with fov=; expected None"),
+        ({"fov": 60, "mask": -30}, "mask: found one, with fov=; expected None"),
+        ({"crop": [0, 90, 0]}, r"crop: found \[0, 90, 0\]"),
+        ({"crop": [0, 90, 0, 90]}, "crop: found .*square"),
+        ({"upright": "yes"}, "upright: found 'yes'; expected 'pose' or 'auto'"),
+        ({"upright": "pose"}, "upright: found pose, of ndarray .* Give the path"),
+        ({"mask": 30}, "mask: found 30; expected a latitude"),
+        ({"mask": "none.png"}, "none.png: found no such file"),
+        ({"mask": _RGB[..., 0].T}, r"mask: found ndarray \(32, 16\).*expected \(H, W\)"),
+    ],
+)
+def test_settings_that_do_not_suit_the_image_are_refused(
+    settings: dict[str, Any], message: str, network: Network
+) -> None:
+    with pytest.raises((DataError, SettingError), match=message):
+        network.labels(_RGB, **settings)
+
+
+def test_a_folder_of_masks_is_for_files(tmp_path: Path, network: Network) -> None:
+    with pytest.raises(SettingError, match="mask: found a folder, for ndarray"):
+        network.labels(_RGB, mask=tmp_path)
+    erp = tt.load(write_checkpoint(tmp_path / "erp.ckpt", ERP))
+    with pytest.raises(SettingError, match="equirectangular images"):
+        erp.labels(_RGB, upright="auto")
 
 
 def test_impossible_settings_are_refused(tmp_path: Path, network: Network) -> None:

@@ -101,6 +101,18 @@ def test_latitude_bands_go_from_north_to_south() -> None:
     assert BAND_EDGES_DEG[:: len(bands)] == (90, -90)
 
 
+def test_a_row_on_the_edge_of_two_bands_counts_in_the_northern_one() -> None:
+    """Row i of H has its centre at 90° − (2i + 1) · 90°/H, here in whole numbers of H-ths."""
+    for height in range(1, 64):
+        expected = np.zeros(6, np.int64)
+        for row in range(height):
+            above = [e for e in BAND_EDGES_DEG[1:-1] if (2 * row + 1) * 90 > (90 - e) * height]
+            expected[len(above)] += 2 * height
+        metric = ConfusionMatrix(2)
+        metric.update(*[torch.ones(height, 2 * height, dtype=torch.int64)] * 2)
+        np.testing.assert_array_equal(metric.compute().bands[:, 1, 1], expected)
+
+
 def test_large_counts_stay_exact() -> None:
     # Float32 cannot count beyond 2**24: a data set has more pixels of one class than that.
     metric = ConfusionMatrix(2)

@@ -124,6 +124,15 @@ def _gradients(
     return scores, found
 
 
+def test_chunks_are_even() -> None:
+    """5 images in chunks of at most 4: not one alone, which batch normalization may refuse."""
+    context = small_context(small_unet()).eval()
+    sizes = []
+    context.network.register_forward_pre_hook(lambda _, images: sizes.append(len(images[0])))
+    context(torch.randn(5, 3, 16, 16), sphere_rays(5), images_per_chunk=4)
+    assert set(sizes) == {3, 2}
+
+
 def _with_kept_statistics(context: nn.Module) -> nn.Module:
     for module in context.modules():
         if isinstance(module, nn.BatchNorm2d):

@@ -10,7 +10,7 @@ from unittest.mock import patch
 import lightning
 import pytest
 import torch
-from lightning.pytorch.strategies import DDPStrategy
+from lightning.pytorch.strategies import DDPStrategy, SingleDeviceStrategy
 from torch import Tensor, nn
 from torch.distributed.algorithms.ddp_comm_hooks import default_hooks
 from torch.nn.functional import cross_entropy
@@ -34,7 +34,7 @@ def _task(images_per_chunk: int | None = None, **settings: Any) -> SegmentationT
         _network(),
         TANGENT,
         NAMES,
-        partial(torch.optim.SGD, lr=0.1),
+        settings.pop("optimizer", partial(torch.optim.SGD, lr=0.1)),
         class_weights=WEIGHTS.tolist(),
         label_smoothing=0.1,
         images_per_chunk=images_per_chunk,
@@ -45,7 +45,7 @@ def _task(images_per_chunk: int | None = None, **settings: Any) -> SegmentationT
 def _gradients(
     images_per_chunk: int | None, batch_size: int = 3, trainer: Any = None, **settings: Any
 ) -> tuple[list[Tensor], Tensor]:
-    """Of one step over the three spheres, and the loss of its last batch."""
+    """Of the last step of an epoch of three spheres, and the loss of its last batch."""
     gradients = Gradients()
     given = {"max_epochs": 1, "accumulate_grad_batches": 3 // batch_size} | (trainer or {})
     callbacks = {"callbacks": [gradients, *given.get("callbacks", [])]}
@@ -55,26 +55,56 @@ def _gradients(
     return gradients.found, gradients.loss
 
 
-def _expected(batch_size: int) -> tuple[list[Tensor], Tensor]:
-    """Torch's weighted mean over the labelled pixels of each batch, and the mean over batches."""
-    network, losses = _network(), []
+def _expected(batch_size: int, batches: int | None = None) -> tuple[list[Tensor], Tensor]:
+    """Torch's weighted mean over the labelled pixels of the last batches, and of the last one."""
+    network, pixels = _network(), []
     for batch in Data(batch_size=batch_size).train_dataloader():
         labels = batch.labels.flatten(0, 1).long()
         known = labels > 0
         scores = network(batch.images.flatten(0, 1)).movedim(1, -1)[known]
-        loss = cross_entropy(scores, labels[known] - 1, WEIGHTS, label_smoothing=0.1)
-        losses.append(loss if known.any() else torch.zeros(()))
-    gradients = torch.autograd.grad(torch.stack(losses).mean(), list(network.parameters()))
-    return list(gradients), losses[-1].detach()
+        pixels.append((scores, labels[known] - 1))
+    scores, labels = map(torch.cat, zip(*pixels[-(batches or len(pixels)) :], strict=True))
+    mean = partial(cross_entropy, weight=WEIGHTS, label_smoothing=0.1)
+    gradients = torch.autograd.grad(mean(scores, labels), list(network.parameters()))
+    return list(gradients), mean(*pixels[-1]).detach()
 
 
 @pytest.mark.parametrize("size", [None, 1, 7, 59, 1000])
 @pytest.mark.parametrize("batch_size", [3, 1], ids=["plain", "accumulated"])
 def test_chunks_give_the_gradient_of_the_whole_batch(size: int | None, batch_size: int) -> None:
+    """Accumulated batches too, of which one is unknown and the others have other classes."""
     found, loss = _gradients(size, batch_size)
     expected, expected_loss = _expected(batch_size)
+    _assert_same(found, expected)
+    torch.testing.assert_close(loss, expected_loss, rtol=1e-5, atol=0)
+
+
+def test_fewer_batches_at_the_end_of_an_epoch_are_a_whole_step() -> None:
+    """Three batches of one sphere, two per step, at a learning rate of 0 before the last one."""
+    found, _ = _gradients(
+        None, 1, {"accumulate_grad_batches": 2}, optimizer=partial(torch.optim.SGD, lr=0)
+    )
+    _assert_same(found, _expected(1, batches=1)[0])
+
+
+def _assert_same(found: list[Tensor], expected: list[Tensor]) -> None:
     for one, other in zip(found, expected, strict=True):
         assert float((one - other).norm() / other.norm()) < 1e-5
+
+
+class TwinStrategy(SingleDeviceStrategy):
+    """Another process does the same as this one; the mean of their gradients is that of one."""
+
+    def reduce(self, tensor: Any, group: Any = None, reduce_op: Any = "mean") -> Any:
+        assert reduce_op in ("mean", "sum")
+        return 2 * tensor if reduce_op == "sum" else tensor
+
+
+@pytest.mark.parametrize("batch_size", [3, 1], ids=["plain", "accumulated"])
+def test_the_norm_of_processes_is_averaged_as_their_gradients_are(batch_size: int) -> None:
+    found, loss = _gradients(7, batch_size, {"strategy": TwinStrategy(torch.device("cpu"))})
+    expected, expected_loss = _expected(batch_size)
+    _assert_same(found, expected)
     torch.testing.assert_close(loss, expected_loss, rtol=1e-5, atol=0)
 
 
@@ -114,10 +144,11 @@ class Exchanges(lightning.Callback):
 
 # Lightning leaves variables behind that tell later processes that they are part of a run.
 @patch.dict(os.environ)
-def test_processes_exchange_gradients_once_after_the_last_chunk() -> None:
+@pytest.mark.parametrize("batch_size", [3, 1], ids=["plain", "accumulated"])
+def test_processes_exchange_gradients_once_after_the_last_chunk(batch_size: int) -> None:
     exchanges = Exchanges()
     strategy = DDPStrategy(process_group_backend="gloo")
     trainer = {"devices": 1, "strategy": strategy, "callbacks": [exchanges]}
-    found, _ = _gradients(7, trainer=trainer)
+    found, _ = _gradients(7, batch_size, trainer)
     assert exchanges.count == 1
-    torch.testing.assert_close(found, _expected(3)[0])
+    torch.testing.assert_close(found, _expected(batch_size)[0])

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import re
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -10,7 +14,7 @@ import torch
 
 from tests.cli.test_commands import CUT_SHORT
 from tests.cli.tiny_runs import SETTINGS, Run, results
-from tests.running import run_python
+from tests.running import ROOT, further_processes, has_ended, run_python, wait_for
 
 
 def _train(folder: Path, *arguments: str, status: int = 0, program: str = "-m") -> str:
@@ -29,7 +33,9 @@ def test_two_processes_make_the_steps_and_figures_of_one(
 ) -> None:
     settings = [text for text in SETTINGS if not text.startswith("network.")]
     common = [*plain, *settings, rooms]
-    common += ["trainer.max_steps=3", "optimizer=adam", "data.validation_fraction=0.4", "panels=2"]
+    common += ["trainer.max_steps=3", "data.validation_fraction=0.4", "panels=2"]
+    # Not of Adam, whose steps do not depend on the size of the gradient.
+    common += ["optimizer=adam", "optimizer._target_=torch.optim.SGD", "optimizer.lr=0.1"]
     one = ["data.panoramas_per_step=2", "hydra.run.dir=one"]
     run("train", *common, *one)
     devices = ["trainer.accelerator=cpu", "trainer.devices=2"]
@@ -53,10 +59,30 @@ def test_two_processes_make_the_steps_and_figures_of_one(
     _train(tmp_path, *resumed)
     assert results(tmp_path / "cut") == results(tmp_path / "two")
     checkpoint = f"checkpoint={tmp_path / 'one' / 'checkpoints' / 'last.ckpt'}"
-    run("evaluate", checkpoint, rooms, "hydra.run.dir=again")
+    odd = "data.fold=3"  # five test panoramas: 3 and 2
+    run("evaluate", checkpoint, rooms, odd, "hydra.run.dir=again")
     ddp = ["trainer=ddp", *devices, "hydra.run.dir=evaluated"]
-    evaluate = ("-m", "tangent_train.cli.main", "evaluate", checkpoint, rooms, *ddp)
+    evaluate = ("-m", "tangent_train.cli.main", "evaluate", checkpoint, rooms, odd, *ddp)
     assert run_python(tmp_path, *evaluate).returncode == 0
     figures = [results(tmp_path / folder) for folder in ("again", "evaluated")]
+    assert figures[0]["images"] == figures[1]["images"] == 5
     assert figures[0]["confusion"] == figures[1]["confusion"]
     assert figures[0]["miou_solid_angle"] == pytest.approx(figures[1]["miou_solid_angle"])
+
+
+@pytest.mark.parametrize("seconds", [0, 3, 8])
+def test_no_process_outlives_a_first_one_that_was_killed(
+    seconds: float, rooms: str, tmp_path: Path
+) -> None:
+    """Killed when it has started the other one, while they join, and in training."""
+    settings = [*SETTINGS, rooms, "trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2"]
+    line = [sys.executable, "-m", "tangent_train.cli.main", "train", *settings]
+    line += ["data.validation_fraction=0.4", "trainer.max_epochs=1000"]
+    environment = {name: text for name, text in os.environ.items() if name != "LOCAL_RANK"}
+    environment["PYTHONPATH"] = str(ROOT)
+    with subprocess.Popen(line, cwd=tmp_path, env=environment) as first:
+        wait_for(lambda: further_processes(first.pid), 120)
+        (other,) = further_processes(first.pid)
+        time.sleep(seconds)
+        first.kill()
+        wait_for(lambda: has_ended(other), 60)

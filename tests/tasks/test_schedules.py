@@ -1,0 +1,145 @@
+"""Learning rates of resumed trainings: those of an uninterrupted one, or a refusal."""
+
+from __future__ import annotations
+
+import math
+from contextlib import nullcontext
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import lightning
+import pytest
+import torch
+from torch.optim import lr_scheduler
+from transformers import get_scheduler
+
+from tangent_train.callbacks.checkpoints import AtomicCheckpointIO, LastCheckpoint
+from tangent_train.errors import SettingError
+from tests.tasks.shapes import Shapes, quiet_trainer, shape_task
+
+LR = 0.1
+STEPS = 3  # of an epoch
+
+
+class CutError(Exception):
+    """Ends a training."""
+
+
+class Rates(lightning.Callback):
+    """Keeps the learning rate of every step; ends the training after some epochs."""
+
+    def __init__(self, until: int | None) -> None:
+        self.found: list[float] = []
+        self.until = until
+
+    def on_train_epoch_start(self, trainer: Any, *_: Any) -> None:
+        if trainer.current_epoch == self.until:
+            raise CutError
+
+    def on_train_batch_start(self, trainer: Any, *_: Any) -> None:
+        self.found.append(trainer.optimizers[0].param_groups[0]["lr"])
+
+
+def _train(
+    folder: Path, scheduler: Any, *, resume: bool = False, until: int | None = None, **trainer: Any
+) -> list[float]:
+    """The learning rate of every step."""
+    rates = Rates(until)
+    task = shape_task(scheduler=scheduler, optimizer=partial(torch.optim.SGD, lr=LR, momentum=0.9))
+    made = quiet_trainer(
+        callbacks=[rates, LastCheckpoint(folder)],
+        enable_checkpointing=True,
+        limit_val_batches=0,
+        plugins=[AtomicCheckpointIO()],
+        **trainer,
+    )
+    path = folder / "last.ckpt" if resume else None
+    with nullcontext() if until is None else pytest.raises(CutError):
+        made.fit(task, datamodule=Shapes(3 * STEPS), ckpt_path=path, weights_only=True)
+    return rates.found
+
+
+def _warm_up_and_cosine(optimizer: Any, epochs: int) -> Any:
+    parts = [
+        lr_scheduler.LinearLR(optimizer, total_iters=1),
+        lr_scheduler.CosineAnnealingLR(optimizer, epochs - 1),
+    ]
+    return lr_scheduler.SequentialLR(optimizer, parts, milestones=[1])
+
+
+def _linear_to_zero(optimizer: Any, total_steps: int) -> Any:
+    return lr_scheduler.LambdaLR(optimizer, lambda step: 1 - step / total_steps)
+
+
+FIXED: dict[str, Any] = {
+    "cosine": partial(lr_scheduler.CosineAnnealingLR, T_max=4),
+    "cosine with a floor": partial(lr_scheduler.CosineAnnealingLR, T_max=4, eta_min=0.01),
+    "cosine to its last epoch": partial(lr_scheduler.CosineAnnealingLR, T_max=3),
+    "polynomial": partial(lr_scheduler.PolynomialLR, total_iters=4, power=2),
+    "linear": partial(lr_scheduler.LinearLR, start_factor=1, end_factor=0.1, total_iters=4),
+    "linear warm-up": partial(lr_scheduler.LinearLR, total_iters=4),
+    "one restart": partial(lr_scheduler.CosineAnnealingWarmRestarts, T_0=4),
+    "sequence": partial(_warm_up_and_cosine, epochs=4),
+    "of every step": partial(lr_scheduler.OneCycleLR, max_lr=LR),
+    "function of every step": _linear_to_zero,
+    **{
+        f"{name} of transformers": partial(
+            get_scheduler, name, num_warmup_steps=1, num_training_steps=4
+        )
+        for name in ("cosine", "linear", "polynomial", "cosine_with_restarts")
+    },
+}
+ENDLESS: dict[str, tuple[Any, Any]] = {
+    "none": (None, lambda epoch: 1),
+    "constant": (partial(lr_scheduler.ConstantLR, factor=1, total_iters=0), lambda epoch: 1),
+    "steps": (
+        partial(lr_scheduler.StepLR, step_size=4, gamma=0.5),
+        lambda epoch: 0.5 ** (epoch // 4),
+    ),
+    "exponential": (partial(lr_scheduler.ExponentialLR, gamma=0.5), lambda epoch: 0.5**epoch),
+    "milestones": (
+        partial(lr_scheduler.MultiStepLR, milestones=[2, 4]),
+        lambda epoch: 0.1 ** ((epoch >= 2) + (epoch >= 4)),
+    ),
+    "a cosine that ends later": (
+        partial(lr_scheduler.CosineAnnealingLR, T_max=6),
+        lambda epoch: (1 + math.cos(math.pi * epoch / 6)) / 2,
+    ),
+    "warm-up of transformers": (
+        partial(get_scheduler, "constant_with_warmup", num_warmup_steps=2),
+        lambda epoch: min(epoch / 2, 1),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FIXED)
+def test_a_schedule_of_fixed_length_is_resumed_for_that_length_only(
+    name: str, tmp_path: Path
+) -> None:
+    scheduler = FIXED[name]
+    whole = _train(tmp_path / "whole", scheduler, max_epochs=4)
+    assert len(set(whole[::STEPS])) >= 3, "it is a schedule"
+    begun = _train(tmp_path, scheduler, max_epochs=4, until=2)
+    for length in ({"max_epochs": 6}, {"max_epochs": 3}, {"max_epochs": 4, "max_steps": 7}):
+        with pytest.raises(SettingError, match=r"max_epochs.*; expected (4|12),.*init_from="):
+            _train(tmp_path, scheduler, resume=True, **length)
+    rest = _train(tmp_path, scheduler, resume=True, max_epochs=4)
+    assert begun + rest == pytest.approx(whole)
+
+
+@pytest.mark.parametrize("epochs", [6, 3])
+@pytest.mark.parametrize("name", ENDLESS)
+def test_others_continue_for_longer_or_shorter(name: str, epochs: int, tmp_path: Path) -> None:
+    scheduler, factor = ENDLESS[name]
+    found = _train(tmp_path, scheduler, max_epochs=4, until=2)
+    found += _train(tmp_path, scheduler, resume=True, max_epochs=epochs)
+    assert found[::STEPS] == pytest.approx([LR * factor(epoch) for epoch in range(epochs)])
+
+
+def test_a_cosine_ends_where_its_training_does(tmp_path: Path) -> None:
+    found = _train(tmp_path, FIXED["cosine"], max_epochs=4)[::STEPS]
+    expected = [LR * (1 + math.cos(math.pi * epoch / 4)) / 2 for epoch in range(4)]
+    assert found == pytest.approx(expected)
+    with pytest.raises(SettingError, match="found 8 training epochs; expected 4"):
+        _train(tmp_path, FIXED["cosine"], resume=True, max_epochs=8)
