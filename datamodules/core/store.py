@@ -194,7 +194,8 @@ class Store:
 
 def _checksum(path: Path, size: int | None = None) -> int:
     """CRC-32 of the first bytes of a file, or of all."""
-    return zlib.crc32(memoryview(np.memmap(path, mode="r", shape=size)))
+    content: Any = np.memmap(path, mode="r", shape=size)
+    return zlib.crc32(content)
 
 
 def _stamps(files: Mapping[str, Path]) -> dict[str, str]:
