@@ -273,7 +273,8 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
             count = found.check(problems, of_images)
             for split in SPLITS:
                 counts = [of_images[i.name] for i in found.splits[split] if i.name in of_images]
-                self.label_counts[split] = np.sum(counts or [[0] * len(self.class_names)], axis=0)
+                none = np.zeros(len(self.class_names), np.int64)
+                self.label_counts[split] = np.sum([none, *counts], axis=0)
         return problems, count
 
     def check_classes(self) -> None:

@@ -123,7 +123,7 @@ class Store:
             record[key] = array
         with atomic_path(self.path(name)) as temporary:
             np.save(temporary, record, allow_pickle=False)
-            content = {"made_from": made_from, "crc32": zlib.crc32(np.memmap(temporary, mode="r"))}
+            content = {"made_from": made_from, "crc32": _checksum(temporary)}
             with temporary.open("ab") as file:
                 file.write(b"\n" + json.dumps(content).encode())
 
@@ -151,7 +151,7 @@ class Store:
                 file.seek(size)
                 content = parse_json(file.read())
             checked = not whole or name in self._whole
-            total = None if checked else zlib.crc32(np.memmap(path, mode="r", shape=size))
+            total = None if checked else _checksum(path, size)
             arrays = {key: np.asarray(record[key]) for key in record.dtype.names}
             written, found = content["crc32"], dict.fromkeys(files, "nothing")
             found |= content["made_from"]
@@ -190,6 +190,12 @@ class Store:
         except (DataError, OSError):
             return False
         return True
+
+
+def _checksum(path: Path, size: int | None = None) -> int:
+    """CRC-32 of the first bytes of a file, or of all."""
+    content: Any = np.memmap(path, mode="r", shape=size)
+    return zlib.crc32(content)
 
 
 def _stamps(files: Mapping[str, Path]) -> dict[str, str]:

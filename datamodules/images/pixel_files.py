@@ -138,7 +138,7 @@ def read_image_size(path: Path) -> tuple[int, int]:
 def _orientation(image: Image.Image) -> int:
     """EXIF orientation of the pixels that Pillow decodes, 1 to 8."""
     # It turns TIFF files itself.
-    found = 1 if image.format == "TIFF" else _exif(image).get(ExifTags.Base.Orientation)
+    found: Any = 1 if image.format == "TIFF" else _exif(image).get(ExifTags.Base.Orientation)
     return found if found in range(1, 9) else 1
 
 

@@ -90,7 +90,7 @@ def _chunks(file: BinaryIO) -> list[tuple[bytes, int, int]]:
     return chunks
 
 
-def read_png_metadata(path: Path) -> dict[str, Any]:
+def read_png_metadata(path: Path) -> dict[Any, Any]:
     """Read the texts and EXIF data of a whole PNG file, before or behind its pixels.
 
     Returns:

@@ -70,7 +70,7 @@ def _doubts(shares: Mapping[str, NDArray[np.float64]], class_names: Sequence[str
     """What makes it likely that labels and classes do not belong together."""
     doubts = []
     for split, of in shares.items():
-        missing = [repr(class_names[label])[1:-1] for label in np.flatnonzero(of == 0) if label]
+        missing = [repr(class_names[k])[1:-1] for k in range(1, len(of)) if of[k] == 0]
         if of[0] > _MOST_UNKNOWN:
             doubts.append(f"{percent(of[0])} % of the pixels for {split} are unknown.")
         if missing:

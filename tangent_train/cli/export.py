@@ -48,7 +48,7 @@ def export(config: Mapping[str, Any]) -> None:
         size, opset = settings.image_size, settings.opset
         written = export_network(trained, output, image_size=size, opset=opset)
     fixed, multiple = written.trained.fixed_size, trained.size_multiple
-    sides = width_height(fixed) if fixed else "of any size"
+    sides = width_height(fixed) if fixed else "any size"
     sides += f", multiples of {multiple}" if multiple > 1 and not fixed else ""
     say(
         f"{output}: {output.stat().st_size / 1e6:.1f} MB\n"

@@ -29,7 +29,7 @@ def test_the_suffix_says_the_format(
     path = tmp_path / name
     assert re.fullmatch(
         rf"{re.escape(name)}: {path.stat().st_size / 1e6:.1f} MB\n"
-        r"images: 4 channels, h×w, multiples of 2; scores: 13 classes\n"
+        r"images: 4 channels, any size, multiples of 2; scores: 13 classes\n"
         r"largest difference to PyTorch: \d\.\de[+-]\d\d of the range of the scores\n",
         said,
     )

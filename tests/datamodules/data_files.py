@@ -76,7 +76,7 @@ def turned(stored: NDArray[Any], orientation: int) -> NDArray[Any]:
 
 
 def tiff_bytes(
-    pixels: NDArray[Any], order: str = "<", tags: Mapping[int, Any] = {}, *, big: bool = False
+    pixels: NDArray[Any], order: Any = "<", tags: Mapping[int, Any] = {}, *, big: bool = False
 ) -> bytes:
     """A TIFF file of ``(H, W[, C])`` in one strip, byte by byte; of planes, one strip each.
 
@@ -98,8 +98,9 @@ def tiff_bytes(
         strips = [zlib.compress(strip) for strip in strips]
     size, head, entry = (8, 16, 20) if big else (4, 8, 12)
     places = np.cumsum([head, *map(len, strips)]).tolist()
-    shorts = {256: width, 257: height, 258: [8 * pixels.itemsize] * channels, 277: channels}
-    shorts |= {259: 1, 262: 1 if channels < 3 else 2, 278: height} | tags
+    bits = [8 * pixels.itemsize] * channels
+    shorts: dict[int, Any] = {256: width, 257: height, 258: bits, 277: channels, 278: height}
+    shorts |= {259: 1, 262: 1 if channels < 3 else 2, **tags}
     values = {tag: np.array(value, f"{order}u2") for tag, value in shorts.items()}
     values |= {273: np.array(places[:-1], f"{order}u4")}
     values |= {279: np.array([len(strip) for strip in strips], f"{order}u4")}

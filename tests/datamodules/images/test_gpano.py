@@ -179,9 +179,8 @@ def test_xmp_that_cannot_be_read(tmp_path: Path, packet: bytes) -> None:
     path.write_bytes(_jpeg(_adobe(packet)))
     with pytest.raises(DataError, match=r"image\.jpg: found XMP data that .*exiftool"):
         up_of(path)
-    other = packet.replace(b"photos", b"videos").replace(
-        *(s.encode("utf-16-le") for s in ("photos", "videos"))
-    )
+    old, new = (name.encode("utf-16-le") for name in ("photos", "videos"))
+    other = packet.replace(b"photos", b"videos").replace(old, new)
     path.write_bytes(_jpeg(_adobe(other)))
     assert up_of(path) is None
 

@@ -168,6 +168,9 @@ def test_lossless_images_are_turned(tmp_path: Path, suffix: str) -> None:
         assert read_image_size(path) == turned(stored, orientation).shape[:2]
 
 
+_TO_LAB: Any = ImageCms.buildTransform(
+    ImageCms.createProfile("sRGB"), ImageCms.createProfile("LAB"), "RGB", "LAB"
+)
 _MODES: dict[str, Callable[[Image.Image, Path], None]] = {
     "inks.jpg": lambda image, path: image.convert("CMYK").save(path, quality=95, subsampling=0),
     "inks.tif": lambda image, path: image.convert("CMYK").save(path),
@@ -195,10 +198,14 @@ _MODES: dict[str, Callable[[Image.Image, Path], None]] = {
     "png.jpg": lambda image, path: image.save(path, "PNG"),
     "jpeg.png": lambda image, path: image.save(path, "JPEG", quality=95, subsampling=0),
     "jpeg.tif": lambda image, path: image.save(path, compression="jpeg"),
-    "lab.tif": lambda image, path: ImageCms.profileToProfile(
-        image, ImageCms.createProfile("sRGB"), ImageCms.createProfile("LAB"), outputMode="LAB"
-    ).save(path),
+    "lab.tif": lambda image, path: _to_lab(image).save(path),
 }
+
+
+def _to_lab(image: Image.Image) -> Image.Image:
+    converted = ImageCms.applyTransform(image, _TO_LAB)
+    assert converted is not None
+    return converted
 
 
 def _with_alpha(image: Image.Image) -> Image.Image:
@@ -287,7 +294,7 @@ def test_other_tiff_files(tmp_path: Path) -> None:
     path.write_bytes(tiff_bytes(inks, tags={262: 5}))
     expected = (255.0 - inks[..., :3]) * (255.0 - inks[..., 3:]) / 255
     assert np.abs(read_rgb(path) - expected).max() <= 1
-    for pixels, tags in [
+    refused: list[tuple[NDArray[Any], dict[int, Any]]] = [
         (values, {284: 2}),  # planes
         (grey.astype(np.uint16) * 257, {262: 0}),
         (_values("u2", 4), {338: 1}),  # colours multiplied by alpha
@@ -295,7 +302,8 @@ def test_other_tiff_files(tmp_path: Path) -> None:
         (_values("u1", 3), {262: 6, 530: [2, 2]}),  # colours of fewer pixels
         (grey.astype(np.uint16) // 16, {258: 12}),
         (values, {339: [1, 1, 2]}),
-    ]:
+    ]
+    for pixels, tags in refused:
         path.write_bytes(tiff_bytes(pixels, tags=tags))
         with pytest.raises(DataError, match=r"image\.tif: found .*(layout|no image)"):
             read_pixels(path, indices=False)
