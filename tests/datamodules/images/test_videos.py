@@ -62,7 +62,7 @@ def _write(
         stream.pix_fmt = pixels
         stream.codec_context.time_base = Fraction(1, _RATE)
         setup(stream)
-        audio = output.add_stream("aac", rate=44100) if sound else None
+        audio: Any = output.add_stream("aac", rate=44100) if sound else None
         for number, rgb in enumerate(frames):
             frame = av.VideoFrame.from_ndarray(rgb, format="rgb24").reformat(format=pixels)
             frame.pts, frame.time_base = (times or range(99))[number], Fraction(1, _RATE)
@@ -162,13 +162,17 @@ def test_frames_that_need_what_was_cut_off_do_not_count(tmp_path: Path, suffix: 
     np.testing.assert_array_equal(_read(path), _decoded(path))
 
 
-def test_reference_frames_of_vp8_do_not_count(tmp_path: Path) -> None:
-    """Bit 4 of a frame's first byte says whether it is shown (RFC 6386, 9.1)."""
-    path = _write(tmp_path / "a.mkv", "vp8")
+def _hide(path: Path, number: int) -> None:
+    """Make a frame of VP8 one that is not shown: bit 4 of its first byte (RFC 6386, 9.1)."""
     with av.open(str(path)) as container:
-        packet = [bytes(packet) for packet in container.demux(video=0)][5]
+        packet = [bytes(packet) for packet in container.demux(video=0)][number]
     hidden = bytes([packet[0] & ~0x10]) + packet[1:]
     path.write_bytes(path.read_bytes().replace(packet, hidden))
+
+
+def test_reference_frames_of_vp8_do_not_count(tmp_path: Path) -> None:
+    path = _write(tmp_path / "a.mkv", "vp8")
+    _hide(path, 5)
     assert len(_decoded(path)) == _COUNT - 1
     np.testing.assert_array_equal(_read(path), _decoded(path))
 
@@ -274,9 +278,7 @@ def test_an_incomplete_last_packet_in_a_box_without_a_size(tmp_path: Path) -> No
 
 def test_a_video_without_a_frame_and_another_number_of_frames(tmp_path: Path) -> None:
     path = _write(tmp_path / "a.mkv", "vp8", _pictures(1))
-    data, (start, _) = bytearray(path.read_bytes()), _packets(path)[0]
-    data[start] &= ~0x10  # not shown
-    path.write_bytes(data)
+    _hide(path, 0)
     with pytest.raises(DataError, match=r"a\.mkv: found no frame that can be decoded"):
         read_video_size(path)
     with pytest.raises(DataError, match="12 of 13 frames"):
