@@ -115,7 +115,7 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
         with av.open(
             _file_url(path), container_options=options, metadata_errors="replace"
         ) as container:
-            stream = container.streams.best("video")
+            stream: Any = container.streams.best("video")
             if stream is None or stream.disposition & stream.disposition.attached_pic:
                 raise DataError(path, found="no video stream", expected="a video")
             if stream.codec_context is None:

@@ -164,7 +164,7 @@ def hide_start(path: Path, seconds: float) -> None:
     import av
 
     with av.open(str(path)) as container:
-        ticks = round(seconds / container.streams.video[0].time_base)
+        ticks = round(seconds / float(container.streams.video[0].time_base or 1))
     data = bytearray(path.read_bytes())
     place = data.index(b"elst") + 12
     duration, start = struct.unpack_from(">Ii", data, place)

@@ -325,8 +325,10 @@ def test_other_formats(tmp_path: Path, suffix: str, modes: str) -> None:
     path, rgb = tmp_path / f"image{suffix}", np.kron(_noise((4, 8, 3)), np.ones((8, 8, 1)))
     for mode in modes.split():
         image = Image.fromarray(rgb.astype(np.uint8)).convert(mode.replace("animated", "P"))
-        frames = {"save_all": True, "append_images": [image.rotate(180)]}
-        lossless = {"quality": 100, "subsampling": "4:4:4"} if suffix == ".avif" else {}
+        frames: dict[str, Any] = {"save_all": True, "append_images": [image.rotate(180)]}
+        lossless: dict[str, Any] = (
+            {"quality": 100, "subsampling": "4:4:4"} if suffix == ".avif" else {}
+        )
         image.save(path, **lossless, **(frames if mode == "animated" else {}))
         read = read_rgb(path)
         assert read.shape == (32, 64, 3) == (*read_image_size(path), 3)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+import struct
 from collections.abc import Callable, Sequence
 from fractions import Fraction
 from pathlib import Path
@@ -61,7 +62,7 @@ def _write(
         stream.pix_fmt = pixels
         stream.codec_context.time_base = Fraction(1, _RATE)
         setup(stream)
-        audio = output.add_stream("aac", rate=44100) if sound else None
+        audio: Any = output.add_stream("aac", rate=44100) if sound else None
         for number, rgb in enumerate(frames):
             frame = av.VideoFrame.from_ndarray(rgb, format="rgb24").reformat(format=pixels)
             frame.pts, frame.time_base = (times or range(99))[number], Fraction(1, _RATE)
@@ -133,6 +134,18 @@ def test_frames_that_an_edit_list_hides_do_not_count(
     np.testing.assert_array_equal(_read(path), whole[hidden:])
 
 
+@pytest.mark.parametrize("codec", ["x264", "mjpeg", "opengop"])
+def test_frames_after_the_end_of_an_edit_list_do_not_count(tmp_path: Path, codec: str) -> None:
+    path = _write(tmp_path / "cut.mp4", codec)
+    whole, data = _decoded(path), bytearray(path.read_bytes())
+    place = data.index(b"elst") + 12
+    struct.pack_into(">I", data, place, struct.unpack_from(">I", data, place)[0] * 7 // _COUNT)
+    path.write_bytes(data)
+    assert 0 < read_video_size(path)[0] < _COUNT
+    np.testing.assert_array_equal(_read(path), _decoded(path))
+    np.testing.assert_array_equal(_read(path), whole[: len(_read(path))])
+
+
 @pytest.mark.parametrize("suffix", [".mkv", ".mp4"])
 def test_frames_that_need_what_was_cut_off_do_not_count(tmp_path: Path, suffix: str) -> None:
     """A cut without encoding at a key frame that others before it refer to."""
@@ -149,13 +162,17 @@ def test_frames_that_need_what_was_cut_off_do_not_count(tmp_path: Path, suffix: 
     np.testing.assert_array_equal(_read(path), _decoded(path))
 
 
-def test_reference_frames_of_vp8_do_not_count(tmp_path: Path) -> None:
-    """Bit 4 of a frame's first byte says whether it is shown (RFC 6386, 9.1)."""
-    path = _write(tmp_path / "a.mkv", "vp8")
+def _hide(path: Path, number: int) -> None:
+    """Make a frame of VP8 one that is not shown: bit 4 of its first byte (RFC 6386, 9.1)."""
     with av.open(str(path)) as container:
-        packet = [bytes(packet) for packet in container.demux(video=0)][5]
+        packet = [bytes(packet) for packet in container.demux(video=0)][number]
     hidden = bytes([packet[0] & ~0x10]) + packet[1:]
     path.write_bytes(path.read_bytes().replace(packet, hidden))
+
+
+def test_reference_frames_of_vp8_do_not_count(tmp_path: Path) -> None:
+    path = _write(tmp_path / "a.mkv", "vp8")
+    _hide(path, 5)
     assert len(_decoded(path)) == _COUNT - 1
     np.testing.assert_array_equal(_read(path), _decoded(path))
 
@@ -247,13 +264,25 @@ def test_a_damaged_frame_is_an_error_after_those_before(tmp_path: Path, name: st
     np.testing.assert_array_equal(kept, whole[: len(kept)])
 
 
-def test_a_video_without_a_frame_that_can_be_decoded(tmp_path: Path) -> None:
-    path = _write(tmp_path / "a.mp4", frames=_pictures(1))
-    data, (start, size) = bytearray(path.read_bytes()), _packets(path)[0]
-    data[start : start + size] = bytes(size)
+def test_an_incomplete_last_packet_in_a_box_without_a_size(tmp_path: Path) -> None:
+    path = _write(tmp_path / "a.mp4", movflags="faststart")
+    data = bytearray(path.read_bytes())
+    place = data.index(b"mdat")
+    data[place - 4 : place] = bytes(4)  # to the end of the file
     path.write_bytes(data)
-    with pytest.raises(DataError, match=r"a\.mp4: found"):
+    assert read_video_size(path)[0] == _COUNT
+    path.write_bytes(data[:-5])
+    with pytest.raises(DataError, match=r"packet 11 is incomplete"):
         read_video_size(path)
+
+
+def test_a_video_without_a_frame_and_another_number_of_frames(tmp_path: Path) -> None:
+    path = _write(tmp_path / "a.mkv", "vp8", _pictures(1))
+    _hide(path, 0)
+    with pytest.raises(DataError, match=r"a\.mkv: found no frame that can be decoded"):
+        read_video_size(path)
+    with pytest.raises(DataError, match="12 of 13 frames"):
+        list(read_frames(_write(tmp_path / "b.mkv"), _COUNT + 1))
 
 
 def test_names_and_contents_open_nothing_else(
