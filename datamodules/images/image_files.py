@@ -22,7 +22,7 @@ def image_paths(pattern: str | Path, suffixes: Sequence[str] = IMAGE_SUFFIXES) -
 
     Args:
         pattern: A file; a folder, searched recursively; or a glob pattern, with ``**`` for folders
-            of any depth. ``~`` is the home folder.
+            of any depth.
         suffixes: Of images, in lower case.
 
     Returns:
@@ -33,8 +33,6 @@ def image_paths(pattern: str | Path, suffixes: Sequence[str] = IMAGE_SUFFIXES) -
         DataError: There are none, or a folder cannot be opened.
     """
     path = Path(pattern)
-    # The shell leaves the ~ of "input=~/holiday" alone.
-    path = path.expanduser() if path.parts[:1] == ("~",) else path
     if path.is_file():
         return [path]
     if path.is_dir():

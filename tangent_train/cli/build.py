@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -103,7 +104,7 @@ def build_trained(
 class _Mapping:
     """See ``configs/evaluate.yaml``."""
 
-    class_map: str
+    class_map: str | Path
     unmapped: Unmapped
 
 

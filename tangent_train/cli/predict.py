@@ -49,9 +49,9 @@ class Settings:
     """See ``configs/predict.yaml``."""
 
     checkpoint: Path
-    input: str
+    input: str | Path
     output: Path
-    class_map: str | None
+    class_map: str | Path | None
     unmapped: Unmapped
     depth: Path | None
     depth_scale: float

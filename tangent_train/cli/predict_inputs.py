@@ -32,7 +32,10 @@ class Inputs:
 
     @classmethod
     def find(
-        cls, pattern: str, output: Path, check_size: Callable[[Path, tuple[int, int]], object]
+        cls,
+        pattern: str | Path,
+        output: Path,
+        check_size: Callable[[Path, tuple[int, int]], object],
     ) -> Inputs:
         """The files that a setting names, without results of this command.
 

@@ -54,7 +54,7 @@ _Work = Callable[[Job, Callable[[float], object]], Path]
 class Settings:
     """See ``configs/render.yaml``."""
 
-    input: str | None
+    input: str | Path | None
     output: Path | None
     overwrite: bool
     base_level: int

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from tangent_train.checkpoints.content import INPUTS, NORMALIZATION, read_checkpoint
-from tangent_train.cli.compose import config_folder, quoted
+from tangent_train.cli.compose import config_folder, path_text, quoted
 from tangent_train.cli.settings import Trust, typed
 from tangent_train.errors import DataError, SettingError
 from tangent_train.registry import SettingsFile, Text, check_fields
@@ -206,7 +206,7 @@ def stored_run(command: str, arguments: Sequence[str]) -> StoredRun | StoredNetw
     given = [a.partition("=")[2] for a in arguments if a.startswith(f"{setting}=")]
     if not setting or not given or given[-1] in ("", "null"):
         return None
-    path = Path(given[-1].strip("'\"")).absolute()
+    path = Path(path_text(given[-1])).absolute()
     place = [f"{setting}={path}"]
     left = [a for a in arguments if not a.startswith(f"{setting}=")]
     if command == "train":

@@ -22,6 +22,7 @@ from tangent_train.checkpoints.content import read_checkpoint
 from tangent_train.cli.build import Settings
 from tangent_train.cli.evaluate import Run, machine_faults
 from tangent_train.cli.fine_tuning import begin_from, load_start
+from tangent_train.cli.settings import RunFiles, typed
 from tangent_train.cli.sweep import OBJECTIVE_FILE
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import atomic_path, write_text
@@ -39,12 +40,12 @@ def train(settings: Settings, source: SettingsFile | None = None) -> float | Non
     Returns:
         The best validation score, which sweeps compare; None without a validation split.
     """
-    resumed = start = None
-    if settings["resume"] is not None:
-        resumed = Path(settings["resume"]) / "checkpoints" / "last.ckpt"
+    resumed, files = None, typed(RunFiles, settings)
+    start = None if files.resume else files.init_from
+    if files.resume is not None:
+        resumed = files.resume / "checkpoints" / "last.ckpt"
         _check_resumed(settings, **read_checkpoint(resumed, ("config", "epoch")))
-    elif settings["init_from"] is not None:
-        start = Path(settings["init_from"])
+    elif start is not None:
         settings, source = begin_from(start, settings)
     run = Run.begin(settings, source)
     if start is not None:

@@ -295,7 +295,7 @@ def stage_command(stage: Stage) -> list[str]:
 def _digest(weights: Path, config: Mapping[str, Any]) -> str:
     """A hash of the network's file and, if there is one, of its class map's."""
     given = str(config.get("class_map") or "")
-    own_map = [Path(given).expanduser()] if given.lower().endswith(".json") else []
+    own_map = [Path(given)] if given.lower().endswith(".json") else []
     hashed = hashlib.blake2b()
     for path in (weights, *own_map):
         with path.open("rb") as file:

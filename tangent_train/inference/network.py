@@ -72,7 +72,7 @@ def load(
     check_choice("unmapped", unmapped, get_args(Unmapped))
     trained = load_trained(Path(path), (trust,) if isinstance(trust, str) else trust)
     if class_map is not None:
-        trained = map_classes(trained, load_class_map(str(class_map)), unmapped).trained
+        trained = map_classes(trained, load_class_map(class_map), unmapped).trained
     views = PanoramaViews(trained, levels or (level,), base_level, blend, rotations)
     how = device, images_per_forward, min_confidence
     return Network(

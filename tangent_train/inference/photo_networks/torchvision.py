@@ -37,14 +37,14 @@ def load(
     if model not in known:
         raise SettingError("model", found=model or "none", expected=", ".join(known))
     published = models.get_model_weights(model)
-    is_file = weights is not None and Path(weights).expanduser().is_file()
+    is_file = weights is not None and Path(weights).is_file()
     if weights is None or not (is_file or weights in published.__members__):
         known = ", ".join(published.__members__)
         raise SettingError("weights", found=weights or "none", expected=f"{known}, or a file")
     chosen: WeightsEnum = published["DEFAULT" if is_file else weights]
     preset: Any = chosen.transforms()
     names = tuple(chosen.meta["categories"]) if classes is None else class_names_in(classes)
-    tensors = read_tensors(Path(weights).expanduser()) if is_file else fetch_tensors(chosen)
+    tensors = read_tensors(Path(weights)) if is_file else fetch_tensors(chosen)
     tensors = {name: t for name, t in tensors.items() if not name.startswith(_AUXILIARY)}
     settings = {
         "_target_": f"torchvision.models.segmentation.{model}",
