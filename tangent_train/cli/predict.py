@@ -122,9 +122,10 @@ def _label(
 ) -> list[Entry]:
     """Label images, those of a shard or all; returns their entries, with those done before."""
     summary = None if part is None else part.path
-    earlier = folder.earlier(decisive, summary) if settings.resume else {}
-    if not (settings.overwrite or earlier or (part is not None and part.folder.exists())):
-        folder.check()
+    known = folder.earlier(decisive, summary) if settings.resume else None
+    if not (settings.overwrite or known is not None or (part and part.folder.exists())):
+        folder.check(resume=settings.resume)
+    earlier = known or {}
     names = dict.fromkeys(inputs.names())
     entries = [entry for name, entry in earlier.items() if name in names]
     if part is not None:
@@ -133,7 +134,7 @@ def _label(
     def save() -> None:
         if part is not None:
             part.save(entries)
-        elif any("classes" in e for e in entries):  # else nothing is in the way of another try
+        else:
             folder.write_summary(decisive, entries)
 
     count = len(names)
@@ -142,6 +143,7 @@ def _label(
     steps = label, label.read, label.write
     labelled = set()
     saved = -math.inf
+    save()
     try:
         with closing(each("Predicting", inputs.missing(earlier), missing, *steps)) as done:
             for job in done:
@@ -156,6 +158,8 @@ def _label(
         raise
     finally:
         save()
+        if part is None and not any("classes" in entry for entry in entries):
+            folder.remove_summary()
     if unmade := _make_videos(inputs, folder, entries, labelled):
         entries += unmade
         save()
@@ -173,7 +177,7 @@ def _finish(
     used = {entry["name"] for entry in entries if "classes" in entry}
     if not used:
         return
-    pictures = label.pictures({name: path for name, path in inputs.files.items() if name in used})
+    pictures = label.pictures([n for n in inputs.names() if n in used], inputs.files)
     if pictures:
         folder.write_page(entries, pictures)
     folder.mean_shares(entries).print()
@@ -253,19 +257,25 @@ class _Labeller:
             self._shown[job.item] = self._folder.viewer_image(job.item, image, labels, area)
         return entry
 
-    def pictures(self, images: Mapping[str, Path]) -> list[EncodedImage]:
+    def pictures(self, names: Sequence[str], files: Mapping[str, Path]) -> list[EncodedImage]:
         """Pictures for the report; images labelled earlier or elsewhere are read again.
 
         Args:
-            images: That have been labelled.
+            names: Of all images and frames that have been labelled.
+            files: Of images by name. Frames of a video are not read again.
         """
-        for name in self._shown.keys() & images.keys():
+        count = self._settings.report
+        wanted = [names[number] for number in evenly_spread(count, len(names))]
+        for name in wanted:
             labels = self._folder.files(name).get("labels")
-            if self._shown[name] is None and labels is not None:
-                image, area = self.read(Job(name, images[name]))
+            if self._shown.get(name) is None and labels is not None and name in files:
+                image, area = self.read(Job(name, files[name]))
                 read = read_pixels(labels, indices=True)
                 self._shown[name] = self._folder.viewer_image(name, image, read, area)
-        return [picture for picture in self._shown.values() if picture is not None]
+        others = [name for name in self._shown if name not in wanted]
+        made = [name for name in (*wanted, *others) if self._shown.get(name) is not None]
+        shown = (self._shown[name] for name in names if name in made[:count])
+        return [picture for picture in shown if picture is not None]
 
 
 def _make_videos(
