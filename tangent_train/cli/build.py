@@ -49,11 +49,7 @@ def build(settings: Settings, source: SettingsFile | None = None) -> tuple[Any, 
     )
     task = _build_task(settings, data, make(section, "network", source), source)
     _try_network(task, data.in_channels)
-    try:
-        task.make_optimizer([{"params": [torch.zeros(1, 1, requires_grad=True)]}])
-    except (TypeError, ValueError) as error:
-        expected = f"settings that {settings['optimizer']['_target_']} takes"
-        raise SettingError("optimizer", found=str(error), expected=expected) from error
+    _try_schedule(task, settings)
     return data, task
 
 
@@ -156,6 +152,23 @@ def _build_task(
         backbone_lr_factor=backbone_lr_factor,
         **parts,
     )
+
+
+def _try_schedule(task: Any, settings: Settings) -> None:
+    """Make the optimizer, and the scheduler for some number of steps."""
+    group = {"params": [torch.zeros(1, 1, requires_grad=True)]}
+    trials = {
+        "optimizer": lambda: task.make_optimizer([group]),
+        "scheduler": lambda: task.optimization(lambda: 1000),
+    }
+    for name, trial in trials.items():
+        try:
+            trial()
+        except Exception as error:
+            expected = f"settings that {settings[name]['_target_']} takes"
+            raise SettingError(
+                name, found=f"{type(error).__name__}: {error}", expected=expected
+            ) from error
 
 
 def _try_network(task: Any, channels: int) -> None:
