@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -157,7 +157,7 @@ def _build_task(
 def _try_schedule(task: Any, settings: Settings) -> None:
     """Make the optimizer, and the scheduler for some number of steps."""
     group = {"params": [torch.zeros(1, 1, requires_grad=True)]}
-    trials = {
+    trials: dict[str, Callable[[], object]] = {
         "optimizer": lambda: task.make_optimizer([group]),
         "scheduler": lambda: task.optimization(lambda: 1000),
     }

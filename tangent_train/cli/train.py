@@ -157,10 +157,8 @@ def _remember(run: Run, *, is_resumed: bool) -> Collection[str]:
         if isinstance(value, str) and not from_file(name, value)
         if name in names or not is_composed
     }
-    if rank_zero_only.rank == 0:
-        remember_paths(
-            run.folder, {**(remembered_paths(run.folder) if is_resumed else {}), **paths}
-        )
+    before = remembered_paths(run.folder) if is_resumed else {}
+    rank_zero_only(remember_paths)(run.folder, {**before, **paths})
     return remembered_paths(run.folder)
 
 

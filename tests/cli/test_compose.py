@@ -24,7 +24,16 @@ EXPERIMENTS = sorted(
     path.relative_to(config_folder() / "experiment").with_suffix("").as_posix()
     for path in (config_folder() / "experiment").rglob("*.yaml")
 )
-GROUPS = ("representation", "optimizer", "scheduler", "network", "data", "trainer", "task")
+GROUPS = (
+    "recipe",
+    "representation",
+    "optimizer",
+    "scheduler",
+    "network",
+    "data",
+    "trainer",
+    "task",
+)
 
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
@@ -108,7 +117,7 @@ def test_what_arrives_is_what_was_typed(text: str) -> None:
     def arrived(argument: str) -> Any:
         (literal,) = literal_paths("predict", [argument])
         override = OverridesParser.create().parse_override(literal)
-        return OmegaConf.to_container(OmegaConf.create({"x": override.value()}), resolve=True)["x"]
+        return OmegaConf.create({"x": override.value()}).x
 
     in_hydras_quotes = path_text(text) != text
     if not in_hydras_quotes and text.lower() not in ("", "null"):

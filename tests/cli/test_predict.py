@@ -120,7 +120,8 @@ def test_a_prediction_killed_between_any_two_files_is_continued(
 ) -> None:
     for name in ("a", "b"):
         write_pixels(tmp_path / "in" / f"{name}.png", sphere(16))
-    replace, lock, killed = Path.replace, threading.Lock(), []
+    replace, lock = Path.replace, threading.Lock()
+    killed: list[Path] = []
 
     def snapshot(source: Path, target: Path) -> Any:
         with lock:

@@ -273,5 +273,6 @@ def test_on_a_phone_more_classes_are_announced_and_errors_take_lines(
             x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] - 2
             clip: FloatRect = {"x": x, "y": y, "width": 1, "height": 1}
             png = report.page.screenshot(clip=clip)
-            shades.append(int(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR).mean()))
+            pixels: Any = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+            shades.append(pixels.mean())
         assert shades[0] < shades[1] - 20, "a shade where more follows, none at the end"
