@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Quote, QuotedString
@@ -92,8 +93,16 @@ def quoted(text: str) -> str:
     """Quote a string so that Hydra takes it literally, without interpolation."""
     if _PLAIN.fullmatch(text):
         return text
-    escaped = re.sub(r"(\\*)\$\{", r"\1\1\\${", text)
-    return QuotedString(escaped, Quote.single).with_quotes()
+    return QuotedString(without_interpolation(text), Quote.single).with_quotes()
+
+
+def without_interpolation(value: Any) -> Any:
+    """Plain values that OmegaConf reads as they are."""
+    if isinstance(value, dict):
+        return {name: without_interpolation(inner) for name, inner in value.items()}
+    if isinstance(value, list):
+        return [without_interpolation(inner) for inner in value]
+    return re.sub(r"(\\*)\$\{", r"\1\1\\${", value) if isinstance(value, str) else value
 
 
 def _quoted_path(value: str) -> str:
