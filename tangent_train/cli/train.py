@@ -158,7 +158,8 @@ def _remember(run: Run, *, is_resumed: bool) -> Collection[str]:
         if name in names or not is_composed
     }
     before = remembered_paths(run.folder) if is_resumed else {}
-    rank_zero_only(remember_paths)(run.folder, {**before, **paths})
+    kept = {name: path for name, path in before.items() if name not in names}
+    rank_zero_only(remember_paths)(run.folder, kept | paths)
     return remembered_paths(run.folder)
 
 
