@@ -103,7 +103,7 @@ def make(settings: Any, place: str, file: SettingsFile | None = None, **given: A
 
     Raises:
         SettingError: The class or function cannot be imported, gets text for a number, or does not
-            take what it gets; of a class of the user's own the error is its own.
+            take what it gets; of a class of the user's own other errors are its own.
         DataError: The file gives forbidden or invalid settings.
     """
     maker, kinds = _maker(settings, place, file)
@@ -113,7 +113,9 @@ def make(settings: Any, place: str, file: SettingsFile | None = None, **given: A
         for name, value in settings.items()
         if name != "_target_"
     }
-    if arguments.pop("_partial_", False):
+    is_partial = arguments.pop("_partial_", False)
+    _check_taken(maker, settings["_target_"], arguments, place, file)
+    if is_partial:
         return partial(maker, **arguments, **given)
     source, name = file if file is not None and file.owns(place) else None, settings["_target_"]
     try:
@@ -130,6 +132,30 @@ def make(settings: Any, place: str, file: SettingsFile | None = None, **given: A
         if source is not None:
             raise DataError(source.path, found=f"{place}: {found}", expected=expected) from error
         raise SettingError(place, found=found, expected=expected) from error
+
+
+def _check_taken(
+    maker: Any, target: str, arguments: Collection[str], place: str, file: SettingsFile | None
+) -> None:
+    """Refuse arguments that a class or function does not have, such as those of another one."""
+    try:
+        known = inspect.signature(maker).parameters
+    except (TypeError, ValueError):  # it is not written in Python
+        return
+    unknown = [name for name in arguments if name not in known]
+    if not unknown or any(one.kind is one.VAR_KEYWORD for one in known.values()):
+        return
+    name = f"{place}.{unknown[0]}"
+    found, expected = f"{', '.join(unknown)} for {target}", f"settings of {', '.join(known)}"
+    if file is not None and file.owns(name):
+        raise DataError(file.path, found=f"{place}: {found}", expected=expected)
+    raise SettingError(
+        place,
+        found=found,
+        expected=expected,
+        remedy=f"Remove it with ~{name}, or choose an option of {place}=. Experiments have "
+        "settings of their own data set; recipe=small is for any panoramas.",
+    )
 
 
 def maker_of(settings: Any, place: str, file: SettingsFile | None = None) -> Any:

@@ -37,7 +37,7 @@ def image_paths(
 
     Args:
         pattern: A file; a folder, searched recursively; or a glob pattern, with ``**`` for folders
-            of any depth. ``~`` is the home folder.
+            of any depth.
         suffixes: Of images, in lower case.
         is_result: True for files that a command wrote: they are passed over.
         tell: Called with the number of the other files of a folder or pattern, if there are any.
@@ -50,8 +50,6 @@ def image_paths(
         DataError: There are none, or a folder cannot be opened.
     """
     path = Path(pattern)
-    # The shell leaves the ~ of "input=~/holiday" alone.
-    path = path.expanduser() if path.parts[:1] == ("~",) else path
     if path.is_file() and not is_result(path):
         return [path]
     if path.is_dir():

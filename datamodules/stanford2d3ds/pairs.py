@@ -98,7 +98,7 @@ class StanfordPairs(PanoramaPairs):
     ) -> None:
         if pairs not in ("paper", "rooms"):
             raise SettingError("data.pairs", found=pairs, expected="paper or rooms")
-        self.root = Path(root).expanduser()
+        self.root = Path(root)
         self.published = {str(p.number): p for p in published_pairs()} if pairs == "paper" else {}
         self._areas = areas
         self._height = erp_height

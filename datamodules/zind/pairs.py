@@ -35,7 +35,7 @@ class ZindPairs(PanoramaPairs):
         max_distance_m: float | None = None,
         erp_height: int | None = None,
     ) -> None:
-        self.root = Path(root).expanduser()
+        self.root = Path(root)
         self._max_distance_m = math.inf if max_distance_m is None else max_distance_m
         self._height = erp_height
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -59,11 +60,7 @@ def build(
     probe = copy.deepcopy(task).to("meta")
     data.try_step = partial(_try_step, probe, data, synchronized)
     data.try_step(data.per_step)
-    try:
-        task.make_optimizer([{"params": [torch.zeros(1, 1, requires_grad=True)]}])
-    except (TypeError, ValueError) as error:
-        expected = f"settings that {settings['optimizer']['_target_']} takes"
-        raise SettingError("optimizer", found=str(error), expected=expected) from error
+    _try_schedule(task, settings)
     return data, task
 
 
@@ -115,7 +112,7 @@ def build_trained(
 class _Mapping:
     """See ``configs/evaluate.yaml``."""
 
-    class_map: str
+    class_map: str | Path
     unmapped: Unmapped
 
 
@@ -172,6 +169,23 @@ def _build_task(
 
 def _no_optimizer(*_: Any, **__: Any) -> Any:
     raise RuntimeError("a task that is only evaluated has no optimizer")
+
+
+def _try_schedule(task: Any, settings: Settings) -> None:
+    """Make the optimizer, and the scheduler for some number of steps."""
+    group = {"params": [torch.zeros(1, 1, requires_grad=True)]}
+    trials: dict[str, Callable[[], object]] = {
+        "optimizer": lambda: task.make_optimizer([group]),
+        "scheduler": lambda: task.optimization(lambda: 1000),
+    }
+    for name, trial in trials.items():
+        try:
+            trial()
+        except Exception as error:
+            expected = f"settings that {settings[name]['_target_']} takes"
+            raise SettingError(
+                name, found=f"{type(error).__name__}: {error}", expected=expected
+            ) from error
 
 
 def _try_network(task: Any, channels: int) -> None:

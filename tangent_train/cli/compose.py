@@ -1,17 +1,31 @@
-"""Finding configs, before anything heavy is imported."""
+"""Finding configs, and taking paths literally, before anything heavy is imported."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Quote, QuotedString
+from hydra.errors import HydraException
 
-_PATHS = (
-    *("back", "cameras", "checkpoint", "class_map", "classes", "depth", "figure", "file"),
-    *("init_from", "input", "left", "mask", "model", "output", "resume", "right", "weights"),
+from tangent_train.cli.declared import declared_types, is_declared
+
+_PLAIN = re.compile(r"(?!(null|true|false|inf|nan)$)[a-z_/][a-z0-9_/.-]*", re.IGNORECASE | re.ASCII)
+"""Text that Hydra reads as this text, without quotes."""
+
+_OF_A_SWEEP = re.compile(r"""('(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*"|[^,]*)(?:,|$)""", re.DOTALL)
+"""One of several values, and the comma after it."""
+
+_OF_RUNS = (
+    "tangent_train.cli.settings.RunFiles",
+    "tangent_train.cli.settings.EvaluatedFile",
+    "tangent_train.cli.build._Mapping",
 )
-"""Settings that name files or folders."""
+"""Take the settings of commands that have no `Settings` of their own."""
 
 
 def config_folder() -> Path:
@@ -33,20 +47,102 @@ def named(argument: str, setting: str) -> str:
     return f"{name}={{name:{value}}}" if name == setting and value else argument
 
 
-def quote_path(argument: str) -> str:
-    """Quote an override of a file or folder, so that Hydra takes its value literally.
+def literal_paths(command: str, arguments: Sequence[str]) -> list[str]:
+    """Quote the values of settings that are paths, so that Hydra takes them literally.
 
-    >>> quote_path("input=holiday (1)/a=b,c.jpg"), quote_path("level=7"), quote_path("depth=null")
-    ("input='holiday (1)/a=b,c.jpg'", 'level=7', 'depth=null')
+    A setting is a path if the class that takes it declares it as `Path`. Then everything after
+    ``=`` is the path, except for ``~/``, which is the home folder; for ``null`` or nothing, which
+    are no path; and for Hydra's quotes around the whole value. In a sweep, commas separate paths.
+    The folders of Hydra (``hydra.run.dir``) keep their ``${…}``.
+
+    Args:
+        command: The command, such as predict.
+        arguments: Its command line.
+
+    >>> literal_paths("predict", ["input=holiday (1)/a=b,c.jpg", "level=7", "depth=null"])
+    ["input='holiday (1)/a=b,c.jpg'", 'level=7', 'depth=null']
     """
-    name, _, value = argument.partition("=")
-    if name not in _PATHS or value in ("", "null") or value[0] in "'\"":
-        return argument
-    return f"{name}={quoted(value)}"
+    is_sweep = not {"-m", "--multirun", "hydra.mode=MULTIRUN"}.isdisjoint(arguments)
+    literal = []
+    for argument in arguments:
+        name, _, value = argument.partition("=")
+        setting = name.lstrip("+")
+        if _PLAIN.fullmatch(value) or not re.fullmatch(r"\w[\w.]*", setting):
+            literal.append(argument)
+        elif re.fullmatch(r"hydra\..*\bdir", setting):
+            within = _in_quotes(value)
+            text = QuotedString(value if within is None else within, Quote.single)
+            literal.append(f"{name}={text.with_quotes()}")
+        elif _is_path(command, setting, value, arguments):
+            parts = _OF_A_SWEEP.findall(f"{value},")[:-1] if is_sweep else [value]
+            literal.append(f"{name}={','.join(map(_quoted_path, parts))}")
+        else:
+            literal.append(argument)
+    return literal
+
+
+def path_text(value: str) -> str:
+    """The path that a value on a command line stands for, see `literal_paths`."""
+    within = _in_quotes(value)
+    if within is not None:
+        return re.sub(r"(\\*)\1\\\$\{", r"\1${", within)
+    return str(Path.home()) + value[1:] if re.match("~(/|$)", value) else value
 
 
 def quoted(text: str) -> str:
     """Quote a string so that Hydra takes it literally, without interpolation."""
-    if re.fullmatch(r"[\w/.+-]+", text):
+    if _PLAIN.fullmatch(text):
         return text
-    return QuotedString(text.replace("${", r"\${"), Quote.single).with_quotes()
+    return QuotedString(without_interpolation(text), Quote.single).with_quotes()
+
+
+def without_interpolation(value: Any) -> Any:
+    """Plain values that OmegaConf reads as they are."""
+    if isinstance(value, dict):
+        return {name: without_interpolation(inner) for name, inner in value.items()}
+    if isinstance(value, list):
+        return [without_interpolation(inner) for inner in value]
+    return re.sub(r"(\\*)\$\{", r"\1\1\\${", value) if isinstance(value, str) else value
+
+
+def _quoted_path(value: str) -> str:
+    return "null" if value.lower() in ("", "null") else quoted(path_text(value))
+
+
+def _in_quotes(value: str) -> str | None:
+    """Text in Hydra's quotes; None if they are not around the whole value."""
+    if len(value) > 1 and value[0] == value[-1] and value[0] in "'\"":
+        with suppress(HydraException):
+            found = OverridesParser.create().parse_override(f"x={value}").value()
+            return found if isinstance(found, str) else None
+    return None
+
+
+def _is_path(command: str, setting: str, value: str, arguments: Sequence[str]) -> bool:
+    """True for a setting that is declared as `Path`, unless it may be a number and is one."""
+    types = declared_types(_takers(command, setting, arguments), setting.rpartition(".")[2])
+    if types & {"float", "int"}:
+        with suppress(ValueError):
+            float(value)
+            return False
+    return "Path" in types
+
+
+def _takers(command: str, setting: str, arguments: Sequence[str]) -> Iterator[str]:
+    """Names of the classes and functions that may take a setting.
+
+    They are those of the command, or all that the options of a section's group name, in any folder
+    of configs.
+    """
+    groups = setting.split(".")[:-1]
+    if not groups:
+        module = "import_network" if command == "import" else command
+        own = f"tangent_train.cli.{module}.Settings"
+        yield from (own,) if is_declared(own) else _OF_RUNS
+    text = "\0".join(arguments)
+    for folder in (config_folder(), *re.findall(r"(?:--config-dir|-cd)[=\0]([^\0]+)", text)):
+        for file in (file for group in groups for file in Path(folder).glob(f"{group}/*.yaml")):
+            yield from re.findall(
+                r"^ *_target_: *['\"]?([\w.]+)", file.read_text("utf-8"), re.MULTILINE
+            )
+    yield from re.findall(r"\._target_=([^\0]+)", text)

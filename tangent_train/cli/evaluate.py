@@ -26,6 +26,7 @@ from tangent_train.checkpoints.scores import Scores, size_multiple_of
 from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
 from tangent_train.cli.build import Settings, build, build_trained, check_fits, shown
 from tangent_train.cli.say import say
+from tangent_train.cli.settings import EvaluatedFile, typed
 from tangent_train.cli.stored import GROUPS, run_settings
 from tangent_train.errors import SettingError, at_least
 from tangent_train.files import no_room
@@ -62,9 +63,7 @@ def evaluate(
     Raises:
         SettingError: No checkpoint is given, or it does not fit the data.
     """
-    if settings["checkpoint"] is None:
-        raise SettingError("checkpoint", found="none", expected="checkpoints/best.ckpt of a run")
-    checkpoint = Path(settings["checkpoint"])
+    checkpoint = typed(EvaluatedFile, settings).checkpoint
     mapped = settings.get("class_map") is not None
     if not mapped:
         settings = {name: value for name, value in settings.items() if name != "unmapped"}

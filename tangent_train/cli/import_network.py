@@ -41,8 +41,8 @@ class Settings:
     """See ``configs/import.yaml``; `normalization` may also be a mapping."""
 
     network: str
-    model: str | None
-    weights: str | None
+    model: str | Path | None
+    weights: str | Path | None
     file: Path | None
     classes: Path | None
     nothing: tuple[str, ...]

@@ -30,7 +30,7 @@ class InputSettings:
         every: Of videos, the first and then every n-th frame is taken.
     """
 
-    input: str | None
+    input: str | Path | None
     crop: tuple[float, ...] | None
     every: int
 

@@ -32,6 +32,9 @@ class Settings:
     """Settings of ``configs/keypoints.yaml`` that are neither in `Ways` nor data."""
 
     output: Path
+    left: Path | None
+    right: Path | None
+    input: str | Path | None
     max_pairs: int | None
     pictures: int
     export: bool

@@ -33,7 +33,7 @@ def _main(command: str) -> None:
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 
-    from tangent_train.cli.compose import config_folder, named, quote_path
+    from tangent_train.cli.compose import config_folder, literal_paths, named
     from tangent_train.cli.help import annotate
     from tangent_train.cli.processes import end_with_first_process, ended_by_sigterm
     from tangent_train.cli.stored import stored_run
@@ -55,7 +55,7 @@ def _main(command: str) -> None:
             arguments = stored.arguments
         if command == "import":
             arguments = [named(argument, "network") for argument in arguments]
-        sys.argv[1:] = map(quote_path, arguments)
+        sys.argv[1:] = literal_paths(command, arguments)
         try:
             folder = config_folder()
             os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises what it would print

@@ -56,9 +56,9 @@ class Settings(InputSettings):
     """See ``configs/predict.yaml``."""
 
     checkpoint: Path
-    input: str
+    input: str | Path
     output: Path
-    class_map: str | None
+    class_map: str | Path | None
     unmapped: Unmapped
     depth: Path | None
     depth_scale: float
@@ -128,9 +128,10 @@ def _label(
 ) -> list[Entry]:
     """Label images, those of a shard or all; returns their entries, with those done before."""
     summary = None if part is None else part.path
-    earlier = folder.earlier(decisive, summary) if settings.resume else {}
-    if not (settings.overwrite or earlier or (part is not None and part.folder.exists())):
-        folder.check()
+    known = folder.earlier(decisive, summary) if settings.resume else None
+    if not (settings.overwrite or known is not None or (part and part.folder.exists())):
+        folder.check(resume=settings.resume)
+    earlier = known or {}
     names = dict.fromkeys(inputs.names())
     entries = [entry for name, entry in earlier.items() if name in names]
     if part is not None:
@@ -139,7 +140,7 @@ def _label(
     def save() -> None:
         if part is not None:
             part.save(entries)
-        elif any("classes" in e for e in entries):  # else nothing is in the way of another try
+        else:
             folder.write_summary(decisive, entries)
 
     count = len(names)
@@ -148,6 +149,7 @@ def _label(
     steps = label, label.read, label.write
     labelled = set()
     saved = -math.inf
+    save()
     try:
         with closing(each("Predicting", inputs.missing(earlier), missing, *steps)) as done:
             for job in done:
@@ -162,6 +164,8 @@ def _label(
         raise
     finally:
         save()
+        if part is None and not any("classes" in entry for entry in entries):
+            folder.remove_summary()
     if unmade := _make_videos(inputs, folder, entries, labelled):
         entries += unmade
         save()
@@ -266,16 +270,19 @@ class _Labeller:
             inputs: All images and videos.
             used: Names of the images and frames that have been labelled.
         """
-        earlier = {name for name in self._shown.keys() & used if self._shown[name] is None}
-        files = {name: self._folder.files(name).get("labels") for name in earlier}
-        wanted = {name for name, labels in files.items() if labels is not None}
-        for job in inputs.missing({name for name in inputs.names() if name not in wanted}):
-            labels = files.get(job.item)
+        count, names = self._settings.report, [name for name in inputs.names() if name in used]
+        wanted = [names[number] for number in evenly_spread(count, len(names))]
+        earlier = {name for name in wanted if self._shown.get(name) is None}
+        for job in inputs.missing(set(inputs.names()) - earlier):
+            labels = self._folder.files(job.item).get("labels")
             if labels is not None and not job.error:
                 image, area = self.read(job)
                 read = read_pixels(labels, indices=True)
                 self._shown[job.item] = self._folder.viewer_image(job.item, image, read, area)
-        return [picture for picture in self._shown.values() if picture is not None]
+        others = [name for name in self._shown if name not in wanted]
+        made = [name for name in (*wanted, *others) if self._shown.get(name) is not None]
+        shown = (self._shown[name] for name in names if name in made[:count])
+        return [picture for picture in shown if picture is not None]
 
 
 def _make_videos(

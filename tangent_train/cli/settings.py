@@ -31,11 +31,27 @@ class Trust:
     trust: tuple[str, ...]
 
 
+@dataclass(frozen=True)
+class RunFiles:
+    """See ``configs/train.yaml``; `name` is a folder."""
+
+    name: str | Path
+    init_from: Path | None
+    resume: Path | None
+
+
+@dataclass(frozen=True)
+class EvaluatedFile:
+    """See ``configs/evaluate.yaml``."""
+
+    checkpoint: Path
+
+
 def typed(kind: type[_Settings], config: Mapping[str, Any]) -> _Settings:
     """Build a dataclass of settings; values are checked where they are used.
 
     Annotations may be ``bool``, ``int``, ``float``, ``str``, `Path`, ``None``, `Literal`, tuples
-    and unions of these. A single value may stand for a tuple; ``~`` in a path is the home folder.
+    and unions of these. A single value may stand for a tuple.
 
     Args:
         kind: The class.
@@ -82,7 +98,7 @@ def _as(kind: Any, value: Any) -> Any:
         kinds = arguments[:1] * len(values) if arguments[-1] is ... else arguments
         return tuple(_as(each, one) for one, each in zip(values, kinds, strict=True))
     if kind is Path and isinstance(value, str):
-        return Path(value).expanduser()
+        return Path(value)
     if kind is float and type(value) in (int, float) and math.isfinite(value):
         return float(value)
     if type(value) is kind and kind is not float:

@@ -7,20 +7,21 @@ for what is typed and what concerns this machine, and never reach Hydra.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from tangent_train.checkpoints.content import INPUTS, NORMALIZATION, read_checkpoint
-from tangent_train.cli.compose import config_folder, quoted
+from tangent_train.cli.compose import config_folder, path_text, quoted
+from tangent_train.cli.remembered import remembered_paths
 from tangent_train.cli.settings import Trust, typed
 from tangent_train.errors import DataError, SettingError
 from tangent_train.registry import SettingsFile, Text, check_fields
 from tangent_train.setting_rules import from_file
 
 _SECTIONS = ("data", "representation", "network", "task", "optimizer", "scheduler", "trainer")
-GROUPS = ("experiment", *_SECTIONS)
+GROUPS = ("experiment", "recipe", *_SECTIONS)
 """Config groups whose chosen options a checkpoint keeps, as ``choices``."""
 
 _RUN = {
@@ -210,7 +211,7 @@ def stored_run(command: str, arguments: Sequence[str]) -> StoredRun | StoredNetw
     given = [a.partition("=")[2] for a in arguments if a.startswith(f"{setting}=")]
     if not setting or not given or given[-1] in ("", "null"):
         return None
-    path = Path(given[-1].strip("'\"")).absolute()
+    path = Path(path_text(given[-1])).absolute()
     place = [f"{setting}={path}"]
     left = [a for a in arguments if not a.startswith(f"{setting}=")]
     if command == "train":
@@ -237,12 +238,13 @@ def stored_run(command: str, arguments: Sequence[str]) -> StoredRun | StoredNetw
         _check_evaluation(path, _named(left), of_run=config is not None)
         if config is None:
             return StoredNetwork(path, left)
+    left = [*_remembered(path, _named(left)), *left]
     kinds = {name: _RUN[name] for name in ("choices", "level", "seed")}
     known = check_fields(path, config, kinds, _EXPECTED)
-    choices = {g: name for g, name in (known["choices"] or {}).items() if _is_own(g, name)}
+    choices = {g: name for g, name in (known["choices"] or {}).items() if is_own_option(g, name)}
     own = {a.partition("=")[0] for a in left}.intersection(GROUPS)
     if own:  # what an experiment sets of a section is not meant for another option of it
-        choices.pop("experiment", None)
+        choices = {g: name for g, name in choices.items() if g not in ("experiment", "recipe")}
     added = [f"level={known['level']}", f"seed={known['seed']}"]
     added += [f"{group}={name}" for group, name in choices.items() if group not in own]
     return StoredRun(path, config, left, added, place)
@@ -266,6 +268,18 @@ def _named(arguments: Sequence[str]) -> set[str]:
     return {name for name in names if not name.startswith("hydra")}
 
 
+def _remembered(path: Path, names: Collection[str]) -> list[str]:
+    """Overrides for the data of a run that were typed on this machine before, but not now.
+
+    They count as typed. Which run it is follows from where the checkpoint is, not from what is in
+    it.
+    """
+    if "data" in names or path.parent.name != "checkpoints":
+        return []
+    paths = remembered_paths(path.parents[1]).items()
+    return [f"++{name}={quoted(text)}" for name, text in paths if name not in names]
+
+
 def _check_evaluation(path: Path, own: set[str], *, of_run: bool) -> None:
     """Refuse to evaluate a network without data, or with settings of another network."""
     if not of_run and not own & {"data", "experiment"}:
@@ -280,7 +294,7 @@ def _check_evaluation(path: Path, own: set[str], *, of_run: bool) -> None:
         raise SettingError(others[0], found="a value", expected=f"none: the network is in {path}")
 
 
-def _is_own(group: str, option: str) -> bool:
+def is_own_option(group: str, option: str) -> bool:
     """Whether it is an option of this program's configs."""
     folder = config_folder() / group
     return group in GROUPS and folder / f"{option}.yaml" in folder.rglob("*.yaml")

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import signal
 import sys
 import warnings
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ import lightning
 from hydra.core.hydra_config import HydraConfig
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.callbacks import EMAWeightAveraging, LearningRateMonitor
+from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from tangent_train.callbacks.checkpoints import BestCheckpoint, LastCheckpoint
@@ -22,11 +24,14 @@ from tangent_train.checkpoints.content import read_checkpoint
 from tangent_train.cli.build import Settings
 from tangent_train.cli.evaluate import Run, machine_faults
 from tangent_train.cli.fine_tuning import begin_from, load_start
+from tangent_train.cli.remembered import remember_paths, remembered_paths
+from tangent_train.cli.settings import RunFiles, typed
+from tangent_train.cli.stored import is_own_option
 from tangent_train.cli.sweep import OBJECTIVE_FILE
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import atomic_path, write_text
 from tangent_train.registry import SettingsFile
-from tangent_train.setting_rules import differing_settings, from_file
+from tangent_train.setting_rules import differing_settings, flat_settings, from_file
 
 
 def train(settings: Settings, source: SettingsFile | None = None) -> float | None:
@@ -39,13 +44,13 @@ def train(settings: Settings, source: SettingsFile | None = None) -> float | Non
     Returns:
         The best validation score, which sweeps compare; None without a validation split.
     """
-    resumed = start = None
-    if settings["resume"] is not None:
-        resumed = Path(settings["resume"]) / "checkpoints" / "last.ckpt"
+    resumed, files = None, typed(RunFiles, settings)
+    start = None if files.resume else files.init_from
+    if files.resume is not None:
+        resumed = files.resume / "checkpoints" / "last.ckpt"
         content = read_checkpoint(resumed, ("config", "epoch", "state_dict"))
         _check_resumed(settings, content["config"], content["epoch"])
-    elif settings["init_from"] is not None:
-        start = Path(settings["init_from"])
+    elif start is not None:
         settings, source = begin_from(start, settings)
     run = Run.begin(settings, source)
     if start is not None:
@@ -57,7 +62,8 @@ def train(settings: Settings, source: SettingsFile | None = None) -> float | Non
             expected="1 without init_from=, which says what the backbone is",
         )
     checkpoints = run.folder / "checkpoints"
-    last = LastCheckpoint(checkpoints, settings["checkpoint_every_n_steps"], _typed_local())
+    needed = _typed_local(_remember(run, is_resumed=resumed is not None))
+    last = LastCheckpoint(checkpoints, settings["checkpoint_every_n_steps"], needed)
     best = BestCheckpoint(checkpoints, run.task.monitor)
     trainer = run.trainer([last, LearningRateMonitor(), best])
     if settings["ema"] is not None:  # first: the last step is in the average that is saved
@@ -139,8 +145,31 @@ def _check_resumed(settings: Settings, config: Mapping[str, Any], epoch: int | N
         )
 
 
-def _typed_local() -> list[str]:
-    """Typed machine-specific settings, which no file holds: a resumed run needs them again."""
+def _remember(run: Run, *, is_resumed: bool) -> Collection[str]:
+    """Remember where the user's data of a run are; returns the names of the settings."""
+    names = {text.lstrip("+").partition("=")[0] for text in HydraConfig.get().overrides.task}
+    choices = HydraConfig.get().runtime.choices
+    options = [(group, choices.get(group)) for group in ("data", "experiment")]
+    # Else the same options give the same paths again.
+    is_composed = "data" in choices and all(o is None or is_own_option(g, o) for g, o in options)
+    paths = {
+        name: os.path.abspath(value)  # noqa: PTH100 - links stay
+        for name, value in flat_settings({"data": run.settings["data"]})
+        if isinstance(value, str) and not from_file(name, value)
+        if name in names or not is_composed
+    }
+    before = remembered_paths(run.folder) if is_resumed else {}
+    kept = {name: path for name, path in before.items() if name not in names}
+    rank_zero_only(remember_paths)(run.folder, kept | paths)
+    return remembered_paths(run.folder)
+
+
+def _typed_local(remembered: Collection[str]) -> list[str]:
+    """Typed machine-specific settings that a resumed run needs again: no file holds them."""
     typed = [said.lstrip("+") for said in HydraConfig.get().overrides.task]
     parts = [(*said.partition("=")[::2], said) for said in typed]
-    return [said for name, value, said in parts if name == "trust" or not from_file(name, value)]
+    return [
+        said
+        for name, value, said in parts
+        if name == "trust" or not (name in remembered or from_file(name, value))
+    ]

@@ -15,6 +15,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from tangent_train.checkpoints.trained import TrainedNetwork
+from tangent_train.cli.compose import without_interpolation
 from tangent_train.cli.say import say
 from tangent_train.cli.stored import StoredNetwork, run_settings
 from tangent_train.cli.transfer_stages import Stage, plan, run_stage, stage_command, stage_state
@@ -38,7 +39,7 @@ def transfer(config: DictConfig) -> None:
     folder = Path(HydraConfig.get().runtime.output_dir)
     given = trained = None
     if config.checkpoint is not None:
-        config.checkpoint = str(Path(config.checkpoint).absolute())
+        config.checkpoint = without_interpolation(str(Path(config.checkpoint).absolute()))
         given = run_settings(Path(config.checkpoint))
         if given is None:
             config, trained = _of_network(config)

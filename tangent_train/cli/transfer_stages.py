@@ -27,6 +27,7 @@ from filelock import FileLock, Timeout
 from omegaconf import DictConfig, OmegaConf
 
 from tangent_train.checkpoints.content import read_settings
+from tangent_train.cli.compose import without_interpolation
 from tangent_train.cli.processes import command_line, run_process
 from tangent_train.cli.transfer_views import conditions_of, numbers
 from tangent_train.errors import DataError, SettingError
@@ -272,9 +273,8 @@ def run_stage(stage: Stage, state: State) -> int:
         with FileLock(stage.folder / ".lock", blocking=False):
             if state == "new":
                 write_text(stage.folder / "stage.digest", digest)
-            write_text(
-                stage.folder / "stage.yaml", OmegaConf.to_yaml(OmegaConf.create(_HEAD | config))
-            )
+            written = OmegaConf.create(_HEAD | without_interpolation(config))
+            write_text(stage.folder / "stage.yaml", OmegaConf.to_yaml(written))
             status = run_process(stage_command(stage))
     except Timeout as error:
         raise SettingError(
@@ -295,7 +295,7 @@ def stage_command(stage: Stage) -> list[str]:
 def _digest(weights: Path, config: Mapping[str, Any]) -> str:
     """A hash of the network's file and, if there is one, of its class map's."""
     given = str(config.get("class_map") or "")
-    own_map = [Path(given).expanduser()] if given.lower().endswith(".json") else []
+    own_map = [Path(given)] if given.lower().endswith(".json") else []
     hashed = hashlib.blake2b()
     for path in (weights, *own_map):
         with path.open("rb") as file:

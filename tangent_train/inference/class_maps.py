@@ -78,7 +78,7 @@ class MappedNetwork:
         return "; ".join(parts)
 
 
-def load_class_map(given: str) -> ClassMap:
+def load_class_map(given: str | Path) -> ClassMap:
     """A class map.
 
     Args:
@@ -89,11 +89,12 @@ def load_class_map(given: str) -> ClassMap:
         SettingError: There is no map of this name.
         DataError: The file cannot be used.
     """
+    given = str(given)
     shipped = sorted(path.stem for path in _FOLDER.glob("*.json"))
     if given in shipped:
         path = _FOLDER / f"{given}.json"
     elif given.lower().endswith(".json"):
-        path = Path(given).expanduser()
+        path = Path(given)
     else:
         raise SettingError(
             "class_map", found=given, expected=f"{', '.join(shipped)}; or a file my_map.json"

@@ -86,7 +86,7 @@ def load(
     original = load_trained(Path(path), (trust,) if isinstance(trust, str) else trust)
     trained = original
     if class_map is not None:
-        trained = map_classes(original, load_class_map(str(class_map)), unmapped).trained
+        trained = map_classes(original, load_class_map(class_map), unmapped).trained
     views = PanoramaViews(trained, levels or (level,), base_level, blend, rotations)
     how = device, images_per_forward, min_confidence
     panoramas = Predictor(trained, views, *how)

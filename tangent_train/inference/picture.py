@@ -37,7 +37,7 @@ def photo_of(image: Picture, fov: float) -> InputImage:
         SettingError: It is not an image.
     """
     if isinstance(image, str | Path):
-        return read_photo(Path(image).expanduser(), Path(image).stem, fov_deg=fov)
+        return read_photo(Path(image), Path(image).stem, fov_deg=fov)
     rgb = _rgb(image)
     return InputImage(rgb, camera_matrix=camera_matrix_from_fov(fov, (rgb.shape[0], rgb.shape[1])))
 
@@ -57,7 +57,7 @@ def panorama_of(
         SettingError: It is not an image, or a setting does not suit it.
     """
     if isinstance(image, str | Path):
-        path = Path(image).expanduser()
+        path = Path(image)
         return read_panorama(path, path.stem, crop=crop, upright=upright)
     if upright == "pose":
         raise SettingError(

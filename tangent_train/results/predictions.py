@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -14,7 +15,7 @@ from datamodules.folder.classes import UNKNOWN_NAME
 from datamodules.images.image_files import composed
 from datamodules.images.pixel_files import array_file, read_pixels, write_pixels
 from datamodules.images.videos import write_video
-from tangent_train.errors import SettingError
+from tangent_train.errors import SettingError, counted
 from tangent_train.files import csv_text, parse_json, write_text
 from tangent_train.geometry import equirect_solid_angles
 from tangent_train.results.html import EncodedImage, encode_image, write_report
@@ -125,8 +126,11 @@ class PredictionFolder:
         suffixes = {kind: ".npy" if kind == "probabilities" else ".png" for kind in self.kinds}
         return {kind: self.path / kind / f"{name}{suffix}" for kind, suffix in suffixes.items()}
 
-    def check(self) -> None:
+    def check(self, *, resume: bool) -> None:
         """Refuse a folder with earlier results.
+
+        Args:
+            resume: Whether they were to be continued, but have no summary.
 
         Raises:
             SettingError: There are some.
@@ -136,16 +140,25 @@ class PredictionFolder:
             raise SettingError(
                 "output",
                 found=there[0],
-                expected="a folder without earlier results",
-                remedy="Give another folder, resume=true to keep them, or overwrite=true.",
+                expected=f"a readable {_SUMMARY} beside it, of what is to be continued"
+                if resume
+                else "a folder without earlier results",
+                remedy="Give another folder, or overwrite=true."
+                if resume
+                else "Give another folder, resume=true to keep them, or overwrite=true.",
             )
 
-    def earlier(self, settings: Mapping[str, Any], summary: Path | None = None) -> dict[str, Entry]:
+    def earlier(
+        self, settings: Mapping[str, Any], summary: Path | None = None
+    ) -> dict[str, Entry] | None:
         """The entries of the images whose files are there, by name.
 
         Args:
             settings: Settings that earlier predictions must share.
             summary: Where they are; by default in ``summary.json``.
+
+        Returns:
+            Perhaps no entries; None without a summary.
 
         Raises:
             SettingError: They have other settings.
@@ -155,7 +168,7 @@ class PredictionFolder:
             entries = {entry["name"]: entry for entry in content["images"] if "classes" in entry}
             changed = [f"{n}={v}" for n, v in settings.items() if v != content[n]]
         except (OSError, ValueError, KeyError, TypeError):
-            return {}
+            return None
         if changed:
             raise SettingError(
                 "resume",
@@ -251,10 +264,15 @@ class PredictionFolder:
 
         Labels whose class is called unknown are left out of ``classes.json``: they have no class.
 
+        ``summary.json`` is the first file of a folder: a prediction that was killed at any moment
+        can be continued.
+
         Args:
             settings: Settings of the prediction.
             entries: Of the images done so far.
         """
+        content = {**settings, "images": entries}
+        write_text(self.path / _SUMMARY, json.dumps(content, indent=1) + "\n")
         names = dict.fromkeys(self.class_names)
         labels: dict[str, list[int]] = {}
         for label, name in enumerate(map(composed, self.class_names)):
@@ -262,14 +280,19 @@ class PredictionFolder:
                 labels.setdefault(name, []).append(label)
         lines = (f" {json.dumps(name)}: {given}" for name, given in labels.items())
         write_text(self.path / "classes.json", "{\n" + ",\n".join(lines) + "\n}\n")
-        content = {**settings, "images": entries}
-        write_text(self.path / _SUMMARY, json.dumps(content, indent=1) + "\n")
         columns = ("file", "rows", "columns")
         rows = [
             [*map(e.get, columns), *(e.get("classes", {}).get(n) for n in names), e.get("error")]
             for e in entries
         ]
         write_text(self.path / "summary.csv", csv_text([*columns, *names, "error"], rows))
+
+    def remove_summary(self) -> None:
+        """Remove the files of `write_summary`: nothing is in the way of another try."""
+        for name in ("summary.csv", "classes.json", _SUMMARY):
+            (self.path / name).unlink(missing_ok=True)
+        with suppress(OSError):  # there is something else in it
+            self.path.rmdir()
 
     def mean_shares(self, entries: Sequence[Entry]) -> Table:
         """Mean over the images of `class_shares`, the largest first, of classes that occur."""
@@ -311,5 +334,5 @@ class PredictionFolder:
             tables=tables,
             images=shown,
             class_names=self.class_names,
-            notes=[f"Shown: {len(shown)} of {len(entries)} images."],
+            notes=[f"Shown: {len(shown)} of {counted(len(entries) - len(failed), 'images')}."],
         )

@@ -14,6 +14,9 @@ from rich.markup import escape
 _WIDEST = 10_000
 """Characters: no table is wider."""
 
+_LONG = 32
+"""Characters: a longer cell may take several lines in HTML."""
+
 
 @dataclass(frozen=True)
 class Table:
@@ -82,9 +85,10 @@ class Table:
 
 def _html_row(cells: Sequence[str], kinds: Sequence[str], shades: Sequence[float]) -> str:
     first, *others = map(html.escape, cells)
-    parts = [f'<th scope="row">{first}</th>']
+    of_text = ["long" if len(text) > _LONG else "" for text in cells]
+    parts = [f'<th{_class(of_text[0])} scope="row">{first}</th>']
     for k, text in enumerate(others):
-        kind, style = kinds[k + 1], ""
+        kind, style = kinds[k + 1] or of_text[k + 1], ""
         if shades:
             kind = "strong" if shades[k] > 0.5 else ""
             style = f' style="--share:{shades[k]:.3f}"'

@@ -16,6 +16,8 @@ import torch
 
 from datamodules.core.split_module import SplitDataModule
 from tangent_train.checkpoints.content import read_settings
+from tangent_train.cli.compose import path_text
+from tangent_train.cli.stored import stored_run
 from tangent_train.results.record import load_record
 from tangent_train.tasks.segmentation import SegmentationTask
 from tests.cli.tiny_runs import SETTINGS, Run, results
@@ -68,7 +70,8 @@ def test_a_terminated_run_goes_on_as_if_nothing_had_happened(
     assert cut.returncode == 128 + signal.SIGTERM, cut.stderr
     assert "Traceback" not in cut.stderr
     begun, *printed = shlex.split(cut.stderr.strip().splitlines()[-1])
-    resume = [f"resume={tmp_path / 'cut'}", rooms, "trainer.accelerator=cpu"]
+    # Where the rooms are is remembered on this machine.
+    resume = [f"resume={tmp_path / 'cut'}", "trainer.accelerator=cpu"]
     assert begun == "tangent-train"
     assert sorted(printed) == sorted(resume)
     run("train", *resume)
@@ -151,6 +154,27 @@ def test_an_evaluation_repeats_the_figures_exactly(
     assert differing == {"checkpoint", "trainer.accelerator"}, "the processor is chosen anew"
 
 
+def test_where_data_are_is_remembered_by_the_place_of_the_run_and_never_in_it(
+    run_folder: Path, rooms: str, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    best = run_folder / "checkpoints" / "best.ckpt"
+    run("evaluate", f"checkpoint={best}", "hydra.run.dir=again")
+    assert results(tmp_path / "again") == results(run_folder)
+    found = read_settings(tmp_path / "again" / "config.yaml")["data"]["root"]
+    assert found == path_text(rooms.partition("=")[2])
+    moved = stored_run("evaluate", [f"checkpoint={best}", "data.root=moved"])
+    assert moved is not None
+    assert moved.typed == ["data.root=moved"]
+
+    shutil.copytree(run_folder, tmp_path / "theirs")
+    for name, home in (("theirs", None), (str(run_folder), str(tmp_path / "other machine"))):
+        if home is not None:
+            monkeypatch.setenv("XDG_STATE_HOME", home)
+        with pytest.raises(SystemExit, match=r"data\.root: found none, as checkpoints do not say"):
+            run("evaluate", f"checkpoint={name}/checkpoints/best.ckpt")
+    assert not [path for path in run_folder.rglob("*.json") if "data.root" in path.read_text()]
+
+
 @pytest.mark.parametrize(
     ("command", "override", "message"),
     [
@@ -218,6 +242,9 @@ def test_settings_of_an_evaluation(run_folder: Path, rooms: str, run: Run) -> No
     assert config["representation"]["level"] == 4
 
 
+_SCHEDULER = "scheduler._target_=torch.optim.lr_scheduler"
+
+
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
@@ -242,6 +269,30 @@ def test_settings_of_an_evaluation(run_folder: Path, rooms: str, run: Run) -> No
             ["network=deeplabv3_mobilenet", "data.inputs=[rgb]", "task.images_per_chunk=1"],
             r"task.images_per_chunk: found 1, .* DeepLabV3 gets \(1, 3, .*more than 1 value",
         ),
+        (["data=folder"], "data: found rooms for datamodules.FolderPanoramas; .*recipe=small"),
+        (["data=synthshapes"], "data: found panoramas_per_step, rooms for .*SynthShapes"),
+        (["data=zind_pairs"], "data: found ZindPairs; expected labelled images"),
+        (
+            ["scheduler=step", f"{_SCHEDULER}.ExponentialLR"],
+            "found step_size for .*~scheduler.step",
+        ),
+        (
+            ["scheduler=step", f"{_SCHEDULER}.CosineAnnealingLR"],
+            "found step_size, gamma for .*T_max",
+        ),
+        (["~scheduler.max_lr", "~scheduler.pct_start", f"{_SCHEDULER}.StepLR"], "step_size"),
+        (
+            ["scheduler=cosine", "scheduler.T_max=abc"],
+            "scheduler: found .*; expected settings that .*CosineAnnealingLR takes",
+        ),
+        (["optimizer._target_=torch.optim.SGD", "+optimizer.betas=[0,1]"], "betas for torch.optim"),
+        (["network._target_=torch.nn.Conv2d"], "network: found .*widths for torch.nn.Conv2d"),
+        (
+            ["network._target_=tests.cli.tiny_runs.results"],
+            "found .* for tests.cli.tiny_runs.results",
+        ),
+        (["representation._target_=tangent_train.rendering.EquirectRepresentation"], "base_level"),
+        (["data._target_=datamodules.Zind"], "data: found fold, "),
     ],
 )
 def test_impossible_settings_are_refused_before_any_data_is_made(

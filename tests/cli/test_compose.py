@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import inspect
+from dataclasses import is_dataclass
+from importlib import import_module
 from pathlib import Path
+from typing import Any, get_args, get_type_hints
 
 import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from tangent_train.cli.compose import config_folder
+from tangent_train.cli.compose import config_folder, literal_paths, path_text, quoted
+from tangent_train.cli.declared import declared_types
 from tangent_train.cli.stored import stored_run
 from tangent_train.errors import DataError
 from tests.running import composed
@@ -16,7 +24,16 @@ EXPERIMENTS = sorted(
     path.relative_to(config_folder() / "experiment").with_suffix("").as_posix()
     for path in (config_folder() / "experiment").rglob("*.yaml")
 )
-GROUPS = ("representation", "optimizer", "scheduler", "network", "data", "trainer", "task")
+GROUPS = (
+    "recipe",
+    "representation",
+    "optimizer",
+    "scheduler",
+    "network",
+    "data",
+    "trainer",
+    "task",
+)
 
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
@@ -40,3 +57,116 @@ def test_a_command_starts_from_a_stored_run_only_where_there_is_one(tmp_path: Pa
         stored_run("train", [f"resume={tmp_path}"])
     with pytest.raises(DataError, match=r"found a folder; .*checkpoints/best\.ckpt"):
         stored_run("evaluate", [f"checkpoint={tmp_path}"])
+
+
+# Paths.
+
+_ODD = (
+    *("my (rooms), 2024", "2024", "1e3", "0x1", "1_000", "true", "-x", "a=b", "[x]", "{x}", "#1"),
+    *("o'neil", "'", "'a", 'say "x"', "'a' b", "räume", "é.png", "日本.png", "x\\${oc.env:S}.png"),
+    *(
+        "${oc.env:S}",
+        " lead",
+        "trail ",
+        "new\nline",
+        "back\\",
+        "*.png",
+        "a:b",
+        "~x",
+        "x~",
+        "\udc80",
+    ),
+)
+_WITH_PATHS = [
+    *[("check", name) for name in ("data.root", "data.store", "+data.label_table")],
+    *[
+        ("predict", name)
+        for name in ("input", "output", "checkpoint", "depth", "mask", "class_map")
+    ],
+    *[
+        ("render", name)
+        for name in ("input", "output", "figure", "back", "poses", "cameras", "mask")
+    ],
+    *[("import", name) for name in ("model", "weights", "file", "classes", "output")],
+    *[("keypoints", name) for name in ("left", "right", "input", "output", "data.root")],
+    *[("export", "checkpoint"), ("evaluate", "checkpoint"), ("transfer", "photos.data.root")],
+    *[("train", n) for n in ("name", "init_from", "resume", "data.mask", "network.weights")],
+]
+
+
+def _received(command: str, argument: str) -> Any:
+    name = argument.partition("=")[0]
+    return OmegaConf.select(composed(command, *literal_paths(command, [argument])), name)
+
+
+@pytest.mark.parametrize(("command", "name"), _WITH_PATHS)
+def test_settings_that_are_paths(command: str, name: str) -> None:
+    typed = [f"{name}={text}" for text in ("my (rooms), 2024", "é", "null", "")]
+    quotes = [f"{name}={text}" for text in ("'my (rooms), 2024'", "'é'", "null", "null")]
+    assert literal_paths(command, typed) == quotes
+
+
+@pytest.mark.parametrize("text", _ODD)
+def test_paths_are_taken_literally(text: str) -> None:
+    assert _received("predict", f"input={text}") == text
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.text() | st.text("ab'\"\\${}:,[](#= \n\t~%@é日\udc80\x1b"))
+def test_what_arrives_is_what_was_typed(text: str) -> None:
+    def arrived(argument: str) -> Any:
+        (literal,) = literal_paths("predict", [argument])
+        override = OverridesParser.create().parse_override(literal)
+        return OmegaConf.create({"x": override.value()}).x
+
+    in_hydras_quotes = path_text(text) != text
+    if not in_hydras_quotes and text.lower() not in ("", "null"):
+        assert arrived(f"input={text}") == text
+    if text.lower() not in ("", "null"):
+        assert arrived(f"input={quoted(text)}") == text
+
+
+def test_the_home_folder_numbers_and_sweeps(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", "/home/me")
+    for text, path in (("~", "/home/me"), ("~/a b", "/home/me/a b"), ("./~", "./~"), ("~x", "~x")):
+        assert _received("predict", f"input={text}") == path
+    assert _received("predict", "input='my rooms'") == "my rooms"
+    assert _received("predict", "mask=2024") == 2024
+    same = [
+        "seed=2024",
+        "data.mask=-60",
+        "data.inputs=[rgb]",
+        "network.depth=50",
+        "optimizer.lr=1e-3",
+    ]
+    assert literal_paths("train", same) == same
+    swept = literal_paths("train", ["-m", "data.root=a b,'c, d',2024,o'neil", "seed=0,1"])
+    assert swept == ["-m", r"data.root='a b','c, d','2024','o\'neil'", "seed=0,1"]
+    kept = literal_paths("train", ["hydra.run.dir=my (runs)/${name}", "hydra.sweep.dir='a b'"])
+    assert kept == ["hydra.run.dir='my (runs)/${name}'", "hydra.sweep.dir='a b'"]
+
+
+def test_types_are_read_from_the_classes_that_take_the_settings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    takers = [f"{h}.{n}" for h in ("datamodules", "models") for n in import_module(h).__all__]
+    commands = ("predict", "render", "export", "import_network", "keypoints")
+    takers += [f"tangent_train.cli.{command}.Settings" for command in commands]
+    for target in takers:
+        made = getattr(import_module(target.rpartition(".")[0]), target.rpartition(".")[2])
+        by_fields = is_dataclass(made) or inspect.isfunction(made)
+        hints = get_type_hints(made if by_fields else made.__init__)
+        for name in inspect.signature(made).parameters:
+            is_path = Path in (hints.get(name), *get_args(hints.get(name)))
+            assert ("Path" in declared_types([target], name)) == is_path, (target, name)
+
+    (tmp_path / "my_maps.py").write_text(
+        "import typing\nfrom pathlib import Path\nfrom datamodules import FolderPanoramas\n"
+        "class Mine(FolderPanoramas):\n    maps: typing.Optional[Path]\n    scale: float\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    option = tmp_path / "my configs" / "data" / "mine.yaml"
+    option.parent.mkdir(parents=True)
+    option.write_text("_target_: my_maps.Mine\n")
+    typed = [f"--config-dir={option.parents[1]}", "data.maps=2024", "data.root=ä", "data.scale=1e3"]
+    assert literal_paths("check", typed)[1:] == ["data.maps='2024'", "data.root='ä'", typed[3]]

@@ -5,7 +5,9 @@ from __future__ import annotations
 import csv
 import json
 import math
+import shutil
 import signal
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -120,6 +122,53 @@ def test_an_interruption_keeps_what_is_done(
     assert predict(resume="true").keys() == {"a", "b", "c"}
     assert first.stat().st_mtime_ns == written
     assert len(list(first.parent.iterdir())) == 3
+
+
+def test_a_prediction_killed_between_any_two_files_is_continued(
+    tmp_path: Path, predict: Predict, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("a", "b"):
+        write_pixels(tmp_path / "in" / f"{name}.png", sphere(16))
+    replace, lock = Path.replace, threading.Lock()
+    killed: list[Path] = []
+
+    def snapshot(source: Path, target: Path) -> Any:
+        with lock:
+            replaced = replace(source, target)
+            killed.append(tmp_path / f"killed-{len(killed)}")
+            shutil.copytree("out", killed[-1], ignore=shutil.ignore_patterns(".*"))
+            return replaced
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "replace", snapshot)
+        predict(report=0, write="[labels]")
+    for folder in killed[:5]:
+        with pytest.raises(SystemExit, match=f"{folder}.* resume=true to keep them"):
+            predict(output=folder, write="[labels]")
+        again = predict(output=folder, report=0, write="[labels]", resume="true")
+        assert again.keys() == {"a", "b"}
+
+
+def test_results_without_a_summary_are_not_continued(tmp_path: Path, predict: Predict) -> None:
+    write_pixels(tmp_path / "in" / "a.png", sphere(16))
+    write_pixels(tmp_path / "out" / "labels" / "a.png", np.zeros((2, 2), np.uint8))
+    with pytest.raises(SystemExit, match=r"expected a readable summary\.json") as refused:
+        predict(resume="true")
+    assert "resume" not in str(refused.value)
+
+
+def test_usable_images_take_the_places_of_broken_ones_in_the_report(
+    tmp_path: Path, predict: Predict
+) -> None:
+    for k in range(6):
+        write_pixels(tmp_path / "in" / f"{k}.png", sphere(16))
+    for k in (0, 5):
+        (tmp_path / "in" / f"{k}.png").write_bytes(b"broken")
+    with pytest.raises(SystemExit, match="2 of 6 images could not be used"):
+        predict(report=3)
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "Shown: 3 of 4 images." in page
+    assert page.count("<li><button") == 3
 
 
 def test_a_part_of_a_panorama_is_labelled_as_that_part(tmp_path: Path, predict: Predict) -> None:

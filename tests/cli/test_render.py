@@ -206,12 +206,9 @@ def test_yaw_pitch_roll(
     np.testing.assert_allclose(turn @ (0, 1, 0), right, atol=1e-12)
 
 
-def test_a_figure_alone_or_beside_the_images(
-    room: Path, tmp_path: Path, refused: Refused, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_figure_alone_or_beside_the_images(room: Path, tmp_path: Path, refused: Refused) -> None:
     figure = tmp_path / "figure.png"
-    monkeypatch.setenv("HOME", str(tmp_path))
-    render_with(input=room, figure="~/figure.png", base_level=0)
+    render_with(input=room, figure=figure, base_level=0)
     assert _read(figure).shape[1] == 1600
     said = refused(input=room, figure=figure, output=tmp_path / "tan")
     assert "figure.png, which exists" in said

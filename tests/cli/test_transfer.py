@@ -171,9 +171,9 @@ def test_the_study_of_the_angular_resolution(runs: PretendedRuns) -> None:
 
 
 def test_a_given_network_is_not_trained(runs: PretendedRuns, tmp_path: Path) -> None:
-    given = tmp_path / "given.ckpt"
+    given = tmp_path / "given ${x}.ckpt"
     torch.save({"config": {"data": {"fold": 1}}}, given)
-    arguments = ("checkpoint=given.ckpt", "compare=[]")
+    arguments = (r"checkpoint=given \${x}.ckpt", "compare=[]")
     run_transfer(*arguments)
     assert runs.started[:2] == [("evaluate", "P"), ("evaluate", "S")]
     assert runs.configs[0].checkpoint == runs.configs[2].init_from == str(given)

@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from tangent_train.cli.compose import quote_path
+from tangent_train.cli.compose import literal_paths
 from tangent_train.cli.stored import StoredRun, stored_run
 from tangent_train.registry import SettingsFile
 from tests.cli import tiny_runs
@@ -25,7 +25,7 @@ SETTINGS = (
 
 def composed(arguments: list[str]) -> dict[str, Any]:
     """The settings that Hydra composes from the command line of tangent-evaluate."""
-    return composed_settings("evaluate", *map(quote_path, arguments))
+    return composed_settings("evaluate", *literal_paths("evaluate", arguments))
 
 
 def settled(

@@ -15,7 +15,10 @@ from tangent_train.registry import make
 
 
 def load(
-    settings: Mapping[str, Any], weights: str | None, classes: Path | None, normalization: Any
+    settings: Mapping[str, Any],
+    weights: str | Path | None,
+    classes: Path | None,
+    normalization: Any,
 ) -> PhotoNetwork:
     """A network of ``configs/network``.
 
@@ -34,5 +37,5 @@ def load(
     names = class_names_in(classes)
     whole = completed_settings(settings, 3, len(names), restored=True)
     network = make(whole, "network")
-    load_tensors(network, tensors_for(network, Path(weights).expanduser()), weights)
+    load_tensors(network, tensors_for(network, Path(weights)), weights)
     return PhotoNetwork(network, whole, names, Normalization.of(normalization, 3))

@@ -30,7 +30,7 @@ def saved_folder(model: str | None) -> Path:
     """
     if model is None:
         raise SettingError("model", found="none", expected="a name on the hub, or a folder")
-    folder = Path(model).expanduser()
+    folder = Path(model)
     if folder.is_dir():
         return folder
     try:

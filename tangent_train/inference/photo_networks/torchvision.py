@@ -37,7 +37,7 @@ def load(
     if model not in known:
         raise SettingError("model", found=model or "none", expected=", ".join(known))
     published = models.get_model_weights(model)
-    is_file = weights is not None and Path(weights).expanduser().is_file()
+    is_file = weights is not None and Path(weights).is_file()
     if weights is None or not (is_file or weights in published.__members__):
         known = ", ".join(published.__members__)
         raise SettingError("weights", found=weights or "none", expected=f"{known}, or a file")
@@ -54,7 +54,7 @@ def load(
     if "aux_loss" in inspect.signature(builder).parameters:
         settings["aux_loss"] = False
     network = builder(**{name: value for name, value in settings.items() if name != "_target_"})
-    file = Path(weights).expanduser()
+    file = Path(weights)
     tensors = tensors_for(network, file) if is_file else fetch_tensors(chosen)
     tensors = {name: t for name, t in tensors.items() if not name.startswith(_AUXILIARY)}
     load_tensors(network, tensors, weights)

@@ -119,6 +119,7 @@ class Viewer {
     this.find(".legend").hidden = columns.length === 0;
     this.find(".shares").textContent = columns.length ? `share of ${columns.join(" / ")}, %` : "";
     const entries = this.data.shares.map(([index, ...shares]) => this.legendEntry(index, shares));
+    this.find(".legend strong").textContent = `Classes (${entries.length})`;
     this.find(".legend ul").replaceChildren(...entries);
   }
 
