@@ -72,6 +72,12 @@ def _of_network(config: DictConfig) -> tuple[DictConfig, TrainedNetwork]:
             )
     plain: Any = OmegaConf.to_container(config)
     settings, _, trained = StoredNetwork(Path(config.checkpoint), said).settings(plain)
+    if "${" in str(trained.representation):
+        raise DataError(
+            Path(config.checkpoint),
+            found=f"representation={trained.representation}",
+            expected="no ${…} in it: the settings of the stages are interpolated",
+        )
     rows = config.representation.get("erp_height")
     if rows is not None:  # the panoramas of all views
         settings["representation"] |= {"erp_height": rows}

@@ -12,9 +12,13 @@ import numpy as np
 import pytest
 import torch
 import yaml  # type: ignore[import-untyped]
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
 
 import tangent_train
+from tangent_train.checkpoints.trained import METADATA_KEY
 from tangent_train.errors import DataError
+from tangent_train.rendering import TangentRepresentation
 from tests.cli.tiny_runs import run_command
 from tests.models.onnx_files import write_linear
 from tests.security.honest import SETTINGS
@@ -98,6 +102,24 @@ def test_checkpoints(
         network = {"_target_": "models.HuggingFaceNetwork", "config": config, "num_classes": 13}
         torch.save(content | {"config": content["config"] | {"network": network}}, _CHECKPOINT)
         use(found, command, *arguments)
+
+
+def noted(note: str, **settings: Any) -> TangentRepresentation:
+    """A representation of the user's own."""
+    del note
+    return TangentRepresentation(**settings)
+
+
+def test_a_transfer_interpolates_nothing_of_a_file(run: Path, use: Use) -> None:
+    """Its stages are configs; here with a class that the user trusts."""
+    with safe_open(run.parent / "net.safetensors", "pt") as file:
+        described = json.loads(file.metadata()[METADATA_KEY])
+    own = {"_target_": f"{__name__}.noted", "note": f"${{oc.create:{{_target_: {CANARY}.fire}}}}"}
+    described["representation"] |= own
+    text = json.dumps(described)
+    save_file(load_file(run.parent / "net.safetensors"), "theirs.safetensors", {METADATA_KEY: text})
+    arguments = ("checkpoint=theirs.safetensors", "data.root=rooms", f"trust={__name__}.noted")
+    use("expected no ${…} in it", "transfer", *arguments)
 
 
 def test_checkpoints_in_python(content: dict[str, Any], forbidden: Path, tmp_path: Path) -> None:
