@@ -33,7 +33,7 @@ def _write_imported(path: Path, classes: int, **stated: Any) -> Path:
     """Write a network with random numbers as `tangent-import` does."""
     torch.manual_seed(3)
     settings = UNET | {"num_classes": classes}
-    network = with_statistics(make(settings, "network"))
+    network: Any = with_statistics(make(settings, "network"))
     if stated:
         network.head.weight.data.fill_(0)
         network.head.bias.data.fill_(1 / classes)

@@ -126,7 +126,8 @@ def _scores(network: PhotoNetwork, image: Tensor) -> Tensor:
 def _check_labels(found: Sequence[float], named: int) -> None:
     """Refuse other labels than the named ones, beyond which only void has a value, e.g. 255."""
     known = max(2, named)  # those of one class are 0, its background, and 1
-    if known in found or (named == 1 and 1 not in found and max(found) > 1):
+    others = 0 not in found or (1 not in found and max(found) > 1)
+    if known in found or (named == 1 and others):
         raise SettingError(
             "class names of the network",
             found=f"{named}, for labels {', '.join(f'{label:g}' for label in found[:_LISTED])}",

@@ -17,6 +17,7 @@ from models.onnx_network import OnnxNetwork
 from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
 from tangent_train.errors import SettingError
 from tangent_train.inference.class_maps import ClassMap, map_classes
+from tangent_train.inference.export import export_network
 from tangent_train.inference.photo_networks import PhotoNetwork, import_network
 from tangent_train.inference.photo_networks.score_kinds import try_network
 from tangent_train.inference.predictor import Predictor
@@ -149,6 +150,22 @@ def test_one_score_is_of_a_class_and_its_background(
     np.testing.assert_allclose(shares, 1 / (1 + np.exp(-expected)), atol=1e-5)
 
 
+@pytest.mark.parametrize("suffix", ["ckpt", "safetensors", "onnx"])
+def test_one_score_of_a_checkpoint_and_of_its_export(suffix: str, tmp_path: Path) -> None:
+    settings = {"_target_": "torch.nn.Conv2d", "in_channels": 3, "out_channels": 1}
+    network = nn.Conv2d(3, 1, 1)
+    photo = PhotoNetwork(network, settings | {"kernel_size": 1}, ["sky"], UNIT, (16, 24))
+    trained = import_network(photo, tmp_path / "net.ckpt", level=5, base_level=0)
+    if suffix != "ckpt":
+        export_network(trained, tmp_path / f"net.{suffix}")
+    again, images = load_trained(tmp_path / f"net.{suffix}"), _images(32, 48)
+    with torch.no_grad():
+        expected = network(images).sigmoid()
+        found = again.network(images).softmax(dim=1)
+    torch.testing.assert_close(found[:, :1], expected, atol=1e-5, rtol=1e-4)
+    assert again.labels(np.array([0, 1], np.uint8)).tolist() == [1, 0]
+
+
 def test_where_no_sigmoid_is_above_one_half_nothing_wins(tmp_path: Path) -> None:
     sigmoid = _node("Sigmoid", "linear", "scores")
     path = write_linear(tmp_path / "net.onnx", WEIGHT, BIAS - 2, sigmoid)
@@ -253,6 +270,7 @@ class Wrong(nn.Module):
         (5, lambda x: x.sigmoid(), NAMES[:4], "found 4, for 5 scores"),
         (5, lambda x: x.argmax(1), NAMES[:4], "found 4, for labels 0, 1, 2, 3, 4"),
         (1, lambda x: (x[:, 0] > 0) * 255, NAMES[:1], "found 1, for labels 0, 255"),
+        (1, lambda x: x.softmax(1), NAMES[:1], "found 1, for labels 1;"),
         (2, lambda x: x[:, :, 1:], NAMES[:2], "output of the network: found 1×2×15×24"),
     ],
 )
