@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from tangent_train.errors import DataError, SettingError
+from tangent_train.imports import elsewhere
 
 _PREFIX = ".partial-"
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
@@ -69,10 +70,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(dir=path.parent, prefix=_PREFIX, suffix=path.suffix)
     except OSError as error:
-        told = no_room(path, error)
-        if told is None:
-            raise
-        raise told from error
+        raise no_room(path, error) or OSError(error.errno, error.strerror, str(path)) from error
     os.close(handle)
     temporary = Path(name)
     try:
@@ -153,12 +151,13 @@ def load_plain(path: Path, expected: str, *, mmap: bool = False) -> Any:
     Raises:
         DataError: It is missing, damaged, or holds other objects.
     """
-    import torch
+    if not path.exists():
+        raise DataError(path, found="no such file", expected=expected)
+    with elsewhere():
+        import torch
 
     try:
         return torch.load(path, map_location="cpu", weights_only=True, mmap=mmap)
-    except FileNotFoundError as error:
-        raise DataError(path, found="no such file", expected=expected) from error
     except Exception as error:
         if named := re.search(r"GLOBAL (\S+)", str(error)):
             found = f"{named[1]}, a class"
