@@ -21,7 +21,7 @@ from datamodules.core.found import SPLITS, Found, Item, Split, SplitItems
 from datamodules.core.inputs import Normalization
 from datamodules.core.loading import EpochSampler, make_loader, this_process
 from datamodules.core.problems import Problems
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError, SettingError, printable
 from tangent_train.threads import in_threads
 
 Kind = Literal["segmentation", "classification"]
@@ -454,4 +454,4 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
 
 @rank_zero_only
 def _tell(text: str) -> None:
-    Console(soft_wrap=True, highlight=False).print(text, markup=False)
+    Console(soft_wrap=True, highlight=False).print(printable(text), markup=False)
