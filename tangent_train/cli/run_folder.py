@@ -28,7 +28,7 @@ folders = ExitStack()
 """The folders of this process. Closing it gives them back."""
 
 
-class RunFolder(Callback):  # type: ignore[misc]
+class RunFolder(Callback):
     """Makes the folder of a run or sweep before Hydra writes to it, and locks it.
 
     A folder that is named after the time is always a new one. Further processes of a run are in the

@@ -34,7 +34,6 @@ def make_hostile(folder: Path) -> Path:
     (folder / ".numba_config.yaml").write_text("a: b: c\n")
     (folder / "matplotlibrc").write_bytes(b"\xff\n")
     return folder
-    return folder
 
 
 def run_in_hostile(
