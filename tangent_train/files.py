@@ -20,6 +20,7 @@ from typing import IO, Any
 from zipfile import ZipFile, is_zipfile
 
 from tangent_train.errors import DataError, SettingError
+from tangent_train.imports import elsewhere
 
 _PREFIX = ".partial-"
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
@@ -73,10 +74,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(dir=path.parent, prefix=_PREFIX, suffix=path.suffix)
     except OSError as error:
-        told = no_room(path, error)
-        if told is None:
-            raise
-        raise told from error
+        raise no_room(path, error) or OSError(error.errno, error.strerror, str(path)) from error
     os.close(handle)
     temporary = Path(name)
     try:
@@ -159,7 +157,10 @@ def load_plain(path: Path, expected: str, *, mmap: bool = False, whole: bool = T
     Raises:
         DataError: It is missing, damaged, or holds other objects.
     """
-    import torch
+    if not path.exists():
+        raise DataError(path, found="no such file", expected=expected)
+    with elsewhere():
+        import torch
 
     try:
         content = torch.load(path, map_location="cpu", weights_only=True, mmap=mmap)

@@ -9,10 +9,12 @@ import threading
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
-from multiprocessing import connection
+from multiprocessing import connection, forkserver
 from typing import Any, TypeVar
 
 import cv2
+
+from tangent_train.imports import elsewhere
 
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _Result = TypeVar("_Result")
@@ -45,6 +47,9 @@ def in_processes(
     context.set_forkserver_preload([work.__module__])  # imported once, not once per process
     with _one_thread_each(), ProcessPoolExecutor(processes, context, _prepare_worker) as pool:
         try:
+            if "forkserver" in methods:
+                with elsewhere():  # the processes it starts return to the working directory
+                    forkserver.ensure_running()
             futures = [pool.submit(work, *piece) for piece in pieces]
             for future in as_completed(futures):
                 yield future.result()

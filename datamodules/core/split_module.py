@@ -22,7 +22,7 @@ from datamodules.core.found import SPLITS, Found, Item, Split, SplitItems
 from datamodules.core.inputs import Normalization
 from datamodules.core.loading import EpochSampler, make_loader, this_process
 from datamodules.core.problems import Problems
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError, SettingError, printable
 from tangent_train.registry import is_text
 from tangent_train.threads import in_threads
 
@@ -481,4 +481,4 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
 @rank_zero_only
 def tell(text: str) -> None:
     """Print text as it is, in the first process."""
-    Console(soft_wrap=True, highlight=False).print(text, markup=False)
+    Console(soft_wrap=True, highlight=False).print(printable(text), markup=False)

@@ -17,7 +17,7 @@ from lightning.pytorch.callbacks import Callback, Checkpoint, ModelCheckpoint
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 from rich.console import Console
 
-from tangent_train.errors import SettingError
+from tangent_train.errors import SettingError, printable
 from tangent_train.files import atomic_path
 
 
@@ -161,11 +161,13 @@ class LastCheckpoint(Checkpoint):
         self, trainer: Trainer, pl_module: LightningModule, exception: BaseException
     ) -> None:
         """Print how to resume the run."""
-        if trainer.is_global_zero and self.has_begun:
+        if trainer.is_global_zero and self.has_begun and self.path.is_file():
             saved = "here" if isinstance(exception, SIGTERMException) else "the last checkpoint"
             command = shlex.join([f"resume={self.path.parent.parent}", *self.typed])
             text = f"{self.path} has all up to {saved}; resume with\n  tangent-train {command}"
-            Console(stderr=True).print(text, soft_wrap=True, highlight=False)
+            Console(stderr=True, soft_wrap=True, highlight=False).print(
+                printable(text), markup=False
+            )
 
     def _any_told_to_end(self, trainer: Trainer) -> bool:
         """Whether some process got SIGTERM: all end after the same step."""

@@ -12,20 +12,14 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.errors import HydraException
 
-from tangent_train.cli.declared import declared_types, is_declared
+from tangent_train.cli.command_settings import SETTINGS
+from tangent_train.cli.declared import declared_types
 
 _PLAIN = re.compile(r"(?!(null|true|false|inf|nan)$)[a-z_/][a-z0-9_/.-]*", re.IGNORECASE | re.ASCII)
 """Text that Hydra reads as this text, without quotes."""
 
 _OF_A_SWEEP = re.compile(r"""('(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*"|[^,]*)(?:,|$)""", re.DOTALL)
 """One of several values, and the comma after it."""
-
-_OF_RUNS = (
-    "tangent_train.cli.settings.RunFiles",
-    "tangent_train.cli.settings.EvaluatedFile",
-    "tangent_train.cli.build._Mapping",
-)
-"""Take the settings of commands that have no `Settings` of their own."""
 
 
 def config_folder() -> Path:
@@ -136,9 +130,8 @@ def _takers(command: str, setting: str, arguments: Sequence[str]) -> Iterator[st
     """
     groups = setting.split(".")[:-1]
     if not groups:
-        module = "import_network" if command == "import" else command
-        own = f"tangent_train.cli.{module}.Settings"
-        yield from (own,) if is_declared(own) else _OF_RUNS
+        kind = SETTINGS[command]
+        yield f"{kind.__module__}.{kind.__name__}"
     text = "\0".join(arguments)
     for folder in (config_folder(), *re.findall(r"(?:--config-dir|-cd)[=\0]([^\0]+)", text)):
         for file in (file for group in groups for file in Path(folder).glob(f"{group}/*.yaml")):

@@ -30,12 +30,6 @@ def declared_types(targets: Iterable[str], name: str) -> set[str]:
     return {kind for one in filter(None, found) for kind in _types_of_argument(one, name)}
 
 
-def is_declared(target: str) -> bool:
-    """True if the source code of a class or function is found."""
-    found = _find(*target.rpartition(".")[::2])
-    return found is not None and isinstance(found[1], ast.ClassDef | ast.FunctionDef)
-
-
 def _types_of_argument(found: _Found, name: str) -> set[str]:
     module, node = found
     functions = [node] if isinstance(node, ast.FunctionDef) else []

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from datamodules.core.progress import progress_bar
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError, SettingError, printable
 from tangent_train.threads import in_threads
 
 _THREADS = min(4, os.cpu_count() or 1)
@@ -78,7 +78,7 @@ def each(
 
         for job in _stage(after, worked()):
             if job.error:
-                bar.console.print(job.error, style="red", markup=False, soft_wrap=True)
+                bar.console.print(printable(job.error), style="red", markup=False, soft_wrap=True)
             yield job
 
 

@@ -25,8 +25,9 @@ from tangent_train.checkpoints.content import read_checkpoint, write_settings
 from tangent_train.checkpoints.scores import Scores, size_multiple_of
 from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
 from tangent_train.cli.build import Settings, build, build_trained, check_fits, shown
+from tangent_train.cli.command_settings import EvaluateSettings
 from tangent_train.cli.say import say
-from tangent_train.cli.settings import EvaluatedFile, typed
+from tangent_train.cli.settings import typed
 from tangent_train.cli.stored import GROUPS, run_settings
 from tangent_train.errors import SettingError, at_least
 from tangent_train.files import no_room
@@ -63,7 +64,7 @@ def evaluate(
     Raises:
         SettingError: No checkpoint is given, or it does not fit the data.
     """
-    checkpoint = typed(EvaluatedFile, settings).checkpoint
+    checkpoint = typed(EvaluateSettings, settings).checkpoint
     mapped = settings.get("class_map") is not None
     if not mapped:
         settings = {name: value for name, value in settings.items() if name != "unmapped"}

@@ -3,30 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from rich import get_console
+from rich.text import Text
 
 from tangent_train.checkpoints.trained import load_trained
+from tangent_train.cli.command_settings import ExportSettings as Settings
 from tangent_train.cli.say import say
 from tangent_train.cli.settings import check_new, typed
-from tangent_train.errors import width_height
+from tangent_train.errors import printable, width_height
 from tangent_train.inference.export import export_network
 from tangent_train.inference.predictor import sees_rays
-
-
-@dataclass(frozen=True)
-class Settings:
-    """See ``configs/export.yaml``."""
-
-    checkpoint: Path
-    output: Path
-    image_size: tuple[int, int] | None
-    opset: int | None
-    overwrite: bool
-    trust: tuple[str, ...]
 
 
 def export(config: Mapping[str, Any]) -> None:
@@ -43,7 +31,7 @@ def export(config: Mapping[str, Any]) -> None:
     settings = typed(Settings, config)
     output = settings.output
     check_new(settings, output)
-    with get_console().status(f"Writing {output.name} …"):
+    with get_console().status(Text(f"Writing {printable(output.name)} …")):
         trained = load_trained(settings.checkpoint, settings.trust)
         size, opset = settings.image_size, settings.opset
         written = export_network(trained, output, image_size=size, opset=opset)

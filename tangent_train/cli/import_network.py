@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,11 +11,15 @@ from hydra import compose
 from hydra.errors import MissingConfigException
 from omegaconf import OmegaConf
 from rich import get_console
+from rich.text import Text
 
 from tangent_train.checkpoints.content import ScoreKind
+from tangent_train.cli.command_settings import ImportSettings as Settings
+from tangent_train.cli.command_settings import with_network_name
 from tangent_train.cli.say import say
 from tangent_train.cli.settings import check_new, typed
-from tangent_train.errors import SettingError, width_height
+from tangent_train.errors import SettingError, printable, width_height
+from tangent_train.imports import elsewhere
 
 if TYPE_CHECKING:
     from tangent_train.checkpoints.trained import TrainedNetwork
@@ -36,26 +39,6 @@ _SAID: dict[ScoreKind, str] = {
 }
 
 
-@dataclass(frozen=True)
-class Settings:
-    """See ``configs/import.yaml``; `normalization` may also be a mapping."""
-
-    network: str
-    model: str | Path | None
-    weights: str | Path | None
-    file: Path | None
-    classes: Path | None
-    nothing: tuple[str, ...]
-    nothing_wins: bool
-    scores: ScoreKind | None
-    image_size: tuple[int, ...] | None
-    fov: float
-    level: int | None
-    base_level: int | None
-    output: Path
-    overwrite: bool
-
-
 def import_network(config: Mapping[str, Any]) -> None:
     """Write a photo network as a checkpoint and print what was understood.
 
@@ -66,15 +49,16 @@ def import_network(config: Mapping[str, Any]) -> None:
         DataError: A file cannot be used.
         SettingError: A setting is missing or impossible, or the file exists.
     """
-    from tangent_train.inference import photo_networks
+    settings = typed(Settings, with_network_name(config))
+    with elsewhere():
+        from tangent_train.inference import photo_networks
 
-    settings = typed(Settings, {**config, "network": (config["network"] or {}).get("name")})
     output = settings.output
     suffix = ".onnx" if settings.network == "onnx" else ".ckpt"
     if output.suffix.lower() != suffix:
         raise SettingError("output", found=output.name, expected=f"a name ending in {suffix}")
     check_new(settings, output)
-    with get_console().status(f"Writing {output.name} …"):
+    with get_console().status(Text(f"Writing {printable(output.name)} …")):
         network = _load(settings, config["normalization"])
         trained = photo_networks.import_network(
             network,
@@ -107,7 +91,8 @@ def _load(settings: Settings, normalization: Any) -> PhotoNetwork:
     """The network, from the library that the settings name."""
     name = settings.network
     if name in _LIBRARIES:
-        library = import_module(f"tangent_train.inference.photo_networks.{name}")
+        with elsewhere():
+            library = import_module(f"tangent_train.inference.photo_networks.{name}")
         network: PhotoNetwork = library.load(
             model=settings.model,
             weights=settings.weights,

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from datamodules.images.image_files import IMAGE_SUFFIXES, image_paths, short_names
 from datamodules.images.videos import VIDEO_SUFFIXES, read_frames, read_video_size
+from tangent_train.cli.command_settings import InputSettings
 from tangent_train.cli.each import Job, Shard
 from tangent_train.cli.say import say
 from tangent_train.errors import DataError, at_least
@@ -17,22 +18,6 @@ from tangent_train.results.predictions import frame_name
 def is_video(path: Path) -> bool:
     """Whether a file is a video, by its suffix."""
     return path.suffix.lower() in VIDEO_SUFFIXES
-
-
-@dataclass(frozen=True)
-class InputSettings:
-    """Settings of a command that takes images and videos.
-
-    Attributes:
-        input: See `image_paths`.
-        crop: The part of the sphere that panoramas show, see `area_of_crop`; None for that of
-            their GPano tags.
-        every: Of videos, the first and then every n-th frame is taken.
-    """
-
-    input: str | Path | None
-    crop: tuple[float, ...] | None
-    every: int
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import os
 import re
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from rich.progress import track
 
 from datamodules.core.panorama_pairs import ImagePairs, PanoramaPair, PanoramaPairs
 from datamodules.images.pixel_files import read_image_size
+from tangent_train.cli.command_settings import KeypointsSettings as Settings
 from tangent_train.cli.say import say
 from tangent_train.cli.settings import typed
 from tangent_train.errors import DataError, SettingError, width_height
@@ -25,19 +26,6 @@ from tangent_train.results.keypoints.compare import AS_GIVEN, Comparer, Comparis
 from tangent_train.results.keypoints.report import KeypointReport, matches_png
 
 _OF_IMAGES = ("left", "right", "input", "pairing")
-
-
-@dataclass(frozen=True)
-class Settings:
-    """Settings of ``configs/keypoints.yaml`` that are neither in `Ways` nor data."""
-
-    output: Path
-    left: Path | None
-    right: Path | None
-    input: str | Path | None
-    max_pairs: int | None
-    pictures: int
-    export: bool
 
 
 def keypoints(config: Mapping[str, Any]) -> None:

@@ -10,15 +10,18 @@ import logging
 import os
 import signal
 import sys
+import threading
 from contextlib import contextmanager, redirect_stdout, suppress
 from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
-from io import StringIO
+from io import StringIO, TextIOWrapper
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError, SettingError, printable
+from tangent_train.files import no_room
+from tangent_train.imports import elsewhere
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -28,6 +31,7 @@ if TYPE_CHECKING:
 
 def _main(command: str) -> None:
     """Compose the config ``<command>.yaml`` with the command line and hand it to the command."""
+    _prepare_process()
     _import_own_packages()
     import hydra
     from hydra.errors import HydraException
@@ -36,13 +40,14 @@ def _main(command: str) -> None:
     from tangent_train.cli.compose import config_folder, literal_paths, named
     from tangent_train.cli.help import annotate
     from tangent_train.cli.processes import end_with_first_process, ended_by_sigterm
+    from tangent_train.cli.run_folder import folders
     from tangent_train.cli.stored import stored_run
 
     end_with_first_process()
     typed = sys.argv[1:]
     arguments = typed[1:] if __name__ == "__main__" else typed
     visible_gpus = os.environ.get("CUDA_VISIBLE_DEVICES")
-    with _refusals(command), ended_by_sigterm():
+    with _refusals(command), _errors_once(), ended_by_sigterm(), folders:
         stored = stored_run(command, arguments)
 
         def job(config: DictConfig) -> float | None:
@@ -68,16 +73,19 @@ def _main(command: str) -> None:
                 run()
         except (HydraException, OmegaConfBaseException) as error:
             cause = str(error.__cause__ or "").partition("\n")[0]
-            sys.exit(f"tangent-{command}: {error}" + f"\n{cause}" * bool(cause))
-        except (IsADirectoryError, NotADirectoryError, PermissionError) as error:
-            raise SettingError(
-                error.filename or "output",
-                found=(error.strerror or str(error)).lower(),
-                expected="a file or folder that can be read and written",
-                remedy="Change its permissions, or choose another one (of a run: hydra.run.dir=…).",
-            ) from error
+            sys.exit(printable(f"tangent-{command}: {error}" + f"\n{cause}" * bool(cause)))
         finally:
             sys.argv[1:] = typed
+
+
+def _prepare_process() -> None:
+    """Print what the encoding of the output lacks escaped; start no module of this folder."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+    # Of all processes that are started, whatever starts them: the working directory is not on their
+    # path, as it is not on that of the console scripts.
+    os.environ["PYTHONSAFEPATH"] = "1"
 
 
 def _import_own_packages() -> None:
@@ -111,6 +119,7 @@ def report() -> None:
     """``tangent-report <run folders>``: tables and a chart over runs."""
     from tangent_train.cli.report import report as write_report
 
+    _prepare_process()
     with _refusals("report"):
         write_report(sys.argv[1:])
 
@@ -118,6 +127,7 @@ def report() -> None:
 def _run(command: str, config: DictConfig, stored: Any, visible_gpus: str | None) -> Any:
     from omegaconf import OmegaConf
 
+    from tangent_train.cli.command_settings import check_settings
     from tangent_train.cli.sweep import in_sweep, run_job
 
     if in_sweep():
@@ -127,10 +137,12 @@ def _run(command: str, config: DictConfig, stored: Any, visible_gpus: str | None
         # SLURM warns every process; submitit's ends this one, with SIGTERM, for a last checkpoint.
         signal.signal(signal.SIGUSR2, signal.SIG_IGN)
     name = "import_network" if command == "import" else command  # a word of Python
-    run = getattr(import_module(f"tangent_train.cli.{name}"), name)
+    settings: Any = OmegaConf.to_container(config, resolve=True)
+    check_settings(command, settings)
+    with elsewhere():
+        run = getattr(import_module(f"tangent_train.cli.{name}"), name)
     if command == "transfer":  # its stages keep the references of the config
         return run(config)
-    settings: Any = OmegaConf.to_container(config, resolve=True)
     return run(settings) if stored is None else run(*stored.settings(settings))
 
 
@@ -138,13 +150,25 @@ def _run(command: str, config: DictConfig, stored: Any, visible_gpus: str | None
 def _refusals(command: str) -> Iterator[None]:
     """Exit with a one-line message if a setting or a file cannot be used."""
     try:
-        yield
+        with _of_callbacks():
+            yield
         sys.stdout.flush()
     except BrokenPipeError:  # "| head" has read enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(128 + signal.SIGPIPE)
     except (DataError, SettingError) as error:
         sys.exit(f"tangent-{command}: {error}")
+    except OSError as error:
+        if error.errno is None:
+            raise
+        path = error.filename if isinstance(error.filename, str) else None
+        told = (no_room(Path(path), error) if path else None) or SettingError(
+            path or "output",
+            found=os.strerror(error.errno).lower(),
+            expected="a file or folder that can be read and written",
+            remedy="Change its permissions, or choose another one (of a run: hydra.run.dir=…).",
+        )
+        sys.exit(f"tangent-{command}: {told}")
     except KeyboardInterrupt as error:
         _end(command, error)
     except SystemExit as error:
@@ -154,14 +178,40 @@ def _refusals(command: str) -> Iterator[None]:
         raise
 
 
+@contextmanager
+def _errors_once() -> Iterator[None]:
+    """Print no error of a thread that keeps it, as TensorBoard's do: it is raised here too."""
+    before = threading.excepthook
+
+    def print_unless_kept(error: threading.ExceptHookArgs) -> None:
+        if getattr(error.thread, "exception", None) is not error.exc_value:
+            before(error)
+
+    threading.excepthook = print_unless_kept
+    try:
+        yield
+    finally:
+        threading.excepthook = before
+
+
+@contextmanager
+def _of_callbacks() -> Iterator[None]:
+    """Raise the errors of Hydra's callbacks, which reach this as exits."""
+    try:
+        yield
+    except SystemExit as error:
+        if isinstance(error.__cause__, OSError | SettingError):
+            raise error.__cause__ from None
+        raise
+
+
 def _end(command: str, interrupt: KeyboardInterrupt) -> NoReturn:
     """Exit as a shell says it; commands have said how to go on."""
     from tangent_train.cli.processes import SigtermError
 
-    if not isinstance(interrupt, SigtermError):
-        sys.exit(128 + signal.SIGINT)
-    sys.stderr.write(f"tangent-{command}: ended by SIGTERM\n")
-    sys.exit(128 + signal.SIGTERM)
+    received = signal.SIGTERM if isinstance(interrupt, SigtermError) else signal.SIGINT
+    sys.stderr.write(f"tangent-{command}: ended by {received.name}\n")
+    sys.exit(128 + received)
 
 
 if __name__ == "__main__":

@@ -7,25 +7,25 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence, Set
 from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.images.gpano import PanoramaArea
-from datamodules.images.masks import Mask, Masks
+from datamodules.images.masks import Masks
 from datamodules.images.pixel_files import read_pixels
 from datamodules.images.tangent_folders import panorama_area
 from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
+from tangent_train.cli.command_settings import PredictSettings as Settings
 from tangent_train.cli.each import Job, Shard, each
-from tangent_train.cli.input_files import Inputs, InputSettings, is_video
+from tangent_train.cli.input_files import Inputs, is_video
 from tangent_train.cli.predict_shards import PredictionShard
 from tangent_train.cli.say import say
 from tangent_train.cli.settings import typed
 from tangent_train.errors import SettingError, counted
-from tangent_train.inference.class_maps import Unmapped, load_class_map, map_classes
+from tangent_train.inference.class_maps import load_class_map, map_classes
 from tangent_train.inference.images import DepthFolder, read_panorama, read_photo, with_up
 from tangent_train.inference.judge import NetworkJudge
 from tangent_train.inference.predictor import Predictor
@@ -34,7 +34,6 @@ from tangent_train.results.html import EncodedImage
 from tangent_train.results.pictures import evenly_spread
 from tangent_train.results.predictions import (
     Entry,
-    Kind,
     PredictionFolder,
     class_shares,
     is_result_in,
@@ -49,38 +48,6 @@ _DECISIVE = (
 
 _SAVED_EVERY_S = 10.0
 """So much work is done again after a process was killed."""
-
-
-@dataclass(frozen=True)
-class Settings(InputSettings):
-    """See ``configs/predict.yaml``."""
-
-    checkpoint: Path
-    input: str | Path
-    output: Path
-    class_map: str | Path | None
-    unmapped: Unmapped
-    depth: Path | None
-    depth_scale: float
-    projection: Literal["equirectangular", "perspective"]
-    fov: float | None
-    level: int | None
-    levels: tuple[int, ...] | None
-    base_level: int | None
-    blend: Literal["feather", "nearest"]
-    rotations: int
-    upright: Literal["pose", "auto"] | None
-    max_tilt_deg: float
-    mask: Mask
-    min_confidence: float
-    write: tuple[Kind, ...]
-    report: int
-    overwrite: bool
-    resume: bool
-    shard: str | int | None
-    images_per_forward: int | None
-    device: str
-    trust: tuple[str, ...]
 
 
 def predict(config: Mapping[str, Any]) -> None:

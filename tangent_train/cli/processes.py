@@ -15,6 +15,9 @@ from typing import NoReturn
 
 from tangent_train.cli.compose import quoted
 
+_NOTICE_S = 3.0
+"""After an interrupt, in which a process ends that a terminal's Ctrl-C has reached too."""
+
 _PATIENCE_S = 30.0  # for a last checkpoint
 _WATCHED_EVERY_S = 1.0
 _FIRST = "TANGENT_TRAIN_FIRST_PROCESS"
@@ -46,17 +49,16 @@ def run_process(line: Sequence[str], changes: Mapping[str, str | None] | None = 
     Returns:
         The exit status.
     """
-    # Not the working folder on Python's path, as with the console scripts: a folder "models" in it
-    # would be imported. A variable, because it has to reach the processes Lightning starts.
-    environment = {**os.environ, "PYTHONSAFEPATH": "1", **(changes or {})}
+    environment = {**os.environ, **(changes or {})}
     known = {name: value for name, value in environment.items() if value is not None}
     with ended_by_sigterm(), subprocess.Popen(line, env=known) as process:
         try:
             return process.wait()
         except BaseException as error:
-            if type(error) is not KeyboardInterrupt:  # a terminal's Ctrl-C has told it
-                process.terminate()
             try:
+                with suppress(subprocess.TimeoutExpired):
+                    process.wait(_NOTICE_S if type(error) is KeyboardInterrupt else 0)
+                process.terminate()
                 with suppress(subprocess.TimeoutExpired):
                     process.wait(_PATIENCE_S)
             finally:

@@ -5,16 +5,15 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.folder.reader import class_masks
 from datamodules.images.colmap_project import ColmapProject, flat_names
-from datamodules.images.masks import Mask, Masks
+from datamodules.images.masks import Masks
 from datamodules.images.pixel_files import (
     LOSSY_SUFFIXES,
     PIXEL_SUFFIXES,
@@ -29,9 +28,10 @@ from datamodules.images.tangent_folders import (
     shrink_to_level,
     write_tangent_folder,
 )
-from datamodules.images.tangent_results import Kind, TangentResults, result_files
+from datamodules.images.tangent_results import TangentResults, result_files
+from tangent_train.cli.command_settings import RenderSettings as Settings
 from tangent_train.cli.each import Job, each
-from tangent_train.cli.input_files import Inputs, InputSettings, is_video
+from tangent_train.cli.input_files import Inputs, is_video
 from tangent_train.cli.say import say
 from tangent_train.cli.settings import check_new, typed
 from tangent_train.errors import DataError, SettingError, counted
@@ -48,32 +48,6 @@ from tangent_train.rendering.camera_files import (
 from tangent_train.rendering.figure import tangent_figure
 
 _Work = Callable[[Job, Callable[[float], object]], Path]
-
-
-@dataclass(frozen=True)
-class Settings(InputSettings):
-    """See ``configs/render.yaml``."""
-
-    output: Path | None
-    overwrite: bool
-    base_level: int
-    level: int | None
-    dim: int | None
-    faces: tuple[int, ...] | None
-    rotation: tuple[float, float, float] | None
-    format: str
-    interpolation: Literal["bilinear", "nearest"]
-    colmap: bool
-    mask: Mask
-    mask_classes: tuple[str, ...] | None
-    figure: Path | None
-    back: Path | None
-    poses: Path | None
-    cameras: Path | None
-    blend: Literal["feather", "nearest"]
-    height: int | None
-    kind: Literal["auto"] | Kind
-    z_depth: bool
 
 
 def render(config: Mapping[str, Any]) -> None:

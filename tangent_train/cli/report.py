@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from tangent_train.cli.say import say
+from tangent_train.errors import DataError
+from tangent_train.imports import elsewhere
 
 
 def report(arguments: Sequence[str]) -> None:
@@ -19,9 +21,13 @@ def report(arguments: Sequence[str]) -> None:
         DataError: Runs are missing or cannot be read.
     """
     options = _parser().parse_args(arguments)
+    for folder in options.folders:
+        if not folder.is_dir():
+            raise DataError(folder, found="no such folder", expected="a run, or a folder of runs")
     # Heavy, and not needed to say what is wrong with the command line.
-    from tangent_train.results.comparisons import runs_report
-    from tangent_train.results.record import find_runs, load_record, unfinished_runs
+    with elsewhere():
+        from tangent_train.results.comparisons import runs_report
+        from tangent_train.results.record import find_runs, load_record, unfinished_runs
 
     records = [load_record(folder) for folder in find_runs(options.folders)]
     notes = [f"{run}: not finished, left out." for run in unfinished_runs(options.folders)]

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from rich.console import Console
 
+from tangent_train.errors import printable
+
 
 def say(text: str, *, error: bool = False) -> None:
-    """Print text as it is: without markup, highlights, and breaks at the width of the terminal.
+    """Print text without markup, highlights, and breaks at the width of the terminal.
+
+    Control characters are escaped: names of files and classes are untrusted.
 
     Args:
         text: Lines.
         error: Print to standard error.
     """
-    Console(stderr=error, soft_wrap=True, highlight=False).print(text, markup=False)
+    Console(stderr=error, soft_wrap=True, highlight=False).print(printable(text), markup=False)

@@ -31,22 +31,6 @@ class Trust:
     trust: tuple[str, ...]
 
 
-@dataclass(frozen=True)
-class RunFiles:
-    """See ``configs/train.yaml``; `name` is a folder."""
-
-    name: str | Path
-    init_from: Path | None
-    resume: Path | None
-
-
-@dataclass(frozen=True)
-class EvaluatedFile:
-    """See ``configs/evaluate.yaml``."""
-
-    checkpoint: Path
-
-
 def typed(kind: type[_Settings], config: Mapping[str, Any]) -> _Settings:
     """Build a dataclass of settings; values are checked where they are used.
 

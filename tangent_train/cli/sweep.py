@@ -72,4 +72,4 @@ def run_job(
     if status:
         raise CompactHydraException(f"job {hydra.job.num} in {folder} ended with status {status}")
     figure = folder / OBJECTIVE_FILE
-    return float(parse_json(figure.read_text())["best"]) if figure.is_file() else None
+    return float(parse_json(figure.read_bytes())["best"]) if figure.is_file() else None

@@ -22,10 +22,11 @@ from lightning.pytorch.utilities.exceptions import SIGTERMException
 from tangent_train.callbacks.checkpoints import BestCheckpoint, LastCheckpoint
 from tangent_train.checkpoints.content import read_checkpoint
 from tangent_train.cli.build import Settings
+from tangent_train.cli.command_settings import TrainSettings
 from tangent_train.cli.evaluate import Run, machine_faults
 from tangent_train.cli.fine_tuning import begin_from, load_start
 from tangent_train.cli.remembered import remember_paths, remembered_paths
-from tangent_train.cli.settings import RunFiles, typed
+from tangent_train.cli.settings import typed
 from tangent_train.cli.stored import is_own_option
 from tangent_train.cli.sweep import OBJECTIVE_FILE
 from tangent_train.errors import DataError, SettingError
@@ -44,7 +45,7 @@ def train(settings: Settings, source: SettingsFile | None = None) -> float | Non
     Returns:
         The best validation score, which sweeps compare; None without a validation split.
     """
-    resumed, files = None, typed(RunFiles, settings)
+    resumed, files = None, typed(TrainSettings, settings)
     start = None if files.resume else files.init_from
     if files.resume is not None:
         resumed = files.resume / "checkpoints" / "last.ckpt"

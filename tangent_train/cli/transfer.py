@@ -21,6 +21,7 @@ from tangent_train.cli.stored import StoredNetwork, run_settings
 from tangent_train.cli.transfer_stages import Stage, plan, run_stage, stage_command, stage_state
 from tangent_train.cli.transfer_views import views_of
 from tangent_train.errors import DataError, SettingError
+from tangent_train.imports import elsewhere
 from tangent_train.registry import check_fields
 
 _OF_TRAINING = ("ema", "fine_tuning", "network", "optimizer", "scheduler")
@@ -152,7 +153,8 @@ def _report(
     config: DictConfig, folder: Path, stages: Sequence[Stage], trained: TrainedNetwork | None
 ) -> None:
     """Write and print the tables and the chart."""
-    from tangent_train.results.comparisons import levels_report, transfer_report
+    with elsewhere():  # of matplotlib
+        from tangent_train.results.comparisons import levels_report, transfer_report
     from tangent_train.results.record import load_record
 
     found: dict[Any, list[Any]] = defaultdict(list)

@@ -4,20 +4,29 @@ Compiled loops are serial and release the GIL; `over_rows` runs them on several 
 parallel loops are not used: its OpenMP layer kills worker processes forked after its first use, its
 portable layer dies when two threads use it at once.
 
-Compiled code is cached on disk beside each source file and checked against that file alone, so a
-loop must not call compiled functions of another file.
+Compiled code is cached in a folder of the user and checked against its source file alone, so a loop
+must not call compiled functions of another file. The cache holds pickles: the folder has to be
+private. Without one, loops are compiled in every process.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from itertools import pairwise
+from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any, TypeVar
 
 import torch
-from numba import njit
+from numba import config, njit
 from numba.core.compiler import Compiler
+
+from tangent_train.imports import is_private
+
+config._config_fname = ""  # numba would read .numba_config.yaml here at every compilation
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -36,9 +45,28 @@ class _Restrict(Compiler):  # type: ignore[misc]
         return super().define_pipelines()
 
 
+def cache_folder() -> Path | None:
+    """The folder for compiled code, in ``NUMBA_CACHE_DIR`` or else in the user's cache.
+
+    Returns:
+        None if it cannot be written to, or other users have access to it.
+    """
+    with suppress(OSError, RuntimeError):  # no home
+        users = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser()
+        folder = Path(os.environ.get("NUMBA_CACHE_DIR") or users).absolute() / "tangent-train"
+        folder.mkdir(0o700, parents=True, exist_ok=True)
+        TemporaryFile(dir=folder).close()
+        if is_private(folder):
+            return folder
+    return None
+
+
+_CACHE = cache_folder()
+
+
 def njit_exact(function: Function) -> Function:
     """Compile with IEEE arithmetic."""
-    return njit(cache=True, nogil=True, error_model="numpy")(function)
+    return _compiled(function)
 
 
 def njit_fast(function: Function) -> Function:
@@ -47,8 +75,16 @@ def njit_fast(function: Function) -> Function:
     Arrays that the function writes must not overlap its other arguments.
     """
     flags = {"contract", "reassoc", "nsz", "arcp"}
-    settings = {"fastmath": flags, "pipeline_class": _Restrict}
-    return njit(cache=True, nogil=True, error_model="numpy", **settings)(function)
+    return _compiled(function, fastmath=flags, pipeline_class=_Restrict)
+
+
+def _compiled(function: Function, **settings: Any) -> Function:
+    loop = njit(nogil=True, error_model="numpy", **settings)(function)
+    if _CACHE is not None:
+        users, config.CACHE_DIR = config.CACHE_DIR, str(_CACHE)
+        loop.enable_caching()
+        config.CACHE_DIR = users
+    return loop
 
 
 def over_rows(kernel: Callable[..., None], rows: int, width: int, *arguments: Any) -> None:

@@ -11,6 +11,8 @@ from rich import table as rich_table
 from rich.console import Console
 from rich.markup import escape
 
+from tangent_train.errors import printable
+
 _WIDEST = 10_000
 """Characters: no table is wider."""
 
@@ -54,14 +56,14 @@ class Table:
         console = Console(highlight=False)
         if not console.is_terminal:
             console.width = _WIDEST
-        title, note = escape(self.title) or None, escape(self.note) or None
+        title, note = _shown(self.title) or None, _shown(self.note) or None
         table = rich_table.Table(title=title, caption=note, show_lines=self.lines)
         for k, name in enumerate(self.header):
             justify: Any = "left" if k in self.text_columns else "right"
             # Folded, never cut: a path is of use as a whole.
-            table.add_column(escape(name), justify=justify, overflow="fold")
+            table.add_column(_shown(name), justify=justify, overflow="fold")
         for row in self.rows:
-            table.add_row(*map(escape, row))
+            table.add_row(*map(_shown, row))
         console.print(table)
 
     def html(self) -> str:
@@ -81,6 +83,11 @@ class Table:
             f"<table{_class('heat' if self.shades else '')}>\n<thead><tr>{header}</tr></thead>\n"
             f"<tbody>\n{chr(10).join(rows)}\n</tbody></table></div></section>"
         )
+
+
+def _shown(text: str) -> str:
+    """Text for the terminal: names of classes and files are untrusted."""
+    return escape(printable(text))
 
 
 def _html_row(cells: Sequence[str], kinds: Sequence[str], shades: Sequence[float]) -> str:

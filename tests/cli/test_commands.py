@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import errno
+import os
+import re
 import shlex
 import shutil
 import signal
 import subprocess
 import sys
+import threading
+from io import BytesIO, TextIOWrapper
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +21,12 @@ import torch
 
 from datamodules.core.split_module import SplitDataModule
 from tangent_train.checkpoints.content import read_settings
+from tangent_train.cli import main
 from tangent_train.cli.compose import path_text
+from tangent_train.cli.say import say
 from tangent_train.cli.stored import stored_run
 from tangent_train.results.record import load_record
+from tangent_train.results.tables import Table
 from tangent_train.tasks.segmentation import SegmentationTask
 from tests.cli.tiny_runs import SETTINGS, Run, results
 from tests.running import run_python
@@ -249,7 +257,7 @@ _SCHEDULER = "scheduler._target_=torch.optim.lr_scheduler"
     ("overrides", "message"),
     [
         (["representation.faces_per_panorama=99"], "representation.faces_per_panorama: found 99"),
-        (["level=high"], "representation.level: found high; expected int"),
+        (["level=high"], "level: found high; expected a whole number"),
         (["task.channels_last=maybe"], "task.channels_last: found maybe; expected bool"),
         (["network=unet"], "image size for the UNet: found 48 × 48"),
         (["network.num_classes=5"], "scores of the network"),
@@ -326,6 +334,135 @@ def test_answers_before_anything_heavy_is_imported(
     assert said in done.stdout + done.stderr
     assert "heavy 0" in done.stdout
     assert "Traceback" not in done.stderr
+
+
+MISSING = """
+import sys
+from contextlib import suppress
+from tangent_train.cli import main
+for line in sys.argv[1:]:
+    command, *arguments = line.split(" ")
+    sys.argv = [f"tangent-{command}", *arguments]
+    try:
+        getattr(main, command.replace("import", "import_network"))()
+    except SystemExit as refused:
+        print(refused)
+print("heavy", {"torch", "lightning", "cv2", "numba", "matplotlib"} & set(sys.modules))
+"""
+
+
+@pytest.mark.parametrize("name", ["absent", "absent/ä b"])
+def test_missing_inputs_are_refused_before_anything_heavy_is_imported(
+    name: str, tmp_path: Path
+) -> None:
+    name = name.replace(" ", "\N{NO-BREAK SPACE}")
+    lines = [
+        f"predict checkpoint={name} input=there output=out",
+        f"predict checkpoint=there input={name} output=out",
+        f"predict checkpoint=there input={name}/*.jpg output=out",
+        f"predict checkpoint=there input=there output=out depth={name}",
+        f"predict checkpoint=there input=there output=out mask={name}",
+        f"predict checkpoint=there input=there output=out class_map={name}.json",
+        f"render input={name} output=out",
+        f"render back={name} output=out",
+        f"render poses={name} output=out",
+        f"render input=there colmap=true mask={name} output=out",
+        f"export checkpoint={name} output=out.onnx",
+        f"import network=onnx file={name} output=out.onnx",
+        f"import network=onnx file=there classes={name} output=out.onnx",
+        f"keypoints left={name} right=there output=out",
+        f"keypoints input={name} output=out",
+        *(f"keypoints data={data} data.root={name} output=out" for data in ("zind_pairs",)),
+        *(f"{c} data=folder data.root={name}" for c in ("train", "prepare", "check", "transfer")),
+        f"train data=omnisynthia data.root={name}",
+        f"train init_from={name}",
+        f"train resume={name}",
+        f"evaluate checkpoint={name}",
+        f"evaluate checkpoint={name}.onnx data=folder",
+        f"transfer checkpoint={name}",
+        f"report {name}",
+        "train level=high",
+        "predict checkpoint=there input=there output=out report=many",
+    ]
+    quoted = [re.sub(r"=(absent/ä[^ ]*)", r"='\1'", line) for line in lines]
+    (tmp_path / "there").touch()
+    done = run_python(tmp_path, "-c", MISSING, *quoted)
+    *refused, heavy = done.stdout.splitlines()
+    assert heavy == "heavy set()"
+    assert len(refused) == len(lines), done.stderr
+    for line, message in zip(lines, refused, strict=True):
+        command, at_fault = line.partition(" ")[0], name if name in line else "level: |report: "
+        assert re.match(rf"tangent-{command}: .*({at_fault}).*found ", message), (line, message)
+    assert [path.name for path in tmp_path.iterdir()] == ["there"]
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1", "cp1252", "cp437"])
+def test_output_of_any_encoding(
+    encoding: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PYTHONIOENCODING", encoding)
+    monkeypatch.setattr(sys, "argv", ["tangent-report", "Küche\udcff"])
+    with TextIOWrapper(BytesIO(), encoding) as stream:
+        monkeypatch.setattr(sys, "stdout", stream)
+        with pytest.raises(SystemExit, match=r"Küche.*no such folder"):
+            main.report()
+        say("→ ×\udcff")
+        Table("°", ("Küche", "緑"), [["…", "⅓"]]).print()
+        stream.flush()
+        assert stream.buffer.getvalue()  # type: ignore[attr-defined]
+    code = "import sys; from tangent_train.cli import main; sys.argv = ['x', '-h']; main.predict()"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
+    assert b"class_map: null" in done.stdout
+
+
+@pytest.mark.parametrize("number", [errno.EROFS, errno.EACCES, errno.ENOSPC, errno.EIO])
+@pytest.mark.parametrize("named", [True, False])
+def test_what_the_system_refuses_is_one_line(
+    number: int, named: bool, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def render(_: object) -> None:
+        raise OSError(number, os.strerror(number), *(("[red]/\x1b[2Jfile",) if named else ()))
+
+    monkeypatch.setattr("tangent_train.cli.render.render", render)
+    with pytest.raises(SystemExit) as ended:
+        run("render")
+    name = r"\[red\]/\\x1b\[2Jfile" if named else "output"
+    message = rf"tangent-render: {name}: found {os.strerror(number)}.*; expected .*"
+    assert re.fullmatch(message, str(ended.value), re.IGNORECASE)
+
+
+def test_an_error_of_a_thread_that_is_raised_again_is_not_printed_twice(
+    run: Run, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    class Writer(threading.Thread):
+        exception: OSError | None = None
+
+        def run(self) -> None:
+            self.exception = OSError(errno.ENOSPC, "No space left on device")
+            raise self.exception
+
+    def render(_: object) -> None:
+        writer = Writer()
+        writer.start()
+        writer.join()
+        assert writer.exception is not None
+        raise writer.exception
+
+    monkeypatch.setattr("tangent_train.cli.render.render", render)
+    before = threading.excepthook
+    with pytest.raises(SystemExit, match="no space left on device"):
+        run("render")
+    assert threading.excepthook is before
+    assert "Traceback" not in capfd.readouterr().err
+
+
+def test_names_are_printed_without_escapes_and_markup(capsys: pytest.CaptureFixture[str]) -> None:
+    name = "[red]sofa\x1b[2J\x9b\x07"
+    say(name)
+    Table(name, (name,), [[name]], note=name).print()
+    printed = capsys.readouterr().out
+    assert printed.count(r"[red]sofa\x1b[2J\x9b\x07") == 5
+    assert not re.search(r"[\x07\x1b\x9b]", printed)
 
 
 def test_a_pipe_that_is_closed_early_and_tab_completion(tmp_path: Path) -> None:

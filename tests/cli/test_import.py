@@ -221,7 +221,7 @@ def test_tangent_images_have_the_angular_resolution_of_the_photos(
         (("normalization=null",), "normalization: found none; expected imagenet, unit, symmetric"),
         (("nothing=[sky]",), "nothing: found sky; expected of background, dark"),
         (("nothing=[background,dark,green,bright]",), "nothing: found all classes"),
-        (("output=ours.ckpt", "file=absent.onnx"), r"output: found ours\.ckpt; expected .*\.onnx"),
+        (("output=ours.ckpt",), r"output: found ours\.ckpt; expected .*\.onnx"),
         (
             ("network=torchvision", "model=resnet50", "output=net.ckpt"),
             "model: found resnet50; expected deeplabv3",

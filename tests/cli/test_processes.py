@@ -33,10 +33,31 @@ def test_sigterm_reaches_the_job_which_may_finish_its_checkpoint(tmp_path: Path)
     assert signal.getsignal(signal.SIGTERM) == before
 
 
+def test_an_interrupt_that_reached_this_process_only_ends_the_job_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(processes, "_NOTICE_S", 0.1)
+    mark = tmp_path / "saved"
+    code = (
+        f"def save(*_): open({str(mark)!r}, 'w'); sys.exit(143)\n"
+        "signal.signal(signal.SIGTERM, save)\n"
+        "os.kill(os.getppid(), signal.SIGINT)\n"
+        "time.sleep(60)"
+    )
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            processes.run_process(_python(code))
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert mark.exists()
+
+
 def test_ctrl_c_ends_a_job_that_does_not_listen(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(processes, "_PATIENCE_S", 0.3)
+    monkeypatch.setattr(processes, "_NOTICE_S", 0.3)
     number = tmp_path / "pid"
     code = (
         f"open({str(number)!r}, 'w').write(str(os.getpid()))\n"

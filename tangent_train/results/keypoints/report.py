@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tangent_train.files import csv_text, write_text
+from tangent_train.imports import elsewhere
 from tangent_train.results.keypoints.compare import AS_GIVEN, AUC_DEG, ROTATED, Comparison, Row
 from tangent_train.results.tables import Table, percent
 
@@ -194,8 +195,9 @@ def matches_png(comparison: Comparison, condition: str) -> bytes:
     Returns:
         A PNG file.
     """
-    from matplotlib.collections import LineCollection
-    from matplotlib.figure import Figure
+    with elsewhere():
+        from matplotlib.collections import LineCollection
+        from matplotlib.figure import Figure
 
     left, right = comparison.images[condition]
     (rows, width), found = left.shape[:2], comparison.found[condition]

@@ -1,0 +1,248 @@
+"""Settings of the commands, checked before torch is imported.
+
+Importing this takes a few hundredths of a second, importing a command seconds.
+"""
+
+from __future__ import annotations
+
+import glob
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any, Literal
+
+import datamodules
+from tangent_train.checkpoints.content import ScoreKind
+from tangent_train.cli.settings import typed
+from tangent_train.errors import DataError
+
+
+def check_settings(command: str, config: Mapping[str, Any]) -> None:
+    """Refuse settings of a wrong type, and inputs that do not exist.
+
+    Args:
+        command: The command, such as predict.
+        config: Its composed config, resolved.
+
+    Raises:
+        DataError: A file or folder is missing.
+        SettingError: A setting is of another type.
+    """
+    kind = SETTINGS[command]
+    settings = typed(kind, with_network_name(config) if command == "import" else config)
+    for one in fields(kind):
+        value = getattr(settings, one.name)
+        if value is not None and "check" in one.metadata:
+            one.metadata["check"](one.name, value)
+    images = ("left", "right", "input") if command == "keypoints" else ()
+    if any(config[name] is not None for name in images):
+        return  # instead of a data set
+    for section in (config, config.get("photos") or {}):
+        data = section.get("data") or {}
+        root, mask = (Path(str(data.get(name) or ".")) for name in ("root", "mask"))
+        if datamodules.is_read(str(data.get("_target_"))) and not root.is_dir():
+            raise DataError(
+                root,
+                found="no such folder",
+                expected="the folder of the data set",
+                remedy="Give data.root=<folder>.",
+            )
+        if isinstance(data.get("mask"), str):
+            _check_exists("data.mask", mask)
+
+
+def with_network_name(config: Mapping[str, Any]) -> dict[str, Any]:
+    """The config of ``tangent-import`` with the name in ``network: {name: …}`` as its network."""
+    return {**config, "network": (config["network"] or {}).get("name")}
+
+
+def _check_exists(name: str, value: Any) -> None:
+    if isinstance(value, Path) and not value.exists():
+        expected = f"{name}=<a file or folder>"
+        raise DataError(value, found="no such file or folder", expected=expected)
+
+
+def _check_pattern(name: str, value: Any) -> None:
+    path = Path(value)
+    if not path.exists() and next(glob.iglob(str(path), recursive=True), None) is None:  # noqa: PTH207
+        expected = f"{name}=<an image, a folder of images or a pattern such as 'holiday/*.jpg'>"
+        raise DataError(value, found="nothing", expected=expected)
+
+
+def _check_class_map(name: str, value: Any) -> None:
+    if str(value).lower().endswith(".json"):
+        _check_exists(name, Path(value))
+
+
+_EXISTS = {"check": _check_exists}
+_IMAGES = {"check": _check_pattern}
+_CLASS_MAP = {"check": _check_class_map}
+
+
+@dataclass(frozen=True)
+class InputSettings:
+    """Settings of a command that takes images and videos.
+
+    Attributes:
+        input: See `datamodules.images.image_files.image_paths`.
+        crop: The part of the sphere that panoramas show, see `area_of_crop`; None for that of
+            their GPano tags.
+        every: Of videos, the first and then every n-th frame is taken.
+    """
+
+    input: str | Path | None = field(metadata=_IMAGES)
+    crop: tuple[float, ...] | None
+    every: int
+
+
+@dataclass(frozen=True)
+class PredictSettings(InputSettings):
+    """See ``configs/predict.yaml``."""
+
+    checkpoint: Path = field(metadata=_EXISTS)
+    input: str | Path = field(metadata=_IMAGES)
+    output: Path
+    class_map: str | Path | None = field(metadata=_CLASS_MAP)
+    unmapped: Literal["unknown", "never"]
+    depth: Path | None = field(metadata=_EXISTS)
+    depth_scale: float
+    projection: Literal["equirectangular", "perspective"]
+    fov: float | None
+    level: int | None
+    levels: tuple[int, ...] | None
+    base_level: int | None
+    blend: Literal["feather", "nearest"]
+    rotations: int
+    upright: Literal["pose", "auto"] | None
+    max_tilt_deg: float
+    mask: float | Path | None = field(metadata=_EXISTS)
+    min_confidence: float
+    write: tuple[Literal["labels", "color", "overlay", "probabilities"], ...]
+    report: int
+    overwrite: bool
+    resume: bool
+    shard: str | int | None
+    images_per_forward: int | None
+    device: str
+    trust: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class RenderSettings(InputSettings):
+    """See ``configs/render.yaml``."""
+
+    output: Path | None
+    overwrite: bool
+    base_level: int
+    level: int | None
+    dim: int | None
+    faces: tuple[int, ...] | None
+    rotation: tuple[float, float, float] | None
+    format: str
+    interpolation: Literal["bilinear", "nearest"]
+    colmap: bool
+    mask: float | Path | None = field(metadata=_EXISTS)
+    mask_classes: tuple[str, ...] | None
+    figure: Path | None
+    back: Path | None = field(metadata=_EXISTS)
+    poses: Path | None = field(metadata=_EXISTS)
+    cameras: Path | None = field(metadata=_EXISTS)
+    blend: Literal["feather", "nearest"]
+    height: int | None
+    kind: Literal["auto", "color", "labels", "depth", "features"]
+    z_depth: bool
+
+
+@dataclass(frozen=True)
+class ExportSettings:
+    """See ``configs/export.yaml``."""
+
+    checkpoint: Path = field(metadata=_EXISTS)
+    output: Path
+    image_size: tuple[int, int] | None
+    opset: int | None
+    overwrite: bool
+    trust: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class ImportSettings:
+    """See ``configs/import.yaml``; `normalization` may also be a mapping."""
+
+    network: str
+    model: str | Path | None
+    weights: str | Path | None
+    file: Path | None = field(metadata=_EXISTS)
+    classes: Path | None = field(metadata=_EXISTS)
+    nothing: tuple[str, ...]
+    nothing_wins: bool
+    scores: ScoreKind | None
+    image_size: tuple[int, ...] | None
+    fov: float
+    level: int | None
+    base_level: int | None
+    output: Path
+    overwrite: bool
+
+
+@dataclass(frozen=True)
+class KeypointsSettings:
+    """Settings of ``configs/keypoints.yaml`` that are neither in `Ways` nor data."""
+
+    output: Path
+    left: Path | None = field(metadata=_EXISTS)
+    right: Path | None = field(metadata=_EXISTS)
+    input: str | Path | None = field(metadata=_IMAGES)
+    max_pairs: int | None
+    pictures: int
+    export: bool
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """Settings of every run, see ``configs/train.yaml``."""
+
+    seed: int
+    level: int
+    panels: int
+    tensorboard_images: int
+    checkpoint_every_n_steps: int | None
+    ema: float | None
+
+
+@dataclass(frozen=True)
+class TrainSettings(RunSettings):
+    """See ``configs/train.yaml``; `name` is a folder."""
+
+    name: str | Path
+    init_from: Path | None = field(metadata=_EXISTS)
+    resume: Path | None = field(metadata=_EXISTS)
+
+
+@dataclass(frozen=True)
+class EvaluateSettings(RunSettings):
+    """See ``configs/evaluate.yaml``."""
+
+    checkpoint: Path = field(metadata=_EXISTS)
+    class_map: str | Path | None = field(metadata=_CLASS_MAP)
+
+
+@dataclass(frozen=True)
+class TransferSettings(EvaluateSettings):
+    """See ``configs/transfer.yaml``."""
+
+    checkpoint: Path | None = field(metadata=_EXISTS)  # type: ignore[assignment]
+
+
+SETTINGS: Mapping[str, type[Any]] = {
+    "check": RunSettings,
+    "evaluate": EvaluateSettings,
+    "export": ExportSettings,
+    "import": ImportSettings,
+    "keypoints": KeypointsSettings,
+    "predict": PredictSettings,
+    "prepare": RunSettings,
+    "render": RenderSettings,
+    "train": TrainSettings,
+    "transfer": TransferSettings,
+}
