@@ -409,7 +409,7 @@ def test_output_of_any_encoding(
         say("→ ×\udcff")
         Table("°", ("Küche", "緑"), [["…", "⅓"]]).print()
         stream.flush()
-        assert stream.buffer.getvalue()  # type: ignore[attr-defined]
+        assert stream.buffer.getvalue()
     code = "import sys; from tangent_train.cli import main; sys.argv = ['x', '-h']; main.predict()"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
     assert b"class_map: null" in done.stdout
