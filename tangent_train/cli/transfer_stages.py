@@ -43,10 +43,7 @@ _OF_THE_TRANSFER = (
 )
 """Settings that a stage's config does not have."""
 
-_HEAD = {
-    "defaults": ["_self_", {"override hydra/job_logging": "none"}],
-    "hydra": {"callbacks": {"run_folder": {"_target_": "tangent_train.cli.run_folder.RunFolder"}}},
-}
+_HEAD = {"defaults": ["_self_", {"override hydra/job_logging": "none"}]}
 _SLOWER = 10  # fine-tuning: 1e-5 after 1e-4 (paper, supplement, "Transfer learning")
 _REMEDY = "Give another name=, or delete the folder to run it again."
 

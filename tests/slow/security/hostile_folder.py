@@ -13,7 +13,8 @@ from tests.running import ROOT
 _PROGRAM = """
 import sys
 from tangent_train.cli import main
-getattr(main, sys.argv[0].rpartition("tangent_")[2])()
+if __name__ == "__main__":
+    getattr(main, sys.argv[0].rpartition("tangent_")[2])()
 """
 
 _MODULES = (

@@ -32,7 +32,8 @@ TRAINING = (*SETTINGS, "data.inputs=[rgb]", "trainer.max_epochs=1", "panels=0")
             "train",  # makes rooms in several processes, trains in two, with workers
             (
                 *(*TRAINING, "trainer=ddp", "trainer.devices=2", "data.num_workers=1"),
-                *("data.in_memory=false", "data.root=../rooms", "hydra.run.dir=../trained"),
+                *("data.validation_fraction=0.4", "data.in_memory=false"),
+                *("data.root=../rooms", "hydra.run.dir=../trained"),
             ),
             "trained/results.json",
         ),
