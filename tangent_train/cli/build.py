@@ -172,11 +172,18 @@ def _no_optimizer(*_: Any, **__: Any) -> Any:
 
 
 def _try_schedule(task: Any, settings: Settings) -> None:
-    """Make the optimizer, and the scheduler for some number of steps."""
+    """Make the optimizer, and the scheduler for some number of steps; take one of them."""
     group = {"params": [torch.zeros(1, 1, requires_grad=True)]}
+
+    def schedule() -> None:
+        made = task.optimization(lambda: 1000)
+        if isinstance(made, dict):
+            made["optimizer"].step()
+            made["lr_scheduler"]["scheduler"].step()
+
     trials: dict[str, Callable[[], object]] = {
         "optimizer": lambda: task.make_optimizer([group]),
-        "scheduler": lambda: task.optimization(lambda: 1000),
+        "scheduler": schedule,
     }
     for name, trial in trials.items():
         try:

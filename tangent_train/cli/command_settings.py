@@ -6,7 +6,7 @@ Importing this takes a few hundredths of a second, importing a command seconds.
 from __future__ import annotations
 
 import glob
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
@@ -17,12 +17,14 @@ from tangent_train.cli.settings import typed
 from tangent_train.errors import DataError
 
 
-def check_settings(command: str, config: Mapping[str, Any]) -> None:
+def check_settings(command: str, config: Mapping[str, Any], overrides: Sequence[str]) -> None:
     """Refuse settings of a wrong type, and inputs that do not exist.
 
     Args:
         command: The command, such as predict.
         config: Its composed config, resolved.
+        overrides: Settings that the user typed. Folders of data that an experiment names are
+            checked later, with the data set that the user may have put in place of its own.
 
     Raises:
         DataError: A file or folder is missing.
@@ -37,10 +39,12 @@ def check_settings(command: str, config: Mapping[str, Any]) -> None:
     images = ("left", "right", "input") if command == "keypoints" else ()
     if any(config[name] is not None for name in images):
         return  # instead of a data set
-    for section in (config, config.get("photos") or {}):
+    typed_names = {text.lstrip("+").partition("=")[0] for text in overrides}
+    for prefix, section in (("", config), ("photos.", config.get("photos") or {})):
         data = section.get("data") or {}
         root, mask = (Path(str(data.get(name) or ".")) for name in ("root", "mask"))
-        if datamodules.is_read(str(data.get("_target_"))) and not root.is_dir():
+        is_read = datamodules.is_read(str(data.get("_target_")))
+        if f"{prefix}data.root" in typed_names and is_read and not root.is_dir():
             raise DataError(
                 root,
                 found="no such folder",

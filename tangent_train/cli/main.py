@@ -125,6 +125,7 @@ def report() -> None:
 
 
 def _run(command: str, config: DictConfig, stored: Any, visible_gpus: str | None) -> Any:
+    from hydra.core.hydra_config import HydraConfig
     from omegaconf import OmegaConf
 
     from tangent_train.cli.command_settings import check_settings
@@ -138,7 +139,7 @@ def _run(command: str, config: DictConfig, stored: Any, visible_gpus: str | None
         signal.signal(signal.SIGUSR2, signal.SIG_IGN)
     name = "import_network" if command == "import" else command  # a word of Python
     settings: Any = OmegaConf.to_container(config, resolve=True)
-    check_settings(command, settings)
+    check_settings(command, settings, HydraConfig.get().overrides.task)
     with elsewhere():
         run = getattr(import_module(f"tangent_train.cli.{name}"), name)
     if command == "transfer":  # its stages keep the references of the config

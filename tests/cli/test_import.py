@@ -69,7 +69,7 @@ def test_a_file_for_images_that_are_not_square(
     """Larger images are divided into tiles: labels are those of every pixel's own scores."""
     write_linear(here / "net.onnx", WEIGHT, BIAS, shape=(1, 3, *size))
     run("import", *OF_ONNX, "output=ours.onnx")
-    assert f"image size: {size[0]}×{size[1]}\n" in capsys.readouterr().out
+    assert f"image size: {size[1]} × {size[0]} (width × height)\n" in capsys.readouterr().out
     trained = load_trained(here / "ours.onnx")
     assert trained.fixed_size == size
     assert trained.image_size == (max(size), max(size))

@@ -158,6 +158,7 @@ def test_pycolmap_is_missed_before_any_work(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "pycolmap", None)
+    (tmp_path / "in").mkdir()
     with pytest.raises(SystemExit, match=re.escape("tangent-train[keypoints]")):
         run("input=in", "output=out")
-    assert not list(tmp_path.iterdir())
+    assert [path.name for path in tmp_path.iterdir()] == ["in"]

@@ -12,6 +12,7 @@ import pytest
 from filelock import FileLock, Timeout
 from hydra.core.hydra_config import HydraConfig
 
+from tangent_train.cli import processes
 from tangent_train.cli import train as training
 from tests.cli.tiny_runs import Run
 
@@ -58,6 +59,7 @@ def test_runs_that_start_at_the_same_time_have_folders_of_their_own(
 def test_a_running_run_is_left_alone_by_all_but_its_own_processes(
     run: Run, begun: list[Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(processes, "end_with_first_process", lambda: None)
     run("train", "seed=1", "hydra.run.dir=mine")
     settings = (begun[0] / ".hydra" / "config.yaml").read_bytes()
     with FileLock(begun[0] / ".run.lock"):

@@ -54,10 +54,11 @@ def load(*, model: str | None, classes: Path | None, normalization: Any, **_: An
 def _from_folder(folder: Path, classes: Path | None, normalization: Any) -> PhotoNetwork:
     config = json_in(folder, "config.json")
     names = _names(config, folder / "config.json")
+    described = architecture(config | {"use_auxiliary_head": False})
     processor = _processor(folder)
     settings = {
         "_target_": "models.HuggingFaceNetwork",
-        "config": architecture(config | {"use_auxiliary_head": False}),
+        "config": described,
         "num_classes": len(names),
         "bgr": bool(processor.get("do_flip_channel_order")),
     }
