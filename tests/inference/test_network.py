@@ -268,7 +268,7 @@ _RGB = np.zeros((16, 32, 3), np.uint8)
         (torch.zeros(3, 16, 32), "found Tensor.*float32; expected RGB of 0 to 255"),
         (_RGB[:0, :0], r"\(0, 0, 3\)"),
         ("room.jpg", "room.jpg: found .*No such file"),
-        (Image.new("F", (32, 16)), "mode F; expected colours"),
+        (Image.new("F", (32, 16)), r"image: found float32 .*; expected colours"),
         ([[0]], "found list; expected RGB"),
     ],
 )
@@ -289,7 +289,8 @@ def test_other_images_are_refused(image: Any, message: str, network: Network) ->
         ({"upright": "pose"}, "upright: found pose, of ndarray .* Give the path"),
         ({"mask": 30}, "mask: found 30; expected a latitude"),
         ({"mask": "none.png"}, "none.png: found no such file"),
-        ({"mask": _RGB[..., 0].T}, r"mask: found ndarray \(32, 16\).*expected \(H, W\)"),
+        ({"mask": _RGB[..., 0].T}, r"mask: found 16 × 32 .*expected a whole panorama"),
+        ({"mask": Path()}, r"\.png: found no such file; expected a mask .* of each panorama"),
     ],
 )
 def test_settings_that_do_not_suit_the_image_are_refused(
@@ -299,9 +300,7 @@ def test_settings_that_do_not_suit_the_image_are_refused(
         network.labels(_RGB, **settings)
 
 
-def test_a_folder_of_masks_is_for_files(tmp_path: Path, network: Network) -> None:
-    with pytest.raises(SettingError, match="mask: found a folder, for ndarray"):
-        network.labels(_RGB, mask=tmp_path)
+def test_a_zenith_needs_tangent_images(tmp_path: Path) -> None:
     erp = tt.load(write_checkpoint(tmp_path / "erp.ckpt", ERP))
     with pytest.raises(SettingError, match="equirectangular images"):
         erp.labels(_RGB, upright="auto")
