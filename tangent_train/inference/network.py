@@ -184,7 +184,7 @@ class Network:
         if mask is not None and fov is not None:
             raise SettingError("mask", found="one, with fov=", expected="None for photos")
         masks = Masks(mask.numpy(force=True) if isinstance(mask, Tensor) else mask)
-        how = {"depth": depth, "fov": fov, "crop": crop, "upright": upright}
+        how: dict[str, Any] = {"depth": depth, "fov": fov, "crop": crop, "upright": upright}
         mosaic, area = self._predict(image, max_tilt_deg=max_tilt_deg, **how)
         labels: Any = self.trained.labels(mosaic.labels())
         if area is not None:

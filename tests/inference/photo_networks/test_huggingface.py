@@ -88,7 +88,7 @@ def test_a_network_for_images_of_one_size(tmp_path: Path) -> None:
     with torch.no_grad():
         parts = [trained.network(images[..., :64]), trained.network(images[..., 64:])]
         torch.testing.assert_close(large.network(images), torch.cat(parts, dim=-1))
-    with pytest.raises(SettingError, match="image_size: found images of 65×64, which the network"):
+    with pytest.raises(SettingError, match=r"image_size: found 64 × 65 .*, which the network"):
         import_network(network, tmp_path / "large.ckpt", image_size=(65, 64))
 
 
