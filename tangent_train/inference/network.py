@@ -101,9 +101,8 @@ class Network:
     """A trained network for panoramas and photos; made by `load`.
 
     Images are files or in memory, see `Picture`. Files are read as by ``tangent-predict``, with
-    their GPano tags; of an image of Pillow the EXIF orientation is applied, of other images the
-    pixels are all there is. What is returned has the size of the image: tensors on the image's
-    device for tensors, else arrays.
+    their GPano tags. The EXIF orientation of files and of images of Pillow is applied. Results have
+    the size of the image: tensors on the image's device for tensors, else arrays.
 
     Args:
         trained: The network.
