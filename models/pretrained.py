@@ -20,8 +20,8 @@ from tangent_train.files import load_plain
 _PREFIX = "network."
 """Begins the names of the network's tensors in a checkpoint of this package."""
 
-_MOST_MAPPINGS = 100
-"""Mappings of a file that are looked through."""
+_DEEPEST = 8
+"""Mappings inside each other that are searched in a file."""
 
 _COUNTER = "num_batches_tracked"
 """A buffer of batch normalization that older files lack and nothing here uses."""
@@ -30,17 +30,17 @@ _COUNTER = "num_batches_tracked"
 def tensors_for(network: nn.Module, path: Path) -> dict[str, Tensor]:
     """The tensors of a file by the names that a network has for them.
 
-    They are those of the mapping in the file (``state_dict``, ``model``, or all of it) of which
-    most names fit. Names are compared without the prefix that most of the file's (``module.``,
-    ``_orig_mod.``, ``model.net.``, …) or the network's have, and without ``network.``.
+    They are those of the mapping in the file (``state_dict``, ``model``, or all of it) with the
+    most fitting names. Names are compared without ``network.``, and without the commonest prefix of
+    the file's names (``module.``, ``_orig_mod.``, ``model.net.``, …) and of the network's.
 
     Args:
         network: The network.
         path: See `read_tensors`.
 
     Raises:
-        DataError: The file cannot be read, or several mappings with other values fit equally well
-            and none is called ``state_dict``.
+        DataError: The file cannot be read, or several mappings with different tensors fit equally
+            well and none is called ``state_dict``.
     """
     own = network.state_dict()
     found = {place: _renamed(tensors, own) for place, tensors in read_tensors(path).items()}
@@ -49,7 +49,7 @@ def tensors_for(network: nn.Module, path: Path) -> dict[str, Tensor]:
     if "state_dict" in best:
         return found["state_dict"]
     first = found[best[0]]
-    if fitting[best[0]] and any(_differ(first, found[place], own) for place in best):
+    if any(found[place].get(name) is not first.get(name) for place in best for name in own):
         raise DataError(
             path,
             found=f"several state dicts: {', '.join(filter(None, best))}",
@@ -57,15 +57,6 @@ def tensors_for(network: nn.Module, path: Path) -> dict[str, Tensor]:
             remedy=f"Save one of them alone: torch.save(torch.load(…)['{best[-1]}'], 'state.pt').",
         )
     return first
-
-
-def _differ(tensors: Mapping[str, Tensor], others: Mapping[str, Tensor], names: Any) -> bool:
-    """Whether any of these tensors have other values."""
-    pairs = [(tensors.get(name), others.get(name)) for name in names]
-    return not all(
-        a is b or (a is not None and b is not None and a.dtype == b.dtype and torch.equal(a, b))
-        for a, b in pairs
-    )
 
 
 def read_tensors(path: Path) -> dict[str, dict[str, Tensor]]:
@@ -98,7 +89,9 @@ def read_tensors(path: Path) -> dict[str, dict[str, Tensor]]:
     return mappings | ({"state_dict": ours} if ours else {})
 
 
-def _mappings(content: Mapping[Any, Any], seen: set[int]) -> dict[str, dict[str, Tensor]]:
+def _mappings(
+    content: Mapping[Any, Any], seen: set[int], depth: int = 0
+) -> dict[str, dict[str, Tensor]]:
     """The mappings with tensors in one, each once, itself as ""; see `read_tensors`."""
     seen.add(id(content))
     tensors: dict[str, Tensor] = {}
@@ -108,8 +101,8 @@ def _mappings(content: Mapping[Any, Any], seen: set[int]) -> dict[str, dict[str,
             continue
         if isinstance(value, Tensor):
             tensors[name] = value
-        elif isinstance(value, Mapping) and id(value) not in seen and len(seen) < _MOST_MAPPINGS:
-            found = _mappings(value, seen)
+        elif isinstance(value, Mapping) and id(value) not in seen and depth < _DEEPEST:
+            found = _mappings(value, seen, depth + 1)
             inside |= {f"{name}.{place}".rstrip("."): within for place, within in found.items()}
             tensors |= {f"{name}.{inner}": tensor for inner, tensor in found.get("", {}).items()}
     return ({"": tensors} if tensors else {}) | inside

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +16,8 @@ from datamodules.images.pixel_files import LOSSY_SUFFIXES, read_image_size, read
 from tangent_train.errors import DataError, SettingError
 
 Mask = float | Path | None
-"""What of panoramas does not count: what is below a latitude, −90 to 0 degrees; the black pixels of
-a file, for all panoramas, or of the PNG files of a folder, which has one for each; or nothing."""
+"""Pixels of panoramas that do not count: below a latitude, −90 to 0 degrees; black in a file, for
+all panoramas, or in the PNG files of a folder, which has one for each; or none."""
 
 Counts = Callable[[Path], NDArray[np.bool_]]
 """Reads a mask: where it counts, ``(H, W)``."""
@@ -33,7 +34,7 @@ class Masks:
     """Where panoramas count, in the frame in which they are stored.
 
     Args:
-        mask: See `Mask`; text is a path.
+        mask: See `Mask`; text is a path; of an array ``(H, W)`` 0 and False do not count.
         setting: Its name, for messages.
         counts: Reads a file.
 
@@ -46,7 +47,10 @@ class Masks:
     """
 
     def __init__(
-        self, mask: Mask | str, setting: str = "mask", counts: Counts = _not_black
+        self,
+        mask: Mask | str | NDArray[Any],
+        setting: str = "mask",
+        counts: Counts = _not_black,
     ) -> None:
         self._lowest_deg, self._path, self._of_all = -90.0, Path(), None
         self._counts, self.of_each = counts, False
@@ -57,6 +61,8 @@ class Masks:
             self.of_each = self._path.is_dir()
             self._files = NamedFiles(self._path) if self.of_each else None
             self._of_all = None if self.of_each else self._read(self._path)
+        elif isinstance(mask, np.ndarray) and mask.ndim == 2:
+            self._path, self._of_all = Path(setting), mask != 0
         elif isinstance(mask, int | float) and not isinstance(mask, bool) and -90 < mask <= 0:
             self._lowest_deg = float(mask)
         elif mask is not None:

@@ -244,24 +244,27 @@ def _decode_exactly(path: Path, dtype: np.dtype[Any], grey: bool) -> NDArray[Any
     return pixels[..., 2::-1]
 
 
-def read_rgb(path: Path) -> NDArray[np.uint8]:
+def read_rgb(image: Path | Image.Image) -> NDArray[np.uint8]:
     """Decode the colours of an image, ``(H, W, 3)``.
 
     Of 16 bits per channel the upper 8 are kept; grey becomes three equal channels; alpha is
     dropped; the EXIF orientation is applied.
 
     Args:
-        path: An image of `IMAGE_FORMATS`.
+        image: A file of `IMAGE_FORMATS`, or an image of Pillow, which is not changed.
 
     Raises:
         DataError: The file cannot be read, is broken, or holds other values than colours.
     """
-    pixels = read_pixels(path, indices=False)
+    if isinstance(image, Path):
+        pixels = read_pixels(image, indices=False)
+    else:
+        pixels = _turned(_decode(image.copy(), indices=False), _orientation(image))
     if pixels.dtype == np.uint16:
         pixels = (pixels >> 8).astype(np.uint8)
     if pixels.dtype != np.uint8 or pixels.shape[2:] not in ((), (3,)):
         raise DataError(
-            path,
+            image if isinstance(image, Path) else "image",
             found=f"{pixels.dtype} of shape {pixels.shape}",
             expected="colours of 8 or 16 bits",
             remedy="Export the image as JPEG or PNG.",

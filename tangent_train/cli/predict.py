@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence, Set
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -193,11 +194,12 @@ class _Labeller:
 
     def read(self, job: Job) -> tuple[InputImage, PanoramaArea | None]:
         """Read one image; a panorama with its area."""
-        given, path, frame = self._settings, job.path, job.value
-        stem = job.item.removesuffix(path.suffix)
+        given, image = self._settings, job.path if job.value is None else job.value()
+        stem = job.item.removesuffix(job.path.suffix)
+        depth = None if self._depth is None else partial(self._depth.read, stem)
         if given.projection == "perspective":
-            return read_photo(path, stem, self._depth, given.fov, frame), None
-        return read_panorama(path, stem, self._depth, given.crop, given.upright, frame)
+            return read_photo(image, given.fov, depth), None
+        return read_panorama(image, given.crop, given.upright, depth)
 
     def __call__(self, job: Job, progress: Callable[[float], object]) -> _Labelled:
         """Predict the labels of one image that was read."""

@@ -1,33 +1,46 @@
-"""The user's own images as network input."""
+"""The user's own images as network input, from files and from memory."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+from torch import Tensor
 
 from datamodules.core.panoramas import meters_to_steps, resize_nearest
-from datamodules.images.gpano import PanoramaArea, up_of
+from datamodules.images.gpano import PanoramaArea, up_of, whole_area
 from datamodules.images.image_files import NamedFiles, find_depth
 from datamodules.images.pixel_files import photo_fov_deg, read_depth_m, read_rgb
 from datamodules.images.tangent_folders import panorama_area
-from tangent_train.errors import DataError, width_height
+from tangent_train.errors import DataError, SettingError, width_height
 from tangent_train.geometry import camera_matrix_from_fov
 from tangent_train.inference.views import InputImage
 from tangent_train.rendering.upright.gravity import estimate_up
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
-    from pathlib import Path
-
-    from numpy.typing import NDArray
 
     from datamodules.core.image_module import Upright
     from tangent_train.inference.judge import NetworkJudge
 
+    DepthOfSize = Callable[[tuple[int, int]], NDArray[np.uint16] | None]
+    """Depth of an image with these rows and columns, in steps of 1/512 m; None without depth."""
+
+Picture = str | Path | Image.Image | NDArray[Any] | Tensor
+"""A file; an image of Pillow; or RGB of 0 to 255, an array ``(H, W, 3)`` or tensor ``(3, H, W)`` of
+uint8 on any device."""
+
 _ASPECT_TOLERANCE = 0.01
+_IN_MEMORY = Path("image")
+_NOT_WHOLE = (
+    "Of a photo, give fov=, its horizontal field of view in degrees; of a part of a panorama, crop="
+    "[west, east, south, north] in degrees."
+)
 
 
 @dataclass(frozen=True)
@@ -70,38 +83,36 @@ class DepthFolder:
 
 
 def read_panorama(
-    path: Path,
-    name: str,
-    depth: DepthFolder | None = None,
+    image: Picture,
     crop: Sequence[float] | None = None,
     upright: Upright = None,
-    frame: Callable[[], NDArray[np.uint8]] | None = None,
+    depth: DepthOfSize | None = None,
 ) -> tuple[InputImage, PanoramaArea]:
     """Read a panorama of the whole sphere or a part of it.
 
     Args:
-        path: Its file.
-        name: Its path below the folder of all images, without suffix.
-        depth: Its depth file, for networks with depth.
+        image: The panorama; only files have GPano tags.
         crop: Its part of the sphere, see `area_of_crop`; None for that of its GPano tags.
         upright: Source of its zenith: ``pose`` by its GPano tags, ``auto`` likewise, see
             `with_up`; None for z.
-        frame: Gives the frame, if the file is a video; videos have no GPano tags.
+        depth: Gives its depth.
 
     Returns:
-        The whole sphere, black outside the file's area, and that area.
+        The whole sphere, black outside the image's area, and that area.
 
     Raises:
-        DataError: A file cannot be used.
-        SettingError: The crop does not fit the image.
+        DataError: A file cannot be used, or the image is not a whole panorama.
+        SettingError: The crop does not fit, or it is not an image.
     """
-    rgb = read_rgb(path) if frame is None else frame()
-    size = (rgb.shape[0], rgb.shape[1])
-    area = panorama_area(path, size, crop)
-    whole = area.place(rgb)
-    placed_depth = None if depth is None else area.place(depth.read(name, size))
-    up = None if upright is None or frame is not None else up_of(path)
-    return InputImage(whole, placed_depth, up), area
+    rgb, path = _rgb(image), Path(image) if isinstance(image, str | Path) else None
+    size = rgb.shape[0], rgb.shape[1]
+    if path is not None or crop is not None:
+        area = panorama_area(path or _IN_MEMORY, size, crop)
+    else:
+        area = whole_area(_IN_MEMORY, size, _NOT_WHOLE)
+    steps = None if depth is None else depth(size)
+    up = None if upright is None or path is None else up_of(path)
+    return InputImage(area.place(rgb), None if steps is None else area.place(steps), up), area
 
 
 def with_up(image: InputImage, max_tilt_deg: float, judge: NetworkJudge) -> InputImage:
@@ -118,34 +129,53 @@ def with_up(image: InputImage, max_tilt_deg: float, judge: NetworkJudge) -> Inpu
 
 
 def read_photo(
-    path: Path,
-    name: str,
-    depth: DepthFolder | None = None,
-    fov_deg: float | None = None,
-    frame: Callable[[], NDArray[np.uint8]] | None = None,
+    image: Picture, fov_deg: float | None = None, depth: DepthOfSize | None = None
 ) -> InputImage:
     """Read a photo.
 
     Args:
-        path: Its file.
-        name: Its path below the folder of all images, without suffix.
-        depth: File of its z-depth, for networks with depth.
-        fov_deg: Its horizontal field of view; None for what its EXIF data say.
-        frame: Gives the frame, if the file is a video; videos have no EXIF data.
+        image: The photo; only files have EXIF data.
+        fov_deg: Its horizontal field of view; None for that in its EXIF data.
+        depth: Gives its z-depth.
 
     Raises:
         DataError: A file cannot be used, or the field of view is unknown.
+        SettingError: It is not an image.
     """
-    rgb = read_rgb(path) if frame is None else frame()
-    size = (rgb.shape[0], rgb.shape[1])
-    if fov_deg is None and frame is None:
+    rgb, path = _rgb(image), Path(image) if isinstance(image, str | Path) else None
+    size = rgb.shape[0], rgb.shape[1]
+    if fov_deg is None and path is not None:
         fov_deg = photo_fov_deg(path)
     if fov_deg is None:
         raise DataError(
-            path,
+            path or _IN_MEMORY,
             found="no focal length in its EXIF data",
             expected="the field of view, which gives the angular resolution",
             remedy="Give fov=, the horizontal one in degrees: 65 to 80 for most phones.",
         )
-    depth_steps = None if depth is None else depth.read(name, size)
-    return InputImage(rgb, depth_steps, camera_matrix=camera_matrix_from_fov(fov_deg, size))
+    matrix = camera_matrix_from_fov(fov_deg, size)
+    return InputImage(rgb, None if depth is None else depth(size), camera_matrix=matrix)
+
+
+def _rgb(image: Any) -> NDArray[np.uint8]:
+    """An image ``(H, W, 3)``."""
+    if isinstance(image, str | Path | Image.Image):
+        return read_rgb(Path(image) if isinstance(image, str) else image)
+    is_tensor = isinstance(image, Tensor)
+    array = image.numpy(force=True) if is_tensor else image
+    fits = isinstance(array, np.ndarray) and array.ndim == 3 and array.dtype == np.uint8
+    channels = 0 if is_tensor else -1
+    if fits and array.shape[channels] == 3 and array.size:
+        return np.ascontiguousarray(np.moveaxis(array, channels, -1))
+    raise SettingError(
+        "image",
+        found=described(image),
+        expected="RGB of 0 to 255: a uint8 tensor (3, H, W) or array (H, W, 3); an image of "
+        "Pillow; or the path of a file",
+    )
+
+
+def described(value: Any) -> str:
+    """Kind, shape and type of a value, for messages."""
+    kind = type(value).__name__
+    return f"{kind} {tuple(value.shape)} of {value.dtype}" if hasattr(value, "dtype") else kind

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, get_args
 
@@ -21,15 +20,14 @@ from datamodules.images.palette import class_colors
 from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
 from tangent_train.errors import SettingError, width_height
 from tangent_train.inference.class_maps import Unmapped, load_class_map, map_classes
-from tangent_train.inference.images import with_up
-from tangent_train.inference.judge import NetworkJudge
-from tangent_train.inference.picture import (
+from tangent_train.inference.images import (
     Picture,
-    counted_pixels,
     described,
-    panorama_of,
-    photo_of,
+    read_panorama,
+    read_photo,
+    with_up,
 )
+from tangent_train.inference.judge import NetworkJudge
 from tangent_train.inference.predictor import Predictor
 from tangent_train.inference.views import PanoramaViews, PhotoViews
 from tangent_train.rendering import Blend
@@ -103,9 +101,8 @@ class Network:
     """A trained network for panoramas and photos; made by `load`.
 
     Images are files or in memory, see `Picture`. Files are read as by ``tangent-predict``, with
-    their GPano tags; of an image of Pillow the EXIF orientation is applied, of other images the
-    pixels are all there is. What is returned has the size of the image: tensors on the image's
-    device for tensors, else arrays.
+    their GPano tags. The EXIF orientation of files and of images of Pillow is applied. Results have
+    the size of the image: tensors on the image's device for tensors, else arrays.
 
     Args:
         trained: The network.
@@ -172,8 +169,8 @@ class Network:
             upright: Align a panorama with gravity: ``pose`` by its file's GPano tags, ``auto``
                 likewise, else as estimated from the image.
             max_tilt_deg: Of ``auto``: the largest tilt considered.
-            mask: Pixels of a panorama that get the label 0: below a latitude in degrees, or black
-                ones of a file, see `Masks`; or where an array or tensor ``(H, W)`` is 0 or False.
+            mask: Pixels of a panorama that get the label 0: below a latitude in degrees; black in
+                a file; or 0 in an array or tensor. See `Masks`.
 
         Returns:
             ``(H, W)`` labels 1 … K, and 0 where the network sees nothing it knows: an array of
@@ -185,48 +182,34 @@ class Network:
         """
         if mask is not None and fov is not None:
             raise SettingError("mask", found="one, with fov=", expected="None for photos")
-        hidden = mask if isinstance(mask, np.ndarray | Tensor) else Masks(mask)
-        mosaic, area = self._predict(image, depth, fov, crop, upright, max_tilt_deg)
+        masks = Masks(mask.numpy(force=True) if isinstance(mask, Tensor) else mask)
+        how: dict[str, Any] = {"depth": depth, "fov": fov, "crop": crop, "upright": upright}
+        mosaic, area = self._predict(image, max_tilt_deg=max_tilt_deg, **how)
         labels: Any = self.trained.labels(mosaic.labels())
         if area is not None:
-            labels = area.cut(labels)
-            labels = np.where(counted_pixels(hidden, image, area), labels, labels.dtype.type(0))
+            name = Path(image).stem if isinstance(image, str | Path) else ""
+            labels = area.cut(np.where(masks.read(name, area) > 0, labels, labels.dtype.type(0)))
         if isinstance(image, Tensor):
             return torch.from_numpy(labels.astype(np.int64)).to(image.device)
         return labels
 
-    def scores(
-        self,
-        image: Picture,
-        *,
-        depth: Depth = None,
-        fov: float | None = None,
-        crop: Sequence[float] | None = None,
-        upright: Upright = None,
-        max_tilt_deg: float = 60.0,
-    ) -> Any:
+    def scores(self, image: Picture, **settings: Any) -> Any:
         """Probability of every class at every pixel.
 
         Args:
-            image: See `labels`, also for the others.
-            depth: Depth of the image.
-            fov: Field of view of a photo.
-            crop: Part of the sphere.
-            upright: Source of the zenith.
-            max_tilt_deg: Largest tilt considered.
+            image: A panorama, or a photo.
+            **settings: Those of `labels`, but ``mask``.
 
         Returns:
             An array ``(H, W, K)`` or a tensor ``(K, H, W)`` of float32; number k is that of label
-            k + 1. They add up to 1, or less by the share of what an imported network knows as none
-            of the classes.
+            k + 1. They add up to 1, or less by the probability of none of the classes, which some
+            imported networks have.
 
         Raises:
             DataError: See `labels`.
             SettingError: See `labels`.
         """
-        mosaic, area = self._predict(
-            image, depth, fov, crop, upright, max_tilt_deg, probabilities=True
-        )
+        mosaic, area = self._predict(image, probabilities=True, **settings)
         scores: Any = mosaic.probabilities(slice(None))[..., : len(self.class_names) - 1]
         scores = np.ascontiguousarray(scores if area is None else area.cut(scores))
         if isinstance(image, Tensor):
@@ -236,28 +219,33 @@ class Network:
     def _predict(
         self,
         image: Any,
-        depth: Any,
-        fov: float | None,
-        crop: Sequence[float] | None,
-        upright: Upright,
-        max_tilt_deg: float,
         *,
+        depth: Any = None,
+        fov: float | None = None,
+        crop: Sequence[float] | None = None,
+        upright: Any = None,
+        max_tilt_deg: float = 60.0,
         probabilities: bool = False,
     ) -> tuple[ScoreMosaic, PanoramaArea | None]:
         """Scores of the whole sphere, with the part that the image shows; or those of a photo."""
+        of_size = partial(self._depth, depth)
         if fov is not None:
             if crop is not None or upright is not None:
                 given = "crop" if crop is not None else "upright"
                 raise SettingError(given, found="one, with fov=", expected="None for photos")
-            photo = photo_of(image, fov)
-            photo = replace(photo, depth=self._depth(depth, photo.rgb.shape[:2]))
+            photo = read_photo(image, fov, of_size)
             return self._photos.predict(photo, probabilities=probabilities), None
         if upright is not None:
             check_choice("upright", upright, ("pose", "auto"))
             self._views.need_tangent_images(f"upright={upright}")
-        panorama, area = panorama_of(image, crop, upright)
-        steps = self._depth(depth, area.image_shape)
-        panorama = replace(panorama, depth=None if steps is None else area.place(steps))
+            if upright == "pose" and not isinstance(image, str | Path):
+                raise SettingError(
+                    "upright",
+                    found=f"pose, of {described(image)}",
+                    expected="auto or None: only files have GPano tags",
+                    remedy="Give the path of the panorama.",
+                )
+        panorama, area = read_panorama(image, crop, upright, of_size)
         if upright == "auto":
             panorama = with_up(panorama, max_tilt_deg, self._judge)
         return self._panoramas.predict(panorama, probabilities=probabilities), area
@@ -271,12 +259,12 @@ class Network:
         wanted = "depth" in self.trained.inputs
         if depth is None and not wanted:
             return None
-        array = depth.detach().cpu().numpy() if isinstance(depth, Tensor) else depth
+        array = depth.numpy(force=True) if isinstance(depth, Tensor) else depth
         fits = isinstance(array, np.ndarray) and (array.shape, array.dtype.kind) == (size, "f")
         if not (wanted and fits):
             raise SettingError(
                 "depth",
-                found=described(depth),
+                found="none" if depth is None else described(depth),
                 expected=f"floats in metres, {width_height(size)}"
                 if wanted
                 else f"None: the network sees {' and '.join(self.trained.inputs)}",

@@ -15,7 +15,7 @@ import torch
 
 from datamodules.core.inputs import normalize
 from datamodules.core.samples import render_inputs
-from tangent_train.checkpoints.scores import Scores
+from tangent_train.checkpoints.scores import Scores, plain_scores
 from tangent_train.errors import SettingError
 from tangent_train.rendering.mosaic import ScoreMosaic
 
@@ -68,8 +68,7 @@ def view_scores(
     for start in range(0, count, step):
         part = slice(start, min(start + step, count))
         returned = network(views(part), *(() if rays is None else (rays[None],)))
-        scores: Tensor = returned["out"] if isinstance(returned, dict) else returned
-        yield part, scores.float()
+        yield part, plain_scores(returned).float()
 
 
 def image_scores(

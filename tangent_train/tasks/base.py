@@ -135,9 +135,15 @@ class Task(lightning.LightningModule, ABC):
     def scores(self) -> dict[str, float]:
         """The scores of `matrices` by name."""
 
-    @abstractmethod
     def empty_step(self, channels: int, samples: int) -> Tensor:
         """Empty inputs of the network for a training step of some samples, without memory."""
+        example = self.example(channels).to("meta")
+        return example.expand(samples * self.inputs_per_sample, *example.shape[1:])
+
+    @property
+    def inputs_per_sample(self) -> int:
+        """Inputs of the network for a sample of a training step."""
+        return 1
 
     def training_parts(self, batch: Any) -> list[Part]:
         """A batch in parts, see `chunks`."""

@@ -48,10 +48,6 @@ class ClassificationTask(Task):
         views = 1 if grid is None else grid.num_images
         return torch.zeros(1, views, channels, *self.representation.image_size)
 
-    def empty_step(self, channels: int, samples: int) -> Tensor:
-        """All views of empty shapes ``(samples, N, C, h, w)``."""
-        return self.example(channels).to("meta").expand(samples, -1, -1, -1, -1)
-
     def training_pairs(self, batch: Any) -> tuple[Tensor, Tensor]:
         """Views ``(B, N, C, h, w)`` and classes ``(B,)`` of shapes."""
         return batch.images, batch.label

@@ -141,14 +141,12 @@ class SegmentationTask(Task):
         """One empty image ``(1, C, h, w)``."""
         return torch.zeros(1, channels, *self.representation.image_size)
 
-    def empty_step(self, channels: int, samples: int) -> Tensor:
-        """Empty images ``(n, C, h, w)``: all views of some panoramas, or one crop of each photo."""
-        images, seen = (1, *self.representation.image_size), self.representation
-        if isinstance(seen, Representation):
-            rows = seen.erp_height
-            views = seen.sample(np.random.default_rng(0))
-            images = views.render(np.zeros((rows, 2 * rows), np.uint8), "nearest").shape
-        return torch.empty(samples * images[0], channels, *images[1:], device="meta")
+    @property
+    def inputs_per_sample(self) -> int:
+        """Views of a panorama; 1 for a crop of a photo and an equirectangular image."""
+        if not isinstance(self.representation, Representation):
+            return 1
+        return len(self.representation.sample(np.random.default_rng(0)).rays()) or 1
 
     def training_pairs(self, batch: Any) -> tuple[Tensor, Tensor]:
         """All images of all panoramas or photos ``(n, C, h, w)`` and labels ``(n, h, w)``."""

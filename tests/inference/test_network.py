@@ -268,7 +268,7 @@ _RGB = np.zeros((16, 32, 3), np.uint8)
         (torch.zeros(3, 16, 32), "found Tensor.*float32; expected RGB of 0 to 255"),
         (_RGB[:0, :0], r"\(0, 0, 3\)"),
         ("room.jpg", "room.jpg: found .*No such file"),
-        (Image.new("F", (32, 16)), "mode F; expected colours"),
+        (Image.new("F", (32, 16)), r"image: found float32 .*; expected colours"),
         ([[0]], "found list; expected RGB"),
     ],
 )
@@ -288,8 +288,10 @@ def test_other_images_are_refused(image: Any, message: str, network: Network) ->
         ({"upright": "yes"}, "upright: found 'yes'; expected 'pose' or 'auto'"),
         ({"upright": "pose"}, "upright: found pose, of ndarray .* Give the path"),
         ({"mask": 30}, "mask: found 30; expected a latitude"),
+        ({"depth": np.zeros((16, 32))}, "None: the network sees rgb"),
         ({"mask": "none.png"}, "none.png: found no such file"),
-        ({"mask": _RGB[..., 0].T}, r"mask: found ndarray \(32, 16\).*expected \(H, W\)"),
+        ({"mask": _RGB[..., 0].T}, r"mask: found 16 × 32 .*expected a whole panorama"),
+        ({"mask": Path()}, r"\.png: found no such file; expected a mask .* of each panorama"),
     ],
 )
 def test_settings_that_do_not_suit_the_image_are_refused(
@@ -299,19 +301,12 @@ def test_settings_that_do_not_suit_the_image_are_refused(
         network.labels(_RGB, **settings)
 
 
-def test_a_folder_of_masks_is_for_files(tmp_path: Path, network: Network) -> None:
-    with pytest.raises(SettingError, match="mask: found a folder, for ndarray"):
-        network.labels(_RGB, mask=tmp_path)
-    erp = tt.load(write_checkpoint(tmp_path / "erp.ckpt", ERP))
+def test_impossible_settings_of_a_network_are_refused(tmp_path: Path) -> None:
+    path = write_checkpoint(tmp_path / "net.ckpt", ERP)
     with pytest.raises(SettingError, match="equirectangular images"):
-        erp.labels(_RGB, upright="auto")
-
-
-def test_impossible_settings_are_refused(tmp_path: Path, network: Network) -> None:
-    with pytest.raises(SettingError, match="None: the network sees rgb"):
-        network.labels(_RGB, depth=np.zeros((16, 32)))
+        tt.load(path).labels(_RGB, upright="auto")
     with pytest.raises(SettingError, match="unmapped: found '0'"):
-        tt.load(tmp_path / "net.ckpt", unmapped="0")  # type: ignore[arg-type]
+        tt.load(path, unmapped="0")  # type: ignore[arg-type]
 
 
 def test_a_name_of_trusted_code_is_one_name(tmp_path: Path) -> None:

@@ -135,11 +135,3 @@ def test_others_continue_for_longer_or_shorter(name: str, epochs: int, tmp_path:
     found = _train(tmp_path, scheduler, max_epochs=4, until=2)
     found += _train(tmp_path, scheduler, resume=True, max_epochs=epochs)
     assert found[::STEPS] == pytest.approx([LR * factor(epoch) for epoch in range(epochs)])
-
-
-def test_a_cosine_ends_where_its_training_does(tmp_path: Path) -> None:
-    found = _train(tmp_path, FIXED["cosine"], max_epochs=4)[::STEPS]
-    expected = [LR * (1 + math.cos(math.pi * epoch / 4)) / 2 for epoch in range(4)]
-    assert found == pytest.approx(expected)
-    with pytest.raises(SettingError, match="found 8 training epochs; expected 4"):
-        _train(tmp_path, FIXED["cosine"], resume=True, max_epochs=8)

@@ -13,12 +13,18 @@ from torch import Tensor
 from datamodules.core.inputs import Normalization
 from models.huggingface import HuggingFaceNetwork, architecture
 from tangent_train.errors import DataError
-from tangent_train.inference.photo_networks.network import USUAL_SIZE, PhotoNetwork, class_names_in
+from tangent_train.inference.photo_networks.network import (
+    USUAL_SIZE,
+    PhotoNetwork,
+    class_names_in,
+    names_of,
+)
 from tangent_train.inference.photo_networks.saved import json_in, saved_folder, tensors_in
 from tangent_train.inference.quiet import quiet
 from tangent_train.offline import offline
-from tangent_train.registry import SettingsFile, is_text, make
+from tangent_train.registry import SettingsFile, make
 
+_NAMES = 'id2label with the name of every score, {"0": "wall", "1": "floor"}'
 _TASK = "the task is semantic"
 _VOCABULARIES = ("tokenizer.json", "vocab.json")
 _BYTE = 255
@@ -52,8 +58,11 @@ def load(*, model: str | None, classes: Path | None, normalization: Any, **_: An
 
 
 def _from_folder(folder: Path, classes: Path | None, normalization: Any) -> PhotoNetwork:
-    config = json_in(folder, "config.json")
-    names = _names(config, folder / "config.json")
+    config, path = json_in(folder, "config.json"), folder / "config.json"
+    labels = config.get("id2label")
+    if isinstance(labels, dict):
+        labels = {place: str(name).strip() for place, name in labels.items()}
+    names = names_of(labels, path, _NAMES)
     described = architecture(config | {"use_auxiliary_head": False})
     processor = _processor(folder)
     settings = {
@@ -64,14 +73,10 @@ def _from_folder(folder: Path, classes: Path | None, normalization: Any) -> Phot
     }
     if config.get("model_type") == "oneformer":
         settings["task"] = _task(folder, config)
-    network = make(settings, "network", SettingsFile(folder / "config.json"))
+    network = make(settings, "network", SettingsFile(path))
     if len(names) == 1 and network.is_universal:
-        raise DataError(
-            folder / "config.json",
-            found="masks of one class",
-            expected="two classes at least: masks say which class a pixel has, not whether it has "
-            "one",
-        )
+        expected = "two classes at least: masks say which class a pixel has, not if it has one"
+        raise DataError(path, found="masks of one class", expected=expected)
     tensors, remarks = tensors_in(folder)
     _load_tensors(network, tensors, folder)
     settings["config"] = architecture(network.network.config.to_dict())
@@ -85,20 +90,6 @@ def _from_folder(folder: Path, classes: Path | None, normalization: Any) -> Phot
         score_kind="logits",
         remarks=remarks,
     )
-
-
-def _names(config: Mapping[str, Any], path: Path) -> list[str]:
-    """Names of the scores, in their order."""
-    by_place = config.get("id2label")
-    places = by_place if isinstance(by_place, Mapping) else {}
-    names = [str(places.get(str(place), "")).strip() for place in range(len(places))]
-    if not names or not all(name and is_text(name) for name in names):
-        raise DataError(
-            path,
-            found=f"id2label: {by_place}",
-            expected='the name of every score, {"0": "wall", "1": "floor"}',
-        )
-    return names
 
 
 def _processor(folder: Path) -> dict[str, Any]:

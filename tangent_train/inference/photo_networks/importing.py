@@ -20,7 +20,7 @@ from tangent_train.checkpoints.trained import (
     metadata_json,
     write_metadata,
 )
-from tangent_train.errors import SettingError
+from tangent_train.errors import SettingError, width_height
 from tangent_train.files import atomic_path
 from tangent_train.geometry import vertex_resolution
 from tangent_train.inference.photo_networks.network import PhotoNetwork
@@ -68,8 +68,8 @@ def import_network(
     if image_size not in (None, network.image_size) and network.fixed_size:
         raise SettingError(
             "image_size",
-            found="{}×{}".format(*image_size),
-            expected="{}×{}, the only size that the file takes".format(*network.image_size),
+            found=width_height(image_size),
+            expected=f"{width_height(network.image_size)}, the only size that the file takes",
         )
     if image_size is not None:
         network = replace(network, image_size=image_size, fixed_size=True)
@@ -157,20 +157,17 @@ def _groups(
     kept = [(k, name) for k, name in zip(places, score_names, strict=True) if name not in nothing]
     if not kept:
         raise SettingError("nothing", found="all classes", expected="some of them")
-    if not wins and (len(kept) == 1 or (nothing and kind == "labels")):
+    if not wins and (len(kept) == 1 or kind == "labels"):
         raise SettingError(
             "nothing_wins",
             found=f"false, for {kept[0][1]} alone" if len(kept) == 1 else "false, for label maps",
             expected="true: where nothing may not win, the network has no other class to give",
         )
-    if wins:
-        rest += [k for k, name in zip(places, score_names, strict=True) if name in nothing]
-    elif kind != "labels":
-        rest = []
+    rest += [k for k, name in zip(places, score_names, strict=True) if name in nothing]
     names = ["unknown", *(name for _, name in kept)]
     if kind in ("logits", "probabilities") and not nothing:
         return names, None
-    return names, [[k] for k, _ in kept] + ([rest] if rest else [])
+    return names, [[k] for k, _ in kept] + ([rest] if rest and wins else [])
 
 
 def _places(named: int, kind: ScoreKind, count: int) -> tuple[list[int], list[int]]:

@@ -59,7 +59,20 @@ def class_names_in(path: Path | None) -> tuple[str, ...]:
     expected = 'a JSON list of class names in the order of the scores, ["wall", "floor"]'
     if path is None:
         raise SettingError("classes", found="none", expected=f"a file with {expected}")
-    content = read_json(path, expected)
+    return names_of(read_json(path, expected), path, expected)
+
+
+def names_of(content: Any, path: Path, expected: str) -> tuple[str, ...]:
+    """Names from plain values, see `class_names_in`.
+
+    Args:
+        content: A list of names, or a dict with the name of each place.
+        path: Its file, for the message.
+        expected: For the message.
+
+    Raises:
+        DataError: It is something else.
+    """
     names = content if isinstance(content, list) else []
     if isinstance(content, dict):
         names = [content.get(str(place)) for place in range(len(content))]

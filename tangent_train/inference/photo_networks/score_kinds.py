@@ -12,7 +12,7 @@ from torch import Tensor
 
 from tangent_train.checkpoints.content import ScoreKind
 from tangent_train.checkpoints.scores import plain_scores
-from tangent_train.errors import SettingError
+from tangent_train.errors import SettingError, width_height
 from tangent_train.inference.photo_networks.network import PhotoNetwork
 
 _LISTED = 9
@@ -103,23 +103,24 @@ def _images(network: PhotoNetwork) -> Iterator[Tensor]:
 
 def _scores(network: PhotoNetwork, image: Tensor) -> Tensor:
     """Scores ``(1, K, h, w)`` as float32, label maps with K = 1."""
-    size = "×".join(map(str, image.shape[-2:]))
     try:
         scores = plain_scores(network.network(image))
     except Exception as error:  # each network refuses images in its own words
         raise SettingError(
             "image_size",
-            found=f"images of {size}, which the network does not take "
+            found=f"{width_height(image.shape[2:])}, which the network does not take "
             f"({type(error).__name__}: {str(error).partition(chr(10))[0]})",
-            expected="RGB images of the size that it was made for",
-            remedy="Set image_size=[rows,columns] to that size. A network that takes other images "
-            "than RGB cannot be imported.",
+            expected="the size of its RGB images",
+            remedy="Set image_size=[rows,columns]. Networks for other images cannot be imported.",
         ) from error
     scores = scores[:, None] if scores.ndim == image.ndim - 1 else scores
     if scores.shape[0] != 1 or scores.shape[2:] != image.shape[2:]:
-        shape = "×".join(map(str, scores.shape))
-        expected = f"scores 1×K×{size}, or labels 1×{size}"
-        raise SettingError("output of the network", found=shape, expected=expected)
+        rows, columns = image.shape[2:]
+        raise SettingError(
+            "output of the network",
+            found=tuple(scores.shape),
+            expected=f"scores (1, K, {rows}, {columns}) or labels (1, {rows}, {columns})",
+        )
     return scores.float()
 
 

@@ -93,13 +93,16 @@ def test_a_second_output_and_one_score(activation: str | None, tmp_path: Path) -
     aux = {"classes": 2, "dropout": 0.1}
     settings: dict[str, Any] = {"encoder_weights": None, "classes": 1, "aux_params": aux}
     own = segmentation_models_pytorch.Unet("resnet18", activation=activation, **settings).eval()
-    own.segmentation_head[0].bias.fill_(-float(own(_pixels())[0].logit().mean()) if activation
-                                        else -float(own(_pixels())[0].mean()))  # fmt: skip
+
+    def shares_of_own() -> torch.Tensor:
+        scores: torch.Tensor = own(_pixels())[0][0, 0]
+        return scores if activation else scores.sigmoid()
+
+    own.segmentation_head[0].bias -= shares_of_own().logit().mean()
     own.save_pretrained(tmp_path / "net")
     (tmp_path / "classes.json").write_text(json.dumps(["sky"]))
     trained = import_network(_load(tmp_path / "net", "unit"), tmp_path / "net.ckpt")
-    shares = own(_pixels())[0][0, 0] if activation else own(_pixels())[0][0, 0].sigmoid()
-    scores = imported_scores(trained)
+    shares, scores = shares_of_own(), imported_scores(trained)
     torch.testing.assert_close(scores.softmax(dim=0)[0], shares, rtol=0, atol=1e-4)
     best = scores.argmax(dim=0).numpy().astype("uint8")
     labels = torch.from_numpy(trained.labels(best))
@@ -116,7 +119,7 @@ def test_a_network_of_one_size_is_given_it(tmp_path: Path) -> None:
     own.eval().save_pretrained(tmp_path / "net")
     (tmp_path / "classes.json").write_text(json.dumps(NAMES))
     network = _load(tmp_path / "net", "unit")
-    with pytest.raises(SettingError, match=r"found images of 512×512, .* Set image_size=\[rows"):
+    with pytest.raises(SettingError, match=r"found 512 × 512 .*, which .* Set image_size=\[rows"):
         import_network(network, tmp_path / "net.ckpt")
     import_network(network, tmp_path / "net.ckpt", image_size=(224, 224), level=9, base_level=0)
     trained = load_trained(tmp_path / "net.ckpt")
