@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
 from tangent_train.cli.compose import config_folder, literal_paths, path_text, quoted
-from tangent_train.cli.declared import declared_types
 from tangent_train.cli.stored import stored_run
 from tangent_train.errors import DataError
 from tests.running import composed
@@ -146,20 +145,20 @@ def test_the_home_folder_numbers_and_sweeps(monkeypatch: pytest.MonkeyPatch) -> 
     assert kept == ["hydra.run.dir='my (runs)/${name}'", "hydra.sweep.dir='a b'"]
 
 
-def test_types_are_read_from_the_classes_that_take_the_settings(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    takers = [f"{h}.{n}" for h in ("datamodules", "models") for n in import_module(h).__all__]
-    commands = ("predict", "render", "export", "import_network", "keypoints")
-    takers += [f"tangent_train.cli.{command}.Settings" for command in commands]
-    for target in takers:
-        made = getattr(import_module(target.rpartition(".")[0]), target.rpartition(".")[2])
+@pytest.mark.parametrize(("section", "package"), [("data", "datamodules"), ("network", "models")])
+def test_settings_are_paths_where_their_class_declares_it(section: str, package: str) -> None:
+    home = import_module(package)
+    for target in home.__all__:
+        made = getattr(home, target)
         by_fields = is_dataclass(made) or inspect.isfunction(made)
         hints = get_type_hints(made if by_fields else made.__init__)
         for name in inspect.signature(made).parameters:
             is_path = Path in (hints.get(name), *get_args(hints.get(name)))
-            assert ("Path" in declared_types([target], name)) == is_path, (target, name)
+            expected = f"{section}.{name}='a b'" if is_path else f"{section}.{name}=a b"
+            assert literal_paths("train", [f"{section}.{name}=a b"]) == [expected], target
 
+
+def test_paths_of_a_class_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "my_maps.py").write_text(
         "import typing\nfrom pathlib import Path\nfrom datamodules import FolderPanoramas\n"
         "class Mine(FolderPanoramas):\n    maps: typing.Optional[Path]\n    scale: float\n"
