@@ -31,7 +31,7 @@ def check_settings(command: str, config: Mapping[str, Any], overrides: Sequence[
         SettingError: A setting is of another type.
     """
     kind = SETTINGS[command]
-    settings = typed(kind, with_network_name(config) if command == "import" else config)
+    settings = typed(kind, config)
     for one in fields(kind):
         value = getattr(settings, one.name)
         if value is not None and "check" in one.metadata:
@@ -53,11 +53,6 @@ def check_settings(command: str, config: Mapping[str, Any], overrides: Sequence[
             )
         if isinstance(data.get("mask"), str):
             _check_exists("data.mask", mask)
-
-
-def with_network_name(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The config of ``tangent-import`` with the name in ``network: {name: …}`` as its network."""
-    return {**config, "network": (config["network"] or {}).get("name")}
 
 
 def _check_exists(name: str, value: Any) -> None:

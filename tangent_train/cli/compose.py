@@ -30,18 +30,6 @@ def config_folder() -> Path:
     return packaged if packaged.is_dir() else package.parent / "configs"
 
 
-def named(argument: str, setting: str) -> str:
-    """Keep a setting with the name of a config group a setting.
-
-    Hydra never takes a mapping for the choice of an option.
-
-    >>> named("network=unet", "network"), named("level=7", "network")
-    ('network={name:unet}', 'level=7')
-    """
-    name, _, value = argument.partition("=")
-    return f"{name}={{name:{value}}}" if name == setting and value else argument
-
-
 def literal_paths(command: str, arguments: Sequence[str]) -> list[str]:
     """Quote the values of settings that are paths, so that Hydra takes them literally.
 

@@ -10,9 +10,10 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 from tangent_train.checkpoints.content import INPUTS, NORMALIZATION, read_checkpoint
+from tangent_train.cli.command_settings import RunSettings
 from tangent_train.cli.compose import config_folder, path_text, quoted
 from tangent_train.cli.remembered import remembered_paths
 from tangent_train.cli.settings import Trust, typed
@@ -27,12 +28,7 @@ GROUPS = ("experiment", "recipe", *_SECTIONS)
 _RUN = {
     "choices": dict[str, Text] | None,
     "name": Text,
-    "seed": int,
-    "level": int,
-    "panels": int,
-    "tensorboard_images": int,
-    "checkpoint_every_n_steps": int | None,
-    "ema": float | None,
+    **get_type_hints(RunSettings),
 }
 """Settings outside of the sections."""
 
