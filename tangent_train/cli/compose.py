@@ -45,7 +45,6 @@ def literal_paths(command: str, arguments: Sequence[str]) -> list[str]:
     >>> literal_paths("predict", ["input=holiday (1)/a=b,c.jpg", "level=7", "depth=null"])
     ["input='holiday (1)/a=b,c.jpg'", 'level=7', 'depth=null']
     """
-    is_sweep = not {"-m", "--multirun", "hydra.mode=MULTIRUN"}.isdisjoint(arguments)
     literal = []
     for argument in arguments:
         name, _, value = argument.partition("=")
@@ -57,11 +56,18 @@ def literal_paths(command: str, arguments: Sequence[str]) -> list[str]:
             text = QuotedString(value if within is None else within, Quote.single)
             literal.append(f"{name}={text.with_quotes()}")
         elif _is_path(command, setting, value, arguments):
-            parts = _OF_A_SWEEP.findall(f"{value},")[:-1] if is_sweep else [value]
-            literal.append(f"{name}={','.join(map(_quoted_path, parts))}")
+            paths = map(_quoted_path, values_of_sweep(value, arguments))
+            literal.append(f"{name}={','.join(paths)}")
         else:
             literal.append(argument)
     return literal
+
+
+def values_of_sweep(value: str, arguments: Sequence[str]) -> list[str]:
+    """The values that commas separate in a sweep; without ``-m`` on the command line, the value."""
+    if {"-m", "--multirun", "hydra.mode=MULTIRUN"}.isdisjoint(arguments):
+        return [value]
+    return _OF_A_SWEEP.findall(f"{value},")[:-1]
 
 
 def path_text(value: str) -> str:

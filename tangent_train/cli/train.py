@@ -26,7 +26,7 @@ from tangent_train.cli.command_settings import TrainSettings
 from tangent_train.cli.evaluate import Run, machine_faults
 from tangent_train.cli.fine_tuning import begin_from, load_start
 from tangent_train.cli.remembered import remember_paths, remembered_paths
-from tangent_train.cli.settings import typed
+from tangent_train.cli.settings import names_of, typed
 from tangent_train.cli.stored import is_own_option
 from tangent_train.cli.sweep import OBJECTIVE_FILE
 from tangent_train.errors import DataError, SettingError
@@ -148,7 +148,7 @@ def _check_resumed(settings: Settings, config: Mapping[str, Any], epoch: int | N
 
 def _remember(run: Run, *, is_resumed: bool) -> Collection[str]:
     """Remember where the user's data of a run are; returns the names of the settings."""
-    names = {text.lstrip("+").partition("=")[0] for text in HydraConfig.get().overrides.task}
+    names = names_of(HydraConfig.get().overrides.task)
     choices = HydraConfig.get().runtime.choices
     options = [(group, choices.get(group)) for group in ("data", "experiment")]
     # Else the same options give the same paths again.
@@ -168,9 +168,9 @@ def _remember(run: Run, *, is_resumed: bool) -> Collection[str]:
 def _typed_local(remembered: Collection[str]) -> list[str]:
     """Typed machine-specific settings that a resumed run needs again: no file holds them."""
     typed = [said.lstrip("+") for said in HydraConfig.get().overrides.task]
-    parts = [(*said.partition("=")[::2], said) for said in typed]
+    named = [(said, *said.partition("=")[::2]) for said in typed]
     return [
         said
-        for name, value, said in parts
+        for said, name, value in named
         if name == "trust" or not (name in remembered or from_file(name, value))
     ]
