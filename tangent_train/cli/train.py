@@ -63,7 +63,7 @@ def train(settings: Settings, source: SettingsFile | None = None) -> float | Non
             expected="1 without init_from=, which says what the backbone is",
         )
     checkpoints = run.folder / "checkpoints"
-    needed = _typed_local(_remember(run, is_resumed=resumed is not None))
+    needed = _typed_local(_remember(run))
     last = LastCheckpoint(checkpoints, settings["checkpoint_every_n_steps"], needed)
     best = BestCheckpoint(checkpoints, run.task.monitor)
     trainer = run.trainer([last, LearningRateMonitor(), best])
@@ -146,8 +146,11 @@ def _check_resumed(settings: Settings, config: Mapping[str, Any], epoch: int | N
         )
 
 
-def _remember(run: Run, *, is_resumed: bool) -> Collection[str]:
-    """Remember where the user's data of a run are; returns the names of the settings."""
+def _remember(run: Run) -> Collection[str]:
+    """Remember the paths of the user's data; returns the names of their settings.
+
+    Paths that were remembered are among the overrides of a resumed run.
+    """
     names = names_of(HydraConfig.get().overrides.task)
     choices = HydraConfig.get().runtime.choices
     options = [(group, choices.get(group)) for group in ("data", "experiment")]
@@ -159,9 +162,7 @@ def _remember(run: Run, *, is_resumed: bool) -> Collection[str]:
         if isinstance(value, str) and not from_file(name, value)
         if name in names or not is_composed
     }
-    before = remembered_paths(run.folder) if is_resumed else {}
-    kept = {name: path for name, path in before.items() if name not in names}
-    rank_zero_only(remember_paths)(run.folder, kept | paths)
+    rank_zero_only(remember_paths)(run.folder, paths)
     return remembered_paths(run.folder)
 
 
