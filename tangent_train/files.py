@@ -168,8 +168,6 @@ def load_plain(path: Path, expected: str, *, mmap: bool = False, whole: bool = T
         if whole and is_zipfile(path):
             with ZipFile(path) as archive:
                 damaged = archive.testzip()
-    except FileNotFoundError as error:
-        raise DataError(path, found="no such file", expected=expected) from error
     except Exception as error:
         if named := re.search(r"GLOBAL (\S+)", str(error)):
             found = f"{named[1]}, a class"

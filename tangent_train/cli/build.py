@@ -197,37 +197,25 @@ def _try_schedule(task: Any, settings: Settings) -> None:
 
 def _try_network(task: Any, channels: int) -> None:
     """Run the network on an empty input, to find mismatches before any data is generated."""
-    images = task.example(channels)
-    probe = copy.deepcopy(task).to("meta").eval()  # shapes only: nothing is computed
-    with torch.no_grad():
-        try:
-            try:
-                probe(images.to("meta"))
-            except NotImplementedError:  # by an operation that only computes
-                probe = copy.deepcopy(task).eval()
-                probe(images)
-        except SettingError:
-            raise
-        except (RuntimeError, ValueError) as error:
-            raise SettingError(
-                "network",
-                found=f"{type(task.network).__name__}, which does not take {tuple(images.shape)} "
-                f"({str(error).partition(chr(10))[0]})",
-                expected=f"one that maps {task.takes}",
-                remedy="A network for photos takes data.inputs=[rgb]." if channels > _RGB else "",
-            ) from error
+    shape = tuple(task.example(channels).shape)
+    if fault := _fault(task, shape, trains=False):
+        raise SettingError(
+            "network",
+            found=f"{type(task.network).__name__}, which does not take {shape} ({fault})",
+            expected=f"one that maps {task.takes}",
+            remedy="A network for photos takes data.inputs=[rgb]." if channels > _RGB else "",
+        )
 
 
 def _try_step(probe: Any, data: Any, synchronized: bool, samples: int) -> None:
     """Run the network in training mode on the smallest chunk of a training step.
 
-    Batch normalization fails on a single value per channel, as of one image of 1×1 features. Images
-    are empty, and nothing is computed where shapes are enough to know.
+    Batch normalization fails on a single value per channel, such as a single image of 1×1 features.
 
     Args:
         probe: The task, on the device ``meta``.
         data: The data module.
-        synchronized: Whether several processes normalize together.
+        synchronized: True if several processes normalize together.
         samples: Panoramas, photos or shapes of the step.
 
     Raises:
@@ -237,30 +225,38 @@ def _try_step(probe: Any, data: Any, synchronized: bool, samples: int) -> None:
         return
     step = probe.empty_step(data.in_channels, samples)
     chunk = min(probe.chunks(step), key=len)
-    reason = None
-    for device in ("meta", "cpu"):  # what shapes do not show is computed
-        network = copy.deepcopy(probe.train().network).to_empty(device=device)
-        reason = _training_fault(network, torch.zeros(chunk.shape, device=device))
-        if reason is None:
-            return
-    per_step = f"data.{data.noun}_per_step"
-    is_whole = len(chunk) == len(step)
-    raise SettingError(
-        per_step if is_whole else "task.images_per_chunk",
-        found=f"{data.per_step if is_whole else probe.images_per_chunk}, so that in a step of "
-        f"{counted(samples, data.noun)} {type(probe.network).__name__} gets {tuple(chunk.shape)}, "
-        f"on which it cannot be trained ({reason})",
-        expected="more images at a time, in the last step of an epoch too",
-        remedy=f"Change {per_step} or task.images_per_chunk, or choose a network without batch "
-        "normalization.",
-    )
+    shape = tuple(chunk.shape)
+    if fault := _fault(probe.network, shape, trains=True):
+        per_step = f"data.{data.noun}_per_step"
+        is_whole = len(chunk) == len(step)
+        raise SettingError(
+            per_step if is_whole else "task.images_per_chunk",
+            found=f"{data.per_step if is_whole else probe.images_per_chunk}, so that in a step of "
+            f"{counted(samples, data.noun)} {type(probe.network).__name__} gets {shape}, on which "
+            f"it cannot be trained ({fault})",
+            expected="more images at a time, in the last step of an epoch too",
+            remedy=f"Change {per_step} or task.images_per_chunk, or choose a network without batch "
+            "normalization.",
+        )
 
 
-def _training_fault(network: nn.Module, images: torch.Tensor) -> str | None:
-    """The first line of the error of a network on images; None without one."""
-    try:
-        with torch.random.fork_rng(), torch.no_grad():
-            network.forward(images)  # a compiled one is not compiled for this
-    except (RuntimeError, ValueError) as error:
-        return str(error).partition("\n")[0]
-    return None
+def _fault(module: nn.Module, shape: tuple[int, ...], *, trains: bool) -> str | None:
+    """The first line of the error of a module on empty images; None without an error.
+
+    Nothing is computed where shapes are enough to know.
+    """
+    fault = None
+    for device in ("meta", "cpu"):
+        trial = copy.deepcopy(module).to_empty(device=device).train(trains)
+        try:
+            with torch.random.fork_rng(devices=[]), torch.no_grad():
+                for tensor in (*trial.parameters(), *trial.buffers()):
+                    tensor.zero_()  # memory may hold any numbers, and buffers are indices too
+                trial.forward(torch.zeros(shape, device=device))  # a compiled one is not compiled
+        except SettingError:
+            raise
+        except (RuntimeError, ValueError) as error:
+            fault = str(error).partition("\n")[0]
+        else:
+            return None
+    return fault

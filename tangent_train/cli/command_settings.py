@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 import datamodules
 from tangent_train.checkpoints.content import ScoreKind
-from tangent_train.cli.settings import typed
+from tangent_train.cli.settings import names_of, typed
 from tangent_train.errors import DataError
 
 
@@ -31,7 +31,7 @@ def check_settings(command: str, config: Mapping[str, Any], overrides: Sequence[
         SettingError: A setting is of another type.
     """
     kind = SETTINGS[command]
-    settings = typed(kind, with_network_name(config) if command == "import" else config)
+    settings = typed(kind, config)
     for one in fields(kind):
         value = getattr(settings, one.name)
         if value is not None and "check" in one.metadata:
@@ -39,10 +39,10 @@ def check_settings(command: str, config: Mapping[str, Any], overrides: Sequence[
     images = ("left", "right", "input") if command == "keypoints" else ()
     if any(config[name] is not None for name in images):
         return  # instead of a data set
-    typed_names = {text.lstrip("+").partition("=")[0] for text in overrides}
+    typed_names = names_of(overrides)
     for prefix, section in (("", config), ("photos.", config.get("photos") or {})):
         data = section.get("data") or {}
-        root, mask = (Path(str(data.get(name) or ".")) for name in ("root", "mask"))
+        root, mask = Path(str(data.get("root"))), data.get("mask")
         is_read = datamodules.is_read(str(data.get("_target_")))
         if f"{prefix}data.root" in typed_names and is_read and not root.is_dir():
             raise DataError(
@@ -51,13 +51,8 @@ def check_settings(command: str, config: Mapping[str, Any], overrides: Sequence[
                 expected="the folder of the data set",
                 remedy="Give data.root=<folder>.",
             )
-        if isinstance(data.get("mask"), str):
-            _check_exists("data.mask", mask)
-
-
-def with_network_name(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The config of ``tangent-import`` with the name in ``network: {name: …}`` as its network."""
-    return {**config, "network": (config["network"] or {}).get("name")}
+        if isinstance(mask, str):
+            _check_exists("data.mask", Path(mask))
 
 
 def _check_exists(name: str, value: Any) -> None:

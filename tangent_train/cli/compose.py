@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
+from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.errors import HydraException
 
 from tangent_train.cli.command_settings import SETTINGS
-from tangent_train.cli.declared import declared_types
 
 _PLAIN = re.compile(r"(?!(null|true|false|inf|nan)$)[a-z_/][a-z0-9_/.-]*", re.IGNORECASE | re.ASCII)
 """Text that Hydra reads as this text, without quotes."""
@@ -27,18 +28,6 @@ def config_folder() -> Path:
     package = Path(__file__).resolve().parents[1]
     packaged = package / "configs"
     return packaged if packaged.is_dir() else package.parent / "configs"
-
-
-def named(argument: str, setting: str) -> str:
-    """Keep a setting with the name of a config group a setting.
-
-    Hydra never takes a mapping for the choice of an option.
-
-    >>> named("network=unet", "network"), named("level=7", "network")
-    ('network={name:unet}', 'level=7')
-    """
-    name, _, value = argument.partition("=")
-    return f"{name}={{name:{value}}}" if name == setting and value else argument
 
 
 def literal_paths(command: str, arguments: Sequence[str]) -> list[str]:
@@ -56,7 +45,6 @@ def literal_paths(command: str, arguments: Sequence[str]) -> list[str]:
     >>> literal_paths("predict", ["input=holiday (1)/a=b,c.jpg", "level=7", "depth=null"])
     ["input='holiday (1)/a=b,c.jpg'", 'level=7', 'depth=null']
     """
-    is_sweep = not {"-m", "--multirun", "hydra.mode=MULTIRUN"}.isdisjoint(arguments)
     literal = []
     for argument in arguments:
         name, _, value = argument.partition("=")
@@ -68,11 +56,18 @@ def literal_paths(command: str, arguments: Sequence[str]) -> list[str]:
             text = QuotedString(value if within is None else within, Quote.single)
             literal.append(f"{name}={text.with_quotes()}")
         elif _is_path(command, setting, value, arguments):
-            parts = _OF_A_SWEEP.findall(f"{value},")[:-1] if is_sweep else [value]
-            literal.append(f"{name}={','.join(map(_quoted_path, parts))}")
+            paths = map(_quoted_path, values_of_sweep(value, arguments))
+            literal.append(f"{name}={','.join(paths)}")
         else:
             literal.append(argument)
     return literal
+
+
+def values_of_sweep(value: str, arguments: Sequence[str]) -> list[str]:
+    """The values that commas separate in a sweep; without ``-m`` on the command line, the value."""
+    if {"-m", "--multirun", "hydra.mode=MULTIRUN"}.isdisjoint(arguments):
+        return [value]
+    return _OF_A_SWEEP.findall(f"{value},")[:-1]
 
 
 def path_text(value: str) -> str:
@@ -114,7 +109,12 @@ def _in_quotes(value: str) -> str | None:
 
 def _is_path(command: str, setting: str, value: str, arguments: Sequence[str]) -> bool:
     """True for a setting that is declared as `Path`, unless it may be a number and is one."""
-    types = declared_types(_takers(command, setting, arguments), setting.rpartition(".")[2])
+    *groups, name = setting.split(".")
+    if groups:
+        declared = _annotations(groups, name, "\0".join(arguments))
+    else:
+        declared = str(get_type_hints(SETTINGS[command]).get(name))
+    types = set(re.findall(r"\w+", declared))
     if types & {"float", "int"}:
         with suppress(ValueError):
             float(value)
@@ -122,20 +122,41 @@ def _is_path(command: str, setting: str, value: str, arguments: Sequence[str]) -
     return "Path" in types
 
 
-def _takers(command: str, setting: str, arguments: Sequence[str]) -> Iterator[str]:
-    """Names of the classes and functions that may take a setting.
+def _annotations(groups: Sequence[str], name: str, arguments: str) -> str:
+    """Annotations of a name in the source code of what may take it.
 
-    They are those of the command, or all that the options of a section's group name, in any folder
-    of configs.
+    These are the modules of the classes and functions that the options of a section's group name,
+    in any folder of configs. Nothing is imported: torch takes seconds.
     """
-    groups = setting.split(".")[:-1]
-    if not groups:
-        kind = SETTINGS[command]
-        yield f"{kind.__module__}.{kind.__name__}"
-    text = "\0".join(arguments)
-    for folder in (config_folder(), *re.findall(r"(?:--config-dir|-cd)[=\0]([^\0]+)", text)):
-        for file in (file for group in groups for file in Path(folder).glob(f"{group}/*.yaml")):
-            yield from re.findall(
-                r"^ *_target_: *['\"]?([\w.]+)", file.read_text("utf-8"), re.MULTILINE
-            )
-    yield from re.findall(r"\._target_=([^\0]+)", text)
+    folders = config_folder(), *re.findall(r"(?:--config-dir|-cd)[=\0]([^\0]+)", arguments)
+    files = [
+        file for folder in folders for g in groups for file in Path(folder).glob(f"{g}/*.yaml")
+    ]
+    named = r"^ *_target_: *['\"]?([\w.]+)|\._target_=([\w.]+)"
+    texts = (*(file.read_text("utf-8") for file in files), arguments)
+    targets = {"".join(found) for text in texts for found in re.findall(named, text, re.MULTILINE)}
+    modules = {target.rpartition(".")[0] for target in targets}
+    sources = "\n".join(map(_source, modules))
+    found = re.findall(rf"\b{name}: ([\w.|\[\] ]+)", sources)
+    unions = [
+        re.findall(rf"^{one.strip()} = (.*)", sources, re.MULTILINE)
+        for one in found
+        if one.strip().isidentifier()
+    ]
+    return f"{found} {unions}"
+
+
+@cache
+def _source(module: str) -> str:
+    """The source code of a module, and of all below it in a package of this program."""
+    top, *rest = module.split(".")
+    # Of a whole package: finding a module in it would import the package.
+    spec = find_spec(top) if top.isidentifier() else None
+    if spec is None:
+        return ""
+    folders = [Path(folder, *rest) for folder in spec.submodule_search_locations or ()]
+    pattern = "**/*.py" if top in ("datamodules", "models") else "__init__.py"
+    files = [file for folder in folders for file in folder.glob(pattern)]
+    files += [folder.with_suffix(".py") for folder in folders] or [Path(str(spec.origin))]
+    found = (file for file in files if file.suffix == ".py" and file.is_file())
+    return "\n".join(file.read_text("utf-8", errors="replace") for file in found)

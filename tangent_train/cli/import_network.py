@@ -15,7 +15,6 @@ from rich.text import Text
 
 from tangent_train.checkpoints.content import ScoreKind
 from tangent_train.cli.command_settings import ImportSettings as Settings
-from tangent_train.cli.command_settings import with_network_name
 from tangent_train.cli.say import say
 from tangent_train.cli.settings import check_new, typed
 from tangent_train.errors import SettingError, printable, width_height
@@ -49,7 +48,7 @@ def import_network(config: Mapping[str, Any]) -> None:
         DataError: A file cannot be used.
         SettingError: A setting is missing or impossible, or the file exists.
     """
-    settings = typed(Settings, with_network_name(config))
+    settings = typed(Settings, config)
     with elsewhere():
         from tangent_train.inference import photo_networks
 

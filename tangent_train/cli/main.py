@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 import signal
 import sys
 import threading
@@ -37,7 +38,7 @@ def _main(command: str) -> None:
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 
-    from tangent_train.cli.compose import config_folder, literal_paths, named
+    from tangent_train.cli.compose import config_folder, literal_paths
     from tangent_train.cli.help import annotate
     from tangent_train.cli.processes import end_with_first_process, ended_by_sigterm
     from tangent_train.cli.run_folder import folders
@@ -59,7 +60,8 @@ def _main(command: str) -> None:
         if stored is not None:
             arguments = stored.arguments
         if command == "import":
-            arguments = [named(argument, "network") for argument in arguments]
+            # A setting, not a choice of Hydra's group of this name: for that it takes no mapping.
+            arguments = [re.sub("^network=(.+)", r"network={name:\1}", a) for a in arguments]
         sys.argv[1:] = literal_paths(command, arguments)
         try:
             folder = config_folder()
@@ -139,6 +141,8 @@ def _run(command: str, config: DictConfig, stored: Any, visible_gpus: str | None
         signal.signal(signal.SIGUSR2, signal.SIG_IGN)
     name = "import_network" if command == "import" else command  # a word of Python
     settings: Any = OmegaConf.to_container(config, resolve=True)
+    if command == "import":
+        settings["network"] = (settings["network"] or {}).get("name")
     check_settings(command, settings, HydraConfig.get().overrides.task)
     with elsewhere():
         run = getattr(import_module(f"tangent_train.cli.{name}"), name)
@@ -151,32 +155,37 @@ def _run(command: str, config: DictConfig, stored: Any, visible_gpus: str | None
 def _refusals(command: str) -> Iterator[None]:
     """Exit with a one-line message if a setting or a file cannot be used."""
     try:
-        with _of_callbacks():
-            yield
+        yield
         sys.stdout.flush()
     except BrokenPipeError:  # "| head" has read enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(128 + signal.SIGPIPE)
-    except (DataError, SettingError) as error:
-        sys.exit(f"tangent-{command}: {error}")
-    except OSError as error:
+    except (DataError, SettingError, OSError) as error:
+        _refuse(command, error)
+    except KeyboardInterrupt as error:
+        _end(command, error)
+    except SystemExit as error:
+        if isinstance(error.__cause__, OSError | SettingError):  # of `RunFolder`
+            _refuse(command, error.__cause__)
+        # Lightning ends an interrupted run with 1.
+        if error.code == 1 and isinstance(error.__context__, KeyboardInterrupt):
+            _end(command, error.__context__)
+        raise
+
+
+def _refuse(command: str, error: Exception) -> NoReturn:
+    """Exit with one line for an error; raise those that the system did not report."""
+    if isinstance(error, OSError):
         if error.errno is None:
-            raise
+            raise error
         path = error.filename if isinstance(error.filename, str) else None
-        told = (no_room(Path(path), error) if path else None) or SettingError(
+        error = (no_room(Path(path), error) if path else None) or SettingError(
             path or "output",
             found=os.strerror(error.errno).lower(),
             expected="a file or folder that can be read and written",
             remedy="Change its permissions, or choose another one (of a run: hydra.run.dir=…).",
         )
-        sys.exit(f"tangent-{command}: {told}")
-    except KeyboardInterrupt as error:
-        _end(command, error)
-    except SystemExit as error:
-        # Lightning ends an interrupted run with 1.
-        if error.code == 1 and isinstance(error.__context__, KeyboardInterrupt):
-            _end(command, error.__context__)
-        raise
+    sys.exit(f"tangent-{command}: {error}")
 
 
 @contextmanager
@@ -193,17 +202,6 @@ def _errors_once() -> Iterator[None]:
         yield
     finally:
         threading.excepthook = before
-
-
-@contextmanager
-def _of_callbacks() -> Iterator[None]:
-    """Raise the errors of Hydra's callbacks, which reach this as exits."""
-    try:
-        yield
-    except SystemExit as error:
-        if isinstance(error.__cause__, OSError | SettingError):
-            raise error.__cause__ from None
-        raise
 
 
 def _end(command: str, interrupt: KeyboardInterrupt) -> NoReturn:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from itertools import count
 from pathlib import Path
@@ -69,7 +68,8 @@ def _take(config: DictConfig, section: str, *, lock: bool) -> None:
         )
     except OSError as error:  # Hydra would print any other exception and go on
         raise SystemExit from error
-    folders.callback(_remove_unused, made)
+    if made:
+        folders.callback(_remove_unused, *made)
     with read_write(config):
         config.hydra[section].dir = str(folder)
 
@@ -84,21 +84,19 @@ def _make(named: Path, *, is_new: bool) -> tuple[Path, list[Path]]:
         try:
             folder.mkdir()
         except FileExistsError:
-            if not is_new and folder.is_dir():
-                break
             if not is_new:
-                raise
+                break
         else:
             return folder, [*made, folder]
     return folder, []
 
 
-def _remove_unused(made: Sequence[Path]) -> None:
-    """Remove folders in which there is nothing but settings."""
-    files = [path for folder in made[-1:] for path in folder.rglob("*") if not path.is_dir()]
+def _remove_unused(*made: Path) -> None:
+    """Remove folders with nothing but settings in the innermost one, the last."""
+    *parents, folder = made
+    files = [path for path in folder.rglob("*") if not path.is_dir()]
     if all(path.name in _OF_SETTINGS or ".hydra" in path.parts for path in files):
         with suppress(OSError):
-            for folder in made[-1:]:
-                shutil.rmtree(folder)
-            for parent in reversed(made[:-1]):
+            shutil.rmtree(folder)
+            for parent in reversed(parents):
                 parent.rmdir()

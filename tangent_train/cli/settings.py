@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,6 +46,12 @@ def typed(kind: type[_Settings], config: Mapping[str, Any]) -> _Settings:
     """
     hints = get_type_hints(kind)
     return kind(**{name: _converted(name, config[name], hint) for name, hint in hints.items()})
+
+
+def names_of(arguments: Sequence[str]) -> set[str]:
+    """Names of the settings in overrides, without those of Hydra."""
+    names = {a.lstrip("+~").partition("=")[0] for a in arguments if not a.startswith("-")}
+    return {name for name in names if not name.startswith("hydra")}
 
 
 def check_new(settings: Any, *outputs: Path | None) -> None:

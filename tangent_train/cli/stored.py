@@ -10,12 +10,13 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 from tangent_train.checkpoints.content import INPUTS, NORMALIZATION, read_checkpoint
-from tangent_train.cli.compose import config_folder, path_text, quoted
+from tangent_train.cli.command_settings import RunSettings
+from tangent_train.cli.compose import config_folder, path_text, quoted, values_of_sweep
 from tangent_train.cli.remembered import remembered_paths
-from tangent_train.cli.settings import Trust, typed
+from tangent_train.cli.settings import Trust, names_of, typed
 from tangent_train.errors import DataError, SettingError
 from tangent_train.registry import SettingsFile, Text, check_fields
 from tangent_train.setting_rules import from_file
@@ -27,12 +28,7 @@ GROUPS = ("experiment", "recipe", *_SECTIONS)
 _RUN = {
     "choices": dict[str, Text] | None,
     "name": Text,
-    "seed": int,
-    "level": int,
-    "panels": int,
-    "tensorboard_images": int,
-    "checkpoint_every_n_steps": int | None,
-    "ema": float | None,
+    **get_type_hints(RunSettings),
 }
 """Settings outside of the sections."""
 
@@ -77,7 +73,7 @@ class StoredRun:
             DataError: The file lacks settings.
             SettingError: A setting of this machine has to be typed.
         """
-        own = _named(self.typed)
+        own = names_of(self.typed)
         own |= {"representation.level"} if "level" in own else set()
         own |= {"data.seed"} if "seed" in own else set()
         of_run = check_fields(self.path, self.config, _RUN, _EXPECTED)
@@ -161,7 +157,7 @@ class StoredNetwork:
         from tangent_train.inference.predictor import views_per_forward
         from tangent_train.inference.views import panorama_settings
 
-        own = _named(self.typed)
+        own = names_of(self.typed)
         trust = typed(Trust, said).trust
         trained = load_trained(self.path, trust)
         settings = dict(said)
@@ -196,8 +192,8 @@ def stored_run(command: str, arguments: Sequence[str]) -> StoredRun | StoredNetw
 
     ``tangent-train resume=<run folder>`` takes the settings inside the run's last checkpoint,
     ``tangent-evaluate checkpoint=<file>`` those inside that; ``data=<option>`` (or another section)
-    takes the user's own option in place of the stored section. A network without a run is evaluated
-    with the user's settings.
+    takes the user's own option in place of the stored section; the run keeps its experiment. A
+    network without a run is evaluated with the user's settings.
 
     Args:
         command: Any command.
@@ -211,17 +207,14 @@ def stored_run(command: str, arguments: Sequence[str]) -> StoredRun | StoredNetw
     given = [a.partition("=")[2] for a in arguments if a.startswith(f"{setting}=")]
     if not setting or not given or given[-1] in ("", "null"):
         return None
+    files = values_of_sweep(given[-1], arguments)
+    if len(files) > 1:
+        expected = "one in a sweep, which is over settings of its run"
+        raise SettingError(setting, found=", ".join(files), expected=expected)
     path = Path(path_text(given[-1])).absolute()
     place = [f"{setting}={path}"]
     left = [a for a in arguments if not a.startswith(f"{setting}=")]
     if command == "train":
-        chosen = [a for a in left if a.partition("=")[0] in GROUPS]
-        if chosen:
-            raise SettingError(
-                f"resume={path}",
-                found=f"{chosen[0]} beside it",
-                expected="single settings (data.root=…): a resumed run keeps its options",
-            )
         place.append(f"hydra.run.dir={quoted(str(path))}")
         path = path / "checkpoints" / "last.ckpt"
         if not path.is_file():
@@ -235,10 +228,17 @@ def stored_run(command: str, arguments: Sequence[str]) -> StoredRun | StoredNetw
         config = read_checkpoint(path, ("config",))["config"]
     else:
         config = run_settings(path)
-        _check_evaluation(path, _named(left), of_run=config is not None)
+        _check_evaluation(path, names_of(left), of_run=config is not None)
         if config is None:
             return StoredNetwork(path, left)
-    left = [*_remembered(path, _named(left)), *left]
+    kept = GROUPS if command == "train" else ("experiment", "recipe")
+    if chosen := [a for a in left if a.partition("=")[0] in kept]:
+        raise SettingError(
+            place[0],
+            found=f"{chosen[0]} beside it",
+            expected="single settings (data.root=…): the run keeps its options",
+        )
+    left = [*_remembered(path, names_of(left)), *left]
     kinds = {name: _RUN[name] for name in ("choices", "level", "seed")}
     known = check_fields(path, config, kinds, _EXPECTED)
     choices = {g: name for g, name in (known["choices"] or {}).items() if is_own_option(g, name)}
@@ -260,12 +260,6 @@ def run_settings(path: Path) -> dict[str, Any] | None:
         return None
     config: dict[str, Any] = read_checkpoint(path, ("config",))["config"]
     return config if "data" in config else None
-
-
-def _named(arguments: Sequence[str]) -> set[str]:
-    """Names of the settings in overrides, without those of Hydra."""
-    names = {a.lstrip("+~").partition("=")[0] for a in arguments if a[0] != "-"}
-    return {name for name in names if not name.startswith("hydra")}
 
 
 def _remembered(path: Path, names: Collection[str]) -> list[str]:

@@ -26,7 +26,7 @@ from tangent_train.cli.command_settings import TrainSettings
 from tangent_train.cli.evaluate import Run, machine_faults
 from tangent_train.cli.fine_tuning import begin_from, load_start
 from tangent_train.cli.remembered import remember_paths, remembered_paths
-from tangent_train.cli.settings import typed
+from tangent_train.cli.settings import names_of, typed
 from tangent_train.cli.stored import is_own_option
 from tangent_train.cli.sweep import OBJECTIVE_FILE
 from tangent_train.errors import DataError, SettingError
@@ -63,7 +63,7 @@ def train(settings: Settings, source: SettingsFile | None = None) -> float | Non
             expected="1 without init_from=, which says what the backbone is",
         )
     checkpoints = run.folder / "checkpoints"
-    needed = _typed_local(_remember(run, is_resumed=resumed is not None))
+    needed = _typed_local(_remember(run))
     last = LastCheckpoint(checkpoints, settings["checkpoint_every_n_steps"], needed)
     best = BestCheckpoint(checkpoints, run.task.monitor)
     trainer = run.trainer([last, LearningRateMonitor(), best])
@@ -146,9 +146,12 @@ def _check_resumed(settings: Settings, config: Mapping[str, Any], epoch: int | N
         )
 
 
-def _remember(run: Run, *, is_resumed: bool) -> Collection[str]:
-    """Remember where the user's data of a run are; returns the names of the settings."""
-    names = {text.lstrip("+").partition("=")[0] for text in HydraConfig.get().overrides.task}
+def _remember(run: Run) -> Collection[str]:
+    """Remember the paths of the user's data; returns the names of their settings.
+
+    Paths that were remembered are among the overrides of a resumed run.
+    """
+    names = names_of(HydraConfig.get().overrides.task)
     choices = HydraConfig.get().runtime.choices
     options = [(group, choices.get(group)) for group in ("data", "experiment")]
     # Else the same options give the same paths again.
@@ -159,18 +162,16 @@ def _remember(run: Run, *, is_resumed: bool) -> Collection[str]:
         if isinstance(value, str) and not from_file(name, value)
         if name in names or not is_composed
     }
-    before = remembered_paths(run.folder) if is_resumed else {}
-    kept = {name: path for name, path in before.items() if name not in names}
-    rank_zero_only(remember_paths)(run.folder, kept | paths)
+    rank_zero_only(remember_paths)(run.folder, paths)
     return remembered_paths(run.folder)
 
 
 def _typed_local(remembered: Collection[str]) -> list[str]:
     """Typed machine-specific settings that a resumed run needs again: no file holds them."""
     typed = [said.lstrip("+") for said in HydraConfig.get().overrides.task]
-    parts = [(*said.partition("=")[::2], said) for said in typed]
+    named = [(said, *said.partition("=")[::2]) for said in typed]
     return [
         said
-        for name, value, said in parts
+        for said, name, value in named
         if name == "trust" or not (name in remembered or from_file(name, value))
     ]

@@ -18,10 +18,12 @@ from typing import Any
 import cv2
 import pytest
 import torch
+from torch import nn
 
 from datamodules.core.split_module import SplitDataModule
 from tangent_train.checkpoints.content import read_settings
 from tangent_train.cli import main
+from tangent_train.cli.build import _fault
 from tangent_train.cli.compose import path_text
 from tangent_train.cli.say import say
 from tangent_train.cli.stored import stored_run
@@ -195,6 +197,8 @@ def test_where_data_are_is_remembered_by_the_place_of_the_run_and_never_in_it(
         ("evaluate", "data.inputs=[rgb]", "network: found .*|found inputs .* which the"),
         ("evaluate", "data=omnisynthia", r"found class names .*'sky'.*; expected .*'beam'"),
         ("evaluate", "network.widths=[4,9]", "network: found other tensors than in"),
+        ("evaluate", "experiment=rooms/demo", r"found experiment=rooms/demo beside it"),
+        ("evaluate", "recipe=small", r"found recipe=small beside it"),
     ],
 )
 def test_a_run_is_neither_resumed_nor_evaluated_as_another(
@@ -204,6 +208,28 @@ def test_a_run_is_neither_resumed_nor_evaluated_as_another(
     begun = {"train": f"resume={run_folder}", "evaluate": checkpoint}
     with pytest.raises(SystemExit, match=message):
         run(command, begun[command], rooms, override)
+
+
+def test_a_trial_of_a_network_finds_its_fault_whatever_the_memory_holds() -> None:
+    """Numbers in the buffers of some networks are indices."""
+
+    class Indexed(nn.Module):
+        index: torch.Tensor
+
+        def __init__(self) -> None:
+            super().__init__()
+            self.norm = nn.BatchNorm2d(3)
+            self.register_buffer("index", torch.tensor([0]))
+
+        def forward(self, images: torch.Tensor) -> torch.Tensor:
+            return self.norm(images[:, :, self.index, :1])
+
+    torch.use_deterministic_algorithms(True)  # new memory is filled with large numbers
+    try:
+        assert "more than 1 value" in str(_fault(Indexed(), (1, 3, 4, 4), trains=True))
+        assert _fault(Indexed(), (2, 3, 4, 4), trains=True) is None
+    finally:
+        torch.use_deterministic_algorithms(False)
 
 
 @pytest.mark.parametrize("faces", [1, 2])
@@ -293,14 +319,10 @@ _SCHEDULER = "scheduler._target_=torch.optim.lr_scheduler"
             ["scheduler=cosine", "scheduler.T_max=abc"],
             "scheduler: found .*; expected settings that .*CosineAnnealingLR takes",
         ),
-        (["optimizer._target_=torch.optim.SGD", "+optimizer.betas=[0,1]"], "betas for torch.optim"),
-        (["network._target_=torch.nn.Conv2d"], "network: found .*widths for torch.nn.Conv2d"),
         (
             ["network._target_=tests.cli.tiny_runs.results"],
             "found .* for tests.cli.tiny_runs.results",
         ),
-        (["representation._target_=tangent_train.rendering.EquirectRepresentation"], "base_level"),
-        (["data._target_=datamodules.Zind"], "data: found fold, "),
     ],
 )
 def test_impossible_settings_are_refused_before_any_data_is_made(
@@ -338,7 +360,6 @@ def test_answers_before_anything_heavy_is_imported(
 
 MISSING = """
 import sys
-from contextlib import suppress
 from tangent_train.cli import main
 for line in sys.argv[1:]:
     command, *arguments = line.split(" ")
@@ -351,11 +372,8 @@ print("heavy", {"torch", "lightning", "cv2", "numba", "matplotlib"} & set(sys.mo
 """
 
 
-@pytest.mark.parametrize("name", ["absent", "absent/ä b"])
-def test_missing_inputs_are_refused_before_anything_heavy_is_imported(
-    name: str, tmp_path: Path
-) -> None:
-    name = name.replace(" ", "\N{NO-BREAK SPACE}")
+def test_missing_inputs_are_refused_before_anything_heavy_is_imported(tmp_path: Path) -> None:
+    name = "absent/ä\N{NO-BREAK SPACE}b"
     lines = [
         f"predict checkpoint={name} input=there output=out",
         f"predict checkpoint=there input={name} output=out",
@@ -372,7 +390,7 @@ def test_missing_inputs_are_refused_before_anything_heavy_is_imported(
         f"import network=onnx file=there classes={name} output=out.onnx",
         f"keypoints left={name} right=there output=out",
         f"keypoints input={name} output=out",
-        *(f"keypoints data={data} data.root={name} output=out" for data in ("zind_pairs",)),
+        f"keypoints data=zind_pairs data.root={name} output=out",
         *(f"{c} data=folder data.root={name}" for c in ("train", "prepare", "check", "transfer")),
         f"train data=omnisynthia data.root={name}",
         f"train init_from={name}",
@@ -384,9 +402,8 @@ def test_missing_inputs_are_refused_before_anything_heavy_is_imported(
         "train level=high",
         "predict checkpoint=there input=there output=out report=many",
     ]
-    quoted = [re.sub(r"=(absent/ä[^ ]*)", r"='\1'", line) for line in lines]
     (tmp_path / "there").touch()
-    done = run_python(tmp_path, "-c", MISSING, *quoted)
+    done = run_python(tmp_path, "-c", MISSING, *lines)
     *refused, heavy = done.stdout.splitlines()
     assert heavy == "heavy set()"
     assert len(refused) == len(lines), done.stderr
@@ -396,7 +413,7 @@ def test_missing_inputs_are_refused_before_anything_heavy_is_imported(
     assert [path.name for path in tmp_path.iterdir()] == ["there"]
 
 
-@pytest.mark.parametrize("encoding", ["ascii", "latin-1", "cp1252", "cp437"])
+@pytest.mark.parametrize("encoding", ["ascii", "cp1252"])
 def test_output_of_any_encoding(
     encoding: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -415,7 +432,7 @@ def test_output_of_any_encoding(
     assert b"class_map: null" in done.stdout
 
 
-@pytest.mark.parametrize("number", [errno.EROFS, errno.EACCES, errno.ENOSPC, errno.EIO])
+@pytest.mark.parametrize("number", [errno.EROFS, errno.ENOSPC])
 @pytest.mark.parametrize("named", [True, False])
 def test_what_the_system_refuses_is_one_line(
     number: int, named: bool, run: Run, monkeypatch: pytest.MonkeyPatch

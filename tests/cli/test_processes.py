@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -18,59 +19,49 @@ def _python(code: str) -> list[str]:
     return [sys.executable, "-c", f"import os, signal, sys, time\n{code}"]
 
 
-def test_sigterm_reaches_the_job_which_may_finish_its_checkpoint(tmp_path: Path) -> None:
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Short waits; a shell starts programs in the background deaf to Ctrl-C."""
+    monkeypatch.setattr(processes, "_NOTICE_S", 0.1)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("impatient")
+@pytest.mark.parametrize(
+    ("name", "error"), [("SIGTERM", processes.SigtermError), ("SIGINT", KeyboardInterrupt)]
+)
+def test_a_signal_to_this_process_reaches_the_job_which_may_finish_its_checkpoint(
+    name: str, error: type[BaseException], tmp_path: Path
+) -> None:
     mark = tmp_path / "saved"
     code = (
         f"def save(*_): time.sleep(0.2); open({str(mark)!r}, 'w'); sys.exit(143)\n"
         "signal.signal(signal.SIGTERM, save)\n"
-        "os.kill(os.getppid(), signal.SIGTERM)\n"
+        f"time.sleep(0.5); os.kill(os.getppid(), signal.{name})\n"  # not while it is started
         "time.sleep(60)"
     )
     before = signal.getsignal(signal.SIGTERM)
-    with pytest.raises(processes.SigtermError):
+    with pytest.raises(error):
         processes.run_process(_python(code))
     assert mark.exists()
     assert signal.getsignal(signal.SIGTERM) == before
 
 
-def test_an_interrupt_that_reached_this_process_only_ends_the_job_too(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(processes, "_NOTICE_S", 0.1)
-    mark = tmp_path / "saved"
-    code = (
-        f"def save(*_): open({str(mark)!r}, 'w'); sys.exit(143)\n"
-        "signal.signal(signal.SIGTERM, save)\n"
-        "os.kill(os.getppid(), signal.SIGINT)\n"
-        "time.sleep(60)"
-    )
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            processes.run_process(_python(code))
-    finally:
-        signal.signal(signal.SIGINT, before)
-    assert mark.exists()
-
-
+@pytest.mark.usefixtures("impatient")
 def test_ctrl_c_ends_a_job_that_does_not_listen(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(processes, "_PATIENCE_S", 0.3)
-    monkeypatch.setattr(processes, "_NOTICE_S", 0.3)
     number = tmp_path / "pid"
     code = (
         f"open({str(number)!r}, 'w').write(str(os.getpid()))\n"
         "signal.signal(signal.SIGTERM, signal.SIG_IGN)\n"
         "os.kill(os.getppid(), signal.SIGINT)\ntime.sleep(60)"
     )
-    # A shell starts what runs in the background deaf to it.
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            processes.run_process(_python(code))
-    finally:
-        signal.signal(signal.SIGINT, before)
+    with pytest.raises(KeyboardInterrupt):
+        processes.run_process(_python(code))
     with pytest.raises(ProcessLookupError):
         os.kill(int(number.read_text()), 0)
 
