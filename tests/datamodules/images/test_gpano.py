@@ -67,33 +67,34 @@ _OTHERS = (  # of the image that this one was made from, and of another program
     '<rdf:li><rdf:Description GPano:PosePitchDegrees="2"/></rdf:li></rdf:Bag></m:Ingredients>'
     '<m:PosePitchDegrees xmlns:m="of/another">3</m:PosePitchDegrees>'
 )
+_QUALIFIER = '<q:by xmlns:q="of/q">me</q:by>'
+
+
+def _described(old: str = "", new: str = "") -> str:
+    elements = _ELEMENTS.replace(old, new) if old else _ELEMENTS
+    return f"<rdf:Description>{elements}</rdf:Description>"
+
+
 _FORMS = {
     "attributes": f'<rdf:Description rdf:about="" {_ATTRIBUTES}/>',
-    "single quotes": f"<rdf:Description {_ATTRIBUTES}/>".replace('"', "'"),
-    "elements": f"<rdf:Description>{_ELEMENTS}</rdf:Description>",
-    "white space": f"<rdf:Description>\n{_ELEMENTS}</rdf:Description>".replace(">-", ">\n\t-"),
+    "references": f"<rdf:Description {_ATTRIBUTES}/>".replace("-24", "&#x2d;&#50;4"),
+    "elements": _described(),
+    "white space": _described(f">{_PITCH}<", f">\n\t{_PITCH}<"),
     "two descriptions": f"<rdf:Description/><rdf:Description {_ATTRIBUTES}/>",
     "beside others": f"<rdf:Description>{_OTHERS}{_ELEMENTS}{_OTHERS}</rdf:Description>",
     "after others": f"<rdf:Description {_ATTRIBUTES}>{_OTHERS}</rdf:Description>",
-    "references": f"<rdf:Description {_ATTRIBUTES}/>".replace("-24", "&#x2d;&#50;4"),
-    "comments": f"<rdf:Description>{_ELEMENTS}</rdf:Description>".replace(">-", "><!-- ° -->-"),
-    "character data": f"<rdf:Description>{_ELEMENTS}</rdf:Description>".replace(
-        _PITCH, f"<![CDATA[{_PITCH}]]>"
-    ),
-    "language": f"<rdf:Description>{_ELEMENTS}</rdf:Description>".replace(
-        "PitchDegrees>-", 'PitchDegrees xml:lang="x-default">-'
-    ),
-    "qualifiers": f"<rdf:Description>{_ELEMENTS}</rdf:Description>".replace(
+    "comments": _described(f">{_PITCH}<", f"><!-- ° -->-<![CDATA[{_PITCH[1:]}]]><"),
+    "language": _described("PitchDegrees>-", 'PitchDegrees xml:lang="x-default">-'),
+    "qualifiers": _described(
         f"Degrees>{_PITCH}<",
-        f'Degrees rdf:parseType="Resource"><rdf:value>{_PITCH}</rdf:value>'
-        '<q:by xmlns:q="of/q">me</q:by><',
+        f'Degrees rdf:parseType="Resource"><rdf:value>{_PITCH}</rdf:value>{_QUALIFIER}<',
     ),
-    "qualifiers in a description": f"<rdf:Description>{_ELEMENTS}</rdf:Description>".replace(
+    "qualifiers in a description": _described(
         f"Degrees>{_PITCH}<",
-        f'Degrees>\n<rdf:Description><q:by xmlns:q="of/q">me</q:by><rdf:value>{_PITCH}</rdf:value>'
+        f"Degrees>\n<rdf:Description>{_QUALIFIER}<rdf:value>{_PITCH}</rdf:value>"
         "</rdf:Description>\n<",
     ),
-    "a value as attribute": f"<rdf:Description>{_ELEMENTS}</rdf:Description>".replace(
+    "a value as attribute": _described(
         f"Degrees>{_PITCH}</GPano:PosePitchDegrees>",
         f'Degrees rdf:value="{_PITCH}" q:by="me" xmlns:q="of/q"/>',
     ),
@@ -170,11 +171,12 @@ def test_places_of_xmp(tmp_path: Path) -> None:
         b'<!DOCTYPE x [<!ENTITY a "aaaa">]>' + xmp_packet(_FORMS["attributes"]),
         '<?xml version="1.0" encoding="UTF-16"?><!DOCTYPE x>'.encode("utf-16")
         + xmp_packet(_FORMS["attributes"]).decode().encode("utf-16-le"),
+        b'<?xml version="1.0" encoding="none"?>' + xmp_packet(_FORMS["attributes"]),
     ],
-    ids=["truncated", "unknown prefix", "entities", "UTF-16"],
+    ids=["truncated", "unknown prefix", "entities", "UTF-16", "unknown encoding"],
 )
 def test_xmp_that_cannot_be_read(tmp_path: Path, packet: bytes) -> None:
-    """Refused with these tags; without them it is nobody's business."""
+    """Refused with these tags, ignored without them."""
     path = tmp_path / "image.jpg"
     path.write_bytes(_jpeg(_adobe(packet)))
     with pytest.raises(DataError, match=r"image\.jpg: found XMP data that .*exiftool"):
@@ -183,6 +185,13 @@ def test_xmp_that_cannot_be_read(tmp_path: Path, packet: bytes) -> None:
     other = packet.replace(b"photos", b"videos").replace(old, new)
     path.write_bytes(_jpeg(_adobe(other)))
     assert up_of(path) is None
+
+
+def test_a_raw_profile_that_is_not_hexadecimal(tmp_path: Path) -> None:
+    chunk = png_chunk(b"tEXt", b"Raw profile type xmp\0\nxmp\n       3\n3c?\n")
+    (tmp_path / "a.png").write_bytes(png_bytes(np.zeros((4, 8, 3), np.uint8), before=chunk))
+    with pytest.raises(DataError, match=r"a\.png: found XMP data that cannot be read"):
+        up_of(tmp_path / "a.png")
 
 
 @pytest.mark.parametrize("projection", ["Equirectangular", "EQUIRECTANGULAR"])
