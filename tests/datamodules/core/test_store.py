@@ -224,10 +224,12 @@ def test_what_is_there_is_kept_and_what_is_not_is_made(
     make_module(fold=2, seed=1).prepare_data()  # other splits of the same panoramas
     assert _times(store) == before
     damaged, flipped = sorted(before)[3:5]
-    damaged.write_bytes(damaged.read_bytes()[:-9])
-    _flip(flipped, 2000)
-    make_module().prepare_data()
-    assert _made(store, before) == {damaged, flipped}
+    for skip_broken in (False, True):
+        damaged.write_bytes(damaged.read_bytes()[:-9])
+        _flip(flipped, 2000)
+        before = _times(store)
+        make_module(skip_broken=skip_broken).prepare_data()
+        assert _made(store, before) == {damaged, flipped}
     make_module(unknown="any_black").prepare_data()
     Stanford2D3DS(root, EquirectRepresentation(level=2), store=store).prepare_data()
     assert len(_times(store)) == 3 * PANORAMAS, "choices and sizes lie beside each other"
