@@ -144,42 +144,40 @@ def test_problems_are_listed_once(tmp_path: Path, erp: Any) -> None:
 # Names
 
 NFC, NFD = (unicodedata.normalize(form, "küche/Tür") for form in ("NFC", "NFD"))
+FOLDERS = ("images", "labels", "depth", "masks")
+
+
+def _write_accents(root: Path) -> None:
+    """Three panoramas with depth and masks, the first with a composed name."""
+    write_classes(root)
+    for number, name in enumerate((NFC, "b", "c")):
+        write_panorama(root, name, number, 16, depth=True)
+        save(root / "masks" / f"{name}.png", np.ones((16, 32), np.uint8))
 
 
 @pytest.mark.parametrize("forms", list(product((NFC, NFD), repeat=5)))
 def test_names_that_look_the_same_are_the_same(
     tmp_path: Path, erp: Any, forms: tuple[str, ...]
 ) -> None:
-    image, labels, depth, mask, listed = forms
-    write_classes(tmp_path)
-    for number, name in enumerate((NFC, "b", "c")):
-        write_panorama(tmp_path, name, number, 16, depth=True)
-        save(tmp_path / "masks" / f"{name}.png", np.ones((16, 32), np.uint8))
-    for folder, name in (("images", image), ("labels", labels), ("depth", depth), ("masks", mask)):
-        (tmp_path / folder / NFC).with_suffix(".png").rename(tmp_path / "moved")
+    _write_accents(tmp_path)
+    for folder, name in zip(FOLDERS, forms, strict=False):
         path = (tmp_path / folder / name).with_suffix(".png")
+        content = (tmp_path / folder / NFC).with_suffix(".png")
         path.parent.mkdir(exist_ok=True)
-        (tmp_path / "moved").rename(path)
-    (tmp_path / "test.txt").write_text(f"{listed}\n", "utf-8")
-    settings: Any = {"inputs": ["rgb", "depth"], "mask": tmp_path / "masks"}
-    module = FolderPanoramas(tmp_path, erp, **settings)
+        content.rename(tmp_path / "moved").rename(path)
+    (tmp_path / "test.txt").write_text(f"{forms[-1]}\n", "utf-8")
+    module = FolderPanoramas(tmp_path, erp, inputs=["rgb", "depth"], mask=tmp_path / "masks")
     assert module.check()[0].listed() == []
     assert module.source("test").name(0) == NFC
     assert module.source("test").read(0).labels.any()
 
 
-@pytest.mark.parametrize("folder", ["images", "labels", "depth", "masks"])
+@pytest.mark.parametrize("folder", FOLDERS)
 def test_two_files_that_look_the_same_are_refused(tmp_path: Path, erp: Any, folder: str) -> None:
-    write_classes(tmp_path)
-    for name in (NFC, "b", "c"):
-        write_panorama(tmp_path, name, 0, 16, depth=True)
-        save(tmp_path / "masks" / f"{name}.png", np.ones((16, 32), np.uint8))
-    other = (tmp_path / folder / NFD).with_suffix(".png")
-    other.parent.mkdir(exist_ok=True)
-    other.write_bytes((tmp_path / folder / "b.png").read_bytes())
-    settings: Any = {"inputs": ["rgb", "depth"], "mask": tmp_path / "masks"}
-    problems, _ = FolderPanoramas(tmp_path, erp, **settings).check()
-    (problem,) = problems.listed()
+    _write_accents(tmp_path)
+    save((tmp_path / folder / NFD).with_suffix(".png"), np.zeros((16, 32), np.uint8))
+    module = FolderPanoramas(tmp_path, erp, inputs=["rgb", "depth"], mask=tmp_path / "masks")
+    (problem,) = module.check()[0].listed()
     assert r"'Tu\u0308r.png'" in problem.finding
 
 
