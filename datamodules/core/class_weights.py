@@ -1,7 +1,8 @@
-"""Weights of the classes in the loss, from how often they occur."""
+"""How often the classes occur: their weights in the loss, and doubts about labels."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
@@ -13,6 +14,8 @@ ClassWeights = Literal["log", "sqrt", "none"]
 """Class weighting of the loss; see `class_weights`."""
 
 _LOG_OFFSET = 1.02
+_MOST_UNKNOWN = 0.5
+_MOST_NAMED = 10
 
 
 def class_weights(counts: NDArray[np.int64], kind: ClassWeights) -> Tensor:
@@ -38,3 +41,25 @@ def class_weights(counts: NDArray[np.int64], kind: ClassWeights) -> Tensor:
     weights = np.zeros(len(counts), np.float32)
     weights[seen] = of_seen
     return torch.from_numpy(weights)
+
+
+def label_doubts(split: str, counts: NDArray[np.int64], class_names: Sequence[str]) -> list[str]:
+    """Warn of labels and classes that may not belong together.
+
+    Args:
+        split: Name of the split.
+        counts: ``(K+1,)`` pixels of every label, some of them above 0.
+        class_names: ``(K+1,)`` names; the first is that of unknown pixels.
+    """
+    doubts = []
+    unknown = counts[0] / counts.sum()
+    if unknown > _MOST_UNKNOWN:
+        doubts.append(f"{100 * unknown:.1f} % of the pixels for {split} are unknown.")
+    missing = [name for name, count in zip(class_names[1:], counts[1:], strict=True) if not count]
+    if missing:
+        more = f" and {len(missing) - _MOST_NAMED} more" if len(missing) > _MOST_NAMED else ""
+        doubts.append(
+            f"No pixel for {split} is of {len(missing)} of {len(class_names) - 1} classes: "
+            f"{', '.join(missing[:_MOST_NAMED])}{more}."
+        )
+    return doubts

@@ -83,7 +83,7 @@ class Found(Generic[_Item]):
 
         Args:
             problems: Known problems; new ones are added.
-            label_counts: For every image the pixels of each label are added; nothing for shapes.
+            label_counts: The pixels of each label are added by image; shapes have none.
 
         Returns:
             How many images or shapes were read.
@@ -101,7 +101,7 @@ class Found(Generic[_Item]):
         Args:
             splits: The splits to read.
             problems: Known problems; new ones are added.
-            whole: Whether to check the content of the store too; it is checked before use anyway.
+            whole: True to check the content of the store too; samples check it on first use.
         """
         items, store = problems.without(self.of(splits)), self.store
         if store is None:

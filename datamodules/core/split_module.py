@@ -17,7 +17,7 @@ from rich.console import Console
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from datamodules.core.class_weights import ClassWeights, class_weights
+from datamodules.core.class_weights import ClassWeights, class_weights, label_doubts
 from datamodules.core.found import SPLITS, Found, Item, Split, SplitItems
 from datamodules.core.inputs import Normalization
 from datamodules.core.loading import EpochSampler, make_loader, this_process
@@ -325,7 +325,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
                 found.read_some(self.seed, problems)
             problems.refuse(self.root, _GO_ON)
             return found
-        found.read_all(SPLITS, problems)
+        found.read_all(SPLITS, problems, whole=self.trainer is None)
         left = found.without(problems)
         for split in SPLITS:
             if found.splits[split] and not left.splits[split]:
@@ -353,15 +353,19 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
     def class_weights(self, kind: ClassWeights) -> Tensor:
         """Weights of the classes in the loss, from the labels of the training split.
 
+        Labels that seem to be of other classes are warned of.
+
         Args:
             kind: See `class_weights.class_weights`.
         """
-        counts = np.zeros(256, np.int64)
+        counts = np.zeros(len(self.class_names), np.int64)
         if kind != "none":
             source = self.source("train")
             for labels in in_threads(source.labels, range(len(source))):
-                counts += np.bincount(labels.ravel(), minlength=256)
-        return class_weights(counts[1 : len(self.class_names)], kind)
+                counts += np.bincount(labels.ravel(), minlength=len(counts))
+            for doubt in label_doubts("train", counts, self.class_names):
+                tell(f"Warning: {doubt}")
+        return class_weights(counts[1:], kind)
 
     def source(self, split: Split) -> SplitItems[_Item, Any]:
         """The images of one split: in memory, if asked for."""

@@ -54,7 +54,7 @@ class Declared(NamedTuple):
         Args:
             array: The array.
             lengths: Sides of the item so far; those of the array are added.
-            values: Whether its values are looked at.
+            values: True to compare its values with the largest.
         """
         if array.dtype != self.dtype or array.ndim != len(self.shape):
             return False
@@ -138,7 +138,7 @@ class Store:
         Args:
             name: Of the item.
             files: Required source files; it may have more.
-            whole: Whether to check the content too.
+            whole: True to check the content too.
 
         Raises:
             DataError: It is missing, damaged, out of date, or has other arrays than declared.

@@ -99,17 +99,16 @@ def list_images(root: Path, problems: Problems, *, with_depth: bool) -> list[Ima
             expected = "a data set: images/, labels/ and classes.json, see docs/own_data.md"
             raise DataError(folder, found="no such folder", expected=expected)
     found: dict[str, ImageFiles] = {}
-    pictures, labels = NamedFiles(root / "images"), NamedFiles(root / "labels")
+    labels = NamedFiles(root / "labels")
     depths = NamedFiles(root / "depth") if with_depth else None
     for rgb in image_paths(root / "images"):
         name = _name(root / "images", rgb)
         own, depth = labels.folder / f"{name}.png", None
         with problems.noted(name):
-            pictures.path(rgb.relative_to(pictures.folder).as_posix())
             if name in found:
                 raise DataError(
                     rgb,
-                    found=f"{found[name].rgb.name} beside it",
+                    found=f"{found[name].rgb.name!a} beside it",
                     expected="one image of each name: its labels have the same one",
                     remedy="Rename or remove one of them.",
                 )

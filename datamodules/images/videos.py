@@ -26,7 +26,7 @@ _READERS = "mov,matroska,avi"
 _EBML = (b"\x1a\x45\xdf\xa3", b"\x18\x53\x80\x67")  # Matroska's header, and its segment
 _BOXES = (b"moov", b"moof", b"mdat")
 _SHOWN_VP8 = 0x10
-_STRAIGHT = 0.02  # of a matrix: about a degree
+_STRAIGHT = 0.02  # tolerance of a matrix: about a degree
 _AHEAD = 2
 _ENCODER = "libx264"
 _QUALITY = {"crf": "18", "preset": "veryfast"}
@@ -138,7 +138,7 @@ def _file_url(path: Path) -> str:
 
 @contextmanager
 def _logged_errors(path: Path) -> Iterator[list[str]]:
-    """What FFmpeg's reader of Matroska logs: it passes over what it cannot read."""
+    """Errors that FFmpeg's reader of Matroska logs; it passes over damaged parts."""
     with of_extra("video", path):
         import av.logging as log
     errors: list[str] = []
@@ -155,7 +155,7 @@ def _logged_errors(path: Path) -> Iterator[list[str]]:
 
 
 def _check_end(path: Path) -> None:
-    """Refuse a file that ends within one of its outermost elements.
+    """Refuse a file that ends within one of its outermost elements; FFmpeg reads what is there.
 
     These are EBML elements (RFC 8794), RIFF chunks of AVI, and boxes (ISO 14496-12).
     """
@@ -213,21 +213,20 @@ def _upright(path: Path, frame: Any) -> NDArray[np.uint8]:
     data = frame.side_data.get("DISPLAYMATRIX")
     if data is None:
         return rgb
-    # Its rows are what gives the column and the row of a shown pixel.
+    # Its rows give the column and the row of a shown pixel.
     matrix = np.frombuffer(bytes(data), np.int32).reshape(3, 3)[:2, :2].T.astype(float)
-    is_transposed = abs(matrix[0, 1]) > abs(matrix[0, 0])
-    straight = matrix[:, ::-1] if is_transposed else matrix
-    along, across = np.diagonal(straight), np.diagonal(straight[:, ::-1])
-    if (abs(across) > _STRAIGHT * abs(along)).any():
+    unit = matrix / np.maximum(abs(matrix).max(axis=1, keepdims=True), 1)
+    signs = np.rint(unit).astype(int)
+    if (signs @ signs.T != np.eye(2)).any() or abs(unit - signs).max() > _STRAIGHT:
         raise DataError(
             path,
             found=f"a display matrix {matrix.T.tolist()}",
             expected="a rotation by 90°, 180° or 270°, mirrored or not",
             remedy="Export the video upright.",
         )
-    turned = rgb.swapaxes(0, 1) if is_transposed else rgb
-    turned = turned[:, ::-1] if along[0] < 0 else turned
-    return np.ascontiguousarray(turned[::-1] if along[1] < 0 else turned)
+    turned = rgb if signs[0, 0] else rgb.swapaxes(0, 1)
+    column_step, row_step = signs.sum(axis=1)
+    return np.ascontiguousarray(turned[::row_step, ::column_step])
 
 
 def write_video(

@@ -7,18 +7,15 @@ from collections.abc import Mapping, Sequence
 from contextlib import redirect_stdout
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
+from datamodules.core.class_weights import label_doubts
 from tangent_train.cli.say import say
 from tangent_train.errors import counted
 from tangent_train.registry import make
 from tangent_train.results.tables import Table, percent
 
 if TYPE_CHECKING:
+    import numpy as np
     from numpy.typing import NDArray
-
-_MOST_UNKNOWN = 0.5
-_MOST_NAMED = 10
 
 
 def check(settings: Mapping[str, Any]) -> None:
@@ -43,8 +40,12 @@ def check(settings: Mapping[str, Any]) -> None:
         Table("", ("file", "finding", "remedy"), rows, text_columns=range(3), lines=True).print()
     for row in () if terminal else rows:
         sys.stdout.write("\t".join(row) + "\n")
-    labelled = {split: n / n.sum() for split, n in data.label_counts.items() if n.sum()}
-    warnings = _doubts(labelled, data.class_names)
+    labelled = {split: counts for split, counts in data.label_counts.items() if counts.any()}
+    warnings = [
+        doubt
+        for split, counts in labelled.items()
+        for doubt in label_doubts(split, counts, data.class_names)
+    ]
     with redirect_stdout(sys.stdout if terminal else sys.stderr):
         if labelled:
             _share_table(labelled, data.class_names).print()
@@ -58,25 +59,9 @@ def check(settings: Mapping[str, Any]) -> None:
         sys.exit(1)
 
 
-def _share_table(shares: Mapping[str, NDArray[np.float64]], class_names: Sequence[str]) -> Table:
-    rows = [
-        [repr(name)[1:-1], *(percent(of[label]) for of in shares.values())]
-        for label, name in enumerate(class_names)
-    ]
-    return Table("Pixels of each class, %", ["class", *shares], rows)
-
-
-def _doubts(shares: Mapping[str, NDArray[np.float64]], class_names: Sequence[str]) -> list[str]:
-    """What makes it likely that labels and classes do not belong together."""
-    doubts = []
-    for split, of in shares.items():
-        missing = [repr(class_names[k])[1:-1] for k in range(1, len(of)) if of[k] == 0]
-        if of[0] > _MOST_UNKNOWN:
-            doubts.append(f"{percent(of[0])} % of the pixels for {split} are unknown.")
-        if missing:
-            more = f" and {len(missing) - _MOST_NAMED} more" if len(missing) > _MOST_NAMED else ""
-            doubts.append(
-                f"No pixel for {split} is of {len(missing)} of {len(class_names) - 1} classes: "
-                f"{', '.join(missing[:_MOST_NAMED])}{more}."
-            )
-    return doubts
+def _share_table(
+    label_counts: Mapping[str, NDArray[np.int64]], class_names: Sequence[str]
+) -> Table:
+    shares = [[percent(share) for share in n / n.sum()] for n in label_counts.values()]
+    rows = list(map(list, zip(class_names, *shares, strict=True)))
+    return Table("Pixels of each class, %", ["class", *label_counts], rows)

@@ -130,22 +130,19 @@ class PredictionFolder:
         """Refuse a folder with earlier results.
 
         Args:
-            resume: Whether they were to be continued, but have no summary.
+            resume: True if these should be continued, but have no summary.
 
         Raises:
             SettingError: There are some.
         """
         there = [path for name in _RESULTS if (path := self.path / name).exists()]
         if there:
+            without, keep = "a folder without earlier results", " resume=true to keep them,"
             raise SettingError(
                 "output",
                 found=there[0],
-                expected=f"a readable {_SUMMARY} beside it, of what is to be continued"
-                if resume
-                else "a folder without earlier results",
-                remedy="Give another folder, or overwrite=true."
-                if resume
-                else "Give another folder, resume=true to keep them, or overwrite=true.",
+                expected=f"a readable {_SUMMARY} beside it" if resume else without,
+                remedy=f"Give another folder,{'' if resume else keep} or overwrite=true.",
             )
 
     def earlier(
@@ -262,10 +259,8 @@ class PredictionFolder:
     def write_summary(self, settings: Mapping[str, Any], entries: Sequence[Entry]) -> None:
         """Write ``summary.json``, ``summary.csv`` and ``classes.json`` (labels by name).
 
-        Labels whose class is called unknown are left out of ``classes.json``: they have no class.
-
-        ``summary.json`` is the first file of a folder: a prediction that was killed at any moment
-        can be continued.
+        Labels whose class is called unknown are left out of ``classes.json``. ``summary.json`` is
+        the first file of a folder, so that a killed prediction can be continued.
 
         Args:
             settings: Settings of the prediction.
@@ -288,10 +283,10 @@ class PredictionFolder:
         write_text(self.path / "summary.csv", csv_text([*columns, *names, "error"], rows))
 
     def remove_summary(self) -> None:
-        """Remove the files of `write_summary`: nothing is in the way of another try."""
+        """Remove the files of `write_summary`, so that the command can be repeated."""
         for name in ("summary.csv", "classes.json", _SUMMARY):
             (self.path / name).unlink(missing_ok=True)
-        with suppress(OSError):  # there is something else in it
+        with suppress(OSError):  # the folder has other files
             self.path.rmdir()
 
     def mean_shares(self, entries: Sequence[Entry]) -> Table:

@@ -125,15 +125,10 @@ def tiff_bytes(
 _NAMES: Mapping[str, Any] = {"<": "little", ">": "big"}
 
 
-def gpano_xmp(tags: Mapping[str, object], *, elements: bool = False) -> bytes:
-    """XMP data with GPano tags as attributes or, beside those of another program, elements."""
+def gpano_xmp(tags: Mapping[str, object]) -> bytes:
+    """XMP data with GPano tags as attributes."""
     listed = " ".join(f'GPano:{name}="{value}"' for name, value in tags.items())
-    description = f"<rdf:Description {listed}/>"
-    if elements:
-        listed = "".join(f"<GPano:{name}>\n {v}\n</GPano:{name}>" for name, v in tags.items())
-        other = '<o:CroppedAreaTopPixels xmlns:o="of/another">7</o:CroppedAreaTopPixels>'
-        description = f"<rdf:Description>{other}{listed}</rdf:Description>"
-    return xmp_packet(description)
+    return xmp_packet(f"<rdf:Description {listed}/>")
 
 
 def xmp_packet(content: str, prefix: str = "GPano") -> bytes:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+import datamodules
 from datamodules.core.found import Split
 from datamodules.core.image_module import PanoramaDataModule
 from datamodules.core.panoramas import ImageFiles, PngReader
@@ -75,6 +76,15 @@ def test_labels_past_the_classes_are_found(tmp_path: Path) -> None:
     assert problems.items == {"a", "b", "c"}
     with pytest.raises(DataError, match=r"labels/c\.png: found label 4; expected 0 .* to 3"):
         data.source("test").labels(0)
+
+
+def test_data_sets_that_are_read_are_those_that_are_not_made() -> None:
+    sets = {name: getattr(datamodules, name) for name in datamodules.__all__}
+    made = {name for name, kind in sets.items() if getattr(kind, "is_made", False)}
+    assert {"SynthRooms", "SynthShapes"} <= made
+    for name in sets.keys() - {"SynthRoomsPairs"}:  # which has no such attribute
+        assert datamodules.is_read(f"datamodules.{name}") == (name not in made)
+    assert not datamodules.is_read("mine.Toy")
 
 
 @pytest.mark.parametrize(("names", "found"), [(("sky", "wall"), "sky first"), ((), "none")])

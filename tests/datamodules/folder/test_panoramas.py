@@ -122,7 +122,7 @@ def test_files_that_cannot_be_used(own_root: Path, erp: Any) -> None:
     found = {Path(p.file).parent.name: f"{p.finding}. {p.remedy}" for p in problems.listed()}
     assert found.keys() == {"scene_1", "scene_2", "scene_3"}
     assert re.match(r"8-bit RGB; expected .*names values", found["scene_1"])
-    assert "view.1.jpg beside it" in found["scene_2"]
+    assert "'view.1.jpg' beside it" in found["scene_2"]
     assert re.match(r"no such file; .*data\.inputs=\[rgb\]", found["scene_3"])
 
 
@@ -144,44 +144,41 @@ def test_problems_are_listed_once(tmp_path: Path, erp: Any) -> None:
 # Names
 
 NFC, NFD = (unicodedata.normalize(form, "küche/Tür") for form in ("NFC", "NFD"))
+FOLDERS = ("images", "labels", "depth", "masks")
+
+
+def _write_accents(root: Path) -> None:
+    """Three panoramas with depth and masks, the first with a composed name."""
+    write_classes(root)
+    for number, name in enumerate((NFC, "b", "c")):
+        write_panorama(root, name, number, 16, depth=True)
+        save(root / "masks" / f"{name}.png", np.ones((16, 32), np.uint8))
 
 
 @pytest.mark.parametrize("forms", list(product((NFC, NFD), repeat=5)))
 def test_names_that_look_the_same_are_the_same(
     tmp_path: Path, erp: Any, forms: tuple[str, ...]
 ) -> None:
-    image, labels, depth, mask, listed = forms
-    write_classes(tmp_path)
-    for number, name in enumerate((NFC, "b", "c")):
-        write_panorama(tmp_path, name, number, 16, depth=True)
-        save(tmp_path / "masks" / f"{name}.png", np.ones((16, 32), np.uint8))
-    for folder, name in (("images", image), ("labels", labels), ("depth", depth), ("masks", mask)):
-        (tmp_path / folder / NFC).with_suffix(".png").rename(tmp_path / "moved")
+    _write_accents(tmp_path)
+    for folder, name in zip(FOLDERS, forms, strict=False):
         path = (tmp_path / folder / name).with_suffix(".png")
+        content = (tmp_path / folder / NFC).with_suffix(".png")
         path.parent.mkdir(exist_ok=True)
-        (tmp_path / "moved").rename(path)
-    (tmp_path / "test.txt").write_text(f"{listed}\n", "utf-8")
-    settings: Any = {"inputs": ["rgb", "depth"], "mask": tmp_path / "masks"}
-    module = FolderPanoramas(tmp_path, erp, **settings)
+        content.rename(tmp_path / "moved").rename(path)
+    (tmp_path / "test.txt").write_text(f"{forms[-1]}\n", "utf-8")
+    module = FolderPanoramas(tmp_path, erp, inputs=["rgb", "depth"], mask=tmp_path / "masks")
     assert module.check()[0].listed() == []
     assert module.source("test").name(0) == NFC
     assert module.source("test").read(0).labels.any()
 
 
-@pytest.mark.parametrize("folder", ["images", "labels", "depth", "masks"])
+@pytest.mark.parametrize("folder", FOLDERS)
 def test_two_files_that_look_the_same_are_refused(tmp_path: Path, erp: Any, folder: str) -> None:
-    write_classes(tmp_path)
-    for name in (NFC, "b", "c"):
-        write_panorama(tmp_path, name, 0, 16, depth=True)
-        save(tmp_path / "masks" / f"{name}.png", np.ones((16, 32), np.uint8))
-    other = (tmp_path / folder / NFD).with_suffix(".png")
-    other.parent.mkdir(exist_ok=True)
-    other.write_bytes((tmp_path / folder / "b.png").read_bytes())
-    settings: Any = {"inputs": ["rgb", "depth"], "mask": tmp_path / "masks"}
-    problems, _ = FolderPanoramas(tmp_path, erp, **settings).check()
-    (problem,) = problems.listed()
-    assert r"'T\xfcr.png'" in problem.finding
-    assert r"'Tu\u0308r.png', which look the same" in problem.finding
+    _write_accents(tmp_path)
+    save((tmp_path / folder / NFD).with_suffix(".png"), np.zeros((16, 32), np.uint8))
+    module = FolderPanoramas(tmp_path, erp, inputs=["rgb", "depth"], mask=tmp_path / "masks")
+    (problem,) = module.check()[0].listed()
+    assert r"'Tu\u0308r.png'" in problem.finding
 
 
 def test_missing_folders_and_classes(tmp_path: Path, erp: Any) -> None:
@@ -228,3 +225,21 @@ def test_files_that_are_not_images_are_counted_before_training(
         (tmp_path / "images" / name).write_bytes(b"anything")
     FolderPanoramas(tmp_path, erp).prepare_data()
     assert "Skipped: 2 .heic, 1 .mp4. Convert" in capsys.readouterr().out
+
+
+def test_labels_of_other_classes_are_warned_of_in_training(
+    tmp_path: Path, erp: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_classes(tmp_path, {"wall": 1, "door": 2})
+    for number in range(3):
+        write_panorama(tmp_path, f"{number}", number, 16)
+        labels = np.where(np.arange(32) < 12, 1, 9) * np.ones((16, 1))
+        save(tmp_path / "labels" / f"{number}.png", labels.astype(np.uint8))
+    module = FolderPanoramas(tmp_path, erp)
+    module.class_weights("none")
+    assert capsys.readouterr().out == ""
+    assert module.class_weights("log")[1] == 0
+    assert capsys.readouterr().out == (
+        "Warning: 62.5 % of the pixels for train are unknown.\n"
+        "Warning: No pixel for train is of 1 of 2 classes: door.\n"
+    )

@@ -89,7 +89,7 @@ def _read(path: Path) -> list[NDArray[np.uint8]]:
 _WHOLE = [
     ("x264.mp4", {}),
     ("x264.mov", {"times": _UNEVEN}),
-    ("x264.m4v", {"sound": 3}),
+    ("x264.m4v", {}),
     ("x264.mkv", {"sound": 3}),
     ("x264.avi", {"sound": 3}),
     ("x264.mp4", {"movflags": "frag_keyframe+empty_moov"}),
@@ -97,14 +97,12 @@ _WHOLE = [
     ("x264.mkv", {"live": "1"}),
     ("opengop.mkv", {}),
     ("mpeg4.avi", {"times": _UNEVEN}),
-    ("mpeg4.mkv", {"times": range(50, 99)}),
     ("mjpeg.avi", {"frames": _pictures(1)}),
     ("mjpeg.mov", {}),
     ("ffv1.mkv", {"times": _UNEVEN}),
-    ("prores.mov", {"frames": _pictures(1)}),
+    ("prores.mov", {}),
     ("vp8.webm", {}),
     ("vp9.webm", {"times": _UNEVEN}),
-    ("vp9.mp4", {}),
     ("av1.webm", {"frames": _pictures(1)}),
     ("av1.mp4", {"times": _UNEVEN}),
     ("lossless.avi", {}),
@@ -127,23 +125,20 @@ def test_whole_videos_are_read(tmp_path: Path, name: str, settings: dict[str, An
 def test_frames_that_an_edit_list_hides_do_not_count(
     tmp_path: Path, codec: str, hidden: int
 ) -> None:
+    """At the start, and at the end as PyAV leaves them out."""
     path = _write(tmp_path / "cut.mp4", codec)
-    whole = _decoded(path)
+    whole, data = _decoded(path), bytearray(path.read_bytes())
     hide_start(path, hidden / _RATE)
     assert read_video_size(path)[0] == _COUNT - hidden
     np.testing.assert_array_equal(_read(path), whole[hidden:])
-
-
-@pytest.mark.parametrize("codec", ["x264", "mjpeg", "opengop"])
-def test_frames_after_the_end_of_an_edit_list_do_not_count(tmp_path: Path, codec: str) -> None:
-    path = _write(tmp_path / "cut.mp4", codec)
-    whole, data = _decoded(path), bytearray(path.read_bytes())
     place = data.index(b"elst") + 12
-    struct.pack_into(">I", data, place, struct.unpack_from(">I", data, place)[0] * 7 // _COUNT)
+    (ticks,) = struct.unpack_from(">I", data, place)
+    struct.pack_into(">I", data, place, ticks * (_COUNT - hidden) // _COUNT)
     path.write_bytes(data)
-    assert 0 < read_video_size(path)[0] < _COUNT
-    np.testing.assert_array_equal(_read(path), _decoded(path))
-    np.testing.assert_array_equal(_read(path), whole[: len(_read(path))])
+    kept = _read(path)
+    assert 0 < len(kept) == read_video_size(path)[0] < _COUNT
+    np.testing.assert_array_equal(kept, _decoded(path))
+    np.testing.assert_array_equal(kept, whole[: len(kept)])
 
 
 @pytest.mark.parametrize("suffix", [".mkv", ".mp4"])

@@ -29,7 +29,7 @@ from datamodules.zind.homes import list_panoramas
 from tangent_train.errors import DataError
 from tangent_train.geometry import TangentGrid, rotation_about
 from tangent_train.rendering.camera_files import CameraFile, read_cameras, write_cameras
-from tests.datamodules.data_files import GPANO_TAGS, gpano_xmp
+from tests.datamodules.data_files import GPANO_TAGS, gpano_xmp, xmp_packet
 from tests.datamodules.folder.folder_format import VALUES
 from tests.datamodules.zind.zind_format import SQUARE, Camera, write_home
 
@@ -167,7 +167,9 @@ def _read_home(path: Path) -> None:
 def _gpano_seeds() -> list[bytes]:
     tags = GPANO_TAGS | {"PosePitchDegrees": "-3.5", "PoseRollDegrees": "12"}
     black = np.zeros((40, 60, 3), np.uint8)
-    return [_image(black, "webp", xmp=gpano_xmp(tags, elements=e)) for e in (False, True)]
+    elements = "".join(f"<GPano:{name}>{value}</GPano:{name}>" for name, value in tags.items())
+    forms = gpano_xmp(tags), xmp_packet(f"<rdf:Description>{elements}</rdf:Description>")
+    return [_image(black, "webp", xmp=xmp) for xmp in forms]
 
 
 def _read_gpano(path: Path) -> None:
