@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 from datamodules.images.pixel_files import read_metadata
@@ -94,9 +95,9 @@ def _root(packet: bytes) -> ElementTree.Element:
     """The outermost element; what fills the packet after it may be anything."""
     if b"<!DOCTYPE" in packet.replace(b"\0", b""):  # it could define entities that grow
         raise ValueError("a document type")
-    parser = ElementTree.XMLPullParser(("start", "end"))
+    parser: Any = ElementTree.XMLPullParser(("start", "end"))
     parser.feed(packet)
-    root = None
+    root: ElementTree.Element | None = None
     for event, element in parser.read_events():
         if root is None:
             root = element

@@ -202,8 +202,11 @@ def test_colors_of_cameras_and_programs(tmp_path: Path, name: str) -> None:
     mode, settings = _SAVED[name]
     image: Any = Image.fromarray(rgb)
     if mode == "LAB":
-        profiles: list[Any] = [ImageCms.createProfile("sRGB"), ImageCms.createProfile("LAB")]
-        image = ImageCms.profileToProfile(image, *profiles, outputMode="LAB")
+        srgb, lab = map(
+            ImageCms.ImageCmsProfile,
+            (ImageCms.createProfile("sRGB"), ImageCms.createProfile("LAB")),
+        )
+        image = ImageCms.profileToProfile(image, srgb, lab, outputMode="LAB")
     elif mode != "RGB":
         image = image.convert(mode)
     if mode == "RGBA":
