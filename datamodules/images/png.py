@@ -103,7 +103,11 @@ def read_png_metadata(path: Path) -> dict[Any, Any]:
                 file.seek(position)
                 parts.append(file.read(size))
     with Image.open(io.BytesIO(b"".join([*parts, _NO_PIXELS])), formats=["PNG"]) as image:
-        return dict(image.info)
+        info: dict[Any, Any] = dict(image.info)
+    profile = info.get("Raw profile type APP1", "")  # of a JPEG file: EXIF or XMP data
+    if b"Exif".hex() in profile:
+        info.setdefault("Raw profile type exif", profile)
+    return info
 
 
 def check_png(path: Path, bits: int, colors: Sequence[str]) -> PngHeader:

@@ -127,13 +127,16 @@ def test_jpeg_gives_the_upright_pixels_of_another_decoder(tmp_path: Path, orient
     assert read_image_size(tmp_path / "image.jpg") == expected.shape[:2]
 
 
+def _raw_profile(kind: bytes, exif: bytes) -> bytes:
+    digits = (b"Exif\0\0" + exif).hex().encode()
+    text = b"\n%s\n%8d\n%s" % (kind.lower(), len(exif) + 6, digits)
+    return png_chunk(b"tEXt", b"Raw profile type %s\0%s" % (kind, text))
+
+
 _EXIF_FORMS = {
     "chunk": lambda exif: png_chunk(b"eXIf", exif),
-    "raw profile": lambda exif: png_chunk(
-        b"tEXt",
-        b"Raw profile type exif\0\nexif\n%8d\n%s"
-        % (len(exif) + 6, (b"Exif\0\0" + exif).hex().encode()),
-    ),
+    "raw profile": lambda exif: _raw_profile(b"exif", exif),
+    "raw APP1": lambda exif: _raw_profile(b"APP1", exif),
 }
 
 
