@@ -7,6 +7,8 @@ have, the place of the image in it, and the pitch and roll of the camera.
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,6 +33,7 @@ _SIZES = (
     "CroppedAreaLeftPixels",
     "CroppedAreaTopPixels",
 )
+_REAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 _TOLERANCE = 0.02  # of pixels that should be square: angles and sizes are rounded
 _MOST_COLUMNS = 32768  # of the whole panorama
 _SAY_IT = "Say with crop=[west,east,south,north] in degrees what the image shows."
@@ -217,10 +220,7 @@ def up_of(path: Path) -> NDArray[np.float64] | None:
 
 
 def _number(path: Path, name: str, text: str, most: float) -> float:
-    try:
-        number = float(text)
-    except ValueError:
-        number = float("nan")
+    number = float(text) if _REAL.fullmatch(text) else math.nan
     if not abs(number) <= most:
         raise DataError(
             path,

@@ -338,7 +338,10 @@ def test_impossible_crops(crop: tuple[float, ...], message: str) -> None:
 # Pose
 
 
-@pytest.mark.parametrize(("pitch", "roll"), [("-24.49", "-121"), ("5.0", "0"), ("0.0", "-0")])
+@pytest.mark.parametrize(
+    ("pitch", "roll"),
+    [("-24.49", "-121"), ("5.0", "0"), ("0.0", "-0"), ("+2.3E+1", "-.31e2"), ("5.", "007")],
+)
 def test_pose(tmp_path: Path, pitch: str, roll: str) -> None:
     """Programs that do not know it write zero pitch and roll."""
     tags = {"PosePitchDegrees": pitch, "PoseRollDegrees": roll}
@@ -348,7 +351,15 @@ def test_pose(tmp_path: Path, pitch: str, roll: str) -> None:
 
 
 def test_impossible_poses(tmp_path: Path) -> None:
-    for axis, value in (("Pitch", "91"), ("Roll", "nan"), ("Roll", "180.5"), ("Roll", "steep")):
+    for axis, value in (
+        ("Pitch", "91"),
+        ("Roll", "nan"),
+        ("Roll", "180.5"),
+        ("Roll", "steep"),
+        ("Pitch", "1_0"),
+        ("Pitch", "\u0663"),
+        ("Pitch", "1e400"),
+    ):
         path = _save(tmp_path / "image.jpg", {f"Pose{axis}Degrees": value})
         message = rf"image\.jpg: found GPano:Pose{axis}Degrees .*expected a number from"
         with pytest.raises(DataError, match=message):
