@@ -23,6 +23,8 @@ IMAGE_SUFFIXES = tuple(
 )
 """Suffixes of images, in lower case."""
 
+_CONVERT = "Convert images of other formats, for example to JPEG or PNG."
+
 DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".npy", ".exr")
 """Suffixes of depth maps."""
 
@@ -60,18 +62,19 @@ def image_paths(
     files = {file for file in named if not file.is_dir() and not file.name.startswith(".")}
     found = {file for file in files if not is_result(file)}
     images = sorted(file for file in found if file.suffix.lower() in suffixes)
+    skipped = Counter(file.suffix.lower() or "without suffix" for file in found.difference(images))
+    kinds = ", ".join(f"{count} {repr(kind)[1:-1]}" for kind, count in sorted(skipped.items()))
     if not images:
-        others = f"{len(found)} files, none of them an image" if found else "nothing"
+        others = f"{len(found)} files, none of them an image: {kinds}" if found else "nothing"
         raise DataError(
             pattern,
             found="only results of this command" if files and not found else others,
             expected=f"an image, a folder of images or a pattern such as 'holiday/*.jpg' "
             f"({', '.join(suffixes)})",
+            remedy=_CONVERT if skipped else "",
         )
-    skipped = Counter(file.suffix.lower() or "without suffix" for file in found.difference(images))
     if skipped:
-        kinds = ", ".join(f"{count} {repr(kind)[1:-1]}" for kind, count in sorted(skipped.items()))
-        tell(f"Skipped: {kinds}. Convert images of other formats, for example to JPEG or PNG.")
+        tell(f"Skipped: {kinds}. {_CONVERT}")
     return images
 
 

@@ -56,15 +56,17 @@ def test_patterns(tmp_path: Path) -> None:
     ("pattern", "found"),
     [
         ("nowhere.jpg", "found nothing"),
-        ("*.txt", "found 1 files, none of them"),
+        ("*.txt", "found 1 files, none of them an image: 1 .txt"),
+        ("phone", "found 2 files, none of them an image: 1 .heic, 1 .txt"),
         ("empty", "found nothing"),
     ],
 )
 def test_no_images(tmp_path: Path, pattern: str, found: str) -> None:
-    _touch(tmp_path / "notes.txt")
+    _touch(*(tmp_path / name for name in ("notes.txt", "phone/a.HEIC", "phone/notes.txt")))
     (tmp_path / "empty").mkdir()
-    with pytest.raises(DataError, match=rf"{re.escape(pattern)}: {found}.*\.webp"):
+    with pytest.raises(DataError, match=rf"{re.escape(pattern)}: {found}.*\.webp") as caught:
         image_paths(tmp_path / pattern)
+    assert ("Convert images of other formats" in str(caught.value)) == ("files" in found)
 
 
 def test_depth_is_found_by_the_name_of_the_image(tmp_path: Path) -> None:
