@@ -24,9 +24,12 @@ _READERS = "mov,matroska,avi"
 """FFmpeg's readers of these files. Others read playlists, scripts and neighbors of a file."""
 
 _EBML = (b"\x1a\x45\xdf\xa3", b"\x18\x53\x80\x67")  # Matroska's header, and its segment
-_BOXES = (b"moov", b"moof", b"mdat")
+_BOXES = b"ftyp styp moov moof mdat mfra free skip wide meta sidx ssix prft pdin emsg uuid".split()
+_BOX_HEAD = 8  # bytes
 _SHOWN_VP8 = 0x10
 _STRAIGHT = 0.02  # tolerance of a matrix: about a degree
+_UNTURNED = np.eye(2, dtype=np.int64)
+_UPRIGHT = "Export the video upright."
 _AHEAD = 2
 _ENCODER = "libx264"
 _QUALITY = {"crf": "18", "preset": "veryfast"}
@@ -61,7 +64,7 @@ def read_video_size(path: Path) -> tuple[int, int, int]:
     if first is None:
         raise DataError(path, found="no frame that can be decoded", expected="a whole video")
     check_pixels(path, first.height, first.width)
-    rows, columns = _upright(path, first).shape[:2]
+    rows, columns = _upright(first, _turn(path, first)).shape[:2]
     # A cut without encoding leaves frames before the first one that need what was cut off.
     start = first.pts
     return sum(None in (time, start) or time >= start for time in times), rows, columns
@@ -85,18 +88,27 @@ def read_frames(
         DataError: A frame is damaged, or there are more or fewer.
     """
     for frame in _frames(path, read_video_size(path)[0] if frames is None else frames, every):
-        yield partial(_upright, path, frame)
+        yield partial(_upright, *frame)
 
 
-def _frames(path: Path, expected: int, every: int) -> Generator[Any]:
-    def decoded() -> Generator[Any]:
-        number = -1
+def _frames(path: Path, expected: int, every: int) -> Generator[tuple[Any, NDArray[np.int64]]]:
+    """Frames, and the turn that makes them upright."""
+
+    def decoded() -> Generator[tuple[Any, NDArray[np.int64]]]:
+        number, turn = -1, _UNTURNED
         with _opened(path) as (container, stream):
             for number, frame in enumerate(container.decode(stream)):
                 if frame.is_corrupt:
                     raise _damaged(path, f"frame {number}, and frames before that refer to it")
+                # Within an H.264 stream, a matrix may be that of the first frame alone.
+                own = _turn(path, frame)
+                turn = own if number == 0 else turn
+                if "DISPLAYMATRIX" in frame.side_data and (own != turn).any():
+                    found = f"another orientation from frame {number} on"
+                    expects = "a video of one orientation"
+                    raise DataError(path, found=found, expected=expects, remedy=_UPRIGHT)
                 if number % every == 0:
-                    yield frame
+                    yield frame, turn
         if number + 1 != expected:
             raise _damaged(path, f"{number + 1} of {expected} frames")
 
@@ -159,11 +171,15 @@ def _check_end(path: Path) -> None:
 
     These are EBML elements (RFC 8794), RIFF chunks of AVI, and boxes (ISO 14496-12).
     """
-    end = 0
+    end, is_box = 0, False
     try:
         with path.open("rb") as file:
             size = path.stat().st_size
             while head := file.read(16):
+                # Zeros may fill the file; fewer than four may be the start of a size.
+                if is_box and len(head) < _BOX_HEAD and (len(head) < 4 or any(head)):
+                    raise _damaged(path, f"it ends at byte {size}, within the header of a box")
+                is_box = head[4:8] in _BOXES
                 if head[:4] in _EBML and len(head) > 4:
                     width = 9 - head[4].bit_length()  # of the length
                     length = int.from_bytes(head[4 : 4 + width]) % (1 << 7 * width)
@@ -174,11 +190,11 @@ def _check_end(path: Path) -> None:
                     length = 8 + int.from_bytes(head[4:8], "little")
                 else:
                     length = int.from_bytes(head[:4])
-                    length = int.from_bytes(head[8:16]) if length == 1 else length
-                    if length < 8 or not head[4:8].isalnum():  # the last box, or no box at all
+                    if length == 1:  # the length follows
+                        length = int.from_bytes(head[8:]) if len(head) == 16 else 16
+                    if length < _BOX_HEAD or not head[4:8].isalnum():  # the last box, or none
                         break
-                is_known = head[:4] in (*_EBML, b"RIFF") or head[4:8] in _BOXES
-                if is_known and end + length > size:
+                if (is_box or head[:4] in (*_EBML, b"RIFF")) and end + length > size:
                     raise _damaged(path, f"it ends at byte {size} of {end + length}")
                 end = file.seek(end + length)
     except OSError as error:
@@ -201,29 +217,39 @@ def _damaged(path: Path, detail: str) -> DataError:
     )
 
 
-def _upright(path: Path, frame: Any) -> NDArray[np.uint8]:
-    """A frame ``(H, W, 3)`` in RGB as players show it, by its display matrix.
+def _turn(path: Path, frame: Any) -> NDArray[np.int64]:
+    """Signs ``(2, 2)`` of the display matrix of a frame, transposed; the identity without one.
 
     The matrix M of ISO 14496-12 takes a stored pixel [x y 1] to the shown one [x y 1] M.
 
     Raises:
         DataError: It is not a rotation by quarter turns, mirrored or not.
     """
-    rgb: NDArray[np.uint8] = frame.to_ndarray(format="rgb24")
     data = frame.side_data.get("DISPLAYMATRIX")
     if data is None:
-        return rgb
+        return _UNTURNED
     # Its rows give the column and the row of a shown pixel.
     matrix = np.frombuffer(bytes(data), np.int32).reshape(3, 3)[:2, :2].T.astype(float)
     unit = matrix / np.maximum(abs(matrix).max(axis=1, keepdims=True), 1)
-    signs = np.rint(unit).astype(int)
+    signs = np.rint(unit).astype(np.int64)
     if (signs @ signs.T != np.eye(2)).any() or abs(unit - signs).max() > _STRAIGHT:
+        products = matrix @ matrix.T
+        is_rotation = np.allclose(products, products[0, 0] * np.eye(2), atol=1e-3 * products.max())
+        angle_deg = np.degrees(np.arctan2(matrix[1, 0], matrix[0, 0]))
         raise DataError(
             path,
-            found=f"a display matrix {matrix.T.tolist()}",
+            found=f"a rotation by {angle_deg:.4g}°"
+            if is_rotation and matrix.any()
+            else "a display matrix that is not a rotation",
             expected="a rotation by 90°, 180° or 270°, mirrored or not",
-            remedy="Export the video upright.",
+            remedy=_UPRIGHT,
         )
+    return signs
+
+
+def _upright(frame: Any, signs: NDArray[np.int64]) -> NDArray[np.uint8]:
+    """A frame ``(H, W, 3)`` in RGB as players show it, by its `_turn`."""
+    rgb: NDArray[np.uint8] = frame.to_ndarray(format="rgb24")
     turned = rgb if signs[0, 0] else rgb.swapaxes(0, 1)
     column_step, row_step = signs.sum(axis=1)
     return np.ascontiguousarray(turned[::row_step, ::column_step])
@@ -255,10 +281,10 @@ def write_video(
 
     expected, rows, columns = size
 
-    def painted(numbered: tuple[int, Any]) -> Any:
-        place, frame = numbered
+    def painted(numbered: tuple[int, tuple[Any, NDArray[np.int64]]]) -> Any:
+        place, (frame, turn) = numbered
         number = place * every
-        picture = np.ascontiguousarray(paint(number, _upright(source, frame)))
+        picture = np.ascontiguousarray(paint(number, _upright(frame, turn)))
         made = av.VideoFrame.from_ndarray(picture, format="rgb24")
         made = made.reformat(columns, rows, pixels, dst_colorspace=Colorspace.ITU709)
         made.time_base = stream.time_base

@@ -198,8 +198,42 @@ def test_frames_are_upright(tmp_path: Path, suffix: str, turns: int, mirrored: s
 
 def test_other_angles_are_refused(tmp_path: Path) -> None:
     path = _write(tmp_path / "a.mp4", setup=lambda stream: stream.set_display_rotation(30))
-    with pytest.raises(DataError, match=r"a\.mp4: found a display matrix .*90°, 180° or 270°"):
+    with pytest.raises(DataError, match=r"a\.mp4: found a rotation by -?30°; .*90°, 180° or 270°"):
         read_video_size(path)
+
+
+def _orientation_sei(turns: int) -> bytes:
+    """Quarter turns counterclockwise (H.264, D.1.27), with the length of the NAL unit."""
+    bits = f"000{turns % 4 << 14:016b}10100"
+    return b"\0\0\0\x07\x06\x2f\x03" + int(bits, 2).to_bytes(3) + b"\x80"
+
+
+@pytest.mark.parametrize("turns", ["1", "1 1", "3 3", "0 3", "1 3", "3 2", "0 1"])
+def test_the_orientation_in_an_h264_stream_is_that_of_all_frames(
+    tmp_path: Path, turns: str
+) -> None:
+    """In quarter turns of the first frame and of frame 6; FFmpeg gives the other frames no matrix."""
+    whole, path = _write(tmp_path / "whole.mp4", "forward"), tmp_path / "a.mp4"
+    first, *later = map(int, turns.split())
+    places = {0: first} | dict.fromkeys([6] if later else [], *later)
+    with av.open(str(whole)) as source, av.open(str(path), "w") as output:
+        stream = output.add_stream_from_template(source.streams.video[0])
+        for number, packet in enumerate(p for p in source.demux(video=0) if p.size):
+            content = bytes(packet)
+            if number in places:
+                content = _orientation_sei(places[number]) + content
+            written = av.Packet(content)
+            written.pts, written.dts, written.time_base = packet.pts, packet.dts, packet.time_base
+            written.is_keyframe, written.stream = packet.is_keyframe, stream
+            output.mux(written)
+    if later and later != [first]:
+        with pytest.raises(DataError, match=r"a\.mp4: found another orientation from frame 6 on"):
+            _read(path)
+        return
+    shown = [np.rot90(rgb, first) for rgb in _decoded(whole)]
+    assert read_video_size(path) == (_COUNT, *shown[0].shape[:2])
+    np.testing.assert_array_equal(_read(path), shown)
+    np.testing.assert_array_equal([frame() for frame in read_frames(path, every=5)], shown[::5])
 
 
 @pytest.mark.parametrize(
@@ -215,10 +249,12 @@ def test_other_angles_are_refused(tmp_path: Path) -> None:
 def test_truncated_videos_are_refused(tmp_path: Path, name: str, settings: Any) -> None:
     path = _write(tmp_path / name, name.partition(".")[0], **settings)
     data = path.read_bytes()
-    end = data.find(b"mfra") - 4 if b"mfra" in data else len(data)  # what follows repeats
-    tags = (b"mdat", b"moof", b"\x1f\x43\xb6\x75", b"00dc")
+    tags = (b"mdat", b"moof", b"mfra", b"\x1f\x43\xb6\x75", b"00dc")
     starts = {find(tag) for tag in tags if tag in data for find in (data.find, data.rfind)}
+    end, is_fragmented = len(data), b"moof" in data
     cuts = {end * part // 19 for part in range(19)} | {start + 4 for start in starts} | {end - 1}
+    # Within the header of a box, which starts 4 bytes before its name.
+    cuts |= {start - cut for start in starts for cut in range(-3, 4) if is_fragmented}
     for length in cuts:
         path.write_bytes(data[:length])
         with pytest.raises(DataError, match=rf"{name}: found"):
