@@ -21,6 +21,7 @@ from datamodules.images.image_files import (
     composed,
     find_depth,
     image_paths,
+    spelled,
     walk_files,
 )
 from datamodules.images.masks import Masks
@@ -108,7 +109,7 @@ def list_images(root: Path, problems: Problems, *, with_depth: bool) -> list[Ima
             if name in found:
                 raise DataError(
                     rgb,
-                    found=f"{found[name].rgb.name!a} beside it",
+                    found=f"{spelled(found[name].rgb.name)} beside it",
                     expected="one image of each name: its labels have the same one",
                     remedy="Rename or remove one of them.",
                 )

@@ -113,6 +113,15 @@ def composed(name: str) -> str:
     return unicodedata.normalize("NFC", name)
 
 
+def spelled(name: str) -> str:
+    """A quoted name with the code points of its letters beyond ASCII.
+
+    >>> spelled("k" + chr(0xFC) + "che")
+    "'k<U+00FC>che'"
+    """
+    return "'" + "".join(c if c.isascii() else f"<U+{ord(c):04X}>" for c in name) + "'"
+
+
 class NamedFiles:
     """Files of a folder and its subfolders by `composed` names.
 
@@ -143,7 +152,7 @@ class NamedFiles:
         if len(paths) > 1:
             raise DataError(
                 paths[0],
-                found=f"{paths[0].name!a} and {paths[1].name!a}, which look the same",
+                found=f"{spelled(paths[0].name)} and {spelled(paths[1].name)}, which look the same",
                 expected="one file of each name, however its letters are encoded",
                 remedy="Rename or remove one of them.",
             )
