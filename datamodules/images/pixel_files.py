@@ -7,7 +7,7 @@ or read in the wrong byte order: 16-bit colours, and TIFF files of more than 8 b
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.lib.format import open_memmap
 from numpy.typing import DTypeLike, NDArray
-from PIL import ExifTags, Image, TiffImagePlugin, TiffTags
+from PIL import ExifTags, Image, TiffImagePlugin, TiffTags, UnidentifiedImageError
 
 from datamodules.images.exr import read_exr, read_exr_size
 from datamodules.images.image_files import IMAGE_FORMATS
@@ -50,9 +50,13 @@ LOSSY_SUFFIXES = (".jpg", ".jpeg", ".webp")
 
 _SINGLE_CHANNEL = ("L", "I", "F", "I;16", "I;16L", "I;16B", "I;16N")
 _FIRST_TRANSPOSED = 5  # EXIF orientation from which rows are stored as columns
+_REDUCED = 254  # TIFF tag; bit 0 marks a smaller copy of another page
+_COMPRESSION = 259
 _BITS, _PHOTOMETRIC, _BIT_ORDER, _CHANNELS, _PLANES = 258, 262, 266, 277, 284  # TIFF tags
 _EXTRA_CHANNELS, _SAMPLE_FORMAT, _SUBSAMPLING = 338, 339, 530
-_LAYOUT = (_BITS, _PHOTOMETRIC, _BIT_ORDER, _CHANNELS, _PLANES, _EXTRA_CHANNELS, _SAMPLE_FORMAT)
+_PIXEL_TAGS = (_BITS, _SAMPLE_FORMAT, _CHANNELS, _PHOTOMETRIC, _COMPRESSION)
+_LAYOUT = (*_PIXEL_TAGS, _PLANES, _EXTRA_CHANNELS, _BIT_ORDER)
+_PLACES = ((273, 279), (324, 325))  # starts and sizes of strips and of tiles
 _ASSOCIATED_ALPHA = 1
 _EXACT_TYPES = {
     (number, 8 * size): np.dtype(f"{kind}{size}")
@@ -73,6 +77,8 @@ def _opened(path: Path) -> Iterator[Image.Image]:
     try:
         # Not by its name: Pillow would map raw TIFF files into memory, and turn these wrongly.
         with path.open("rb") as file, Image.open(file, formats=IMAGE_FORMATS) as image:
+            if isinstance(image, TiffImagePlugin.TiffImageFile):
+                _seek_full_size(image)
             check_pixels(path, image.height, image.width)
             if image.format == "PNG":
                 read_png_header(path)
@@ -82,6 +88,9 @@ def _opened(path: Path) -> Iterator[Image.Image]:
         raise
     # Decoders of broken files raise anything, from OSError to SyntaxError and IndexError.
     except Exception as error:
+        tags = _whole_tiff(path) if isinstance(error, UnidentifiedImageError) else {}
+        if tags:
+            raise _unknown_layout(path, tags) from error
         reason = getattr(error, "strerror", None) or str(error).partition(" <")[0]
         raise DataError(
             path,
@@ -89,6 +98,41 @@ def _opened(path: Path) -> Iterator[Image.Image]:
             expected=f"a whole image of a known format ({', '.join(IMAGE_FORMATS)})",
             remedy="Copy or export the file again, for example as JPEG or PNG.",
         ) from error
+
+
+def _seek_full_size(image: TiffImagePlugin.TiffImageFile) -> None:
+    """Go to the first page that is not a thumbnail; stay at the first one if all are."""
+    for page in range(image.n_frames if image.tag_v2.get(_REDUCED, 0) & 1 else 0):
+        image.seek(page)
+        if not image.tag_v2.get(_REDUCED, 0) & 1:
+            return
+    image.seek(0)
+
+
+def _whole_tiff(path: Path) -> Mapping[int, Any]:
+    """Tags of the first page of a TIFF file that has all its pixels; empty of another file."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(8)
+            head += file.read(8) if head[2] == 43 else b""  # BigTIFF
+            tags: Any = TiffImagePlugin.ImageFileDirectory_v2(head)
+            file.seek(tags.next)
+            tags.load(file)
+        starts, sizes = next((tags[a], tags[b]) for a, b in _PLACES if a in tags and b in tags)
+        return tags if np.add(starts, sizes).max() <= path.stat().st_size else {}
+    except Exception:  # the parser raises many kinds of errors
+        return {}
+
+
+def _unknown_layout(path: Path, tags: Mapping[int, Any]) -> DataError:
+    known = [f"{TiffTags.lookup(tag).name} {tags[tag]}" for tag in _LAYOUT if tag in tags]
+    return DataError(
+        path,
+        found=f"a TIFF layout that cannot be decoded: {', '.join(known)}",
+        expected="grey or RGB of 8 or 16 bits or depth of 32-bit float, all channels of one type, "
+        "interleaved (PlanarConfiguration 1), without premultiplied alpha",
+        remedy="Convert the image to PNG, or to TIFF of 8 or 16 bits; depth, to 32-bit float.",
+    )
 
 
 def _exif(image: Image.Image) -> Image.Exif:
@@ -178,7 +222,11 @@ def read_pixels(path: Path, *, indices: bool) -> NDArray[Any]:
     with _opened(path) as image:
         size, orientation = _upright_size(image), _orientation(image)
         exact = _exact_type(path, image)
-        pixels = _decode(image, indices=indices) if exact is None else _decode_exactly(path, *exact)
+        pixels = (
+            _decode(image, indices=indices)
+            if exact is None
+            else _decode_exactly(path, image.tell(), *exact)
+        )
         pixels = _turned(pixels, orientation)
         if pixels.shape[:2] != size:
             raise ValueError(f"{width_height(pixels.shape)}, in its header {width_height(size)}")
@@ -221,22 +269,18 @@ def _exact_type(path: Path, image: Image.Image) -> tuple[np.dtype[Any], bool] | 
         is_straight = _ASSOCIATED_ALPHA not in tags.get(_EXTRA_CHANNELS, ())
         right = exact is not None and is_plain and is_interleaved and is_straight
     if not right:
-        raise DataError(
-            path,
-            found="a TIFF layout that cannot be decoded: "
-            + ", ".join(
-                f"{TiffTags.lookup(tag).name} {tags[tag]}" for tag in _LAYOUT if tag in tags
-            ),
-            expected="grey or RGB, all channels of one type, interleaved "
-            "(PlanarConfiguration 1), without premultiplied alpha",
-            remedy="Export the image as PNG, or as TIFF with interleaved channels.",
-        )
+        raise _unknown_layout(path, tags)
     return None if exact is None else (exact, channels == 1)
 
 
-def _decode_exactly(path: Path, dtype: np.dtype[Any], grey: bool) -> NDArray[Any]:
+def _decode_exactly(path: Path, page: int, dtype: np.dtype[Any], grey: bool) -> NDArray[Any]:
     # From memory: `cv2.imread` knows no paths beyond the system's code page.
-    pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+    content = np.fromfile(path, np.uint8)
+    if page:
+        _, pages = cv2.imdecodemulti(content, cv2.IMREAD_UNCHANGED, range=(page, page + 1))
+    else:
+        pages = [cv2.imdecode(content, cv2.IMREAD_UNCHANGED)]
+    pixels: Any = pages[0]
     if pixels is None or pixels.dtype != dtype or pixels.shape[2:] not in ((), (3,), (4,)):
         raise ValueError("broken pixels")
     if grey:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from PIL import ExifTags, Image, ImageCms, features
+from PIL import ExifTags, Image, ImageCms, TiffImagePlugin, features
 
 from datamodules.images.pixel_files import (
     check_writable,
@@ -304,6 +304,47 @@ def test_other_tiff_files(tmp_path: Path) -> None:
         path.write_bytes(tiff_bytes(pixels, tags=tags))
         with pytest.raises(DataError, match=r"image\.tif: found .*(layout|no image)"):
             read_pixels(path, indices=False)
+
+
+@pytest.mark.parametrize(
+    ("pixels", "tags", "found"),
+    [
+        (_values("f2", 1), {339: 3}, r"BitsPerSample \(16,\), SampleFormat \(3,\)"),
+        (_values("f8", 1), {339: 3}, r"BitsPerSample \(64,\), SampleFormat \(3,\)"),
+        (_values("u4", 3), {}, r"BitsPerSample \(32, 32, 32\)"),
+        (_values("i1", 3), {339: [2] * 3}, r"SampleFormat \(2, 2, 2\)"),
+        (_values("u2", 1), {258: 10}, r"BitsPerSample \(10,\)"),
+        (_values("u2", 3), {258: [12] * 3}, r"BitsPerSample \(12, 12, 12\)"),
+        (_values("u1", 3), {259: 34712}, "Compression 34712"),  # JPEG 2000
+        (_values("u1", 3), {259: 34887}, "Compression 34887"),  # LERC
+        (_values("u2", 1), {262: 3}, "PhotometricInterpretation 3"),  # a palette
+    ],
+)
+@pytest.mark.parametrize("big", [False, True])
+def test_layouts_of_tiff_files_that_are_not_read_are_named(
+    tmp_path: Path, pixels: NDArray[Any], tags: dict[int, Any], found: str, big: bool
+) -> None:
+    path = tmp_path / "image.tif"
+    path.write_bytes(tiff_bytes(pixels, tags=tags, big=big))
+    expected = rf"found a TIFF layout .*{found}.*; expected .*16 bits or depth of 32-bit float"
+    with pytest.raises(DataError, match=expected):
+        read_pixels(path, indices=False)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+@pytest.mark.parametrize("kinds", [[1, 0], [1, 1, 0], [0, 1], [1], [1, 1]])
+def test_thumbnails_before_a_page_of_a_tiff_file_are_passed_over(
+    tmp_path: Path, dtype: Any, kinds: list[int]
+) -> None:
+    """The first page is read where all are marked as thumbnails."""
+    pages = [np.full((4 + n, 6), n + 1, dtype) for n in range(len(kinds))]
+    path, chosen = tmp_path / "image.tif", pages[kinds.index(0) if 0 in kinds else 0]
+    with path.open("w+b") as file, TiffImagePlugin.AppendingTiffWriter(file) as writer:
+        for page, kind in zip(pages, kinds, strict=True):
+            Image.fromarray(page).save(writer, "TIFF", tiffinfo={254: kind})
+            writer.newFrame()
+    np.testing.assert_array_equal(read_pixels(path, indices=True), chosen)
+    assert read_image_size(path) == chosen.shape
 
 
 @pytest.mark.parametrize(

@@ -212,7 +212,7 @@ def _orientation_sei(turns: int) -> bytes:
 def test_the_orientation_in_an_h264_stream_is_that_of_all_frames(
     tmp_path: Path, turns: str
 ) -> None:
-    """In quarter turns of the first frame and of frame 6; FFmpeg gives the other frames no matrix."""
+    """In quarter turns of the first frame and of frame 6; the others have no matrix."""
     whole, path = _write(tmp_path / "whole.mp4", "forward"), tmp_path / "a.mp4"
     first, *later = map(int, turns.split())
     places = {0: first} | dict.fromkeys([6] if later else [], *later)
