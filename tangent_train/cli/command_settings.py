@@ -218,15 +218,15 @@ class TrainSettings(RunSettings):
     resume: Path | None = field(metadata=_EXISTS)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class EvaluateSettings(RunSettings):
-    """See ``configs/evaluate.yaml``."""
+    """See ``configs/evaluate.yaml``; stages of a transfer may have no class map."""
 
     checkpoint: Path = field(metadata=_EXISTS)
-    class_map: str | Path | None = field(metadata=_CLASS_MAP)
+    class_map: str | Path | None = field(default=None, metadata=_CLASS_MAP)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TransferSettings(EvaluateSettings):
     """See ``configs/transfer.yaml``."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -39,13 +39,15 @@ def typed(kind: type[_Settings], config: Mapping[str, Any]) -> _Settings:
 
     Args:
         kind: The class.
-        config: A value for every field, and perhaps others.
+        config: A value for every field without a default, and perhaps others.
 
     Raises:
         SettingError: A value is missing or of another type.
     """
-    hints = get_type_hints(kind)
-    return kind(**{name: _converted(name, config[name], hint) for name, hint in hints.items()})
+    defaults = {one.name for one in fields(kind) if one.default is not MISSING}  # type: ignore[arg-type]
+    hints = get_type_hints(kind).items()
+    named = [(name, hint) for name, hint in hints if name in config or name not in defaults]
+    return kind(**{name: _converted(name, config[name], hint) for name, hint in named})
 
 
 def names_of(arguments: Sequence[str]) -> set[str]:

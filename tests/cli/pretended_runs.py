@@ -13,6 +13,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
 from tangent_train.checkpoints.content import write_settings
+from tangent_train.cli.command_settings import check_settings
 from tangent_train.cli.compose import config_folder
 from tangent_train.cli.transfer import transfer
 from tests.cli.tiny_runs import SMALL_ROOMS
@@ -58,6 +59,7 @@ class PretendedRuns:
         self.started.append((command, folder.name))
         self.configs.append(config)
         settings: Any = OmegaConf.to_container(config, resolve=True)
+        check_settings(command, settings, ())
         write_settings(folder / "config.yaml", settings)
         if command == "train":
             (folder / "checkpoints").mkdir(exist_ok=True)
