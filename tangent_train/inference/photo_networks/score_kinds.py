@@ -169,7 +169,7 @@ def _scores(network: PhotoNetwork, image: Tensor) -> Tensor:
     try:
         scores = plain_scores(network.network(image))
     except Exception as error:  # each network refuses images in its own words
-        if isinstance(error, SettingError) and error.subject.startswith("output of"):
+        if isinstance(error, SettingError) and str(error.subject).startswith("output of"):
             raise
         raise SettingError(
             "image_size",
@@ -229,7 +229,7 @@ def _kind_of_one(scores: Tensor, whole: bool, named: int, *, over_image: bool) -
     least, most = scores.amin().item(), scores.amax().item()
     if named <= _MASK_NAMES and _is_mask(scores):
         return "sigmoid"
-    if whole and len(scores[scores < 0].unique()) <= 1:  # of void, e.g. -1
+    if whole and len(np.unique(scores[scores < 0].numpy())) <= 1:  # of void, e.g. -1
         return "labels"
     if least >= 0 and most <= 1:
         return None if over_image else "sigmoid"
@@ -238,7 +238,7 @@ def _kind_of_one(scores: Tensor, whole: bool, named: int, *, over_image: bool) -
 
 def _is_mask(scores: Tensor) -> bool:
     """True of one score that is 0 or one number above 1, such as 255."""
-    values = scores.unique().tolist()
+    values = np.unique(scores.numpy()).tolist()
     return len(scores) == 1 and len(values) == 2 and values[0] == 0 and values[1] > 1
 
 

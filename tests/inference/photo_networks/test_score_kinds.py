@@ -349,10 +349,9 @@ class LabelMaps(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.layer = nn.Conv2d(3, 4, 1)
+        self.layer = nn.Conv2d(3, 4, 1, bias=False)
         generator = torch.Generator().manual_seed(0)
         self.layer.weight.data = torch.randn(4, 3, 1, 1, generator=generator)
-        self.layer.bias.data.zero_()
 
     def forward(self, images: Tensor) -> Tensor:
         return self.layer(images).argmax(dim=1)
