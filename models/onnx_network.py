@@ -132,12 +132,19 @@ class OnnxNetwork(nn.Module):
             ) from error
         size = (images.shape[2], images.shape[3])
         count = len(whole) - missing
-        scores = _channels_first(torch.from_numpy(returned)[:count], size, self._channels_last)
+        output = torch.from_numpy(returned)
+        if self._batch == 1 and (
+            output.ndim == _LABEL_MAP - 1 or (output.ndim == _LABEL_MAP and len(output) != 1)
+        ):
+            output = output[None]  # the file has no axis of images
+        fits = output.ndim > 0 and len(output) == len(whole)
+        scores = _channels_first(output[:count], size, self._channels_last) if fits else None
         if scores is None:
             raise SettingError(
                 f"output of {self.path.name}",
                 found="×".join(map(str, returned.shape)),
-                expected="scores (B, K, h, w) or (B, h, w, K), or labels (B, h, w)",
+                expected="scores (B, K, h, w) or (B, h, w, K), or labels (B, h, w); without B only "
+                "in files whose batch size is 1",
             )
         scores = scores.float()
         if scores.shape[2:] == size:

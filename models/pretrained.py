@@ -39,14 +39,17 @@ def tensors_for(network: nn.Module, path: Path) -> dict[str, Tensor]:
         path: See `read_tensors`.
 
     Raises:
-        DataError: The file cannot be read, or several mappings with different tensors fit equally
-            well and none is called ``state_dict``.
+        DataError: The file cannot be read, several mappings with different tensors fit equally
+            well and none is called ``state_dict``, or a mapping has two networks with different
+            tensors (``student.``, ``teacher.``).
     """
     own = network.state_dict()
-    found = {place: _renamed(tensors, own) for place, tensors in read_tensors(path).items()}
+    given = read_tensors(path)
+    found = {place: _renamed(tensors, own) for place, tensors in given.items()}
     fitting = {place: len(own.keys() & tensors.keys()) for place, tensors in found.items()}
     best = [place for place, count in fitting.items() if count == max(fitting.values())]
     if "state_dict" in best:
+        _check_alone(given["state_dict"], own, path)
         return found["state_dict"]
     first = found[best[0]]
     if any(found[place].get(name) is not first.get(name) for place in best for name in own):
@@ -56,7 +59,30 @@ def tensors_for(network: nn.Module, path: Path) -> dict[str, Tensor]:
             expected="the tensors of one network, or of several one called state_dict",
             remedy=f"Save one of them alone: torch.save(torch.load(…)['{best[-1]}'], 'state.pt').",
         )
+    _check_alone(given[best[0]], own, path)
     return first
+
+
+def _check_alone(tensors: Mapping[str, Tensor], own: Iterable[str], path: Path) -> None:
+    """Refuse a mapping with a second network of other tensors, under another prefix."""
+    inner = {_inner(name): tensor for name, tensor in tensors.items()}
+    counts = _prefixes(inner, {_inner(name): name for name in own})
+    first, *others = sorted(counts, key=lambda prefix: (-counts[prefix], len(prefix))) or [""]
+    for other in others:
+        pairs = [
+            (tensor, inner.get(other + name.removeprefix(first)))
+            for name, tensor in inner.items()
+            if name.startswith(first)
+        ]
+        is_second = counts[other] == counts[first] and not other.startswith(first)
+        if is_second and not all(b is not None and torch.equal(a, b) for a, b in pairs):
+            raise DataError(
+                path,
+                found=f"two networks with different tensors: {first}* and {other}*",
+                expected="the tensors of one network",
+                remedy=f"Save one of them alone: keep the names that begin with {first} or those "
+                f"that begin with {other}.",
+            )
 
 
 def read_tensors(path: Path) -> dict[str, dict[str, Tensor]]:
@@ -128,13 +154,19 @@ def _inner(name: str) -> str:
 
 def _prefix(names: Iterable[str], ends: Mapping[str, object]) -> str:
     """The commonest prefix, of equally common ones the shortest, before one of these ends."""
+    counts = _prefixes(names, ends)
+    return min(counts, key=lambda prefix: (-counts[prefix], len(prefix)), default="")
+
+
+def _prefixes(names: Iterable[str], ends: Mapping[str, object]) -> Counter[str]:
+    """Prefixes before one of these ends, with their numbers of names."""
     counts: Counter[str] = Counter()
     for name in names:
         parts = name.split(".")
         for k in range(len(parts)):
             if ".".join(parts[k:]) in ends:
                 counts["".join(f"{part}." for part in parts[:k])] += 1
-    return min(counts, key=lambda prefix: (-counts[prefix], len(prefix)), default="")
+    return counts
 
 
 def fetch_tensors(weights: WeightsEnum) -> dict[str, Tensor]:

@@ -54,8 +54,15 @@ class Normalization:
 
     def __post_init__(self) -> None:
         # Plain tuples, whatever list a config brought: comparable and safe in checkpoints.
-        object.__setattr__(self, "mean", tuple(float(value) for value in self.mean))
-        object.__setattr__(self, "std", tuple(float(value) for value in self.std))
+        try:
+            object.__setattr__(self, "mean", tuple(float(value) for value in self.mean))
+            object.__setattr__(self, "std", tuple(float(value) for value in self.std))
+        except (TypeError, ValueError) as error:
+            raise SettingError(
+                "normalization",
+                found=f"mean {self.mean}, std {self.std}",
+                expected="lists of a number for every channel, such as mean: [0.5, 0.5, 0.5]",
+            ) from error
         right = len(self.mean) == len(self.std) and len(self.mean) in (3, 4, 6)
         if not (right and all(map(math.isfinite, [*self.mean, *self.std])) and min(self.std) > 0):
             raise SettingError(
@@ -80,7 +87,10 @@ class Normalization:
         if isinstance(given, str):
             given = _NAMED.get(given, given)
         if isinstance(given, Mapping) and set(given) == {"mean", "std"}:
-            given = cls(given["mean"], given["std"])
+            try:
+                given = cls(given["mean"], given["std"])
+            except SettingError as error:
+                raise SettingError(setting, found=error.found, expected=error.expected) from error
             if given.channels < _SHAPES:
                 _check_colors(given, setting)
         if not isinstance(given, cls):

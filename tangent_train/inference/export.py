@@ -134,9 +134,10 @@ def _write_onnx(trained: TrainedNetwork, path: Path, opset: int | None) -> None:
         shape |= {2: step * torch.export.Dim("h"), 3: step * torch.export.Dim("w")}
         least = -(-_LEAST_TRACED // step)
         size = step * max(3, least), step * max(4, least + 1)  # no two dimensions are equal
+    returns_labels = trained.score_kind == "labels"
     with quiet():
         program: Any = torch.onnx.export(
-            trained.network,
+            trained.network.network if returns_labels else trained.network,
             (_random_images(trained, 2, size),),
             dynamo=True,
             input_names=["images"],
@@ -148,9 +149,10 @@ def _write_onnx(trained: TrainedNetwork, path: Path, opset: int | None) -> None:
     written = program.model.opset_imports[""]
     if opset not in (None, written):
         raise SettingError("opset", found=opset, expected=f"{written} for this network")
-    groups = [[k] for k in range(trained.network.num_scores)] if trained.groups else None
-    # The graph computes the logits and adds them up.
-    written_as = replace(trained, settings=None, groups=groups, score_kind="logits")
+    written_as = replace(trained, settings=None)  # of labels, which have no probabilities
+    if not returns_labels:  # the graph computes the logits and adds them up
+        groups = [[k] for k in range(trained.network.num_scores)] if trained.groups else None
+        written_as = replace(written_as, groups=groups, score_kind="logits")
     program.save(path, external_data=False)
     write_metadata(path, path, metadata_json(written_as))
 

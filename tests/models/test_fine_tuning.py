@@ -120,6 +120,26 @@ def test_two_state_dicts_of_equal_right_are_refused(tmp_path: Path) -> None:
         initialize(network, tmp_path / "none.pt")
 
 
+@pytest.mark.parametrize("prefixes", [("student.", "teacher."), ("ema_net.module.", "net.")])
+@pytest.mark.parametrize("wrap", [dict, lambda tensors: {"epoch": 1, "state_dict": tensors}])
+def test_two_networks_in_one_state_dict_are_refused(
+    wrap: Any, prefixes: tuple[str, str], tmp_path: Path
+) -> None:
+    """Unless their tensors are equal."""
+    tensors = _network().state_dict()
+    first, second = prefixes
+    for found in tensors, _changed(tensors):
+        content = _named(first, tensors) | _named(second, found)
+        torch.save(wrap(content), tmp_path / "x.pt")
+        if found is tensors:
+            initialize(_network(), tmp_path / "x.pt")
+            continue
+        with pytest.raises(DataError, match=r"x\.pt: found two networks with different") as raised:
+            initialize(_network(), tmp_path / "x.pt")
+        assert first in str(raised.value)
+        assert second in str(raised.value)
+
+
 def test_depth_starts_at_zero_and_other_classes_untrained(tmp_path: Path) -> None:
     rgb, network = _network(3, 21), _network(4, 5)
     before = {name: tensor.clone() for name, tensor in network.state_dict().items()}

@@ -127,6 +127,27 @@ def test_files_of_a_fixed_batch_and_of_half_precision(tmp_path: Path) -> None:
     torch.testing.assert_close(half(images), images.half().float())
 
 
+@pytest.mark.parametrize("axes", [[0], [0, 1]])
+@pytest.mark.parametrize("batch", [1, "n"])
+def test_outputs_without_an_axis_of_images_are_of_files_for_one(
+    axes: list[int], batch: int | str, tmp_path: Path
+) -> None:
+    """Scores (K, h, w), and one score or labels (h, w)."""
+    first = slice(0, 1) if len(axes) > 1 else slice(None)
+    squeeze = helper.make_node("Squeeze", ["linear", "axes"], ["scores"])
+    tensors = {"axes": np.array(axes)}
+    shape = (batch, 3, 6, 7)
+    path = tmp_path / "net.onnx"
+    write_linear(path, WEIGHT[first], BIAS[first], squeeze, shape=shape, **tensors)
+    network, images = OnnxNetwork(path), torch.randn(3, 3, 6, 7)
+    if batch == 1:
+        plain = OnnxNetwork(write_linear(tmp_path / "plain.onnx", WEIGHT[first], BIAS[first]))
+        torch.testing.assert_close(network(images), plain(images))
+    else:
+        with pytest.raises(SettingError, match="without B only in files whose batch size is 1"):
+            network(images[:1])
+
+
 def test_what_is_no_network_of_photos_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"found images as tensor\(int64\); expected tensor"):
         OnnxNetwork(write_onnx(tmp_path / "whole.onnx", IDENTITY, kind=TensorProto.INT64))

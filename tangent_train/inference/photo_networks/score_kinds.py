@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from math import nan
 from typing import get_args
 
 import numpy as np
@@ -15,14 +14,26 @@ from tangent_train.checkpoints.scores import plain_scores
 from tangent_train.errors import SettingError, width_height
 from tangent_train.inference.photo_networks.network import PhotoNetwork
 
+_MASK_NAMES = 2
+"""Names, at most, of a class and its background."""
+
 _LISTED = 9
 """Labels in a message."""
 
 _VOID = -1
-"""The only negative value in label maps."""
+"""The value of NaN in label maps."""
 
 _ROUNDED = 2e-3
 """Relative error of sums of probabilities in float16."""
+
+_SCALES = (1, 100, 255)
+"""Sums of probabilities, also as percentages and bytes."""
+
+_BYTE = 255
+"""Steps of coarse probabilities: quantized, or clipped near 0 and 1."""
+
+_OVERSHOOT = 0.5
+"""Beyond 0 and 1, after bicubic interpolation."""
 
 _WILD = 30.0
 """Standard deviation of an image that drives scores far from 0 and 1."""
@@ -36,6 +47,11 @@ _OF_ONE_SCORE: dict[ScoreKind, ScoreKind] = {
 }
 """A softmax over one score is always 1, so that its networks end in a sigmoid."""
 
+_FACTOR = (
+    "If they are probabilities times a factor (100, 255), save the network without the factor and "
+    "set scores=sigmoid."
+)
+
 
 @torch.no_grad()
 def try_network(network: PhotoNetwork) -> tuple[ScoreKind, int]:
@@ -45,9 +61,11 @@ def try_network(network: PhotoNetwork) -> tuple[ScoreKind, int]:
     four images, for one alone may mislead:
 
     * One score: whole numbers are labels, numbers from 0 to 1 come from a sigmoid, and numbers
-      of both signs go into one.
-    * More scores: positive ones with the same sum at every pixel come from a softmax, others from
-      0 to 1 from sigmoids.
+      of both signs go into one. For one or two names, 0 and one number above 1 (255) are a mask,
+      which is taken as a sigmoid.
+    * More scores: those with the same sum at every pixel come from a softmax, also where they are
+      rounded or clipped, or slightly negative after a bicubic interpolation. So do those whose sum
+      over the whole image is 1. Others from 0 to 1 come from sigmoids.
 
     Args:
         network: The network; in evaluation mode afterwards.
@@ -57,35 +75,80 @@ def try_network(network: PhotoNetwork) -> tuple[ScoreKind, int]:
     """
     network.network.eval()
     kind = network.score_kind
-    pixels = torch.empty(0)
+    tried: list[Tensor] = []
     for image in _images(network):
-        scores = _scores(network, image).movedim(1, 0).flatten(1)
-        pixels = torch.cat([pixels, scores], dim=1) if len(pixels) else scores
+        tried.append(_scores(network, image).movedim(1, 0).flatten(1))
         if network.score_kind is None:
-            kind = _kind_of(pixels)
-        if kind in _CERTAIN or network.score_kind not in (None, "labels"):
+            kind = _kind_of(tried, len(network.score_names))
+        if kind in _CERTAIN:
             break
+    pixels = torch.cat(tried, dim=1)
+    if not pixels.isfinite().any():
+        raise SettingError(
+            "output of the network",
+            found="no finite number",
+            expected="scores or labels",
+            remedy="Check the weights: they may contain NaN.",
+        )
     count = len(pixels)
-    least, most = pixels.amin().item(), pixels.amax().item()
     if kind is None:
+        raise _unknown_kind(count, pixels)
+    if count == 1 and network.score_kind != "labels" and bool((pixels == 1).all()):
         raise SettingError(
             "scores",
-            found=f"{count} per pixel, from {least:g} to {most:g}",
-            expected=f"of a kind that can be recognized: {', '.join(get_args(ScoreKind))}",
-            remedy="Name it: scores=logits for a network whose last step, a softmax or a sigmoid, "
-            "is missing; scores=probabilities for one that ends in it.",
+            found="1 at every pixel, such as a softmax over one score",
+            expected="scores that differ",
+            remedy="Save the network without its softmax and set scores=sigmoid_logits. "
+            "For label maps, set scores=labels.",
         )
     if kind == "labels":
         found = np.unique(pixels.nan_to_num(_VOID).numpy())
         _check_labels(found.tolist(), len(network.score_names))
     kind = _OF_ONE_SCORE.get(kind, kind) if count == 1 else kind
-    if kind in ("sigmoid", "probabilities") and (least < 0 or (most > 1 and kind == "sigmoid")):
+    _check_range(kind, network.score_kind or kind, tried)
+    return kind, count
+
+
+def _unknown_kind(count: int, pixels: Tensor) -> SettingError:
+    """The error for scores ``(K, pixels)`` of no kind, with the settings that may be right."""
+    least, most = pixels.amin().item(), pixels.amax().item()
+    if count > 1:
+        remedy = (
+            "Name it: scores=logits for a network whose last step, a softmax, is missing; "
+            "scores=probabilities for one that ends in it."
+        )
+    elif least >= 0:
+        remedy = _FACTOR
+    else:
+        remedy = (
+            "Set scores=sigmoid_logits if a sigmoid follows, with numbers above 0 for the class. "
+            "A logarithm of a sigmoid is at most 0: save the network without the logarithm and set "
+            "scores=sigmoid."
+        )
+    return SettingError(
+        "scores",
+        found=f"{count} per pixel, from {least:g} to {most:g}",
+        expected=f"of a kind that can be recognized: {', '.join(get_args(ScoreKind))}",
+        remedy=remedy,
+    )
+
+
+def _check_range(kind: ScoreKind, stated: ScoreKind, tried: Sequence[Tensor]) -> None:
+    """Refuse numbers that are not probabilities."""
+    pixels = torch.cat(list(tried), dim=1)
+    least, most = pixels.amin().item(), pixels.amax().item()
+    wrong = False
+    if kind == "sigmoid" and not _is_mask(pixels):
+        wrong = least < -_OVERSHOOT or most > 1 + _OVERSHOOT
+    elif kind == "probabilities":
+        wrong = least < 0 and _kind_of(tried, 0) != kind
+    if wrong:
         raise SettingError(
             "scores",
-            found=f"{kind}, but numbers from {least:g} to {most:g}",
+            found=f"{stated}, but numbers from {least:g} to {most:g}",
             expected="probabilities from 0 to 1",
+            remedy=_FACTOR if least >= 0 else "",
         )
-    return kind, count
 
 
 def _images(network: PhotoNetwork) -> Iterator[Tensor]:
@@ -106,6 +169,8 @@ def _scores(network: PhotoNetwork, image: Tensor) -> Tensor:
     try:
         scores = plain_scores(network.network(image))
     except Exception as error:  # each network refuses images in its own words
+        if isinstance(error, SettingError) and str(error.subject).startswith("output of"):
+            raise
         raise SettingError(
             "image_size",
             found=f"{width_height(image.shape[2:])}, which the network does not take "
@@ -128,35 +193,65 @@ def _check_labels(found: Sequence[float], named: int) -> None:
     """Refuse other labels than the named ones, beyond which only void has a value, e.g. 255."""
     known = max(2, named)  # those of one class are 0, its background, and 1
     others = 0 not in found or (1 not in found and max(found) > 1)
-    if known in found or (named == 1 and others):
+    is_two_valued = len([label for label in found if label > 1]) <= 1
+    if known in found or (named == 1 and others) or (named <= _MASK_NAMES and not is_two_valued):
         raise SettingError(
             "class names of the network",
             found=f"{named}, for labels {', '.join(f'{label:g}' for label in found[:_LISTED])}",
             expected="a name for every label; one name is that of label 1, beside a background 0",
-            remedy="Name the others too, and set nothing= to the names of those that mean nothing.",
+            remedy="Name the others too, and set nothing= to the names of those that mean nothing."
+            + f" {_FACTOR}" * (named <= _MASK_NAMES),
         )
 
 
-def _kind_of(scores: Tensor) -> ScoreKind | None:
+def _kind_of(tried: Sequence[Tensor], named: int) -> ScoreKind | None:
     """The kind of the scores ``(K, pixels)`` of some images; None if they fit none."""
+    scores = torch.cat(list(tried), dim=1)
     whole = bool(((scores == scores.round()) | scores.isnan()).all())
     scores = scores[:, scores.isfinite().all(dim=0)]
-    least, most = (scores.amin().item(), scores.amax().item()) if scores.numel() else (nan, nan)
+    if not scores.numel():
+        return None
+    least, most = scores.amin().item(), scores.amax().item()
     within = least >= 0 and most <= 1
+    # ONNX's Softmax before version 13 normalizes over classes, rows and columns together.
+    over_image = least >= 0 and all(abs(float(s.double().sum()) - 1) < _ROUNDED for s in tried)
     if len(scores) == 1:
-        if whole and least >= _VOID:
-            return "labels"
-        if within:
-            return "sigmoid"
-        if least < 0 < most:
-            return "sigmoid_logits"
-    else:
-        sums = scores.sum(dim=0)
-        even = (sums - sums.mean()).abs().max() <= _ROUNDED * sums.mean()
-        if least >= 0 and even and most > least:
-            return "probabilities"
-        if within and most > least:
-            return "sigmoid"
-        if least < 0 or not whole:
-            return "logits"
-    return None
+        return _kind_of_one(scores, whole, named, over_image=over_image and not whole)
+    if most > least and (over_image or _has_even_sums(scores, whole)):
+        return "probabilities"
+    if within and most > least:
+        return "sigmoid"
+    return "logits" if least < 0 or not whole else None
+
+
+def _kind_of_one(scores: Tensor, whole: bool, named: int, *, over_image: bool) -> ScoreKind | None:
+    """The kind of one score."""
+    least, most = scores.amin().item(), scores.amax().item()
+    if named <= _MASK_NAMES and _is_mask(scores):
+        return "sigmoid"
+    if whole and len(np.unique(scores[scores < 0].numpy())) <= 1:  # of void, e.g. -1
+        return "labels"
+    if least >= 0 and most <= 1:
+        return None if over_image else "sigmoid"
+    return "sigmoid_logits" if least < 0 < most else None
+
+
+def _is_mask(scores: Tensor) -> bool:
+    """True of one score that is 0 or one number above 1, such as 255."""
+    values = np.unique(scores.numpy()).tolist()
+    return len(scores) == 1 and len(values) == 2 and values[0] == 0 and values[1] > 1
+
+
+def _has_even_sums(scores: Tensor, whole: bool) -> bool:
+    """True if the scores of every pixel have the same sum, up to rounding of each of them."""
+    sums = scores.sum(dim=0)
+    mean = sums.mean().item()
+    if scores.amin() < -mean:
+        return False
+    if (sums - mean).abs().max() <= _ROUNDED * mean:
+        return True
+    for scale in _SCALES:
+        step = max(scale / _BYTE, float(whole))
+        if (sums - scale).abs().max() <= min(len(scores) * step, scale / 2):
+            return True
+    return False

@@ -48,6 +48,14 @@ CROPS: Any = PerspectiveRepresentation(level=5)
         (FolderPanoramas, {"test_fraction": 0}, "test_fraction"),
         (FolderPanoramas, {"split_seed": -1}, "split_seed"),
         (FolderPanoramas, {"normalization": {"mean": [0]}}, "normalization"),
+        *(
+            (
+                FolderPanoramas,
+                {"normalization": {"mean": mean, "std": std}},
+                r"normalization: .*mean",
+            )
+            for mean, std in ((0.5, 0.5), ([".nan", 0, 0], [1, 1, 1]), ([None] * 3, [1] * 3))
+        ),
         (
             FolderPanoramas,
             {"normalization": {"mean": [123.7, 116.3, 103.5], "std": [58.4, 57.1, 57.4]}},

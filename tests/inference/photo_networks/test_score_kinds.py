@@ -62,6 +62,7 @@ def _softmax(scores: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 SOFTMAX = _node("Softmax", "linear", "p", axis=1)
+SOFTMAX_ONLY = _node("Softmax", "linear", "scores", axis=1)
 BY_HAND = [
     _node("Exp", "linear", "e"),
     _node("ReduceSum", "e", "total", "axes"),
@@ -132,18 +133,91 @@ def test_sixty_classes_are_certain_where_the_network_is(softmax: bool, tmp_path:
         assert set(np.unique(network.labels(mosaic.labels()))) == {label}
 
 
+def _quantized(levels: int) -> list[Any]:
+    """Rounding to steps of 1 / levels."""
+    return [
+        _node("Mul", "p", "many", "levels"),
+        _node("Round", "many", "rounded"),
+        _node("Div", "rounded", "scores", "levels"),
+    ]
+
+
+CLIP = _node("Clip", "p", "scores", "low", "high")
+CLIPPED = {"low": np.float32(0.001), "high": np.float32(0.999)}
+
+
+@pytest.mark.parametrize("count", [5, 60])
+@pytest.mark.parametrize(
+    ("nodes", "settings"),
+    [
+        (_quantized(255), {"levels": np.float32(255)}),
+        ([_node("Mul", "p", "many", "levels"), _node("Round", "many", "scores")],
+         {"levels": np.float32(255)}),
+        ([CLIP], CLIPPED),
+    ],
+)  # fmt: skip
+def test_coarse_probabilities_are_those_of_a_softmax(
+    nodes: list[Any], settings: dict[str, Any], count: int, tmp_path: Path
+) -> None:
+    weight = np.concatenate([WEIGHT, np.zeros((count - 5, 3), np.float32)])
+    bias = np.concatenate([BIAS, np.full(count - 5, -4, np.float32)])
+    constants = {name: np.asarray(value) for name, value in settings.items()}
+    names = tuple(map(str, range(count)))
+    for kind, expected in ("Softmax", "probabilities"), ("Sigmoid", "sigmoid"):
+        if (kind, nodes[-1].op_type) == ("Sigmoid", "Round"):
+            continue  # whole numbers without equal sums are refused
+        first = _node(kind, "linear", "p", **({"axis": 1} if kind == "Softmax" else {}))
+        path = write_linear(tmp_path / "net.onnx", weight, bias, first, *nodes, **constants)
+        assert try_network(_network(path, names)) == (expected, count)
+
+
+def test_a_softmax_over_the_whole_image_gives_probabilities(tmp_path: Path) -> None:
+    """ONNX's Softmax before version 13, with axis=1 or none."""
+    flat = _node("Flatten", "linear", "flat"), _node("Softmax", "flat", "p", axis=1)
+    nodes = [*flat, _node("Shape", "linear", "shape"), _node("Reshape", "p", "scores", "shape")]
+    trained = _imported(write_linear(tmp_path / "net.onnx", WEIGHT, BIAS, *nodes))
+    images = _images(16, 24)[:1]
+    found = trained.network(images).softmax(dim=1).movedim(1, -1)
+    np.testing.assert_allclose(found, _softmax(_linear(images)), atol=1e-5)
+    path = write_linear(tmp_path / "one.onnx", WEIGHT[:1], BIAS[:1], *nodes)
+    with pytest.raises(SettingError, match="scores: found 1 per pixel"):
+        _imported(path, NAMES[:1])
+
+
+@pytest.mark.parametrize("count", [5, 60])
+def test_slightly_negative_probabilities_after_a_bicubic_interpolation(
+    count: int, tmp_path: Path
+) -> None:
+    weight = np.concatenate([WEIGHT, np.zeros((count - 5, 3), np.float32)])
+    bias = np.concatenate([BIAS, np.full(count - 5, -4, np.float32)])
+    pool = _node("AveragePool", "p", "small", kernel_shape=[2, 2], strides=[2, 2])
+    resize = helper.make_node("Resize", ["small", "", "scales"], ["scores"], mode="cubic")
+    scales = np.array([1, 1, 2, 2], np.float32)
+    path = write_linear(tmp_path / "net.onnx", weight, bias, SOFTMAX, pool, resize, scales=scales)
+    names = tuple(map(str, range(count)))
+    assert try_network(_network(path, names)) == ("probabilities", count)
+    stated = _network(path, names, score_kind="probabilities")
+    assert try_network(stated) == ("probabilities", count)
+
+
 THRESHOLD = [
     _node("Greater", "linear", "above", "zero"),
     _node("Cast", "above", "scores", to=TensorProto.UINT8),
 ]
 LABELS = {"returned": TensorProto.UINT8, "zero": np.array(0, np.float32)}
+MASK = [
+    _node("Greater", "linear", "above", "zero"),
+    _node("Where", "above", "scores", "on", "off"),
+]
+BYTES = LABELS | {"on": np.array(255, np.uint8), "off": np.array(0, np.uint8)}
 
 
 @pytest.mark.parametrize("names", [("sky",), ("other", "sky")])
 @pytest.mark.parametrize(
     ("nodes", "settings"),
-    [([], {}), ([_node("Sigmoid", "linear", "scores")], {}), (THRESHOLD, LABELS)],
-)
+    [([], {}), ([_node("Sigmoid", "linear", "scores")], {}), (THRESHOLD, LABELS),
+     (MASK, BYTES)],
+)  # fmt: skip
 def test_one_score_is_of_a_class_and_its_background(
     nodes: list[Any], settings: dict[str, Any], names: tuple[str, ...], tmp_path: Path
 ) -> None:
@@ -196,6 +270,7 @@ def test_where_no_sigmoid_is_above_one_half_nothing_wins(tmp_path: Path) -> None
     [
         (TensorProto.INT64, -1),
         (TensorProto.INT64, 255),
+        (TensorProto.INT64, -(2.0**63)),
         (TensorProto.INT32, 300),
         (TensorProto.UINT8, 255),
         (TensorProto.FLOAT, np.nan),
@@ -237,6 +312,51 @@ def test_other_values_of_label_maps_are_unknown(
         map_classes(trained, merged, "never")
 
 
+@pytest.mark.parametrize("batch", [1, "n"])
+def test_one_score_without_an_axis_of_images(batch: int | str, tmp_path: Path) -> None:
+    """Files of a fixed batch of 1 often lack it."""
+    nodes = [_node("Sigmoid", "linear", "p"), _node("Squeeze", "p", "scores", "axes")]
+    axes, shape = np.array([0, 1]), (batch, 3, 16, 24)
+    path = tmp_path / "net.onnx"
+    write_linear(path, WEIGHT[:1], BIAS[:1], *nodes, shape=shape, axes=axes)
+    if batch == 1:
+        assert try_network(_network(path, NAMES[:1])) == ("sigmoid", 1)
+        return
+    with pytest.raises(SettingError, match=r"output of net\.onnx: found 16×24; .* batch size is 1"):
+        try_network(_network(path, NAMES[:1]))
+
+
+@pytest.mark.parametrize("suffix", ["ckpt", "safetensors", "onnx"])
+def test_label_maps_of_a_checkpoint_and_of_its_export(suffix: str, tmp_path: Path) -> None:
+    name = f"{LabelMaps.__module__}.{LabelMaps.__qualname__}"
+    network, names = LabelMaps(), ("a", "b", "(void)", "c")
+    photo = PhotoNetwork(network, {"_target_": name}, names, UNIT, (16, 24))
+    settings: dict[str, Any] = {"level": 5, "base_level": 0, "nothing": ["(void)"]}
+    trained = import_network(photo, tmp_path / "net.ckpt", **settings)
+    if suffix != "ckpt":
+        export_network(trained, tmp_path / f"net.{suffix}")
+    again, images = load_trained(tmp_path / f"net.{suffix}", [name]), _images(32, 48)
+    assert again.score_kind == "labels"
+    expected = np.array([1, 2, 0, 3])[network(images)]
+    labels = again.labels(again.network(images).argmax(dim=1).numpy().astype(np.uint8))
+    np.testing.assert_array_equal(labels, expected)
+    with pytest.raises(SettingError, match="unmapped: found never, for a network that returns lab"):
+        map_classes(again, ClassMap("one", None, {"x": ["a"]}), "never")
+
+
+class LabelMaps(nn.Module):
+    """Four labels of bright and dark pixels."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.layer = nn.Conv2d(3, 4, 1, bias=False)
+        generator = torch.Generator().manual_seed(0)
+        self.layer.weight.data = torch.randn(4, 3, 1, 1, generator=generator)
+
+    def forward(self, images: Tensor) -> Tensor:
+        return self.layer(images).argmax(dim=1)
+
+
 class Wrong(nn.Module):
     """Scores that fit no kind, or a wrong number."""
 
@@ -259,14 +379,18 @@ class Wrong(nn.Module):
             NAMES[:1],
             "scores: found 1 per pixel, from .* to 255",
         ),
-        (1, nn.functional.logsigmoid, NAMES[:1], "scores=probabilities"),
+        (1, lambda x: (255 * x.sigmoid()).round(), NAMES[:1], "without the factor and set scores="),
+        (1, lambda x: (255 * x.sigmoid()).round(), NAMES[:2], "without the factor and set scores="),
+        (1, lambda x: 100 * x.sigmoid(), NAMES[:1], "without the factor and set scores=sigmoid"),
+        (1, nn.functional.logsigmoid, NAMES[:1], "without the logarithm and set scores=sigmoid"),
+        (1, lambda x: x.softmax(1), NAMES[:2], "1 at every pixel, such as a softmax .*scores=sig"),
+        (5, lambda x: x * torch.nan, NAMES, "output of the network: found no finite number"),
         (4, lambda x: x.abs().round(), NAMES[:4], "scores: found 4 per pixel, from 0 to"),
         (1, lambda x: x, NAMES[:3], "found 3, for 1 score; .* the background first"),
         (5, lambda x: x, NAMES[:4], "found 4, for 5 scores"),
         (5, lambda x: x.sigmoid(), NAMES[:4], "found 4, for 5 scores"),
         (5, lambda x: x.argmax(1), NAMES[:4], "found 4, for labels 0, 1, 2, 3, 4"),
-        (1, lambda x: (x[:, 0] > 0) * 255, NAMES[:1], "found 1, for labels 0, 255"),
-        (1, lambda x: x.softmax(1), NAMES[:1], "found 1, for labels 1;"),
+        (1, lambda x: x.softmax(1), NAMES[:1], "1 at every pixel, such as a softmax .*scores=sig"),
         (2, lambda x: x[:, :, 1:], NAMES[:2], r"output of the network: found \(1, 2, 15, 24\)"),
     ],
 )
@@ -289,5 +413,17 @@ def test_what_the_user_says_counts(tmp_path: Path) -> None:
     expected = torch.from_numpy(_linear(images)).sigmoid().movedim(-1, 1).float()
     torch.testing.assert_close(trained.network(images), expected, atol=1e-5, rtol=1e-5)
     path = write_linear(tmp_path / "net.onnx", WEIGHT, BIAS)
-    with pytest.raises(SettingError, match="scores: found probabilities, but numbers from -12"):
+    with pytest.raises(SettingError, match="scores: found probabilities, but numbers from -"):
         _imported(path, score_kind="probabilities")
+    path = write_linear(tmp_path / "one.onnx", WEIGHT[:1], BIAS[:1], SOFTMAX_ONLY)
+    with pytest.raises(SettingError, match="scores: found 1 at every pixel"):
+        _imported(path, NAMES[:1], score_kind="probabilities")
+    factor = _node("Mul", "p", "scores", "hundred")
+    sigmoid = _node("Sigmoid", "linear", "p")
+    hundred = np.array(100, np.float32)
+    arrays = WEIGHT[:1], BIAS[:1]
+    path = write_linear(tmp_path / "percent.onnx", *arrays, sigmoid, factor, hundred=hundred)
+    with pytest.raises(
+        SettingError, match=r"found probabilities, but numbers .*the factor and set"
+    ):
+        _imported(path, NAMES[:1], score_kind="probabilities")
