@@ -143,7 +143,7 @@ _FAULTS = [
     ("stanford", "rgb", _truncate, "truncated; expected a whole PNG"),
     ("stanford", "labels", _corrupt, "no image that can be decoded"),
     ("stanford", "depth", _to_8_bits, "8-bit [a-zA-Z]+; expected 16-bit"),
-    ("stanford", "labels", _smaller, "pixels; expected .*, as "),
+    ("stanford", "labels", _smaller, r"\(width × height\); expected .*, as "),
     ("stanford", "labels", Path.unlink, "No such file"),
     ("stanford", "labels", _past_the_table, r"instance 521 in 1 pixel; expected 0 to 520"),
     ("stanford", "rgb", _link_to_itself, "Too many levels of symbolic links"),
