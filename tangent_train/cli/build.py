@@ -178,7 +178,7 @@ def _try_schedule(task: Any, settings: Settings) -> None:
     def schedule() -> None:
         made = task.optimization(lambda: 1000)
         if isinstance(made, dict):
-            made["optimizer"].step()
+            made["optimizer"].step(lambda: 0.0)  # some optimizers need a closure
             made["lr_scheduler"]["scheduler"].step()
 
     trials: dict[str, Callable[[], object]] = {

@@ -24,7 +24,7 @@ def ends_at(epochs: int, make_optimizer: Callable[..., Any], make_scheduler: Any
     scheduler = make_scheduler(optimizer)
     rates = [optimizer.param_groups[0]["lr"]]
     for _ in range(2 * epochs + 1):
-        optimizer.step()
+        optimizer.step(lambda: 0.0)  # some optimizers need a closure
         scheduler.step()
         rates.append(optimizer.param_groups[0]["lr"])
     changes = [after - before for before, after in itertools.pairwise(rates)]
