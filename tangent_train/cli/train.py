@@ -138,7 +138,7 @@ def _check_resumed(settings: Settings, config: Mapping[str, Any], epoch: int | N
             remedy="Start a new run for it.",
         )
     begun, epochs = (epoch or 0) + 1, settings["trainer"].get("max_epochs")
-    if epochs is not None and -1 < epochs < begun:
+    if isinstance(epochs, int) and -1 < epochs < begun:  # other types are refused when it is made
         raise SettingError(
             "trainer.max_epochs",
             found=f"{epochs} for a run that is in its epoch {begun}",

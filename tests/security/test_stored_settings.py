@@ -122,10 +122,15 @@ def test_what_cannot_be_resumed_is_said_in_a_line(
     monkeypatch.chdir(run.parent)
     theirs = tmp_path / "theirs"
     (theirs / "checkpoints").mkdir(parents=True)
-    for changed in ({"callbacks": "x"}, {"optimizer_states": [{"state": {}, "param_groups": "x"}]}):
+    said = "found what cannot be resumed"
+    endless = {**content["config"], "trainer": {**content["config"]["trainer"], "max_epochs": {}}}
+    for changed, message in (
+        ({"callbacks": "x"}, said),
+        ({"optimizer_states": [{"state": {}, "param_groups": "x"}]}, said),
+        ({"config": endless}, r"trainer\.max_epochs"),
+    ):
         torch.save(content | changed, theirs / "checkpoints" / "last.ckpt")
-        refused = pytest.raises(SystemExit, match=r"^tangent-train: .*found what cannot be resumed")
-        with refused:
+        with pytest.raises(SystemExit, match=rf"^tangent-train: .*{message}"):
             run_command(monkeypatch, "train", f"resume={theirs}", "data.root=rooms")
 
 
