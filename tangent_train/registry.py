@@ -366,6 +366,11 @@ def is_text(value: Any) -> bool:
     return isinstance(value, str) and "\n" not in value and printable(value) == value
 
 
+def is_class_name(value: Any) -> bool:
+    """True for a `Text` that can be written as UTF-8; names of files may hold other bytes."""
+    return is_text(value) and not any("\ud800" <= letter <= "\udfff" for letter in value)
+
+
 def _fits(value: Any, kind: Any) -> bool:
     """Whether a value is of a kind: a type of plain values, or `Text`."""
     origin, arguments = get_origin(kind), get_args(kind)

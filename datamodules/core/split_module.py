@@ -23,7 +23,7 @@ from datamodules.core.inputs import Normalization
 from datamodules.core.loading import EpochSampler, make_loader, this_process
 from datamodules.core.problems import Problems
 from tangent_train.errors import DataError, SettingError, printable
-from tangent_train.registry import is_text
+from tangent_train.registry import is_class_name
 from tangent_train.threads import in_threads
 
 Kind = Literal["segmentation", "classification"]
@@ -290,7 +290,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
                 found=f"{names[0]} first" if names else "none",
                 expected="unknown, then the classes: label 0 is ignored",
             )
-        strange = [name for name in names if not is_text(name)]
+        strange = [name for name in names if not is_class_name(name)]
         if strange:
             raise SettingError(
                 f"class_names of {type(self).__name__}",

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from datamodules.images.image_files import composed
 from tangent_train.errors import DataError, counted
 from tangent_train.files import read_json
-from tangent_train.registry import is_text
+from tangent_train.registry import is_class_name
 
 UNKNOWN_NAME = "unknown"
 """Name of label 0, pixels without a class."""
@@ -160,7 +160,7 @@ def _check_names(path: Path, names: list[Any]) -> None:
         raise DataError(
             path, found=f"{len(names)} classes", expected=f"1 to {_MOST_CLASSES} classes"
         )
-    strange = [name for name in names if not is_text(name) or not name.strip()]
+    strange = [name for name in names if not is_class_name(name) or not name.strip()]
     if strange:
         remedy = "A name is a line of text, without control characters."
         found = f"class name {strange[0]!r}"

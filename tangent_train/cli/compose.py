@@ -52,9 +52,9 @@ def literal_paths(command: str, arguments: Sequence[str]) -> list[str]:
         if _PLAIN.fullmatch(value) or not re.fullmatch(r"\w[\w.]*", setting):
             literal.append(argument)
         elif re.fullmatch(r"hydra\..*\bdir", setting):
-            within = _in_quotes(value)
-            text = QuotedString(value if within is None else within, Quote.single)
-            literal.append(f"{name}={text.with_quotes()}")
+            is_quoted = _in_quotes(value) is not None
+            text = value if is_quoted else QuotedString(value, Quote.single).with_quotes()
+            literal.append(f"{name}={text}")
         elif _is_path(command, setting, value, arguments):
             paths = map(_quoted_path, values_of_sweep(value, arguments))
             literal.append(f"{name}={','.join(paths)}")

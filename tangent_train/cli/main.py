@@ -146,6 +146,7 @@ def _run(command: str, config: DictConfig, stored: Any, visible_gpus: str | None
     check_settings(command, settings, HydraConfig.get().overrides.task)
     with elsewhere():
         run = getattr(import_module(f"tangent_train.cli.{name}"), name)
+        import_module("datamodules.core.split_module")  # for commands that import no library yet
     if command == "transfer":  # its stages keep the references of the config
         return run(config)
     return run(settings) if stored is None else run(*stored.settings(settings))

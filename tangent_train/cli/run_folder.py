@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 from contextlib import ExitStack, suppress
 from itertools import count
@@ -54,9 +55,17 @@ class RunFolder(Callback):
 
 def _take(config: DictConfig, section: str, *, lock: bool) -> None:
     named = OmegaConf.to_container(config.hydra[section], resolve=False)
-    is_new = isinstance(named, dict) and "${now:" in str(named["dir"])
+    is_new = isinstance(named, dict) and bool(re.search(r"(?<!\\)\$\{now:", str(named["dir"])))
+    place = Path(config.hydra[section].dir)
+    if "${" in str(place.absolute()):
+        raise SystemExit from SettingError(
+            place.absolute(),
+            found="a name with ${, which Hydra would replace",
+            expected="another name for the folder of a run",
+            remedy="Rename the folder, or start in another one.",
+        )
     try:
-        folder, made = _make(Path(config.hydra[section].dir), is_new=is_new)
+        folder, made = _make(place, is_new=is_new)
         if lock:
             folders.enter_context(FileLock(folder / _LOCK, blocking=False))
     except Timeout:

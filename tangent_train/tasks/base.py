@@ -323,7 +323,8 @@ class Task(lightning.LightningModule, ABC):
         """Planned steps and epochs of the training; −1 without an end."""
         trainer = self.trainer
         steps = trainer.estimated_stepping_batches
-        each = math.ceil(trainer.num_training_batches / trainer.accumulate_grad_batches)
+        each = trainer.num_training_batches / trainer.accumulate_grad_batches
+        each = math.ceil(each) if math.isfinite(each) else each  # of data without an end
         if not math.isfinite(steps):
             return {"steps": -1, "epochs": -1}
         return {"steps": int(steps), "epochs": math.ceil(steps / max(each, 1))}

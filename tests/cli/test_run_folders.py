@@ -111,6 +111,21 @@ def test_a_refused_run_leaves_nothing(
     assert [path.name for path in tmp_path.iterdir()] == ["net.onnx"]
 
 
+@pytest.mark.parametrize("name", ["${oc.env:HOME}", "${now:%Y}"])
+def test_folders_that_hydra_would_rename_are_refused(
+    name: str, tmp_path: Path, run: Run, begun: list[Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refused = pytest.raises(
+        SystemExit, match=r"^tangent-train: .*found a name with \$\{, which Hydra"
+    )
+    (tmp_path / name).mkdir()
+    monkeypatch.chdir(tmp_path / name)
+    with refused:
+        run("train")
+    assert not list((tmp_path / name).iterdir())
+    assert begun == []
+
+
 def test_what_was_there_before_a_refused_run_stays(tmp_path: Path, run: Run) -> None:
     (tmp_path / "mine").mkdir()
     with pytest.raises(SystemExit, match="level: found high"):

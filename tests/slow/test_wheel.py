@@ -82,4 +82,4 @@ def test_packages_of_the_same_names_on_the_path_hide_nothing(
     *notes, refusal = done.stderr.splitlines()
     for name, note in zip(("datamodules", "models"), notes, strict=True):
         assert note.startswith(f"{tmp_path / name / '__init__.py'} is not used")
-    assert refusal.startswith("tangent-check: nowhere/classes.json: found no folder nowhere")
+    assert refusal.startswith("tangent-check: nowhere: found no such folder")

@@ -13,7 +13,7 @@ from datamodules.core.inputs import Normalization
 from tangent_train.checkpoints.content import ScoreKind
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import read_json
-from tangent_train.registry import is_text
+from tangent_train.registry import is_class_name
 
 USUAL_SIZE = (512, 512)
 """Rows and columns of the photos, where nothing says what they were."""
@@ -76,6 +76,6 @@ def names_of(content: Any, path: Path, expected: str) -> tuple[str, ...]:
     names = content if isinstance(content, list) else []
     if isinstance(content, dict):
         names = [content.get(str(place)) for place in range(len(content))]
-    if not names or not all(name and is_text(name) for name in names):
+    if not names or not all(name and is_class_name(name) for name in names):
         raise DataError(path, found=str(content)[:80], expected=expected)
     return tuple(names)

@@ -32,6 +32,7 @@ def test_a_list_of_classes_and_values_without_one(tmp_path: Path) -> None:
         ('["a", 3]', "class name 3"),
         ('["a", "b", "a"]', """class 'a' twice; expected every name once. For several values"""),
         ('{"ü": 1, "u\\u0308": 2}', "class 'ü' twice"),
+        (json.dumps(["a", "\ud800"]), "without control characters"),
         (json.dumps(["a", "b\x1b[2J"]), r"class name 'b\x1b[2J'"),
         (json.dumps({"a": 1, "b\nc": 2}), r"class name 'b\nc'"),
         (json.dumps(["a", "b\x85"]), "without control characters"),
