@@ -108,7 +108,7 @@ class ImageReader(ABC):
         """Classes, 0 where unknown.
 
         Args:
-            files: Of the image.
+            files: Files of the image.
             shape: ``(h, w)`` of the result, see `resize_nearest`; by default that of the file.
 
         Raises:
@@ -322,7 +322,7 @@ class _Reading:
     """Reads the images of a data set.
 
     Attributes:
-        reader: Of the data set.
+        reader: Reader of the data set.
         num_classes: K + 1, the unknown class included.
         shape: Rows and columns of the result; None for those of the files.
     """
@@ -360,7 +360,7 @@ class _Reading:
 
         Args:
             label_counts: The pixels of each label are added under the name of the image.
-            files: Of the image.
+            files: Files of the image.
         """
 
         def count_labels(files: ImageFiles) -> None:
@@ -404,8 +404,8 @@ def check_headers(
     """Check that all files of an image are there, whole and of one size; nothing is decoded.
 
     Args:
-        files: Of the image.
-        reader: Of the data set.
+        files: Files of the image.
+        reader: Reader of the data set.
         problems: Problems are added under the image's name.
         erp_height: Required rows of a panorama; None for photos.
 

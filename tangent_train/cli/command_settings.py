@@ -86,7 +86,7 @@ class InputSettings:
         input: See `datamodules.images.image_files.image_paths`.
         crop: The part of the sphere that panoramas show, see `area_of_crop`; None for that of
             their GPano tags.
-        every: Of videos, the first and then every n-th frame is taken.
+        every: Step between the frames of a video: 1 takes all, n the first and every n-th one.
     """
 
     input: str | Path | None = field(metadata=_IMAGES)

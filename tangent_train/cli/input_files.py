@@ -1,4 +1,4 @@
-"""What ``tangent-predict`` and ``tangent-render`` take: images, and the frames of videos."""
+"""Input of ``tangent-predict`` and ``tangent-render``: images, and the frames of videos."""
 
 from __future__ import annotations
 

@@ -167,8 +167,8 @@ class Network:
                 `area_of_crop`; None for that of its file's GPano tags, else the whole sphere,
                 W = 2 H.
             upright: Align a panorama with gravity: ``pose`` by its file's GPano tags, ``auto``
-                likewise, else as estimated from the image.
-            max_tilt_deg: Of ``auto``: the largest tilt considered.
+                by these tags or, without them, by an estimate from the image.
+            max_tilt_deg: Largest tilt that ``auto`` considers, in degrees.
             mask: Pixels of a panorama that get the label 0: below a latitude in degrees; black in
                 a file; or 0 in an array or tensor. See `Masks`.
 

@@ -105,9 +105,12 @@ def test_what_arrives_is_what_was_typed(text: str) -> None:
         assert arrived(f"input={quoted(text)}") == text
 
 
-def test_the_home_folder_numbers_and_sweeps(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("HOME", "/home/me")
-    for text, path in (("~", "/home/me"), ("~/a b", "/home/me/a b"), ("./~", "./~"), ("~x", "~x")):
+def test_the_home_folder_numbers_and_sweeps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    home = str(tmp_path)
+    monkeypatch.setenv("HOME", home)
+    for text, path in (("~", home), ("~/a b", f"{home}/a b"), ("./~", "./~"), ("~x", "~x")):
         assert _received("predict", f"input={text}") == path
     assert _received("predict", "input='my rooms'") == "my rooms"
     assert _received("predict", "mask=2024") == 2024

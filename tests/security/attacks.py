@@ -36,7 +36,7 @@ def json_attacks(forbidden: Path) -> Iterator[Any]:
     """Those that JSON and YAML can hold as well.
 
     Args:
-        forbidden: A folder that exists and nobody else names.
+        forbidden: An existing folder that only attacks name.
     """
     command = {"_target_": f"{CANARY}.fire", "path": str(forbidden / "x")}
     for name in _NAMES:
@@ -154,7 +154,7 @@ def second_readings(
     Args:
         settings: Honest ones.
         at: Places of them.
-        forbidden: A folder that exists and nobody else names.
+        forbidden: An existing folder that only attacks name.
     """
     command = {"_target_": f"{CANARY}.fire", "path": str(forbidden / "x")}
     for k, place in enumerate(at):

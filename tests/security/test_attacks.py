@@ -66,7 +66,7 @@ def _light(content: dict[str, Any]) -> dict[str, Any]:
 
 
 def _evaluation(content: dict[str, Any], path: Path, *typed: str) -> Callable[[Path], None]:
-    """What ``tangent-evaluate checkpoint=<path> data.root=rooms …`` builds.
+    """Return a function that builds ``tangent-evaluate checkpoint=<path> data.root=rooms …``.
 
     Args:
         content: An honest checkpoint.

@@ -1,4 +1,4 @@
-"""What a photo network returns, found by trying it."""
+"""Find out by trial which kind of scores a photo network returns."""
 
 from __future__ import annotations
 

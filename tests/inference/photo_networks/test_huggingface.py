@@ -330,7 +330,7 @@ def test_backbones_are_not_looked_up(backbone: Any, folder: Path, tmp_path: Path
 
 
 def fetching() -> None:
-    """A network that needs a file of the hub, at an address where nobody answers."""
+    """A network that needs a file of the hub, at an address without a server."""
     huggingface_hub.hf_hub_download("someone/net", "config.json", endpoint="http://127.0.0.1:9")
 
 

@@ -1,4 +1,4 @@
-"""What networks return: found by trying, and turned into the probabilities of their classes."""
+"""Kinds of scores are found by trial and converted to probabilities of the classes."""
 
 from __future__ import annotations
 
