@@ -13,7 +13,6 @@ from lightning import LightningDataModule
 from lightning.pytorch.trainer.states import TrainerFn
 from lightning.pytorch.utilities import rank_zero_only, rank_zero_warn
 from numpy.typing import NDArray
-from rich.console import Console
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
@@ -22,8 +21,9 @@ from datamodules.core.found import SPLITS, Found, Item, Split, SplitItems
 from datamodules.core.inputs import Normalization
 from datamodules.core.loading import EpochSampler, make_loader, this_process
 from datamodules.core.problems import Problems
-from tangent_train.errors import DataError, SettingError, printable
+from tangent_train.errors import DataError, SettingError
 from tangent_train.registry import is_class_name
+from tangent_train.say import say
 from tangent_train.threads import in_threads
 
 Kind = Literal["segmentation", "classification"]
@@ -485,4 +485,4 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
 @rank_zero_only
 def tell(text: str) -> None:
     """Print text as it is, in the first process."""
-    Console(soft_wrap=True, highlight=False).print(printable(text), markup=False)
+    say(text)

@@ -8,10 +8,10 @@ from contextlib import redirect_stdout
 from typing import TYPE_CHECKING, Any
 
 from datamodules.core.class_weights import label_doubts
-from tangent_train.cli.say import say
 from tangent_train.errors import counted
 from tangent_train.registry import make
 from tangent_train.results.tables import Table, percent
+from tangent_train.say import say
 
 if TYPE_CHECKING:
     import numpy as np

@@ -26,7 +26,6 @@ from tangent_train.checkpoints.scores import Scores, size_multiple_of
 from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
 from tangent_train.cli.build import Settings, build, build_trained, check_fits, shown
 from tangent_train.cli.command_settings import EvaluateSettings
-from tangent_train.cli.say import say
 from tangent_train.cli.settings import typed
 from tangent_train.cli.stored import GROUPS, run_settings
 from tangent_train.errors import SettingError, at_least
@@ -43,6 +42,7 @@ from tangent_train.results.evaluation import (
 )
 from tangent_train.results.html import write_report
 from tangent_train.results.record import Record
+from tangent_train.say import say
 
 # lightning 2.6 asks torch's tree library in a way torch ≥ 2.13 deprecates: nothing to do about it.
 warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)`", FutureWarning)

@@ -10,11 +10,11 @@ from rich.text import Text
 
 from tangent_train.checkpoints.trained import load_trained
 from tangent_train.cli.command_settings import ExportSettings as Settings
-from tangent_train.cli.say import say
 from tangent_train.cli.settings import check_new, typed
 from tangent_train.errors import printable, width_height
 from tangent_train.inference.export import export_network
 from tangent_train.inference.predictor import sees_rays
+from tangent_train.say import say
 
 
 def export(config: Mapping[str, Any]) -> None:

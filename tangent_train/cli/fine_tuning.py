@@ -15,10 +15,10 @@ from models import initialize
 from tangent_train.checkpoints.trained import Start, completed_settings, start_in
 from tangent_train.cli.build import Settings
 from tangent_train.cli.evaluate import Run
-from tangent_train.cli.say import say
 from tangent_train.cli.settings import Trust, typed
 from tangent_train.errors import DataError, printable
 from tangent_train.registry import SettingsFile, make
+from tangent_train.say import say
 
 _TYPED = re.compile(r"[+~]*network[.@=]")
 _RGB = 3

@@ -15,10 +15,10 @@ from rich.text import Text
 
 from tangent_train.checkpoints.content import ScoreKind
 from tangent_train.cli.command_settings import ImportSettings as Settings
-from tangent_train.cli.say import say
 from tangent_train.cli.settings import check_new, typed
 from tangent_train.errors import SettingError, printable, width_height
 from tangent_train.imports import elsewhere
+from tangent_train.say import say
 
 if TYPE_CHECKING:
     from tangent_train.checkpoints.trained import TrainedNetwork

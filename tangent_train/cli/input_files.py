@@ -10,9 +10,9 @@ from datamodules.images.image_files import IMAGE_SUFFIXES, image_paths, short_na
 from datamodules.images.videos import VIDEO_SUFFIXES, read_frames, read_video_size
 from tangent_train.cli.command_settings import InputSettings
 from tangent_train.cli.each import Job, Shard
-from tangent_train.cli.say import say
 from tangent_train.errors import DataError, at_least
 from tangent_train.results.predictions import frame_name
+from tangent_train.say import say
 
 
 def is_video(path: Path) -> bool:

@@ -15,7 +15,6 @@ from rich.progress import track
 from datamodules.core.panorama_pairs import ImagePairs, PanoramaPair, PanoramaPairs
 from datamodules.images.pixel_files import read_image_size
 from tangent_train.cli.command_settings import KeypointsSettings as Settings
-from tangent_train.cli.say import say
 from tangent_train.cli.settings import typed
 from tangent_train.errors import DataError, SettingError, width_height
 from tangent_train.files import read_json, write_bytes
@@ -24,6 +23,7 @@ from tangent_train.keypoints.two_view import colmap
 from tangent_train.registry import check_fields, make, maker_of
 from tangent_train.results.keypoints.compare import AS_GIVEN, Comparer, Comparison, Row, Ways
 from tangent_train.results.keypoints.report import KeypointReport, matches_png
+from tangent_train.say import say
 
 _OF_IMAGES = ("left", "right", "input", "pairing")
 

@@ -23,7 +23,6 @@ from tangent_train.cli.command_settings import PredictSettings as Settings
 from tangent_train.cli.each import Job, Shard, each
 from tangent_train.cli.input_files import Inputs, is_video
 from tangent_train.cli.predict_shards import PredictionShard
-from tangent_train.cli.say import say
 from tangent_train.cli.settings import typed
 from tangent_train.errors import SettingError, counted
 from tangent_train.inference.class_maps import load_class_map, map_classes
@@ -39,6 +38,7 @@ from tangent_train.results.predictions import (
     class_shares,
     is_result_in,
 )
+from tangent_train.say import say
 
 _DECISIVE = (
     "checkpoint", "class_map", "unmapped", "depth_scale", "projection", "crop", "fov", "level",

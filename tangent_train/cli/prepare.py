@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from tangent_train.cli.build import Settings
 from tangent_train.cli.each import Shard
-from tangent_train.cli.say import say
 from tangent_train.registry import make
+from tangent_train.say import say
 
 
 def prepare(settings: Settings) -> None:

@@ -32,7 +32,6 @@ from datamodules.images.tangent_results import TangentResults, result_files
 from tangent_train.cli.command_settings import RenderSettings as Settings
 from tangent_train.cli.each import Job, each
 from tangent_train.cli.input_files import Inputs, is_video
-from tangent_train.cli.say import say
 from tangent_train.cli.settings import check_new, typed
 from tangent_train.errors import DataError, SettingError, counted
 from tangent_train.geometry import TangentGrid, nearest_level, rotation_about
@@ -46,6 +45,7 @@ from tangent_train.rendering.camera_files import (
     write_poses,
 )
 from tangent_train.rendering.figure import tangent_figure
+from tangent_train.say import say
 
 _Work = Callable[[Job, Callable[[float], object]], Path]
 

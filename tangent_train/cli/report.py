@@ -6,9 +6,9 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from tangent_train.cli.say import say
 from tangent_train.errors import DataError
 from tangent_train.imports import elsewhere
+from tangent_train.say import say
 
 
 def report(arguments: Sequence[str]) -> None:

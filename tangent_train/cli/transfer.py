@@ -16,13 +16,13 @@ from omegaconf import DictConfig, OmegaConf
 
 from tangent_train.checkpoints.trained import TrainedNetwork
 from tangent_train.cli.compose import without_interpolation
-from tangent_train.cli.say import say
 from tangent_train.cli.stored import StoredNetwork, run_settings
 from tangent_train.cli.transfer_stages import Stage, plan, run_stage, stage_command, stage_state
 from tangent_train.cli.transfer_views import views_of
 from tangent_train.errors import DataError, SettingError
 from tangent_train.imports import elsewhere
 from tangent_train.registry import check_fields
+from tangent_train.say import say
 
 _OF_TRAINING = ("ema", "fine_tuning", "network", "optimizer", "scheduler")
 

@@ -25,10 +25,10 @@ from tangent_train.checkpoints.content import read_settings
 from tangent_train.cli import main
 from tangent_train.cli.build import _fault
 from tangent_train.cli.compose import path_text
-from tangent_train.cli.say import say
 from tangent_train.cli.stored import stored_run
 from tangent_train.results.record import load_record
 from tangent_train.results.tables import Table
+from tangent_train.say import say
 from tangent_train.tasks.segmentation import SegmentationTask
 from tests.cli.tiny_runs import SETTINGS, Run, results
 from tests.running import run_python
